@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from html import escape
 
-INK, GREY, WIRE, BORDER = "#1f2933", "#66727f", "#33475b", "#8a9bab"
+INK, GREY, WIRE, BORDER = "#1f2933", "#5b6875", "#33475b", "#8a9bab"
 NAME, PLANT = "#0b5394", "#fff3dc"
 """Colours of the names of wires, and of stepped blocks, such as FMUs."""
 

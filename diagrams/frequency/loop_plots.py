@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...blocks.core import OptionError, with_unit
-from ..results import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, VERMILION, legend_above, new_figure, style
+from ..results import BLUE, DARK, GREEN, GREY, PURPLE, STONE, VERMILION, legend_above, new_figure, style
 from .realization import Realization
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLORS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE)
+COLORS = (BLUE, VERMILION, GREEN, PURPLE, DARK)
 LINES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
 POINTS = 800
 FAR = 8.0
@@ -212,7 +212,7 @@ def nichols(loops: Sequence[Any], omega: ArrayLike | None, labels: Sequence[str]
         value = 10.0 ** (gain / 20.0) * np.exp(1j * np.radians(phase))
         with np.errstate(divide="ignore"):
             closed = 20.0 * np.log10(np.abs(value / (1.0 + value)))
-        lines = axes.contour(phase, gain, closed, levels=[-12, -6, -3, 0, 3, 6, 12], colors=GREY, linewidths=0.6)
+        lines = axes.contour(phase, gain, closed, levels=[-12, -6, -3, 0, 3, 6, 12], colors=STONE, linewidths=0.5)
         axes.clabel(lines, fmt="%g dB", fontsize=6)
         axes.plot([-180.0], [0.0], marker="+", color=DARK, markersize=9, linestyle="none")
         axes.set(

@@ -49,8 +49,8 @@ LOOPS_TITLE = "Loops"
 PERIODIC = frozenset(f.name for f in fields(PeriodicMargins))
 
 
-def inner(case: Case) -> Section:
-    """Return the section about the loops, one part for each wire."""
+def inner(case: Case) -> Section | None:
+    """Return the section about the loops, one part for each wire; None where nothing is to be said of any."""
     text, parts = [*TEXTS.paragraphs("margins")], []
     for key, wire in case.loop_wires().items():
         part = _wire(case, key, wire)
@@ -58,8 +58,10 @@ def inner(case: Case) -> Section:
             text += left_out(case, wire, blocks_on_loops(case.diagram))
         else:
             parts.append(widened(wire, part))
-    if not parts and len(text) == 1:
-        text.append(TEXTS.line("no_loop"))
+    if not parts:
+        text = text[len(TEXTS.paragraphs("margins")) :]  # they are about the numbers
+        if not text:
+            return None
     return Section("inner", LOOPS_TITLE, tuple(text), sections=tuple(parts))
 
 
@@ -124,7 +126,11 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
         Table(
             f"Margins at {wire}",
             ("", *(titles[k] for k in found)),
-            tuple((text, *(m.numbers()[name] for m in found.values())) for name, text in ROWS.items()),
+            tuple(
+                (text, *(m.numbers()[name] for m in found.values()))
+                for name, text in ROWS.items()
+                if name != "delay_margin_samples" or any(L.dt for L in loops.values())
+            ),
         ),
         Table(
             f"Crossings at {wire}",
@@ -151,10 +157,11 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
         tables.append(Table(title, columns, tuple(beside), details=True))
     plain = {at: loops[at] for at in designs}
     looks = {at: case.looks[at.partition(".")[0]] for at in designs}
+    drawn = figures.DrawnLoops(wire, plain, found, titles, looks, case.axes)
     plots = (
-        figures.bode(f"inner_{key}_bode", wire, plain, found, titles, case.axes, looks),
-        figures.nyquist(f"inner_{key}_nyquist", wire, plain, found, titles, looks),
-        figures.sensitivities(f"inner_{key}_sensitivities", wire, plain, found, titles, case.axes, looks),
+        figures.bode(f"inner_{key}_bode", drawn),
+        figures.nyquist(f"inner_{key}_nyquist", drawn),
+        figures.sensitivities(f"inner_{key}_sensitivities", drawn),
         *gang_of_four(case, key, wire),
     )
     return LoopPart(Section(key, f"Loop at {wire}", tuple(notes), tuple(tables), plots, numbers), own)

@@ -20,8 +20,8 @@ REAL = 1e-9
 """Size of an imaginary part, relative to the pole, up to which it is rounding."""
 
 
-def closed_loops(case: Case) -> Section:
-    """Return the table of each variant's slowest and fastest poles, all loops closed."""
+def closed_loops(case: Case) -> Section | None:
+    """Return the table of each variant's slowest and fastest poles, all loops closed; None without any states."""
     numbers: dict[str, Number] = {}
     rows = []
     for v in case.usable():
@@ -32,9 +32,12 @@ def closed_loops(case: Case) -> Section:
             number = with_findings(number, v.model.findings_on_loops)
             numbers[f"{v.key}.slowest"] = number
             rows.append((v.title, len(s), Stability.of(v), number, fastest))
+    if not rows:
+        return None
     columns = ("variant", "poles", "stable", "largest Re s", "smallest Re s [1/s]")
-    table = Table("Closed loop", columns, tuple(rows), TEXTS.line("closed_loop", limit=ON_THE_LIMIT))
-    return Section("poles", POLES_TITLE, (), (table,), (), numbers)
+    table = Table("Poles", columns, tuple(rows), TEXTS.line("closed_loop", limit=ON_THE_LIMIT))
+    title = POLES_TITLE if case.loop_wires() else TEXTS.line("no_loop")
+    return Section("poles", title, (), (table,), (), numbers)
 
 
 def memory(case: Case) -> Section | None:

@@ -69,15 +69,15 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities) -> Section:
         value = found[name, first]
         rows.append((name, Number(value.value, value.unit or "1", 0.0, "", given=True), *cells))
     if kinks:
-        text.append(TEXTS.line("kink", wire=wire, names=", ".join(dict.fromkeys(kinks))))
+        text.append(TEXTS.line("kink", names=", ".join(dict.fromkeys(kinks))))
     if lost:
-        text.append(TEXTS.line("lost", wire=wire, names=", ".join(dict.fromkeys(lost))))
+        text.append(TEXTS.line("lost", names=", ".join(dict.fromkeys(lost))))
     if others:
-        text.append(TEXTS.line("others", wire=wire, names=", ".join(others), number=ROWS[first]))
+        text.append(TEXTS.line("others", names=", ".join(others), number=ROWS[first]))
     small = [row.parameter for row in found.of(first) if not _acts(row)]
     none = sorted({*found.without_effect, *small})
     if none:
-        text.append(TEXTS.line("without", wire=wire, count=len(none), number=ROWS[first]))
+        text.append(TEXTS.line("without", count=len(none), number=ROWS[first]))
     columns = ("parameter", "value", *(f"{ROWS[quantity]} per +1 %" for quantity in shown))
     table = Table(f"Largest sensitivities at {wire}", columns, tuple(rows), digits=4)
     plot = figures.sensitivity_bars(f"sensitivity_{key}", wire, ROWS[first], bars)

@@ -19,7 +19,7 @@ from .section_measured import MEASURED
 from .section_steps import NAMES
 from .section_worst_case import KEY as WORST_CASE
 from .stability import unstable_first
-from .variant import Variant
+from .variant import Implementation, Variant
 
 TEXTS = Texts(__package__, "summary")
 TITLE = "Summary"
@@ -117,6 +117,8 @@ def _weakest(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
     if actual is None:
         return
     found = weakest(numbers, [actual.key])
+    if found is None and not case.loop_wires():
+        return
     if found is None:
         yield TEXTS.line("no_margin")
         return
@@ -194,7 +196,8 @@ def _loops(case: Case, numbers: Mapping[str, Number]) -> Table | None:
             found[wire] = [numbers.get(f"{start}{name}") for name in LOOP_NUMBERS]
     if not found:
         return None
-    rows = tuple((ROWS[name], *(values[i] for values in found.values())) for i, name in enumerate(LOOP_NUMBERS))
+    all_rows = ((ROWS[name], *(values[i] for values in found.values())) for i, name in enumerate(LOOP_NUMBERS))
+    rows = tuple(row for row in all_rows if any(number is not None for number in row[1:]))
     return Table(TEXTS.line("loops"), ("", *found), rows, digits=DIGITS)
 
 
@@ -216,9 +219,14 @@ def _not_analysed(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
         yield TEXTS.line("moving", largest=actual.point.largest)
     for finding in () if model is None else model.findings:
         yield str(finding)
+    if "inner" in case.keys and not case.loop_wires():
+        yield TEXTS.line("no_loop")
+        return
+    several = not any(path.startswith("inner.") and path.endswith(".phase_margin_deg") for path in numbers)
+    sampled = any(case.usable(Implementation.SAMPLED, Implementation.DELAYED))
     for key in ("steps", "injection"):
         if key in case.keys and not any(path.split(".")[0] == key for path in numbers):
-            yield TEXTS.line("no_run", key=key)
+            yield TEXTS.line("no_run", key=key, several=several, sampled=sampled)
 
 
 def _model(v: Variant) -> Linearization | None:

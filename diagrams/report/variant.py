@@ -13,7 +13,7 @@ import numpy as np
 from ...blocks.core import Finding, LoopwrightError, PeriodicLoopError
 from ..flat import WiredDiagram
 from ..linearization import Linearization, linearize
-from ..results import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, VERMILION, OperatingPoint
+from ..results import BLUE, DARK, GREEN, PURPLE, STONE, VERMILION, OperatingPoint
 from .points import point_of
 
 AT_REST = 1e-6
@@ -39,11 +39,11 @@ class Implementation(StrEnum):
 
 
 LOOKS: Mapping[str, tuple[str, Any]] = {
-    Implementation.CONTINUOUS: (GREY, "-"),
+    Implementation.CONTINUOUS: (STONE, "-"),
     Implementation.SAMPLED: (GREEN, "-"),
     Implementation.DELAYED: (VERMILION, (0, (4, 2))),
 }
-OTHER = ((ORANGE, (0, (4, 2))), (PURPLE, (0, (1, 1.5))), (DARK, (0, (1, 1.5))))
+OTHER = ((PURPLE, (0, (4, 2))), (DARK, (0, (1, 1.5))), (PURPLE, (0, (1, 1.5))))
 
 
 def look_of(key: str, i: int) -> dict[str, Any]:

@@ -3,13 +3,14 @@
 from .axes import AxisUnits, set_powers
 from .contact_figures import contact_admittance, contact_map, level_text
 from .drawings import with_drawing
-from .loop_figures import bode, gang, nyquist, response, sensitivities
+from .loop_figures import DrawnLoops, bode, gang, nyquist, response, sensitivities
 from .measured_figures import Measured, injected, measured
 from .sensitivity_figures import sensitivity_bars
 from .step_figures import step_responses
 
 __all__ = [
     "AxisUnits",
+    "DrawnLoops",
     "Measured",
     "bode",
     "contact_admittance",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,33 @@ LIGHTLY_DAMPED = 0.3
 """Damping ratio of a pole below which a response is drawn at more frequencies around it."""
 OFF_THE_PAGE = 1e3
 """Size of L from which on it is not drawn in the complex plane: beyond lies the other branch of a resonance."""
+
+
+class DrawnLoops(NamedTuple):
+    """Loops at a wire, as their figures draw them: by their keys.
+
+    Attributes
+    ----------
+    wire : str
+        The wire.
+    loops : mapping of str to LinearSystem
+        L of each.
+    found : mapping of str to Margins
+        Their margins, which are marked.
+    titles : mapping of str to str
+        Their names in legends.
+    looks : mapping of str to dict
+        Colors and lines.
+    axes : AxisUnits
+        Units of the axes.
+    """
+
+    wire: str
+    loops: Mapping[str, Any]
+    found: Mapping[str, Margins]
+    titles: Mapping[str, str]
+    looks: Mapping[str, dict[str, Any]]
+    axes: AxisUnits
 
 
 def _span(loops: Mapping[str, Any], found: Mapping[str, Margins]) -> tuple[float, float]:
@@ -48,50 +75,42 @@ def _response(L: Any, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
     return w, r.response(w)[0]
 
 
-def bode(
-    key: str,
-    wire: str,
-    loops: Mapping[str, Any],
-    found: Mapping[str, Margins],
-    titles: Mapping[str, str],
-    axes: AxisUnits,
-    looks: Mapping[str, dict[str, Any]],
-) -> Plot:
+def bode(key: str, of: DrawnLoops) -> Plot:
     """Draw L over frequency, with the margins marked."""
-    low, high = _span(loops, found)
+    low, high = _span(of.loops, of.found)
     with style():
         figure = new_figure(3.0)
         top, bottom = figure.subplots(2, 1, sharex=True)
-        for name, L in loops.items():
-            look = looks[name]
+        for name, L in of.loops.items():
+            look = of.looks[name]
             w, value = _response(L, low, high)
             phase = np.degrees(np.unwrap(np.angle(value)))
             phase -= 360 * np.round((phase[0] + 180) / 360)  # the branch that begins nearest to −180°
-            top.semilogx(axes.frequency(w), axes.magnitude(np.abs(value)), label=titles[name], **look)
-            bottom.semilogx(axes.frequency(w), phase, **look)
-            for c in found[name].gain_crossovers:
+            top.semilogx(of.axes.frequency(w), of.axes.magnitude(np.abs(value)), label=of.titles[name], **look)
+            bottom.semilogx(of.axes.frequency(w), phase, **look)
+            for c in of.found[name].gain_crossovers:
                 at = c.frequency.value
-                x, y = axes.frequency(at), np.interp(at, w, phase)
-                top.plot(x, axes.magnitude(1.0), "o", color=look["color"], markersize=3.5)
+                x, y = of.axes.frequency(at), np.interp(at, w, phase)
+                top.plot(x, of.axes.magnitude(1.0), "o", color=look["color"], markersize=3.5)
                 bottom.plot([x, x], [-180, y], color=look["color"], linewidth=2.0, alpha=0.6)
-            for p in found[name].phase_crossovers:
+            for p in of.found[name].phase_crossovers:
                 if low < p.frequency.value < high:
-                    x, k = axes.frequency(p.frequency.value), p.gain_margin.value
-                    top.plot([x] * 2, axes.magnitude([1.0, 1.0 / k]), color=look["color"], linewidth=2.0, alpha=0.6)
+                    x, k = of.axes.frequency(p.frequency.value), p.gain_margin.value
+                    top.plot([x] * 2, of.axes.magnitude([1.0, 1.0 / k]), color=look["color"], linewidth=2.0, alpha=0.6)
                     bottom.plot(x, -180, "s", color=look["color"], markersize=3.5)
             if L.dt:
                 for ax in (top, bottom):
-                    ax.axvline(axes.frequency(np.pi / L.dt), color=GREY, linewidth=0.6, linestyle=":")
-        set_magnitudes(top, axes)
-        top.axhline(axes.magnitude(1.0), color=DARK, linewidth=0.6)
+                    ax.axvline(of.axes.frequency(np.pi / L.dt), color=GREY, linewidth=0.6, linestyle=":")
+        set_magnitudes(top, of.axes)
+        top.axhline(of.axes.magnitude(1.0), color=DARK, linewidth=0.6)
         bottom.axhline(-180, color=DARK, linewidth=0.6)
         _degrees(bottom)
         set_frequencies(bottom, 9)
-        top.set_ylabel(axes.magnitude_label("|L|"))
+        top.set_ylabel(of.axes.magnitude_label("|L|"))
         bottom.set_ylabel(with_unit("phase of L", "deg"))
-        bottom.set_xlabel(axes.frequency_label)
+        bottom.set_xlabel(of.axes.frequency_label)
         legend_above(figure, top)
-    caption = TEXTS.line("bode", wire=wire)
+    caption = TEXTS.line("bode", wire=of.wire)
     return Plot(key, caption, figure)
 
 
@@ -105,23 +124,16 @@ def _degrees(ax: Axes) -> None:
     ax.yaxis.set_major_locator(MultipleLocator(step, 180 if step == 360 else 0))  # −180° has a tick
 
 
-def nyquist(
-    key: str,
-    wire: str,
-    loops: Mapping[str, Any],
-    found: Mapping[str, Margins],
-    titles: Mapping[str, str],
-    looks: Mapping[str, dict[str, Any]],
-) -> Plot:
+def nyquist(key: str, of: DrawnLoops) -> Plot:
     """Draw L in the complex plane: near −1, and beside it so far that all crossings of the real axis are in view."""
-    low, high = _span(loops, found)
-    crossings = [-1 / p.gain_margin.value for m in found.values() for p in m.phase_crossovers if p.gain_margin.value]
+    low, high = _span(of.loops, of.found)
+    crossings = [-1 / p.gain_margin.value for m in of.found.values() for p in m.phase_crossovers if p.gain_margin.value]
     farthest = min([-1.0, *(x for x in crossings if np.isfinite(x))])
     with style():
         figure = new_figure(2.9)
         panels = figure.subplots(1, 2 if farthest < NEAR[0] else 1, squeeze=False)[0]
         for ax in panels:
-            _draw_nyquist(ax, loops, found, titles, looks, low, high)
+            _draw_nyquist(ax, of, low, high)
         near = panels[-1]
         near.set_xlim(*NEAR)
         near.set_ylim(-1.7, 1.7)
@@ -132,7 +144,7 @@ def nyquist(
             panels[0].set_title("all crossings")
             near.set_title("near −1")
         legend_above(figure, panels[0])
-    caption = TEXTS.line("nyquist", wire=wire)
+    caption = TEXTS.line("nyquist", wire=of.wire)
     return Plot(key, caption, figure)
 
 
@@ -140,26 +152,18 @@ NEAR = (-2.6, 1.4)
 """Real parts that are drawn near −1."""
 
 
-def _draw_nyquist(
-    ax: Axes,
-    loops: Mapping[str, Any],
-    found: Mapping[str, Margins],
-    titles: Mapping[str, str],
-    looks: Mapping[str, dict[str, Any]],
-    low: float,
-    high: float,
-) -> None:
+def _draw_nyquist(ax: Axes, of: DrawnLoops, low: float, high: float) -> None:
     angle = np.linspace(0, 2 * np.pi, 361)
     ax.plot(np.cos(angle), np.sin(angle), color=GREY, linewidth=0.6)
-    for name, L in loops.items():
-        look = looks[name]
+    for name, L in of.loops.items():
+        look = of.looks[name]
         _, value = _response(L, low / 10, high)
-        far = [abs(10 / p.gain_margin.value) for p in found[name].phase_crossovers if p.gain_margin.value]
+        far = [abs(10 / p.gain_margin.value) for p in of.found[name].phase_crossovers if p.gain_margin.value]
         value = np.where(np.abs(value) < max([OFF_THE_PAGE, *far]), value, np.nan)
-        ax.plot(value.real, value.imag, label=titles[name], **look)
+        ax.plot(value.real, value.imag, label=of.titles[name], **look)
         ax.plot(value.real, -value.imag, color=look["color"], linestyle=look["linestyle"], linewidth=0.5)
         _arrows(ax, value, look["color"])
-        m = found[name]
+        m = of.found[name]
         if np.isfinite(m.modulus_margin.value):
             r = m.modulus_margin.value
             ax.plot(-1 + r * np.cos(angle), r * np.sin(angle), color=look["color"], linewidth=0.5, linestyle=":")
@@ -187,38 +191,30 @@ def _arrows(ax: Axes, value: np.ndarray, color: str) -> None:
             ax.annotate("", xy=ends[1], xytext=ends[0], arrowprops=arrow, annotation_clip=True)
 
 
-def sensitivities(
-    key: str,
-    wire: str,
-    loops: Mapping[str, Any],
-    found: Mapping[str, Margins],
-    titles: Mapping[str, str],
-    axes: AxisUnits,
-    looks: Mapping[str, dict[str, Any]],
-) -> Plot:
+def sensitivities(key: str, of: DrawnLoops) -> Plot:
     """Draw |S| and |T|."""
-    low, high = _span(loops, found)
+    low, high = _span(of.loops, of.found)
     with style():
         figure = new_figure(2.1)
         left, right = figure.subplots(1, 2, sharey=True)
-        for name, L in loops.items():
+        for name, L in of.loops.items():
             w, value = _response(L, low, high)
-            x, look = axes.frequency(w), looks[name]
-            left.semilogx(x, axes.magnitude(np.abs(1 / (1 + value))), label=titles[name], **look)
-            right.semilogx(x, axes.magnitude(np.abs(value / (1 + value))), **look)
+            x, look = of.axes.frequency(w), of.looks[name]
+            left.semilogx(x, of.axes.magnitude(np.abs(1 / (1 + value))), label=of.titles[name], **look)
+            right.semilogx(x, of.axes.magnitude(np.abs(value / (1 + value))), **look)
             for ax, place, peak in ((left, "ms_frequency", "ms"), (right, "mt_frequency", "mt")):
-                at, size = getattr(found[name], place).value, getattr(found[name], peak).value
+                at, size = getattr(of.found[name], place).value, getattr(of.found[name], peak).value
                 if low < at < high:
-                    ax.plot(axes.frequency(at), axes.magnitude(size), "o", color=look["color"], markersize=3.5)
+                    ax.plot(of.axes.frequency(at), of.axes.magnitude(size), "o", color=look["color"], markersize=3.5)
         for ax, name in ((left, "|S|"), (right, "|T|")):
-            set_magnitudes(ax, axes)
-            ax.axhline(axes.magnitude(1.0), color=DARK, linewidth=0.6)
-            ax.set_title(axes.magnitude_label(name))
-            ax.set_xlabel(axes.frequency_label)
+            set_magnitudes(ax, of.axes)
+            ax.axhline(of.axes.magnitude(1.0), color=DARK, linewidth=0.6)
+            ax.set_title(of.axes.magnitude_label(name))
+            ax.set_xlabel(of.axes.frequency_label)
             set_frequencies(ax)
-            ax.set_ylim(bottom=axes.magnitude(1e-3))
+            ax.set_ylim(bottom=of.axes.magnitude(1e-3))
         legend_above(figure, left)
-    return Plot(key, TEXTS.line("sensitivities", wire=wire), figure)
+    return Plot(key, TEXTS.line("sensitivities", wire=of.wire), figure)
 
 
 def gang(

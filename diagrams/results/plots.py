@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 # Okabe and Ito's palette, which colour-blind readers tell apart
 BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
-GREY, DARK = "#A6A6A6", "#333333"
+GREY, STONE, DARK = "#A6A6A6", "#6E6E6E", "#333333"
+"""Helping lines; curves and texts that stand back; texts."""
 
 WIDTH = 170 / 25.4
 """Width of a figure in inches: the text of an A4 page."""

@@ -10,7 +10,7 @@ from loopwright.diagrams import Diagram, Number, Report, Section, Table, Verdict
 from loopwright.diagrams.report.case import Case
 from loopwright.diagrams.report.gang import gang_of_four
 from loopwright.diagrams.report_figures import AxisUnits, Measured, measured
-from loopwright.diagrams.report_figures.loop_figures import bode, nyquist
+from loopwright.diagrams.report_figures.loop_figures import DrawnLoops, bode, nyquist
 from loopwright.diagrams.report_writing import Judged
 from loopwright.diagrams.report_writing.definitions import definition
 from loopwright.diagrams.report_writing.figures import embedded
@@ -34,8 +34,8 @@ def drawn(diagram, wire, kind=bode):
     L = v.loop(wire)
     from loopwright.diagrams import margins
 
-    args = ("k", wire, {v.key: L}, {v.key: margins(L)}, {v.key: v.title})
-    return (kind(*args, AxisUnits(), case.looks) if kind is bode else kind(*args, case.looks)).figure
+    of = DrawnLoops(wire, {v.key: L}, {v.key: margins(L)}, {v.key: v.title}, case.looks, AxisUnits())
+    return kind("k", of).figure
 
 
 def test_a_resonance_is_drawn_to_its_peak():

@@ -1,0 +1,81 @@
+"""Sections that don't apply don't appear, and the first page says what was not analysed, and why."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import Constant, Gain, Integrator, Sine, StateSpace
+from loopwright.diagrams import Diagram, analyse
+
+PARTS = ("subject", "operating_points", "poles", "inner", "steps", "sensitivity", "injection", "limits")
+
+
+def open_chain():
+    """Return an integrator that nothing feeds back."""
+    return Diagram("open", Integrator(name="x")(Gain(gain=2.0, name="k")(Constant(value=0.0, name="r"))).named("y"))
+
+
+def static():
+    return Diagram("static", Gain(gain=2.0, name="k")(Sine(frequency=1.0, name="s")).named("v"))
+
+
+def channels():
+    """Return a continuous loop with two channels, cut at u or y."""
+    plant = StateSpace(A=[[-1.0, 0.2], [0.1, -2.0]], B=np.eye(2), C=[[1.0, 0.3], [0.2, 1.0]], name="plant")
+    minus = Gain(gain=-1.0, name="minus")(plant.y.named("y"))
+    return Diagram(
+        "channels", plant(StateSpace(A=np.zeros((2, 2)), B=np.eye(2), C=np.eye(2), name="C")(minus).named("u"))
+    )
+
+
+MADE = {"open": open_chain, "static": static, "channels": channels}
+
+
+@cache
+def report(name):
+    return analyse(MADE[name]())
+
+
+def walk(sections):
+    for section in sections:
+        yield section
+        yield from walk(section.sections)
+
+
+def said(name):
+    return " ".join(report(name).sections[0].text)
+
+
+@pytest.mark.parametrize(
+    ("name", "keys"),
+    [
+        ("open", ["summary", "subject", "operating_points", "poles", "limits"]),
+        ("static", ["summary", "subject", "operating_points", "limits"]),
+        ("channels", ["summary", "subject", "operating_points", "poles", "inner", "sensitivity", "limits"]),
+    ],
+)
+def test_sections_that_do_not_apply_do_not_appear(name, keys):
+    assert [section.key for section in report(name).sections] == keys
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_no_table_is_empty_and_no_section_has_nothing(name):
+    for section in walk(report(name).sections):
+        assert section.text or section.tables or section.plots or section.sections, section.key
+        for table in section.tables:
+            assert table.rows, table.title
+            assert all(any(cell not in (None, "") for cell in row[1:]) for row in table.rows), table.title
+
+
+def test_a_diagram_without_loops_has_plain_poles_and_its_first_page_says_that_there_are_no_margins():
+    assert "no wire of this diagram lies on a loop" in said("open")
+    assert "Step responses" not in said("open")
+    assert "injection" not in said("open")
+    assert next(s.title for s in report("open").sections if s.key == "poles") == "Poles"
+    assert report("open").numbers()["poles.continuous.slowest"].value == 0.0
+
+
+def test_the_first_page_says_why_steps_and_injection_are_missing():
+    assert "a wire with several entries has no single one" in said("channels")
+    assert "measures sampled loops, and the diagram has none" in said("channels")
