@@ -222,7 +222,7 @@ def _not_analysed(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
     if "inner" in case.keys and not case.loop_wires():
         yield TEXTS.line("no_loop")
         return
-    several = not any(path.startswith("inner.") and path.endswith(".phase_margin_deg") for path in numbers)
+    several = LOOP_NUMBERS[0] not in {path.rpartition(".")[2] for path in numbers}
     sampled = any(case.usable(Implementation.SAMPLED, Implementation.DELAYED))
     for key in ("steps", "injection"):
         if key in case.keys and not any(path.split(".")[0] == key for path in numbers):
