@@ -230,7 +230,7 @@ def frequency_response(
     chosen, point, t0 = _find_beginning(diagram, at, dict(options))
     variant = diagram.replace(point.parameters) if point is not None and point.parameters else diagram
     discrete = diagram.has_clock or diagram.has_fmu
-    if not discrete and chosen.get("step") is None and point is None:
+    if not discrete and chosen.get("step") is None:
         chosen["step"] = choose_step(omega)
     flat = variant.flatten(chosen.get("step", None if point is None or diagram.has_clock else point.base))
     every = math.lcm(*(clock.every for clock in flat.distinct)) if flat.distinct else 1

@@ -26,6 +26,7 @@ from ..linearization import (
     ticks_between_renewals,
     ticks_to_renewal,
 )
+from ..results import PointOrigin
 from .injection import InjectionRun, inject_signal
 
 SAMPLES = 1000
@@ -187,9 +188,11 @@ def step_response(
     if flat.hybrid:
         options |= {"rtol": 1e-9, "atol": 1e-12}
 
+    begins = point if sampled or point.how is not PointOrigin.RUN else None
+
     def run_with(height: float) -> tuple[np.ndarray, np.ndarray, bool]:
-        with InjectionRun(variant, made, signal, taps, point if sampled else None, options) as run:
-            if not sampled and point.t > 0:
+        with InjectionRun(variant, made, signal, taps, begins, options) as run:
+            if begins is None and point.t > 0:
                 run.simulation.advance(point.t)
             if wait:
                 run.go(wait, 1)

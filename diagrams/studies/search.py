@@ -20,6 +20,8 @@ from .cases import Case, CaseOrigin, CaseState, Goal, describe
 from .numbers import numbers_of
 
 if TYPE_CHECKING:
+    from control import StateSpace
+
     from ..linearization import LoopSlope
 
 MOST_CORNERS = 5
@@ -53,6 +55,7 @@ class Study:
         self.names = [(name, i) for name, box in boxes.items() for i in range(box.size)]
         self.smooth = {name for name in boxes if not _is_start_value(diagram, name)}
         self._bases: dict[int, Linearization] = {}
+        self._loops: dict[int, dict[tuple[str, ...], StateSpace]] = {}
         self._asked: dict[int, tuple[WiredDiagram, OperatingPoint]] = {}
 
     # --- cases --------------------------------------------------------------------------------------------------------
@@ -76,25 +79,48 @@ class Study:
             asked = point(diagram) if callable(point) else point
             if not parameters:
                 self._bases[place] = linearize(diagram, asked, **self.options)
+                self._loops[place] = {wires: self._bases[place].loop(*wires) for wires in self.goal.loops}
             base = self._bases.get(place)
             if base is None:
                 raise OptionError("the diagram as it is can't be analysed at this operating point.", block=diagram.name)
             run = {name: value for name, value in self.options.items() if name not in ("plants", "stairs")}
             at = base.point if not parameters else operating_point(diagram, asked, run)
             self._asked[start.index] = (diagram, at)
-            return self._judge(start, base, diagram, at)
+            return self._judge(start, base, diagram, at, self._loops[place] if not parameters else {})
         except LoopwrightError as error:
             return replace(start, reason=str(error))
 
-    def _judge(self, case: Case, base: Linearization, diagram: WiredDiagram, at: OperatingPoint) -> Case:
-        """Return a case with its numbers and its goodness."""
+    def with_findings(self, case: Case) -> Case:
+        """Return a stable case with its numbers made anew by the whole linear model, which tells what it leaves out.
+
+        The numbers of many cases come from their loops' matrices alone, without the model's checks and findings.
+        """
+        if case.state not in (CaseState.STABLE, CaseState.MOVING):
+            return case
+        diagram, at = self._asked[case.index]
+        try:
+            model = linearize(diagram, at, **self.options)
+            loops = {wires: model.loop(*wires) for wires in self.goal.loops}
+        except LoopwrightError as error:
+            return replace(case, state=CaseState.FAILED, goodness=FAILED, loop=(), quantity="", reason=str(error))
+        return self._judge(case, self._bases[case.point], diagram, at, loops)
+
+    def _judge(
+        self,
+        case: Case,
+        base: Linearization,
+        diagram: WiredDiagram,
+        at: OperatingPoint,
+        loops: Mapping[tuple[str, ...], Any],
+    ) -> Case:
+        """Return a case with its numbers and its goodness; ``loops`` are those that are known."""
         numbers: dict[tuple[str, ...], dict[str, Number]] = {}
         worst: tuple[float, tuple[str, ...], str] = (math.inf, (), "")
         unstable: tuple[str, ...] = ()
         growth, rests = -math.inf, True
         for wires in self.goal.loops:
             L, still = loop_of_variant(base, wires, diagram, at)
-            rests = rests and still
+            L, rests = loops.get(wires, L), rests and still
             r = Realization.of(L, delay=self.delay)
             own = r.logarithm(r.eigenvalues()) if r.order and not r.is_stable() else np.zeros(0)
             hidden = np.array(find_hidden_unstable(r))  # poles of other loops, which this one does not move
@@ -118,9 +144,7 @@ class Study:
         if not worst[1]:
             asked = ", ".join(dict.fromkeys(name for limits in self.goal.loops.values() for name in limits))
             there = ", ".join(dict.fromkeys(name for found in numbers.values() for name in found)) or "none"
-            return replace(
-                case, reason=f"found no {asked} that is a number; its loops have {there}. Take one of these."
-            )
+            return replace(case, reason=f"found no {asked}; expected a number of its loops. Take one of: {there}.")
         state = CaseState.STABLE if rests or not base.is_equilibrium else CaseState.MOVING
         return replace(case, state=state, goodness=worst[0], loop=worst[1], quantity=worst[2], numbers=numbers)
 

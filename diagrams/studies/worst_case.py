@@ -190,8 +190,9 @@ def find_worst_case(
     if boxes and starts > 0:
         study.try_corners()
         study.search(starts, steps)
+    worst = study.with_findings(min(study.cases, key=lambda case: (case.goodness, case.index)))
+    study.cases[worst.index] = worst
     cases = tuple(study.cases)
-    worst = min(cases, key=lambda case: (case.goodness, case.index))
     return WorstCase(worst, tuple(nominal), cases, boxes, goal, diagram, places, {**options, "delay": delay})
 
 

@@ -7,6 +7,7 @@ import pytest
 from loopwright.blocks import Gain, Integrator, OptionError, Saturation, SimulationError, Sine
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.measure import measure_step, step_response
+from support.tuned_loops import make_slide, slide_slope
 
 
 def spring(damping=3.0):
@@ -42,6 +43,19 @@ def test_the_final_value_is_that_of_the_linear_model_at_frequency_zero():
     assert found.final_answer() == pytest.approx(1.0)
     held = step_response(sampled(), "u", size=0.1, length=0.1, outputs=["lag.y"])
     np.testing.assert_allclose(held.final / 0.1, [-1.0, 1 / 3], atol=1e-9)
+
+
+def test_a_continuous_diagram_is_tried_at_the_point_that_was_trimmed():
+    """It starts 2.9 N off the rest of its integral, which the step response was measured around."""
+    diagram = make_slide()
+    found = step_response(diagram, "u", size=1e-4, length=1.0, at=diagram.trim(targets={"slide.speed": 0.3}))
+    s = control.tf("s")
+    L = (6 * s + 40) / (s * (2 * s + slide_slope()))
+    _, T = control.step_response(L / (1 + L), found.t)
+    np.testing.assert_allclose(found.answer(), T, atol=1e-4)
+    assert found.moved < 1e-9
+    measured = diagram.frequency_response("u", [5.0], amplitude=1e-5, at=diagram.trim(targets={"slide.speed": 0.3}))
+    assert measured.L.frdata.item() == pytest.approx(complex(L(1j * measured.omega[0])), rel=1e-4)
 
 
 def test_overshoot_and_settling_are_those_of_the_closed_form():
