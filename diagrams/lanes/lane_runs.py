@@ -25,6 +25,8 @@ class LaneStart:
         Longest step of each FMU's integrator in s. Runs go side by side if these are equal.
     row : ndarray
         The entries of the log that are kept.
+    messages : tuple of str
+        What its start has told.
     """
 
     x: np.ndarray
@@ -34,6 +36,7 @@ class LaneStart:
     plants: Mapping[str, np.ndarray]
     steps: tuple[float, ...]
     row: np.ndarray
+    messages: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

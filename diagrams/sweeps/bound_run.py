@@ -68,9 +68,9 @@ class BoundRun:
         with LOADING:
             try:
                 self.engine.load(self._stack, 0.0)
-                self._notes += tuple(self._take_messages())
+                self._notes += self.take_messages()
                 self.engine.initialize()
-                self._take_messages()  # of numbers that are no sample's
+                self.take_messages()  # of numbers that are no sample's
             except BaseException:
                 self._stack.close()
                 raise
@@ -151,12 +151,12 @@ class BoundRun:
 
     def _take_record(self, started: float) -> Run:
         t, data = self.recorder.finish()
-        return self.make_run(t, data, self.engine.position.stopped, started)
+        return self.make_run(t, data, self.engine.position.stopped, started, self.take_messages())
 
     def make_run(
-        self, t: np.ndarray, data: np.ndarray, stopped: Stopped | None, started: float, messages: Sequence[str] = ()
+        self, t: np.ndarray, data: np.ndarray, stopped: Stopped | None, started: float, messages: Sequence[str]
     ) -> Run:
-        """Return samples of a run with the numbers that it was begun with, and what has been told since.
+        """Return a run from its samples.
 
         Parameters
         ----------
@@ -167,9 +167,8 @@ class BoundRun:
         started : float
             Reading of the clock at its start.
         messages : sequence of str
-            Further messages.
+            What was told in it.
         """
-        engine = self.engine
         run = Run(
             t=t,
             data=data,
@@ -178,7 +177,7 @@ class BoundRun:
             units=self._recording.units,
             diagram=None,
             elapsed=perf_counter() - started,
-            messages=(*self._notes, *engine.messages, *engine.workspace.messages, *self._take_messages(), *messages),
+            messages=(*self._notes, *self.engine.messages, *messages),
             stopped=stopped,
             columns=self.recorder.columns,
             has_states=self._recording.states,
@@ -187,11 +186,11 @@ class BoundRun:
         run.find_in(self._places)
         return run
 
-    def _take_messages(self) -> list[str]:
-        """Return what the FMUs have told since the last run."""
-        found: list[str] = []
+    def take_messages(self) -> tuple[str, ...]:
+        """Return what a run's start and the FMUs have told since the last run."""
+        found = [*self.engine.workspace.messages]
         for path, plant in self.engine.plants.items():
             texts = plant.messages
             found += texts[self._told.get(path, 0) :]
             self._told[path] = len(texts)
-        return found
+        return tuple(found)

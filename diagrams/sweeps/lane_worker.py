@@ -12,9 +12,9 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError
 from ...fmus.calls import FmuInstance
-from ..flat import ClockSets, is_exact, kinds_of
+from ..flat import EVERY, ClockSets, is_exact, kinds_of, ticks_after
 from ..lanes import LaneCode, LaneEnd, LaneRuns, LaneStart, NoLanesError, compile_lanes
-from ..results import Run, Stopped
+from ..results import Run, Stopped, machine_memory
 from ..simulation import StopConditions
 from .bound_run import BoundRun, Tell
 from .outcome import Outcome
@@ -108,10 +108,12 @@ class LaneWorker(Worker):
         if isinstance(found, str) or (found is not None and found.bound is bound):
             return found
         try:
-            self._found[numbers.key] = made = _Lanes(bound, self.plan.lanes)
+            made = _Lanes(bound, self.plan.lanes)
         except NoLanesError as reason:
             self._found[numbers.key] = text = str(reason)
             return text
+        self._found = {key: old for key, old in self._found.items() if isinstance(old, str) or key in self._bound}
+        self._found[numbers.key] = made
         return made
 
 
@@ -126,16 +128,20 @@ class _Lanes:
         if bound.ends_between_ticks or not is_exact(flat, bound.count):
             raise NoLanesError("their duration is no whole number of ticks, or of too many")
         acting = kinds_of(flat, every=engine.every_tick)
-        self._ticks = np.fromiter(flat.ticks(0, bound.count, every=engine.every_tick), dtype=np.int64)
+        visited = [EVERY] if engine.every_tick else [*flat.visited]
+        self._ticks = ticks_after(visited, 0, bound.count, bound.count) if bound.count else np.zeros(0, dtype=np.int64)
         self._kinds = ClockSets(flat.distinct, {clocks: k for k, clocks in enumerate(acting)}).at(self._ticks)
         if (self._kinds < 0).any():
             raise NoLanesError("at some tick no clock acts, such as that at which they end, or a set that comes late")
         ends, base = np.concatenate([[0], self._ticks]), flat.base
         self._times = ends * base.numerator / base.denominator
         self._widths = np.diff(ends) * base.numerator / base.denominator
-        self._code: LaneCode = compile_lanes(flat, acting, count)
         entries = bound.recorder.entries
         self._columns = np.arange(engine.workspace.log.size) if entries is None else entries
+        needed = 3 * 8 * count * (len(self._ticks) // bound.recorder.every + 2) * len(self._columns)
+        if needed > 0.3 * machine_memory():
+            raise NoLanesError(f"the samples of {count} runs at a time would take {needed / 2**30:.0f} GiB")
+        self._code: LaneCode = compile_lanes(flat, acting, count)
         self._stops = StopConditions(flat, engine.workspace.log, str)
 
     def start(self, numbers: Numbers[Any]) -> LaneStart | None:
@@ -161,7 +167,8 @@ class _Lanes:
                 raise NoLanesError(f"{path} integrates with {step:g} s, more than {_MOST_SUBSTEPS} substeps in a tick")
             steps.append(step)
         here = workspace.here
-        return LaneStart(here.x.copy(), here.w.copy(), workspace.z.copy(), here.p.copy(), plants, tuple(steps), rows[0])
+        vectors = here.x.copy(), here.w.copy(), workspace.z.copy(), here.p.copy()
+        return LaneStart(*vectors, plants, tuple(steps), rows[0], bound.take_messages())
 
     def run(self, starts: Sequence[LaneStart], tell: Tell, started: float) -> Iterator[Run | None]:
         """Yield the runs; None for one that has failed."""
@@ -180,10 +187,10 @@ class _Lanes:
                 parts.append(np.ascontiguousarray(room[:rows, :n, lane]))
             k = end
             tell(float(self._times[k]))
-        for parts, end_of in zip(kept, runs.ends(), strict=True):
-            yield None if end_of.failed else self._make_run(parts, end_of, started)
+        for start, parts, end_of in zip(starts, kept, runs.ends(), strict=True):
+            yield None if end_of.failed else self._make_run(parts, end_of, started, (*start.messages, DIFFER))
 
-    def _make_run(self, parts: Sequence[np.ndarray], end: LaneEnd, started: float) -> Run:
+    def _make_run(self, parts: Sequence[np.ndarray], end: LaneEnd, started: float, messages: Sequence[str]) -> Run:
         """Return a run from its rows, of which those after its end are left out."""
         every = self.bound.recorder.every
         last = end.stopped or len(self._ticks)
@@ -193,7 +200,7 @@ class _Lanes:
         if last % every:  # the last sample is kept in any case
             data, t = np.concatenate([data, end.last[None]]), np.append(t, self._times[last])
         stopped = Stopped(float(self._times[last]), self._stops.paths[end.by]) if end.stopped else None
-        return self.bound.make_run(t.copy(), data, stopped, started, (DIFFER,))
+        return self.bound.make_run(t.copy(), data, stopped, started, messages)
 
 
 def _itself(run: Run) -> Run:

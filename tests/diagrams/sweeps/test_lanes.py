@@ -7,18 +7,23 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Compare, Gain, Input, OptionError, Output, Step, StopCondition, UnitDelay
+from loopwright.blocks import Block, Compare, Constant, Gain, Input, OptionError, Output, Step, StopCondition, UnitDelay
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.diagrams.sweeps import final, maximum, mean, minimum, settling_time
+from loopwright.diagrams.sweeps import final, lane_worker, maximum, mean, minimum, settling_time
+from loopwright.diagrams.sweeps.bound_run import BoundRun
 from loopwright.diagrams.sweeps.lane_worker import DIFFER
+from loopwright.diagrams.sweeps.samples import Sample
+from loopwright.diagrams.sweeps.sweep import make_plan
+from loopwright.diagrams.sweeps.workers import make_worker
 from loopwright.fmus import Fmu, ModelSpec, Variable, build_fmu
+from loopwright.fmus.models import bouncing_ball, dc_motor, mass_spring_damper, scara
 
 QUIET = {"progress": False}
 T, STEP = 0.01, 2.5e-3
 LANES = 4
 NEAR = 1e-12
 """Difference of a run in a lane from a single one, of the largest value: some thousand roundings of a stable loop."""
-PAPER = 1e-9
+PAPER = 1e-10
 """The difference that docs/sweeps.md states for the experiments of the paper, whose friction is steep near rest."""
 
 
@@ -234,11 +239,105 @@ def test_results_in_lanes_are_stored_apart_from_those_of_single_runs(tmp_path):
         run(values)
 
 
+def three_plants():
+    """An arm, a motor and a mass, the motor of FMI 2, in two rates; the arm's external force is no port."""
+    arm, motor, mass = (
+        Fmu(model.build(fmi=fmi), name=model.__name__.rpartition(".")[2], start=start, ports=ports)
+        for model, fmi, start, ports in (
+            (scara, 3, {"external_force": [0.5, -1.0]}, ["motor_torque", "joint_angle", "position"]),
+            (dc_motor, 2, {"load_torque": 0.01}, ["voltage", "speed", "angle", "torque"]),
+            (mass_spring_damper, 3, {}, None),
+        )
+    )  # fmt: skip
+
+    @subsystem(sample_time=T, name="box")
+    def box(angle, speed, position, reference):
+        torque = Gain(gain=np.diag([3.0, 2.0]), name="arm_gain")(reference - angle)
+        return torque, Gain(gain=0.2, name="motor_gain")(8.0 - speed), -4.0 * position
+
+    @subsystem(sample_time=2 * T, name="slow")
+    def slow(position):
+        return Gain(gain=0.1, name="slow_gain")(position)
+
+    angle, reference = arm.joint_angle, Constant(value=(0.3, -0.4), name="reference")
+    torque, voltage, force = box(angle, motor.speed, mass.position, reference + slow(arm.position))
+    calls = arm(motor_torque=torque), motor(voltage=voltage), mass(force=force)
+    signals = arm.position.named("tip"), motor.angle.named("angle"), mass.acceleration.named("a")
+    return Diagram("three", *calls, *signals)
+
+
 @pytest.mark.slow
-def test_experiment_c_is_near_single_runs_whatever_its_friction_and_its_compliance():
-    experiment = experiments.hand_guiding()
-    ranges = {"plant.coulomb_scale": (0.5, 1.5), "controller.admittance_perp.stiffness": (100.0, 300.0)}
-    names = ["xi", "motor_force", "f_perp"]
-    found = experiment.diagram.sweep(ranges, 0.3, samples="latin", count=9, signals=names, lanes=8, **QUIET)
+def test_several_plants_with_vectors_of_ports_run_in_one_loop():
+    diagram = three_plants()
+    rng = np.random.default_rng(8)
+    table = [
+        {"arm_gain.gain[1,1]": a, "mass_spring_damper.stiffness": k, "dc_motor.resistance": r}
+        for a, k, r in rng.uniform((2.0, 5.0, 0.5), (4.0, 20.0, 2.0), (6, 3))
+    ]
+    found = diagram.sweep(None, 0.4, samples=table, signals=["tip", "angle", "a"], lanes=LANES, **QUIET)
     assert ran_in_lanes(found)
-    assert_near_single_runs(experiment.diagram, found, 0.3, names, bound=PAPER)
+    assert np.ptp(found["tip"][:, -1], axis=0).min() > 1e-6
+    assert_near_single_runs(diagram, found, 0.4, ["tip", "angle", "a"])
+
+
+def test_fmus_with_events_go_by_themselves():
+    ball = Fmu(bouncing_ball.build(), name="ball")
+    diagram = Diagram("ball", ball(), subsystem(sample_time=T, name="box")(lambda x: 2.0 * x)(ball.height).named("y"))
+    found = diagram.sweep({"ball.height": (1.0, 2.0)}, 0.1, signals="y", lanes=LANES, workers=1, **QUIET)
+    assert "Not side by side in vector lanes: ball: it has events." in found.messages
+    assert not found.failures
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [experiments.path_following, experiments.hand_guiding, experiments.force_tracking])
+def test_experiments_are_near_single_runs_whatever_their_friction_and_their_gains(make):
+    experiment = make()
+    ranges = {"plant.coulomb_scale": (0.5, 1.5), "plant.viscous_scale": (0.5, 1.5), "pid_perp.a1": (4000.0, 6000.0)}
+    names = ["xi", "eta", "motor_force", "position"]
+    options = {"samples": "latin", "count": 9, "signals": names, "workers": 1, **QUIET}
+    found, alone = experiment.sweep(ranges, lanes=8, **options), experiment.sweep(ranges, **options)
+    assert ran_in_lanes(found)
+    assert not found.failures
+    for name in names:
+        assert np.abs(found[name] - alone[name]).max() <= PAPER * np.abs(alone[name]).max(), name
+
+
+def test_runs_whose_samples_would_fill_the_memory_go_by_themselves(monkeypatch):
+    monkeypatch.setattr(lane_worker, "machine_memory", lambda: 10_000)
+    found = loop().sweep({"kp.gain": (1.0, 2.0)}, 1.0, reduce={"end": lambda run: run["x"][-1]}, lanes=LANES, **QUIET)
+    assert any("the samples of 4 runs at a time would take" in text for text in found.messages)
+    assert DIFFER not in found.messages
+
+
+def test_what_the_start_of_a_run_has_told_belongs_to_that_run(monkeypatch):
+    told = BoundRun.begin
+
+    def begin(bound, numbers):
+        told(bound, numbers)
+        gain = np.nansum(bound.engine.workspace.here.p)
+        bound.engine.workspace.messages = (f"begun with {gain:.6g}",)
+
+    monkeypatch.setattr(BoundRun, "begin", begin)
+    samples = [{"kp.gain": gain} for gain in (1.0, 1.5, 3.0)]
+    found = loop().sweep(None, 0.1, samples=samples, reduce={"end": final("x")}, lanes=LANES, workers=1, **QUIET)
+    texts = [outcome.messages for outcome in found.outcomes]
+    assert [len(text) for text in texts] == [2, 2, 2]
+    assert len({text[0] for text in texts}) == 3
+
+
+class EndedError(Exception):
+    """Raised to end a sweep."""
+
+
+def test_a_sweep_that_is_ended_ends_within_a_chunk_of_ticks():
+    plan = make_plan(loop(), 1000.0, ["x"], None, (), {}, lanes=LANES)
+    told = []
+
+    def tell(t):
+        told.append(t)
+        raise EndedError
+
+    with make_worker(plan) as worker, pytest.raises(EndedError):
+        list(worker.run_all([Sample(i, {"box.kp.gain": 1.0 + i}, 0) for i in range(4)], tell))
+    assert len(told) == 1
+    assert told[0] < 200.0
