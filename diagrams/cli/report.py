@@ -233,6 +233,7 @@ def _analyse(
         progress=tell,
         measured=measured,
         worst_case=searched,
+        written=True,
     )
     return with_drawing(made, diagram)
 

@@ -14,6 +14,7 @@ from ..linearization import find_signal
 from ..report_figures import AxisUnits
 from ..report_writing import DEFINITIONS, Report
 from ..requirements import Requirements, TomlFile, read_requirements
+from ..second_process import processors
 from ..studies import WorstCase, WorstCaseTask
 from .case import Case, ReportedExperiment
 from .content_hash import content_hash
@@ -51,6 +52,21 @@ ANY_DIAGRAM = ReportKind(
 """The report of a diagram of which nothing is known but its structure."""
 
 
+def check_workers(given: int | None, written: bool) -> int:
+    """Return the number of processes that make the sections of a report.
+
+    Raises
+    ------
+    OptionError
+        If it is no whole number from 1 on.
+    """
+    if given is None:
+        return min(processors(), 2) if written else 1
+    if isinstance(given, bool) or not isinstance(given, int) or given < 1:
+        raise OptionError(f"found {given!r}; expected 1, or 2 for a second process. Give one of them.", port="workers")
+    return given
+
+
 @on_one_thread
 def analyse(
     diagram: WiredDiagram | ReportedExperiment,
@@ -69,6 +85,8 @@ def analyse(
     measured: Mapping[str, Any] | None = None,
     worst_case: WorstCase | WorstCaseTask | str | os.PathLike[str] | None = None,
     contacts: Mapping[str, Any] | None = None,
+    workers: int | None = None,
+    written: bool = False,
 ) -> Report:
     """Analyse a diagram, and return the content of its report.
 
@@ -116,6 +134,11 @@ def analyse(
         unstable.
     progress : callable, optional
         Told the key of each section before it is made, and of the injection check each measurement, too.
+    workers : int, optional
+        1 makes all sections in this process; with 2, a second process makes some of a diagram with FMUs. The report is
+        the same. Without it there are two where the report is written, and two processors.
+    written : bool
+        Whether the report is written next, so that its figures are drawn.
 
     Returns
     -------
@@ -148,9 +171,9 @@ def analyse(
     file = None if isinstance(requirements, Requirements | None) else TomlFile.read(requirements, "requirements")
     asked = requirements if isinstance(requirements, Requirements | None) else read_requirements(file or requirements)
     task = read_task(diagram, worst_case, file, asked)
-    case, sections = kind.sections(
-        diagram, point, experiment, wires, only, tell, stairs, asked, AxisUnits(decibels, hertz), tuple(measured or ())
-    )
+    axes, names = AxisUnits(decibels, hertz), tuple(measured or ())
+    how: dict[str, Any] = {"workers": check_workers(workers, written), "drawn": written}
+    case, sections = kind.sections(diagram, point, experiment, wires, only, tell, stairs, asked, axes, names, **how)
     loops_measured = read_measured(case, measured) if measured else ()
     if loops_measured:
         sections = (*sections, measured_loops(case, loops_measured))

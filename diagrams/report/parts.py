@@ -6,20 +6,26 @@ parts and definitions, which the diagram gives as its ``report_kind``. The parts
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+import contextlib
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import chain
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Protocol, TypeVar, cast, runtime_checkable
 
 from ...blocks.core import OptionError
 from ..flat import WiredDiagram
 from ..report_figures import AxisUnits
-from ..report_writing import Section
+from ..report_writing import Section, draw_section, keep_drawings
 from ..requirements import Requirements
+from ..results import Snapshot
+from ..second_process import SecondProcess
 from .case import Case, ReportedExperiment
 from .review import check_names
 
 RADIANS = AxisUnits()
+LONG = 4
+"""Sections from which on a second process is worth its start."""
 C = TypeVar("C", bound=Case)
 C_contra = TypeVar("C_contra", bound=Case, contravariant=True)
 
@@ -71,6 +77,9 @@ class MakesSections(Protocol):
         requirements: Requirements | None = None,
         axes: AxisUnits = RADIANS,
         measured: Collection[str] = (),
+        *,
+        workers: int = 1,
+        drawn: bool = False,
     ) -> tuple[Case, tuple[Section, ...]]:
         """Return the case of a diagram, and its sections."""
 
@@ -134,6 +143,9 @@ class ReportKind(Generic[C]):
         requirements: Requirements | None = None,
         axes: AxisUnits = RADIANS,
         measured: Collection[str] = (),
+        *,
+        workers: int = 1,
+        drawn: bool = False,
     ) -> tuple[Case, tuple[Section, ...]]:
         """Return the case of a diagram, and its sections.
 
@@ -152,27 +164,78 @@ class ReportKind(Generic[C]):
         tell : callable
             Told "variants" before the case is made, and the key of each section before it is made; of the injection
             check each measurement, too.
+        workers : int
+            With two, a second process makes sections of a diagram with FMUs, from the last one on.
+        drawn : bool
+            Whether that process draws the figures of its sections at once.
         """
         tell("variants")
-        case = self.case(diagram, point, experiment, wires, stairs)
-        case.axes = axes
-        case.tell = tell
-        if requirements is not None:
-            case.requirements = requirements
-            check_names(case, requirements, measured)
         wanted = set(self.keys if only is None else only)
-        case.keys = tuple(key for key in self.keys if key in wanted)
-        return case, tuple(self._made(case, tell))
+        keys = tuple(key for key in self.keys if key in wanted)
+        task = SectionTask(self, diagram, point, wires, stairs, requirements, axes, tuple(measured), keys, drawn)
+        long = diagram.has_fmu and len(keys) >= LONG and not isinstance(point, Snapshot)
+        with contextlib.ExitStack() as stack:
+            second: SecondProcess[tuple[Section | None, tuple[str, ...]]] | None = None
+            if workers > 1 and long:
+                second = stack.enter_context(SecondProcess(task, diagram.name))
+            case = task.make_case(experiment)
 
-    def _made(self, case: C, tell: Callable[[str], None]) -> Iterator[Section]:
-        for key in case.keys:
-            parts = [part for part in self.parts if part.key == key and part.applies(case)]
-            if parts:
-                tell(key)
-                made = [section for part in parts if (section := part.make(case)) is not None]
-                if made:
-                    whole = joined(made)
-                    yield replace(whole, title=self.titles.get(key, whole.title))
+            def make(key: str) -> tuple[Section | None, tuple[str, ...]]:
+                return self.make_section(case, key, tell), ()
+
+            case.tell = tell
+            if requirements is not None:
+                check_names(case, requirements, measured)
+            made = list(map(make, keys)) if second is None else second.share(keys, make, tell)
+        for section, pictures in made:
+            if section is not None and pictures:
+                keep_drawings(section, pictures)
+        return case, tuple(section for section, _ in made if section is not None)
+
+    def make_section(self, case: Case, key: str, tell: Callable[[str], None]) -> Section | None:
+        """Return the section of a key; None where nothing is to be said."""
+        own = cast("C", case)
+        parts = [part for part in self.parts if part.key == key and part.applies(own)]
+        if not parts:
+            return None
+        tell(key)
+        made = [section for part in parts if (section := part.make(own)) is not None]
+        if not made:
+            return None
+        whole = joined(made)
+        return replace(whole, title=self.titles.get(key, whole.title))
+
+
+@dataclass(frozen=True, eq=False)
+class SectionTask:
+    """Makes the sections of a case, in any process; its fields are as of `ReportKind.sections`."""
+
+    kind: ReportKind[Any]
+    diagram: WiredDiagram
+    point: Any
+    wires: tuple[str, ...] | None
+    stairs: str | None
+    requirements: Requirements | None
+    axes: AxisUnits
+    measured: tuple[str, ...]
+    keys: tuple[str, ...]
+    drawn: bool
+
+    def make_case(self, experiment: ReportedExperiment | None = None) -> Case:
+        """Return the case of the diagram."""
+        case: Case = self.kind.case(self.diagram, self.point, experiment, self.wires, self.stairs)
+        case.axes, case.keys, case.requirements = self.axes, self.keys, self.requirements
+        return case
+
+    @cached_property
+    def _case(self) -> Case:
+        return self.make_case()
+
+    def make(self, key: str, tell: Callable[[str], None]) -> tuple[Section | None, tuple[str, ...]]:
+        """Return the section of a key, and its figures as SVG where they are to be drawn."""
+        self._case.tell = tell
+        made = self.kind.make_section(self._case, key, tell)
+        return made, draw_section(made) if self.drawn and made is not None else ()
 
 
 def joined(sections: list[Section]) -> Section:

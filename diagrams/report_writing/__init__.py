@@ -1,6 +1,7 @@
 """A report as a document: sections, tables and numbers, written as HTML, PDF and JSON."""
 
 from .definitions import DEFINITIONS, read_definitions
+from .figures import draw_section, keep_drawings
 from .files import check_files, write_report
 from .model import Judged, Plot, Section, Table
 from .report import Report
@@ -16,6 +17,8 @@ __all__ = [
     "Table",
     "Texts",
     "check_files",
+    "draw_section",
+    "keep_drawings",
     "plain",
     "quantity",
     "read_definitions",

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 if TYPE_CHECKING:
     from markupsafe import Markup
+
+    from .model import Plot, Section
 
 WIDE = 900.0
 """Width in pixels above which a figure is turned by a right angle on paper."""
@@ -35,6 +39,28 @@ class Picture:
     height: float = 0.0
 
 
+_KEPT: WeakKeyDictionary[Any, str] = WeakKeyDictionary()
+"""Drawings of figures that another process has made; each is used once, as a figure may be changed later."""
+
+
+def draw_section(section: Section) -> tuple[str, ...]:
+    """Return the figures of a section, and of those in it, as SVG."""
+    return tuple(plot.figure if isinstance(plot.figure, str) else _drawn(plot.figure) for plot in _plots(section))
+
+
+def keep_drawings(section: Section, drawings: Sequence[str]) -> None:
+    """Keep the drawings of `draw_section` until the section's figures are written."""
+    for plot, drawing in zip(_plots(section), drawings, strict=True):
+        if not isinstance(plot.figure, str):
+            _KEPT[plot.figure] = drawing
+
+
+def _plots(section: Section) -> Iterator[Plot]:
+    yield from section.plots
+    for inner in section.sections:
+        yield from _plots(inner)
+
+
 def embedded(figure: Any, key: str, caption: str = "") -> Picture:
     """Return a figure as a page holds it; a wide one twice, for the screen and, to be turned, for paper.
 
@@ -47,7 +73,7 @@ def embedded(figure: Any, key: str, caption: str = "") -> Picture:
     caption : str
         Its text for people who don't see it.
     """
-    svg = figure if isinstance(figure, str) else _drawn(figure)
+    svg = figure if isinstance(figure, str) else _KEPT.pop(figure, "") or _drawn(figure)
     svg = re.sub(r"<\?xml.*?\?>|<!DOCTYPE.*?>|<!--.*?-->|<metadata>.*?</metadata>", "", svg, flags=re.DOTALL).strip()
     head, rest = svg[: svg.index(">")], svg[svg.index(">") :]
     head = re.sub(r'\s(role|aria-label)="[^"]*"', "", head)

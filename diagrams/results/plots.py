@@ -111,7 +111,16 @@ def _figure_class() -> type[Figure]:
                 self.savefig(buffer, format="png", dpi=110)
             return buffer.getvalue()
 
+        def __reduce__(self) -> tuple[Any, ...]:
+            return _bare_figure, (), self.__getstate__()
+
     return Picture
+
+
+def _bare_figure() -> Figure:
+    """Return a figure that a copy, or a figure from another process, is put into."""
+    kind = _figure_class()
+    return kind.__new__(kind)
 
 
 def new_figure(height: float) -> Figure:

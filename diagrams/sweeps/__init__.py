@@ -1,7 +1,9 @@
 """Sweeps: runs of a diagram with many values of its parameters, and studies over ranges of them."""
 
+from .child import receive, send
 from .names import find_parameter
 from .outcome import Failure
+from .processes import to_bytes
 from .reductions import Reduction, final, maximum, mean, minimum, settling_time
 from .result import Sweep
 from .samples import Box, Sample, Samples, grid, latin, read_samples, table
@@ -23,7 +25,10 @@ __all__ = [
     "mean",
     "minimum",
     "read_samples",
+    "receive",
+    "send",
     "settling_time",
     "sweep",
     "table",
+    "to_bytes",
 ]

@@ -1,0 +1,144 @@
+"""The side of the first process: parts of a result are shared out as both processes get to them."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from queue import Empty, SimpleQueue
+from typing import Any, Generic, TypeVar
+
+from ...blocks.core import OptionError
+from ..sweeps import receive, send, to_bytes
+from .child import Task
+
+T = TypeVar("T")
+_PROGRAM = "from loopwright.diagrams.second_process.child import main; main()"
+PAUSE = 0.1
+"""Seconds between two looks at what the second process tells, while this one waits for it."""
+
+
+def processors() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class SecondProcess(Generic[T]):
+    """A process that makes parts of a result; use it in a ``with`` statement.
+
+    Every part is the same, whichever process makes it, and they are returned in their order. A part that the second
+    process can't make or send, or on which it ends, is made here. Its end is that of the ``with`` block.
+
+    Parameters
+    ----------
+    task : Task
+        Makes the parts there; it travels as bytes.
+    name : str
+        Name of the diagram, for errors.
+    """
+
+    def __init__(self, task: Task, name: str):
+        self._process: subprocess.Popen[bytes] | None = None
+        self._told: SimpleQueue[str] = SimpleQueue()
+        self._lock, self._over = threading.Lock(), False
+        self._made: dict[str, bytes] = {}
+        self._left: deque[str] = deque()
+        self._thread: threading.Thread | None = None
+        try:
+            data = to_bytes(task, name)
+            program = [sys.executable, "-c", _PROGRAM]
+            self._process = subprocess.Popen(
+                program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+            )
+        except (OptionError, OSError):  # such as a class of the main script: everything is made here
+            return
+        self._send(sys.path)
+        self._send(data)
+
+    def __enter__(self) -> SecondProcess[T]:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._over = True
+        process = self._process
+        if process is None:
+            return
+        process.kill()
+        process.wait()
+        if self._thread is not None:
+            self._thread.join()
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                with suppress(OSError):
+                    pipe.close()
+
+    def share(self, keys: Sequence[str], make: Callable[[str], T], tell: Callable[[str], None]) -> list[T]:
+        """Return the parts of all keys: from the first one on made here, from the last one on in the second process.
+
+        Parameters
+        ----------
+        keys : sequence of str
+            The keys, in the order of the result.
+        make : callable
+            Makes a part here.
+        tell : callable
+            Told what the second process tells, by this thread.
+        """
+        self._left = deque(keys)
+        if self._process is not None:
+            self._thread = threading.Thread(target=self._go, daemon=True)
+            self._thread.start()
+        found: dict[str, T] = {}
+        while (key := self._take(first=True)) is not None:
+            self._pass_on(tell)
+            found[key] = make(key)
+        while self._thread is not None and self._thread.is_alive():
+            self._thread.join(PAUSE)
+            self._pass_on(tell)
+        self._pass_on(tell)
+        for key in keys:
+            if key not in found:  # in their order, so that the first error is that of one process alone
+                found[key] = pickle.loads(self._made.pop(key)) if key in self._made else make(key)
+        return [found[key] for key in keys]
+
+    def _pass_on(self, tell: Callable[[str], None]) -> None:
+        with suppress(Empty):
+            while True:
+                tell(self._told.get_nowait())
+
+    def _take(self, *, first: bool) -> str | None:
+        with self._lock:
+            if not self._left or self._over:
+                return None
+            return self._left.popleft() if first else self._left.pop()
+
+    def _go(self) -> None:
+        """Give the second process one key after the other, and keep its answers."""
+        with suppress(EOFError, OSError):
+            while (key := self._take(first=False)) is not None:
+                self._send(key)
+                kind, answer = self._receive()
+                while kind == "told":
+                    self._told.put(answer)
+                    kind, answer = self._receive()
+                if kind == "made":
+                    self._made[key] = answer
+
+    def _send(self, message: object) -> None:
+        assert self._process is not None
+        with suppress(OSError):  # it has ended: the answer tells it
+            send(_pipe(self._process.stdin), message)
+
+    def _receive(self) -> tuple[str, Any]:
+        assert self._process is not None
+        found: tuple[str, Any] = receive(_pipe(self._process.stdout))
+        return found
+
+
+def _pipe(file: Any) -> Any:
+    return file

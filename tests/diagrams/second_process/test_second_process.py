@@ -1,0 +1,107 @@
+"""Parts of a result from two processes are those of one, in their order, whatever happens to the second one."""
+
+import os
+import time
+from dataclasses import dataclass, field
+
+import pytest
+
+from loopwright.blocks import LoopwrightError, OptionError
+from loopwright.diagrams.report.analysis import check_workers
+from loopwright.diagrams.second_process import SecondProcess
+
+KEYS = ("a", "b", "c", "d")
+
+
+@dataclass
+class Parts:
+    """Makes letters; in another process some of them go wrong."""
+
+    wrong: dict = field(default_factory=dict)
+    home: int = 0
+
+    def make(self, key, tell):
+        tell(f"making {key}")
+        if os.getpid() != self.home and key in self.wrong:
+            if self.wrong[key] == "ends":
+                os._exit(3)
+            if self.wrong[key] == "fails":
+                raise LoopwrightError("not here")
+            return lambda: None  # can't be sent
+        return key.upper(), os.getpid()
+
+
+@pytest.fixture
+def parts(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(os.path.dirname(__file__))
+    module = __import__("test_second_process")
+    return lambda wrong: module.Parts(wrong, os.getpid())
+
+
+def share(task, told):
+    def make(key):
+        if key == "a":
+            time.sleep(0.1)  # the second process gets its turn
+        return task.make(key, told.append)
+
+    with SecondProcess(task, "letters") as second:
+        return second.share(KEYS, make, told.append), second
+
+
+@pytest.mark.slow
+def test_both_processes_make_parts_and_tell_of_them(parts):
+    told = []
+    found, _ = share(parts({}), told)
+    assert [letter for letter, _ in found] == ["A", "B", "C", "D"]
+    assert found[0][1] == os.getpid()
+    assert found[3][1] != os.getpid()
+    assert sorted(told) == [f"making {key}" for key in KEYS]
+
+
+@pytest.mark.parametrize(
+    "way", ["ends", *(pytest.param(way, marks=pytest.mark.slow) for way in ("fails", "can't be sent"))]
+)
+def test_parts_that_the_second_process_does_not_make_are_made_here(parts, way):
+    found, _ = share(parts(dict.fromkeys(KEYS, way)), [])
+    assert found == [(key.upper(), os.getpid()) for key in KEYS]
+
+
+def test_an_error_here_ends_the_second_process(parts):
+    task = parts({})
+    with pytest.raises(KeyboardInterrupt), SecondProcess(task, "letters") as second:
+        second.share(KEYS, lambda key: (_ for _ in ()).throw(KeyboardInterrupt), print)
+    assert second._process.poll() is not None
+
+
+def test_a_task_that_can_not_be_sent_is_done_here():
+    class Local(Parts):
+        def __reduce__(self):
+            raise TypeError("never")
+
+    found, second = share(Local({}, os.getpid()), [])
+    assert second._process is None
+    assert {place for _, place in found} == {os.getpid()}
+
+
+def test_the_number_of_processes_is_checked():
+    assert check_workers(1, written=True) == 1
+    assert check_workers(None, written=False) == 1
+    for wrong in (0, True, 1.5):
+        with pytest.raises(OptionError, match="expected 1, or 2"):
+            check_workers(wrong, written=True)
+
+
+@pytest.mark.slow
+def test_a_report_is_the_same_from_one_process_and_from_two(tmp_path):
+    from loopwright.diagrams import experiments
+
+    diagram = experiments.path_following().diagram
+    pages = []
+    for workers in (1, 2):
+        told = []
+        diagram.report(tmp_path / "page.html", json=True, workers=workers, about={"made": "now"}, progress=told.append)
+        page = (tmp_path / "page.html").read_text() + (tmp_path / "page.json").read_text()
+        pages.append(page)
+        assert {"poles", "inner", "injection"} <= set(told)
+    one, two = ([line for line in page.splitlines() if "UTC" not in line] for page in pages)
+    assert one == two
