@@ -247,6 +247,12 @@ class CompiledHybrid:
         self._outcome = OutcomeStructure()
         self._run = hybrid_master()["loopwright_go"]
         self._run.restype = None
+        self._fresh = [(structure, bytes(structure)) for structure in (hybrid, *self.methods)]
+
+    def begin_anew(self) -> None:
+        """Forget the run before: methods have no step in mind, and no sign of stiffness has been seen."""
+        for structure, content in self._fresh:
+            ctypes.memmove(ctypes.addressof(structure), content, len(content))
 
     def _own(self, values: np.ndarray) -> int | None:
         self._kept.append(values)

@@ -44,6 +44,10 @@ class Sliding:
         )
         return (told,)
 
+    def forget(self) -> None:
+        """Tell of events again that were told in a run before."""
+        self._told.clear()
+
     def save(self) -> tuple[bool, bool]:
         """Return what is needed to go on from here."""
         return self.active, self.switched

@@ -128,6 +128,9 @@ class HybridTicks:
             Time in s at which a stop condition has ended the run between two ticks.
         """
         loop = self._bind(recorder)
+        if k == 0:  # of a run before nothing is left
+            self._fired = []
+            loop.begin_anew()
         self._hand_over(loop, self._time_of(k))
         try:
             return self._run(loop, k, last, recorder, arrived, progress)

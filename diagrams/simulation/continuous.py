@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -11,12 +11,21 @@ import numpy as np
 from ...blocks.core import OptionError, SimulationError, is_before, left_of
 from ..events import Domains, ManyInstants, Sliding
 from ..exchange import ExchangedBlocks, OutsideEvents
-from ..flat import Times, announcers
+from ..flat import announcers
 from ..results import Occurrence
 from ..solvers import AcceptedStep, Problem, make_solver
 from .diagnosis import forget_trials, opaque_failure, state_values
 from .initialize import domains_from_left
-from .solver_setup import NextInstants, absolute_tolerances, has_guards, longest_step, remembers, time_scale_of
+from .solver_setup import (
+    Memory,
+    NextInstants,
+    absolute_tolerances,
+    find_late,
+    has_guards,
+    longest_step,
+    remembers,
+    time_scale_of,
+)
 from .transport_delays import delays_of, keep_step
 from .trials import Trials
 from .workspace import Workspace
@@ -29,7 +38,7 @@ TIGHT, ONE_STEP = 1e-9, ("auto", "RK23", "RK45", "DOP853", "Radau")
 """Below this relative tolerance these methods, to which a stop costs little, land on every sample."""
 
 
-class Continuous(Trials):
+class Continuous(Trials, Memory):
     """The continuous part of a run.
 
     Parameters
@@ -117,8 +126,9 @@ class Continuous(Trials):
         self._accepts = not plain or remembers(flat) or has_guards(flat)
         """Whether a step that ends at a tick is to be evaluated there, from the left, before the tick itself."""
         self._announced = NextInstants(self.sources)
-        self.late = {t: after for _, one in self.sources if isinstance(one, Times) for t, after in one.late.items()}
+        self.late = find_late(self.sources)
         """Instants at which sources are seen at a time just after."""
+        self._fresh = self.save()
 
     # --- the instant that is reached ---------------------------------------------------------------------------------
 
@@ -377,23 +387,3 @@ class Continuous(Trials):
         outside = math.inf if self.outside is None else self.outside.next_instant(t)
         self._sources_edge = min(self._announced.after(t), outside)
         return min(self._sources_edge, math.inf if self.delays is None else self.delays.next_edge(t))
-
-    # --- saved states ------------------------------------------------------------------------------------------------
-
-    def save(self) -> dict[str, Any]:
-        """Return what is needed to go on from here."""
-        return {
-            "domains": None if self.domains is None else self.domains.save(),
-            "delays": None if self.delays is None else self.delays.save(),
-            "solver": self.solver.save(),
-            "sliding": self.sliding.save(),
-        }
-
-    def restore(self, saved: Mapping[str, Any]) -> None:
-        """Go back to what `save` returned."""
-        if self.domains is not None and saved["domains"] is not None:
-            self.domains.restore(saved["domains"])
-        if self.delays is not None and saved["delays"] is not None:
-            self.delays.restore(saved["delays"])
-        self.solver.restore(saved["solver"])
-        self.sliding.restore(saved["sliding"])

@@ -73,11 +73,10 @@ class Engine:
         self._stops = StopConditions(flat, self.workspace.log, self._find_asking)
         self._passes_on = check_start_exchange(options.start_exchange)
         self._compile, self._fuse = check_compile(options.compile, fuse=options.fuse), options.fuse
-        self._changed = False  # whether C has taken over within the run
+        self._changed = self._due = False  # whether C has taken over within the run, or does so at the next tick
         self._compiled: CompiledTicks | HybridTicks | None = None
         self.messages: tuple[str, ...] = ()
         self._can_stop = self._stops.exist or bool(self.exchanged)
-        self._due = False  # whether C takes over at the next tick
         self.is_ahead = False
         """Whether the run has ended at a tick beyond which the solver has gone: signals are not those of the end."""
         self._tell = on_event
@@ -178,23 +177,24 @@ class Engine:
 
     @property
     def can_begin_anew(self) -> bool:
-        """Whether `begin_anew` leaves nothing of the run before: without solver, coupling, loops and outside blocks."""
-        plain = self.continuous is None and self.coupled is None and not self.exchanged and not self.workspace.looped
+        """Whether `begin_anew` leaves nothing of the run before: no solver in Python, coupling or outside blocks."""
+        plain = (self.continuous is None or self.is_compiled) and self.coupled is None and not self.exchanged
         return plain and all(isinstance(p, FmuInstance) and p.native is not None for p in self.plants.values())
 
     def begin_anew(self, flat: FlatDiagram, set_start: Callable[[Workspace], None] | None = None) -> None:
-        """Go back to t = 0 with other numbers; the plants were initialized anew before, and stay bound.
+        """Go back to t = 0 with other numbers; the plants, initialized anew before, stay bound.
 
         Parameters
         ----------
         flat : FlatDiagram
-            The diagram with its numbers: blocks, parameters and start values. Its functions are those that are bound.
+            The diagram with its numbers; its functions are those that are bound.
         set_start : callable, optional
             Computes start values, as `initialize` takes it.
         """
-        workspace = self.workspace
-        workspace.begin_anew(flat)
+        self.workspace.begin_anew(flat)
         self.position.restore(0, None)
+        if self.continuous is not None:
+            self.continuous.begin_anew(flat)
         for plant in self.plants.values():
             assert isinstance(plant, FmuInstance)
             plant.read(0.0)

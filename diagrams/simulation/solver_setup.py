@@ -1,15 +1,18 @@
-"""Facts of a diagram that a solver is set up with."""
+"""Facts of a diagram that a solver is set up with, and what the continuous part of a run keeps from step to step."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import SimulationError, is_before
-from ..flat import Announcer, FlatDiagram
+from ...blocks.core import Block, SimulationError, identity, is_before
+from ..events import Domains, Sliding
+from ..flat import Announcer, FlatDiagram, Times, announcers
+from ..solvers import Solver
+from .transport_delays import Delays
 
 
 def time_scale_of(flat: FlatDiagram) -> float:
@@ -61,6 +64,11 @@ def longest_step(flat: FlatDiagram, max_step: float | None, time_scale: float, s
     return longest
 
 
+def find_late(sources: Sequence[tuple[str, Announcer]]) -> dict[float, float]:
+    """Return the instants in s at which sources are seen at a time just after, and that time."""
+    return {t: after for _, one in sources if isinstance(one, Times) for t, after in one.late.items()}
+
+
 class NextInstants:
     """The next instant of all sources, which are asked again where it is reached, or where time has gone back."""
 
@@ -95,3 +103,66 @@ def next_instant(path: str, block: Announcer, t: float) -> float:
             t=t,
         )
     return found
+
+
+def _scales(block: Block) -> object:
+    return block.time_scale(), [identity(port.nominal) for port in block.states.values()]
+
+
+class Memory:
+    """Part of the continuous part of a run: what it keeps from step to step is saved, restored and forgotten."""
+
+    flat: FlatDiagram
+    domains: Domains | None
+    """Domains of the indicators; None without events."""
+    delays: Delays | None
+    """Transport delays; None without any."""
+    solver: Solver
+    sliding: Sliding
+    sources: Sequence[tuple[str, Announcer]]
+    late: Mapping[float, float]
+    _announced: NextInstants
+    _looked: float
+    _edge: float
+    _left: float
+    _sources_edge: float
+    _beyond: tuple[float, np.ndarray] | None
+    _fresh: Mapping[str, Any]
+    """What it keeps before its first run."""
+
+    def save(self) -> dict[str, Any]:
+        """Return what is needed to go on from here."""
+        return {
+            "domains": None if self.domains is None else self.domains.save(),
+            "delays": None if self.delays is None else self.delays.save(),
+            "solver": self.solver.save(),
+            "sliding": self.sliding.save(),
+        }
+
+    def restore(self, saved: Mapping[str, Any]) -> None:
+        """Go back to what `save` returned."""
+        if self.domains is not None and saved["domains"] is not None:
+            self.domains.restore(saved["domains"])
+        if self.delays is not None and saved["delays"] is not None:
+            self.delays.restore(saved["delays"])
+        self.solver.restore(saved["solver"])
+        self.sliding.restore(saved["sliding"])
+
+    def fits(self, old: Mapping[str, Block], new: Mapping[str, Block]) -> bool:
+        """Whether it fits variants of some blocks: no tolerance and no limit of a step changes with them.
+
+        Parameters
+        ----------
+        old, new : mapping of str to Block
+            By path: the blocks that it was set up with, and those that differ.
+        """
+        return self.delays is None and all(_scales(block) == _scales(old[path]) for path, block in new.items())
+
+    def begin_anew(self, flat: FlatDiagram) -> None:
+        """Forget the run before: another one begins, with other numbers of the diagram."""
+        self.flat, self.sources = flat, announcers(flat)
+        self._announced, self.late = NextInstants(self.sources), find_late(self.sources)
+        self._edge, self._left, self._sources_edge = math.inf, math.inf, math.inf
+        self._beyond, self._looked = None, math.nan
+        self.restore(self._fresh)
+        self.sliding.forget()

@@ -64,8 +64,10 @@ class Workspace:
     def begin_anew(self, flat: FlatDiagram) -> None:
         """Put all numbers to those with which a run of a diagram begins; its functions are those that are bound."""
         self.flat, self.begun = flat, False
-        self.p[:], self.here.x[:], self.here.t[0] = flat.p, flat.x0, 0.0
-        for vector in (self.here.w, self.x_next, self.z, self.log, self.ok):
+        self.p[:], self.messages = flat.p, ()
+        for instant in (self.here, self.trial):
+            instant.t[0], instant.x[:], instant.w[:] = 0.0, flat.x0, 0.0
+        for vector in (self.x_next, self.z, self.log, self.ok):
             vector[:] = 0.0
 
     def _bind(

@@ -1,6 +1,6 @@
 """Solvers of fixed and variable step behind one interface."""
 
-from .base import AcceptedStep, Polynomial, Problem, solver_name
+from .base import AcceptedStep, Polynomial, Problem, Solver, solver_name
 from .choose import make_solver
 from .scipy_methods import AutoSolver
 
@@ -9,6 +9,7 @@ __all__ = [
     "AutoSolver",
     "Polynomial",
     "Problem",
+    "Solver",
     "make_solver",
     "solver_name",
 ]

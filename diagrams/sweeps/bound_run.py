@@ -14,7 +14,7 @@ from ...blocks.core import SimulationError
 from ...fmus.calls import FmuInstance
 from ..coupling import note_fine_steps, note_loops
 from ..flat import EVERY, FlatDiagram, renumber
-from ..results import Places, Recorder, Recording, Run, Stopped
+from ..results import Occurrence, Places, Recorder, Recording, Run, Stopped
 from ..simulation import Engine, RunOptions, SimulatedDiagram, default_step, refuse_rest, ticks_in
 from .start_values import StartValues
 from .variation import Numbers
@@ -53,7 +53,7 @@ class BoundRun:
         self._recording = Recording(self.flat, diagram.name, record, every, states, None, False)
         every_tick = base is not None or EVERY in self.flat.visited
         self._recording.check_memory(self.count, every_tick=every_tick)
-        self.engine = Engine(self.flat, diagram.name, options, every_tick=every_tick, on_event=lambda event: None)
+        self.engine = Engine(self.flat, diagram.name, options, every_tick=every_tick, on_event=self._note)
         rows = self.count + 2 if self.engine.every_tick else None
         self.recorder: Recorder = self._recording.begin(rows)
         fine = note_fine_steps(self.flat) if base is None else ()
@@ -61,7 +61,7 @@ class BoundRun:
         self._has_begun = False
         self._told: dict[str, int] = {}
         self._places: Places = {}
-        self._start = StartValues(self.engine.workspace)
+        self._start = StartValues(self.engine.workspace) if StartValues.fits(self.flat) else None
         self._stack = ExitStack()
 
     def __enter__(self) -> BoundRun:
@@ -83,7 +83,13 @@ class BoundRun:
     @property
     def is_possible(self) -> bool:
         """Whether its runs can follow each other: each leaves nothing behind for the next one."""
-        return self.engine.can_begin_anew and StartValues.fits(self.flat)
+        opaque = any(self.flat.table.blocks[path].opaque for path in self.flat.checked.traced)
+        return self.engine.can_begin_anew and not opaque
+
+    def fits(self, numbers: Numbers[Any]) -> bool:
+        """Whether a run with the numbers of a sample can follow: the solver has the same tolerances and step limits."""
+        continuous = self.engine.continuous
+        return continuous is None or continuous.fits(self.flat.table.blocks, numbers.blocks)
 
     @property
     def ends_between_ticks(self) -> bool:
@@ -131,7 +137,8 @@ class BoundRun:
         except BaseException:
             recorder.finish()
             raise
-        recorder.last(engine.position.t, engine.workspace.log)
+        if not engine.is_ahead:
+            recorder.last(engine.position.t, engine.workspace.log)
         return self._take_record(started)
 
     def begin(self, numbers: Numbers[Any]) -> None:
@@ -146,7 +153,8 @@ class BoundRun:
             for path, plant in self.engine.plants.items():
                 assert isinstance(plant, FmuInstance)
                 plant.start_anew(numbers.starts.get(path, {}))
-            self.engine.begin_anew(renumber(self.flat, numbers.blocks), self._start.set)
+            find_start = None if self._start is None else self._start.set
+            self.engine.begin_anew(renumber(self.flat, numbers.blocks), find_start)
             self._has_begun = True
 
     def _take_record(self, started: float) -> Run:
@@ -177,6 +185,9 @@ class BoundRun:
             units=self._recording.units,
             diagram=None,
             elapsed=perf_counter() - started,
+            tier=self.engine.take_tier(),
+            events=self.recorder.events,
+            residual=self.recorder.residual,
             messages=(*self._notes, *self.engine.messages, *messages),
             stopped=stopped,
             columns=self.recorder.columns,
@@ -185,6 +196,9 @@ class BoundRun:
         )
         run.find_in(self._places)
         return run
+
+    def _note(self, event: Occurrence) -> None:
+        self.recorder.event(event)
 
     def take_messages(self) -> tuple[str, ...]:
         """Return what a run's start and the FMUs have told since the last run."""

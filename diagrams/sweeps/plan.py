@@ -163,7 +163,7 @@ class Worker:
     def _simulate(self, parameters: Mapping[str, Any], tell: Tell) -> Run:
         numbers = self._variation.find(parameters)
         bound = self._bind(numbers) if self._repeats else None
-        if bound is None:
+        if bound is None or not bound.fits(numbers):
             return simulate(numbers.make_diagram(), self.plan.duration, self._options, progress=False)
         try:
             return bound.run(numbers, tell)
