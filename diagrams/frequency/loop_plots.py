@@ -105,7 +105,10 @@ def _span(loops: Sequence[Any], omega: ArrayLike | None) -> list[np.ndarray]:
         if is_measured(loop):
             spans.append(w)
             continue
-        asked = np.geomspace(low, high, POINTS) if omega is None else np.atleast_1d(np.asarray(omega, dtype=float))
+        if omega is None:
+            spans.append(Realization.of(loop).grid(low, high, POINTS))
+            continue
+        asked = np.atleast_1d(np.asarray(omega, dtype=float))
         if not (asked.size and np.all(np.isfinite(asked)) and np.all(asked > 0.0)):
             raise OptionError(f"found {omega!r}; expected positive frequencies in rad/s. Give some.", port="omega")
         dt = float(loop.dt or 0.0)
@@ -213,7 +216,7 @@ def nichols(loops: Sequence[Any], omega: ArrayLike | None, labels: Sequence[str]
         with np.errstate(divide="ignore"):
             closed = 20.0 * np.log10(np.abs(value / (1.0 + value)))
         lines = axes.contour(phase, gain, closed, levels=[-12, -6, -3, 0, 3, 6, 12], colors=STONE, linewidths=0.5)
-        axes.clabel(lines, fmt="%g dB", fontsize=6)
+        axes.clabel(lines, fmt=lambda value: f"{value:g} dB".replace("-", "−"), fontsize=6)
         axes.plot([-180.0], [0.0], marker="+", color=DARK, markersize=9, linestyle="none")
         axes.set(
             xlim=(left, right), ylim=(low, high), xlabel=with_unit("phase of L", "deg"), ylabel=with_unit("|L|", "dB")
@@ -253,6 +256,8 @@ def four(systems: Sequence[Mapping[str, Any]], names: Sequence[str], omega: Arra
             own = [found[key] for found in systems]
             spans = _span([found["L"] for found in systems], omega)
             for i, (system, w) in enumerate(zip(own, spans, strict=True)):
+                if omega is None:  # closed loops have resonances of their own
+                    w = Realization.of(system).grid(float(w[0]), float(w[-1]), POINTS)
                 axes.plot(w, np.abs(response(system, w)), label=names[i], **_look(i, system))
             axes.set_xscale("log")
             axes.set_yscale("log")

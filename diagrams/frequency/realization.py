@@ -24,6 +24,8 @@ ROUNDING = (1e-8, 1e-10, 1e-12)
 """Sizes below which an entry may be such a zero; each is tried, and kept if the response stays the same."""
 MARGINAL = 1e-14
 """Distance from the limit of stability, relative to the largest pole, below which a pole counts as on it."""
+LIGHTLY_DAMPED = 0.3
+"""Damping ratio of a pole below which a response is drawn at more frequencies around it."""
 LARGE = 1e4
 """|L| above which a difference does not show in the closed loop."""
 
@@ -198,6 +200,23 @@ class Realization:
         part, first = _split_uncontrollable(whole)
         part, second = _split_uncontrollable(_transpose(part))
         return whole._replace_by(_transpose(part), np.concatenate([first, second]))
+
+    def grid(self, low: float, high: float, count: int) -> np.ndarray:
+        """Return frequencies in rad/s at which the response is drawn: evenly over the logarithm, and around resonances.
+
+        Parameters
+        ----------
+        low, high : float
+            Ends; a sampled system's response ends below π/T.
+        count : int
+            Frequencies between them, besides those around resonances.
+        """
+        top = min(high, self.nyquist * (1 - 1e-6))
+        s = self.logarithm(np.linalg.eigvals(self.A))
+        peaks = [abs(p) for p in s if p.imag > 0 and abs(p.real) < LIGHTLY_DAMPED * abs(p)]
+        near = np.geomspace(1e-5, 0.3, 60)
+        w = np.concatenate([np.geomspace(low, top, count), *(peak * (1 + np.append(near, -near)) for peak in peaks)])
+        return np.unique(w[(w >= low) & (w <= top)])
 
     def agrees(self, other: Realization) -> bool:
         """Whether the responses are the same to 1e-9 around every open-loop and closed-loop pole.

@@ -18,9 +18,11 @@ from ..requirements import Limit, Reason, RequirementResult, Requirements, TomlF
 from ..studies import Case as StudyCase
 from ..studies import CaseOrigin, CaseState, RunConfirmation, WorstCase, WorstCaseTask
 from .content_hash import content_hash
+from .section_loops import ROWS
 
 TEXTS = Texts(__package__, "worst_case")
 KEY = "worst_case"
+GROWING, GROWTH = "worst_growth", "growth of the fastest pole"
 """Key of the section, and the variant that its verdicts belong to."""
 
 
@@ -186,17 +188,18 @@ def worst_case_of(reported: ReportedWorstCase) -> Section:
     if run is None:
         text.append(TEXTS.line("left_out", wire=", ".join(worst.loop) or "worst case", message=reported.problem))
     else:
-        text.append(f"{run}.")
+        text.append(f"{str(run)[0].upper()}{str(run)[1:]}.")
     numbers: dict[str, Number] = {}
     for name, case in (("as_it_is", nominal), ("worst", worst)):
         if case.state is CaseState.UNSTABLE:
-            numbers[f"{name}.worst_growth"] = Number(case.growth, "1/s", 1e-6 * abs(case.growth), confirmed)
+            numbers[f"{name}.{GROWING}"] = Number(case.growth, "1/s", 1e-6 * abs(case.growth), confirmed)
         elif case.quantity:
             number = case.numbers[case.loop][case.quantity]
             how = f"{number.confirmed_by}; {confirmed}" if confirmed and case is worst else number.confirmed_by
             numbers[f"{name}.{case.quantity}"] = replace(number, confirmed_by=how)
     rows = [
-        (path.partition(".")[0].replace("_", " "), path.partition(".")[2], number) for path, number in numbers.items()
+        (case.replace("_", " "), ROWS.get(name, GROWTH if name == GROWING else name), number)
+        for (case, _, name), number in ((path.partition("."), number) for path, number in numbers.items())
     ]
     tables = [Table("Worst case, beside the diagram as it is", ("case", "number", "value"), tuple(rows), digits=4)]
     given = tuple((name, _text(value)) for name, value in worst.parameters.items())

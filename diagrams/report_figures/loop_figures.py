@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from ..frequency import Margins
 
 TEXTS = Texts(__package__, "figures")
-LIGHTLY_DAMPED = 0.3
-"""Damping ratio of a pole below which a response is drawn at more frequencies around it."""
 OFF_THE_PAGE = 1e3
 """Size of L from which on it is not drawn in the complex plane: beyond lies the other branch of a resonance."""
 
@@ -65,13 +63,8 @@ def _span(loops: Mapping[str, Any], found: Mapping[str, Margins]) -> tuple[float
 def _response(L: Any, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
     from ..frequency import Realization
 
-    top = min(high, np.pi / L.dt * (1 - 1e-6)) if L.dt else high
     r = Realization.of(L)
-    s = r.logarithm(np.linalg.eigvals(r.A))
-    near = 1 + np.concatenate([-np.geomspace(1e-5, 0.3, 60), np.geomspace(1e-5, 0.3, 60)])
-    peaks = [abs(p) for p in s if p.imag > 0 and abs(p.real) < LIGHTLY_DAMPED * abs(p)]
-    w = np.concatenate([np.geomspace(low, top, 600), *(size * near for size in peaks)])
-    w = np.unique(w[(w >= low) & (w <= top)])
+    w = r.grid(low, high, 600)
     return w, r.response(w)[0]
 
 

@@ -14,7 +14,7 @@ LEAST = 0.62
 """Smallest factor by which a figure is set smaller."""
 CAPTION = 0.065
 """Share of a page that a caption takes, with the space around it."""
-ROWS = 6
+ROWS = 12
 """Rows above which a table may go over to the next page to fill one."""
 TABLE_PART = 0.2
 """Share of a page that has to be free for the first part of such a table."""

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import OptionError, near
+from ...blocks.core import OptionError, near, with_unit
+from ..results import BLUE, DARK, GREEN, PURPLE, VERMILION, legend_above, new_figure, style
 from ..sweeps import Box
 from .cases import Case, CaseOrigin, CaseState, Goal
 
@@ -20,8 +21,6 @@ def plot_cases(
     cases: Sequence[Case], worst: Case, goal: Goal, boxes: Mapping[str, Box], parameters: Sequence[str] | None = None
 ) -> Figure:
     """Return a scatter of the number over each parameter; see `WorstCase.plot`."""
-    from matplotlib.figure import Figure
-
     every = [name for name, value in worst.parameters.items() if isinstance(value, float | int)]
     names = every if parameters is None else list(parameters)
     for name in names:
@@ -30,43 +29,46 @@ def plot_cases(
     if not names:
         raise OptionError("found no parameter with one number; expected one to draw over. Look at table().")
     loop, quantity = _drawn(worst, goal)
-    figure = Figure(figsize=(3.4 * min(len(names), 3), 3.2 * math.ceil(len(names) / 3)), layout="constrained")
-    grid = figure.subplots(math.ceil(len(names) / 3), min(len(names), 3), squeeze=False)
-    looks = {
-        CaseOrigin.SAMPLE: ("C0", 12, "samples"),
-        CaseOrigin.CORNER: ("C4", 18, "corners"),
-        CaseOrigin.SEARCH: ("C1", 8, "search"),
-    }
-    for place, axes in enumerate(grid.flat):
-        if place >= len(names):
-            axes.set_visible(False)
-            continue
-        name = names[place]
-        for origin, (color, size, label) in looks.items():
-            mine = [c for c in cases if c.origin is origin and c.state in (CaseState.STABLE, CaseState.MOVING)]
-            mine = [c for c in mine if loop in c.numbers and math.isfinite(c.numbers[loop][quantity].value)]
-            if mine:
-                y = [c.numbers[loop][quantity].value for c in mine]
-                axes.scatter([c.parameters[name] for c in mine], y, s=size, color=color, label=label, alpha=0.8)
-        bad = [c for c in cases if c.parameters and c.state in (CaseState.UNSTABLE, CaseState.FAILED)]
-        low = axes.get_ylim()[0] if axes.collections else 0.0
-        if bad:
-            x = [c.parameters[name] for c in bad]
-            axes.scatter(x, np.full(len(bad), low), marker="x", color="C3", s=20, label="unstable or failed")
-        y_worst = worst.numbers[loop][quantity].value if loop in worst.numbers else low
-        axes.scatter([worst.parameters[name]], [y_worst], marker="*", s=130, color="C3", label="worst", zorder=3)
-        limit = goal.loops[loop][quantity]
-        for end in () if limit is None else limit:
-            if math.isfinite(end):
-                axes.axhline(end, color="0.3", linestyle="--", linewidth=0.9)
-        if name in boxes and boxes[name].scale == "log":
-            axes.set_xscale("log")
-        axes.set_xlabel(name if len(name) < 34 else f"…{name[-32:]}")
-        axes.grid(alpha=0.3)
-        if place % 3 == 0:
-            unit = next((c.numbers[loop][quantity].unit for c in cases if loop in c.numbers), "1")
-            axes.set_ylabel(quantity if unit == "1" else f"{quantity} ({unit})")
-    figure.axes[0].legend(fontsize="small")
+    rows, columns = math.ceil(len(names) / 3), min(len(names), 3)
+    with style():
+        figure = new_figure(0.3 + 2.4 * rows)
+        grid = figure.subplots(rows, columns, squeeze=False)
+        looks = {
+            CaseOrigin.SAMPLE: (BLUE, 12, "samples"),
+            CaseOrigin.CORNER: (PURPLE, 18, "corners"),
+            CaseOrigin.SEARCH: (GREEN, 8, "search"),
+        }
+        for place, axes in enumerate(grid.flat):
+            if place >= len(names):
+                axes.set_visible(False)
+                continue
+            name = names[place]
+            for origin, (color, size, label) in looks.items():
+                mine = [c for c in cases if c.origin is origin and c.state in (CaseState.STABLE, CaseState.MOVING)]
+                mine = [c for c in mine if loop in c.numbers and math.isfinite(c.numbers[loop][quantity].value)]
+                if mine:
+                    y = [c.numbers[loop][quantity].value for c in mine]
+                    axes.scatter([c.parameters[name] for c in mine], y, s=size, color=color, label=label, alpha=0.8)
+            bad = [c for c in cases if c.parameters and c.state in (CaseState.UNSTABLE, CaseState.FAILED)]
+            low = axes.get_ylim()[0] if axes.collections else 0.0
+            if bad:
+                x = [c.parameters[name] for c in bad]
+                axes.scatter(x, np.full(len(bad), low), marker="x", color=VERMILION, s=20, label="unstable or failed")
+            y_worst = worst.numbers[loop][quantity].value if loop in worst.numbers else low
+            axes.scatter(
+                [worst.parameters[name]], [y_worst], marker="*", s=130, color=VERMILION, label="worst", zorder=3
+            )
+            limit = goal.loops[loop][quantity]
+            for end in () if limit is None else limit:
+                if math.isfinite(end):
+                    axes.axhline(end, color=DARK, linestyle="--", linewidth=0.9)
+            if name in boxes and boxes[name].scale == "log":
+                axes.set_xscale("log")
+            axes.set_xlabel(name if len(name) < 34 else f"…{name[-32:]}")
+            if place % 3 == 0:
+                unit = next((c.numbers[loop][quantity].unit for c in cases if loop in c.numbers), "1")
+                axes.set_ylabel(with_unit(quantity, unit))
+        legend_above(figure, grid.flat[0])
     return figure
 
 

@@ -219,3 +219,15 @@ def test_interconnected_systems_of_several_signals_in_any_sample_time_come_in_an
     back = block.to_control()
     assert (back.dt, back.input_labels, back.output_labels) == (True, ["r1", "r2"], ["y1", "y2"])
     np.testing.assert_allclose(back(1j), closed(1j), rtol=1e-12)
+
+
+def test_resonances_are_drawn_to_their_peaks_and_legends_stand_above(loop):
+    """|1/(s² + 2 ζ s + 1)| is 1/(2 ζ √(1 − ζ²)) at its peak."""
+    damping = 1e-3
+    figure = loop.bode(control.tf([1.0], [1.0, 2 * damping, 1.0], name="resonant"), db=False)
+    peak = np.max(curve(figure.axes[0], 1)[1])
+    assert peak == pytest.approx(1 / (2 * damping * np.sqrt(1 - damping**2)), rel=1e-3)
+    (legend,) = figure.legends
+    figure.draw(figure.canvas.get_renderer())
+    bottom = legend.get_window_extent().y0
+    assert all(axes.get_window_extent().y1 <= bottom + 1 for axes in figure.axes)
