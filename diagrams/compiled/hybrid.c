@@ -5,7 +5,7 @@
    `t`. Python, with the same numbers before it, does the rest of the way to the next tick and says what has happened. */
 
 /* Begin a stretch that ends at a discontinuity, or at the next tick. */
-static double begin_stretch(hybrid *h, progress *g, double end) {
+static inline double begin_stretch(hybrid *h, progress *g, double end) {
     problem *p = &h->p;
     const span *s = g->s;
     method *m = h->methods[h->active];
@@ -22,7 +22,7 @@ static double begin_stretch(hybrid *h, progress *g, double end) {
 }
 
 /* Go on to the next tick that is landed on; DONE: it is reached. */
-static int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
+static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
     const span *s = g->s;
     problem *p = &h->p;
     const int64_t landing = landing_of(g);

@@ -57,6 +57,7 @@ class _Method(ctypes.Structure):
         *_fields(_AT, "x x_old f y g K D J lu lu_complex Z W F error scale pivots pivots_complex"),
         *_fields(_REAL, "h_of_lu h_before error_before tolerance"),
         *_fields(ctypes.c_int32, "has_lu has_slope slope_is_new predicts"),
+        ("step", _AT),
     ]
 
 
@@ -230,7 +231,7 @@ class CompiledHybrid:
                 hybrid.p.entries = len(rows)
                 hybrid.p.row, hybrid.p.column = (self._own(np.array([*v, 0], dtype=np.int64)) for v in (rows, columns))
         of = ctypes.addressof(hybrid) + _Hybrid.p.offset
-        self.methods = [self._method(options, n, of) for options in methods]
+        self.methods = [self._method(options, n, of, code.steps.get(options.name)) for options in methods]
         for i, method in enumerate(self.methods):
             hybrid.methods[i] = ctypes.addressof(method)
         hybrid.before = self._own(np.zeros(width))
@@ -269,11 +270,13 @@ class CompiledHybrid:
         self._kept.append(bound)
         return bound.structure
 
-    def _method(self, options: MethodOptions, n: int, of: int) -> _Method:
+    def _method(self, options: MethodOptions, n: int, of: int, step: int | None) -> _Method:
         import scipy.integrate
 
         name = options.name
-        made = _Method(kind=_KINDS[name], n=n, of=of, rtol=options.rtol, longest=options.longest, planned=np.nan)
+        made = _Method(
+            kind=_KINDS[name], n=n, of=of, rtol=options.rtol, longest=options.longest, planned=np.nan, step=step
+        )
         made.atol = self._own(np.ascontiguousarray(np.broadcast_to(options.atol, (n,)), dtype=float))
         if name in ("RK23", "RK45", "DOP853"):
             of_scipy = getattr(scipy.integrate, name)

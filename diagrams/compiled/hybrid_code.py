@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -30,9 +30,11 @@ from .code import (
 from .grouped_parts import Differences, GroupedPart, find_differences
 from .grouping import make_part_tables, make_tables
 from .kernels import write_kernels
+from .small_steps import STEPS, write_steps
 
-_SOURCES = ("newton.c", "master.c", "methods.c", "radau.c", "events.c", "instants.c", "hybrid.c")
+_SOURCES = ("newton.c", "master.c", "problem.c", "methods.c", "radau.c", "events.c", "instants.c", "hybrid.c")
 
+_FLAGS = ("-fno-unroll-loops",)  # vectors are short: a third less for the compiler
 _GROUPED = ("grouped", "grouped_part", "grouped_differences")
 
 EMBEDDED = ("euler", "heun", "rk4", "RK23", "RK45", "DOP853", "Radau", "auto")
@@ -72,10 +74,13 @@ class HybridCode:
         Its ticks; that at which no clock acts is an instant between ticks.
     between : mapping
         Its other functions that there are, by name: ``"flow"``, ``"slope"``, ``"indicators"``, ``"jump"``.
+    steps : mapping
+        Addresses of steps that were made for its rates, by method.
     """
 
     ticks: TickCode
     between: Mapping[str, Between]
+    steps: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,13 +202,16 @@ def _write_straight(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], 
         check_size(function)
         generator.add(function)
 
+    steps = "" if flat.active_loops(NONE) else write_steps(flat.flow.last.fast, flat.continuous.tolist())
+
     def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
         library = libraries[0]
         straight = {c: StraightTick(ticks[c], address_of(library, f"tick{i}")) for i, c in enumerate(kinds)}
         between = {name: Compiled(function, address_of(library, name)) for name, function in others.items()}
-        return HybridCode(TickCode(straight, exact=False, library=library), between)
+        made = {method: address_of(library, step) for method, step in STEPS.items()} if steps else {}
+        return HybridCode(TickCode(straight, exact=False, library=library), between, made)
 
-    return HybridSources([make_visible(generator.dump())], make)
+    return HybridSources([make_visible(generator.dump()) + steps], make)
 
 
 def _write_grouped(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridSources:
@@ -252,4 +260,4 @@ def hybrid_master() -> ctypes.CDLL:
     FmuError
         If the cache can't be written.
     """
-    return load_compiled(read_sources(*_SOURCES))
+    return load_compiled(read_sources(*_SOURCES), _FLAGS)

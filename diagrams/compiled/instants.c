@@ -47,14 +47,14 @@ typedef struct {
 } progress;
 
 /* Return the tick that is landed on next, behind the instants of the span if it is not among them. */
-static int64_t landing_of(progress *g) {
+static inline int64_t landing_of(progress *g) {
     if (g->landing < g->i)
         for (g->landing = g->i; g->landing < g->s->count && !g->s->lands[g->landing];) g->landing++;
     return g->landing;
 }
 
 /* Stand at an instant, beyond any discontinuity there. */
-static void enter(hybrid *h, progress *g, double t) {
+static inline void enter(hybrid *h, progress *g, double t) {
     problem *p = &h->p;
     const span *s = g->s;
     p->edge = p->left = INFINITY;
@@ -65,19 +65,19 @@ static void enter(hybrid *h, progress *g, double t) {
     memcpy(p->x, h->l.x, (size_t)h->l.states * sizeof(double));
 }
 
-static void put_states(hybrid *h, const double *x) {
+static inline void put_states(hybrid *h, const double *x) {
     for (int64_t i = 0; i < h->p.n; i++) h->l.x[h->p.where[i]] = x[i];
 }
 
 /* Evaluate everything at the present instant between ticks; take over what blocks remember, if asked for. */
-static int64_t accept(hybrid *h) {
+static inline int64_t accept(hybrid *h) {
     if (evaluate(&h->l, h->between) != DONE) return NOT_OK;
     memcpy(h->l.x, h->l.x_next, (size_t)h->l.states * sizeof(double));
     memcpy(h->p.x, h->l.x, (size_t)h->l.states * sizeof(double));
     return DONE;
 }
 
-static bool has_room(const hybrid *h, const progress *g) { return h->l.skip || g->out->rows < g->s->room; }
+static inline bool has_room(const hybrid *h, const progress *g) { return h->l.skip || g->out->rows < g->s->room; }
 
 
 /* Look for signs that stability bounds an explicit method's steps, or that it would no longer; see AutoSolver. */
@@ -277,7 +277,7 @@ static int settle(hybrid *h, double t, bool ahead) {
 
 /* --- a tick -------------------------------------------------------------------------------------------------------- */
 
-static void keep_instant(hybrid *h) {
+static inline void keep_instant(hybrid *h) {
     memcpy(h->before, h->l.x, (size_t)h->l.states * sizeof(double));
     if (h->w.m) keep(&h->w);
 }
@@ -292,7 +292,7 @@ static int64_t ask(hybrid *h, int64_t reason) {
 }
 
 /* Go through a tick that the continuous states have reached: FMUs, events before and after it, a sample. */
-static int64_t land(hybrid *h, progress *g) {
+static inline int64_t land(hybrid *h, progress *g) {
     const span *s = g->s;
     loop *l = &h->l;
     const int64_t i = g->i, kind = s->kinds[i];

@@ -64,20 +64,20 @@ typedef struct {
     int64_t reason, plant, stage, status;
 } outcome;
 
-static int move(const plant *p, const transfer *of) {
+static inline int move(const plant *p, const transfer *of) {
     if (p->version == 2)
         return ((set_or_get2)of->function)(p->instance, of->references, of->count, of->values);
     return ((set_or_get3)of->function)(p->instance, of->references, of->count, of->values, of->size);
 }
 
-static int step(const plant *p) {
+static inline int step(const plant *p) {
     if (p->version == 2) return ((do_step2)p->step)(p->instance, *p->now, *p->width, *(const int *)p->final);
     return ((do_step3)p->step)(p->instance, *p->now, *p->width, *(const bool *)p->final, p->flags, p->flags + 1,
                                p->flags + 2, p->reached);
 }
 
 /* Step one FMU; return DONE, or why it can't go on. */
-static int64_t step_plant(const plant *p, double now, double width, outcome *out) {
+static inline int64_t step_plant(const plant *p, double now, double width, outcome *out) {
     unsigned status; /* Python tells a warning, and what is worse; a negative one is no success */
     out->stage = INPUTS;
     if (p->inputs.function && (status = (unsigned)move(p, &p->inputs)) > 0) return out->status = (int)status, FMU_FAILED;
@@ -88,7 +88,7 @@ static int64_t step_plant(const plant *p, double now, double width, outcome *out
     return p->flags[1] | p->flags[2] ? FMU_FLAGS : DONE; /* a flag for an event is for event mode alone */
 }
 
-static int64_t read_plant(const plant *p, double now, double width, double near, outcome *out) {
+static inline int64_t read_plant(const plant *p, double now, double width, double near, outcome *out) {
     unsigned status; /* a negative one is no success */
     if (fabs(*p->reached - now - width) > width * near) return FMU_FLAGS;
     out->stage = OUTPUTS;
@@ -97,7 +97,7 @@ static int64_t read_plant(const plant *p, double now, double width, double near,
 }
 
 /* Step all FMUs, one after the other. */
-static int64_t step_plants(const loop *l, double now, double width, outcome *out) {
+static inline int64_t step_plants(const loop *l, double now, double width, outcome *out) {
     for (int64_t j = 0; j < l->plants; j++) {
         const plant *p = l->fmus + j;
         int64_t reason;
@@ -111,7 +111,7 @@ static int64_t step_plants(const loop *l, double now, double width, outcome *out
 }
 
 /* Evaluate a tick at which clocks of some kind act; return DONE, or why its results are not to be taken over. */
-static int64_t evaluate(const loop *l, int64_t kind) {
+static inline int64_t evaluate(const loop *l, int64_t kind) {
     newton *loops = l->loops ? l->loops + kind : NULL;
     if (!loops || !loops->n) return CALL_TICK(l, kind) || l->ok[0] == 0.0 ? NOT_OK : DONE;
     if (solve_loops(loops, l->x) && !CALL_TICK(l, kind) && l->ok[0] != 0.0) return DONE;
@@ -120,7 +120,7 @@ static int64_t evaluate(const loop *l, int64_t kind) {
 }
 
 /* Record a sample if it is one that is kept: into the row after the `written` ones; return how many are then. */
-static int64_t record(loop *l, double t, double *rows, int64_t written) {
+static inline int64_t record(loop *l, double t, double *rows, int64_t written) {
     if (l->skip) {
         l->skip--;
         return written;
@@ -135,7 +135,7 @@ static int64_t record(loop *l, double t, double *rows, int64_t written) {
     return written + 1;
 }
 
-static bool is_stopped(const loop *l) {
+static inline bool is_stopped(const loop *l) {
     for (int64_t j = 0; j < l->stops; j++)
         if (l->log[l->stop[j]] > l->truth) return true;
     return false;

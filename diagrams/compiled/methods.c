@@ -2,61 +2,6 @@
    step. Norms, step control and dense output are those of SciPy's methods, whose coefficients come from Python; what
    differs is that a restart costs one evaluation of the rates. */
 
-/* The differential equation: its functions read `x`, the vector of all states, with the integrated ones at `where`. */
-typedef struct {
-    int64_t n, width;
-    const int64_t *where;
-    tick flow, slope;        /* the rates at (t, x), and their derivative by the integrated states */
-    double *t, *x, *slopes;
-    int64_t entries;         /* of the slope that may not be 0, which stand in slopes; else all of them do, by columns */
-    const int64_t *row, *column;
-    double stop;             /* rates are evaluated no later */
-    double edge, left;       /* from the time `edge` on sources are seen at the time `left` before it */
-    double at, late;         /* at the time `at` they are seen at the time `late`, just after it */
-    newton *loops;           /* algebraic loops of a trial, with values among the states; NULL: none */
-    const double *here;      /* states of the instant that is reached, from which the loops are sought */
-    double *by_loops;        /* of the slope: ∂f/∂v, then ∂r/∂x, for loops with the values v and r(x, v) = 0 */
-    int64_t rates, jacobians;
-} problem;
-
-enum { EULER, HEUN, RK4, EXPLICIT, EIGHT, RADAU };
-enum { PASSED, FAILED };
-
-typedef struct {
-    int64_t kind, n, stages, order, extra; /* order: of the dense output; extra: stages for it */
-    const double *A, *B, *C, *E, *E3, *P, *A_extra, *C_extra, *atol;
-    double rtol, longest, exponent; /* longest: step in s; exponent: of the error in the step control */
-    problem *of;
-    double planned;                 /* step that would be taken next, s; NaN: none is known */
-    double t, t_old, h, start;
-    int64_t count, done, steps, rejected, segment;
-    double mark;
-    int32_t sliver, prepared;
-    double *x, *x_old, *f, *y, *g, *K, *D; /* D: dense output, a row for each power */
-    double *J, *lu, *lu_complex, *Z, *W, *F, *error, *scale;
-    int64_t *pivots, *pivots_complex;
-    double h_of_lu, h_before, error_before, tolerance;
-    int32_t has_lu, has_slope, slope_is_new, predicts;
-} method;
-
-static const double TOLERANCE = 4.0 * 2.220446049250313e-16; /* of a time; see blocks/core/instants.py */
-
-/* The distance to the next number further from zero, the larger and the smaller one of two: without libm's calls. */
-static inline double ulp(double t) {
-    const double size = fabs(t);
-    uint64_t bits;
-    double next;
-    memcpy(&bits, &size, sizeof bits);
-    bits++;
-    memcpy(&next, &bits, sizeof next);
-    return next - size;
-}
-
-static inline double larger(double a, double b) { return a > b ? a : b; }
-static inline double smaller(double a, double b) { return a < b ? a : b; }
-static inline double left_of(double t) { return t - 4.0 * TOLERANCE * fabs(t); }
-static inline bool is_before(double a, double b) { return b < INFINITY ? a < b - 2.0 * TOLERANCE * fabs(b) : a < b; }
-
 /* Put the trial to an instant; false if its algebraic loops are not solved there. */
 static inline bool look(problem *p, double t, const double *x) {
     *p->t = t >= p->edge ? p->left : t == p->at ? p->late : t;
@@ -75,12 +20,6 @@ static inline void rate(problem *p, double t, const double *x, double *f) {
     }
     p->flow.results[0] = f;
     call(&p->flow);
-}
-
-static inline bool all_finite(const double *x, int64_t n) {
-    double sum = 0.0;
-    for (int64_t i = 0; i < n; i++) sum += 0.0 * x[i];
-    return sum == 0.0;
 }
 
 static double norm_of(const double *e, const double *scale, int64_t n) {
@@ -133,7 +72,7 @@ static double first_step(method *m, double order) {
 }
 
 /* Start at (t, m->x), up to p->stop. */
-static void restart(method *m, double t) {
+static inline void restart(method *m, double t) {
     problem *p = m->of;
     m->t = m->t_old = m->start = m->mark = t;
     m->prepared = 0;
@@ -227,7 +166,7 @@ static inline int step_explicit(method *m) {
         const double error = error_of(m, h);
         if (error < 1.0) {
             if (all_finite(m->g, n) && all_finite(m->K + last * n, n)) {
-                factor = error == 0.0 ? 10.0 : smaller(10.0, 0.9 * pow(error, -1.0 / (m->exponent + 1.0)));
+                factor = growth(error, m->exponent);
                 if (again) factor = smaller(1.0, factor);
                 break;
             }
@@ -254,10 +193,12 @@ static inline int step_explicit(method *m) {
 static int step_radau(method *m);
 
 /* Take one step that the error control accepts, at most to p->stop. */
-static int take_step(method *m) {
+static inline int take_step(method *m) {
     int result;
     m->prepared = 0;
-    if (m->kind <= RK4)
+    if (m->step && !m->sliver)
+        result = m->step(m);
+    else if (m->kind <= RK4)
         result = step_fixed(m);
     else if (m->sliver)
         result = step_sliver(m);
@@ -309,7 +250,7 @@ static void prepare(method *m) {
 }
 
 /* Write the states at a time of the last step. */
-static void interpolate(method *m, double t, double *out) {
+static inline void interpolate(method *m, double t, double *out) {
     const int64_t n = m->n;
     if (t == m->t) {
         memcpy(out, m->x, n * sizeof(double));

@@ -25,7 +25,7 @@ typedef struct {
     double *w;
 } tick;
 
-static int call(const tick *f) { return f->evaluate(f->arguments, f->results, f->iw, f->w, 0); }
+static inline int call(const tick *f) { return f->evaluate(f->arguments, f->results, f->iw, f->w, 0); }
 
 /* The algebraic loops at such a tick: r is what comes round less v, J its derivative by v, column by column. */
 typedef struct {

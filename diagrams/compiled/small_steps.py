@@ -1,0 +1,61 @@
+"""C code of steps for one small differential equation: its rates are inlined into every stage of a method."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .code import make_visible, read_sources, rename
+
+STEPS = {"rk4": "step_rk4", "RK23": "step_rk23", "RK45": "step_rk45"}
+"""Names of the C functions, by method."""
+_MOST_STATES, _MOST_OPERATIONS = 8, 120
+_CASADI = re.compile(r"\b(_?(?:casadi|CASADI)_)")
+
+
+def write_steps(rates: Any, where: Sequence[int]) -> str:
+    """Return the C code of steps for a differential equation; empty where it is too large to be inlined.
+
+    Parameters
+    ----------
+    rates : casadi.Function
+        The rates by (t, x, w, p).
+    where : sequence of int
+        Entries of x that are integrated.
+    """
+    n = len(where)
+    if not (0 < n <= _MOST_STATES and rates.is_a("SXFunction") and rates.n_instructions() <= _MOST_OPERATIONS):
+        return ""
+    generator = ca.CodeGenerator("rates.c")
+    generator.add(rename(rates, "rates"))
+    text = make_visible(generator.dump()).replace("static int casadi_f0(", "INLINE int casadi_f0(")
+    numbers = f"#define N {n}\n#define WIDTH {rates.numel_in(1)}\n#define PLACES {', '.join(map(str, where))}\n"
+    numbers += "#define INLINE static inline __attribute__((always_inline))\n"
+    named = _CASADI.sub(r"of_\1", text) + "#define RATES(a, r) of_casadi_f0(a, r, NULL, NULL, 0)\n"
+    return "\n".join([read_sources("newton.c", "problem.c"), numbers, named, read_sources("small.c"), _embedded()])
+
+
+@lru_cache(maxsize=1)
+def _embedded() -> str:
+    """Return the steps of embedded methods, with the coefficients of SciPy's methods."""
+    from scipy.integrate import RK23, RK45
+
+    return "".join(_write_embedded(name, method) for name, method in (("RK23", RK23), ("RK45", RK45)))
+
+
+def _write_embedded(name: str, method: Any) -> str:
+    stages = method.n_stages
+    A = np.zeros((stages, stages))
+    A[:, : method.A.shape[1]] = method.A
+    tables = {"A": A.ravel(), "B": method.B, "C": method.C, "E": method.E}
+    texts = [
+        f"    static const double {letter}[] = {{{', '.join(map(float.hex, map(float, values)))}}};\n"
+        for letter, values in tables.items()
+    ]
+    call = f"    return step_embedded(m, {stages}, A, B, C, E, {float(method.error_estimator_order)});\n"
+    return f"\nVISIBLE int {STEPS[name]}(method *m) {{\n" + "".join(texts) + call + "}\n"
