@@ -29,8 +29,9 @@ class SimulatedDiagram(WiredDiagram):
             Show a progress bar; by default on a terminal, and in a notebook where ipywidgets is installed.
         **options
             Options of the run by name: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step``, ``record``, ``every``,
-            ``states``, ``to``, ``overwrite``, ``start``, ``coupling``, ``start_exchange``. `RunOptions` says what each
-            means, and its default.
+            ``states``, ``to``, ``overwrite``, ``start``, ``coupling``, ``start_exchange``, ``compile`` (whether C goes
+            from tick to tick) and ``fuse`` (faster, and other in the last digits). `RunOptions` says what each means,
+            and its default.
 
         Returns
         -------

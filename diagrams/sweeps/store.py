@@ -43,9 +43,20 @@ class Store:
 
     def __init__(self, folder: Path, revision: str, about: dict[str, Any], *, overwrite: bool = False):
         self.folder = folder
+        try:
+            self._open(revision, about, overwrite=overwrite)
+        except OSError as error:
+            raise OptionError(
+                f"the folder {str(folder)!r} can't be made, read or written: {error.strerror or error}; expected one "
+                "that keeps the sweep. Choose a folder of your own, such as to='sweeps/first'.",
+                block=str(about.get("diagram", "")) or None,
+                port="to",
+            ) from error
         self._waiting: list[tuple[str, Outcome]] = []
         self._last = monotonic()
-        head = folder / HEAD
+
+    def _open(self, revision: str, about: dict[str, Any], *, overwrite: bool) -> None:
+        folder, head = self.folder, self.folder / HEAD
         if folder.exists() and not folder.is_dir():
             raise OptionError(f"found a file at {str(folder)!r}; expected a folder, or nothing. Choose another path.")
         if head.is_file():
@@ -71,7 +82,13 @@ class Store:
             write_text(head, json.dumps({"format": _FORMAT, "revision": revision, **about}, indent=1) + "\n")
 
     def read(self) -> dict[str, Outcome]:
-        """Return the outcomes that are there, by the keys of their samples; unfinished parts don't count."""
+        """Return the outcomes that are there, by the keys of their samples; unfinished parts don't count.
+
+        Raises
+        ------
+        OptionError
+            If a part can't be read.
+        """
         found: dict[str, Outcome] = {}
         for path in sorted(self.folder.glob("part-*.npz")):
             found.update(_read_part(path))

@@ -78,6 +78,8 @@ def sweep(
     count_workers = _check_workers(workers)
     store, known = None, dict[str, Outcome]()
     if to is not None:
+        if not isinstance(to, str | os.PathLike) or "\0" in str(to):
+            raise OptionError(f"found {to!r}; expected the path of a folder. Give one.", block=name, port="to")
         store = Store(Path(to), revision_of(plan), {"diagram": name, "duration": plan.duration}, overwrite=overwrite)
         known = store.read()
     keys = [key_of(sample, seeded=bool(plan.seeds)) for sample in found] if store is not None else []

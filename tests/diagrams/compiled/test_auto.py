@@ -1,5 +1,6 @@
 """compile="auto": runs that take long go on in C as soon as the code is there, with the same bits whenever that is."""
 
+from dataclasses import fields
 from unittest import mock
 
 import numpy as np
@@ -18,7 +19,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Diagram, Run, subsystem
 from loopwright.diagrams.compiled import background, code
-from loopwright.diagrams.simulation import change_over, compiled_ticks
+from loopwright.diagrams.simulation import RunOptions, change_over, compiled_ticks
 from loopwright.fmus import Fmu, dc_motor
 from support.both_forms import assert_same_bits
 
@@ -193,3 +194,8 @@ def test_a_failure_after_the_change_says_the_same(eager):
 def test_another_value_is_refused():
     with pytest.raises(OptionError, match="expected True, False or"):
         sums().simulate(1.0, compile="yes", **QUIET)
+
+
+def test_the_docstring_of_simulate_names_every_option():
+    options = (field.name for field in fields(RunOptions))
+    assert not [name for name in options if f"``{name}``" not in Diagram.simulate.__doc__]
