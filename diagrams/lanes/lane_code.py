@@ -143,8 +143,12 @@ def compile_lanes(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], c
 
 
 def _compile(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], count: int) -> LaneCode:
-    if flat.hybrid or flat.loops.slices or flat.apart:
-        raise NoLanesError("it has continuous states, algebraic loops or blocks that are evaluated from outside")
+    if flat.hybrid:
+        raise NoLanesError("it has continuous states")
+    if flat.loops.slices:
+        raise NoLanesError("it has algebraic loops")
+    if flat.apart:
+        raise NoLanesError("it has blocks that are evaluated from outside")
     if flat.by_block:
         raise NoLanesError("its ticks have too many operations to be compiled as a whole")
     ticks = [flat.at_tick(clocks).last.fast for clocks in acting]

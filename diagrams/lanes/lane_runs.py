@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -110,10 +111,6 @@ class LaneRuns:
         """Rows to be left out before the next one that is kept."""
         return int(self._structure.skip)
 
-    def room(self, rows: int) -> np.ndarray:
-        """Return memory for some rows of all runs, shape (rows, columns, lanes)."""
-        return _aligned(np.zeros((max(rows, 1), max(self._columns.size, 1), self._code.count)))
-
     def run(self, times: np.ndarray, widths: np.ndarray, kinds: np.ndarray, rows: np.ndarray) -> int:
         """Go through ticks, as `CompiledLoop.run` does; return the number of rows that were written.
 
@@ -125,8 +122,8 @@ class LaneRuns:
             Length of each tick, in s.
         kinds : ndarray, shape (n,), of int32
             Clocks that act at each of them, as numbers of the code.
-        rows : ndarray
-            The memory, of `room`.
+        rows : ndarray, shape (m, columns, lanes)
+            The memory for the rows, of `make_room`.
         """
         self._structure.rows = 0
         self._code.run(
@@ -143,6 +140,14 @@ class LaneRuns:
             LaneEnd(found.failed[i], found.stopped[i], found.by[i], self._last[: self._columns.size, i].copy())
             for i in range(self._count)
         ]
+
+
+def make_room(*shape: int) -> np.ndarray:
+    """Return memory for numbers, of which C loads and stores whole vectors of the last axis."""
+    count, size = 8 * math.prod(shape), 8 * shape[-1]
+    memory = np.empty(count + size, dtype=np.uint8)
+    begin = -memory.ctypes.data % size
+    return memory[begin : begin + count].view(float).reshape(shape)
 
 
 _STRUCTURES: dict[int, type[ctypes.Structure]] = {}
@@ -164,9 +169,6 @@ def _structure(count: int) -> type[ctypes.Structure]:
 
 def _aligned(values: np.ndarray) -> np.ndarray:
     """Return a copy at an address that suits vectors of its last axis: C loads and stores them whole."""
-    size = 8 * values.shape[-1]
-    memory = np.empty(values.nbytes + size, dtype=np.uint8)
-    begin = -memory.ctypes.data % size
-    found = memory[begin : begin + values.nbytes].view(float).reshape(values.shape)
+    found = make_room(*values.shape)
     found[...] = values
     return found

@@ -13,7 +13,7 @@ import numpy as np
 from ...blocks.core import LoopwrightError
 from ...fmus.calls import FmuInstance
 from ..flat import EVERY, ClockSets, is_exact, kinds_of, ticks_after
-from ..lanes import LaneCode, LaneEnd, LaneRuns, LaneStart, NoLanesError, compile_lanes
+from ..lanes import LaneCode, LaneEnd, LaneRuns, LaneStart, NoLanesError, compile_lanes, make_room
 from ..results import Run, Stopped, machine_memory
 from ..simulation import StopConditions
 from .bound_run import BoundRun, Tell
@@ -142,6 +142,9 @@ class _Lanes:
         if needed > 0.3 * machine_memory():
             raise NoLanesError(f"the samples of {count} runs at a time would take {needed / 2**30:.0f} GiB")
         self._code: LaneCode = compile_lanes(flat, acting, count)
+        width, every = max(1, len(self._columns)), bound.recorder.every
+        self._chunk = max(1, min(_TICKS, len(self._ticks), every * _BYTES // (8 * width * count)))
+        self._room = make_room(self._chunk // every + 1, width, count)
         self._stops = StopConditions(flat, engine.workspace.log, str)
 
     def start(self, numbers: Numbers[Any]) -> LaneStart | None:
@@ -177,14 +180,13 @@ class _Lanes:
             self._code, starts, columns=self._columns, every=bound.recorder.every, stops=self._stops.entries
         )
         kept = [[start.row[None]] for start in starts]
-        chunk = max(1, min(_TICKS, bound.recorder.every * _BYTES // (8 * max(n, 1) * self._code.count)))
-        room = runs.room(chunk // bound.recorder.every + 1)
+        chunk, room = self._chunk, self._room
         k, total = 0, len(self._ticks)
         while k < total and runs.is_going:
             end = min(k + chunk, total)
             rows = runs.run(self._times[k : end + 1], self._widths[k:end], self._kinds[k:end], room)
-            for lane, parts in enumerate(kept):
-                parts.append(np.ascontiguousarray(room[:rows, :n, lane]))
+            for parts, lane in zip(kept, np.ascontiguousarray(room[:rows, :n].transpose(2, 0, 1)), strict=False):
+                parts.append(lane)
             k = end
             tell(float(self._times[k]))
         for start, parts, end_of in zip(starts, kept, runs.ends(), strict=True):

@@ -7,7 +7,20 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Compare, Constant, Gain, Input, OptionError, Output, Step, StopCondition, UnitDelay
+from loopwright.blocks import (
+    Block,
+    Compare,
+    Constant,
+    Gain,
+    Input,
+    Integrator,
+    Lookup1D,
+    OptionError,
+    Output,
+    Step,
+    StopCondition,
+    UnitDelay,
+)
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.sweeps import final, lane_worker, maximum, mean, minimum, settling_time
 from loopwright.diagrams.sweeps.bound_run import BoundRun
@@ -29,7 +42,7 @@ PAPER = 1e-10
 
 @functools.lru_cache(maxsize=1)
 def lag():
-    """An FMU of dx/dt = (gain u − x − bend x²) / lag, x(0) = 0, that puts out x and 2 x + u."""
+    """An FMU of dx/dt = (gain u − x − bend x²) / lag, x(0) = 0, that puts out x, 2 x + u and x + 1."""
     t, x, u, p = ca.SX.sym("t"), ca.SX.sym("x"), ca.SX.sym("u"), ca.SX.sym("p", 3)
     numbers = {"gain": ("tunable", 1.0), "lag": ("tunable", 0.2), "bend": ("fixed", 0.0)}
     return build_fmu(
@@ -37,17 +50,17 @@ def lag():
             name="lag",
             description="A lag",
             inputs=(Variable("u", "input"),),
-            outputs=(Variable("mixed", "output"),),
+            outputs=(Variable("mixed", "output"), Variable("shifted", "output")),
             parameters=tuple(Variable(name, "parameter", kind, start=v) for name, (kind, v) in numbers.items()),
             states=(Variable("x", "output", start=0.0, state=True),),
             derivative=ca.Function("f", [t, x, u, p], [(p[0] * u - x - p[2] * x * x) / p[1]]),
-            output=ca.Function("g", [t, x, u, p], [2.0 * x + u]),
+            output=ca.Function("g", [t, x, u, p], [ca.vertcat(2.0 * x + u, x + 1.0)]),
             internal_step=STEP,
         )
     )
 
 
-def loop(*, stops=False, slow=1, more=None):
+def loop(*, stops=False, slow=1, more=None, loops="error"):
     """The lag under a proportional controller of reference 1, with a counter at a lower rate."""
     plant = Fmu(lag(), name="plant")
 
@@ -66,8 +79,14 @@ def loop(*, stops=False, slow=1, more=None):
 
     force = box(plant.x, Step(times=0.0, values=1.0, name="reference"))
     call = plant(u=force)
-    signals = plant.x.named("x"), plant.mixed.named("mixed"), force.named("u"), counter(plant.x).named("k")
-    return Diagram("lag_loop", call, *signals)
+    signals = (
+        plant.x.named("x"),
+        plant.mixed.named("mixed"),
+        plant.shifted.named("shifted"),
+        force.named("u"),
+        counter(plant.x).named("k"),
+    )
+    return Diagram("lag_loop", call, *signals, loops=loops)
 
 
 def exact_states(gain, lag, kp, ticks):
@@ -107,13 +126,16 @@ def test_runs_are_those_of_the_closed_form_with_other_parameters_in_every_lane()
         "settled": settling_time("x", band=0.02), "late": settling_time("x", band=0.02, since=0.1),
         "mine": lambda run: [run["x"][10], run.t[10]],
     }  # fmt: skip
-    found = loop().sweep(None, 1.0, samples=table, signals=["x", "mixed"], reduce=reduce, lanes=LANES, **QUIET)
+    found = loop().sweep(
+        None, 1.0, samples=table, signals=["x", "mixed", "shifted"], reduce=reduce, lanes=LANES, **QUIET
+    )
     assert ran_in_lanes(found)
     assert not found.failures
     for i, sample in enumerate(table):
         x = exact_states(sample["plant.gain"], sample["plant.lag"], sample["kp.gain"], 100)
         np.testing.assert_allclose(found["x"][i], x, rtol=0, atol=1e-13)
         np.testing.assert_allclose(found["mixed"][i][1:], 2 * x[1:] + sample["kp.gain"] * (1 - x[:-1]), atol=1e-12)
+        np.testing.assert_allclose(found["shifted"][i], x + 1.0, rtol=0, atol=1e-13)
         assert found["end"][i] == found["x"][i][-1]
         assert found["top"][i] == found["x"][i].max()
         assert found["bottom"][i] == pytest.approx(sample["kp.gain"] * (1 - x.max()), abs=1e-12)
@@ -183,6 +205,14 @@ def test_runs_of_other_structure_or_other_steps_go_side_by_side_with_their_like(
     assert_near_single_runs(diagram, found, 0.2, ["x"])
 
 
+def around(u):
+    """y = u − y / 2."""
+    half = Gain(gain=0.5, name="half")
+    y = u - half.y
+    half(y)
+    return y
+
+
 class Odd(Block):
     """Twice its input, evaluated by Python."""
 
@@ -214,6 +244,14 @@ def test_runs_that_cannot_go_side_by_side_go_by_themselves_and_say_why():
     assert "more than 10000 substeps" in notes(loop(), [{**row, "plant.internal_step": 1e-8} for row in table], 0.01)
     assert "set-up of its own" in notes(loop(more=lambda u: Odd(name="odd")(u)), table)
     assert "whole number of ticks" in notes(loop(), table, 0.105)
+    rates = Diagram(
+        "rates", Gain(gain=1.0, name="kp")(Integrator(name="held")(Constant(value=1.0, name="one"))).named("x")
+    )
+    assert "it has continuous states" in notes(rates, table, step=T)
+    assert "it has algebraic loops" in notes(loop(more=around, loops="solve"), table)
+    assert "no scalar operations" in notes(
+        loop(more=Lookup1D(breakpoints=(-9.0, 0.0, 9.0), values=(-9.0, 0.0, 4.0))), table
+    )
 
 
 def test_lanes_are_a_number_that_processors_have():
