@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...blocks import PlanarModel
-from ...blocks.core import Array
+from ...blocks.core import Array, identity
 from ...blocks.tracing import flat_column, wrap
 
 
@@ -22,8 +22,31 @@ class Slopes(NamedTuple):
     """Derivatives of f_v and G_v by the position, one after the other."""
 
 
+_KNOWN: dict[Any, Slopes] = {}
+MOST = 64
+"""Slopes that are kept: every variant of a loop asks for those of its models anew."""
+
+
 def compute_slopes(model: PlanarModel, position: Array, velocity: Array) -> Slopes:
-    """Return G_v, ∂f_v/∂x_v and the derivatives by the position, by algorithmic differentiation."""
+    """Return G_v, ∂f_v/∂x_v and the derivatives by the position, by algorithmic differentiation.
+
+    Those of models of this package are kept: the equations of others may have changed since.
+    """
+    ours = type(model).__module__.partition(".")[0] == __name__.partition(".")[0]
+    key = identity(model), np.asarray(position, dtype=float).tobytes(), np.asarray(velocity, dtype=float).tobytes()
+    found = _KNOWN.get(key) if ours else None
+    if found is None:
+        found = _differentiate(model, position, velocity)
+        if ours:
+            for value in found:
+                value.setflags(write=False)
+            _KNOWN[key] = found
+            while len(_KNOWN) > MOST:
+                _KNOWN.pop(next(iter(_KNOWN)), None)
+    return found
+
+
+def _differentiate(model: PlanarModel, position: Array, velocity: Array) -> Slopes:
     import casadi as ca
 
     x_c, x_v = ca.MX.sym("x_c", 2), ca.MX.sym("x_v", 2)

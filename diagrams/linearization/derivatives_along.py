@@ -10,7 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, cast
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar, cast
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -21,12 +23,33 @@ from .derivatives import SLOPE, LocalDerivatives, Numbers
 from .flow_model import EQUILIBRIUM
 from .plant_models import PlantModel, model_equations, model_step
 
+P = ParamSpec("P")
+T = TypeVar("T")
 STEP = 2.0**-9
 """Step of a difference of fourth order between models of an FMU, relative to 1 + the size of what moves."""
 ROUNDING = 1e-13
 """Change of an FMU's states and inputs by a change of the parameter as large as itself that is rounding alone."""
 STILL = 1e3 * EQUILIBRIUM
 """Largest slope of an FMU's rates at which it stays at rest."""
+
+
+def once_for_model(find: Callable[P, T]) -> Callable[P, T]:
+    """Keep what a method of ``self.model`` finds for a diagram's numbers and a direction, as long as the model lives.
+
+    The method takes ``(self, flat, diagram, direction)``. An equilibrium follows a parameter alike for all loops.
+    """
+    known: WeakKeyDictionary[Any, dict[tuple[bytes, bytes], T]] = WeakKeyDictionary()
+
+    @wraps(find)
+    def found(*args: P.args, **kwargs: P.kwargs) -> T:
+        owner, flat, _, direction = cast("tuple[Any, FlatDiagram, Any, np.ndarray]", args)
+        of_model = known.setdefault(owner.model, {})
+        key = flat.p.tobytes(), direction.tobytes()
+        if key not in of_model:
+            of_model[key] = find(*args, **kwargs)
+        return of_model[key]
+
+    return found
 
 
 def join_slope(value: np.ndarray, slope: np.ndarray) -> np.ndarray:

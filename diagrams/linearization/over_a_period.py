@@ -49,6 +49,8 @@ def model_period(
     at: OperatingPoint,
     way: str | None,
     frozen: frozenset[TickPattern] = NONE,
+    *,
+    with_findings: bool = True,
 ) -> Model:
     """Return the model over the least common period of all clocks; those that are frozen do not act."""
     period = period_of(flat, frozen)
@@ -58,7 +60,7 @@ def model_period(
     names = chain.labels
     keep = find_needed(A, chain.C, own_states(flat, frozen), set(range(flat.width, flat.width + chain.n_p)))
     memory, findings = _find_memory(flat, A, names)
-    findings += chain.findings(at.tick + period)
+    findings += chain.findings(at.tick + period) if with_findings else []
     A, B, C = A[np.ix_(keep, keep)], B[keep], chain.C[:, keep]
     labels = [names[i] for i in keep]
     return Model(

@@ -19,7 +19,7 @@ from ..results import OperatingPoint
 from ..wiring import join
 from .checks import replace_stairs
 from .derivatives import LocalDerivatives, find_signal
-from .derivatives_along import DerivativesAlong, join_slope, slope_of
+from .derivatives_along import DerivativesAlong, join_slope, once_for_model, slope_of
 from .exchanged import evaluators_at
 from .flow_model import EQUILIBRIUM, Four, Model, model_continuous
 from .linear_model import Linearization
@@ -168,7 +168,7 @@ def _model_at(
     if slow == "open":
         frozen = find_slower_clocks(flat, ports, diagram.name)
     if period_of(flat) == 1:
-        return model_period(flat, local, at, model.plants, frozen)
+        return model_period(flat, local, at, model.plants, frozen, with_findings=False)
     at = advance_point(flat, at, model.plants, ticks_to_renewal(flat, ports, at.tick), closed)
     return model_loop(flat, local, at, model.plants, lifted=False, frozen=frozen)[0]
 
@@ -197,6 +197,7 @@ class _Cut:
         local.direction = closed.direction = direction
         return _loop_matrices(_model_at(self.model, flat, diagram, at, local, closed, self.slow))
 
+    @once_for_model
     def rest(self, flat: FlatDiagram, diagram: WiredDiagram, direction: np.ndarray) -> OperatingPoint | None:
         """Return the point with the slopes of the equilibrium that follows a parameter; None if none follows.
 
