@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import Any
 
+from ...fmus.build_notes import hear_builds
 from ..results import Run
+
+
+def _is_shown(show: bool | None) -> bool:
+    """Whether progress is shown: where it is asked for; by default on a terminal and in a notebook with widgets."""
+    if show is not None:
+        return show
+    widgets = "ipykernel" in sys.modules and find_spec("ipywidgets") is not None
+    return sys.stderr.isatty() or widgets
 
 
 @contextmanager
@@ -15,12 +25,7 @@ def progress_bar(
     name: str, start: float, end: float, show: bool | None, shown: str = "{task.completed:.2f} / {task.total:g} s"
 ) -> Iterator[Any]:
     """Yield a function that is told the simulated time, or another count, and draws it where that is wanted."""
-    if show is None:
-        import sys
-
-        widgets = "ipykernel" in sys.modules and find_spec("ipywidgets") is not None
-        show = sys.stderr.isatty() or widgets
-    if not show:
+    if not _is_shown(show):
         yield lambda t: None
         return
     from rich.console import Console
@@ -30,6 +35,27 @@ def progress_bar(
     with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(name, total=end - start)
         yield lambda t: bar.update(task, completed=t - start)
+
+
+@contextmanager
+def compiler_notes(show: bool | None) -> Iterator[None]:
+    """Say within the ``with`` statement that a compiler runs, where progress is shown: a run may wait for it."""
+    if not _is_shown(show):
+        yield
+        return
+    from rich.console import Console
+
+    status = Console(stderr=True).status("")
+
+    def say(note: str) -> None:
+        if note:
+            status.update(note)
+            status.start()
+        else:
+            status.stop()
+
+    with hear_builds(say):
+        yield
 
 
 class Interrupted(KeyboardInterrupt):

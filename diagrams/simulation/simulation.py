@@ -29,7 +29,7 @@ from ..results import (
     not_open_error,
 )
 from .engine import Engine
-from .progress import Interrupted, progress_bar
+from .progress import Interrupted, compiler_notes, progress_bar
 from .run_options import RunOptions, default_step, refuse_rest, ticks_in
 from .save import can_save, restore_state, save_state
 from .start_at_point import apply_point
@@ -390,7 +390,9 @@ def simulate(diagram: WiredDiagram, duration: float, options: RunOptions, *, pro
     span: float | None = duration  # None is a user's slip, and no run without an end
     if span is None:
         ticks_in(span, Fraction(1), diagram.name)  # refused
-    with Simulation(diagram, options, duration=duration) as simulation:
+    with ExitStack() as stack:
+        with compiler_notes(progress):
+            simulation = stack.enter_context(Simulation(diagram, options, duration=duration))
         first = simulation.t
         with progress_bar(diagram.name, first, first + float(duration), progress) as show:
             if simulation.stopped is None:

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from ...blocks.core import CompilerError, near
+from ..build_notes import tell_build
 from ..platform import cache_folder, check_cache, native_platform
 
 #: FMI 3.0 platform tuples (2.5.1.4) of the platforms to build for, and zig's name of each with the oldest system:
@@ -181,10 +182,18 @@ def compile_shared(
         includes = [f"-I{path}" for path in include]
         given = [*flags(compiler, platform), *more_flags]
         command = [*compiler.command, *given, "-I.", *includes, "-o", library, *names, *math]
-        _run(command, folder, platform)
+        with tell_build(_note(compiler)):
+            _run(command, folder, platform)
         if not (folder / library).is_file():
             raise CompilerError(f"{shlex.join(command)} wrote no library. Check LOOPWRIGHT_CC.")
         os.replace(folder / library, out)
+
+
+def _note(compiler: Compiler) -> str:
+    first = compiler.zig and not Path(os.environ.get("ZIG_GLOBAL_CACHE_DIR", cache_folder() / "zig")).is_dir()
+    return (
+        "compiling C code; the compiler's first start on a machine takes some seconds" if first else "compiling C code"
+    )
 
 
 def _run(command: Sequence[str], folder: Path, platform: str) -> None:

@@ -1,0 +1,59 @@
+"""A run that waits for a compiler says so, where progress is shown."""
+
+import pytest
+
+from loopwright.blocks import Sine
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.fmus.build_notes import hear_builds, tell_build
+from loopwright.fmus.export import compile_shared, compiler
+
+
+def test_what_is_compiled_is_told_and_its_end(tmp_path):
+    heard = []
+    with hear_builds(heard.append):
+        compile_shared({"a.c": "int f(void) { return 1; }"}, tmp_path / "a.so")
+    compile_shared({"a.c": "int f(void) { return 2; }"}, tmp_path / "b.so")  # nobody listens
+    assert len(heard) == 2
+    assert "compiling C code" in heard[0]
+    assert heard[1] == ""
+
+
+def test_the_first_start_of_a_compiler_is_announced(tmp_path, monkeypatch):
+    zig = compiler.Compiler(("zig", "cc"), "zig", zig=True)
+    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(tmp_path / "zig"))
+    assert "first start" in compiler._note(zig)
+    assert "first start" not in compiler._note(compiler.Compiler(("cc",), "cc"))
+    (tmp_path / "zig").mkdir()
+    assert "first start" not in compiler._note(zig)
+
+
+def test_the_end_is_told_of_a_compilation_that_fails():
+    heard = []
+    with pytest.raises(ZeroDivisionError), hear_builds(heard.append), tell_build("x"):
+        raise ZeroDivisionError
+    assert heard == ["x", ""]
+
+
+@pytest.mark.parametrize("show", [True, False])
+def test_a_run_says_that_it_compiles_where_progress_is_shown(show, monkeypatch):
+    @subsystem(sample_time=0.1, name="box")
+    def box(u):
+        return 2.0 * u
+
+    said = []
+
+    class Status:
+        def update(self, text):
+            said.append(text)
+
+        def start(self):
+            said.append("start")
+
+        def stop(self):
+            said.append("stop")
+
+    monkeypatch.setattr("rich.console.Console.status", lambda console, text: Status())
+    monkeypatch.setattr("loopwright.diagrams.compiled.code._is_whole", lambda library: False)
+    Diagram("d", box(Sine(frequency=0.1 + show)())).simulate(0.2, compile=True, progress=show)
+    assert said[1:3] == (["start", "stop"] if show else [])
+    assert not show or "compiling C code" in said[0]
