@@ -152,8 +152,9 @@ class VariedDiagram(SimulatedDiagram):
         parameters: Mapping[str, Any] | None,
         loop: str | Iterable[str] | None = None,
         *,
-        quantity: str | None = None,
+        quantity: str | Callable[[Any], Any] | None = None,
         requirements: Requirements | None = None,
+        contact: Mapping[str, Any] | None = None,
         samples: Any = "latin",
         count: int | None = None,
         seed: int = 0,
@@ -178,14 +179,18 @@ class VariedDiagram(SimulatedDiagram):
         loop : str or list of str
             Wire that the loop is cut at; with requirements several wires, each a loop of its own. Without them several
             wires are one loop, cut at all at once, with a disk margin.
-        quantity : str, optional
-            The number, ``"disk_margin"`` without it: one of those that `Requirements` can limit.
+        quantity : str or callable, optional
+            The number, ``"disk_margin"`` without it: one of those that `Requirements` can limit. Or a function from a
+            diagram to a number, the smaller, the worse, without a loop; its search takes differences.
         requirements : Requirements, optional
             In place of a number: the smallest distance to a limit, relative to the limit, is made worst.
+        contact : mapping, optional
+            In place of a loop: the contact whose limit of coupled stability is made worst, with arguments of `contact`
+            and of `Contact.stability_limit`: ``{"vary": "stiffness", "damping": 10.0}``. Its search takes differences.
         samples, count, seed
             As of `sweep`: ``count`` samples of a Latin hypercube (100), ``"grid"``, or a table.
         starts, steps : int
-            Number of searches, 0 for none, and the most steps of each.
+            Number of searches, 0 for samples alone, without corners, and the most steps of each.
         at : OperatingPoint, Snapshot, float or callable, optional
             Point of each case, as of `sensitivity`; ``points`` is a list of them, each of which every case is tried at.
         delay : int
@@ -207,6 +212,7 @@ class VariedDiagram(SimulatedDiagram):
         from .studies import find_worst_case
 
         return find_worst_case(
-            self, parameters, loop, quantity=quantity, requirements=requirements, samples=samples, count=count,
-            seed=seed, starts=starts, steps=steps, at=at, points=points, delay=delay, progress=progress, **options,
+            self, parameters, loop, quantity=quantity, requirements=requirements, contact=contact, samples=samples,
+            count=count, seed=seed, starts=starts, steps=steps, at=at, points=points, delay=delay, progress=progress,
+            **options,
         )  # fmt: skip

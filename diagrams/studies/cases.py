@@ -102,6 +102,8 @@ class Goal:
     """The numbers whose worst case is looked for: by loop, each with its limit, or one number without a limit."""
 
     loops: Mapping[tuple[str, ...], Mapping[str, Limit | None]]
+    left_out: tuple[str, ...] = ()
+    """Requirements that a worst case is not looked for with, as those of steps."""
 
     def goodness(self, loop: tuple[str, ...], quantity: str, value: float) -> float:
         """Return the distance of a number to its limit over the limit's size; without a limit the number by its sense.
@@ -110,7 +112,7 @@ class Goal:
         """
         limit = self.loops[loop][quantity]
         if limit is None:
-            return value if SENSES[quantity] is Sense.LEAST else -value
+            return value if SENSES.get(quantity, Sense.LEAST) is Sense.LEAST else -value
         ends = [abs(end) for end in limit if math.isfinite(end)]
         return limit.distance(value) / (max(ends) or 1.0)
 
@@ -118,7 +120,7 @@ class Goal:
         """Return the derivative of the goodness by the number."""
         limit = self.loops[loop][quantity]
         if limit is None:
-            return 1.0 if SENSES[quantity] is Sense.LEAST else -1.0
+            return 1.0 if SENSES.get(quantity, Sense.LEAST) is Sense.LEAST else -1.0
         ends = [abs(end) for end in limit if math.isfinite(end)]
         return (1.0 if value - limit.low < limit.high - value else -1.0) / (max(ends) or 1.0)
 
@@ -176,7 +178,12 @@ def make_goal(
     if not found:
         raise OptionError(
             "found requirements that limit no number of a loop; expected some, such as phase_margin_deg=45, and "
-            "loop='u'. Limits of step responses and of the report's numbers belong to report().",
+            "loop='u'. Limits of step responses, contacts and the report's numbers belong to report(); contact={…} or "
+            "a function as quantity looks for their worst case.",
             block=diagram,
         )
-    return Goal(found)
+    steps = [requirements.step, *requirements.steps, *(of.step for of in requirements.loops.values())]
+    left_out = [f"step.{name}" for step in steps if step is not None for name in step.limits]
+    left_out += [f"numbers.{path}" for path in requirements.numbers]
+    left_out += ["contact"] if requirements.contacts else []
+    return Goal(found, tuple(dict.fromkeys(left_out)))

@@ -49,6 +49,8 @@ class ConfirmationKind(StrEnum):
     """A sine is added to the wire of the running diagram, at the frequency that decides the margin."""
     GROWTH = "growth"
     """A small step is added to the wire, and the signal grows as the unstable pole says."""
+    CONTACT = "contact"
+    """The environment is at the plant, at 0.97 and 1.03 of the limit, and the motion decays and grows as predicted."""
 
 
 @dataclass(frozen=True)
@@ -58,14 +60,14 @@ class RunConfirmation:
     Attributes
     ----------
     kind : ConfirmationKind
-        Injection, or growth.
+        Injection, growth, or contact.
     wire : str
-        Wire at which the test signal was added.
+        Wire at which the test signal was added; of a contact the port at which the environment pushes.
     omega : float
-        Frequency of the sine in rad/s; NaN of a growth.
+        Frequency of the sine, or of the motion in contact, in rad/s; NaN of a growth.
     predicted, measured : float
-        The margin, or the growth in 1/s, which the linear model's response shows in the same time. A response that
-        leaves all bounds has an infinite growth.
+        The margin, or the growth in 1/s (of a contact at 1.03 of its limit), which the linear model's response shows in
+        the same time. A response that leaves all bounds has an infinite growth.
     agrees : bool
         Whether they agree: a margin to 1 % and ten times the measurement's own uncertainty, a growth to 10 %.
     uncertainty : float

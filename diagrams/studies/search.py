@@ -17,6 +17,7 @@ from ..linearization import Linearization, differentiate_loop, linearize, loop_o
 from ..results import OperatingPoint
 from ..sweeps import Box
 from .cases import Case, CaseOrigin, CaseState, Goal, describe
+from .measures import Measure
 from .numbers import numbers_of
 
 if TYPE_CHECKING:
@@ -48,9 +49,10 @@ class Study:
         delay: int,
         options: Mapping[str, Any],
         tell: Callable[[str], None],
+        measure: Measure | None = None,
     ):
         self.diagram, self.goal, self.boxes, self.points = diagram, goal, boxes, points
-        self.delay, self.options, self.tell = delay, options, tell
+        self.delay, self.options, self.tell, self.measure = delay, options, tell, measure
         self.cases: list[Case] = []
         self.names = [(name, i) for name, box in boxes.items() for i in range(box.size)]
         self.smooth = {name for name in boxes if not _is_start_value(diagram, name)}
@@ -77,6 +79,8 @@ class Study:
             diagram = self.diagram.replace(parameters) if parameters else self.diagram
             point = self.points[place]
             asked = point(diagram) if callable(point) else point
+            if self.measure is not None:
+                return self._take(start, self.measure, self.measure(diagram, asked))
             if not parameters:
                 self._bases[place] = linearize(diagram, asked, **self.options)
                 self._loops[place] = {wires: self._bases[place].loop(*wires) for wires in self.goal.loops}
@@ -90,12 +94,22 @@ class Study:
         except LoopwrightError as error:
             return replace(start, reason=str(error))
 
+    def _take(self, case: Case, measure: Measure, number: Number) -> Case:
+        """Return a case with a number that is no loop's."""
+        place, name = (measure.place,), measure.name
+        if math.isnan(number.value):
+            return replace(case, reason=f"found no {name}; expected a number. Look at the diagram with its parameters.")
+        goodness = self.goal.goodness(place, name, number.value)
+        return replace(
+            case, state=CaseState.STABLE, goodness=goodness, loop=place, quantity=name, numbers={place: {name: number}}
+        )
+
     def with_findings(self, case: Case) -> Case:
         """Return a stable case with its numbers made anew by the whole linear model, which tells what it leaves out.
 
         The numbers of many cases come from their loops' matrices alone, without the model's checks and findings.
         """
-        if case.state not in (CaseState.STABLE, CaseState.MOVING):
+        if self.measure is not None or case.state not in (CaseState.STABLE, CaseState.MOVING):
             return case
         diagram, at = self._asked[case.index]
         try:
@@ -231,7 +245,12 @@ class Study:
             self.run(self.parameters_at(np.where(ends[-1] == 0.0, fractions, corner)), CaseOrigin.CORNER)
 
     def gradient(self, case: Case, fractions: np.ndarray) -> np.ndarray:
-        """Return the derivative of a case's goodness by the fractions, exact where the parameters are traced."""
+        """Return the derivative of a case's goodness by the fractions, exact where the parameters are traced.
+
+        A number that is no loop's has differences alone.
+        """
+        if self.measure is not None:
+            return np.array([self._difference(case, fractions, i) for i in range(fractions.size)])
         diagram, at = self._asked[case.index]
         model, found = linearize(diagram, at, **self.options), np.zeros(fractions.size)
         L = model.loop(*case.loop)
@@ -261,7 +280,8 @@ class Study:
         moved[i] += side * DIFFERENCE
         other = min(self.run(self.parameters_at(moved), CaseOrigin.SEARCH), key=lambda c: c.goodness)
         change = (other.goodness - case.goodness) / (side * DIFFERENCE)
-        return change if abs(change) < abs(UNSTABLE) else 0.0
+        bad = other.state in (CaseState.UNSTABLE, CaseState.FAILED)
+        return change if math.isfinite(change) and not bad else 0.0
 
     def _polish(self) -> None:
         """Step along single parameters from the worst case on: a kink in the margin stops a gradient, but not these."""

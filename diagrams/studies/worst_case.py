@@ -19,6 +19,7 @@ from ..requirements import Requirements
 from ..sweeps import Box, Samples, read_samples
 from .cases import Case, CaseOrigin, CaseState, Goal, describe, make_goal
 from .confirmation import RunConfirmation, confirm_case
+from .measures import ContactMeasure, FunctionMeasure, Measure
 from .parameters import check_parameters
 from .search import Study
 from .worst_case_plot import plot_cases
@@ -49,6 +50,10 @@ class WorstCase:
         The diagram as it is.
     points : tuple
         The operating points as they were asked for.
+    options : mapping
+        Options of the linear models.
+    measure : Measure, optional
+        The number, where it is no loop's.
     """
 
     worst: Case
@@ -59,6 +64,7 @@ class WorstCase:
     base: WiredDiagram = field(repr=False)
     points: tuple[Any, ...] = field(repr=False)
     options: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    measure: Measure | None = field(default=None, repr=False)
 
     @property
     def parameters(self) -> Mapping[str, Any]:
@@ -116,6 +122,9 @@ class WorstCase:
                 f"found a worst case that failed: {self.worst.reason} Expected one that was analysed: look at "
                 "worst_analysed.", block=self.base.name,
             )  # fmt: skip
+        if self.measure is not None:
+            point, diagram = self.points[self.worst.point], self.diagram
+            return self.measure.confirm(diagram, point(diagram) if callable(point) else point)
         return confirm_case(self.diagram, self.worst, self.points[self.worst.point], amplitude, self.options["delay"])
 
     def __str__(self) -> str:
@@ -127,6 +136,8 @@ class WorstCase:
         lines += [f"  {name} = {_short(value)}" for name, value in w.parameters.items()]
         if w.point or len(self.points) > 1:
             lines.append(f"  at operating point {w.point} of {len(self.points)}")
+        if self.goal.left_out:
+            lines.append(f"  not looked at: {', '.join(self.goal.left_out)}")
         if counts[CaseState.FAILED]:
             lines.append(f"  {counts[CaseState.FAILED]} cases failed, the first: {self.failures[0].reason}")
         return "\n".join(lines)
@@ -151,8 +162,9 @@ def find_worst_case(
     parameters: Mapping[str, Any] | None,
     loop: str | Iterable[str] | None = None,
     *,
-    quantity: str | None = None,
+    quantity: str | Callable[[Any], Any] | None = None,
     requirements: Requirements | None = None,
+    contact: Mapping[str, Any] | None = None,
     samples: Any = "latin",
     count: int | None = None,
     seed: int = 0,
@@ -165,21 +177,26 @@ def find_worst_case(
     **options: Any,
 ) -> WorstCase:
     """Return the worst case of a loop's numbers over ranges of parameters; see `Diagram.worst_case`."""
-    if quantity is None and requirements is None:
+    measure = _make_measure(diagram, loop, quantity, requirements, contact, options)
+    if quantity is None and requirements is None and measure is None:
         quantity = "disk_margin"
     if points is not None and at is not None:
         raise OptionError("found at and points; expected one of them. Give points=[…] alone.", block=diagram.name)
     for name, number in (("starts", starts), ("steps", steps), ("delay", delay)):
         if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < 0:
             raise OptionError(f"found {name}={number!r}; expected an integer from 0 on.", block=diagram.name, port=name)
-    goal = make_goal(loop, quantity, requirements, diagram.name)
+    if measure is not None:
+        goal = Goal({(measure.place,): {measure.name: None}})
+    else:
+        assert not callable(quantity)
+        goal = make_goal(loop, quantity, requirements, diagram.name)
     if samples == "latin" and count is None:
         count = 100
     drawn = read_samples(diagram, parameters, samples, count=count, seed=seed)
     check_parameters(diagram, drawn.names, "a worst case", blocks=True)
     boxes = _read_boxes(diagram, parameters, drawn)
     places = tuple(points) if points is not None else (at,)
-    study = Study(diagram, goal, boxes, places, delay, options, progress or (lambda text: None))
+    study = Study(diagram, goal, boxes, places, delay, options, progress or (lambda text: None), measure)
     nominal = study.run({}, CaseOrigin.NOMINAL)
     if all(case.state is CaseState.FAILED for case in nominal):
         raise OptionError(
@@ -193,7 +210,33 @@ def find_worst_case(
     worst = study.with_findings(min(study.cases, key=lambda case: (case.goodness, case.index)))
     study.cases[worst.index] = worst
     cases = tuple(study.cases)
-    return WorstCase(worst, tuple(nominal), cases, boxes, goal, diagram, places, {**options, "delay": delay})
+    return WorstCase(worst, tuple(nominal), cases, boxes, goal, diagram, places, {**options, "delay": delay}, measure)
+
+
+def _make_measure(
+    diagram: WiredDiagram,
+    loop: str | Iterable[str] | None,
+    quantity: object,
+    requirements: Requirements | None,
+    contact: Mapping[str, Any] | None,
+    options: Mapping[str, Any],
+) -> Measure | None:
+    """Return the number that is no loop's: a contact's limit, or a function; None of a loop's."""
+    if contact is None and not callable(quantity):
+        return None
+    given = {"loop": loop, "requirements": requirements, "quantity": None if contact is None else quantity}
+    for name, value in given.items():
+        if value is not None and value != ():
+            said = "contact" if contact is not None else "a function as quantity"
+            raise OptionError(
+                f"found {said} and {name}={value!r}; expected one of them. Leave one out.",
+                block=diagram.name,
+                port=name,
+            )
+    if contact is not None:
+        return ContactMeasure(contact, diagram.name, options)
+    assert callable(quantity)
+    return FunctionMeasure(quantity, diagram.name)
 
 
 def _read_boxes(diagram: WiredDiagram, parameters: Mapping[str, Any] | None, drawn: Samples) -> dict[str, Box]:

@@ -13,12 +13,13 @@ from ..linearization import find_signal
 from ..requirements import Requirements, TomlFile
 from ..sweeps import Box, find_parameter, read_samples
 from .cases import Goal, make_goal
+from .measures import ContactMeasure
 from .parameters import check_parameters
 from .worst_case import WorstCase, find_worst_case
 
 TABLE = "worst_case"
 """Name of the table."""
-KEYS = ("ranges", "loop", "quantity", "requirements", "samples", "count", "seed", "starts", "steps", "delay")
+KEYS = ("ranges", "loop", "quantity", "requirements", "contact", "samples", "count", "seed", "starts", "steps", "delay")
 """Entries of the table."""
 STEP = 1e-3
 """Communication step in s with which signals of a diagram without a clock are looked up."""
@@ -127,7 +128,10 @@ class WorstCaseTask:
                 if samples == "latin":
                     Box.of(values)
         with _Placed(self.file, TABLE):
-            self._goal(diagram, requirements)
+            if "contact" in self.options:
+                ContactMeasure(self.options["contact"], diagram.name, {})
+            else:
+                self._goal(diagram, requirements)
             count = self.options.get("count", 100 if samples == "latin" else None)
             read_samples(diagram, self.ranges or None, samples, count=count, seed=self.options.get("seed", 0))
 
@@ -158,14 +162,16 @@ class WorstCaseTask:
         quantity, limits = self._asked(diagram, requirements)
         with _Placed(self.file, TABLE, KEYS):
             return find_worst_case(
-                diagram, self.ranges or None, self.loops, quantity=quantity, requirements=limits, progress=progress,
-                **given, **options,
+                diagram, self.ranges or None, self.loops or None, quantity=quantity, requirements=limits,
+                progress=progress, **given, **options,
             )  # fmt: skip
 
     def _asked(
         self, diagram: WiredDiagram, requirements: Requirements | None
     ) -> tuple[str | None, Requirements | None]:
         quantity, limits = self.options.get("quantity"), self.requirements
+        if "contact" in self.options:
+            return quantity, limits
         if quantity is None and limits is None and requirements is not None:
             try:
                 make_goal(self.loops, None, requirements, diagram.name)
