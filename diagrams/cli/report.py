@@ -30,10 +30,12 @@ from .text import say
 from .user_models import load_user_file
 
 if TYPE_CHECKING:
-    from ..studies import WorstCaseTask
+    from ..studies import ContactTask, WorstCaseTask
 
-KEY = "worst_case"
-"""Table of a worst case."""
+KEY, CONTACT = "worst_case", "contact"
+"""Tables of a worst case, and of contacts."""
+SAID = {KEY: "a worst case", CONTACT: "contacts"}
+"""Contents of the tables in words."""
 ABOUT = ("title", "author", "project", "date")
 """Lines of the heading that the command line can give."""
 EXIT_STATUS = {Verdict.PASSED: 0, Verdict.FAILED: 3, Verdict.UNDECIDED: 4}
@@ -82,6 +84,12 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="find a worst case over ranges of parameters, as the file's table [worst_case] says, which the file of "
         "the requirements may have, too; see docs/worst_case.md",
     )
+    report.add_argument(
+        "--contact",
+        metavar="FILE.toml",
+        help="contacts of environments with the plant, as the file's tables [contact.NAME] say, which the file of the "
+        "requirements may have, too; see docs/frequency.md",
+    )
     report.add_argument("--check", action="store_true", help="say by the exit status whether they are met")
     for name in ABOUT:
         report.add_argument(f"--{name}", metavar="TEXT", help=f"the {name} in the report's heading")
@@ -106,11 +114,12 @@ def report_command(arguments: argparse.Namespace) -> int:
     """Make the diagram, analyse it, write the files; return the exit status."""
     from ..report_writing import check_files, write_report
 
-    if arguments.check and arguments.requirements is None:
-        raise OptionError("there is nothing to check. Give the file: --requirements loop.toml.", port="--check")
     file = None if arguments.requirements is None else TomlFile.read(arguments.requirements, "--requirements")
     asked = None if file is None else read_requirements(file)
     searched = _read_worst_case(arguments.worst_case, file)
+    touched = _read_contacts(arguments.contact, file)
+    if arguments.check and asked is None and not (touched is not None and touched.limits):
+        raise OptionError("there is nothing to check. Give the file: --requirements loop.toml.", port="--check")
     measured = _read_measured(arguments.measured)
     subject = arguments.diagram or DEFAULT
     with contextlib.ExitStack() as open_file:
@@ -125,11 +134,13 @@ def report_command(arguments: argparse.Namespace) -> int:
         check_files(out, pdf=arguments.pdf, json=arguments.json)
         if searched is not None:
             searched.check(diagram, asked)
+        if touched is not None:
+            touched.check(diagram)
         began = time.perf_counter()
         about = {name: text for name in ABOUT if (text := getattr(arguments, name)) is not None}
         try:
             with _progress(diagram.name) as tell:
-                report = _analyse(diagram, experiment, arguments, asked, about, tell, measured, searched)
+                report = _analyse(diagram, experiment, arguments, asked, about, tell, measured, searched, touched)
         except UnknownNameError as error:
             say(f"loopwright: error: {error}", sys.stderr)
             return 1 if asked is None and not measured else 2
@@ -158,22 +169,36 @@ def _read_worst_case(given: str | None, file: TomlFile | None) -> WorstCaseTask 
     """Return the worst case that a file of its own asks for, or that of the requirements."""
     from ..studies import WorstCaseTask
 
-    mine = file is not None and bool(file.table(KEY))
+    own = _read_study(given, file, KEY, "--worst-case")
+    return None if own is None else WorstCaseTask.read(own)
+
+
+def _read_contacts(given: str | None, file: TomlFile | None) -> ContactTask | None:
+    """Return the contacts that a file of their own asks for, or those of the requirements."""
+    from ..studies import ContactTask
+
+    own = _read_study(given, file, CONTACT, "--contact")
+    return None if own is None else ContactTask.read(own)
+
+
+def _read_study(given: str | None, file: TomlFile | None, table: str, option: str) -> TomlFile | None:
+    """Return the file with a study's table: that of an option, or that of the requirements; None without it."""
+    mine = file is not None and bool(file.table(table))
     if given is None:
-        return WorstCaseTask.read(file) if file is not None and mine else None
-    own = TomlFile.read(given, "--worst-case")
+        return file if mine else None
+    own = TomlFile.read(given, option)
     if file is not None and own.path == file.path:
-        return WorstCaseTask.read(own)
+        return own
     if mine:
-        raise own.error("the file of the requirements has a worst case, too; expected one. Leave one out.", KEY)
+        raise own.error(f"the file of the requirements has {SAID[table]}, too; expected one. Leave one out.", table)
     for key in own.content:
         if key not in STUDIES:
             raise own.error(
-                "found it beside [worst_case], where requirements are not read. Name the file by --requirements, which "
+                f"found it beside [{table}], where requirements are not read. Name the file by --requirements, which "
                 "takes its table along.",
                 key,
             )
-    return WorstCaseTask.read(own)
+    return own
 
 
 def _read_measured(given: Sequence[str]) -> dict[str, Any]:
@@ -219,6 +244,7 @@ def _analyse(
     tell: Callable[[str], None],
     measured: Mapping[str, Any],
     searched: WorstCaseTask | None,
+    touched: ContactTask | None,
 ) -> Report:
     from ..report import analyse, with_drawing
 
@@ -233,6 +259,7 @@ def _analyse(
         progress=tell,
         measured=measured,
         worst_case=searched,
+        contacts=touched,
         written=True,
     )
     return with_drawing(made, diagram)

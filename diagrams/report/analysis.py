@@ -15,13 +15,13 @@ from ..report_figures import AxisUnits
 from ..report_writing import DEFINITIONS, Report
 from ..requirements import Requirements, TomlFile, read_requirements
 from ..second_process import processors
-from ..studies import WorstCase, WorstCaseTask
+from ..studies import ContactTask, WorstCase, WorstCaseTask
 from .case import Case, ReportedExperiment
 from .content_hash import content_hash
 from .parts import HasReportKind, MakesSections, ReportKind, ReportPart
 from .points import STEP
 from .review import review
-from .section_contact import check_contacts, contact_sections
+from .section_contact import contact_sections, contacts_on_first_page, read_contacts
 from .section_injection import injected
 from .section_limits import not_modelled
 from .section_loops import inner
@@ -84,7 +84,7 @@ def analyse(
     progress: Callable[[str], None] | None = None,
     measured: Mapping[str, Any] | None = None,
     worst_case: WorstCase | WorstCaseTask | str | os.PathLike[str] | None = None,
-    contacts: Mapping[str, Any] | None = None,
+    contacts: Mapping[str, Any] | ContactTask | str | os.PathLike[str] | None = None,
     workers: int | None = None,
     written: bool = False,
 ) -> Report:
@@ -123,10 +123,11 @@ def analyse(
         Loops that were measured, by their wires: data as `measured_margins` takes them, or the path of a CSV file (see
         `read_frequency_data`). Their margins, with intervals, stand beside the model's, and requirements hold for them
         as for the model's: passed only if the whole interval is within the limits.
-    contacts : mapping of str to Contact, optional
+    contacts : mapping of str to Contact, or path, optional
         Contacts of an environment with the plant, by names that stand in dotted paths: ``{"tool":
-        diagram.contact(…)}``. Each gets its admittance, the limits of coupled stability, a map of them, and a trial in
-        the nonlinear run.
+        diagram.contact(…)}``; or a TOML file with tables ``[contact.NAME]``, which may be that of ``requirements``,
+        too. Each gets its admittance, the limits of coupled stability, a map of them, a trial in the nonlinear run, and
+        a row on the first page. Limits that are required of it get verdicts.
     worst_case : WorstCase or path, optional
         A worst case of this diagram, of `Diagram.worst_case`, or a TOML file with a table ``[worst_case]``, which may
         be that of ``requirements``, too: it gets a section, with a run that confirms it, and a line on the first page.
@@ -167,9 +168,11 @@ def analyse(
     for wire in (*(wires or ()), *(measured or ())):
         find_signal(diagram.flatten(None if diagram.has_clock else STEP), wire)
     tell = progress or (lambda key: None)
-    contacts = check_contacts(diagram, contacts or {})
     file = None if isinstance(requirements, Requirements | None) else TomlFile.read(requirements, "requirements")
     asked = requirements if isinstance(requirements, Requirements | None) else read_requirements(file or requirements)
+    touched = read_contacts(diagram, contacts, file, asked)
+    if asked is None and touched is not None and touched.limits:
+        asked = Requirements(stable=False)  # a robot that yields to a force may drift, and has a pole on the limit
     task = read_task(diagram, worst_case, file, asked)
     axes, names = AxisUnits(decibels, hertz), tuple(measured or ())
     how: dict[str, Any] = {"workers": check_workers(workers, written), "drawn": written}
@@ -180,14 +183,15 @@ def analyse(
     searched = None if task is None else find_reported(diagram, task, asked, point, stairs, tell)
     if searched is not None:
         sections = (*sections, worst_case_of(searched))
-    if contacts:
+    if touched is not None and touched.contacts:
         tell("contact")
-        sections = (*sections, contact_sections(contacts))
+        sections = (*sections, contact_sections(touched))
     made = Report("", sections).numbers()
-    reviewed = None if asked is None else review(case, asked, made, loops_measured, searched)
+    reviewed = None if asked is None else review(case, asked, made, loops_measured, searched, touched)
     if only is None or asked is not None:
         found = None if searched is None else searched.found
-        sections = (summary(case, reviewed, made, found), *sections)
+        more = [] if touched is None or not touched.contacts else [contacts_on_first_page(touched)]
+        sections = (summary(case, reviewed, made, found, more), *sections)
     name = diagram.name if experiment is None else f"Experiment {experiment.letter}: {diagram.name}"
     lines = {str(key): str(text) for key, text in (about or {}).items()}
     title = lines.pop("title", f"Design report: {name}")

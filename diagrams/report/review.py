@@ -25,6 +25,7 @@ from ..studies import Case as StudyCase
 from ..studies import CaseState
 from .case import Case
 from .points import STEP
+from .section_contact import ReportedContacts
 from .section_injection import REFUTED
 from .section_measured import MEASURED, MeasuredLoop
 from .section_steps import key_of_step
@@ -69,6 +70,7 @@ def review(
     numbers: Mapping[str, Number],
     measured: Sequence[MeasuredLoop] = (),
     worst_case: ReportedWorstCase | None = None,
+    contacts: ReportedContacts | None = None,
 ) -> Review:
     """Return the verdicts on requirements.
 
@@ -84,11 +86,16 @@ def review(
         Loops that were measured; limits of their margins hold for the measured ones, too.
     worst_case : ReportedWorstCase, optional
         The worst case of the report.
+    contacts : ReportedContacts, optional
+        Its contacts, with the limits that are required of them.
     """
+    felt = () if contacts is None else contacts.results(numbers)
     outcomes = {} if worst_case is None else worst_case.outcomes()
     searched = () if worst_case is None else worst_case.results()
     plain = (_plain(path, limit, numbers, outcomes) for path, limit in asked.numbers.items())
-    return Review((*_results(case, asked, numbers), *plain, *_measured(case, asked, numbers, measured), *searched))
+    return Review(
+        (*_results(case, asked, numbers), *plain, *_measured(case, asked, numbers, measured), *searched, *felt)
+    )
 
 
 def _results(case: Case, asked: Requirements, numbers: Mapping[str, Number]) -> Iterator[RequirementResult]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ...blocks.core import LoopwrightError, print_unit
@@ -14,6 +14,7 @@ from ..requirements import Limit, RequirementResult, Review, Verdict
 from ..studies import WorstCase
 from .case import Case
 from .review import weakest
+from .section_contact import KEY as CONTACT
 from .section_loops import ROWS
 from .section_measured import MEASURED
 from .section_steps import NAMES
@@ -35,7 +36,11 @@ ORDER = (Verdict.FAILED, Verdict.UNDECIDED, Verdict.PASSED)
 
 
 def summary(
-    case: Case, reviewed: Review | None, numbers: Mapping[str, Number], worst_case: WorstCase | None = None
+    case: Case,
+    reviewed: Review | None,
+    numbers: Mapping[str, Number],
+    worst_case: WorstCase | None = None,
+    more: Sequence[Table] = (),
 ) -> Section:
     """Return the first section of a report.
 
@@ -49,6 +54,8 @@ def summary(
         All numbers of the report by their dotted paths.
     worst_case : WorstCase, optional
         The worst case that has a section.
+    more : sequence of Table
+        Tables behind that of the loops.
     """
     unstable = unstable_first(case)
     text = [*(unstable.text if unstable is not None else ())]
@@ -63,7 +70,7 @@ def summary(
     text += _weakest(case, numbers)
     text += [_worst_case(worst_case)] if worst_case is not None else []
     loops = _loops(case, numbers)
-    tables += [loops] if loops is not None else []
+    tables += [*([loops] if loops is not None else []), *more]
     missing = list(dict.fromkeys(_not_analysed(case, numbers)))
     if missing:
         text += [TEXTS.line("not_analysed"), *(f"- {line}" for line in missing)]
@@ -85,13 +92,17 @@ def _relative(result: RequirementResult) -> float:
 def _row(case: Case, result: RequirementResult) -> tuple[Any, ...]:
     variant = case.variants.get(result.variant)
     unit = "" if result.number is None or result.number.unit == "1" else result.number.unit
-    said = TEXTS.line("outcome", verdict=result.verdict.value, reason=result.reason.name, detail=result.detail)
+    touches = result.variant == CONTACT
+    facts = {"verdict": result.verdict.value, "reason": result.reason.name, "contact": touches}
+    said = TEXTS.line("outcome", **facts, detail=result.detail)
     distance: Any = "–"
     if result.number is not None and not math.isnan(result.distance):
         number = result.number
         distance = Number(result.distance, number.unit, number.tolerance, number.confirmed_by, findings=number.findings)
     place = case.loop_wires().get(result.loop, result.loop) or (result.detail if result.quantity[:5] == "step." else "")
-    title = variant.title if variant else {MEASURED: "measured", WORST_CASE: "worst case"}.get(result.variant, "–")
+    place = f"{place}, with {result.detail}" if touches and place and result.detail else place
+    others = {MEASURED: "measured", WORST_CASE: "worst case", CONTACT: "as it is"}
+    title = variant.title if variant else others.get(result.variant, "–")
     return (
         Judged(said, result.verdict), words_of(result.quantity), place or "whole diagram", title,
         _required(result.limit, unit), result.number if result.number is not None else "–", distance,
@@ -108,6 +119,8 @@ def words_of(quantity: str) -> str:
     if quantity == "stable":
         return TEXTS.line("stable")
     head, _, tail = quantity.partition(".")
+    if head == CONTACT:
+        return TEXTS.line("contact", vary=tail)
     return NAMES.get(tail, tail) if head == "step" else ROWS.get(quantity, quantity)
 
 

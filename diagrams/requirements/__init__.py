@@ -1,13 +1,16 @@
 """Requirements on a design, and the verdicts on its numbers."""
 
+from .contact_limits import ContactLimits, read_contact_limits
 from .limits import SENSES, Limit, Reason, Sense, Verdict, judge, judge_interval
 from .requirements import LoopLimits, Requirements, StepLimits
 from .results import RequirementResult, Review
-from .toml_file import STUDIES, TomlFile, read_requirements
+from .toml_file import REQUIRED, STUDIES, TomlFile, read_requirements
 
 __all__ = [
+    "REQUIRED",
     "SENSES",
     "STUDIES",
+    "ContactLimits",
     "Limit",
     "LoopLimits",
     "Reason",
@@ -20,5 +23,6 @@ __all__ = [
     "Verdict",
     "judge",
     "judge_interval",
+    "read_contact_limits",
     "read_requirements",
 ]

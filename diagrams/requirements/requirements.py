@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ...blocks.core import OptionError, near
+from .contact_limits import ContactLimits, read_contacts
 from .limits import SENSES, STEP_SENSES, Limit, make_limit
 
 PLACES = ("input", "output", "size", "length")
@@ -137,6 +138,9 @@ class Requirements(LoopLimits):
         ones.
     numbers : mapping of str to (float, float), optional
         Ranges of any numbers of the report, by their dotted paths.
+    contact : mapping, optional
+        Limits of coupled stability of the report's contacts, as `ContactLimits`: ``{"stiffness": 5e4}`` of all, and
+        ``{"hand": {"stiffness": 5e4, "with": {"damping": 10}}}`` of the one with that name. A list has several.
     stable : bool
         Whether all closed-loop poles of the diagram as it is have to be stable.
     **limits : float or (float, float)
@@ -161,6 +165,7 @@ class Requirements(LoopLimits):
         loops: Any = None,
         variants: Any = None,
         numbers: Any = None,
+        contact: Any = None,
         stable: bool = True,
         **limits: Any,
     ):
@@ -182,6 +187,7 @@ class Requirements(LoopLimits):
         self.loops: Mapping[str, LoopLimits] = MappingProxyType(
             {str(wire): _loop_limits(given, f"loops.{wire}") for wire, given in (loops or {}).items()}
         )
+        self.contacts: Mapping[str, tuple[ContactLimits, ...]] = MappingProxyType(read_contacts(contact))
         if numbers is not None and not isinstance(numbers, Mapping):
             raise OptionError(
                 f"found {numbers!r}; expected ranges by dotted path. Write [numbers], and "
@@ -197,7 +203,7 @@ class Requirements(LoopLimits):
 
     @staticmethod
     def _names() -> tuple[str, ...]:
-        return (*SENSES, "step", "loops", "variants", "numbers", "stable")
+        return (*SENSES, "step", "loops", "variants", "numbers", "contact", "stable")
 
     @property
     def further_variants(self) -> tuple[str, ...]:

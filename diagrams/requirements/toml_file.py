@@ -19,6 +19,8 @@ _PART = re.compile(r"""\s*(?:"([^"]*)"|'([^']*)'|([\w-]+))\s*\.?""")
 
 STUDIES = ("worst_case", "contact")
 """Tables that belong to studies of the report, and not to its requirements."""
+REQUIRED = "requirements"
+"""Table of a study with requirements on it."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,9 @@ class TomlFile:
         OptionError
             If there is something else by its name.
         """
-        found = self.content.get(name, {})
+        found: Any = self.content
+        for part in name.split("."):
+            found = found.get(part, {}) if isinstance(found, Mapping) else found
         if not isinstance(found, Mapping):
             raise self.error(f"found {found!r}; expected a table. Write [{name}], and its entries below.", name)
         return found
@@ -149,13 +153,26 @@ def read_requirements(path: str | os.PathLike[str] | TomlFile) -> Requirements:
         found = Requirements(**given)
     except OptionError as error:
         raise file.error_at(error) from None
-    if found.is_empty and not (found.loops or found.numbers or found.steps) and not given.get("stable"):
+    contacts = _requires_contacts(file.content.get("contact"))
+    if (
+        found.is_empty
+        and not contacts
+        and not (found.loops or found.numbers or found.steps)
+        and not given.get("stable")
+    ):
         raise OptionError(
             f"{str(file.path)!r} requires nothing; expected a limit. Write one, such as phase_margin_deg = 45, or "
             "stable = true.",
             port="requirements",
         )
     return found
+
+
+def _requires_contacts(tables: Any) -> bool:
+    """Return whether tables of contacts have requirements."""
+    if not isinstance(tables, Mapping):
+        return False
+    return REQUIRED in tables or any(isinstance(one, Mapping) and REQUIRED in one for one in tables.values())
 
 
 def _joined(key: str) -> str:

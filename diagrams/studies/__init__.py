@@ -2,6 +2,7 @@
 
 from .cases import Case, CaseOrigin, CaseState, Goal
 from .confirmation import ConfirmationKind, RunConfirmation, confirm_parameter, confirm_sensitivity
+from .contact_task import ContactTask
 from .sensitivity import Sensitivities, Sensitivity, find_sensitivities, sensitivities_of
 from .worst_case import WorstCase, find_worst_case
 from .worst_case_task import WorstCaseTask
@@ -11,6 +12,7 @@ __all__ = [
     "CaseOrigin",
     "CaseState",
     "ConfirmationKind",
+    "ContactTask",
     "Goal",
     "RunConfirmation",
     "Sensitivities",

@@ -1,0 +1,128 @@
+"""Contacts that a TOML file asks for: ports, wires and directions, and limits that are required of them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+from ...blocks.core import LoopwrightError, OptionError
+from ..admittance import Contact, make_contact
+from ..flat import WiredDiagram
+from ..requirements import REQUIRED, ContactLimits, TomlFile, read_contact_limits
+
+TABLE = "contact"
+"""Name of the tables, [contact.NAME]."""
+PLACES = {"port": "plant.external_force", "position": "plant.position", "velocity": "plant.velocity", "force": "force"}
+"""Entries that name ports and wires, with the names that they have without them."""
+KEYS = (*PLACES, "direction", "at", "stairs", REQUIRED)
+"""Entries of a contact's table."""
+
+
+@dataclass(frozen=True)
+class ContactTask:
+    """Contacts that a TOML file asks for.
+
+    Attributes
+    ----------
+    file : TomlFile
+        The file.
+    places : mapping
+        Entries of each contact's table, by its name.
+    limits : mapping of str to tuple of ContactLimits
+        Limits by the names of contacts; those of all have the name "".
+    """
+
+    file: TomlFile
+    places: Mapping[str, Mapping[str, Any]]
+    limits: Mapping[str, tuple[ContactLimits, ...]]
+    _made: dict[str, Contact] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def read(cls, source: str | os.PathLike[str] | TomlFile) -> Self:
+        """Return the task of a file with tables ``[contact.NAME]``.
+
+        Parameters
+        ----------
+        source : path or TomlFile
+            File such as this one; ``force = false`` is a force that the controller does not measure::
+
+                [contact.hand]
+                port = "cart.push"
+                position = "cart.position"
+                velocity = "cart.velocity"
+                force = "felt"
+                direction = [1.0]
+
+                [contact.hand.requirements]
+                stiffness = 5e4
+                with = {damping = 10}
+
+        Raises
+        ------
+        OptionError
+            A file that isn't there, isn't TOML or has no such table; an unknown entry, or a limit that is none.
+        """
+        file = source if isinstance(source, TomlFile) else TomlFile.read(source, TABLE)
+        tables = file.table(TABLE)
+        named = {name: table for name, table in tables.items() if name != REQUIRED}
+        if not named:
+            raise file.error(
+                'found no table [contact.NAME]; expected one. Write [contact.hand], with port = "plant.external_force".'
+            )
+        limits = {"": _read_limits(file, tables[REQUIRED], f"{TABLE}.{REQUIRED}")} if REQUIRED in tables else {}
+        for name, table in named.items():
+            key = f"{TABLE}.{name}"
+            if not isinstance(table, Mapping):
+                raise file.error(f"found {table!r}; expected a table. Write [{key}], and its entries below.", key)
+            if not name.isidentifier():
+                raise file.error(
+                    "found this name; expected letters, digits and underscores, as it stands in dotted paths.", key
+                )
+            file.check_keys(key, KEYS)
+            if REQUIRED in table:
+                limits[name] = _read_limits(file, table[REQUIRED], f"{key}.{REQUIRED}")
+        return cls(file, {name: {k: v for k, v in t.items() if k != REQUIRED} for name, t in named.items()}, limits)
+
+    def check(self, diagram: WiredDiagram) -> None:
+        """Make the contacts, before anything else is computed.
+
+        Raises
+        ------
+        OptionError
+            A port, a wire or a direction that makes no contact. It names the file and the line.
+        """
+        self.find(diagram)
+
+    def find(self, diagram: WiredDiagram) -> Mapping[str, Contact]:
+        """Return the contacts by their names.
+
+        Raises
+        ------
+        OptionError
+            As `check`.
+        """
+        for name, given in self.places.items():
+            if name in self._made and self._made[name].diagram is diagram:
+                continue
+            where = {key: given.get(key, own) for key, own in PLACES.items()}
+            force = None if where["force"] is False else where["force"]
+            options = {key: given[key] for key in ("stairs",) if key in given}
+            try:
+                self._made[name] = make_contact(
+                    diagram, where["port"], (where["position"], where["velocity"], force),
+                    given.get("direction", "perp"), given.get("at"), options,
+                )  # fmt: skip
+            except LoopwrightError as error:
+                known = error.port if error.port in KEYS else ""
+                key = ".".join(part for part in (TABLE, name, known) if part)
+                raise self.file.error(error.message, key) from error
+        return dict(self._made)
+
+
+def _read_limits(file: TomlFile, given: Any, key: str) -> tuple[ContactLimits, ...]:
+    try:
+        return read_contact_limits(given, key)
+    except OptionError as error:
+        raise file.error_at(error) from None
