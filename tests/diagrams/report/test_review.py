@@ -385,7 +385,17 @@ def test_every_number_of_a_step_is_defined_and_has_the_units_of_its_signals():
     assert numbers[f"{start}.difference"].value < 1e-3
     for path in numbers:
         term, _ = definition(path)
-        assert term in ("overshoot", "settling", "rise", "peak", "final", "difference", "effort"), path
+        assert term in (
+            "overshoot",
+            "settling",
+            "rise",
+            "peak",
+            "final",
+            "difference",
+            "effort",
+            "length",
+            "settled",
+        ), path
 
 
 def test_a_function_is_shown_by_its_name_and_not_by_its_place_in_memory():
