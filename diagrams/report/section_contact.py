@@ -180,8 +180,8 @@ def contact_sections(reported: ReportedContacts) -> Section:
 
 def contacts_on_first_page(reported: ReportedContacts) -> Table:
     """Return the weakest limit of stiffness of each contact."""
-    columns = ("contact", "least of the largest k_e", "with", "oscillates at", "first Re Y < 0 at")
-    return Table("Contacts: stiffness that they bear", columns, tuple(reported.weakest), digits=4)
+    columns = ("contact", "stable up to k_e", "with", "oscillates at", "first Re Y < 0 at")
+    return Table("Contacts: weakest limits of stiffness", columns, tuple(reported.weakest), digits=4)
 
 
 def _place(vary: str, environment: Mapping[str, float]) -> str:
