@@ -86,7 +86,7 @@ def test_springs_break_the_loop_where_the_admittance_is_no_longer_passive(name, 
     assert found.value == pytest.approx(w / abs(here.admittance([w]).rendered[0]), rel=7e-4)  # the fundamental
     off, turned = abs(found.second_look / found.value - 1.0), found.frequency * 1e-3  # ω T
     assert off < 7e-4
-    assert off < 0.05 * turned**4 + 1e-9  # the aliases that the fundamental lacks
+    assert off < 0.5 * turned**4 + 1e-9  # the aliases that the fundamental lacks
 
 
 def mass_by_hand(here, side):
