@@ -7,13 +7,19 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from ..coupling import Plant, PlantSteps
+from .continuous import Continuous
 from .view import Position
 from .workspace import Workspace
 
 if TYPE_CHECKING:
+    from .compiled_hybrid import HybridTicks
     from .compiled_ticks import CompiledTicks, LaterTicks
 
 _PATIENCE = 0.02  # s of interpreted ticks before which nobody thinks of a compiler
+_PATIENCE_OF_WORK = 0.05  # s of counted work before which it says nothing about the rest
+_STEP, _EVENT, _OPERATION = 1e-4, 3e-4, 6e-8  # s of a solver's step, of an event, and of an operation in a step
+_LANDING, _SAMPLE = 6e-5, 5e-6  # s, at least, of a tick at which a solver begins anew, and of a sample
+_START, _COMPILING, _LARGE = 0.4, 1e-3, 2000  # s to begin with C, and to compile one of at most so many operations
 
 
 class ChangeOver:
@@ -93,3 +99,87 @@ class ChangeOver:
     def take_over(self) -> CompiledTicks | None:
         """Return the ticks in C; None while there is no code."""
         return None if self._later is None else self._later.take_over()
+
+
+class HybridChange:
+    """Decides when a run with continuous states goes on in C under "auto".
+
+    Values of both forms agree within the tolerances, not in every bit. So the decision depends on no clock and no
+    cache: it counts the work of the run, in seconds of a usual machine, and the same run changes at the same instant
+    wherever it runs.
+
+    Parameters
+    ----------
+    continuous : Continuous
+        The run's solver and events.
+    position : Position
+        The instant that the run has reached.
+    plants : mapping of str to Plant
+        The plants by path; it may be filled later.
+    make : callable
+        Returns the ticks in C; None where they can't be had.
+    every : bool
+        Visit every tick, not only those at which a subsystem acts.
+
+    Attributes
+    ----------
+    ticks : HybridTicks or None
+        The ticks in C, once they are wanted.
+    """
+
+    def __init__(
+        self,
+        continuous: Continuous,
+        position: Position,
+        plants: Mapping[str, Plant],
+        make: Callable[[], HybridTicks | None],
+        every: bool,
+    ):
+        self._continuous, self._position, self._plants, self._every = continuous, position, plants, every
+        self._make, self._possible = make, True
+        flat = continuous.flat
+        self._limit = _START + _COMPILING * min(flat.operations, _LARGE)
+        self._step = _STEP + _OPERATION * flat.operations
+        self._work = 0.0
+        self.ticks: HybridTicks | None = None
+
+    def begin_anew(self) -> None:
+        """Count the work of another run."""
+        self._work, self.ticks = 0.0, None
+
+    def is_due(self, last: int) -> bool:
+        """Whether the ticks up to one are so many that C begins with them at once."""
+        flat, count = self._continuous.flat, last - self._position.tick
+        landed = count if self._every and (self._continuous.fixed or self._plants) else 0
+        landed = max(landed, sum(count // clock.every for clock in flat.distinct))
+        return self._possible and _LANDING * min(landed, count) + _SAMPLE * count > self._limit and self._begin(last)
+
+    def watch(self, last: int, note_due: Callable[[], None]) -> Callable[[float, bool], bool] | None:
+        """Return the `Continuous.watch` of interpreted steps up to a tick, which counts their work.
+
+        It has the run paused where C takes over; beside plants it calls ``note_due``, and C begins at the next tick.
+        """
+        if not self._possible:
+            return None
+        position, before, first = self._position, self._work, self._position.t
+        end = position.time_of(last)
+
+        def tell(t: float, fires: bool) -> bool:
+            self._work += self._step + (_EVENT if fires else 0.0)
+            if self._work < _PATIENCE_OF_WORK or not self._possible or self.ticks is not None:
+                return False
+            rest = (self._work - before) * (end - t) / (t - first)
+            if max(self._work, rest) < self._limit or not self._begin(last):
+                return False
+            if self._plants:
+                note_due()
+            return not self._plants
+
+        return tell
+
+    def _begin(self, last: int) -> bool:
+        self.ticks = self._make()
+        if self.ticks is not None and not self.ticks.reaches(last):
+            self.ticks = None
+        self._possible = self.ticks is not None
+        return self._possible

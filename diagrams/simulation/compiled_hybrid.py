@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import CompilerError, SimulationError
-from ...fmus.calls import FmuInstance, NativeStep
+from ...blocks.core import CompilerError, LoopwrightError, SimulationError
+from ...fmus.calls import FmuInstance
 from ..compiled import (
     CompiledHybrid,
-    CompiledLoop,
     Fired,
     HybridOutcome,
     HybridReason,
@@ -38,8 +37,10 @@ from .compiled_ticks import (
     FIRST,
     LARGEST_CHUNK,
     WISHED,
+    bind_loop,
     find_obstacle_at_ticks,
     newton_options,
+    tell_failure_once,
 )
 from .continuous import Continuous
 from .solver_setup import has_guards, remembers
@@ -98,6 +99,8 @@ class HybridTicks:
         self._loop: CompiledHybrid | None = None
         self._recorder: Recorder | None = None
         self._chunk = FIRST
+        self.start: float | None = None
+        """Time in s after a tick that interpreted steps have come to, if C begins there."""
         self._fired: list[Fired] = []
 
     @property
@@ -131,9 +134,12 @@ class HybridTicks:
         if k == 0:  # of a run before nothing is left
             self._fired = []
             loop.begin_anew()
-        self._hand_over(loop, self._time_of(k))
+        t, self.start = self._time_of(k) if self.start is None else self.start, None
+        while self._sampled and self._time_of(k + 1) <= t:
+            k += 1
+        self._hand_over(loop, t)
         try:
-            return self._run(loop, k, last, recorder, arrived, progress)
+            return self._run(loop, k, t, last, recorder, arrived, progress)
         finally:
             self._take_back(loop)
 
@@ -141,13 +147,13 @@ class HybridTicks:
         self,
         loop: CompiledHybrid,
         k: int,
+        t: float,
         last: int,
         recorder: Recorder,
         arrived: Callable[[int], bool],
         progress: Callable[[float], Any],
     ) -> float | None:
         visited, rest = (EVERY,) if self._sampled else self._clocks, np.zeros(0, dtype=np.int64)
-        t = self._time_of(k)
         while rest.size or (rest := ticks_after(visited, k, last, self._chunk)).size:
             rows = recorder.room(t)
             loop.skip = recorder.skip
@@ -272,29 +278,13 @@ class HybridTicks:
 
     def _bind(self, recorder: Recorder) -> CompiledHybrid:
         if self._loop is None or recorder is not self._recorder:
-            workspace, entries, steps = self._workspace, recorder.entries, list[NativeStep]()
-            here = workspace.here
-            for plant in self._plants.values():
-                native = plant.native
-                assert native is not None
-                steps.append(native)
-            arguments = [here.t, here.x, here.w, here.p]
-            ticks = CompiledLoop(
-                self._code.ticks,
-                arguments,
-                [workspace.x_next, workspace.z, workspace.log, workspace.ok],
-                steps,
-                columns=entries,
-                width=workspace.log.size if entries is None else len(entries),
-                every=recorder.every,
-                stops=self._stops,
-                loops={clocks: newton_options(self._flat, clocks) for clocks in self._code.ticks.loops},
-            )
+            workspace, here = self._workspace, self._workspace.here
+            ticks = bind_loop(workspace, self._plants.values(), self._code.ticks, recorder, self._stops)
             self._recorder = recorder
             accepts = bool(self._plants) or workspace.looped or remembers(self._flat) or has_guards(self._flat)
             continuous, domains = self._continuous, self._continuous.domains
             self._loop = CompiledHybrid(
-                self._code, self._flat, ticks, arguments, workspace.x_next, self._methods,
+                self._code, self._flat, ticks, [here.t, here.x, here.w, here.p], workspace.x_next, self._methods,
                 step=float(self._flat.base) if continuous.fixed else None,
                 spacing=math.inf if domains is None else domains.spacing,
                 own=() if domains is None else domains.own,
@@ -353,6 +343,7 @@ def make_hybrid(
     *,
     every: bool,
     regular: bool,
+    asked: bool = True,
 ) -> tuple[HybridTicks | None, tuple[str, ...]]:
     """Return the ticks of a run with continuous states in C, None where they can't be had, and messages about them.
 
@@ -360,6 +351,8 @@ def make_hybrid(
     ----------
     regular : bool
         Whether every plant steps once from each tick to the next.
+    asked : bool
+        Whether the user asks for C, by ``compile=True``; else a compiler that fails is told once, and nothing else.
     """
     native = {
         path: plant for path, plant in plants.items() if isinstance(plant, FmuInstance) and plant.native is not None
@@ -369,12 +362,18 @@ def make_hybrid(
     if reason is None:
         try:
             found = HybridTicks(workspace, continuous, native, steps, stops, every=every)
-        except CompilerError as error:
+        except (LoopwrightError, OSError) as error:
+            if not asked:
+                return None, tell_failure_once(error)
+            if not isinstance(error, CompilerError):
+                raise
             reason = str(error)
         else:
             told = (
                 f"Compiled: {found.solver} runs in C as solver={continuous.solver.name!r}, by the same rules as "
                 "interpreted; values differ from those of an interpreted run by rounding and within the tolerances."
             )
-            return found, (told,) if continuous.where.size else ()
+            return found, (told,) if continuous.where.size and asked else ()
+    if not asked:
+        return None, ()
     return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)

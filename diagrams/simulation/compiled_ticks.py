@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -32,11 +32,8 @@ from .algebraic_loops import HALVINGS, ITERATIONS, ROUNDING, SINGULAR, TOLERANCE
 from .diagnosis import forget_trials
 from .workspace import Workspace
 
-if TYPE_CHECKING:
-    from ...fmus.running import Fmu
-
-FIRST, LARGEST_CHUNK = 64, 2**15
-"""Ticks of a chunk: the first one, and at most, so that lists of them stay in the processor's cache."""
+FIRST, LARGEST_CHUNK = 64, 2**20
+"""Ticks of a chunk: the first one, and at most."""
 WISHED = 0.05
 """Seconds that a chunk takes, half or double; Ctrl-C and the progress bar have their turn after it."""
 _WINDOW = 2**14
@@ -201,24 +198,8 @@ class CompiledTicks:
 
     def _bind(self, recorder: Recorder) -> CompiledLoop:
         if self._loop is None or recorder is not self._recorder:
-            workspace, entries, steps = self._workspace, recorder.entries, list[NativeStep]()
-            here = workspace.here
-            for plant in self._plants:
-                native = plant.native
-                assert native is not None
-                steps.append(native)
             self._recorder = recorder
-            self._loop = CompiledLoop(
-                self._code,
-                [here.t, here.x, here.w, here.p],
-                [workspace.x_next, workspace.z, workspace.log, workspace.ok],
-                steps,
-                columns=entries,
-                width=workspace.log.size if entries is None else len(entries),
-                every=recorder.every,
-                stops=self._stops,
-                loops={clocks: newton_options(self._flat, clocks) for clocks in self._code.loops},
-            )
+            self._loop = bind_loop(self._workspace, self._plants, self._code, recorder, self._stops)
         return self._loop
 
     def _take_tick(self, before: int, k: int, found: Outcome, recorder: Recorder) -> None:
@@ -243,6 +224,28 @@ class CompiledTicks:
         workspace.here.t[0] = t
         workspace.tick(self._flat.acting(k))
         recorder.row(t, workspace.log)
+
+
+def bind_loop(
+    workspace: Workspace, plants: Iterable[FmuInstance], code: TickCode, recorder: Recorder, stops: Sequence[int]
+) -> CompiledLoop:
+    """Return the loop over ticks in C, bound to the numbers of a run, its plants, and the samples that it keeps."""
+    steps, entries, here = list[NativeStep](), recorder.entries, workspace.here
+    for plant in plants:
+        native = plant.native
+        assert native is not None
+        steps.append(native)
+    return CompiledLoop(
+        code,
+        [here.t, here.x, here.w, here.p],
+        [workspace.x_next, workspace.z, workspace.log, workspace.ok],
+        steps,
+        columns=entries,
+        width=workspace.log.size if entries is None else len(entries),
+        every=recorder.every,
+        stops=stops,
+        loops={clocks: newton_options(workspace.flat, clocks) for clocks in code.loops},
+    )
 
 
 def newton_options(flat: FlatDiagram, clocks: frozenset[TickPattern]) -> NewtonOptions:
@@ -308,18 +311,12 @@ def _fuse(flat: FlatDiagram, native: Mapping[str, FmuInstance], *, every: bool) 
         block, step = flat.table.blocks[path], plant.native
         assert isinstance(block, Fmu)
         assert step is not None
-        file = Path(block.file) if _is_plain(block) else None
+        declared = block.description.variables.get("integrator")
+        integrator = block.start.get("integrator", None if declared is None else declared.start)
+        file = Path(block.file) if integrator == _RK4 else None
         to, of = (() if ports is None else ports.read_references() for ports in (step.inputs, step.outputs))
         plants[path] = FusedPlant(file, to, of)
     return compile_fused(flat, kinds_of(flat, every=every), plants)
-
-
-def _is_plain(block: Fmu) -> bool:
-    """Whether a step of an FMU is one of classical Runge-Kutta steps between inputs and outputs."""
-    declared = block.description.variables.get("integrator")
-    integrator = block.start.get("integrator", None if declared is None else declared.start)
-    ports = [*block.input_variables.values(), *block.output_variables.values()]
-    return integrator == _RK4 and all(v.causality in ("input", "output") for v in ports)
 
 
 class LaterTicks:
@@ -348,15 +345,19 @@ class LaterTicks:
 
     def tell_failure(self) -> tuple[str, ...]:
         """Return a message that there is no compiler, or one that fails; once in a process."""
-        failure = self.code.failure
-        if failure is None or _TOLD:
-            return ()
-        _TOLD.append(failure)
-        reason = str(failure).rstrip(".")
-        return (f"Interpreted, though the run is long enough for C: {reason}. compile=False asks for no compiler.",)
+        return () if self.code.failure is None else tell_failure_once(self.code.failure)
 
 
 _TOLD: list[Exception] = []  # the failure that this process has told
+
+
+def tell_failure_once(failure: Exception) -> tuple[str, ...]:
+    """Return a message that there is no compiler, or one that fails; once in a process."""
+    if _TOLD:
+        return ()
+    _TOLD.append(failure)
+    reason = str(failure).rstrip(".")
+    return (f"Interpreted, though the run is long enough for C: {reason}. compile=False asks for no compiler.",)
 
 
 def make_later(

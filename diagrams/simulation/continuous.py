@@ -93,6 +93,9 @@ class Continuous(Trials, Memory):
             max_step=longest,
         )
         self.fixed = self.solver.fixed
+        self.watch: Callable[[float, bool], bool] | None = None
+        """Told the end of every step, and whether events fire there; returns whether the run is to pause there."""
+        self.paused: float | None = None
         self.sliding = Sliding(float(flat.base) if self.fixed else None)
         self.lands = rtol < TIGHT and self.solver.name in ONE_STEP
         """Whether the solver lands on every sample: the dense output is of lower order than the step."""
@@ -289,7 +292,7 @@ class Continuous(Trials, Memory):
         Returns
         -------
         float or None
-            Time at which a stop condition has ended the run.
+            Time at which a stop condition has ended the run, or `watch` has it ``paused``.
         """
         workspace = self.workspace
         self.sliding.begin_step()
@@ -302,10 +305,10 @@ class Continuous(Trials, Memory):
             if self.delays is not None:
                 self.delays.look_from(0.5 * (t + edge))
             self._synchronize()
-            self._restart(t, edge)
-            found, wanted = None, False
-            while found is None and not wanted and t < edge:
-                step = self._step()
+            self._explained(self.solver.restart, t, workspace.here.x[self.where], edge)
+            found, wanted, paused = None, False, False
+            while found is None and not (wanted or paused) and t < edge:
+                step: AcceptedStep = self._explained(self.solver.step)
                 if self.domains is not None and not self.sliding.active:
                     found = self.domains.locate(step)
                     solved = workspace.trial.x[self._loops]
@@ -326,6 +329,7 @@ class Continuous(Trials, Memory):
                 if self._accepts or t < end or found is not None:
                     self.accept()
                 wanted = self.outside is not None and self.outside.complete_step()
+                paused = self.watch is not None and self.watch(t, found is not None) and t < end
             happened = found is not None or wanted
             if t == end and not (happened or self.delays or self.flat.plant_outputs.total):
                 self._looked = end if is_before(end, self._sources_edge) else math.nan
@@ -346,18 +350,14 @@ class Continuous(Trials, Memory):
                 pending = next(times, math.inf)
             elif happened and self._stops_at(t, sample):
                 return t
+            if paused:
+                self.paused = t
+                return t
         return None
 
-    def _restart(self, t: float, edge: float) -> None:
+    def _explained(self, call: Callable[..., Any], *arguments: Any) -> Any:
         try:
-            self.solver.restart(t, self.workspace.here.x[self.where], edge)
-        except SimulationError as error:
-            found = self._explain(error)
-            raise found from found.__cause__
-
-    def _step(self) -> AcceptedStep:
-        try:
-            return self.solver.step()
+            return call(*arguments)
         except SimulationError as error:
             found = self._explain(error)
             raise found from found.__cause__

@@ -16,7 +16,7 @@ from ..exchange import ExchangedBlock, ExchangedBlocks
 from ..flat import FlatDiagram
 from ..results import Occurrence, OperatingPoint, Recorder, Stopped, TextSignal
 from ..solvers import solver_name
-from .change_over import ChangeOver
+from .change_over import ChangeOver, HybridChange
 from .continuous import Continuous
 from .continuous_part import ContinuousPart
 from .diagnosis import opaque_failure
@@ -66,9 +66,8 @@ class Engine:
         self.workspace = Workspace(flat, self.exchanged.evaluators)
         self.position = Position(flat.base)
         self.plants: dict[str, Plant] = {}
-        self.view = SimulationView.of(
-            self.workspace, MappingProxyType(self.plants), MappingProxyType(self.exchanged.blocks), self.position
-        )
+        plants, blocks = MappingProxyType(self.plants), MappingProxyType(self.exchanged.blocks)
+        self.view = SimulationView.of(self.workspace, plants, blocks, self.position)
         self.continuous: Continuous | None = None
         self._stops = StopConditions(flat, self.workspace.log, self._find_asking)
         self._passes_on = check_start_exchange(options.start_exchange)
@@ -82,16 +81,9 @@ class Engine:
         self._tell = on_event
         if flat.hybrid:
             self.continuous = Continuous(
-                self.workspace,
-                name,
-                options.solver,
-                options.rtol,
-                options.atol,
-                options.max_step,
-                self._on_event,
-                self._stops.is_met,
-                self.exchanged,
-            )
+                self.workspace, name, options.solver, options.rtol, options.atol, options.max_step,
+                self._on_event, self._stops.is_met, self.exchanged,
+            )  # fmt: skip
         elif options.solver != "auto":
             solver_name(options.solver)  # an unknown one is an error here, too
         self.every_tick = every_tick or (self.continuous is not None and self.continuous.fixed)
@@ -100,31 +92,20 @@ class Engine:
         self.coupled: CoupledSteps | None = None
         """Steps of the plants by another scheme than the default."""
         self.steps = PlantSteps(
-            flat,
-            self.plants,
-            self.workspace.z,
-            self.workspace.here.w,
-            self.position.time_of,
-            every_tick=self.every_tick,
-            coupled=is_coupled,
-        )
-        stops, plain = self._stops.entries, self.coupling.is_plain
-        self._change_over = ChangeOver(
-            self.workspace, self.position, self.plants, self.steps, stops, every=self.every_tick, plain=plain
-        )
+            flat, self.plants, self.workspace.z, self.workspace.here.w, self.position.time_of,
+            every_tick=self.every_tick, coupled=is_coupled,
+        )  # fmt: skip
+        numbers = self.workspace, self.position, self.plants, self.steps, self._stops.entries
+        self._change_over = ChangeOver(*numbers, every=self.every_tick, plain=self.coupling.is_plain)
+        part = self.continuous if self._compile == "auto" and not is_coupled else None
+        parts = self.position, self.plants, self._make_hybrid, self.every_tick
+        self._hybrid = None if part is None else HybridChange(part, *parts)
         if is_coupled:
             refuse_exchanged(self.coupling, {path: flat.table.blocks[path] for path in flat.outside})
             self.coupled = CoupledSteps(
-                flat,
-                name,
-                self.plants,
-                self.coupling,
-                self.steps,
-                self.workspace.z,
-                self.workspace.here.w,
-                self.workspace.bind_exchange(),
-                ContinuousPart(self.workspace, self.continuous, self.exchanged),
-            )
+                flat, name, self.plants, self.coupling, self.steps, self.workspace.z, self.workspace.here.w,
+                self.workspace.bind_exchange(), ContinuousPart(self.workspace, self.continuous, self.exchanged),
+            )  # fmt: skip
 
     def load(self, stack: ExitStack, start_time: float) -> None:
         """Load the plants for a run from a time in s on; ``stack`` unloads them."""
@@ -193,6 +174,9 @@ class Engine:
         """
         self.workspace.begin_anew(flat)
         self.position.restore(0, None)
+        if self._hybrid is not None:
+            self._hybrid.begin_anew()
+            self._compiled = None
         if self.continuous is not None:
             self.continuous.begin_anew(flat)
         for plant in self.plants.values():
@@ -202,22 +186,27 @@ class Engine:
 
     def _make_compiled(self) -> CompiledTicks | HybridTicks | None:
         """Return the ticks in C; None, with a message, where they can't be had."""
-        from .compiled_hybrid import make_hybrid
         from .compiled_ticks import make_compiled
 
-        regular = self.steps.regular and self.coupled is None
         if self.continuous is not None:
-            ticks, message = make_hybrid(
-                self.workspace, self.continuous, self.plants, self.steps, self._stops.entries,
-                every=self.every_tick, regular=regular,
-            )  # fmt: skip
-            self.messages += message
-            return ticks
+            return self._make_hybrid()
         found, message = make_compiled(
-            self.workspace, self.plants, self._stops.entries, every=self.every_tick, regular=regular, fuse=self._fuse
-        )
+            self.workspace, self.plants, self._stops.entries, every=self.every_tick,
+            regular=self.steps.regular and self.coupled is None, fuse=self._fuse,
+        )  # fmt: skip
         self.messages += message
         return found
+
+    def _make_hybrid(self) -> HybridTicks | None:
+        from .compiled_hybrid import make_hybrid
+
+        assert self.continuous is not None
+        ticks, message = make_hybrid(
+            self.workspace, self.continuous, self.plants, self.steps, self._stops.entries, every=self.every_tick,
+            regular=self.steps.regular and self.coupled is None, asked=self._compile is True,
+        )  # fmt: skip
+        self.messages += message
+        return ticks
 
     def take_first_tick(self, point: OperatingPoint | None, row: Row) -> None:
         """Go through the tick with which the run begins, tick 0 or that of an operating point, and record it."""
@@ -249,11 +238,11 @@ class Engine:
         workspace, plants, position, row = self.workspace, self.plants, self.position, recorder.row
         self.is_ahead = False
         try:
-            few = self._compile == "auto" and last - position.tick < _FEW
+            few = self._compile == "auto" and self.continuous is None and last - position.tick < _FEW
+            if self._hybrid is not None and self._compiled is None and self._hybrid.is_due(last):
+                self._compiled = self._hybrid.ticks
             if self._compiled is not None and not few and self._compiled.reaches(last):
-                ended = self._compiled.run(position.tick, last, recorder, arrived=self._arrive, progress=progress)
-                if ended is not None:
-                    position.stopped = self._stops.met_at(ended)
+                self._go_in_c(last, recorder, progress)
                 return
             if self.continuous is None:
                 auto = self._compile == "auto" and self._compiled is None and not few
@@ -269,24 +258,35 @@ class Engine:
                     if position.stopped is None and position.tick < last:
                         self.go(last, recorder, progress)
                 return
+            change = self._hybrid if self._compiled is None else None
+            self.continuous.watch = None if change is None else change.watch(last, self._note_due)
             ended = run_hybrid(
                 workspace, self.continuous, plants, self.steps, self.coupled, position, last,
                 every=self.every_tick, row=row, arrived=self._arrive, progress=progress,
             )  # fmt: skip
-            if ended is not None:
+            start, self.continuous.paused, self._due = self.continuous.paused, None, False
+            if ended is not None and start is None:
                 position.stopped = self._stops.met_at(ended)
+            elif change is not None and change.ticks is not None and position.stopped is None:
+                self._compiled, self._changed, change.ticks.start = change.ticks, True, start
+                self._go_in_c(last, recorder, progress)
         except SimulationError as error:
             if not self._end_within_step(error):
                 culprit = self.blame(error)
                 raise culprit from culprit.__cause__
 
+    def _go_in_c(self, last: int, recorder: Recorder, progress: Progress) -> None:
+        assert self._compiled is not None
+        ended = self._compiled.run(self.position.tick, last, recorder, arrived=self._arrive, progress=progress)
+        if ended is not None:
+            self.position.stopped = self._stops.met_at(ended)
+
     def end_between_ticks(self, end: float, row: Row, progress: Progress) -> None:
         """Go on from a tick to the end of the run, before the next tick, and record it; see `go`."""
         position = self.position
         try:
-            ended = end_between_ticks(
-                self.workspace, self.continuous, self.plants, self.steps, self.coupled, position, end, row
-            )
+            parts = (self.workspace, self.continuous, self.plants, self.steps, self.coupled)
+            ended = end_between_ticks(*parts, position, end, row)
             position.end = end
             if ended is not None:
                 position.stopped = self._stops.met_at(ended)

@@ -114,12 +114,13 @@ class RunOptions:
         inputs keep their start values until the first step. Tools differ in this.
     compile : {"auto", True, False}
         Go from tick to tick in C. "auto": a diagram of sampled subsystems is interpreted at first; a compiler works
-        beside it if the run is long enough, and C takes over at some tick, with the same results to the last bit. Where
-        results could differ, with tables or continuous states, it is interpreted. True: in C from the beginning; with
-        continuous states the results are the same within the tolerances. It needs a compiler (the extra ``build``), and
-        a diagram without transport delays and FMUs in processes of their own; between ticks no blocks of Python and one
-        of the solvers "auto", "RK23", "RK45", "DOP853", "Radau" and those of fixed step. Where one of these fails, the
-        run is interpreted, and ``run.messages`` says why.
+        beside it if the run is long enough, and C takes over at some tick, with the same results to the last bit. With
+        continuous states results are the same within the tolerances: there C takes over where a count of the run's
+        work says so, at the same instant wherever it runs. With tables it is interpreted. ``run.tier`` says what was
+        done. True: in C from the beginning. It needs a compiler (the extra ``build``), and a diagram without transport
+        delays and FMUs in processes of their own; between ticks one of the solvers "auto", "RK23", "RK45", "DOP853",
+        "Radau" and those of fixed step. Where one of these fails, the run is interpreted, and ``run.messages`` says
+        why.
     fuse : bool
         Compile the ticks, the loop over them and the equations of FMUs that Loopwright has built on this machine
         together, for its processor, with products and sums fused (FMA): faster, and other in the last digits (less than

@@ -6,9 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from loopwright.blocks import LoopwrightError
-from loopwright.diagrams.simulation import compiled_hybrid, simulated_diagram, simulation
+from loopwright.diagrams.simulation import simulated_diagram, simulation
+from loopwright.diagrams.simulation.compiled_hybrid import HybridTicks
 from loopwright.diagrams.simulation.compiled_ticks import CompiledTicks
 
+FACTOR = 100.0
+"""Times the tolerances that values of both forms may differ by."""
 counts = Counter()
 """Runs so far, by what came of them."""
 
@@ -17,11 +20,15 @@ def install(patch):
     """Let `Diagram.simulate` run every diagram a second time in C, where its ticks can be; ``patch`` undoes it."""
     original = simulation.simulate
     used = []
-    run = CompiledTicks.run
 
-    def watched(self, *arguments, **options):
-        used.append(self)
-        return run(self, *arguments, **options)
+    def watch(kind):
+        run = kind.run
+
+        def watched(self, *arguments, **options):
+            used.append(self)
+            return run(self, *arguments, **options)
+
+        patch.setattr(kind, "run", watched)
 
     def simulate(diagram, duration, options, **keywords):
         first = original(diagram, duration, options, **keywords)
@@ -32,14 +39,41 @@ def install(patch):
             second = original(diagram, duration, replace(options, compile=True), progress=False)
         except LoopwrightError as error:
             raise AssertionError(f"compiled, this run ends with {error}") from error
-        if used:
+        if not used:
+            counts["interpreted"] += 1
+        elif isinstance(used[0], HybridTicks):
+            compare_within_tolerances(first, second, options)
+            counts["compiled with continuous states"] += 1
+        else:
             compare(first, second, exact=not used[0].messages)
-        counts["compiled" if used else "interpreted"] += 1
+            counts["compiled"] += 1
         return first
 
-    patch.setattr(CompiledTicks, "run", watched)
-    patch.setattr(compiled_hybrid, "make_hybrid", lambda *_, **__: (None, ()))  # its values differ within tolerances
+    watch(CompiledTicks)
+    watch(HybridTicks)
     patch.setattr(simulated_diagram, "simulate", simulate)
+
+
+def compare_within_tolerances(first, second, options):
+    """Compare two runs with continuous states: samples, events in their order, and values within the tolerances.
+
+    Both forms take steps of one method by one rule. They differ by rounding, which may change a step: the errors of both
+    are within the tolerances, so that values differ by a multiple of these, and an event is as much apart in time.
+    """
+    events, others = ([(e.block, e.event) for e in run.events] for run in (first, second))
+    assert events == others
+    span = max(1.0, first.t[-1]) if len(first.t) else 1.0
+    near = FACTOR * options.rtol * span
+    assert first.t.shape == second.t.shape
+    assert np.all(np.abs(first.t - second.t) <= near * 1e-3), "samples are at other times"
+    sizes = np.max(np.abs(first.data), axis=0, initial=0.0)
+    atol = np.max(np.asarray(options.atol))
+    bound = FACTOR * (options.rtol * sizes + atol) + 1e-12
+    times = np.sort([e.t for run in (first, second) for e in run.events] + [np.inf])
+    since = np.abs(first.t - times[np.searchsorted(times, first.t - 1e-9 * span)])
+    smooth = since > 1e-9 * span  # at an event a signal jumps, and a sample of either form may be on either side
+    apart = np.max(np.abs(first.data - second.data)[smooth], axis=0, initial=0.0)
+    assert np.all(apart <= bound), f"apart by {np.max(apart / bound):.3g} times the bound"
 
 
 def compare(first, second, *, exact):

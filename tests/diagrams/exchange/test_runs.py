@@ -167,6 +167,7 @@ def test_a_spring_that_the_position_pulls_on_acts_within_the_step(files, fmi):
     np.testing.assert_allclose(run["plant.position"], exact, atol=1e-8)
 
 
+@pytest.mark.one_tier
 def test_ticks_ask_neither_the_description_nor_the_sources_anew(files, monkeypatch):
     """Inputs that a sampled subsystem makes jump at every tick: an event each time, and nothing is looked up for it."""
     from loopwright.diagrams.simulation import continuous, solver_setup

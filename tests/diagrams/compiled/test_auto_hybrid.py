@@ -1,0 +1,159 @@
+"""compile="auto" with continuous states: C takes over where the counted work says so, whatever a clock says."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from loopwright.blocks import (
+    Compare,
+    Constant,
+    Integrator,
+    Relay,
+    Sine,
+    StopCondition,
+    Sum,
+    TransferFunction,
+    UnitDelay,
+)
+from loopwright.diagrams import Diagram, Run, subsystem
+from loopwright.diagrams.compiled import code
+from loopwright.diagrams.simulation import change_over, compiled_ticks
+from loopwright.fmus import Fmu, dc_motor
+from support.both_forms import assert_same_bits
+
+pytestmark = pytest.mark.one_tier
+QUIET = {"progress": False}
+T = 1e-3
+
+
+def controlled():
+    """A PI controller at 1 kHz around two lags."""
+
+    @subsystem(sample_time=T, name="controller")
+    def controller(r, y):
+        integral, e = UnitDelay(initial_value=0.0, name="integral"), r - y
+        integral(integral.y + 3.0 * T * e)
+        return 2.0 * e + integral.y
+
+    first = TransferFunction(numerator=1.0, denominator=[0.1, 1.0], name="first")
+    second = TransferFunction(numerator=1.0, denominator=[0.3, 1.0], name="second")
+    return Diagram("pi", second(first(controller(Constant(value=1.0, name="r"), second.y))))
+
+
+def thermostat(*more):
+    """Temperature y' = u − y; the heating u switches between 2 and 0 at 0.9 and 1.1."""
+    lag = TransferFunction(numerator=1.0, denominator=[1.0, 1.0], name="room")
+    heating = Relay(on_point=-0.9, off_point=-1.1, on_value=2.0, off_value=0.0, name="heating")
+    heated = lag(heating(Sum(signs="-", name="minus")(lag.y)))
+    return Diagram("thermostat", heated, *(make(lag.y) for make in more))
+
+
+@pytest.fixture
+def little(monkeypatch):
+    """Little work is enough."""
+    monkeypatch.setattr(change_over, "_PATIENCE_OF_WORK", 2e-3)
+    monkeypatch.setattr(change_over, "_START", 5e-3)
+    monkeypatch.setattr(change_over, "_COMPILING", 0.0)
+    monkeypatch.setattr(compiled_ticks, "_TOLD", [])
+
+
+def test_many_ticks_are_compiled_before_the_first_one():
+    run = controlled().simulate(20.0, rtol=1e-8, atol=1e-10, **QUIET)
+    assert run.tier == "compiled"
+    assert run.messages == ()
+    a, b = np.array([[-10.0, 0.0], [1 / 0.3, -1 / 0.3]]), np.array([10.0, 0.0])
+    whole = expm(np.block([[a, b[:, None]], [np.zeros((1, 3))]]) * T)
+    x, integral = np.zeros(2), 0.0
+    for k in range(2000):
+        assert abs(run["second.y"][k] - x[1]) < 1e-6
+        e = 1.0 - x[1]
+        u = 2.0 * e + integral
+        integral += 3.0 * T * e
+        x = whole[:2, :2] @ x + whole[:2, 2] * u
+
+
+def test_few_ticks_stay_interpreted_and_keep_their_bits():
+    run = controlled().simulate(1.0, **QUIET)
+    assert run.tier == "interpreted"
+    assert_same_bits(controlled().simulate(1.0, compile=False, **QUIET), run)
+
+
+def test_c_takes_over_between_two_ticks_where_events_are_many(little):
+    run = thermostat().simulate(20.0, step=0.05, rtol=1e-9, atol=1e-11, **QUIET)
+    assert run.tier == "both"
+    assert len(run.t) == 401
+    assert np.array_equal(run.t, np.arange(401) / 20)
+    first = -np.log(1.0 - 1.1 / 2.0)
+    down, up = np.log(1.1 / 0.9), np.log((2.0 - 0.9) / (2.0 - 1.1))
+    times = first + np.cumsum([0.0, *([down, up] * 60)])
+    expected = times[times < 20.0]
+    assert [e.t for e in run.events] == pytest.approx(expected, abs=1e-7)
+    last = expected[-1]
+    at_end = 1.1 * np.exp(last - 20.0) if len(expected) % 2 else 2.0 - 1.1 * np.exp(last - 20.0)
+    assert run["room.y"][-1] == pytest.approx(at_end, abs=1e-7)
+
+
+def test_the_instant_of_the_change_depends_on_no_cache(little):
+    bits = {thermostat().simulate(5.0, step=0.05, **QUIET).data.tobytes() for _ in range(2)}
+    code.load_compiled.cache_clear()
+    bits.add(thermostat().simulate(5.0, step=0.05, **QUIET).data.tobytes())
+    assert len(bits) == 1
+
+
+def test_beside_an_fmu_c_takes_over_at_a_tick(little, monkeypatch):
+    monkeypatch.setattr(change_over, "_LANDING", 0.0)
+    monkeypatch.setattr(change_over, "_SAMPLE", 0.0)
+    plant = Fmu(dc_motor.build(), name="plant")
+    lag = TransferFunction(numerator=1.0, denominator=[0.01, 1.0], name="lag")
+    made = Diagram("loop", plant(voltage=lag(Sine(frequency=2.0, name="source")), load_torque=0.0))
+    run = made.simulate(0.4, step=T, **QUIET)
+    assert run.tier == "both"
+    interpreted = made.simulate(0.4, step=T, compile=False, **QUIET)
+    assert np.array_equal(run.t, interpreted.t)
+    assert np.max(np.abs(run["plant.speed"] - interpreted["plant.speed"])) < 1e-9
+
+
+def test_pieces_disk_saved_states_and_every_nth_sample(little, tmp_path):
+    made = thermostat()
+    interpreted = made.simulate(10.0, step=0.05, compile=False, every=3, **QUIET)
+    stored = made.simulate(10.0, step=0.05, every=3, to=tmp_path / "run", **QUIET)
+    assert Run.open(tmp_path / "run").tier == "both"
+    with made.simulation(step=0.05, every=3) as simulation:
+        simulation.advance(4.0)
+        state = simulation.save()
+        simulation.advance(6.0)
+        pieces = simulation.run()
+    again = made.simulate(6.0, step=0.05, start=state, compile=False, **QUIET)
+    for run in (stored, pieces):
+        assert np.array_equal(run.t, interpreted.t)
+        assert len(run.events) == len(interpreted.events)
+        assert np.max(np.abs(run.data - interpreted.data)) < 1e-5
+    assert again["room.y"][-1] == pytest.approx(interpreted["room.y"][-1], abs=1e-5)
+
+
+def test_a_stop_condition_ends_it_in_c_at_its_event(little):
+    def counted(y):
+        total = Integrator(name="total")(y)
+        return StopCondition(name="stop")(Compare(">", name="full")(total, 5.0))
+
+    run = thermostat(counted).simulate(20.0, step=0.05, rtol=1e-9, atol=1e-11, **QUIET)
+    assert run.tier == "both"
+    assert run.stopped.block == "stop"
+    assert run["total.y"][-1] == pytest.approx(5.0, abs=1e-7)
+
+
+def test_without_a_compiler_the_bits_are_those_of_an_interpreted_run(little, monkeypatch):
+    from loopwright.diagrams.compiled import hybrid_code
+
+    monkeypatch.setattr(hybrid_code, "load_compiled", _fail)
+    monkeypatch.setattr(hybrid_code, "hybrid_master", _fail)
+    runs = [thermostat().simulate(10.0, step=0.05, **QUIET) for _ in range(2)]
+    assert [len(run.messages) for run in runs] == [1, 0]
+    assert "no such compiler" in runs[0].messages[0]
+    assert_same_bits(thermostat().simulate(10.0, step=0.05, compile=False, **QUIET), runs[0])
+
+
+def _fail(*_):
+    from loopwright.blocks.core import CompilerError
+
+    raise CompilerError("no such compiler.")
