@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from fractions import Fraction
 
 import numpy as np
 
-from ...blocks.core import Block, Layout, SampleTimeError, Shape, without_collection
+from ...blocks.core import Block, Layout, SampleTimeError, Shape, one_thread, without_collection
 from ..wiring import Checked, Order, Structure, join, stepped_blocks
 from .clocks import TickPattern
 from .flat_diagram import FlatDiagram
 from .layout import FlatEvent, StateLayout, sample_time_of
 from .plant_ticks import own_step
+
+_MANY = 300
+"""Blocks from which on it pays to limit BLAS to one thread, which takes some 20 ms."""
 
 
 @without_collection
@@ -84,7 +88,8 @@ def flatten(
             if (p, q) in table.wires
         }
     )
-    packed = {path: traced[path].pack(blocks[path], sample_time_of(table, path)) for path in paths}
+    with one_thread() if len(paths) > _MANY else nullcontext():  # matrices of a few states each
+        packed = {path: traced[path].pack(blocks[path], sample_time_of(table, path)) for path in paths}
     log_shapes = dict(plant_outputs.shapes) | {join(p, q): s for p in paths for q, s in traced[p].outputs.items()}
     start_values = [
         np.ravel(port.start_value(blocks[path], traced[path].inputs))

@@ -29,6 +29,8 @@ SYMBOLS = {"stiffness": "ke", "damping": "be", "mass": "me", "tool_mass": "tool"
 """Names of an environment's properties in dotted paths."""
 WORDS = {"stiffness": "k_e", "damping": "b_e", "mass": "m_e", "tool_mass": "tool"}
 """Properties of an environment in tables."""
+ALONE = "alone"
+"""Environment with nothing but what varies, in tables."""
 SCANNED = {"stiffness": 1e8, "damping": 1e8, "mass": 1e4, "tool_mass": 1e4}
 """Upper ends of the scans; one beyond a required limit is taken where that is larger."""
 BEYOND = 1.1
@@ -180,8 +182,8 @@ def contact_sections(reported: ReportedContacts) -> Section:
 
 def contacts_on_first_page(reported: ReportedContacts) -> Table:
     """Return the weakest limit of stiffness of each contact."""
-    columns = ("contact", "least of the largest k_e", "with", "oscillates at", "first Re Y < 0 at")
-    return Table("Contacts: stiffness that they bear", columns, tuple(reported.weakest), digits=4)
+    columns = ("contact", "stable up to k_e", "with", "oscillates at", "first Re Y < 0 at")
+    return Table("Contacts: weakest limits of stiffness", columns, tuple(reported.weakest), digits=4)
 
 
 def _place(vary: str, environment: Mapping[str, float]) -> str:
@@ -191,10 +193,10 @@ def _place(vary: str, environment: Mapping[str, float]) -> str:
 
 
 def _describe(environment: Mapping[str, float]) -> str:
-    """Return the properties of an environment in words."""
+    """Return the properties of an environment in words, empty without any."""
     units = {"stiffness": "N/m", "damping": "N.s/m", "mass": "kg", "tool_mass": "kg"}
     parts = (f"{WORDS[p]} = {environment[p]:g} {print_unit(units[p])}" for p in WORDS if p in environment)
-    return ", ".join(parts) or "nothing else"
+    return ", ".join(parts)
 
 
 def _contact(name: str, contact: Contact, reported: ReportedContacts) -> Section:
@@ -273,7 +275,7 @@ def _required(contact: Contact, required: tuple[ContactLimits, ...], numbers: di
             found = contact.stability_limit(vary, high=high, **environment)
             cells = _enter(found, LIMITS[vary], _place(vary, one.environment), numbers)
             asked = f"{limit} {print_unit(found.unit)}"
-            rows.append((WORDS[vary], _describe(one.environment), asked, *cells))
+            rows.append((WORDS[vary], _describe(one.environment) or ALONE, asked, *cells))
     columns = ("largest", "with", "required", "found", "oscillates at", "moves", "stable again")
     return [Table("Limits that are required", columns, tuple(rows))] if rows else []
 
@@ -282,7 +284,8 @@ def _find_weakest(name: str, required: tuple[ContactLimits, ...], numbers: Mappi
     """Return the row of a contact on the first page: its weakest limit of stiffness."""
     key = LIMITS["stiffness"]
     environments: list[Mapping[str, float]] = [*({"damping": b} for b in DAMPINGS), *(o.environment for o in required)]
-    words = {_place("stiffness", one): _describe(one) for one in environments}
+    words = {_place("stiffness", one): _describe(one) or ALONE for one in environments}
+    words[_place("stiffness", {})] = ALONE
     places = [path.partition(".")[2] for path in numbers if path.startswith(f"{key}.")]
     place = min(places, key=lambda p: numbers[f"{key}.{p}"].value)
     frequency = numbers.get(f"{key}_frequency.{place}", "–")
@@ -335,7 +338,8 @@ def _tried(
             f"{trial.fastest:.2g} m/s",
         ))  # fmt: skip
     columns = ("of the limit", "k_e", "growth rate, measured", "predicted", "speeds up to")
-    title = f"Limit of stiffness with {_describe(environment)}, tried in the nonlinear run"
+    besides = f" with {_describe(environment)}" if environment else ""
+    title = f"Limit of stiffness{besides}, tried in the nonlinear run"
     held = TEXTS.paragraphs("tried", method=found.method.value, tried=found.tried, limit=limit.value)
     return [Table(title, columns, tuple(rows))], held, []
 

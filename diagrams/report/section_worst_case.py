@@ -150,6 +150,8 @@ class ReportedWorstCase:
         if found.failures and verdict is not Verdict.FAILED:
             told = found.failures[0].reason.rstrip(".")
             return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.NOT_ANALYSED, detail=told)
+        if verdict is Verdict.PASSED and len(known) < len(numbers):  # some case has no such number
+            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.NO_VALUE)
         if verdict is Verdict.PASSED and any(one.state is CaseState.MOVING for one in found.cases):
             return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.MOVING)
         if case is found.worst and self.run is not None and not self.run.agrees:

@@ -98,7 +98,7 @@ class Numbered:
         units = [_common_unit(table, i) for i in columns]
         right = [is_numeric([row[i] for row in table.rows if i < len(row)]) for i in columns]
         heads = zip(table.columns, units, right, strict=True)
-        headings = [Heading(str(text), _heading_unit(text, unit), flush) for text, unit, flush in heads]
+        headings = [_heading(str(text), unit, flush) for text, unit, flush in heads]
         reasons = _grouped(v for row in table.rows for v in row if isinstance(v, Number))
         letters = {method: _letter(i) for i, method in enumerate(reasons)} if len(reasons) > 1 else {}
         rows = []
@@ -192,12 +192,12 @@ def _common_unit(table: Table, column: int) -> str | None:
     return units.pop() if len(units) == 1 else None
 
 
-def _heading_unit(heading: str, unit: str | None) -> str:
-    """Return the unit that stands behind a heading; none where the heading names it already."""
-    if unit is None or unit == "1":
-        return ""
-    words = re.split(r"[\s(),\[\]]+", str(heading))
-    return "" if {unit, print_unit(unit), f"/{unit}"} & set(words) else print_unit(unit)
+def _heading(text: str, unit: str | None, right: bool) -> Heading:
+    """Return a head with the unit that it names itself in brackets, or else that of its numbers."""
+    named = re.fullmatch(r"(.*\S)\s\[([^\]]+)\]", text)
+    if named is not None:
+        return Heading(named[1], named[2], right)
+    return Heading(text, "" if unit is None else print_unit(unit), right)
 
 
 def _letter(i: int) -> str:

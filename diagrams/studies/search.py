@@ -148,7 +148,7 @@ class Study:
                 if quantity not in found or math.isnan(found[quantity].value):
                     continue
                 goodness = self.goal.goodness(wires, quantity, found[quantity].value)
-                if goodness < worst[0]:
+                if goodness < worst[0] or not worst[1]:  # an infinite margin is a number, too
                     worst = (goodness, wires, quantity)
         if unstable:
             return replace(
@@ -203,7 +203,8 @@ class Study:
 
     def search(self, starts: int, steps: int) -> None:
         """Go downhill from the worst cases that could be analysed; an unstable one is bad enough."""
-        ranked = sorted((c for c in self.cases if c.parameters and c.quantity), key=lambda c: (c.goodness, c.index))
+        known = (c for c in self.cases if c.parameters and c.quantity and math.isfinite(c.goodness))
+        ranked = sorted(known, key=lambda c: (c.goodness, c.index))
         begun: list[np.ndarray] = []
         for case in ranked:
             if len(begun) == starts or self._is_lost():

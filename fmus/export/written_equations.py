@@ -14,6 +14,7 @@ from typing import Any
 import casadi as ca
 
 from ...blocks.core import FmuError
+from .c_code import runtime
 
 _BINARY: Mapping[str, Callable[[Any, Any], Any]] = {
     "+": lambda a, b: a + b, "-": lambda a, b: a - b, "*": lambda a, b: a * b, "/": lambda a, b: a / b,
@@ -83,7 +84,6 @@ class WrittenEquations:
     first: Mapping[str, int]
 
 
-@lru_cache(maxsize=8)
 def read_equations(path: Path) -> WrittenEquations:
     """Read the equations of an FMU that Loopwright has exported from its sources.
 
@@ -95,16 +95,24 @@ def read_equations(path: Path) -> WrittenEquations:
     Raises
     ------
     FmuError
-        If it has no such sources, has events, or its equations are no scalar operations.
+        If it has no such sources, or those of another version, has events, or its equations are no scalar operations.
     """
     try:
         with zipfile.ZipFile(os.fspath(path)) as archive:
-            text = archive.read("sources/model.c").decode()
+            texts = {
+                name.removeprefix("sources/"): archive.read(name).decode()
+                for name in archive.namelist()
+                if name.startswith("sources/") and name.endswith((".c", ".h"))
+            }
+            text = texts.pop("model.c")
     except (OSError, KeyError, zipfile.BadZipFile) as error:
         raise FmuError(f"its sources can't be read: {error}. Export it with Loopwright.") from None
+    if texts not in (runtime(3), runtime(2)):
+        raise FmuError("another version of Loopwright has exported it. Export it anew.")
     return read_text(text)
 
 
+@lru_cache(maxsize=8)
 def read_text(text: str) -> WrittenEquations:
     """Read the equations of an FMU from the text of its ``model.c``; see `read_equations`."""
     sizes = {name: int(count) for name, count in re.findall(r"#define\sLW_N_([A-Z])\s(\d+)", text)}

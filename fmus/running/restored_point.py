@@ -62,6 +62,15 @@ class RestoredPoint:
         self._start()
         self.save()
 
+    def give_up(self) -> None:
+        """Restore no state from here on: the FMU goes on otherwise behind a restored state than from its start."""
+        self.free()
+        self.is_restored, self.lied = False, True
+
+    def resume(self) -> None:
+        """Restore states again, after `give_up` for a look at the difference that there was none."""
+        self.is_restored, self.lied = True, False
+
     def free(self) -> None:
         """Free the saved state; do so before the instance is made anew, to which it does not belong."""
         if self._handle is not None:

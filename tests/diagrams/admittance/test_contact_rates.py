@@ -20,7 +20,7 @@ from loopwright.blocks import (
     TransferFunction,
 )
 from loopwright.diagrams import Diagram, TrialMethod, subsystem
-from loopwright.fmus import Fmu, build, scara
+from loopwright.fmus import Fmu, StepOptions, build, scara
 
 M, KV, WEIGHT, DRAG = 3.0, 400.0, 1.5, 20.0
 """Mass of the cart in kg, gain of the servo in N s/m; mass in kg and damping in N s/m of the impedance."""
@@ -210,11 +210,12 @@ class JointController(Block):
         return 2.0 * (JACOBIAN.T @ u.force) - 400.0 * (u.angle - ANGLES) - 30.0 * u.rate
 
 
-def arm_diagram(slow=5e-3, tool=0.1):
-    arm = Fmu(scara.build(), name="arm")
+def arm_diagram(slow=5e-3, tool=0.1, offset=0.0, stepping=None):
+    options = {} if stepping is None else {"stepping": StepOptions(communication_step=stepping)}
+    arm = Fmu(scara.build(), name="arm", **options)
     push = Constant(value=(0.0, 0.0), unit="N", name="push")
 
-    @subsystem(sample_time=slow)
+    @subsystem(sample_time=slow, offset=offset)
     def sensors(acceleration, push):
         return ForceSensor(name="sensor", tool_mass=tool)(push, acceleration).named("felt")
 
@@ -258,4 +259,33 @@ def test_an_arm_with_a_slow_force_sensor_has_the_limit_of_its_own_matrices_and_o
     expected = brentq(lambda k: arm_growth(k, 5.0, d, 5e-3, 0.1), 0.9 * limit.value, 1.1 * limit.value, rtol=1e-14)
     assert limit.value == pytest.approx(expected, rel=1e-8)
     found = here.confirm(limit, push=1e-8, method=method)
+    assert found.below.measured < 0.0 < found.above.measured
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{"stepping": 5e-4}, {"stepping": 2e-3}, {"offset": 5e-4}, {"slow": 2e-3, "at": 0.013}],
+                         ids=str)  # fmt: skip
+def test_communication_steps_of_their_own_and_offsets_hold_in_the_run(options):
+    options = dict(options)
+    at = options.pop("at", None)
+    plain, made = arm_diagram(1e-3), arm_diagram(**{"slow": 1e-3, **options})
+    ports = {"position": "arm.position", "velocity": "arm.velocity", "force": "felt", "direction": (0.6, 0.8)}
+    here = made.contact("arm.external_force", at=at, **ports)
+    assert len(here.parts.ticks) == 2
+    limit = here.stability_limit(damping=5.0)
+    if options.get("stepping") == 5e-4:  # points at which nothing acts
+        same = plain.contact("arm.external_force", **ports).stability_limit(damping=5.0)
+        assert limit.value == pytest.approx(same.value, rel=1e-9)
+    found = here.confirm(limit, push=1e-8)
+    assert found.method is TrialMethod.INSIDE
+    for trial in found.trials:
+        assert trial.measured == pytest.approx(trial.predicted, rel=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("vary", ["mass", "tool_mass"])
+def test_masses_in_two_rates_hold_in_the_run(vary):
+    ports = {"position": "arm.position", "velocity": "arm.velocity", "force": "felt", "direction": (0.6, 0.8)}
+    here = arm_diagram(2e-3).contact("arm.external_force", **ports)
+    found = here.confirm(here.stability_limit(vary, stiffness=50.0), push=1e-8)
     assert found.below.measured < 0.0 < found.above.measured

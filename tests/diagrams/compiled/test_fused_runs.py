@@ -100,6 +100,23 @@ def test_an_fmu_with_events_keeps_its_own_step():
     assert differ(plain, fused) < BOUND
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options", [{"ports": ("voltage", "load_torque", "speed", "der(speed)")}, {"start": {"integrator": 2}}]
+)
+def test_an_fmu_with_derivatives_as_ports_or_another_integrator_keeps_its_own_step(options):
+    @subsystem(sample_time=1e-3, name="box")
+    def box(speed):
+        return 6.0 - Gain(gain=0.01, name="gain")(speed)
+
+    plant = Fmu(dc_motor.build(), name="plant", **options)
+    made = Diagram("motor", plant(voltage=box(plant.speed), load_torque=0.0).speed)
+    plain, fused = made.simulate(0.05, compile=True, **QUIET), made.simulate(0.05, fuse=True, **QUIET)
+    assert inside(fused) == []
+    assert fused.tier == "compiled"
+    assert differ(plain, fused) < BOUND
+
+
 def test_compile_false_asks_for_no_loop_in_c():
     run = experiments.hand_guiding().diagram.simulate(0.01, fuse=True, compile=False, **QUIET)
     assert run.tier == "interpreted"

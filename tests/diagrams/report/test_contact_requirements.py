@@ -184,4 +184,4 @@ def test_page_one_the_json_and_the_exit_status_say_the_same(untried, tmp_path, c
     assert [(r["quantity"], r["verdict"]) for r in data["requirements"]["results"]] == [("contact.stiffness", verdict)]
     page = out.read_text(encoding="utf-8")
     assert f"Verdict: {verdict}." in page
-    assert "Contacts: stiffness that they bear" in page
+    assert "Contacts: weakest limits of stiffness" in page

@@ -180,6 +180,12 @@ def test_a_unit_that_a_whole_column_shares_stands_in_its_heading():
     ]
 
 
+def test_a_head_that_names_its_unit_shows_it_as_all_others_do():
+    numbers = (Number(2.0, "s", 0.0, "x"), Number(3.0, "s", 0.0, "x"))
+    page = to_html(Report("R", (Section("s", "S", tables=(Table("T", ("", "t", "end [s]"), (("a", *numbers),)),)),)))
+    assert re.findall(r"(\w+) <span class=\"unit\">(.*?)</span>", page) == [("t", "[s]"), ("end", "[s]")]
+
+
 def test_contents_lists_and_numbering():
     tree = parsed(to_html(report()))
     nav = text_of(next(tree.iter("nav")))

@@ -88,6 +88,19 @@ def test_entries_of_an_array_are_ranges_by_the_names_that_sensitivity_gives():
     assert found.diagram.blocks["motor"].denominator[0] == 0.05
 
 
+@pytest.mark.parametrize("quantity", ["phase_margin_deg", "delay_margin_s", "gain_margin_high"])
+def test_an_infinite_margin_is_as_good_as_can_be(quantity):
+    """L = k/(s + 1) has no crossover below k = 1, and never a limit of its gain."""
+    plant = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="plant")
+    diagram = Diagram("lag", plant(Gain(gain=0.8, name="k")(Constant(value=0.0, name="r") - plant.y).named("u")))
+    found = diagram.worst_case({"k.gain": (0.5, 3.0)}, "u", quantity=quantity, count=4, seed=1, steps=5)
+    assert not found.failures
+    assert found.nominal[0].value == math.inf
+    margin = math.pi - math.atan(math.sqrt(8.0))
+    by_hand = {"phase_margin_deg": math.degrees(margin), "delay_margin_s": margin / math.sqrt(8.0)}
+    assert found.worst.value == pytest.approx(by_hand.get(quantity, math.inf), rel=1e-9)
+
+
 def draw(count, seed=5):
     rng = np.random.default_rng(seed)
     return [tuple(rng.uniform(low, high) for low, high in RANGES.values()) for _ in range(count)]

@@ -8,7 +8,7 @@ import pytest
 
 from loopwright.blocks import FmuError
 from loopwright.fmus.export import read_equations
-from loopwright.fmus.export.c_code import generate
+from loopwright.fmus.export.c_code import generate, runtime
 from loopwright.fmus.export.written_equations import read_text
 from support.exported import mass_spring_damper, pendulums
 
@@ -70,3 +70,21 @@ def test_sources_that_are_none_or_more_than_scalar_operations_are_refused(tmp_pa
         archive.writestr("sources/other.c", "")
     with pytest.raises(FmuError, match="its sources can't be read"):
         read_equations(tmp_path / "empty.fmu")
+
+
+def write_sources(path, spec, fmi=3, **changes):
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, text in {**runtime(fmi), "model.c": generate(spec, "token", fmi)[0], **changes}.items():
+            archive.writestr(f"sources/{name}", text)
+
+
+def test_a_file_that_was_written_anew_is_read_anew(tmp_path):
+    for spec, states, fmi in ((mass_spring_damper(), 2, 3), (pendulums(), 5, 2)):
+        write_sources(tmp_path / "model.fmu", spec, fmi)
+        assert read_equations(tmp_path / "model.fmu").states == states
+
+
+def test_sources_of_another_version_are_refused(tmp_path):
+    write_sources(tmp_path / "model.fmu", mass_spring_damper(), **{"integrators.c": "/* other steps */"})
+    with pytest.raises(FmuError, match="another version of Loopwright has exported it"):
+        read_equations(tmp_path / "model.fmu")

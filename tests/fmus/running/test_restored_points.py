@@ -38,6 +38,11 @@ canGetAndSetFMUstate="true"/><ModelVariables>
 </ModelVariables><ModelStructure><Outputs><Unknown index="2" dependencies=""/><Unknown index="3" dependencies="1"/>
 </Outputs>STATES</ModelStructure>"""
 LISTED = '<Derivatives><Unknown index="4"/></Derivatives>'
+TENTATIVE = SOURCE.replace("double t, u, y; int id;", "double t, u, y, kept; int id, back;").replace(
+    "instance *c = p; c->y = c->u +",
+    "instance *c = p; if (c->back) c->y = c->kept; c->kept = c->y; c->back = !no; c->y = c->u +",
+)
+"""Takes a step back when the next one begins, unless it was said to be final."""
 RESTORES = ["*c = *o;", "", "c->u = o->u;", "c->y = o->y;"]
 NAMES = ["all", "nothing", "inputs alone", "states alone"]
 
@@ -75,3 +80,15 @@ def test_identification_has_its_response_whatever_the_fmu_restores(make, restore
         assert y[0] == pytest.approx((1.0 - np.exp(-H)) * np.exp(-k * H), rel=1e-8)
         assert twice[0] == pytest.approx(2.0 * (k == 0), abs=1e-8)
     assert found.derivation.restarted == (restore in RESTORES[1:3])  # it sets the inputs itself
+
+
+def test_an_fmu_that_takes_back_steps_that_are_not_final_is_identified_from_new_starts(cache, tmp_path):
+    """Its state was found as one of a single sample: the pulse was gone with the step behind it."""
+    source = TENTATIVE.replace("RESTORE", RESTORES[0])
+    assert source.count("kept") == 3
+    lag = Fmu(small_fmu(tmp_path, "fmi2", source, MODEL.replace("STATES", "")), name="lag", isolate=False)
+    found = identify_step(lag, {"t": 0.0, "state": {}, "inputs": {"u": np.array(0.0)}}, H, samples=60)
+    assert found.derivation.restarted
+    for k in range(5):
+        y, _ = found.C @ np.linalg.matrix_power(found.A, k) @ found.B
+        assert y[0] == pytest.approx((1.0 - np.exp(-H)) * np.exp(-k * H), rel=1e-8)
