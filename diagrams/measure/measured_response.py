@@ -334,7 +334,8 @@ def _find_beginning(
         if "start" not in options:
             return options, None, at.t
     if isinstance(at, OperatingPoint) and at.how == PointOrigin.RUN and "start" not in options:
-        return {**options, "step": options.get("step") or at.base}, None, at.t
+        free = not (diagram.has_clock or diagram.has_fmu) and at.t == 0.0  # any step begins there
+        return {**options, "step": options.get("step") or (None if free else at.base)}, None, at.t
     if at is None or (isinstance(at, int | float) and not isinstance(at, bool) and "start" not in options):
         return options, None, float(at or 0.0)
     point = operating_point(diagram, at, options)
