@@ -14,8 +14,8 @@ LEAST = 0.62
 """Smallest factor by which a figure is set smaller."""
 CAPTION = 0.065
 """Share of a page that a caption takes, with the space around it."""
-ROWS = 12
-"""Rows above which a table may go over to the next page to fill one."""
+ROWS, WIDE_GAP = (12, 7), 0.26
+"""Rows above which a table may go over to the next page to fill one: to fill a gap, and one of this share of a page."""
 TABLE_PART = 0.2
 """Share of a page that has to be free for the first part of such a table."""
 MOST = 24
@@ -25,7 +25,9 @@ TOP, BOTTOM = 18.0 / 25.4 * 72, 18.0 / 25.4 * 72
 MARK = 2.0
 """Height of a mark in points; marks stand in the text's left edge ahead of each figure and table."""
 
-_PLACE = re.compile(r"""<figure\sid="[^"]*"[^>]*>(?:\s*<div\sclass="scroll">\s*<svg)?|<div\sclass="table(\slong)?">""")
+_PLACE = re.compile(
+    r"""<figure\sid="[^"]*"[^>]*>(?:\s*<div\sclass="scroll">\s*<svg)?|(?:<div\sclass="keep">\s*<h\d.*?</h\d>\s*)?<div\sclass="table(\slong)?">"""
+)
 _WIDTH = re.compile(r'<svg[^>]*?\bwidth="([\d.]+)(pt|px)?"')
 _TEXT_WIDTH = (210 - 37) / 25.4 * 96
 """Width of the text of an A4 page in pixels."""
@@ -114,7 +116,8 @@ def _change(html: str, places: list[re.Match[str]], changes: Changes, book: Any,
             changes.left.add(index)
         return factor >= LEAST or before is not None
     rows = html.count("<tr", found.start(), html.find("</table>", found.start())) - 1
-    if found[1] or rows <= ROWS or free - first.begin < TABLE_PART * height:
+    least = ROWS[free > WIDE_GAP * height]
+    if found[1] or rows <= least or free - first.begin < TABLE_PART * height:
         return False
     changes.over.add(index)
     return True
@@ -131,7 +134,7 @@ def _changed(html: str, changes: Changes, *, marked: bool) -> str:
         mark = f'<div style="display:block;height:{MARK}pt;width:4pt;{color}"></div>'
         text = found[0]
         if index in changes.over:
-            text = '<div class="table long">'
+            text = text.replace('class="keep"', 'class="parted"').replace('class="table"', 'class="table long"')
         if index in changes.smaller:
             natural = _WIDTH.search(html, found.start())
             width = _TEXT_WIDTH
@@ -139,8 +142,9 @@ def _changed(html: str, changes: Changes, *, marked: bool) -> str:
                 width = min(width, float(natural[1]) * (4 / 3 if natural[2] == "pt" else 1.0))
             limit = f'<div class="scroll" style="max-width:{changes.smaller[index] * width:.0f}px">'
             text = text.replace('<div class="scroll">', limit)
-        begin, close, rest = text.partition(">")
-        return begin + close + mark + rest
+        begin, close, rest = text.rpartition('class="table') if "<figure" not in text else ("", "", text)
+        of_its_own, end, inner = rest.partition(">")
+        return begin + close + of_its_own + end + mark + inner
 
     return _PLACE.sub(change, html)
 

@@ -69,8 +69,15 @@ class SectionView:
     @property
     def kept(self) -> bool:
         """Whether the heading is kept together with the first thing below it, which is no text."""
-        first = (*self.drawings, *self.tables, *self.figures)[:1]
-        return not self.text and any(not isinstance(of, TableView) or not of.is_long for of in first)
+        return not self.text and any(not isinstance(of, TableView) or not of.is_long for of in self._first())
+
+    @property
+    def heads_long(self) -> bool:
+        """Whether a table that may go over to the next page follows the heading at once."""
+        return not self.text and any(isinstance(of, TableView) and of.is_long for of in self._first())
+
+    def _first(self) -> tuple[FigureView | TableView, ...]:
+        return (*self.drawings, *self.tables, *self.figures)[:1]
 
 
 @dataclass(frozen=True)

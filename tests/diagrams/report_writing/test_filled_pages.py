@@ -79,3 +79,19 @@ def test_a_figure_that_just_misses_a_sheets_end_is_set_smaller_and_no_smaller_th
 
 def test_a_page_without_figures_and_tables_stays_as_it_is():
     assert fill_pages("<p>text</p>", None, None) == "<p>text</p>"
+
+
+@pytest.mark.parametrize(
+    "lines", [26, pytest.param(28, marks=pytest.mark.slow), pytest.param(30, marks=pytest.mark.slow)]
+)
+def test_a_heading_stays_with_the_long_table_below_it(lines, tmp_path):
+    table = Table("LONG", ("name", "value"), tuple((f"row{i}", float(i)) for i in range(40)))
+    part = Section("p", "HEADING", tables=(table,))
+    made = Report("R", (Section("a", "First", ("Filling.",) * lines), Section("b", "B", ("Text.",), sections=(part,))))
+    write_pdf(to_html(made), tmp_path / "r.pdf")
+    document = pypdfium2.PdfDocument(tmp_path / "r.pdf")
+    sheets = [page.get_textpage().get_text_range() for page in document]
+    document.close()
+    (at,) = [sheet for sheet in sheets if "HEADING" in sheet and "row" in sheet]
+    assert "row0" in at
+    assert "LONG" in at
