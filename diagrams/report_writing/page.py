@@ -77,7 +77,8 @@ class SectionView:
         return not self.text and any(isinstance(of, TableView) and of.is_long for of in self._first())
 
     def _first(self) -> tuple[FigureView | TableView, ...]:
-        return (*self.drawings, *self.tables, *self.figures)[:1]
+        shown: tuple[FigureView | TableView, ...] = (*self.drawings, *self.tables, *self.figures)
+        return shown[:1]
 
 
 @dataclass(frozen=True)
