@@ -162,15 +162,19 @@ diagram = cart_diagram()
 """
 
 
-@pytest.mark.parametrize(
-    ("share", "verdict", "status", "way"),
-    [
-        (0.9, "passed", 0, "--contact"),
-        pytest.param(1.1, "failed", 3, "--contact", marks=pytest.mark.slow),
-        pytest.param(0.9, "passed", 0, "--requirements", marks=pytest.mark.slow),
-        pytest.param(1.1, "failed", 3, "--requirements", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("share", "verdict"), [(0.9, "passed"), (1.1, "failed")])
+def test_page_one_and_the_json_say_the_same(untried, tmp_path, share, verdict):
+    file = write(tmp_path / "c.toml", TABLE, "[contact.hand.requirements]", f"stiffness = {share * SOFT}")
+    out = tmp_path / "page.html"
+    report = cart_diagram().report(out, json=True, only=("poles",), contacts=file)
+    assert report.review.verdict.value == verdict
+    assert json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))["requirements"]["verdict"] == verdict
+    assert f"Verdict: {verdict}." in out.read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("share", "verdict", "status"), [(0.9, "passed", 0), (1.1, "failed", 3)])
+@pytest.mark.parametrize("way", ["--contact", "--requirements"])
 def test_page_one_the_json_and_the_exit_status_say_the_same(untried, tmp_path, capsys, share, verdict, status, way):
     write(tmp_path / "loop.py", PROGRAM)
     first = "stable = false" if way == "--requirements" else ""  # the cart drifts
