@@ -107,3 +107,23 @@ def test_states_to_which_the_force_on_the_plant_does_not_lead_are_refused(option
     name = "sensors.cell.y" if block == "sensors.cell" else "felt"
     with pytest.raises(OptionError, match=rf"behind the states of '.*{block}.*force=….*force=None"):
         made.contact("cart.push", force=name, direction=[1.0], **PORTS)
+
+
+def test_the_wire_ahead_of_a_delay_passes_the_delay():
+    made = diagram(Gain(gain=1.0, name="cell"), delay=1)
+    ahead, behind = (
+        made.contact("cart.push", force=name, direction=[1.0], **PORTS) for name in ("sensors.cell.y", "felt")
+    )
+    assert (ahead.entry, behind.entry) == ("sensors.cell.y", "hand.y")
+    assert ahead.stability_limit().value == pytest.approx(behind.stability_limit().value, rel=1e-10)
+
+
+def test_a_continuous_filter_of_the_force_is_on_the_way():
+    cart, hand = Cart(name="cart"), Constant(value=0.0, unit="N", name="hand")
+    felt = TransferFunction(numerator=[1.0], denominator=[LAG, 1.0], name="cell")(hand).named("felt")
+    drive = Gain(gain=SHARE, name="share")(felt) - Gain(gain=DRAG, name="drag")(cart.velocity)
+    here = Diagram("cart", cart(motor=drive, push=hand)).contact("cart.push", force="felt", direction=[1.0], **PORTS)
+    # (LAG s + 1)(M s² + DRAG s + k) + SHARE k = 0, by Routh: (M + LAG DRAG)(DRAG + LAG k) = LAG M k (1 + SHARE)
+    k = (M + LAG * DRAG) * DRAG / (LAG * M * (1 + SHARE) - LAG * (M + LAG * DRAG))
+    assert here.entry == "hand.y"
+    assert here.stability_limit().value == pytest.approx(k, rel=1e-9)
