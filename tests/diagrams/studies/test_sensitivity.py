@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import UnknownNameError
-from loopwright.diagrams import experiments
-from loopwright.diagrams.studies import confirm_sensitivity
+from loopwright.diagrams import experiments, margins
+from loopwright.diagrams.studies import confirm_parameter, confirm_sensitivity, sensitivities_of
+from support import reviewed
 from support.tuned_loops import make_pi_loop, pi_phase_margin
 
 NAMES = ["p.gain", "ki.gain", "rate.gain"]
@@ -82,3 +83,23 @@ def test_the_weakest_margin_of_fig3_leans_on_the_friction_that_is_compensated():
     assert found["plant.start.coulomb_scale", "disk_margin"].slope.value > 0.5
     assert found["model.coulomb_scale", "disk_margin"].slope.value < -1.0
     assert not found["plant.start.coulomb_scale", "disk_margin"].is_exact
+
+
+@pytest.mark.slow
+def test_a_margin_that_bends_over_the_step_of_the_differences_is_confirmed_by_their_limit():
+    """An observer of a swinging load: plain differences over 1e-3 of an entry are off by 1.5e-3, and are no kink."""
+    model = reviewed.crane().linearize(reviewed.CRANE_T)
+    found = sensitivities_of(model, ("controller.force",))
+    (row,) = confirm_parameter(found, "controller.observer.A[2,1]", ("disk_margin",))
+    entry = model.diagram.blocks["controller.observer"].A[1][0]
+
+    def margin(change):
+        changed = np.array(model.diagram.blocks["controller.observer"].A, dtype=float)
+        changed[1, 0] = entry + change
+        loop = model.diagram.replace({"controller.observer.A": changed}).linearize(reviewed.CRANE_T).loop("force")
+        return margins(loop).disk_margin.value
+
+    h = 1e-5 * abs(entry)
+    assert row.slope.value == pytest.approx((margin(h) - margin(-h)) / (2 * h), rel=1e-5)
+    assert not row.kink
+    assert "differences of the margin" in row.slope.confirmed_by
