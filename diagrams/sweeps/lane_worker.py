@@ -24,8 +24,10 @@ from .variation import Numbers
 
 DIFFER = "Side by side in vector lanes: values differ from those of single runs in their last digits."
 _MOST_SUBSTEPS = 10_000
-_BYTES, _TICKS = 2**20, 2**14
-"""Of the rows of a chunk, and ticks of one, at most: C keeps them in the processor's cache, Ctrl-C has its turn."""
+_BYTES = 2**20
+"""Of the rows of a chunk, at most: C keeps them in the processor's cache."""
+_FIRST, _WISHED = 64, 0.05
+"""Ticks of the first chunk, and seconds that one takes, half or double: Ctrl-C has its turn after it."""
 
 
 class LaneWorker(Worker):
@@ -143,7 +145,8 @@ class _Lanes:
             raise NoLanesError(f"the samples of {count} runs at a time would take {needed / 2**30:.0f} GiB")
         self._code: LaneCode = compile_lanes(flat, acting, count)
         width, every = max(1, len(self._columns)), bound.recorder.every
-        self._chunk = max(1, min(_TICKS, len(self._ticks), every * _BYTES // (8 * width * count)))
+        self._chunk = max(1, min(len(self._ticks), every * _BYTES // (8 * width * count)))
+        self._span = min(_FIRST, self._chunk)
         self._room = make_room(self._chunk // every + 1, width, count)
         self._stops = StopConditions(flat, engine.workspace.log, str)
 
@@ -180,13 +183,18 @@ class _Lanes:
             self._code, starts, columns=self._columns, every=bound.recorder.every, stops=self._stops.entries
         )
         kept = [[start.row[None]] for start in starts]
-        chunk, room = self._chunk, self._room
+        room = self._room
         k, total = 0, len(self._ticks)
         while k < total and runs.is_going:
-            end = min(k + chunk, total)
+            end, begun = min(k + self._span, total), perf_counter()
             rows = runs.run(self._times[k : end + 1], self._widths[k:end], self._kinds[k:end], room)
             for parts, lane in zip(kept, np.ascontiguousarray(room[:rows, :n].transpose(2, 0, 1)), strict=False):
                 parts.append(lane)
+            took = perf_counter() - begun
+            if took < _WISHED:
+                self._span = min(2 * self._span, self._chunk)
+            elif took > 2 * _WISHED:
+                self._span = max(1, self._span // 2)
             k = end
             tell(float(self._times[k]))
         for start, parts, end_of in zip(starts, kept, runs.ends(), strict=True):
