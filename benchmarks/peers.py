@@ -2,13 +2,15 @@
 
 A PI controller at 1 kHz around two lags, 10 s, each tool as its own documentation would write it, every tick recorded;
 then the lags as an FMU (FMI 3.0, co-simulation). A row has the processor time of a tick in µs, without set-up and
-without a compiler's work, and the largest difference from the exact trajectory, which matrix exponentials give. A tool
-that isn't installed has an empty row: pip install fmpy pathsim bdsim drake jaxonomy.
+without a compiler's work; its ratio to the first row, as the median of three turns, and the smallest and the largest
+one; and the largest difference from the exact trajectory, which matrix exponentials give. A tool that isn't installed
+has an empty row: pip install fmpy pathsim pathsim-fmi ecospy tbb bdsim drake jaxonomy.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import importlib.util
 import io
 import logging
@@ -260,6 +262,49 @@ def run_fmpy() -> Timed:
     return took / TICKS, found
 
 
+def run_ecospy() -> Timed:
+    """Ecos' simulation of a structure; a listener is the controller, which acts before each step.
+
+    Its library needs oneTBB: pip install tbb, which the loader finds by its name once it is loaded.
+    """
+    with contextlib.suppress(OSError):
+        ctypes.CDLL(str(Path(sys.prefix) / "lib" / "libtbb.so.12"), mode=ctypes.RTLD_GLOBAL)
+    from ecospy import EcosSimulation, EcosSimulationStructure, SimulationListener
+
+    class Controller(SimulationListener):
+        def __init__(self, simulation: EcosSimulation):
+            self.simulation, self.integral, self.found = simulation, 0.0, list[float]()
+
+        def pre(self, info: object) -> None:
+            y = self.simulation.get_real("plant::y")
+            self.found.append(y)
+            self.simulation.set_real("plant::u", KP * (1.0 - y) + self.integral)
+            self.integral += KI * T * (1.0 - y)
+
+    with EcosSimulationStructure() as structure:
+        structure.add_model("plant", _export())
+        with EcosSimulation(structure=structure, step_size=T) as simulation:
+            controller = Controller(simulation)
+            simulation.add_listener("controller", controller)
+            simulation.init()
+            started = time.process_time()
+            simulation.step(TICKS)
+            took = time.process_time() - started
+            controller.found.append(simulation.get_real("plant::y"))
+    return took / TICKS, np.array(controller.found)
+
+
+def run_pathsim_fmi() -> Timed:
+    """Pathsim's block of an FMU, and the controller of its row above; a tenth of the time.
+
+    The block puts out the end of a step at its beginning: its trajectory is shifted by a tick.
+    """
+    from pathsim_fmi import CoSimulationFMU
+
+    took, y = _pathsim(CoSimulationFMU(str(_export()), dt=T), TICKS // 10)
+    return took, np.concatenate([[0.0], y[:-1]])
+
+
 ROWS: dict[str, dict[str, tuple[str, Callable[[], Timed]]]] = {
     "two lags as blocks": {
         "Loopwright, compiled": ("loopwright", lambda: run_loopwright(compiled=True)),
@@ -274,8 +319,43 @@ ROWS: dict[str, dict[str, tuple[str, Callable[[], Timed]]]] = {
         "Loopwright, compiled": ("loopwright", lambda: run_loopwright_fmu(compiled=True)),
         "Loopwright, interpreted": ("loopwright", lambda: run_loopwright_fmu(compiled=False)),
         "FMPy, controller in Python": ("fmpy", run_fmpy),
+        "ecospy, controller in Python ": ("ecospy", run_ecospy),
+        "pathsim-fmi": ("pathsim_fmi", run_pathsim_fmi),
     },
 }
+
+
+TURNS = 3
+
+
+def measure(exact: np.ndarray, tools: dict[str, tuple[str, Callable[[], Timed]]]) -> None:
+    """Print the rows of some tools, which take turns; the first one is what the others are compared with."""
+    found: dict[str, list[float]] = {}
+    ends: dict[str, str] = {}
+    for _ in range(TURNS):
+        for name, (package, run) in tools.items():
+            if importlib.util.find_spec(package) is None:
+                ends[name] = "not installed"
+                continue
+            try:
+                with contextlib.redirect_stdout(io.StringIO()):
+                    took, y = run()
+            except Exception as error:  # a peer of another version: its row says so
+                if package == "loopwright":
+                    raise
+                ends[name] = f"{type(error).__name__}: {str(error).splitlines()[0][:60]}"
+                continue
+            found.setdefault(name, []).append(took * 1e6)
+            ends[name] = f"{np.abs(y - exact[: len(y)]).max():.1e}"
+    first = found[next(iter(tools))]
+    for name in tools:
+        times = found.get(name)
+        if times is None:
+            print(f"  {name:42}       –   {ends[name]}")
+            continue
+        ratios = np.divide(times, first)
+        spread = f"{ratios.min():7.1f} to {ratios.max():7.1f}"
+        print(f"  {name:42} {np.median(times):7.2f}  {np.median(ratios):8.1f}  {spread}   {ends[name]}")
 
 
 def main() -> None:
@@ -284,20 +364,8 @@ def main() -> None:
     logging.disable(logging.WARNING)
     exact = solve_exactly()
     for title, tools in ROWS.items():
-        print(f"{title:44} µs/tick   largest error")
-        for name, (package, run) in tools.items():
-            if importlib.util.find_spec(package) is None:
-                print(f"  {name:42}       –   not installed")
-                continue
-            try:
-                with contextlib.redirect_stdout(io.StringIO()):
-                    took, y = run()
-            except Exception as error:  # a peer of another version: its row says so
-                print(f"  {name:42}       –   {type(error).__name__}: {str(error).splitlines()[0][:60]}")
-                if package == "loopwright":
-                    raise
-                continue
-            print(f"  {name:42} {took * 1e6:7.2f}   {np.abs(y - exact[: len(y)]).max():.1e}")
+        print(f"{title:44} µs/tick  of the first  its spread          largest error")
+        measure(exact, tools)
 
 
 if __name__ == "__main__":
