@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
+
+from .no_lanes import NoLanesError
 
 _INFIX = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
 _COMPARED = {ca.OP_LT: "<", ca.OP_LE: "<=", ca.OP_EQ: "==", ca.OP_NE: "!="}
@@ -32,13 +34,10 @@ class VectorCode:
         ``NAME_prepare(arguments that are fixed, kept)`` and ``NAME(arguments, kept, results)``.
     kept : int
         Number of vectors that are computed from fixed arguments, once.
-    operations : int
-        Number of operations.
     """
 
     text: str
     kept: int
-    operations: int
 
 
 @dataclass
@@ -52,7 +51,6 @@ class _Value:
     uses: int = 0
     place: int | None = None
     constant: float | None = None
-    negated: str | None = field(default=None)
 
 
 def write_vectors(name: str, function: Any, arguments: Sequence[str], fixed: Collection[int]) -> VectorCode:
@@ -72,6 +70,11 @@ def write_vectors(name: str, function: Any, arguments: Sequence[str], fixed: Col
         Names of its arguments in C; each is an array of vectors.
     fixed : collection of int
         Arguments that don't change in a run: what they determine is computed once.
+
+    Raises
+    ------
+    NoLanesError
+        For an operation that has no form over vectors.
     """
     writer = _Writer(function, arguments, fixed)
     writer.write()
@@ -81,7 +84,7 @@ def write_vectors(name: str, function: Any, arguments: Sequence[str], fixed: Col
     head = f"static void {name}_prepare({given}vec *restrict kept) {{\n"
     body = f"static inline __attribute__((always_inline)) void {name}({all_given}const vec *restrict kept, {made}) {{\n"
     text = f"{head}{''.join(writer.early)}}}\n\n{body}{''.join(writer.late)}}}\n"
-    return VectorCode(text, writer.kept, function.n_instructions())
+    return VectorCode(text, writer.kept)
 
 
 class _Writer:
@@ -151,7 +154,7 @@ class _Writer:
             return self._new(f"-{x}", fixed)
         if op in _CALLS:
             return self._new(f"vec_{_CALLS[op]}({', '.join([x, *others])})", fixed)
-        raise NotImplementedError(f"operation {op}")
+        raise NoLanesError("it has an operation that has no form over vectors")
 
     def _new(self, text: str, fixed: bool, *, mask: bool = False, product: bool = False) -> _Value:
         if product:  # written where it is used

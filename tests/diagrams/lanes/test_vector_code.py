@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from loopwright.diagrams.compiled import load_compiled
+from loopwright.diagrams.lanes import NoLanesError
 from loopwright.diagrams.lanes.lane_code import FLAGS, read_source
 from loopwright.diagrams.lanes.vector_code import write_vectors
 from loopwright.fmus.export import processor_flags
@@ -162,3 +163,9 @@ def test_a_lane_depends_on_no_other_and_not_on_their_number(four):
     assert together[:, others].tobytes() == beside[:, others].tobytes()
     halves = [four.evaluate([column[:, k : k + 4] for column in columns])[0] for k in (0, 4)]
     assert beside.tobytes() == np.concatenate(halves, axis=1).tobytes()
+
+
+def test_an_operation_without_a_form_over_vectors_is_refused():
+    x = ca.SX.sym("x")
+    with pytest.raises(NoLanesError, match="no form over vectors"):
+        write_vectors("f", ca.Function("f", [x], [ca.erfinv(x)]), ("x",), ())
