@@ -80,6 +80,8 @@ class SecondProcess(Generic[T]):
     def share(self, keys: Sequence[str], make: Callable[[str], T], tell: Callable[[str], None]) -> list[T]:
         """Return the parts of all keys: from the first one on made here, from the last one on in the second process.
 
+        The first one is always made here.
+
         Parameters
         ----------
         keys : sequence of str
@@ -89,14 +91,16 @@ class SecondProcess(Generic[T]):
         tell : callable
             Told what the second process tells, by this thread.
         """
-        self._left = deque(keys)
+        self._left = deque(keys[1:])
         if self._process is not None:
             self._thread = threading.Thread(target=self._go, daemon=True)
             self._thread.start()
         found: dict[str, T] = {}
-        while (key := self._take(first=True)) is not None:
+        key = keys[0] if keys else None
+        while key is not None:
             self._pass_on(tell)
             found[key] = make(key)
+            key = self._take(first=True)
         while self._thread is not None and self._thread.is_alive():
             self._thread.join(PAUSE)
             self._pass_on(tell)
