@@ -218,6 +218,17 @@ class Fig3Case(Case):
 
     def excitation(self, variant: Variant, wire: str) -> InjectionPlan:
         """Return the test signal, for a variant whose references are held, so that it stays where it is."""
+        if variant not in self._held:
+            self._held[variant] = self._hold_references(variant)
+        plan = InjectionPlan(self._held[variant], FREQUENCIES, AMPLITUDE)
+        asked_outside = bool(variant.diagram.flatten_like(variant.point).outside)
+        return plan.shortened(OUTSIDE) if asked_outside else plan
+
+    @cached_property
+    def _held(self) -> WeakKeyDictionary[Variant, Variant]:
+        return WeakKeyDictionary()
+
+    def _hold_references(self, variant: Variant) -> Variant:
         changes: dict[str, Any] = {
             path: Constant(value=0.0, unit=block.unit, name=path)
             for path, block in variant.diagram.blocks.items()
@@ -226,9 +237,7 @@ class Fig3Case(Case):
         for name in REFERENCES:
             if f"{name}.y" in variant.point.values:
                 changes[name] = Reference(float(np.ravel(variant.point.values[f"{name}.y"])[0]), unit="m", name=name)
-        plan = InjectionPlan(variant.with_parameters(changes), FREQUENCIES, AMPLITUDE)
-        asked_outside = bool(variant.diagram.flatten_like(variant.point).outside)
-        return plan.shortened(OUTSIDE) if asked_outside else plan
+        return variant.with_parameters(changes)
 
     @cached_property
     def _elsewhere(self) -> WeakKeyDictionary[Variant, dict[tuple[float, float], Variant | None]]:
