@@ -25,10 +25,9 @@ from .code import (
     master_source,
     rename,
 )
+from .hybrid_code import FUSING
 from .reordered import reorder
 
-_FLAGS = ("-finline-functions", "-freciprocal-math", "-fno-vectorize", "-fno-slp-vectorize")
-# A parameter's inverse is computed once. Vectors of two or four values cost more shuffling than they save.
 _LIMIT = "0x1p20"  # LW_FAST_LIMIT
 _MANY = 16  # kinds of ticks that are written twice
 _CASADI = re.compile(r"\b(_?(?:casadi|CASADI)_)")
@@ -84,7 +83,7 @@ def _compile(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], plants
     straight = bool(found) and all(function.is_a("SXFunction") for function in found.values())
     functions = {clocks: rename(f, f"tick{i}") for i, (clocks, f) in enumerate(found.items())} if straight else {}
     text = "\n".join([_write_ticks([*functions.values()]), models, steps, master_source()])
-    library = load_compiled(text, (*processor_flags(), *_FLAGS), describe_processor())
+    library = load_compiled(text, (*processor_flags(), *FUSING), describe_processor())
     master = library[MASTER]
     master.restype = None
     notes = tuple(f"Fused: the equations of {path} stand in the loop, compiled with the ticks." for path in inside)

@@ -12,6 +12,7 @@ from weakref import WeakKeyDictionary
 import casadi as ca
 import numpy as np
 
+from ...fmus.export import describe_processor, processor_flags
 from ..flat import NONE, FlatDiagram, TickPattern
 from .code import (
     GroupedTick,
@@ -35,6 +36,8 @@ from .small_steps import STEPS, write_steps
 _SOURCES = ("newton.c", "master.c", "problem.c", "methods.c", "radau.c", "events.c", "instants.c", "hybrid.c")
 
 _FLAGS = ("-fno-unroll-loops",)  # vectors are short: a third less for the compiler
+FUSING = ("-finline-functions", "-freciprocal-math", "-fno-tree-vectorize", "-fno-tree-slp-vectorize")
+"""Flags of fused code: a parameter's inverse is computed once; vectors of few values cost more than they save."""
 _GROUPED = ("grouped", "grouped_part", "grouped_differences")
 
 EMBEDDED = ("euler", "heun", "rk4", "RK23", "RK45", "DOP853", "Radau", "auto")
@@ -98,8 +101,13 @@ class HybridSources:
     texts: Sequence[str]
     make: Callable[[Sequence[ctypes.CDLL]], HybridCode]
 
-    def load(self) -> HybridCode:
+    def load(self, *, fuse: bool = False) -> HybridCode:
         """Return the code; libraries that the cache lacks are compiled.
+
+        Parameters
+        ----------
+        fuse : bool, default False
+            Compile it for the processor of this machine, with products and sums fused.
 
         Raises
         ------
@@ -108,7 +116,8 @@ class HybridSources:
         FmuError
             If the cache can't be written.
         """
-        libraries = [load_compiled(text) for text in self.texts]
+        more = ((*processor_flags(), *FUSING), describe_processor()) if fuse else ()
+        libraries = [load_compiled(text, *more) for text in self.texts]
         hybrid_master()  # if it can't be compiled, the run is interpreted
         return self.make(libraries)
 
@@ -138,7 +147,9 @@ def find_hybrid_obstacle(flat: FlatDiagram, solver: str) -> str | None:
     return None
 
 
-def compile_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridCode:
+def compile_hybrid(
+    flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, stiff: bool, fuse: bool = False
+) -> HybridCode:
     """Compile the functions of a diagram with continuous states.
 
     Parameters
@@ -147,6 +158,8 @@ def compile_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], 
         Sets of clocks that act together at some tick.
     stiff : bool
         Whether the derivative of the rates is needed, too.
+    fuse : bool, default False
+        See `HybridSources.load`.
 
     Raises
     ------
@@ -157,9 +170,9 @@ def compile_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], 
     """
     kinds = (NONE, *(clocks for clocks in acting if clocks))
     known = _COMPILED.setdefault(flat.origin, {})
-    if (kinds, stiff) not in known:
-        known[kinds, stiff] = write_hybrid(flat.origin, acting, stiff=stiff).load()
-    return known[kinds, stiff]
+    if (kinds, stiff, fuse) not in known:
+        known[kinds, stiff, fuse] = write_hybrid(flat.origin, acting, stiff=stiff).load(fuse=fuse)
+    return known[kinds, stiff, fuse]
 
 
 def write_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridSources:

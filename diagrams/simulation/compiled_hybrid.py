@@ -69,6 +69,8 @@ class HybridTicks:
         Entries of the log that end the run where they are true.
     every : bool
         Visit every tick, not only those at which something acts.
+    fuse : bool, default False
+        Compile for the processor of this machine.
 
     Raises
     ------
@@ -85,13 +87,14 @@ class HybridTicks:
         stops: Sequence[int],
         *,
         every: bool,
+        fuse: bool = False,
     ):
         flat = self._flat = workspace.flat
         self._workspace, self._continuous, self._plants, self._steps = workspace, continuous, plants, steps
         self._stops = stops
         self._methods = methods_of(continuous)
         stiff = any(method.name == "Radau" for method in self._methods)
-        self._code = compile_hybrid(flat, kinds_of(flat, every=every), stiff=stiff)
+        self._code = compile_hybrid(flat, kinds_of(flat, every=every), stiff=stiff, fuse=fuse)
         self._clocks = flat.visited if plants else flat.distinct
         self._sampled = every or not self._clocks or EVERY in self._clocks
         lands = continuous.fixed or bool(plants) or continuous.lands
@@ -344,6 +347,7 @@ def make_hybrid(
     every: bool,
     regular: bool,
     asked: bool = True,
+    fuse: bool = False,
 ) -> tuple[HybridTicks | None, tuple[str, ...]]:
     """Return the ticks of a run with continuous states in C, None where they can't be had, and messages about them.
 
@@ -353,6 +357,8 @@ def make_hybrid(
         Whether every plant steps once from each tick to the next.
     asked : bool
         Whether the user asks for C, by ``compile=True``; else a compiler that fails is told once, and nothing else.
+    fuse : bool, default False
+        Compile them for the processor of this machine.
     """
     native = {
         path: plant for path, plant in plants.items() if isinstance(plant, FmuInstance) and plant.native is not None
@@ -361,7 +367,7 @@ def make_hybrid(
     reason = reason or find_obstacle_at_ticks(workspace.flat, plants, native, regular=regular)
     if reason is None:
         try:
-            found = HybridTicks(workspace, continuous, native, steps, stops, every=every)
+            found = HybridTicks(workspace, continuous, native, steps, stops, every=every, fuse=fuse)
         except (LoopwrightError, OSError) as error:
             if not asked:
                 return None, tell_failure_once(error)
@@ -373,7 +379,8 @@ def make_hybrid(
                 f"Compiled: {found.solver} runs in C as solver={continuous.solver.name!r}, by the same rules as "
                 "interpreted; values differ from those of an interpreted run by rounding and within the tolerances."
             )
-            return found, (told,) if continuous.where.size and asked else ()
+            fused = "Fused: ticks and rates are compiled for this processor; values differ in their last digits."
+            return found, (*((told,) if continuous.where.size and asked else ()), *((fused,) if fuse else ()))
     if not asked:
         return None, ()
     return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)

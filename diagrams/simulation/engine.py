@@ -203,7 +203,7 @@ class Engine:
         assert self.continuous is not None
         ticks, message = make_hybrid(
             self.workspace, self.continuous, self.plants, self.steps, self._stops.entries, every=self.every_tick,
-            regular=self.steps.regular and self.coupled is None, asked=self._compile is True,
+            regular=self.steps.regular and self.coupled is None, asked=self._compile is True, fuse=self._fuse,
         )  # fmt: skip
         self.messages += message
         return ticks

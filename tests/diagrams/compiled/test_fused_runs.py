@@ -1,10 +1,12 @@
 """Fused runs: ticks and plants in one unit, for this machine's processor. Their bound is stated, and their words remain."""
 
+import shutil
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import Clock, FmuRuntimeError, Gain, Sine
+from loopwright.blocks import Clock, FmuRuntimeError, Gain, Sine, TransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.compiled.reordered import reorder
 from loopwright.fmus import Fmu, dc_motor, gantry_contact
@@ -114,6 +116,34 @@ def test_an_fmu_with_derivatives_as_ports_or_another_integrator_keeps_its_own_st
     plain, fused = made.simulate(0.05, compile=True, **QUIET), made.simulate(0.05, fuse=True, **QUIET)
     assert inside(fused) == []
     assert fused.tier == "compiled"
+    assert differ(plain, fused) < BOUND
+
+
+@pytest.mark.parametrize("solver", ["rk4", "RK45"])
+def test_continuous_states_stay_within_the_bound_and_as_near_to_the_exact_ones(solver):
+    @subsystem(sample_time=0.01, name="controller")
+    def controller(y):
+        return 2.0 * (1.0 - y)
+
+    lag = TransferFunction(numerator=1.0, denominator=[0.05, 1.0], name="lag")
+    made = Diagram("loop", lag(controller(lag.y)))
+    options = {"solver": solver, "rtol": 1e-10, "atol": 1e-12, **QUIET}
+    plain, fused = made.simulate(1.0, compile=True, **options), made.simulate(1.0, fuse=True, **options)
+    assert differ(plain, fused) < BOUND
+    assert any("rates are compiled for this processor" in message for message in fused.messages)
+    y, decay = 0.0, np.exp(-0.2)
+    for value in fused["lag.y"]:
+        assert value == pytest.approx(y, abs=1e-5 if solver == "rk4" else 1e-9)  # rk4: (0.2)^5/120 of a step
+        y = decay * y + (1.0 - decay) * 2.0 * (1.0 - y)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+def test_gcc_fuses_too(monkeypatch):
+    monkeypatch.setenv("LOOPWRIGHT_CC", "gcc")
+    diagram = experiments.hand_guiding().diagram
+    plain, fused = diagram.simulate(0.5, compile=False, **QUIET), diagram.simulate(0.5, fuse=True, **QUIET)
+    assert inside(fused) == ["plant"]
     assert differ(plain, fused) < BOUND
 
 
