@@ -166,7 +166,7 @@ class HybridChange:
 
         def tell(t: float, fires: bool) -> bool:
             self._work += self._step + (_EVENT if fires else 0.0)
-            if self._work < _PATIENCE_OF_WORK or not self._possible or self.ticks is not None:
+            if self._work < _PATIENCE_OF_WORK or t >= end or not self._possible or self.ticks is not None:
                 return False
             rest = (self._work - before) * (end - t) / (t - first)
             if max(self._work, rest) < self._limit or not self._begin(last):

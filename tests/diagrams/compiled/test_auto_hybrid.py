@@ -157,3 +157,24 @@ def _fail(*_):
     from loopwright.blocks.core import CompilerError
 
     raise CompilerError("no such compiler.")
+
+
+def test_samples_of_a_sweep_have_the_bits_of_single_runs_whatever_ran_before(little):
+    made, gains = thermostat(), [1.0, 0.8, 1.2]
+    options = {"step": 0.05, "compile": "auto", **QUIET}
+    found = made.sweep({"room.numerator": gains}, duration=8.0, signals=["room.y"], workers=1, **options)
+    for i, gain in enumerate(gains):
+        single = made.replace({"room.numerator": gain}).simulate(8.0, **options)
+        assert single.tier == "both"
+        assert np.array_equal(found["room.y"][i], single["room.y"])
+
+
+def test_an_end_between_two_ticks_is_reached_though_much_work_comes_before_it(little, monkeypatch):
+    monkeypatch.setattr(change_over, "_STEP", 0.0)
+    monkeypatch.setattr(change_over, "_OPERATION", 0.0)
+    monkeypatch.setattr(change_over, "_SAMPLE", 0.0)
+    monkeypatch.setattr(change_over, "_EVENT", 1.0)
+    run = thermostat().simulate(0.9, step=0.75, **QUIET)  # the first event is at 0.7985 s
+    assert run.stopped is None
+    assert run.t.tolist() == [0.0, 0.75, 0.9]
+    assert len(run.events) == 1
