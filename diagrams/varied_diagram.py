@@ -178,7 +178,7 @@ class VariedDiagram(SimulatedDiagram):
             Ranges by path; values of each for a grid; None where ``samples`` is a table.
         loop : str or list of str
             Wire that the loop is cut at; with requirements several wires, each a loop of its own. Without them several
-            wires are one loop, cut at all at once, with a disk margin.
+            wires are one loop, cut at all at once, with a disk margin. Requirements need none where they name loops.
         quantity : str or callable, optional
             The number, ``"disk_margin"`` without it: one of those that `Requirements` can limit. Or a function from a
             diagram to a number, the smaller, the worse, without a loop; its search takes differences.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -92,15 +93,36 @@ def find_reported(
     at: Any,
     stairs: str | None,
     tell: Callable[[str], None],
+    wires: Mapping[str, str],
 ) -> ReportedWorstCase:
     """Return the worst case of a report: one that was found, or one that a file asks for, with its run."""
     if isinstance(given, WorstCaseTask):
         options = {} if stairs is None else {"stairs": stairs}
-        given = given.find(diagram, requirements, at=at, progress=lambda line: tell(f"{KEY}: {line}"), **options)
+        asked = None if requirements is None else _name_wires(requirements, wires, given.loops)
+        given = given.find(diagram, asked, at=at, progress=lambda line: tell(f"{KEY}: {line}"), **options)
     try:
         return ReportedWorstCase(given, given.confirm())
     except LoopwrightError as error:
         return ReportedWorstCase(given, problem=error.message)
+
+
+def _name_wires(requirements: Requirements, wires: Mapping[str, str], loops: tuple[str, ...]) -> Requirements:
+    """Return requirements whose loops are named by wires, as a worst case names them, and not by keys of the report.
+
+    Parameters
+    ----------
+    requirements : Requirements
+        The requirements.
+    wires : mapping of str to str
+        Wires of the report's loops by their keys.
+    loops : tuple of str
+        Names of wires, or unique ends of them, that the worst case is looked for at; those of the report without any.
+    """
+    short = {wire: next((w for w in loops if wire == w or wire.endswith(f".{w}")), wire) for wire in wires.values()}
+    names = {name: short[wire] for key, wire in wires.items() for name in (key, wire)}
+    made = copy(requirements)
+    made.loops = {names.get(name, name): limits for name, limits in requirements.loops.items()}
+    return made
 
 
 @dataclass(frozen=True)
@@ -186,6 +208,8 @@ def worst_case_of(reported: ReportedWorstCase) -> Section:
     facts = {"corners": CaseOrigin.CORNER in origins, "searched": CaseOrigin.SEARCH in origins}
     counts = {"cases": len(found.cases), "unstable": len(found.unstable), "failed": len(found.failures)}
     text = [TEXTS.line("worst", **counts, **facts)]
+    if found.goal.left_out:
+        text.append(TEXTS.line("not_looked_at", names=found.goal.left_out))
     confirmed = run.trial if run is not None and run.agrees else ""
     if run is None:
         text.append(TEXTS.line("left_out", wire=", ".join(worst.loop) or "worst case", message=reported.problem))

@@ -171,7 +171,7 @@ def make_goal(
             )
         return Goal({tuple(wires): {quantity: None}})
     found: dict[tuple[str, ...], Mapping[str, Limit | None]] = {}
-    for wire in dict.fromkeys([*wires, *requirements.loops]):
+    for wire in dict.fromkeys(wires or requirements.loops):
         limits = requirements.limits_of([wire], "")
         if limits:
             found[wire,] = dict(limits)
@@ -184,6 +184,7 @@ def make_goal(
         )
     steps = [requirements.step, *requirements.steps, *(of.step for of in requirements.loops.values())]
     left_out = [f"step.{name}" for step in steps if step is not None for name in step.limits]
+    left_out += [f"loops.{name}" for name in requirements.loops if wires and name not in wires]
     left_out += [f"numbers.{path}" for path in requirements.numbers]
     left_out += ["contact"] if requirements.contacts else []
     return Goal(found, tuple(dict.fromkeys(left_out)))

@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from loopwright.blocks import OptionError
+from loopwright.blocks import Gain, Integrator, OptionError
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.cli.command_line import main
 from loopwright.diagrams.report import analyse
 from loopwright.diagrams.requirements import Reason, Verdict, read_requirements
@@ -98,6 +99,22 @@ def test_requirements_of_the_file_are_made_worst_and_judged(tmp_path):
     assert mine["continuous", "phase_margin_deg"].verdict is Verdict.PASSED
     assert report.review.verdict is Verdict.FAILED
     assert report.numbers()["worst_case.worst.phase_margin_deg"].value == pytest.approx(margins[0.5], rel=1e-9)
+
+
+def test_limits_of_a_loop_hold_by_its_key_in_the_report_too(tmp_path):
+    """The wire controller.u has the key u in the report, and the file names the loop by its key."""
+    lag = Integrator(name="lag")
+
+    @subsystem(sample_time=0.01)
+    def controller(y):
+        return Gain(gain=3.0, name="gain")(0.0 - y).named("u")
+
+    text = '[loops.u]\nms = 1.01\n[worst_case]\nloop = "controller.u"\nsamples = "grid"\nstarts = 0\n'
+    file = write(tmp_path, f"{text}[worst_case.ranges]\ngain.gain = [1.0, 6.0]")
+    report = analyse(Diagram("loop", lag(controller(lag.y))), requirements=file, only=("inner",))
+    (searched,) = [r for r in report.review.results if r.variant == "worst_case"]
+    assert (searched.quantity, searched.verdict) == ("ms", Verdict.FAILED)
+    assert searched.number.value == pytest.approx(2 / (2 - 0.06), rel=1e-6)  # L(z) = 0.06/(z − 1), S at z = −1
 
 
 def test_limits_that_an_unstable_case_breaks_fail(tmp_path):
