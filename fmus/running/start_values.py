@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -84,6 +85,8 @@ def check_value(description: FmuDescription, name: str, value: Any, label: str) 
             block=label,
             port=port,
         )
+    if type(value) is float and _is_plainly_within(variable, value):
+        return np.array(value)
     numbers = _number_items(variable, value)
     if isinstance(numbers, str | bytes) or np.asarray(numbers).dtype.kind in "US":
         raise _refuse_words(variable, value, label)
@@ -108,6 +111,14 @@ def check_value(description: FmuDescription, name: str, value: Any, label: str) 
     if np.any((array < low) | (array > high)):
         raise ParameterError(f"found {value!r}; the FMU allows {variable.range_text}.", block=label, port=port)
     return array
+
+
+def _is_plainly_within(variable: FmuVariable, value: float) -> bool:
+    """Whether a number is one of a Float64 scalar within its range; sweeps ask for thousands of them."""
+    if variable.type != "Float64" or variable.shape or not isfinite(value):
+        return False
+    low, high = variable.minimum, variable.maximum
+    return (low is None or bool(value >= low)) and (high is None or bool(value <= high))
 
 
 def _check_text(description: FmuDescription, name: str, value: Any, label: str) -> Any:
