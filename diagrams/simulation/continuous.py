@@ -79,7 +79,7 @@ class Continuous(Trials, Memory):
         self._loops = flat.active_loops(NOTHING)
         self._opaque = any(flat.table.blocks[path].opaque for path in flat.checked.traced)
         self.delays = delays_of(flat)
-        self._flow, self._jacobian = workspace.flow(), None
+        self._jacobian = None
         problem = Problem(self.where.size, self._rate, self._slope, flat.continuous_labels)
         self.time_scale = time_scale_of(flat)
         shortest = math.inf if self.delays is None else self.delays.shortest

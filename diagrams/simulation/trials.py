@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import cached_property
 
 import numpy as np
 
@@ -28,7 +29,6 @@ class Trials:
     """Last time before it."""
     late: Mapping[float, float]
     _loops: list[int]
-    _flow: Callable[[float, np.ndarray], np.ndarray]
     _jacobian: Callable[[float, np.ndarray], np.ndarray] | None
     _indicators: Callable[[float, np.ndarray], np.ndarray]
     _opened: np.ndarray
@@ -38,6 +38,11 @@ class Trials:
     """A zero for each rate."""
     _beyond: tuple[float, np.ndarray] | None
     """The last trial of the solver at which a rate was not finite."""
+
+    @cached_property
+    def _flow(self) -> Callable[[float, np.ndarray], np.ndarray]:
+        """The rates at a trial; a run in C seldom asks for them, and those of a large diagram take seconds to trace."""
+        return self.workspace.flow()
 
     def _time(self, t: float) -> float:
         t = self._left if t >= self._edge else self.late.get(t, t)

@@ -149,3 +149,12 @@ def test_the_output_that_an_open_subsystem_will_hold_is_recorded(form, mode, sol
     held = made.flatten(0.05).held.slices["box.inner.y"].start
     found = np.array([run.at(t).state[held] for t in run.t])
     assert found == pytest.approx(np.clip(run.t - 0.25, 0.0, 0.5), abs=1e-9)
+
+
+def test_the_rates_of_a_grouped_run_are_not_traced_as_a_whole(grouped):
+    """Tracing takes seconds with 10,000 blocks, and only Python's solver would ask for them."""
+    made, _ = ring(6)
+    with made.simulation(step=0.05, solver="rk4", compile=True) as simulation:
+        simulation.advance(1.0)
+        assert "flow" not in vars(simulation.flat)
+        assert simulation.run().tier == "compiled"
