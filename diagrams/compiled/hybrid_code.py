@@ -35,7 +35,7 @@ from .small_steps import STEPS, write_steps
 
 _SOURCES = ("newton.c", "master.c", "problem.c", "methods.c", "radau.c", "events.c", "instants.c", "hybrid.c")
 
-_FLAGS = ("-fno-unroll-loops",)  # vectors are short: a third less for the compiler
+_FLAGS = ("-fno-unroll-loops",)  # vectors are short: a sixth less for the compiler
 FUSING = ("-finline-functions", "-freciprocal-math", "-fno-tree-vectorize", "-fno-tree-slp-vectorize")
 """Flags of fused code: a parameter's inverse is computed once; vectors of few values cost more than they save."""
 _GROUPED = ("grouped", "grouped_part", "grouped_differences")
