@@ -9,7 +9,7 @@ import numpy as np
 
 from ...blocks.core import with_unit
 from ..report import look_of
-from ..report_figures import level_text, set_powers
+from ..report_figures import fill_growth, set_powers, tint
 from ..report_writing import Plot, Texts
 from ..results import DARK, VERMILION, legend_above, new_figure, style
 
@@ -51,8 +51,8 @@ def draw_admittances(
             bottom.semilogx(w, np.degrees(np.angle(Y)), **look)
         for y in (-90, 90):
             bottom.axhline(y, color=DARK, linewidth=0.6)
-        bottom.axhspan(90, 180, color=VERMILION, alpha=0.07, linewidth=0)
-        bottom.axhspan(-180, -90, color=VERMILION, alpha=0.07, linewidth=0)
+        bottom.axhspan(90, 180, color=tint(VERMILION, 0.07), linewidth=0, zorder=0)
+        bottom.axhspan(-180, -90, color=tint(VERMILION, 0.07), linewidth=0, zorder=0)
         bottom.set_ylim(-180, 180)
         bottom.set_yticks([-180, -90, 0, 90, 180])
         top.set_ylabel(with_unit("|Y|", "m/(N.s)"))
@@ -94,29 +94,8 @@ def draw_stability(
     with style():
         figure = new_figure(2.9)
         ax = figure.subplots()
-        levels = [-100, -10, -1, -0.1, 0, 0.1, 1, 10, 100, 1000]
-        from matplotlib.colors import SymLogNorm
-
-        growth = np.clip(growth, -99.9, 999.0)
-        filled = ax.contourf(
-            k,
-            b,
-            growth,
-            levels=levels,
-            cmap="RdBu_r",
-            alpha=0.55,
-            norm=SymLogNorm(linthresh=0.1, vmin=-1000, vmax=1000),
-        )
+        fill_growth(ax, k, b, growth, least=-100.0)
         for name, (title, x) in lines.items():
             ax.plot(x, b, label=title, **(DOTTED if name == RULE else looks.get(name, {})))
-        ax.set_xscale("log")
-        ax.set_yscale("log")
-        ax.set_xlim(k[0], k[-1])
-        ax.set_ylim(b[0], b[-1])
-        set_powers(ax.xaxis, ax.get_xlim(), 9)
-        set_powers(ax.yaxis, ax.get_ylim(), 6)
-        ax.set_xlabel(with_unit("stiffness kₑ of the environment", "N/m"))
-        ax.set_ylabel(with_unit("damping bₑ", "N.s/m"))
-        figure.colorbar(filled, ax=ax, label=with_unit("growth rate σ", "1/s"), ticks=levels, format=level_text)
         legend_above(figure, ax)
     return Plot(key, TEXTS.line("map", along=along), figure)

@@ -1,7 +1,7 @@
 """Figures of a design report, drawn without pyplot."""
 
 from .axes import AxisUnits, set_powers
-from .contact_figures import contact_admittance, contact_map, level_text
+from .contact_figures import contact_admittance, contact_map, fill_growth, tint
 from .drawings import with_drawing
 from .loop_figures import DrawnLoops, bode, gang, nyquist, response, sensitivities
 from .measured_figures import Measured, injected, measured
@@ -15,9 +15,9 @@ __all__ = [
     "bode",
     "contact_admittance",
     "contact_map",
+    "fill_growth",
     "gang",
     "injected",
-    "level_text",
     "measured",
     "nyquist",
     "response",
@@ -25,5 +25,6 @@ __all__ = [
     "sensitivity_bars",
     "set_powers",
     "step_responses",
+    "tint",
     "with_drawing",
 ]

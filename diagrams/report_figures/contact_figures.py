@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
 from ...blocks.core import with_unit
 from ..report_writing import Plot, Texts
 from ..results import BLUE, DARK, VERMILION, legend_above, new_figure, style
+from .axes import set_frequencies, set_powers
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 TEXTS = Texts(__package__, "figures")
 
@@ -32,32 +39,56 @@ def contact_admittance(
         for y in (-90, 90):
             bottom.axhline(y, color=DARK, linewidth=0.6)
         for low in (90, -180):
-            bottom.axhspan(low, low + 90, color=VERMILION, alpha=0.07, linewidth=0)
+            bottom.axhspan(low, low + 90, color=tint(VERMILION, 0.07), linewidth=0, zorder=0)
         bottom.set_ylim(-180, 180)
         bottom.set_yticks([-180, -90, 0, 90, 180])
         top.set_ylabel(with_unit("|Y|", "m/(N.s)"))
         bottom.set_ylabel(with_unit("phase of Y", "deg"))
         bottom.set_xlabel(with_unit("ω", "rad/s"))
+        set_frequencies(bottom, 9)
+        set_powers(top.yaxis, top.get_ylim(), 6)
         legend_above(figure, top)
     return Plot(key, TEXTS.line("contact_admittance", name=name, filtered=target is not None), figure)
 
 
-def contact_map(key: str, name: str, k: np.ndarray, b: np.ndarray, growth: np.ndarray) -> Plot:
-    """Draw growth rates in 1/s over stiffness in N/m and damping in N·s/m, with the limit as a line."""
+LEVELS = (-1000.0, -100.0, -10.0, -1.0, -0.1, 0.0, 0.1, 1.0, 10.0, 100.0, 1000.0)
+"""Growth rates in 1/s between which a map of stability has one color."""
+
+
+def tint(color: Any, share: float) -> tuple[float, ...]:
+    """Return a color so far from white; opacity would make a group of its own in a PDF, whose edges show."""
+    from matplotlib.colors import to_rgb
+
+    return tuple(1.0 - share * (1.0 - c) for c in to_rgb(color))
+
+
+def fill_growth(ax: Axes, k: np.ndarray, b: np.ndarray, growth: np.ndarray, least: float = LEVELS[0]) -> None:
+    """Fill a map of growth rates in 1/s over stiffness in N/m and damping in N·s/m, with its axes and a color bar."""
+    from matplotlib import colormaps
     from matplotlib.colors import SymLogNorm
 
-    levels = [-1000, -100, -10, -1, -0.1, 0, 0.1, 1, 10, 100, 1000]
+    levels = [level for level in LEVELS if level >= least]
+    norm, colors = SymLogNorm(linthresh=0.1, vmin=LEVELS[0], vmax=LEVELS[-1]), colormaps["RdBu_r"]
+    between = [tint(colors(float(norm(0.5 * (low + high)))), 0.55) for low, high in pairwise(levels)]
+    filled = ax.contourf(k, b, np.clip(growth, 0.999 * least, 0.999 * LEVELS[-1]), levels=levels, colors=between)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlim(k[0], k[-1])
+    ax.set_ylim(b[0], b[-1])
+    set_powers(ax.xaxis, ax.get_xlim(), 9)
+    set_powers(ax.yaxis, ax.get_ylim(), 6)
+    ax.set_xlabel(with_unit("stiffness kₑ of the environment", "N/m"))
+    ax.set_ylabel(with_unit("damping bₑ", "N.s/m"))
+    figure: Any = ax.figure
+    figure.colorbar(filled, ax=ax, label=with_unit("growth rate σ", "1/s"), ticks=levels, format=level_text)
+
+
+def contact_map(key: str, name: str, k: np.ndarray, b: np.ndarray, growth: np.ndarray) -> Plot:
+    """Draw growth rates in 1/s over stiffness in N/m and damping in N·s/m, with the limit as a line."""
     with style():
         figure = new_figure(2.9)
         ax = figure.subplots()
-        shown = np.clip(growth, -999.0, 999.0)
-        norm = SymLogNorm(linthresh=0.1, vmin=-1000, vmax=1000)
-        filled = ax.contourf(k, b, shown, levels=levels, cmap="RdBu_r", alpha=0.55, norm=norm)
-        if np.min(shown) < 0.0 < np.max(shown):
-            ax.contour(k, b, shown, levels=[0.0], colors=[DARK], linewidths=1.6)
-        ax.set_xscale("log")
-        ax.set_yscale("log")
-        ax.set_xlabel(with_unit("stiffness kₑ of the environment", "N/m"))
-        ax.set_ylabel(with_unit("damping bₑ", "N.s/m"))
-        figure.colorbar(filled, ax=ax, label=with_unit("growth rate σ", "1/s"), ticks=levels, format=level_text)
+        fill_growth(ax, k, b, growth)
+        if np.min(growth) < 0.0 < np.max(growth):
+            ax.contour(k, b, np.clip(growth, -999.0, 999.0), levels=[0.0], colors=[DARK], linewidths=1.6)
     return Plot(key, TEXTS.line("contact_map", name=name), figure)

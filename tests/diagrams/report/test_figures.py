@@ -1,5 +1,6 @@
 """Figures and tables of a report: one color for a variant, resonances in full, ticks apart, no empty columns."""
 
+import re
 from itertools import pairwise
 
 import numpy as np
@@ -9,7 +10,7 @@ from loopwright.blocks import Constant, Gain, Integrator, StateSpace, TransferFu
 from loopwright.diagrams import Diagram, Number, Report, Section, Table, Verdict, analyse
 from loopwright.diagrams.report.case import Case
 from loopwright.diagrams.report.gang import gang_of_four
-from loopwright.diagrams.report_figures import AxisUnits, Measured, measured
+from loopwright.diagrams.report_figures import AxisUnits, Measured, contact_admittance, contact_map, measured
 from loopwright.diagrams.report_figures.loop_figures import DrawnLoops, bode, nyquist
 from loopwright.diagrams.report_writing import Judged
 from loopwright.diagrams.report_writing.definitions import definition
@@ -211,3 +212,16 @@ def test_every_number_has_a_definition_and_a_confirmation(name):
     for path, number in report.numbers().items():
         assert definition(path) is not None, path
         assert number.given or number.confirmed_by.strip(), path
+
+
+def test_maps_and_admittances_have_no_transparent_faces_whose_edges_a_pdf_shows():
+    k, b = np.geomspace(10.0, 1e5, 30), np.geomspace(0.1, 7.0, 20)
+    stable = np.log10(k)[None, :] - 3.0 - np.log10(b)[:, None]
+    w = np.geomspace(0.1, 1e3, 50)
+    for plot in (contact_map("m", "hand", k, b, 50.0 * stable), contact_admittance("a", "hand", w, 1 / (1j * w + 1))):
+        check_layout(plot.figure)
+        svg = str(embedded(plot.figure, "k").screen)
+        assert not re.search(r"(?<!stroke-)opacity: 0", svg)
+    (ax, bar) = contact_map("m", "hand", k, b, 50.0 * stable).figure.axes
+    assert ax.get_ylabel() == "damping bₑ [N·s/m]"
+    assert "−100" in [text.get_text() for text in bar.get_yticklabels()]
