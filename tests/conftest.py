@@ -22,6 +22,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 def pytest_addoption(parser):
     parser.addoption("--both-tiers", action="store_true", help="compile every run as well, and compare the bits")
+    parser.addoption("--grouped", action="store_true", help="compile every diagram block by block")
 
 
 def pytest_terminal_summary(terminalreporter, config):
@@ -41,6 +42,15 @@ def both_tiers(request):
 
     with pytest.MonkeyPatch.context() as patch:
         tiers.install(patch)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def by_block(request):
+    """Take every diagram for a large one, with ``--grouped``."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.config.getoption("--grouped"):
+            patch.setattr("loopwright.diagrams.flat.flat_diagram.LARGEST", 0)
         yield
 
 

@@ -1,28 +1,21 @@
 """The tests of compiled runs with continuous states once more, with every diagram as grouped code."""
 
-import importlib.util
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from loopwright.diagrams.flat import flat_diagram
-
 HERE = Path(__file__).parent
-pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(autouse=True)
-def grouped(monkeypatch):
-    """Every diagram is compiled block by block."""
-    monkeypatch.setattr(flat_diagram, "LARGEST", 0)
-
-
-for _path in sorted([*HERE.glob("test_hybrid_*.py"), HERE / "test_stiff_runs.py"]):
-    _spec = importlib.util.spec_from_file_location(f"grouped_{_path.stem}", _path)
-    _module = importlib.util.module_from_spec(_spec)
-    _spec.loader.exec_module(_module)
-    for _name, _value in vars(_module).items():
-        if _name.startswith("test_") and callable(_value):
-            globals()[f"test_{_path.stem.removeprefix('test_')}_{_name.removeprefix('test_')}"] = _value
-        elif type(_value).__name__ == "FixtureFunctionDefinition":
-            globals()[f"{_name}"] = _value
+@pytest.mark.slow
+def test_runs_with_continuous_states_are_right_as_grouped_code():
+    files = [*HERE.glob("test_hybrid_*.py"), HERE / "test_stiff_runs.py"]
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "--grouped"]
+    free = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST_", "LOOPWRIGHT_"))}
+    done = subprocess.run(
+        [*command, *map(str, sorted(files))], cwd=HERE.parents[2], env=free, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout[-5000:]
