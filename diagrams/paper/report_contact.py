@@ -128,10 +128,10 @@ def _tried(
             how = "the nonlinear run with the environment inside the plant, beside the linear loop's poles"
             numbers[path] = Number(trial.measured, "1/s", found.within, how)
             rows.append(
-                (titles.get(name, name), f"{trial.factor:g}", f"{trial.value:.6g} N/m", numbers[path],
-                 f"{trial.predicted:.4g} 1/s", f"{trial.fastest:.2g} m/s")
+                (titles.get(name, name), f"{trial.factor:g}", trial.value, numbers[path],
+                 float(f"{trial.predicted:.4g}"), float(f"{trial.fastest:.2g}"))
             )  # fmt: skip
-    columns = ("variant", "of the limit", "k_e", "growth rate, measured", "predicted", "speeds up to")
+    columns = ("variant", "of the limit", "k_e [N/m]", "growth rate, measured", "predicted [1/s]", "speeds up to [m/s]")
     title = f"Limits of stiffness at b_e = {TRIED_DAMPING:g} N·s/m, tried in the nonlinear run"
     return ([Table(title, columns, tuple(rows))] if rows else []), list(said)
 

@@ -246,9 +246,9 @@ def _stiffness(contact: Contact, soft: ContactLimit, numbers: dict[str, Number])
     rows = []
     for b in DAMPINGS:
         found = soft if b == 0.0 else contact.stability_limit("stiffness", damping=b)
-        again = f"{found.second_look:.6g} N/m" if math.isfinite(found.second_look) else ""
+        again = found.second_look if math.isfinite(found.second_look) else None
         rows.append((f"{b:g}", *_enter(found, "ke_limit", f"be_{b:g}", numbers), again))
-    columns = ("b_e [N·s/m]", "largest k_e", "oscillates at", "moves", "stable again", "from Re Y = 0")
+    columns = ("b_e [N·s/m]", "largest k_e", "oscillates at", "moves", "stable again", "from Re Y = 0 [N/m]")
     return Table("Largest stiffness of the environment", columns, tuple(rows))
 
 
@@ -334,10 +334,10 @@ def _tried(
         how = f"the nonlinear run with {found.method.value}, beside the linear loop's poles"
         numbers[path] = Number(trial.measured, "1/s", found.within, how)
         rows.append((
-            f"{trial.factor:g}", f"{trial.value:.6g} N/m", numbers[path], f"{trial.predicted:.4g} 1/s",
-            f"{trial.fastest:.2g} m/s",
+            f"{trial.factor:g}", trial.value, numbers[path], float(f"{trial.predicted:.4g}"),
+            float(f"{trial.fastest:.2g}"),
         ))  # fmt: skip
-    columns = ("of the limit", "k_e", "growth rate, measured", "predicted", "speeds up to")
+    columns = ("of the limit", "k_e [N/m]", "growth rate, measured", "predicted [1/s]", "speeds up to [m/s]")
     besides = f" with {_describe(environment)}" if environment else ""
     title = f"Limit of stiffness{besides}, tried in the nonlinear run"
     held = TEXTS.paragraphs("tried", method=found.method.value, tried=found.tried, limit=limit.value)
