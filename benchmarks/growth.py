@@ -27,7 +27,7 @@ BLOCKS = (10, 30, 100, 300, 1000, 3000, 10000)
 FMUS = (1, 2, 4, 8, 16, 32, 64)
 BALLS = (1, 2, 4, 8, 16, 32)
 LANES = (1, 4, 8, 16)
-SAMPLES = 64
+SAMPLES = 320
 FORMS = {"compiled": True, "interpreted": False}
 
 

@@ -175,9 +175,11 @@ def _run(plan: Plan, samples: Sequence[Sample], workers: int, client: Any) -> Ge
             for k in range(0, len(samples), worker.width):
                 yield from worker.run_all(samples[k : k + worker.width])
             return
-        compiled = worker.can_compile(samples[0])
-    run = run_in_threads if compiled else run_in_processes
-    with closing(run(plan, samples, min(workers, len(samples)))) as stream:
+        if worker.can_compile(samples[0]):
+            with closing(run_in_threads(plan, samples, min(workers, len(samples)), worker)) as stream:
+                yield from stream
+            return
+    with closing(run_in_processes(plan, samples, min(workers, len(samples)))) as stream:
         yield from stream
 
 

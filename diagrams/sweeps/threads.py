@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterable
+from functools import partial
 
 from .desk import Desk
 from .outcome import Outcome
-from .plan import Plan
+from .plan import Plan, Worker
 from .samples import Sample
 from .workers import make_worker
 
@@ -15,7 +16,7 @@ class Halt(BaseException):
     """Ends the run of a thread whose sweep is over."""
 
 
-def run_in_threads(plan: Plan, samples: Iterable[Sample], count: int) -> Generator[Outcome, None, None]:
+def run_in_threads(plan: Plan, samples: Iterable[Sample], count: int, worker: Worker) -> Generator[Outcome, None, None]:
     """Yield the outcomes of samples, in the order in which they are ready.
 
     Where the caller stops, such as after Ctrl-C, the runs at hand end within a chunk of ticks.
@@ -28,16 +29,21 @@ def run_in_threads(plan: Plan, samples: Iterable[Sample], count: int) -> Generat
         The samples.
     count : int
         Number of threads.
+    worker : Worker
+        The worker of the first thread, which has been set up; each of the others makes its own.
     """
 
-    def work(desk: Desk) -> None:
+    def work(worker: Worker, desk: Desk) -> None:
         def tell(t: float) -> None:
             if desk.is_closed:
                 raise Halt
 
-        with make_worker(plan) as worker:
-            while taken := desk.take(worker.width):
-                for outcome in worker.run_all(taken, tell):
-                    desk.put(outcome)
+        while taken := desk.take(worker.width):
+            for outcome in worker.run_all(taken, tell):
+                desk.put(outcome)
 
-    yield from Desk(samples).serve([work] * count)
+    def make_and_work(desk: Desk) -> None:
+        with make_worker(plan) as own:
+            work(own, desk)
+
+    yield from Desk(samples).serve([partial(work, worker), *[make_and_work] * (count - 1)])

@@ -7,6 +7,7 @@ import pytest
 
 from loopwright.diagrams import experiments
 from loopwright.diagrams.sweeps import final, maximum
+from loopwright.diagrams.sweeps.bound_run import BoundRun
 from loopwright.diagrams.sweeps.plan import Worker
 from loopwright.diagrams.sweeps.samples import Sample
 from loopwright.diagrams.sweeps.sweep import make_plan
@@ -57,3 +58,13 @@ def test_start_values_are_set_in_one_call_and_a_run_of_others_is_a_single_run(di
             single = diagram.replace(sample.parameters).simulate(0.05, progress=False)
             assert found.signals["xi"].tobytes() == single["xi"].tobytes()
             assert found.numbers["force"].tobytes() == single["motor_force"].max(axis=0).tobytes()
+
+
+def test_two_threads_set_up_twice(diagram, monkeypatch):
+    made = []
+    enter = BoundRun.__enter__
+    monkeypatch.setattr(BoundRun, "__enter__", lambda self: (made.append(self), enter(self))[1])
+    parameters = {"plant.coulomb_scale": np.linspace(0.5, 1.5, 8).tolist()}
+    found = diagram.sweep(parameters, 0.02, reduce=KEPT, workers=2, progress=False)
+    assert not found.failures
+    assert len(made) <= 2
