@@ -24,7 +24,7 @@ def bode() -> Figure:
     """Return the Bode diagram of Fig. 3's loop across the path, with its margins marked."""
     from loopwright.diagrams import experiments, margins
     from loopwright.diagrams.report.variant import look_of
-    from loopwright.diagrams.report_figures import AxisUnits, bode
+    from loopwright.diagrams.report_figures import AxisUnits, DrawnLoops, bode
 
     robot = experiments.compliance().diagram
     variants = {"continuous": robot.continuous(), "sampled_d0": robot}
@@ -34,7 +34,7 @@ def bode() -> Figure:
     names = {"continuous": "continuous", "sampled_d0": "1 kHz", "sampled_d1": "1 kHz, one sample of delay"}
     titles = {key: f"{name}: phase margin {found[key].phase_margin_deg.value:.1f}°" for key, name in names.items()}
     looks = {key: look_of(key, i) for i, key in enumerate(loops, 1)}
-    return bode("frequency", "v_perp", loops, found, titles, AxisUnits(), looks).figure
+    return bode("frequency", DrawnLoops("v_perp", loops, found, titles, looks, AxisUnits())).figure
 
 
 def main(folder: Path) -> None:

@@ -174,3 +174,13 @@ def test_the_notebooks_run(path):
     NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(path.parent)}}).execute()
     shown = [o for cell in notebook.cells for o in cell.get("outputs", [])]
     assert any("image/png" in o.get("data", {}) for o in shown)
+
+
+@pytest.mark.slow
+def test_the_figures_of_the_pages_are_made(tmp_path):
+    done = subprocess.run(
+        [sys.executable, ROOT / "docs" / "figures.py", tmp_path], capture_output=True, text=True, check=False,
+        env=os.environ,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert {file.name for file in tmp_path.iterdir()} == {"C_path.png", "frequency.png", "loop.png", "sweep.png"}
