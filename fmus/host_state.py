@@ -75,7 +75,7 @@ class HostState:
         numbers.get(self._now)
         if numbers.modes(self._now) != numbers.modes(self._numbers):
             numbers.set(self._numbers)
-            self._note("the rounding mode or the traps of floating-point numbers")
+            self.note_modes()
         folder = ""
         with suppress(OSError):
             folder = os.getcwd()
@@ -83,6 +83,10 @@ class HostState:
             with suppress(OSError):
                 os.chdir(self._folder)
             self._note("the working folder")
+
+    def note_modes(self) -> None:
+        """Tell that rounding mode or traps were changed, and set back."""
+        self._note("the rounding mode or the traps of floating-point numbers")
 
     def _note(self, change: str) -> None:
         if change not in self._told:

@@ -246,7 +246,7 @@ class CompiledHybrid:
         hybrid.taken_first = self._own(np.cumsum([0, *map(len, taken)]).astype(np.int64))
         hybrid.taken_states = self._own(np.zeros(width))
         self._outcome = OutcomeStructure()
-        self._run = hybrid_master()["loopwright_go"]
+        self._run, self._guard = hybrid_master()["loopwright_go"], loop.guard
         self._run.restype = None
         self._fresh = [(structure, bytes(structure)) for structure in (hybrid, *self.methods)]
 
@@ -385,9 +385,9 @@ class CompiledHybrid:
             late=address(span.late),
             room=len(rows),
         )
-        at = ctypes.byref
-        self._run(at(self._hybrid), at(given), ctypes.c_void_p(address(rows)), at(self._outcome))
-        found = self._outcome
+        at, found = ctypes.byref, self._outcome
+        with self._guard():
+            self._run(at(self._hybrid), at(given), ctypes.c_void_p(address(rows)), at(found))
         return HybridOutcome(
             found.ticks, found.rows, HybridReason(found.reason), found.plant, found.stage, found.status, self._hybrid.t
         )

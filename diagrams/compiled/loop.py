@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...fmus.calls import NEAR, NativeStep
+from ...fmus.host_state import HostState
 from ..flat import TRUE, TickPattern
 from .code import GroupedTick, StraightTick, TickCode, master
 from .native_tick import at, bind_native
@@ -51,7 +53,7 @@ class _Plant(ctypes.Structure):
         ("step", ctypes.c_void_p),
         ("inputs", _Transfer),
         ("outputs", _Transfer),
-        *((name, ctypes.c_void_p) for name in ("now", "width", "final", "flags", "reached")),
+        *((name, ctypes.c_void_p) for name in ("now", "width", "final", "flags", "reached", "changed")),
     ]
 
 
@@ -169,6 +171,7 @@ class CompiledLoop:
         loops: Mapping[frozenset[TickPattern], NewtonOptions] | None = None,
     ):
         self._kept: list[Any] = [code, arguments, results, plants, columns]
+        self._watched: list[tuple[HostState, ctypes.c_bool]] = []
         t, x, _, _ = arguments
         x_next, _, log, ok = results
         self.kinds = {clocks: i for i, clocks in enumerate(code.ticks)}
@@ -249,10 +252,31 @@ class CompiledLoop:
             else _Transfer(call.function, call.references, call.count, call.values, call.size)
             for call in (step.inputs, step.outputs)
         )
+        changed = None
+        if step.host is not None:
+            self._watched.append((step.host, ctypes.c_bool()))
+            changed = ctypes.addressof(self._watched[-1][1])
         return _Plant(
             step.version, step.instance, step.step, inputs, outputs, step.now, step.width, step.final, step.flags,
-            step.reached,
+            step.reached, changed,
         )  # fmt: skip
+
+    def guard(self) -> AbstractContextManager[None]:
+        """Leave this process's state as it was, whatever FMUs of others do to it meanwhile, and tell it.
+
+        C sets rounding mode and traps back after each step; the working folder is set back at the end.
+        """
+        return self._guard() if self._watched else nullcontext()
+
+    @contextmanager
+    def _guard(self) -> Iterator[None]:
+        with ExitStack() as stack:
+            for host, _ in self._watched:
+                stack.enter_context(host)
+            yield
+        for host, changed in self._watched:
+            if changed:
+                host.note_modes()
 
     @property
     def skip(self) -> int:
@@ -277,11 +301,12 @@ class CompiledLoop:
         rows : ndarray, shape (m, 1 + width)
             Samples: their time in s, then their values.
         """
-        self._run(
-            ctypes.byref(self.structure),
-            ctypes.c_int64(len(widths)),
-            *(ctypes.c_void_p(at(vector)) for vector in (times, widths, kinds, rows)),
-            ctypes.byref(self._outcome),
-        )
+        with self.guard():
+            self._run(
+                ctypes.byref(self.structure),
+                ctypes.c_int64(len(widths)),
+                *(ctypes.c_void_p(at(vector)) for vector in (times, widths, kinds, rows)),
+                ctypes.byref(self._outcome),
+            )
         found = self._outcome
         return Outcome(found.ticks, found.rows, Reason(found.reason), found.plant, found.stage, found.status)

@@ -28,6 +28,7 @@ typedef struct {
     const void *final;
     bool *flags;
     double *reached;
+    bool *changed; /* set where it changes modes of the processor, which are set back; NULL: it is known not to */
 } plant;
 
 typedef struct {
@@ -63,6 +64,30 @@ typedef struct {
     int64_t ticks, rows; /* that were gone through, and recorded */
     int64_t reason, plant, stage, status;
 } outcome;
+
+/* Modes of floating-point numbers: rounding and traps, without the flags of past exceptions. */
+#if defined(__x86_64__)
+static inline uint64_t modes(void) {
+    uint16_t x87;
+    __asm__ volatile("fnstcw %0" : "=m"(x87));
+    return (uint64_t)x87 << 32 | (__builtin_ia32_stmxcsr() & ~0x3fu);
+}
+static inline void set_modes(uint64_t m) {
+    const uint16_t x87 = (uint16_t)(m >> 32);
+    __asm__ volatile("fnclex\n\tfldcw %0" : : "m"(x87)); /* an exception that waits would come now */
+    __builtin_ia32_ldmxcsr((uint32_t)m);
+}
+#elif defined(__aarch64__)
+static inline uint64_t modes(void) {
+    uint64_t m;
+    __asm__ volatile("mrs %0, fpcr" : "=r"(m));
+    return m;
+}
+static inline void set_modes(uint64_t m) { __asm__ volatile("msr fpcr, %0" : : "r"(m)); }
+#else
+static inline uint64_t modes(void) { return 0; }
+static inline void set_modes(uint64_t m) { (void)m; }
+#endif
 
 static inline int move(const plant *p, const transfer *of) {
     if (p->version == 2)
@@ -103,9 +128,13 @@ static inline int64_t step_plants(const loop *l, double now, double width, outco
         int64_t reason;
         out->plant = j;
         if (STEP_FUSED(j, p, now, width)) continue;
-        if ((reason = step_plant(p, now, width, out)) != DONE ||
-            (reason = read_plant(p, now, width, l->near, out)) != DONE)
-            return reason;
+        const uint64_t own = p->changed ? modes() : 0;
+        if ((reason = step_plant(p, now, width, out)) == DONE) reason = read_plant(p, now, width, l->near, out);
+        if (p->changed && modes() != own) {
+            set_modes(own);
+            *p->changed = true;
+        }
+        if (reason != DONE) return reason;
     }
     return DONE;
 }

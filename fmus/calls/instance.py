@@ -148,7 +148,8 @@ class FmuInstance(StepFailures):
         """Its step as addresses; None in another process, and where a step is more than three calls."""
         if self._native is None:
             return None
-        return native_step(self.description.fmi, self._now, self._width, self._final, *self._native)
+        host = None if self.is_built_here else self.host
+        return native_step(self.description.fmi, self._now, self._width, self._final, *self._native, host=host)
 
     def _ask(self, t: float, h: float) -> None:
         self._asked = t, h

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..archive import FmuDescription
+from ..host_state import HostState
 from .fmi_calls import FmiCalls, StepCall
 from .texts import waits_for_initialization
 from .transfer import Transfer
@@ -52,6 +53,8 @@ class NativeStep:
         Of the time that a step has reached, in s.
     kept : tuple
         Whatever must live as long as the addresses.
+    host : HostState or None
+        The state of this process, which a library that Loopwright has not built may change.
     """
 
     version: int
@@ -65,10 +68,19 @@ class NativeStep:
     flags: int
     reached: int
     kept: tuple[Any, ...]
+    host: HostState | None
 
 
 def native_step(
-    fmi: str, now: ctypes.c_double, width: ctypes.c_double, final: Any, call: StepCall, ins: Transfer, outs: Transfer
+    fmi: str,
+    now: ctypes.c_double,
+    width: ctypes.c_double,
+    final: Any,
+    call: StepCall,
+    ins: Transfer,
+    outs: Transfer,
+    *,
+    host: HostState | None,
 ) -> NativeStep:
     """Return a step of a library in this process as addresses."""
     at = ctypes.addressof
@@ -84,6 +96,7 @@ def native_step(
         flags=at(call.flags),
         reached=at(call.reached),
         kept=(now, width, final, call, ins, outs),
+        host=host,
     )
 
 

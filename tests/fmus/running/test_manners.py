@@ -7,8 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant
-from loopwright.diagrams import Diagram
+from loopwright.blocks import Constant, Integrator
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu
 from support.small_fmus import small_fmu, values
 
@@ -62,14 +62,14 @@ def modes():
     return library.fegetround(), library.fegetexcept(), os.getcwd()
 
 
-@pytest.mark.one_tier  # in C nothing looks at the modes after each call
 @pytest.mark.skipif(sys.platform != "linux", reason="modes are kept on Linux alone")
-@pytest.mark.parametrize("isolate", [False, True])
+@pytest.mark.parametrize(("isolate", "compiled"), [(False, False), (True, False), (False, True)])
 @pytest.mark.parametrize(("place", "kind"), [(1, 1), (2, 1), (3, 1), (1, 2), (2, 2), (1, 3), (2, 3), (3, 3)])
-def test_modes_of_this_process_stay_as_they_are(file, place, kind, isolate):
+def test_modes_of_this_process_stay_as_they_are(file, place, kind, isolate, compiled):
     before = modes()
     plant = Fmu(file, name="plant", start={"fault": place, "kind": kind}, isolate=isolate)
-    run = Diagram("d", plant()).simulate(0.5, step=0.1, progress=False)
+    run = Diagram("d", plant()).simulate(0.5, step=0.1, progress=False, compile=compiled)
+    assert run.tier == ("compiled" if compiled else "interpreted")
     assert modes() == before
     assert run["plant.time"] == pytest.approx(run.t, abs=1e-12)
     said = [m for m in run.messages if m.endswith("of this process; it was set back")]
@@ -156,3 +156,20 @@ def test_start_values_of_inputs_are_set_in_initialization_mode(tmp_path, isolate
     plant = Fmu(file, name="plant", start={"u": 3.0, "p": 2.0}, isolate=isolate)
     run = Diagram("d", plant()).simulate(0.2, step=0.1, progress=False)
     assert run["plant.y"].tolist() == [6.0] * 3
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="modes are kept on Linux alone")
+@pytest.mark.parametrize("continuous", [False, True])
+def test_a_compiled_run_computes_in_its_own_modes_beside_an_fmu_that_rounds_upward(file, continuous):
+    # 1 + 2^-60 is 1, and above 1 where sums are rounded upward
+    @subsystem(sample_time=0.1, name="sum")
+    def add(time):
+        return Constant(value=1.0, name="one") + 2.0**-60 * (1.0 + 0.0 * time)
+
+    plant = Fmu(file, name="plant", start={"fault": 2, "kind": 1}, isolate=False)
+    calls = [plant(), add(plant.time).named("total")]
+    calls += [Integrator(initial_value=0.0, name="x")(plant.time)] if continuous else []
+    run = Diagram("d", *calls).simulate(0.5, progress=False, compile=True)
+    assert run.tier == "compiled"
+    assert np.all(run["total"] == 1.0)
+    assert any("the FMU has changed the rounding mode or the traps" in text for text in run.messages)
