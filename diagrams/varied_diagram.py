@@ -42,8 +42,9 @@ class VariedDiagram(SimulatedDiagram):
     ) -> Sweep:
         """Run the diagram with many values of its parameters, on every core; see docs/sweeps.md.
 
-        Without ``lanes`` each run is, to the last bit, that of ``diagram.replace(parameters).simulate(duration)``,
-        whoever makes it, and however many workers there are. A run that fails is kept as data, and harms no other.
+        Without ``lanes`` each run is, to the last bit, that of ``diagram.replace(parameters).simulate(duration)`` with
+        the same options and ``compile=True``, whoever makes it, and however many workers there are. A run that fails
+        is kept as data, and harms no other.
 
         Parameters
         ----------

@@ -6,6 +6,7 @@ import ctypes
 import os
 import platform
 import sys
+import threading
 from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
@@ -15,6 +16,8 @@ _CONTROLS = {"x86_64": ((0, 2), (28, 32)), "aarch64": ((0, 4),)}
 """Bytes of C's ``fenv_t`` that hold rounding modes and traps, by the machine; glibc's layout."""
 _FLAGS = 0x3F
 """Bits of the last of them on x86_64 that tell past exceptions, which are no modes."""
+FOLDER = threading.RLock()
+"""Held while a library is loaded, which takes place in its own folder: relative paths then lead elsewhere."""
 P = ParamSpec("P")
 R = TypeVar("R")
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from ...blocks.core import CompilerError, FmuError
 from ...fmus.export import tune
 from ...fmus.platform import is_built_here
@@ -27,7 +25,7 @@ def fuse(diagram: WiredDiagram) -> tuple[WiredDiagram, tuple[str, ...]]:
             kept.append(path)
             continue
         try:
-            changes[f"{path}.file"] = tune(Path(block.file))
+            changes[f"{path}.file"] = tune(description.file)
         except (CompilerError, FmuError) as error:
             raise error.at(block=path) from error.__cause__
     messages = [

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from string import Template
 from typing import Any
 
@@ -142,7 +141,7 @@ def read_plant(path: str, block: Fmu, inputs: Mapping[str, slice], outputs: Mapp
         If they can't be had.
     """
     try:
-        found = read_equations(Path(block.file))
+        found = read_equations(block.description.file)
     except FmuError as error:
         raise NoLanesError(f"{path}: {error}".rstrip(".")) from error
     ins, outs = list[tuple[int, int]](), list[tuple[int, str, int]]()

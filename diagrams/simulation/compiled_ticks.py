@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -314,7 +313,7 @@ def _fuse(flat: FlatDiagram, native: Mapping[str, FmuInstance], *, every: bool) 
         block, step = flat.table.blocks[path], plant.native
         assert isinstance(block, Fmu)
         assert step is not None
-        file = Path(block.file) if _is_plain(block) else None
+        file = block.description.file if _is_plain(block) else None
         to, of = (() if ports is None else ports.read_references() for ports in (step.inputs, step.outputs))
         plants[path] = FusedPlant(file, to, of)
     return compile_fused(flat, kinds_of(flat, every=every), plants)

@@ -69,6 +69,7 @@ class BoundRun:
             try:
                 self.engine.load(self._stack, 0.0)
                 self._notes += self.take_messages()
+                self._forget_messages()
                 self.engine.initialize()
                 self.take_messages()  # of numbers that are no sample's
             except BaseException:
@@ -150,6 +151,7 @@ class BoundRun:
             If the start can't be found with them.
         """
         with nullcontext() if self._has_begun else LOADING:  # the first start traces functions
+            self._forget_messages()
             for path, plant in self.engine.plants.items():
                 assert isinstance(plant, FmuInstance)
                 plant.start_anew(numbers.starts.get(path, {}))
@@ -199,6 +201,13 @@ class BoundRun:
 
     def _note(self, event: Occurrence) -> None:
         self.recorder.event(event)
+
+    def _forget_messages(self) -> None:
+        """Let FMUs forget what they have told in runs before: a run's messages, and its error, quote its own."""
+        for path, plant in self.engine.plants.items():
+            if isinstance(plant, FmuInstance):
+                plant.log.begin_anew()
+                self._told[path] = len(plant.messages)
 
     def take_messages(self) -> tuple[str, ...]:
         """Return what a run's start and the FMUs have told since the last run."""

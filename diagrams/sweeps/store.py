@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import secrets
-import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from time import monotonic
@@ -42,7 +41,7 @@ class Store:
     """
 
     def __init__(self, folder: Path, revision: str, about: dict[str, Any], *, overwrite: bool = False):
-        self.folder = folder
+        self.folder = folder.absolute()  # loading an FMU changes the working folder for a moment
         try:
             self._open(revision, about, overwrite=overwrite)
         except OSError as error:
@@ -62,17 +61,22 @@ class Store:
         if head.is_file():
             try:
                 found = json.loads(head.read_text(encoding="utf-8"))
-                fits = found["format"] == _FORMAT and found["revision"] == revision
-            except (ValueError, KeyError, TypeError):
+                fits = found["format"] == _FORMAT and found["revision"] == revision and "diagram" in found
+            except (ValueError, KeyError, TypeError):  # no text, no JSON, or that of others
                 found, fits = {}, False
+            if not found and not overwrite:
+                raise OptionError(
+                    f"the file {str(head)!r} is damaged, or of something else; expected the head of a sweep. Choose "
+                    "another folder, or replace the sweep in this one with overwrite=True."
+                )
             if not fits and not overwrite:
                 raise OptionError(
-                    f"the folder {str(folder)!r} holds a sweep of {found.get('diagram', 'something')!r} that differs "
+                    f"the folder {str(folder)!r} holds a sweep of {found['diagram']!r} that differs "
                     "from this one in its diagram, duration, options, signals or reductions. Choose another folder, or "
                     "replace it with overwrite=True."
                 )
             if not fits:
-                shutil.rmtree(folder)
+                self._remove()
         elif folder.exists() and any(folder.iterdir()):
             raise OptionError(
                 f"the folder {str(folder)!r} holds other files, and no sweep. Choose another one, or an empty one."
@@ -80,6 +84,11 @@ class Store:
         folder.mkdir(parents=True, exist_ok=True)
         if not head.is_file():
             write_text(head, json.dumps({"format": _FORMAT, "revision": revision, **about}, indent=1) + "\n")
+
+    def _remove(self) -> None:
+        """Remove the sweep, and nothing else that stands in its folder."""
+        for path in (*self.folder.glob("part-*.npz"), self.folder / HEAD):
+            path.unlink()
 
     def read(self) -> dict[str, Outcome]:
         """Return the outcomes that are there, by the keys of their samples; unfinished parts don't count.
@@ -159,7 +168,7 @@ def _read_part(path: Path) -> dict[str, Outcome]:
                     head["units"],
                     tuple(head["messages"]),
                 )
-    except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
+    except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:
         raise OptionError(
             f"the file {str(path)!r} of a sweep can't be read: {error}. Remove it; its samples are then run again."
         ) from error

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import FmuFileError, Layout
+from ..host_state import FOLDER
 from .binaries import find_binary, judge_name
 from .exchange import ExchangeInfo, read_exchange
 from .faults import FmuFault, FmuFinding
@@ -200,12 +201,15 @@ def read_description(
         for this platform; if its archive is unsafe, damaged or beyond the limits. Its ``fault`` is an `FmuFault`.
     """
     path = os.path.expanduser(os.fspath(file))  # blocks ask often: pathlib would take most of the time
+    if not os.path.isabs(path):
+        with FOLDER:  # another thread may load a library, which takes place in its folder
+            path = os.path.abspath(path)
     try:
         status = os.stat(path)
     except (FileNotFoundError, NotADirectoryError):
         status = None
     if status is None or not stat.S_ISREG(status.st_mode):
-        shown = str(Path(path))
+        shown = str(Path(os.path.expanduser(os.fspath(file))))
         found = f"{shown!r} is a folder" if os.path.isdir(path) else f"there is no file {shown!r}"
         raise FmuFileError(f"{found}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
     identity = (status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...blocks.core import FmuError, FmuFileError, FmuProcessError, FmuRuntimeError, UnknownNameError, near
 from ..archive import FmuFault, FmuVariable, inexact, unpack
-from ..host_state import HostState, guard_host
+from ..host_state import FOLDER, HostState, guard_host
 from ..platform import is_built_here
 from .fmi1 import Fmi1Calls
 from .fmi2 import Fmi2Calls
@@ -53,6 +53,7 @@ class LoadedFmu:
         except FmuError as error:
             error.at(block=block.label)
             raise
+        FOLDER.acquire()
         self.host.__enter__()
         try:
             self.fmi = make(
@@ -80,6 +81,7 @@ class LoadedFmu:
             raise FmuFileError(text, fault=FmuFault.LOADING, block=block.label) from error
         finally:
             self.host.__exit__()  # FMPy stays in the binary's folder if loading fails, too
+            FOLDER.release()
         self._open = True
         if description.only_once and self.fmi.in_process:
             _OPEN.add(self)

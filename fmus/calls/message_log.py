@@ -32,6 +32,7 @@ class MessageLog:
 
     def __init__(self, label: str, notes: Iterable[str] = ()):
         self._label, self._notes = label, list(notes)
+        self._lasting: int | None = None
         self._said: dict[str, int] = {}
         self._last: deque[str] = deque(maxlen=_QUOTED)
         self._left_out = 0
@@ -40,6 +41,15 @@ class MessageLog:
     def note(self, text: str) -> None:
         """Add a note, which is not the FMU's own."""
         self._notes.append(f"{self._label}: {text}")
+
+    def begin_anew(self) -> None:
+        """Forget all but the notes that stood at the first call: another run begins, and tells its own."""
+        if self._lasting is None:
+            self._lasting = len(self._notes)
+        del self._notes[self._lasting :]
+        self._said, self._left_out = {}, 0
+        self._last.clear()
+        self._warned.clear()
 
     def warn(self, action: str, status: str, t: float) -> None:
         """Note a call that gave a warning, with the FMU's last words: the first time that an action does."""

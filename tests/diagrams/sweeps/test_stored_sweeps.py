@@ -258,3 +258,28 @@ def test_a_folder_that_cannot_be_made_is_told_before_the_first_run(to, found, ru
     assert found in str(caught.value)
     assert "folder" in caught.value.message
     assert not runs
+
+
+def test_a_sweep_that_is_replaced_takes_no_other_files_of_its_folder_along(tmp_path):
+    folder, kept = tmp_path / "found", {"to": tmp_path / "found", **KEPT, **QUIET}
+    guarded().sweep({"guard.gain": GAINS}, 0.1, **kept)
+    (folder / "chapter.tex").write_text("mine")
+    replaced = guarded().sweep({"guard.gain": GAINS}, 0.2, overwrite=True, **kept)
+    assert replaced.reused == 0
+    assert (folder / "chapter.tex").read_text() == "mine"
+    assert guarded().sweep({"guard.gain": GAINS}, 0.2, **kept).reused == 4
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"mine": 1}'])
+def test_a_head_that_is_no_sweeps_is_named(tmp_path, text):
+    (tmp_path / "sweep.json").write_text(text)
+    with pytest.raises(OptionError, match="sweep.json' is damaged, or of something else; expected the head of a sweep"):
+        guarded().sweep({"guard.gain": GAINS}, 0.1, to=tmp_path, **KEPT, **QUIET)
+
+
+def test_an_empty_part_is_named(tmp_path):
+    guarded().sweep({"guard.gain": GAINS}, 0.1, to=tmp_path, **KEPT, **QUIET)
+    (part,) = tmp_path.glob("part-*.npz")
+    part.write_bytes(b"")
+    with pytest.raises(OptionError, match=f"{part.name}' of a sweep can't be read: .* Remove it"):
+        guarded().sweep({"guard.gain": GAINS}, 0.1, to=tmp_path, **KEPT, **QUIET)
