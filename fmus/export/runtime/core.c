@@ -16,7 +16,7 @@
 
 /* ---- logging ---- */
 
-static void lw_log(lw_instance *self, lw_category category, const char *format, va_list args) {
+static void lw_write_log(lw_instance *self, lw_category category, const char *format, va_list args) {
     char text[1024], escaped[2 * sizeof text];
     if (!(self->categories & (unsigned)category) || !self->write) return;
     int n = snprintf(text, sizeof text, "%s: ", self->name ? self->name : LW_MODEL_NAME);
@@ -32,14 +32,14 @@ static void lw_log(lw_instance *self, lw_category category, const char *format, 
 static void lw_warn(lw_instance *self, const char *format, ...) {
     va_list args;
     va_start(args, format);
-    lw_log(self, LW_LOG_WARNING, format, args);
+    lw_write_log(self, LW_LOG_WARNING, format, args);
     va_end(args);
 }
 
 static bool lw_fail(lw_instance *self, const char *format, ...) {
     va_list args;
     va_start(args, format);
-    lw_log(self, LW_LOG_ERROR, format, args);
+    lw_write_log(self, LW_LOG_ERROR, format, args);
     va_end(args);
     self->s.mode = LW_TERMINATED;
     return false;

@@ -14,6 +14,9 @@ import numpy as np
 import pytest
 
 import loopwright.fmus.export as export
+from loopwright.blocks import Block, Output, State
+from loopwright.diagrams import Diagram
+from loopwright.fmus import Fmu, build
 from loopwright.fmus.export import compile_shared, own_functions, processor_flags
 from loopwright.fmus.export.elementary_tables import FUNCTIONS, prepare_functions, restore_functions
 from loopwright.fmus.models import gantry
@@ -231,3 +234,21 @@ def test_the_functions_of_fused_code_err_by_a_few_units_in_the_last_place_of_1(t
         exact = np.array([float(getattr(mpmath, name)(mpmath.mpf(float(v)))) for v in x])
         assert np.abs(fast(name, x) - exact).max() < 5e-16
         assert np.isnan(fast(name, [math.nan])).all()
+
+
+@pytest.mark.parametrize("function", [np.sin, np.cos, np.tanh, np.exp, np.expm1, np.log, np.log1p, np.log10])
+def test_a_plant_with_any_of_them_is_exported(function, tmp_path):
+    class Plant(Block):
+        """A state whose rate is a function of it."""
+
+        x = State(start=1.0, output=True)
+        y = Output()
+
+        def derivative(self, t, x, u):
+            return -function(x.x)
+
+        def output(self, t, x, u):
+            return function(x.x)
+
+    run = Diagram("plant", Fmu(build(Plant(), out=tmp_path / "plant.fmu"), name="plant")()).simulate(0.1, step=0.1)
+    np.testing.assert_allclose(run["plant.y"], function(run["plant.x"]), rtol=1e-15, atol=1e-15)
