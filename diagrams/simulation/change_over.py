@@ -157,7 +157,8 @@ class HybridChange:
     def watch(self, last: int, note_due: Callable[[], None]) -> Callable[[float, bool], bool] | None:
         """Return the `Continuous.watch` of interpreted steps up to a tick, which counts their work.
 
-        It has the run paused where C takes over; beside plants it calls ``note_due``, and C begins at the next tick.
+        It has the run paused where C takes over; beside plants, and where each step ends at a tick, it calls
+        ``note_due``, and C begins at the next tick.
         """
         if not self._possible:
             return None
@@ -171,8 +172,7 @@ class HybridChange:
             rest = (self._work - before) * (end - t) / (t - first)
             if max(self._work, rest) < self._limit or not self._begin(last):
                 return False
-            if self._plants:
-                note_due()
+            note_due()
             return not self._plants
 
         return tell

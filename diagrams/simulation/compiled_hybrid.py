@@ -259,8 +259,9 @@ class HybridTicks:
         assert isinstance(solver, AutoSolver)
         self._take_back(loop)
         self._continuous.enter(t)
+        told = len(solver.statistics.messages)
         if solver.decide(t, self._workspace.here.x[self._continuous.where], h):
-            self._workspace.messages += (solver.statistics.messages[-1],)
+            self._workspace.messages += tuple(solver.statistics.messages[told:])
             self._hand_over(loop, t)
 
     def _judge(self, found: HybridOutcome, now: float, h: float) -> None:

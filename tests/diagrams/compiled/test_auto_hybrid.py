@@ -5,11 +5,13 @@ import pytest
 from scipy.linalg import expm
 
 from loopwright.blocks import (
+    Block,
     Compare,
     Constant,
     Integrator,
     Relay,
     Sine,
+    State,
     StopCondition,
     Sum,
     TransferFunction,
@@ -17,7 +19,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Diagram, Run, subsystem
 from loopwright.diagrams.compiled import code
-from loopwright.diagrams.simulation import change_over, compiled_ticks
+from loopwright.diagrams.simulation import change_over, compiled_hybrid, compiled_ticks
 from loopwright.fmus import Fmu, dc_motor
 from support.both_forms import assert_same_bits
 
@@ -91,6 +93,46 @@ def test_c_takes_over_between_two_ticks_where_events_are_many(little):
     last = expected[-1]
     at_end = 1.1 * np.exp(last - 20.0) if len(expected) % 2 else 2.0 - 1.1 * np.exp(last - 20.0)
     assert run["room.y"][-1] == pytest.approx(at_end, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"solver": "rk4", "step": T}, {"rtol": 1e-6}, {"rtol": 1e-10, "atol": 1e-12}],
+    ids=["fixed step", "fast clock", "tight"],
+)
+def test_c_takes_over_where_each_step_ends_at_a_tick(little, monkeypatch, options):
+    monkeypatch.setattr(change_over.HybridChange, "is_due", lambda self, last: False)
+    begun, run_in_c = [], compiled_hybrid.HybridTicks.run
+
+    def note(ticks, k, last, *args, **kwargs):
+        begun.append((k, last))
+        return run_in_c(ticks, k, last, *args, **kwargs)
+
+    monkeypatch.setattr(compiled_hybrid.HybridTicks, "run", note)
+    run = controlled().simulate(1.0, **options, **QUIET)
+    assert run.tier == "both"
+    [(k, last)] = begun
+    assert 0 < k < 100
+    assert last == 1000
+    alone = controlled().simulate(1.0, compile=False, **options, **QUIET)
+    assert np.array_equal(run.t, alone.t)
+    assert np.abs(run["second.y"] - alone["second.y"]).max() < 1e-12
+
+
+def test_changes_of_the_method_that_are_left_out_are_told_once():
+    class VanDerPol(Block):
+        """Van der Pol's oscillator: x' = v, v' = 200 (1 - x²) v - x."""
+
+        x = State(start=1.0, output=True)
+        v = State()
+
+        def derivative(self, t, x, u):
+            return x.v, 200.0 * (1.0 - x.x**2) * x.v - x.x
+
+    run = Diagram("oscillator", VanDerPol()).simulate(3000.0, compile=True, **QUIET)
+    changes = [message for message in run.messages if "→" in message]
+    assert len(changes) == 10
+    assert run.messages.count("… and more such changes") == 1
 
 
 def test_the_instant_of_the_change_depends_on_no_cache(little):
