@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from itertools import groupby
 from typing import Any, TypeVar
 from weakref import WeakSet
@@ -53,35 +53,32 @@ class LoadedFmu:
         except FmuError as error:
             error.at(block=block.label)
             raise
-        FOLDER.acquire()
-        self.host.__enter__()
-        try:
-            self.fmi = make(
-                name=block.label,
-                token=description.token,
-                folder=files,
-                library=files / (description.model_exchange_binary if model_exchange else description.binary),
-                model_exchange=model_exchange,
-            )
-            self._fmu, self.fmi.lose, self._reading = self.fmi.fmu, self.lose, SharedReading(self.fmi)
-            self._check_version()
-            if not model_exchange:
-                choose_modes(self.fmi, description, block.stepping)
-            self.fmi.instantiate(self.log.take)
-        except FmuProcessError as error:
-            raise self.lose(error) from None
-        except FmuError as error:
-            self._end_calls()
-            error.at(block=block.label)
-            raise
-        except Exception as error:
-            self._end_calls()
-            text = f"the FMU {str(description.file)!r} can't be loaded: {error}{self._quote_messages()} "
-            text += f"Look for its fault with 'loopwright doctor {description.file}'."
-            raise FmuFileError(text, fault=FmuFault.LOADING, block=block.label) from error
-        finally:
-            self.host.__exit__()  # FMPy stays in the binary's folder if loading fails, too
-            FOLDER.release()
+        # FMPy stays in the binary's folder if loading fails, too; another process has a folder of its own
+        with FOLDER if make_calls is None else nullcontext(), self.host:
+            try:
+                self.fmi = make(
+                    name=block.label,
+                    token=description.token,
+                    folder=files,
+                    library=files / (description.model_exchange_binary if model_exchange else description.binary),
+                    model_exchange=model_exchange,
+                )
+                self._fmu, self.fmi.lose, self._reading = self.fmi.fmu, self.lose, SharedReading(self.fmi)
+                self._check_version()
+                if not model_exchange:
+                    choose_modes(self.fmi, description, block.stepping)
+                self.fmi.instantiate(self.log.take)
+            except FmuProcessError as error:
+                raise self.lose(error) from None
+            except FmuError as error:
+                self._end_calls()
+                error.at(block=block.label)
+                raise
+            except Exception as error:
+                self._end_calls()
+                text = f"the FMU {str(description.file)!r} can't be loaded: {error}{self._quote_messages()} "
+                text += f"Look for its fault with 'loopwright doctor {description.file}'."
+                raise FmuFileError(text, fault=FmuFault.LOADING, block=block.label) from error
         self._open = True
         if description.only_once and self.fmi.in_process:
             _OPEN.add(self)
