@@ -250,7 +250,7 @@ def _numbers(got: StepResponse, test: StepTest, v: Variant) -> dict[str, Number]
     measured = measure_step(t, got.answer(output)[begins:], held=held, target=target)
     if known and math.isnan(known["final"].value) and not settled:
         measured |= dict.fromkeys(OF_SETTLED, NONE)
-    found["length"] = Number(float(t[-1]), "s", 0.0, "", given=True)
+    found["length"] = Number(float(t[-1]), "s", 0.0, "given: the last sample", given=True)
     found["settled"] = Number(float(settled), "1", 0.0, how)
     for name, (value, tolerance) in measured.items():
         factor = abs(got.size) if name == "peak" else 1.0
