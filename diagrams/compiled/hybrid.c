@@ -34,6 +34,7 @@ static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
         if (!h->stepped) {
             if ((*steps)++ > h->budget || (h->w.m && h->w.logged > h->w.capacity / 2)) return SUSPENDED;
             keep_instant(h);
+            h->planned = m->planned;
             if (take_step(m) != PASSED) return ask(h, ASK_BETWEEN);
             if (h->automatic) look_for_stiffness(h, m);
             h->to = m->t;
@@ -55,7 +56,7 @@ static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
             interpolate(m, t, m->y);
             put_states(h, m->y);
             *h->l.t = t;
-            if (evaluate(&h->l, h->between) != DONE) return ask(h, ASK_BETWEEN);
+            if (evaluate(&h->l, h->between) != DONE) return ask_for_step(h);
             g->out->rows = record(&h->l, t, g->rows, g->out->rows);
             g->i++;
             if (is_stopped(&h->l)) {
@@ -72,7 +73,7 @@ static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
             memcpy(m->y, m->x, (size_t)m->n * sizeof(double));
         put_states(h, m->y);
         *h->l.t = h->to >= edge ? p->left : h->to;
-        if (h->accepts && accept(h) != DONE) return ask(h, ASK_BETWEEN);
+        if (h->accepts && accept(h) != DONE) return ask_for_step(h);
         const double t = h->to;
         bool happened = h->found;
         h->stepped = 0;

@@ -67,7 +67,7 @@ class _Hybrid(ctypes.Structure):
         *_fields(_INT, "active automatic accepts between budget inside begun stepped"), *_fields(_REAL, "t to"),
         *_fields(_INT, "found hits misses easy"), ("before", _AT), ("outputs", _INT),
         *_fields(_AT, "taken taken_first taken_states"), ("switched", _INT), ("solved", _AT), ("looked_at", _REAL),
-        *_fields(_AT, "z held"), ("inputs", _INT),
+        *_fields(_AT, "z held"), ("inputs", _INT), ("planned", _REAL),
     ]  # fmt: skip
 
 
@@ -169,7 +169,8 @@ class CompiledHybrid:
     loops : NewtonOptions, optional
         Newton's method for the algebraic loops between ticks, where there are some.
     accepts : bool
-        Whether blocks are to be evaluated after every step: they remember something, have guards, or FMUs read them.
+        Whether blocks are to be evaluated after every step: they remember something, have guards, may fail, or FMUs
+        read them.
     held : pair of ndarray
         Inputs of FMUs as they are now, and as they are held from a tick to the next one; one array where nothing
         changes them between ticks.

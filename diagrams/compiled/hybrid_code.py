@@ -32,6 +32,7 @@ from .grouped_parts import Differences, GroupedPart, find_differences
 from .grouping import make_part_tables, make_tables
 from .kernels import write_kernels
 from .small_steps import STEPS, write_steps
+from .step_outputs import may_fail_at_steps
 
 _SOURCES = ("newton.c", "master.c", "problem.c", "methods.c", "radau.c", "events.c", "instants.c", "hybrid.c")
 
@@ -79,11 +80,14 @@ class HybridCode:
         Its other functions that there are, by name: ``"flow"``, ``"slope"``, ``"indicators"``, ``"jump"``.
     steps : mapping
         Addresses of steps that were made for its rates, by method.
+    judged : bool
+        Whether outputs are to be looked at after every step, as they may be non-finite while states are finite.
     """
 
     ticks: TickCode
     between: Mapping[str, Between]
     steps: Mapping[str, int] = field(default_factory=dict)
+    judged: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,15 +194,13 @@ def write_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *,
     kinds = (NONE, *(clocks for clocks in acting if clocks))
     grouped = flat.by_block and not flat.active_loops(NONE)
     written = _write_grouped(flat, kinds, stiff=stiff) if grouped else _write_straight(flat, kinds, stiff=stiff)
-    loops = loop_functions(flat, kinds)
-    if not loops:
-        return written
+    loops, judged = loop_functions(flat, kinds), may_fail_at_steps(flat)
 
     def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
-        code = written.make(libraries)
-        return replace(code, ticks=replace(code.ticks, loops=find_loops(loops, libraries[-1])))
+        code = replace(written.make(libraries), judged=judged)
+        return replace(code, ticks=replace(code.ticks, loops=find_loops(loops, libraries[-1]))) if loops else code
 
-    return HybridSources([*written.texts, write_loops(loops)], make)
+    return HybridSources([*written.texts, *([write_loops(loops)] if loops else [])], make)
 
 
 def _write_straight(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridSources:

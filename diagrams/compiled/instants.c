@@ -37,6 +37,7 @@ typedef struct hybrid {
     const double *z;    /* inputs of all plants as they are now, and as they are held between ticks */
     double *held;
     int64_t inputs;
+    double planned;     /* step in s that the method had in mind before it took the last one */
 } hybrid;
 
 typedef struct {
@@ -289,6 +290,12 @@ static int64_t ask(hybrid *h, int64_t reason) {
     if (h->w.m) go_back(&h->w);
     h->inside = 0;
     return reason;
+}
+
+/* Go back to before the last step, which Python takes again as it was taken. */
+static int64_t ask_for_step(hybrid *h) {
+    h->methods[h->active]->planned = h->planned;
+    return ask(h, ASK_BETWEEN);
 }
 
 /* Go through a tick that the continuous states have reached: FMUs, events before and after it, a sample. */

@@ -285,8 +285,9 @@ class HybridTicks:
             workspace, here = self._workspace, self._workspace.here
             ticks = bind_loop(workspace, self._plants.values(), self._code.ticks, recorder, self._stops)
             self._recorder = recorder
-            accepts = bool(self._plants) or workspace.looped or remembers(self._flat) or has_guards(self._flat)
             continuous, domains = self._continuous, self._continuous.domains
+            accepts = bool(self._plants) or workspace.looped or remembers(self._flat) or has_guards(self._flat)
+            accepts = accepts or (self._code.judged and not continuous.fixed)
             self._loop = CompiledHybrid(
                 self._code, self._flat, ticks, [here.t, here.x, here.w, here.p], workspace.x_next, self._methods,
                 step=float(self._flat.base) if continuous.fixed else None,
