@@ -78,7 +78,8 @@ class VariedDiagram(SimulatedDiagram):
             Show a progress bar; see `simulate`.
         lanes : bool or {2, 4, 8, 16}, optional
             Make so many runs side by side in the lanes of the processor's vectors, 8 for True: some times as fast.
-            Their values then differ from those of single runs in their last digits, and the sweep's messages say so.
+            Their values then differ from those of single runs by rounding, and the sweep's messages say so. A motion
+            that magnifies small differences (a limit cycle, sticking) magnifies these, too; see docs/sweeps.md.
             Every FMU must have been built by Loopwright on this machine, with steps of fixed length and without events;
             runs that can't go so are made one after the other, which is told.
         **options

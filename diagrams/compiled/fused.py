@@ -29,7 +29,8 @@ def fuse(diagram: WiredDiagram) -> tuple[WiredDiagram, tuple[str, ...]]:
         except (CompilerError, FmuError) as error:
             raise error.at(block=path) from error.__cause__
     messages = [
-        f"Fused: {path.removesuffix('.file')} is compiled for this processor; values differ in their last digits."
+        f"Fused: {path.removesuffix('.file')} is compiled for this processor; values differ "
+        "by rounding, which some motions magnify."
         for path in changes
     ]
     messages += [f"Not fused: {path} was not built by Loopwright on this machine." for path in kept]

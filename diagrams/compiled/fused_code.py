@@ -90,7 +90,9 @@ def _compile(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], plants
     if not functions:
         return replace(compile_ticks(flat, acting), master=master, notes=notes)
     bound = {clocks: StraightTick(f, address_of(library, f.name())) for clocks, f in functions.items()}
-    notes += ("Fused: the ticks are compiled for this processor; values differ in their last digits.",)
+    notes += (
+        "Fused: the ticks are compiled for this processor; values differ by rounding, which some motions magnify.",
+    )
     return TickCode(bound, True, library, compile_loops(flat, acting), master, notes)
 
 

@@ -381,7 +381,10 @@ def make_hybrid(
                 f"Compiled: {found.solver} runs in C as solver={continuous.solver.name!r}, by the same rules as "
                 "interpreted; values differ from those of an interpreted run by rounding and within the tolerances."
             )
-            fused = "Fused: ticks and rates are compiled for this processor; values differ in their last digits."
+            fused = (
+                "Fused: ticks and rates are compiled for this processor; values differ by rounding, which some motions "
+                "magnify."
+            )
             return found, (*((told,) if continuous.where.size and asked else ()), *((fused,) if fuse else ()))
     if not asked:
         return None, ()

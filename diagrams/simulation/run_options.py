@@ -123,8 +123,9 @@ class RunOptions:
         why.
     fuse : bool
         Compile the ticks, the loop over them and the equations of FMUs that Loopwright has built on this machine
-        together, for its processor, with products and sums fused (FMA): faster, and other in the last digits (less than
-        1e-10 of a signal's size), as ``run.messages`` says. ``compile="auto"`` is then True. With ``compile=False`` the
+        together, for its processor, with products and sums fused (FMA): faster, and values differ by rounding, as
+        ``run.messages`` says: by less than 1e-10 of a signal's size, but where a motion magnifies small differences (a
+        limit cycle, sticking), which magnifies these, too. ``compile="auto"`` is then True. With ``compile=False`` the
         FMUs alone are compiled anew, see `loopwright.fmus.tune`.
     """
 

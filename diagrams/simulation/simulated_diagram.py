@@ -30,7 +30,7 @@ class SimulatedDiagram(WiredDiagram):
         **options
             Options of the run by name: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step``, ``record``, ``every``,
             ``states``, ``to``, ``overwrite``, ``start``, ``coupling``, ``start_exchange``, ``compile`` (whether C goes
-            from tick to tick) and ``fuse`` (faster, and other in the last digits). `RunOptions` says what each means,
+            from tick to tick) and ``fuse`` (faster; values differ by rounding). `RunOptions` says what each means,
             and its default.
 
         Returns

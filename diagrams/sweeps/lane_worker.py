@@ -22,7 +22,9 @@ from .plan import Plan, Worker
 from .samples import Sample
 from .variation import Numbers
 
-DIFFER = "Side by side in vector lanes: values differ from those of single runs in their last digits."
+DIFFER = (
+    "Side by side in vector lanes: values differ from those of single runs by rounding, which some motions magnify."
+)
 _MOST_SUBSTEPS = 10_000
 _BYTES = 2**20
 """Of the rows of a chunk, at most: C keeps them in the processor's cache."""

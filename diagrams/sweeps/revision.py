@@ -25,7 +25,7 @@ from .samples import Sample
 
 _OURS = __name__.partition(".")[0]
 _SILENT = ("progress", "compile")
-"""Options of a run that change no result; in fused runs, "compile" does in last digits."""
+"""Options of a run that change no result; in fused runs, "compile" changes rounding."""
 
 
 def revision_of(plan: Plan) -> str:

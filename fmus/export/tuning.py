@@ -33,8 +33,8 @@ def processor_flags() -> tuple[str, ...]:
 def tune(path: str | os.PathLike[str]) -> Path:
     """Return an FMU with its binary compiled anew for the processor of this machine.
 
-    It has the instructions of this processor and fuses products with sums (FMA), so that it is faster, other in its
-    last digits than the FMU, and runs on such processors only. It is made once, and kept in the cache.
+    It has the instructions of this processor and fuses products with sums (FMA), so that it is faster, and runs on such
+    processors only. Its values differ from the FMU's by rounding. It is made once, and kept in the cache.
 
     Parameters
     ----------
