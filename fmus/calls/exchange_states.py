@@ -56,7 +56,7 @@ def unpack_state(description: FmuDescription, data: bytes, width: int) -> tuple[
         raise FmuError(
             f"found the state of another FMU: SHA-256 {digest.hex()[:12]}… on "
             f"{platform.rstrip(bytes(1)).decode()}, expected {here[0].hex()[:12]}… on {native_platform()}. Run the "
-            "FMU that was saved."
+            "FMU that was saved, with the fuse= of that run."
         )
     return t, next_time, np.frombuffer(data[_HEADER.size : n], "<f8").copy(), data[n:]
 

@@ -90,7 +90,8 @@ def unpack_state(data: bytes, digest: str, label: str) -> tuple[float, bool, byt
     if (found, platform) != _identify(digest):
         raise FmuError(
             f"found the state of another FMU: SHA-256 {found.hex()[:12]}… on {platform.rstrip(bytes(1)).decode()}, "
-            f"expected {digest[:12]}… on {native_platform()}. Run the FMU that was saved.",
+            f"expected {digest[:12]}… on {native_platform()}. Run the FMU that was saved, with "
+            "the fuse= of that run.",
             block=label,
         )
     return t, running, rest

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import Clock, FmuRuntimeError, Gain, Sine, TransferFunction
+from loopwright.blocks import Clock, FmuError, FmuRuntimeError, Gain, Sine, TransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.compiled.reordered import reorder
 from loopwright.fmus import Fmu, dc_motor, gantry_contact
@@ -70,6 +70,15 @@ def test_a_fused_run_goes_on_branches_and_is_saved():
         simulation.restore(half)
         simulation.advance(0.3)
         assert simulation.run().data[-1].tobytes() == whole.data[-1].tobytes()
+
+
+@pytest.mark.parametrize("fuse", [True, False])
+def test_a_state_of_the_other_kind_of_run_is_refused_and_fuse_is_named(fuse):
+    made = experiments.hand_guiding().diagram
+    first = made.simulate(0.01, fuse=fuse, **QUIET)
+    assert made.simulate(0.01, fuse=fuse, start=first.final_state, **QUIET).t[-1] == pytest.approx(0.02)
+    with pytest.raises(FmuError, match=r"^plant: .*Run the FMU that was saved, with the fuse= of that run\.$"):
+        made.simulate(0.01, fuse=not fuse, start=first.final_state, **QUIET)
 
 
 def test_an_error_within_the_loop_has_the_words_of_the_fmu():
