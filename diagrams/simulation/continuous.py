@@ -309,6 +309,7 @@ class Continuous(Trials, Memory):
             found, wanted, paused = None, False, False
             while found is None and not (wanted or paused) and t < edge:
                 step: AcceptedStep = self._explained(self.solver.step)
+                self.tell_changes(workspace)
                 if self.domains is not None and not self.sliding.active:
                     found = self.domains.locate(step)
                     solved = workspace.trial.x[self._loops]

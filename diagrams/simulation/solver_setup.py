@@ -13,6 +13,7 @@ from ..events import Domains, Sliding
 from ..flat import Announcer, FlatDiagram, Times, announcers
 from ..solvers import Solver
 from .transport_delays import Delays
+from .workspace import Workspace
 
 
 def time_scale_of(flat: FlatDiagram) -> float:
@@ -129,6 +130,16 @@ class Memory:
     _beyond: tuple[float, np.ndarray] | None
     _fresh: Mapping[str, Any]
     """What it keeps before its first run."""
+
+    _told = 0
+    """Messages of the solver that were told."""
+
+    def tell_changes(self, workspace: Workspace) -> None:
+        """Take the solver's new messages, such as changes of its method, among those of the run."""
+        messages = self.solver.statistics.messages
+        if len(messages) > self._told:
+            workspace.messages += tuple(messages[self._told :])
+            self._told = len(messages)
 
     def save(self) -> dict[str, Any]:
         """Return what is needed to go on from here."""
