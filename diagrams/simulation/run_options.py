@@ -104,7 +104,9 @@ class RunOptions:
         Replace a run that is stored there.
     start : RunState or OperatingPoint, optional
         State to go on from: ``run.final_state``, that of `Simulation.save`, or an operating point, such as
-        `trim` finds one, with the parameters that belong to it.
+        `trim` finds one, with the parameters that belong to it. Where ticks end the solver's steps, the run has the
+        bits of one in one go with ``compile=True`` or False; with continuous states under "auto", C may take over
+        elsewhere, and long runs differ by rounding, within the tolerances.
     coupling : str or Coupling
         Exchange of values between FMUs in a communication step: "jacobi", all step at once with the inputs of its
         beginning; "gauss_seidel", one after the other; "iterated", until they agree; or a `Coupling` with its options,
@@ -115,12 +117,13 @@ class RunOptions:
     compile : {"auto", True, False}
         Go from tick to tick in C. "auto": a diagram of sampled subsystems is interpreted at first; a compiler works
         beside it if the run is long enough, and C takes over at some tick, with the same results to the last bit. With
-        continuous states results are the same within the tolerances: there C takes over where a count of the run's
-        work says so, at the same instant wherever it runs. With tables it is interpreted. ``run.tier`` says what was
-        done. True: in C from the beginning. It needs a compiler (the extra ``build``), and a diagram without transport
-        delays and FMUs in processes of their own; between ticks one of the solvers "auto", "RK23", "RK45", "DOP853",
-        "Radau" and those of fixed step. Where one of these fails, the run is interpreted, and ``run.messages`` says
-        why.
+        continuous states results are the same within the tolerances: there the work is counted (ticks, steps, events),
+        and C takes over at the step at which the count says so, the same one wherever it runs (before the first
+        tick where there are many; beside FMUs, and where the step ends at a tick, at the next tick). With tables it is
+        interpreted. ``run.tier`` says what was done. True: in C from the beginning. It needs a compiler (the extra
+        ``build``), and a diagram without transport delays and FMUs in processes of their own; between ticks one of the
+        solvers "auto", "RK23", "RK45", "DOP853", "Radau" and those of fixed step. Where one of these fails, the run is
+        interpreted, and ``run.messages`` says why.
     fuse : bool
         Compile the ticks, the loop over them and the equations of FMUs that Loopwright has built on this machine
         together, for its processor, with products and sums fused (FMA): faster, and values differ by rounding, as

@@ -350,7 +350,7 @@ class Simulation:
         return self._begun and alive and can_save(self._engine)
 
     def save(self) -> RunState:
-        """Return the complete state at this tick, that of the FMUs included.
+        """Return the complete state at this tick, with that of the FMUs. See ``start`` of `simulate` for its bits.
 
         Raises
         ------
