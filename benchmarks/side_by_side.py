@@ -1,7 +1,7 @@
 """All that is compared with others, in one run: python benchmarks/side_by_side.py [--quick].
 
 The hand-written C of Fig. 3 beside interpreted, compiled and fused runs, with its counts of instructions (valgrind);
-sampled and continuous loops in both forms; sweeps over threads and lanes; an anti-lock brake with some 10,000 events;
+sampled and continuous loops in both forms; sweeps over threads and lanes; an anti-lock brake with 12,900 events;
 and the tools of others. Each is a benchmark of its own, which prints its ratios and their spread. With --quick sweeps
 are shorter, and instructions are not counted. The program ends with status 1 if one of them does.
 """
