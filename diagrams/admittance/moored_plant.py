@@ -250,11 +250,23 @@ def hold_beside(table: Structure, block: str, wire: Wire, name: str) -> Wire:
 
 
 def set_tool(table: Structure, tool_mass: float | None) -> None:
-    """Give the force sensors another tool; None leaves them their own."""
-    if tool_mass is not None:
-        for path, sensor in table.blocks.items():
-            if isinstance(sensor, ForceSensor):
-                table.blocks[path] = sensor.replace(tool_mass=tool_mass)
+    """Give the force sensors another tool; None leaves them their own.
+
+    Raises
+    ------
+    OptionError
+        If there is no force sensor: nothing in a run would carry the tool.
+    """
+    if tool_mass is None:
+        return
+    sensors = {path: block for path, block in table.blocks.items() if isinstance(block, ForceSensor)}
+    if not sensors:
+        raise OptionError(
+            "found no ForceSensor in the diagram; a run with another tool mass needs one, whose measured force leaves "
+            "out the tool's inertia. Put one on the measured force, or take a limit of stiffness, damping or mass."
+        )
+    for path, sensor in sensors.items():
+        table.blocks[path] = sensor.replace(tool_mass=tool_mass)
 
 
 def _own_start(block: Fmu, cls: type[Block]) -> Mapping[str, Any]:

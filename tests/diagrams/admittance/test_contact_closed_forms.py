@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from loopwright.blocks import Array, Block, Constant, Gain, Input, Output, State, parameter
+from loopwright.blocks import Array, Block, Constant, Gain, Input, OptionError, Output, State, parameter
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams.admittance.moored_plant import copy_table, set_tool
 
 # --- a haptic device: Colgate and Schenkel, b > K T/2 + |B| ------------------------------------------------------------
 
@@ -168,6 +169,11 @@ def test_a_flexible_joint_has_the_limits_of_its_polynomial(vary, held):
         assert found.frequency == pytest.approx(abs(poles[np.argmax(poles.real)].imag), rel=1e-6)
     else:
         assert (found.value == 0.0) is bool(sigma[0] > 0.0)
+
+
+def test_a_limit_of_the_tool_is_not_tried_where_no_force_sensor_carries_a_tool():
+    with pytest.raises(OptionError, match="found no ForceSensor in the diagram"):
+        set_tool(copy_table(flexible().diagram), 1.0)
 
 
 def test_the_admittance_and_a_map_of_a_flexible_joint_are_those_of_its_polynomial():
