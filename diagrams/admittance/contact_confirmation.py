@@ -213,8 +213,8 @@ def _check(contact: TriedContact, limit: ContactLimit, push: float) -> float:
         )
     if not (math.isfinite(limit.value) and limit.value > 0.0):
         raise OptionError(
-            f"found a limit of {limit.value:g} {limit.unit}; expected a finite one that is not 0, with runs on both sides "
-            "of it. Take one in another environment: other values beside the one that varies.",
+            f"found a limit of {limit.value:g} {limit.unit}; expected a finite one that is not 0, with runs on both "
+            "sides of it. Take one in another environment: other values beside the one that varies.",
             block=contact.plant,
             port=limit.vary,
         )
