@@ -112,6 +112,11 @@ def pytest_collection_finish(session):
     gc.set_threshold(20_000, 20, 50)
 
 
+def pytest_unconfigure(config):
+    """Let the end of the process collect all, as libraries that count their objects expect."""
+    gc.unfreeze()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def cache(tmp_path_factory):
     """Folder of this worker's cache. The compiler's own, 50 MB that are the same for all, is shared by the workers."""
