@@ -209,7 +209,7 @@ class Sweep:
 
 
 def _labels(values: Sequence[Any]) -> np.ndarray:
-    """Return values as a coordinate: numbers where they are numbers, else their texts."""
-    if all(isinstance(value, bool | int | float) for value in values):
+    """Return values as a coordinate: numbers where they are numbers, texts where they are texts, else as they print."""
+    if all(isinstance(value, bool | int | float) for value in values) or all(isinstance(v, str) for v in values):
         return np.array(values)
     return np.array([repr(value.tolist() if isinstance(value, np.ndarray) else value) for value in values])

@@ -9,6 +9,7 @@ import pytest
 from loopwright.blocks import (
     BandLimitedNoise,
     Block,
+    Compare,
     Constant,
     Gain,
     Input,
@@ -482,3 +483,9 @@ def test_fused_runs_have_the_bits_of_fused_single_runs(how):
     assert not np.array_equal(single["plant.position"], experiment.simulate(**QUIET)["plant.position"])
     assert np.array_equal(found["plant.position"][0], single["plant.position"])
     assert any("Fused: plant" in message for message in found.messages)
+
+
+def test_texts_are_coordinates_as_they_are():
+    compared = Diagram("c", Compare(relation=">", name="cmp")(Constant(value=1.0), Constant(value=2.0)).named("y"))
+    found = compared.sweep({"cmp.relation": [">", "<"]}, 0.1, reduce={"end": final("y")}, progress=False)
+    assert [float(found.dataset["end"].sel({"cmp.relation": relation})) for relation in (">", "<")] == [0.0, 1.0]
