@@ -112,7 +112,14 @@ def _span(loops: Sequence[Any], omega: ArrayLike | None) -> list[np.ndarray]:
         if not (asked.size and np.all(np.isfinite(asked)) and np.all(asked > 0.0)):
             raise OptionError(f"found {omega!r}; expected positive frequencies in rad/s. Give some.", port="omega")
         dt = float(loop.dt or 0.0)
-        spans.append(asked[asked < np.pi / dt] if dt else asked)
+        shown = asked[asked < np.pi / dt] if dt else asked
+        if not shown.size:
+            raise OptionError(
+                f"found {omega!r} rad/s, none below π/T = {np.pi / dt:.6g} rad/s of the loop sampled every {dt:g} s; "
+                "expected one at least. Give lower ones, or leave the loop out.",
+                port="omega",
+            )
+        spans.append(shown)
     return spans
 
 
@@ -237,7 +244,7 @@ def step(closed: Sequence[Any], names: Sequence[str], times: ArrayLike | None, h
             raise OptionError(f"found {times!r}; expected times in s above 0. Give some.", port="t")
         for i, system in enumerate(closed):
             dt = float(system.dt or 0.0)
-            grid = dt * np.arange(int(end / dt) + 1) if dt else np.linspace(0.0, end, POINTS)
+            grid = dt * np.arange(int(end / dt * (1 + 1e-9)) + 1) if dt else np.linspace(0.0, end, POINTS)
             found = control.step_response(system, T=grid)
             look = _look(i, system)
             axes.plot(found.t, np.ravel(found.y), label=names[i], drawstyle="steps-post" if dt else "default", **look)

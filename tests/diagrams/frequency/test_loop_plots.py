@@ -231,3 +231,15 @@ def test_resonances_are_drawn_to_their_peaks_and_legends_stand_above(loop):
     figure.draw(figure.canvas.get_renderer())
     bottom = legend.get_window_extent().y0
     assert all(axes.get_window_extent().y1 <= bottom + 1 for axes in figure.axes)
+
+
+@pytest.mark.parametrize("end", [0.6, 1.2, 1.4])  # divided by 0.2 s, they are just below a whole number
+def test_a_sampled_step_response_has_its_last_sample(end):
+    figure = drive(0.2).replace({"pi.numerator": [1.0, 0.5]}).linearize().loop("u").step(t=end)
+    assert figure.axes[0].lines[0].get_xdata()[-1] == pytest.approx(end, rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["bode", "nyquist", "nichols"])
+def test_frequencies_that_all_lie_beyond_a_sampled_loop_are_refused(sampled, kind):
+    with pytest.raises(OptionError, match=r"omega: found .* none below π/T = 157\.08 rad/s"):
+        getattr(sampled, kind)(omega=[200.0, 1000.0])
