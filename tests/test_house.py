@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -48,15 +49,18 @@ def literals(node):
     elif isinstance(node, ast.JoinedStr | ast.Tuple | ast.List | ast.Set):
         for part in getattr(node, "values", getattr(node, "elts", ())):
             yield from literals(part)
-    elif isinstance(node, ast.Name) and node.id in CONSTANTS:
-        yield from literals(CONSTANTS[node.id])
+    elif isinstance(node, ast.Name) and node.id in constants():
+        yield from literals(constants()[node.id])
 
 
-CONSTANTS = {}
-for source in SOURCES:
-    for statement in ast.parse(source.read_text(encoding="utf-8")).body:
-        if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
-            CONSTANTS[statement.targets[0].id] = statement.value
+@cache
+def constants():
+    found = {}
+    for source in SOURCES:
+        for statement in ast.parse(source.read_text(encoding="utf-8")).body:
+            if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
+                found[statement.targets[0].id] = statement.value
+    return found
 
 
 def is_text(node):
@@ -125,7 +129,7 @@ def test_every_exception_is_still_needed():
     ],
 )
 def test_the_rule_sees_what_it_is_about(line, monkeypatch):
-    monkeypatch.setitem(CONSTANTS, "WAYS_OF_A_TEST", ast.parse('("differences", "identified")', mode="eval").body)
+    monkeypatch.setitem(constants(), "WAYS_OF_A_TEST", ast.parse('("differences", "identified")', mode="eval").body)
     assert list(prose_read(ast.parse(line)))
 
 

@@ -221,3 +221,13 @@ def test_margins_that_are_there_are_compared_without_a_second_reduction(monkeypa
     monkeypatch.setattr("loopwright.diagrams.frequency.python_control.margins", None)
     found = compare_margins(Realization.of(loop), ours, loop)
     assert {row.name for row in found} >= {"gain_margin_low", "phase_margin_deg"}
+
+
+@pytest.mark.parametrize("damping", [0.05, 0.003])
+@pytest.mark.parametrize("period", [0.0, 0.1])
+def test_its_disk_margin_is_asked_for_at_the_frequencies_where_it_is_least(damping, period):
+    """An integrator before a resonance: a peak as wide as the damping is asked for where it is, and the tools agree."""
+    loop = control.ss(control.tf([1.8 * damping], [1, 0]) * control.tf([1], [1, 2 * damping, 1]))
+    row = rows(control.sample_system(loop, period) if period else loop)["disk_margin"]
+    assert row.right == "both"
+    assert row.control == pytest.approx(row.value, rel=1e-7)

@@ -3,7 +3,6 @@
 import random
 import struct
 
-import lief
 import pytest
 
 from loopwright.fmus import mass_spring_damper
@@ -21,6 +20,8 @@ def data(cache):
 
 @LINUX
 def test_symbols_and_needed_libraries_are_those_that_lief_reads(data):
+    import lief  # it takes a second
+
     found, other = read_library(data), lief.parse(list(data))
     assert found.symbols == {s.name for s in other.exported_symbols}
     assert found.undefined == {
@@ -38,6 +39,8 @@ def test_symbols_and_needed_libraries_are_those_that_lief_reads(data):
 @LINUX
 def test_a_library_that_is_cut_off_before_its_segments_end_is_damaged(data):
     """The loader maps the segments: from LIEF's numbers, a file that ends within one brings a process down."""
+    import lief
+
     other = lief.parse(list(data))  # its segments live as long as it
     end = max(s.file_offset + s.physical_size for s in other.segments if s.type == lief.ELF.Segment.TYPE.LOAD)
     step = max(1, end // 200)
