@@ -11,7 +11,7 @@ environment's mass, are sampled `EARLY` of a tick before it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -116,7 +116,7 @@ def attach_environment(
     model: PlantEquations,
     measured: Tap | None,
     mooring: Mooring,
-    tool_mass: float | None,
+    tool: Mapping[str, float] | None,
     tick: Fraction | None,
     *,
     held: bool = False,
@@ -135,8 +135,8 @@ def attach_environment(
         Wire to which its force is added, for all readers but the plant.
     mooring : Mooring
         The environment.
-    tool_mass : float, optional
-        Mass beyond the force sensor in kg; the diagram's own without it.
+    tool : dict, optional
+        Mass in kg beyond a force sensor, by the sensor's path; the diagram's own without it.
     tick : Fraction, optional
         Sample time of a sampled diagram in s.
     held : bool
@@ -153,7 +153,7 @@ def attach_environment(
             f"found {measured.name!r}, which the plant measures itself; expected a sensor outside of it.", block=path
         )
     table = copy_table(diagram)
-    set_tool(table, tool_mass)
+    set_tool(table, tool)
     taken = {*table.blocks, *table.subsystems}
     name = next(n for n in (BLOCK + "_" * k for k in range(99)) if n not in taken)
     held_by = f"{name}_sampling"

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from .contact_confirmation import ContactConfirmation
     from .contact_trials import TrialMethod
 
+SOON = 1e-9
+"""Time in s just behind the start of a continuous diagram."""
 _FREQUENCY = "frequency in rad/s"
 
 
@@ -291,9 +293,12 @@ def make_contact(
     point = operating_point(diagram, at, options)
     diagram = diagram.replace(point.parameters) if point.parameters else diagram  # parameters that a trim has found
     ports = Ports.find(diagram, diagram.flatten_like(point), port, position, velocity)
+    if not diagram.has_clock and point.t == 0.0:  # a sensor's first value lacks its tool; at rest, a later one does not
+        point = _move_on(point, 0, SOON)
     parts, unusual = take_apart(diagram, ports, force, point, taken)
-    if unusual:  # such as a sensor's first sample: at rest, the next tick has the same states
-        point = _move_on(point, round(parts.sample_time / float(point.base)))
+    if unusual:  # so does its first sample; the next tick has the same states
+        count = round(parts.sample_time / float(point.base))
+        point = _move_on(point, count, float(point.base * count))
         parts, _ = take_apart(diagram, ports, force, point, taken)
     unit, side, scale = _find_direction(diagram, point, ports, direction, parts.force.shape[1])
     return Contact(
@@ -301,9 +306,8 @@ def make_contact(
     )
 
 
-def _move_on(point: OperatingPoint, count: int) -> OperatingPoint:
-    """Return the operating point some ticks later, of a diagram that rests."""
-    h = float(point.base * count)
+def _move_on(point: OperatingPoint, count: int, h: float) -> OperatingPoint:
+    """Return the operating point some ticks and seconds later, of a diagram that rests."""
     plants = {path: {**plant, "t": plant["t"] + h} for path, plant in point.plants.items()}
     return replace(point, t=point.t + h, tick=point.tick + count, plants=plants)
 

@@ -136,6 +136,8 @@ class CoupledLoop:
     @classmethod
     def of(cls, parts: ContactParts, direction: np.ndarray, vary: str, held: Mapping[str, float]) -> CoupledLoop:
         """Return the coupled loop, with the modes split off that the environment can't move."""
+        if "tool_mass" in {vary, *held}:
+            parts.tool.check()
         used = {vary} | {name for name, value in held.items() if value and name != "tool_mass"}
         loop = close_loop(parts, join_environment(parts, direction, **held))
         return cls(parts, direction, vary, held, split_modes(parts, direction, loop, used))
@@ -174,13 +176,15 @@ class CoupledLoop:
         """
         fixed, sampled = self.modes.fixed, bool(self.parts.sample_time)
         near_rest = np.abs(fixed - (1.0 if sampled else 0.0)) < (1e-3 if sampled else 1.0)
-        scatter = 3.0 * 1e-16 ** (1.0 / max(1, int(np.count_nonzero(near_rest))))
+        loop = self.close(np.float64(0.0))
+        known = not sampled and bool(np.all(np.isfinite(loop.A)))
+        size = max(1.0, float(np.max(np.abs(np.linalg.eigvals(loop.A)), initial=0.0))) if known else 1.0
+        scatter = 3.0 * 1e-16 ** (1.0 / max(1, int(np.count_nonzero(near_rest)))) * size
         excess = np.abs(fixed) - 1.0 if sampled else fixed.real
         if not np.any(excess > scatter):
             return None
         pole = fixed[int(np.argmax(excess))]
         rate = to_rates(self.parts, np.array([pole]))[0]
-        loop = self.close(np.float64(0.0))
         found, vectors = np.linalg.eig(loop.A)
         state = vectors[:, int(np.argmin(np.abs(found - pole)))]
         frequency = find_frequency(self.parts, loop, complex(rate), state)

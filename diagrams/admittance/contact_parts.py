@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks import ForceSensor
 from ...blocks.core import (
     Finding,
     FmuError,
@@ -35,9 +34,10 @@ from ..linearization import (
     moves_between_ticks,
 )
 from .compliance_loop import StateMatrices
-from .contact_ports import Ports, Source, check_command, check_force_wire, check_unit
+from .contact_ports import Ports, Source, check_command, check_unit, force_wire_error
 from .contact_ticks import ControllerTick, Four, hold_signals
-from .force_entry import find_entry, find_sensor
+from .force_entry import find_entry
+from .sensed_tool import Tool, find_tool
 
 if TYPE_CHECKING:
     from ..flat import FlatDiagram, WiredDiagram
@@ -72,8 +72,8 @@ class ContactParts:
         Sample time T of the controller in s, the period of several rates; 0 if everything is continuous.
     is_stepped : bool
         Whether the plant is an FMU, whose outputs at a tick are those under its last inputs.
-    tool_mass : float
-        Mass of the tool in kg that the diagram's force sensor feels.
+    tool : Tool
+        Tool that the diagram's force sensor feels.
     derivation : Derivation
         Method by which the plant was differentiated.
     errors : tuple of StateMatrices
@@ -94,12 +94,17 @@ class ContactParts:
     controller: StateMatrices
     sample_time: float
     is_stepped: bool
-    tool_mass: float
+    tool: Tool
     derivation: Derivation
     errors: tuple[StateMatrices, StateMatrices]
     findings: tuple[Finding, ...]
     entry: str | None = None
     ticks: tuple[ControllerTick, ...] = ()
+
+    @property
+    def tool_mass(self) -> float:
+        """Mass of the tool in kg that the diagram's force sensor feels."""
+        return self.tool.mass
 
     @property
     def controllers(self) -> tuple[ControllerTick, ...]:
@@ -191,12 +196,13 @@ def take_apart(
     if signal is not None:
         check_unit(diagram, path, ports, signal)
         check_command(flat, ports, signal, wires)
-        driven = wires.get(ports.force)
-        direct = driven is not None and (driven.block, driven.port) == signal.port
-        for one in ticks or [ControllerTick(K, 0.0)]:
-            entries = [wired.index(i) for i in pushed if i in wired]
-            check_force_wire(path, ports, signal, one.matrices, entries, direct=direct)
-    sensor = None if signal is None else find_sensor(flat, signal.port[0])
+        entries = [wired.index(i) for i in pushed if i in wired]
+        if any(np.any(one.matrices.D[entries, -len(felt) :]) for one in ticks or [ControllerTick(K, 0.0)]):
+            raise force_wire_error(flat, ports, signal)
+
+    def lead(names: Sequence[str]) -> Linearization:
+        return linearize(diagram, point, inputs=names, outputs=sources, openings=outputs, **options)
+
     parts = ContactParts(
         plant=plant,
         force=m.B[:, pushed],
@@ -206,7 +212,7 @@ def take_apart(
         controller=K,
         sample_time=model.dt,
         is_stepped=block.stepped,
-        tool_mass=0.0 if sensor is None else cast(ForceSensor, flat.table.blocks[sensor]).tool_mass,
+        tool=find_tool(flat, ports, m, signal, entry, lead, sampled=bool(model.dt)),
         derivation=m.derivation,
         errors=(
             StateMatrices(E.A, E.B[:, wired], E.C[rows], E.D[np.ix_(rows, wired)]),

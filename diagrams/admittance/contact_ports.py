@@ -10,7 +10,6 @@ import numpy as np
 
 from ...blocks.core import OptionError, UnknownNameError, near, same_unit
 from ..linearization import Tap, find_signal
-from .compliance_loop import StateMatrices
 
 if TYPE_CHECKING:
     from ..flat import FlatDiagram, WiredDiagram
@@ -96,12 +95,14 @@ def check_command(flat: FlatDiagram, ports: Ports, signal: Tap, wires: Mapping[s
             )
 
 
-def check_force_wire(path: str, ports: Ports, signal: Tap, K: StateMatrices, rows: list[int], *, direct: bool) -> None:
-    """Refuse a measured force that drives the force port itself: the environment's force would act twice."""
-    if direct or (rows and np.any(K.D[rows, -len(signal.entries) :])):
-        raise OptionError(
-            f"found {signal.name!r}, which leads on to {path}.{ports.force}; expected the signal of the force sensor, "
-            "which acts on the controller alone. Name that wire: force=….",
-            block=path,
-            port=ports.force,
-        )
+def force_wire_error(flat: FlatDiagram, ports: Ports, signal: Tap) -> OptionError:
+    """Return the error of a measured force that leads on to the force port: the environment's force would act twice."""
+    readers = sorted({f"{path}.{port}" for (path, port), wire in flat.table.wires.items()
+                      if (wire.block, wire.port) == signal.port and path != ports.plant})  # fmt: skip
+    return OptionError(
+        f"found {signal.name!r}, which leads on to {ports.plant}.{ports.force}, and is read by {', '.join(readers)}; "
+        "expected a wire that acts on the controller alone. Put a Gain(gain=1, name='cell') on the wire to those of "
+        "them that belong to the controller, and name its output: force='cell.y'.",
+        block=ports.plant,
+        port=ports.force,
+    )

@@ -231,7 +231,8 @@ class Trials:
         """Return the diagram with the environment."""
         contact, still = self.contact, self._still
         environment = {**self.limit.environment, self.limit.vary: value}
-        tool = environment.pop("tool_mass", None)
+        mass = environment.pop("tool_mass", None)
+        tool = None if mass is None else self._on_sensor(float(mass))
         d = contact.direction
         mobility = float(d @ contact.parts.velocity @ contact.parts.force @ d)
         step = contact.sample_time or STEP
@@ -249,6 +250,19 @@ class Trials:
         tick = Fraction(contact.point.base) if contact.sample_time else None
         held = self.method is TrialMethod.HELD
         return attach_environment(still, contact.ports, self._model, source, mooring, tool, tick, held=held)
+
+    def _on_sensor(self, mass: float) -> dict[str, float]:
+        """Return a tool by the path of the contact's force sensor."""
+        sensor = self.contact.parts.tool.sensor
+        if sensor is None:
+            raise OptionError(
+                "found no ForceSensor on the way of the measured force; a run with another tool mass needs one, whose "
+                "measured force leaves out the tool's inertia. Put one there, or take a limit of stiffness, damping "
+                "or mass.",
+                block=self.contact.plant,
+                port="tool_mass",
+            )
+        return {sensor: mass}
 
 
 def _choose(contact: TriedContact, limit: ContactLimit, method: TrialMethod | str | None) -> TrialMethod:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks import Constant, ForceSensor, Hold, Reference, Sum
+from ...blocks import Constant, Hold, Reference, Sum
 from ...blocks.core import Array, Block, OptionError, Output, Source, parameter
 from ...fmus.export import build
 from ...fmus.models import gantry, gantry_elastic, gantry_stiction, scara
@@ -166,7 +166,7 @@ def moored_diagram(
     ports: tuple[str, str, str],
     measured: Tap | None,
     mooring: Mooring,
-    tool_mass: float | None = None,
+    tool: Mapping[str, float] | None = None,
 ) -> WiredDiagram:
     """Return a diagram with an environment inside its plant; the measured force has the environment's.
 
@@ -182,8 +182,8 @@ def moored_diagram(
         Wire to which its force is added, for all readers but the plant.
     mooring : Mooring
         The environment.
-    tool_mass : float, optional
-        Mass beyond the force sensor in kg; the diagram's own without it.
+    tool : dict, optional
+        Mass in kg beyond a force sensor, by the sensor's path; the diagram's own without it.
 
     Raises
     ------
@@ -208,7 +208,7 @@ def moored_diagram(
         made: Any = moor(cls, *ports)
         table.blocks[plant] = made(**{k: v for k, v in values.items() if v is not None}, **mooring.parameters(),
                                    name=block.label)  # fmt: skip
-    set_tool(table, tool_mass)
+    set_tool(table, tool)
     if measured is not None:
         source = measured.port
         if source[0] == plant:
@@ -249,24 +249,10 @@ def hold_beside(table: Structure, block: str, wire: Wire, name: str) -> Wire:
     return Wire(path, "y")
 
 
-def set_tool(table: Structure, tool_mass: float | None) -> None:
-    """Give the force sensors another tool; None leaves them their own.
-
-    Raises
-    ------
-    OptionError
-        If there is no force sensor: nothing in a run would carry the tool.
-    """
-    if tool_mass is None:
-        return
-    sensors = {path: block for path, block in table.blocks.items() if isinstance(block, ForceSensor)}
-    if not sensors:
-        raise OptionError(
-            "found no ForceSensor in the diagram; a run with another tool mass needs one, whose measured force leaves "
-            "out the tool's inertia. Put one on the measured force, or take a limit of stiffness, damping or mass."
-        )
-    for path, sensor in sensors.items():
-        table.blocks[path] = sensor.replace(tool_mass=tool_mass)
+def set_tool(table: Structure, tool: Mapping[str, float] | None) -> None:
+    """Give a force sensor another tool; None leaves it its own."""
+    for path, mass in (tool or {}).items():
+        table.blocks[path] = table.blocks[path].replace(tool_mass=mass)
 
 
 def _own_start(block: Fmu, cls: type[Block]) -> Mapping[str, Any]:

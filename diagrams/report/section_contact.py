@@ -255,7 +255,7 @@ def _stiffness(contact: Contact, soft: ContactLimit, numbers: dict[str, Number])
 def _masses(contact: Contact, numbers: dict[str, Number]) -> Table:
     rows = []
     kinds = {"mass": ("me_limit", "m_e")}
-    if contact.measured is not None:
+    if contact.measured is not None and not contact.parts.tool.problem:
         kinds["tool_mass"] = ("tool_mass_limit", "tool")
     for vary, (key, symbol) in kinds.items():
         found = contact.stability_limit(vary, stiffness=SPRING)
@@ -269,6 +269,8 @@ def _required(contact: Contact, required: tuple[ContactLimits, ...], numbers: di
     rows = []
     for one in required:
         for vary, limit in one.limits.items():
+            if contact.parts.tool.problem and "tool_mass" in {vary, *one.environment}:
+                continue
             ends = [end for end in limit if math.isfinite(end)]
             high = max([SCANNED[vary], *(BEYOND * end for end in ends)])
             environment: dict[str, Any] = dict(one.environment)

@@ -196,6 +196,14 @@ def test_force_tracking_drifts_in_the_other_direction_and_has_its_limit(side):
     assert len(slow) >= 1  # the drift of the other direction, which no growth rate counts
 
 
+def test_the_wire_of_the_force_on_the_plant_is_a_measured_force():
+    here = diagram().contact(force="free_space.y")
+    assert (here.entry, here.parts.tool.sensor) == ("free_space.y", "sensors.force_sensor")
+    for vary, held in (("stiffness", {"damping": 10.0}), ("tool_mass", {})):
+        expected = contact().stability_limit(vary, **held).value
+        assert here.stability_limit(vary, **held).value == pytest.approx(expected, rel=1e-9)
+
+
 # --- refusals --------------------------------------------------------------------------------------------------------
 
 
@@ -210,7 +218,6 @@ def test_force_tracking_drifts_in_the_other_direction_and_has_its_limit(side):
         ({"force": "position"}, OptionError, "found 'position' in m; expected the measured force in N"),
         ({"direction": "across"}, OptionError, "found 'across'; expected 'par', 'perp' or a vector"),
         ({"direction": (0.0, 0.0)}, OptionError, "expected a vector of 2 finite entries that is not zero"),
-        ({"force": "free_space.y"}, OptionError, "which leads on to plant.external_force"),
         ({"at": 1.2}, ParameterError, "found a point at which states change"),
         ({"when": 1.2}, UnknownNameError, "contact takes no 'when'"),
     ],

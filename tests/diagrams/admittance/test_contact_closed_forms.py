@@ -1,6 +1,7 @@
 """Contacts of users' own plants against closed forms: a haptic wall, a flexible joint, and a mass that changes with its place."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,7 +10,6 @@ from scipy.optimize import brentq
 
 from loopwright.blocks import Array, Block, Constant, Gain, Input, OptionError, Output, State, parameter
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.admittance.moored_plant import copy_table, set_tool
 
 # --- a haptic device: Colgate and Schenkel, b > K T/2 + |B| ------------------------------------------------------------
 
@@ -172,8 +172,12 @@ def test_a_flexible_joint_has_the_limits_of_its_polynomial(vary, held):
 
 
 def test_a_limit_of_the_tool_is_not_tried_where_no_force_sensor_carries_a_tool():
-    with pytest.raises(OptionError, match="found no ForceSensor in the diagram"):
-        set_tool(copy_table(flexible().diagram), 1.0)
+    here = flexible()
+    loop = here.loop("tool_mass", stiffness=20.0)
+    rates = {"growth_below": loop.growth_at(0.97), "growth_above": loop.growth_at(1.03)}
+    limit = replace(here.stability_limit("tool_mass", stiffness=20.0), value=1.0, frequency=10.0, **rates)
+    with pytest.raises(OptionError, match="arm.tool_mass: found no ForceSensor on the way of the measured force"):
+        here.confirm(limit)
 
 
 def test_the_admittance_and_a_map_of_a_flexible_joint_are_those_of_its_polynomial():

@@ -24,6 +24,19 @@ class Cart(Block):
         return x.velocity, (u.motor + u.push) / M
 
 
+def bare_diagram(scale=None, cell=False):
+    """The cart without a sensor: the drive reads the force on it, which is scaled on its way to the cart."""
+    cart, hand = Cart(name="cart"), Constant(value=0.0, unit="N", name="hand")
+
+    @subsystem(sample_time=T)
+    def drive(velocity, felt):
+        return Gain(gain=SHARE, name="share")(felt) - Gain(gain=DRAG, name="drag")(velocity)
+
+    felt = Gain(gain=1, name="cell")(hand) if cell else hand
+    push = hand if scale is None else Gain(gain=scale, name="scale")(hand)
+    return Diagram("cart", cart(motor=drive(cart.velocity, felt), push=push))
+
+
 def diagram(sensor, delay=0, slow=T, wired=True):
     """A cart whose drive amplifies the measured force, sampled by T, and damps it; the sensor is sampled by ``slow``."""
     cart, hand = Cart(name="cart"), Constant(value=0.0, unit="N", name="hand")
@@ -127,3 +140,28 @@ def test_a_continuous_filter_of_the_force_is_on_the_way():
     k = (M + LAG * DRAG) * DRAG / (LAG * M * (1 + SHARE) - LAG * (M + LAG * DRAG))
     assert here.entry == "hand.y"
     assert here.stability_limit().value == pytest.approx(k, rel=1e-9)
+
+
+# --- the force on the plant, measured on its own wire -------------------------------------------------------------------
+
+
+def is_limit(limit):
+    value = brentq(growth, 0.9 * limit.value, 1.1 * limit.value, xtol=1e-300, rtol=1e-13)
+    assert limit.value == pytest.approx(value, rel=1e-8)
+
+
+def test_the_force_on_the_plant_is_measured_on_its_own_wire():
+    here = bare_diagram().contact("cart.push", force="hand.y", direction=[1.0], **PORTS)
+    assert here.entry == "hand.y"
+    limit = here.stability_limit()
+    is_limit(limit)
+    for trial in here.confirm(limit).trials:
+        assert trial.measured == pytest.approx(growth(trial.value), rel=0.01)
+
+
+def test_the_advice_for_a_force_that_leads_to_the_plant_through_a_block_can_be_followed():
+    with pytest.raises(OptionError, match=r"is read by drive.share.u, scale.u; .*name='cell'.*force='cell.y'"):
+        bare_diagram(scale=2.0).contact("cart.push", force="hand.y", direction=[1.0], **PORTS)
+    here = bare_diagram(scale=2.0, cell=True).contact("cart.push", force="cell.y", direction=[1.0], **PORTS)
+    assert here.entry == "cell.y"
+    is_limit(here.stability_limit())
