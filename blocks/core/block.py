@@ -253,6 +253,10 @@ class Block(Value, Wireable):
             return iter(self._signal())  # one signal, or none: the error says what to do
         return iter([Signal(self, name) for name in names])
 
+    def entries_of(self, parameter: str) -> Collection[str]:
+        """Return the names that entries of a mapping among its parameters may have, besides those that it holds."""
+        return ()
+
     def check_place(self, old: Block, wired: Collection[str], read: Collection[str]) -> None:
         """Check that the block fits the wires of another one; `Diagram.replace` calls it.
 

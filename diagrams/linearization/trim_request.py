@@ -12,7 +12,7 @@ from ...blocks.core import Block, OptionError, ParameterError, UnknownNameError,
 from ...blocks.tracing import traced_parameters
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, PointOrigin
-from ..wiring import change_parameter, index_of, split_entry, split_path
+from ..wiring import change_parameter, find_place, index_of, split_entry
 from .derivatives import find_signal
 from .plant_models import plant_layout
 
@@ -276,7 +276,7 @@ def free_parameters(diagram: WiredDiagram, asked: Mapping[str, Any]) -> tuple[li
     """
     found, moved = [], {}
     for name, given in asked.items():
-        path, keys = split_path(diagram.structure, name, diagram.name)
+        path, keys = find_place(diagram.structure, name, diagram.name)
         block = diagram.structure.blocks[path]
         value = read_value(block, keys, block.label)
         low, high = _read_bounds(given, np.shape(value), name)
@@ -298,7 +298,7 @@ def free_parameters(diagram: WiredDiagram, asked: Mapping[str, Any]) -> tuple[li
 
 def split_array(diagram: WiredDiagram, name: str) -> tuple[str, tuple[int, ...]]:
     """Return the path of a parameter, and the entry of an array that is named behind it: ``"motor.denominator[1]"``."""
-    path, keys = split_path(diagram.structure, name, diagram.name)
+    path, keys = find_place(diagram.structure, name, diagram.name)
     block = diagram.structure.blocks[path]
     known = cast("Fmu", block).description.variables if block.stepped and keys[0] == "start" else ()
     return (name, ()) if ".".join(keys[1:]) in known else split_entry(name, ())

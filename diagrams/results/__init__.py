@@ -19,7 +19,7 @@ from .plots import (
     save,
     style,
 )
-from .recorder import Recorder
+from .recorder import Recorder, select
 from .recording import Recording
 from .run import Run
 from .saved_state import RunState, check_fits, layout_of, not_open_error
@@ -61,5 +61,6 @@ __all__ = [
     "not_open_error",
     "resolve",
     "save",
+    "select",
     "style",
 ]

@@ -14,7 +14,7 @@ from ..flat import WiredDiagram
 from ..frequency import MarginSlope, Number, margin_slopes
 from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize
 from ..results import OperatingPoint
-from ..sweeps import find_parameter
+from ..wiring import find_parameter
 from .parameters import check_parameters, list_parameters, unit_of
 
 if TYPE_CHECKING:

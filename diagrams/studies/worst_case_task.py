@@ -11,7 +11,8 @@ from ...blocks.core import LoopwrightError, OptionError
 from ..flat import WiredDiagram
 from ..linearization import find_signal
 from ..requirements import Requirements, TomlFile
-from ..sweeps import Box, find_parameter, read_samples
+from ..sweeps import Box, read_samples
+from ..wiring import find_parameter
 from .cases import Goal, make_goal
 from .measures import ContactMeasure
 from .parameters import check_parameters

@@ -1,7 +1,6 @@
 """Sweeps: runs of a diagram with many values of its parameters, and studies over ranges of them."""
 
 from .child import receive, send
-from .names import find_parameter
 from .outcome import Failure
 from .processes import to_bytes
 from .reductions import Reduction, final, maximum, mean, minimum, settling_time
@@ -18,7 +17,6 @@ __all__ = [
     "Samples",
     "Sweep",
     "final",
-    "find_parameter",
     "grid",
     "latin",
     "maximum",

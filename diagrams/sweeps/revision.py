@@ -27,21 +27,46 @@ _OURS = __name__.partition(".")[0]
 _SILENT = ("progress", "compile")
 """Options of a run that change no result; in fused runs, "compile" changes rounding."""
 
+Parts = Mapping[str, Mapping[str, str]]
+"""Parts of a sweep by kind and name, as short texts."""
+DIGEST = "#"
+"""Begins a part that is a digest, and no text of a value."""
+_LONGEST = 40
+
 
 def revision_of(plan: Plan) -> str:
-    """Return the digest of a sweep without its samples: the diagram, its equations, duration, options, reductions.
+    """Return the digest of a sweep without its samples: that of its parts."""
+    return digest_of(parts_of(plan))
 
-    Equations count by their traces, so that a change in a function that they call is seen; those of blocks that Python
-    evaluates count by their source. FMUs count by their content. A function of the user counts by its own code.
+
+def digest_of(parts: Parts) -> str:
+    """Return the digest of a sweep's parts."""
+    texts = (f"{kind}\0{name}\0{text}" for kind in sorted(parts) for name, text in sorted(parts[kind].items()))
+    return hashlib.sha256("\0".join(texts).encode()).hexdigest()
+
+
+def parts_of(plan: Plan) -> dict[str, dict[str, str]]:
+    """Return all that the outcomes of a sweep depend on besides its samples, by kind and name.
+
+    Each part is a short text of its value, or a digest. Equations count by their traces, so that a change in a function
+    that they call is seen; those of blocks that Python evaluates count by their source. FMUs count by their content. A
+    function of the user counts by its own code.
     """
     silent = _SILENT[:1] if plan.options.get("fuse") else _SILENT
-    options = {name: value for name, value in plan.options.items() if name not in silent}
-    parts = (
-        _of_diagram(plan.diagram), repr(float(plan.duration)), _text(options), repr(plan.signals),
-        _text(plan.reductions), repr(plan.seeds), ca.CasadiMeta.version(),
-        repr(plan.lanes > 1),
-    )  # fmt: skip
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+    single = {
+        "duration": repr(float(plan.duration)),
+        "signals": repr(plan.signals),
+        "seeds": repr(plan.seeds),
+        "lanes": repr(plan.lanes > 1),
+        "treatment of algebraic loops": plan.diagram.loops,
+        "version of CasADi": ca.CasadiMeta.version(),
+    }
+    return {
+        "sweep": single,
+        "option": {name: _short(value) for name, value in plan.options.items() if name not in silent},
+        "reduction": {name: _short(function) for name, function in plan.reductions.items()},
+        **_of_diagram(plan.diagram),
+    }
 
 
 def key_of(sample: Sample, *, seeded: bool) -> str:
@@ -50,26 +75,68 @@ def key_of(sample: Sample, *, seeded: bool) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def _of_diagram(diagram: SimulatedDiagram) -> str:
-    table, checked = diagram.scheduled, diagram.checked
-    parts = [
-        diagram.loops, _text(table.blocks), _text(table.subsystem_of), _text(table.subsystems), _text(table.wires),
-        _text(table.names), _text(table.controls),
-    ]  # fmt: skip
-    seen: dict[int, str] = {}
-    for path, trace in sorted(checked.traced.items()):
-        block = table.blocks[path]
-        if block.opaque:
-            parts.append(_source(type(block)))
-            continue
-        if id(trace) not in seen:
-            functions = (trace.function, trace.indicators, trace.jump, trace.system_matrix)
-            texts = [f.serialize() for f in functions if f is not None]
-            seen[id(trace)] = hashlib.sha256("\0".join(texts).encode()).hexdigest()
-        parts.append(seen[id(trace)])
-        if not type(block).__module__.startswith(_OURS):
-            parts.append(_source(type(block)))  # its start and its instants are no part of the trace
-    return "\0".join(parts)
+def _of_diagram(diagram: SimulatedDiagram) -> dict[str, dict[str, str]]:
+    table = diagram.scheduled
+    blocks, parameters, contents, settings = (dict[str, str]() for _ in range(4))
+    for path, block in table.blocks.items():
+        blocks[path] = f"{_name(type(block))} in {table.subsystem_of[path] or diagram.name}"
+        parameters |= _of_value(block, path)
+        if block._content:
+            contents[path] = _short(block._content)
+    for path, chosen in table.subsystems.items():
+        named = {f.name: _short(getattr(chosen, f.name)) for f in fields(chosen) if f.name != "path"}
+        settings |= {f"{path or diagram.name}.{name}": text for name, text in named.items()}
+    return {
+        "block": blocks,
+        "parameter": parameters,
+        "content": contents,
+        "setting": settings,
+        "wire": {".".join(port): _short(wire) for port, wire in table.wires.items()},
+        "name": {name: _short(wire) for name, wire in table.names.items()},
+        "control": {path: _short(wire) for path, wire in table.controls.items()},
+        "equations": _equations_of(diagram),
+    }
+
+
+def _equations_of(diagram: SimulatedDiagram) -> dict[str, str]:
+    found, seen = dict[str, str](), dict[int, str]()
+    for path, trace in diagram.checked.traced.items():
+        block, own = diagram.scheduled.blocks[path], list[str]()
+        if not block.opaque:
+            if id(trace) not in seen:
+                functions = (trace.function, trace.indicators, trace.jump, trace.system_matrix)
+                seen[id(trace)] = _short([f.serialize() for f in functions if f is not None])
+            own.append(seen[id(trace)])
+        if block.opaque or not type(block).__module__.startswith(_OURS):
+            own.append(_source(type(block)))  # its start and its instants are no part of the trace
+        found[path] = _short(own)
+    return found
+
+
+def _of_value(value: Value, path: str) -> dict[str, str]:
+    """Return the parameters of a value, by their paths; parts of values and of mappings one by one."""
+    parts: dict[str, str] = {}
+    for name, inner in value.parameters.items():
+        if isinstance(inner, Value):
+            parts[f"{path}.{name}"] = f"{_name(type(inner))} {_short(inner._content)}"
+            parts |= _of_value(inner, f"{path}.{name}")
+        elif isinstance(inner, Mapping):
+            parts |= {f"{path}.{name}.{key}": _short(entry) for key, entry in inner.items()}
+        elif name != "file":
+            parts[f"{path}.{name}"] = _short(inner)
+    return parts
+
+
+def _short(value: Any) -> str:
+    """Return a short text of a value that is equal in every process exactly for equal values: itself, or a digest."""
+    plain = value.item() if isinstance(value, np.ndarray | np.generic) and value.ndim == 0 else value
+    if (plain is None or type(plain) in (bool, int, float, str, Fraction)) and len(shown := str(plain)) <= _LONGEST:
+        return repr(shown) if isinstance(plain, str) else shown
+    return DIGEST + hashlib.sha256(_text(value).encode()).hexdigest()[:24]
+
+
+def _name(kind: type) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}"
 
 
 def _source(cls: type) -> str:

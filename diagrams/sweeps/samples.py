@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import OptionError, near
-from ..wiring import CheckedDiagram
-from .names import find_parameter
+from ..wiring import CheckedDiagram, find_parameter
 
 KINDS = ("grid", "latin")
 _SCALES = ("linear", "log")

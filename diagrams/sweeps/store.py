@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import secrets
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -13,10 +13,12 @@ from zipfile import BadZipFile
 import numpy as np
 
 from ...blocks.core import OptionError, replace_file, write_text
+from .differences import describe_differences
 from .outcome import WORKER_ENDED, Failure, Outcome
+from .revision import Parts, digest_of
 
 HEAD = "sweep.json"
-_FORMAT = 1
+_FORMAT = 2
 _EVERY = 1.0  # s between two parts
 
 
@@ -27,8 +29,8 @@ class Store:
     ----------
     folder : path
         The folder; it is made where it isn't there.
-    revision : str
-        Digest of all that outcomes depend on besides their samples.
+    parts : mapping
+        All that outcomes depend on besides their samples; see `parts_of`.
     about : mapping
         Facts for people who look into the folder.
     overwrite : bool
@@ -40,10 +42,10 @@ class Store:
         If something else stands there.
     """
 
-    def __init__(self, folder: Path, revision: str, about: dict[str, Any], *, overwrite: bool = False):
+    def __init__(self, folder: Path, parts: Parts, about: dict[str, Any], *, overwrite: bool = False):
         self.folder = folder.absolute()  # loading an FMU changes the working folder for a moment
         try:
-            self._open(revision, about, overwrite=overwrite)
+            self._open(parts, about, overwrite=overwrite)
         except OSError as error:
             raise OptionError(
                 f"the folder {str(folder)!r} can't be made, read or written: {error.strerror or error}; expected one "
@@ -54,8 +56,8 @@ class Store:
         self._waiting: list[tuple[str, Outcome]] = []
         self._last = monotonic()
 
-    def _open(self, revision: str, about: dict[str, Any], *, overwrite: bool) -> None:
-        folder, head = self.folder, self.folder / HEAD
+    def _open(self, parts: Parts, about: dict[str, Any], *, overwrite: bool) -> None:
+        folder, head, revision = self.folder, self.folder / HEAD, digest_of(parts)
         if folder.exists() and not folder.is_dir():
             raise OptionError(f"found a file at {str(folder)!r}; expected a folder, or nothing. Choose another path.")
         if head.is_file():
@@ -71,9 +73,8 @@ class Store:
                 )
             if not fits and not overwrite:
                 raise OptionError(
-                    f"the folder {str(folder)!r} holds a sweep of {found['diagram']!r} that differs "
-                    "from this one in its diagram, duration, options, signals or reductions. Choose another folder, or "
-                    "replace it with overwrite=True."
+                    f"the folder {str(folder)!r} holds a sweep of {found.get('diagram')!r} that differs from this one "
+                    f"in {_tell(found, parts)}. Choose another folder, or replace it with overwrite=True."
                 )
             if not fits:
                 self._remove()
@@ -83,7 +84,10 @@ class Store:
             )
         folder.mkdir(parents=True, exist_ok=True)
         if not head.is_file():
-            write_text(head, json.dumps({"format": _FORMAT, "revision": revision, **about}, indent=1) + "\n")
+            write_text(
+                head,
+                json.dumps({"format": _FORMAT, "revision": revision, **about, "parts": parts}, indent=1) + "\n",
+            )
 
     def _remove(self) -> None:
         """Remove the sweep, and nothing else that stands in its folder."""
@@ -122,6 +126,15 @@ class Store:
                 ) from error
         self._waiting = []
         self._last = monotonic()
+
+
+def _tell(found: Mapping[str, Any], parts: Parts) -> str:
+    """Return in words in what a stored sweep differs from this one."""
+    if found.get("format") != _FORMAT:
+        return "the version of Loopwright that wrote it"
+    kinds = found.get("parts")
+    known = {kind: part for kind, part in kinds.items() if isinstance(part, dict)} if isinstance(kinds, dict) else {}
+    return describe_differences(known, parts) or "its head, which was changed by hand"
 
 
 def _write_part(path: Path, outcomes: Iterable[tuple[str, Outcome]]) -> None:

@@ -14,15 +14,15 @@ import numpy as np
 
 from ...blocks.core import OptionError, one_thread
 from ..flat import FlatDiagram
-from ..results import Run, entries, machine_memory, resolve
+from ..results import Run, entries, machine_memory, resolve, select
 from ..simulation import SimulatedDiagram, Simulation, progress_bar
-from .names import find_parameter
+from ..wiring import find_parameter
 from .outcome import Outcome
 from .plan import Plan
 from .processes import run_in_processes
 from .reductions import Reduction, check_reductions
 from .result import Sweep
-from .revision import key_of, revision_of
+from .revision import key_of, parts_of
 from .samples import Sample, read_samples
 from .store import Store
 from .threads import run_in_threads
@@ -80,7 +80,7 @@ def sweep(
     if to is not None:
         if not isinstance(to, str | os.PathLike) or "\0" in str(to):
             raise OptionError(f"found {to!r}; expected the path of a folder. Give one.", block=name, port="to")
-        store = Store(Path(to), revision_of(plan), {"diagram": name, "duration": plan.duration}, overwrite=overwrite)
+        store = Store(Path(to), parts_of(plan), {"diagram": name, "duration": plan.duration}, overwrite=overwrite)
         known = store.read()
     keys = [key_of(sample, seeded=bool(plan.seeds)) for sample in found] if store is not None else []
     outcomes: list[Outcome | None] = [None] * len(found)
@@ -146,19 +146,38 @@ def make_plan(
             block=name,
         )
     paths = [find_parameter(diagram, path) for path in ((seeds,) if isinstance(seeds, str) else seeds)]
+    if isinstance(record := options.get("record"), Iterable) and not isinstance(record, str):
+        options = {**options, "record": tuple(record)}  # for each of the runs
     compiled = not paths  # a seed is a fixed number in the code, which would be compiled anew for every sample
     plan = Plan(
         diagram, duration, {"compile": compiled, **options}, chosen, reductions, tuple(paths), _check_lanes(lanes)
     )
     flat = Simulation(diagram, plan.run_options, duration=duration).flat  # it checks the options
-    for signal in [*chosen, *(f.signal for f in reductions.values() if isinstance(f, Reduction))]:
-        resolve(signal, flat.table.names, flat.log.slices)
+    needed = [*chosen, *(f.signal for f in reductions.values() if isinstance(f, Reduction))]
+    _check_recorded(plan, flat, [resolve(signal, flat.table.names, flat.log.slices) for signal in needed])
     if clash := sorted(set(chosen) & set(reductions)):
         raise OptionError(
             f"found {clash[0]!r} among signals and reductions; give the reduction another name.", block=name
         )
     _check_room(plan, flat, count)
     return plan
+
+
+def _check_recorded(plan: Plan, flat: FlatDiagram, needed: Iterable[str]) -> None:
+    """Refuse a ``record`` that lacks signals that are kept, or reduced."""
+    wires, width = flat.table.names, flat.log.total + flat.width
+    columns = select(plan.run_options.record, flat.log, wires, width, states=False)
+    if plan.options.get("record") is None or columns is None:
+        return
+    kept = set(columns.tolist())
+    missing = [name for name in needed if not kept.issuperset(entries(name, flat.log, wires).ravel().tolist())]
+    if missing := list(dict.fromkeys(missing)):
+        raise OptionError(
+            f"found a choice without {', '.join(map(repr, missing))}, which signals= or reduce= need; expected all "
+            "that the sweep keeps. Add them, or leave record= out: each run then records what is kept alone.",
+            block=plan.diagram.name,
+            port="record",
+        )
 
 
 def _run(plan: Plan, samples: Sequence[Sample], workers: int, client: Any) -> Generator[Outcome, None, None]:

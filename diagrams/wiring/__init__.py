@@ -1,14 +1,15 @@
 """Structure of a diagram: blocks, wires, subsystems, checks and the order of evaluation."""
 
 from .check import Checked
-from .checked_diagram import CheckedDiagram
+from .checked_diagram import CheckedDiagram, find_parameter
 from .cycles import find_cyclic_parts
 from .entry_names import index_of, split_entry
 from .entry_order import OrderStep
 from .order import Order, find_orders
+from .parameter_names import find_place, split_path
 from .structure import Collector, Structure, SubsystemSettings, Wire, join, stepped_blocks
 from .subsystems import Subsystem, exact_time, subsystem
-from .variants import change_parameter, split_path
+from .variants import change_parameter
 
 __all__ = [
     "Checked",
@@ -24,6 +25,8 @@ __all__ = [
     "exact_time",
     "find_cyclic_parts",
     "find_orders",
+    "find_parameter",
+    "find_place",
     "index_of",
     "join",
     "split_entry",

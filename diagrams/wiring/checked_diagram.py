@@ -12,10 +12,11 @@ from ...blocks.tracing import check_method
 from .check import Checked, check
 from .delay_blocks import add_delay_blocks
 from .order import Order, find_orders
+from .parameter_names import find_name, find_path
 from .structure import Collector, Structure, SubsystemSettings, Wire, stepped_blocks
 from .subsystems import exact_time
 from .units import add_unit_conversions
-from .variants import apply_changes, find_path
+from .variants import apply_changes
 
 LOOPS = ("error", "solve")
 
@@ -126,7 +127,7 @@ class CheckedDiagram:
             (``"controller.admittance_par.stiffness"``), an entry of an array, counted from 1
             (``"motor.denominator[1]"``), a subsystem's ``sample_time``, ``method``, ``offset`` or
             ``delay`` (``"controller.sample_time"``; None: that of its surroundings), a plant's start value
-            (``"plant.start.position"``).
+            (``"plant.start.position"``, or ``"plant.position"`` where the block has no parameter of that name).
         **more
             Changes whose paths are identifiers, as keywords: ``replace(plant=Fmu("other.fmu"))``.
 
@@ -204,3 +205,8 @@ class CheckedDiagram:
     def has_fmu(self) -> bool:
         """Whether a block in it is stepped from outside, such as an FMU."""
         return bool(stepped_blocks(self.structure))
+
+
+def find_parameter(diagram: CheckedDiagram, name: object) -> str:
+    """Return the full path of a parameter of a diagram; see `find_name`."""
+    return find_name(diagram.structure, name, diagram.name)

@@ -9,19 +9,18 @@ from typing import Any, TypeVar
 from ...blocks.core import Block, LoopwrightError, UnknownNameError, Value, WiringError, near
 from ...blocks.tracing import check_method
 from .entry_names import split_entry, with_entry
+from .parameter_names import OF_A_SUBSYSTEM, check_name, find_path, find_place
 from .structure import Structure, SubsystemSettings
 from .subsystems import check_delay, exact_offset, exact_time
 
 V = TypeVar("V", bound=Value)
-
-_OF_A_SUBSYSTEM = ("sample_time", "method", "offset", "delay")
 
 
 def apply_changes(table: Structure, changes: Mapping[str, object], diagram: str) -> Structure:
     """Return the structure of a variant; see `Diagram.replace`."""
     table = table.copy()
     for path, value in changes.items():
-        _change(table, path, value, diagram)
+        _change(table, check_name(path, diagram), value, diagram)
     return table
 
 
@@ -40,7 +39,7 @@ def _change(table: Structure, path: str, value: object, diagram: str) -> None:
         full = find_path(path, table.blocks, "block", diagram)
         value.check_place(table.blocks[full], *_used_ports(table, full))
         table.blocks[full] = value.replace(name=full.rpartition(".")[2])
-    elif last in _OF_A_SUBSYSTEM and (subsystem := _find_subsystem(table, head, last, diagram)) is not None:
+    elif last in OF_A_SUBSYSTEM and (subsystem := _find_subsystem(table, head, last, diagram)) is not None:
         table.subsystems[subsystem] = _change_subsystem(table.subsystems[subsystem], last, value)
     elif path in table.blocks:
         raise WiringError(
@@ -49,7 +48,7 @@ def _change(table: Structure, path: str, value: object, diagram: str) -> None:
             block=path,
         )
     else:
-        full, keys = split_path(table, path, diagram)
+        full, keys = find_place(table, path, diagram)
         try:
             table.blocks[full] = change_parameter(table.blocks[full], keys, value)
         except LoopwrightError as error:
@@ -75,26 +74,6 @@ def _find_subsystem(table: Structure, path: str, key: str, diagram: str) -> str 
     raise UnknownNameError(f"a diagram has no {key!r} of its own; {step}.")
 
 
-def split_path(table: Structure, path: str, diagram: str) -> tuple[str, list[str]]:
-    """Split a dotted path into the path of a block and the names of a parameter in it."""
-    parts = path.split(".")
-    for cut in range(len(parts) - 1, 0, -1):
-        try:
-            return find_path(".".join(parts[:cut]), table.blocks, "block", diagram), parts[cut:]
-        except UnknownNameError:
-            continue
-    last = split_entry(path, ())[0]
-    owners = [p for p, block in sorted(table.blocks.items()) if last in type(block).parameter_specs]
-    if len(owners) == 1:
-        return owners[0], [path]
-    if owners:
-        raise UnknownNameError(
-            f"{path!r} is a parameter of {', '.join(owners)}; write the path, such as '{owners[0]}.{path}'."
-        )
-    known = {f"{p}.{q}" for p, block in table.blocks.items() for q in type(block).parameter_specs} | set(table.blocks)
-    raise UnknownNameError(f"nothing is called {path!r} in diagram {diagram!r}. {near(path, known)}")
-
-
 def _change_subsystem(settings: SubsystemSettings, key: str, value: Any) -> SubsystemSettings:
     """Return a subsystem's settings with another sample time, method, offset or delay."""
     new, path = value, settings.path
@@ -111,20 +90,6 @@ def _change_subsystem(settings: SubsystemSettings, key: str, value: Any) -> Subs
         exact_offset(settings.offset, new, block=path)
         check_delay(settings.delay, new, block=path)
     return replace_fields(settings, **changed)
-
-
-def find_path(path: str, known: Mapping[str, object], kind: str, diagram: str) -> str:
-    """Return the full path that ``path``, or the unique end of one, names."""
-    if not isinstance(path, str):
-        raise UnknownNameError(f"found {path!r}; expected the path of a {kind}, such as {next(iter(known), '')!r}.")
-    if path in known:
-        return path
-    found = sorted(p for p in known if p.endswith("." + path))
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise UnknownNameError(f"{path!r} stands for several {kind}s: {', '.join(found)}. Write more of the path.")
-    raise UnknownNameError(f"no {kind} {path!r} in diagram {diagram!r}. {near(path, known)}")
 
 
 def change_parameter(block: V, keys: list[str], value: object) -> V:

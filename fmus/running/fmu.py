@@ -28,7 +28,7 @@ from ..calls import FmuInstance, StepOptions, check_offered
 from ..isolation import Isolation, check_isolation, open_fmu
 from .exchange import ExchangeMembers, choose_interface
 from .linearization import STEP, FmuLinearization, linear_model, step_difference
-from .ports import FmuPorts, choose_ports
+from .ports import FmuPorts, choose_ports, find_element
 from .replacement import check_replacement
 from .start_values import check_start, check_value, read_sized
 
@@ -121,6 +121,11 @@ class Fmu(ExchangeMembers):
             Or one of its kinds; the text says port by port what is missing, extra, or of another shape, unit or type.
         """
         check_replacement(self, old, wired, read)
+
+    def entries_of(self, parameter: str) -> Collection[str]:
+        """Return the FMU's names for `start` and `rename`: its variables, and the elements of its arrays."""
+        about = self.description
+        return [*about.variables, *about.elements] if parameter in ("start", "rename") else ()
 
     def start_value(self, description: FmuDescription, name: str, value: Any) -> Any:
         """Return a start value in the variable's shape, after checking it.
@@ -281,17 +286,10 @@ class Fmu(ExchangeMembers):
         if isinstance(name, str):
             if name in self.outputs:
                 return Signal(self, name)
-            array, index = self.description.elements.get(name, ("", ()))
-            ports = [port for port, v in self.output_variables.items() if v.name == array]
-            if ports and len(index) == 1:
-                return Signal(self, ports[0])[index[0]]
-            if ports:
-                raise UnknownNameError(
-                    f"found {name!r}, an element of the matrix {ports[0]!r}, and a wire takes rows alone. Wire "
-                    f"plant[{ports[0]!r}][{index[0]}], or make its elements ports: rename={{{name!r}: …}}.",
-                    block=self.label,
-                )
-            raise UnknownNameError(self._no_port(name), block=self.label)
+            element = find_element(self.description, self.output_variables, name, self.label)
+            if element is None:
+                raise UnknownNameError(self._no_port(name), block=self.label)
+            return Signal(self, element[0])[element[1]]
         return super().__getitem__(name)
 
     def linear_model(

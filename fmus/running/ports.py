@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -134,3 +134,26 @@ def _check_chosen(description: FmuDescription, chosen: tuple[str, ...], label: s
                 block=label,
                 port="ports",
             )
+
+
+def find_element(
+    description: FmuDescription, outputs: Mapping[str, FmuVariable], name: str, label: str
+) -> tuple[str, int] | None:
+    """Return the port of a vector and the place in it that an FMU's name of an element means; None for other names.
+
+    Raises
+    ------
+    UnknownNameError
+        For an element of a matrix.
+    """
+    array, index = description.elements.get(name, ("", ()))
+    ports = [port for port, v in outputs.items() if v.name == array]
+    if not ports:
+        return None
+    if len(index) != 1:
+        raise UnknownNameError(
+            f"found {name!r}, an element of the matrix {ports[0]!r}, and a wire takes rows alone. Wire "
+            f"plant[{ports[0]!r}][{index[0]}], or make its elements ports: rename={{{name!r}: …}}.",
+            block=label,
+        )
+    return ports[0], index[0]

@@ -204,7 +204,7 @@ def test_a_parameter_that_is_structure_is_refused():
 
 
 def test_an_unknown_parameter_of_a_blocks_path_is_told_with_the_block():
-    with pytest.raises(UnknownNameError, match=r"path_projection: it has no parameter 'centre'\. .*center"):
+    with pytest.raises(UnknownNameError, match=r"path_projection: it has no parameter 'path.centre'\. .*center"):
         fig3_at_rest().trim(free=["controller.path_projection.path.centre"])
 
 

@@ -7,7 +7,8 @@ import pytest
 
 from loopwright.blocks import Constant, Gain, Integrator, OptionError, StateSpace, UnknownNameError
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.diagrams.sweeps import Box, find_parameter, grid, latin, read_samples, table
+from loopwright.diagrams.sweeps import Box, grid, latin, read_samples, table
+from loopwright.diagrams.wiring import find_parameter
 
 
 @subsystem(sample_time=0.1)
@@ -95,6 +96,14 @@ def test_a_start_value_of_an_fmu_is_found_without_the_word_start():
     assert find_parameter(diagram, "plant.coulomb_scale") == "plant.start.coulomb_scale"
     assert find_parameter(diagram, "plant.start.coulomb_scale") == "plant.start.coulomb_scale"
     assert find_parameter(diagram, "pid_par.a0") == "controller.pid_par.a0"
+    variant = diagram.replace({"plant.coulomb_scale": 2.0})
+    assert variant["plant"].start == diagram.replace({"plant.start.coulomb_scale": 2.0})["plant"].start
+    for wrong in ("plant.coulomb_scal", "plant.start.viscous"):
+        with pytest.raises(UnknownNameError, match="_scale") as said:
+            diagram.replace({wrong: 2.0})
+        with pytest.raises(UnknownNameError) as found:
+            find_parameter(diagram, wrong)
+        assert str(said.value) == str(found.value)
     with pytest.raises(UnknownNameError, match=r"plant: it has no parameter 'coulomb_scal'. .*coulomb_scale"):
         find_parameter(diagram, "plant.coulomb_scal")
     with pytest.raises(UnknownNameError, match=r"no entry 'viscous' in 'start'.*viscous_scale"):
@@ -108,7 +117,7 @@ def test_a_start_value_of_an_fmu_is_found_without_the_word_start():
         ({"sine.gain": (1.0, 2.0)}, {}, r"nothing is called 'sine.gain' in diagram 'loop'. .*sign.gain"),
         ({"gain": (1.0, 2.0)}, {}, r"parameter of controller.proportional, sign; write the path"),
         ({"proportional.gain": (1.0,), "controller.proportional.gain": (2.0,)}, {}, "found two names of one parameter"),
-        ({"sign.gain.real": (1.0,)}, {}, r"sign: it has no parameter 'gain.real': 'gain' is -1.0, without parts"),
+        ({"sign.gain.real": (1.0,)}, {}, r"sign: it has no parameter 'gain.real': 'gain' is -1, without parts"),
         ({}, {}, r"loop: found {}; expected parameters by name"),
         ({"sign.gain": ()}, {}, r"sign.gain: found no value; expected one at least"),
         ({"sign.gain": 2.0}, {}, r"sign.gain: found 2.0; expected a list of its values"),

@@ -8,9 +8,10 @@ import sys
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Input, OptionError, Output, Ramp, parameter
+from loopwright.blocks import Block, Input, OptionError, Output, Ramp, Step, parameter
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.sweeps import InterruptedSweep, final, maximum, store
+from loopwright.diagrams.sweeps.differences import describe_differences
 from loopwright.diagrams.sweeps.plan import Worker
 
 QUIET = {"progress": False, "workers": 1, "compile": False}
@@ -114,16 +115,19 @@ def _other_power(run):
 @pytest.mark.parametrize(
     ("change", "differs"),
     [
-        ({}, False),
-        ({"diagram": guarded(slope=2.0)}, True),
-        ({"duration": 0.2}, True),
-        ({"signals": ()}, True),
-        ({"reduce": {"end": maximum("y")}}, True),
-        ({"reduce": {"end": _power}}, True),
-        ({"every": 2}, True),
-        ({"step": 0.005}, True),
-        ({"workers": 2}, False),
-        ({"compile": True}, False),
+        ({}, ""),
+        ({"diagram": guarded(slope=2.0)}, r"the parameter ramp\.slope \(1\.0 there, 2\.0 here\)"),
+        ({"diagram": guarded().replace({"box.sample_time": 0.02})}, r".*box\.sample_time \(1/100 there, 1/50 here\)"),
+        ({"diagram": guarded().replace(ramp=Step(times=0.0, values=1.0))}, r".*the block ramp"),
+        ({"duration": 0.2}, r"the duration \(0\.1 there, 0\.2 here\)"),
+        ({"signals": ()}, r"the signals \(\('y',\) there, \(\) here\)"),
+        ({"reduce": {"end": maximum("y")}}, "the reduction 'end'"),
+        ({"reduce": {"end": _power}}, "the reduction 'end'"),
+        ({"reduce": {"end": final("y"), "top": maximum("y")}}, r"the reduction 'top' \(here alone\)"),
+        ({"every": 2}, r"the option every \(not given there, 2 here\)"),
+        ({"step": 0.005}, r"the option step \(not given there, 0\.005 here\)"),
+        ({"workers": 2}, ""),
+        ({"compile": True}, ""),
     ],
 )
 def test_a_folder_belongs_to_one_diagram_with_one_set_of_options(tmp_path, change, differs):
@@ -136,10 +140,49 @@ def test_a_folder_belongs_to_one_diagram_with_one_set_of_options(tmp_path, chang
     if not differs:
         assert sweep(**{**arguments, **change}).reused == 1
         return
-    with pytest.raises(OptionError, match=r"holds a sweep of 'guarded' that differs .* overwrite=True"):
+    with pytest.raises(
+        OptionError, match=rf"holds a sweep of 'guarded' that differs from this one in {differs}.* overwrite=True"
+    ):
         sweep(**{**arguments, **change})
     assert sweep(**{**arguments, **change}, overwrite=True).reused == 0
     assert sweep(**{**arguments, **change}).reused == 1
+
+
+def test_several_differences_are_told_and_the_others_counted(tmp_path):
+    arguments = {"parameters": {"guard.limit": (1.0,)}, "duration": 0.1, "to": tmp_path / "s", **KEPT, **QUIET}
+    guarded().sweep(**arguments)
+    other = guarded(slope=2.0).replace({"guard.gain": 3.0, "box.sample_time": 0.02})
+    with pytest.raises(OptionError, match=r"2\.0 there, 3\.0 here.* and [1-9] more\. Choose") as error:
+        other.sweep(**{**arguments, "duration": 0.2, "reduce": {"top": maximum("y")}}, every=2, rtol=1e-3)
+    assert "equations" not in str(error.value)  # they only follow from the parameters
+    head = tmp_path / "s" / store.HEAD
+    head.write_text(json.dumps({**json.loads(head.read_text()), "format": 1}))
+    with pytest.raises(OptionError, match="differs from this one in the version of Loopwright that wrote it"):
+        guarded().sweep(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ({"content": {"plant": "#1"}}, {"content": {"plant": "#2"}}, "the content of plant"),
+        ({"parameter": {"plant.start.m": "1.0"}}, {}, "the parameter plant.start.m (1.0 there, not given here)"),
+        (
+            {"block": {"a": "Gain"}, "parameter": {"a.gain": "1.0"}, "wire": {"a.u": "#"}},
+            {},
+            "the block a (there alone)",
+        ),
+        ({"wire": {"a.u": "#1"}}, {"wire": {"a.u": "#2"}}, "the wire to a.u"),
+        (
+            {"sweep": {"version of CasADi": "1"}},
+            {"sweep": {"version of CasADi": "2"}},
+            "the version of CasADi (1 there, 2 here)",
+        ),
+        ({"parameter": {"a.gain": "#1"}}, {"parameter": {"a.gain": "2.0"}}, "the parameter a.gain"),
+        ({"equations": {"a": "#1"}}, {"equations": {"a": "#1"}}, ""),
+    ],
+)
+def test_differences_are_told_by_the_names_of_parts(old, new, said):
+    assert describe_differences(old, new) == said
 
 
 def test_a_function_counts_by_its_code(tmp_path):
@@ -148,7 +191,7 @@ def test_a_function_counts_by_its_code(tmp_path):
 
     sweep(_power)
     assert sweep(_power).reused == 1
-    with pytest.raises(OptionError, match="differs from this one"):
+    with pytest.raises(OptionError, match=r"differs from this one in the reduction 'n'\. "):
         sweep(_other_power)
 
 
@@ -157,7 +200,7 @@ def test_equations_count_by_what_they_do(tmp_path, monkeypatch):
     guarded().sweep(**sweep, **KEPT, **QUIET)
     assert guarded().sweep(**sweep, **KEPT, **QUIET).reused == 1
     monkeypatch.setattr(Guarded, "output", lambda self, t, x, u: self.gain * u.u + 1.0)
-    with pytest.raises(OptionError, match="differs from this one"):
+    with pytest.raises(OptionError, match=r"differs from this one in the equations of box\.guard\. "):
         guarded().sweep(**sweep, **KEPT, **QUIET)
 
 

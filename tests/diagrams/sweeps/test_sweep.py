@@ -391,6 +391,9 @@ def test_a_sweep_with_seeds_compiles_nothing_by_default(monkeypatch):
         ({"signals": "y", "evry": 2}, r"lag.evry: it is no option of a run"),
         ({"signals": "y", "client": "tcp://there"}, r"lag.client: found client='tcp://there'; expected a distributed"),
         ({"signals": "y", "seeds": "noise.seed"}, r"nothing is called 'noise.seed'"),
+        ({"signals": "y", "record": ["step"]}, r"lag.record: found a choice without 'y', which signals= or reduce="),
+        ({"signals": "y", "reduce": {"end": final("step.y")}, "record": ["y"]}, r"lag.record: .* without 'step.y'"),
+        ({"signals": "y", "record": []}, r"lag.record: .* leave record= out"),
     ],
 )
 def test_what_does_not_fit_is_refused_before_the_first_run(options, message, monkeypatch):

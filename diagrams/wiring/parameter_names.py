@@ -1,0 +1,168 @@
+"""Names of parameters: dotted paths, or their unique ends, each with one spelling in full.
+
+All that takes parameters by name finds them here: variants, sweeps, sensitivities, worst cases and trims.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ...blocks.core import Block, OptionError, UnknownNameError, Value, elements, near, shorten
+from .entry_names import index_of, split_entry
+from .structure import Structure
+
+OF_A_SUBSYSTEM = ("sample_time", "method", "offset", "delay")
+"""Settings of a subsystem that have names like parameters."""
+
+
+def find_name(table: Structure, name: object, diagram: str) -> str:
+    """Return the full path of a parameter, a start value, a subsystem's setting or a block.
+
+    A start value of an FMU is found without ``start`` as well: ``"plant.mass"`` is ``"plant.start.mass"``. An entry of
+    an array is one, too, counted from 1: ``"motor.denominator[1]"``.
+
+    Parameters
+    ----------
+    table : Structure
+        The structure of the diagram.
+    name : str
+        The path, or its unique end.
+    diagram : str
+        The diagram's name, for errors.
+
+    Raises
+    ------
+    OptionError
+        If it is no text.
+    UnknownNameError
+        If nothing, or more than one thing, is called that; near names are offered.
+    """
+    name = check_name(name, diagram)
+    if name in table.blocks:
+        return name
+    head, _, last = name.rpartition(".")
+    if last in OF_A_SUBSYSTEM:
+        found = [path for path in table.subsystems if path and head and (path == head or path.endswith("." + head))]
+        if len(found) == 1:
+            return f"{found[0]}.{last}"
+    ends = [path for path in table.blocks if path.endswith("." + name)]
+    if len(ends) == 1:
+        return ends[0]
+    path, keys = find_place(table, name, diagram)
+    return ".".join([path, *keys])
+
+
+def check_name(name: object, diagram: str) -> str:
+    """Return a name of a parameter; refuse what is no text."""
+    if not isinstance(name, str) or not name:
+        raise OptionError(
+            f"found {shorten(name)} as the name of a parameter; expected a dotted path, such as 'controller.gain'.",
+            block=diagram,
+        )
+    return name
+
+
+def find_place(table: Structure, name: str, diagram: str) -> tuple[str, list[str]]:
+    """Return the path of a block, and the names that lead to a parameter in it, from its path or the end of one.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such parameter, or more than one; near names are offered.
+    """
+    path, keys = split_path(table, name, diagram)
+    return path, _inside(table.blocks[path], path, keys)
+
+
+def split_path(table: Structure, path: str, diagram: str) -> tuple[str, list[str]]:
+    """Split a dotted path into the path of a block and the names of a parameter in it, which are not looked at."""
+    parts = path.split(".")
+    for cut in range(len(parts) - 1, 0, -1):
+        try:
+            return find_path(".".join(parts[:cut]), table.blocks, "block", diagram), parts[cut:]
+        except UnknownNameError:
+            continue
+    last = split_entry(path, ())[0]
+    owners = [p for p, block in sorted(table.blocks.items()) if last in type(block).parameter_specs]
+    if len(owners) == 1:
+        return owners[0], [path]
+    if owners:
+        raise UnknownNameError(
+            f"{path!r} is a parameter of {', '.join(owners)}; write the path, such as '{owners[0]}.{path}'."
+        )
+    known = {f"{p}.{q}" for p, block in table.blocks.items() for q in type(block).parameter_specs} | set(table.blocks)
+    raise UnknownNameError(f"nothing is called {path!r} in diagram {diagram!r}. {near(path, known)}")
+
+
+def find_path(path: str, known: Mapping[str, object], kind: str, diagram: str) -> str:
+    """Return the full path that ``path``, or the unique end of one, names."""
+    if not isinstance(path, str):
+        raise UnknownNameError(f"found {path!r}; expected the path of a {kind}, such as {next(iter(known), '')!r}.")
+    if path in known:
+        return path
+    found = sorted(p for p in known if p.endswith("." + path))
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise UnknownNameError(f"{path!r} stands for several {kind}s: {', '.join(found)}. Write more of the path.")
+    raise UnknownNameError(f"no {kind} {path!r} in diagram {diagram!r}. {near(path, known)}")
+
+
+def _inside(block: Block, path: str, keys: list[str]) -> list[str]:
+    """Return the names that lead to a parameter in a block."""
+    specs = type(block).parameter_specs
+    if len(keys) == 1 and keys[0] in specs:
+        return keys
+    whole, starts = ".".join(keys), block.entries_of("start") if "start" in specs else ()
+    array, entry = split_entry(keys[-1], starts)
+    if entry and whole not in starts and ".".join(keys[1:]) not in starts:
+        return _entry_inside(block, path, [*keys[:-1], array], entry)
+    if keys[0] not in specs:
+        if whole in starts:
+            return ["start", *keys]
+        raise UnknownNameError(f"it has no parameter {whole!r}. {near(whole, [*specs, *starts])}", block=path)
+    inner: object = block
+    for place, key in enumerate(keys):
+        if isinstance(inner, Value):
+            if key not in type(inner).parameter_specs:
+                raise UnknownNameError(
+                    f"it has no parameter {whole!r}. {near(key, type(inner).parameter_specs)}", block=path
+                )
+            inner = inner.__dict__[key]
+        elif isinstance(inner, Mapping):
+            rest = ".".join(keys[place:])
+            known = {*map(str, inner), *(block.entries_of(keys[0]) if place == 1 else ())}
+            if rest not in known:
+                raise UnknownNameError(f"it has no entry {rest!r} in {keys[0]!r}. {near(rest, known)}", block=path)
+            break
+        else:
+            raise UnknownNameError(
+                f"it has no parameter {whole!r}: {'.'.join(keys[:place])!r} is {shorten(inner)}, without parts. "
+                "Name it alone.",
+                block=path,
+            )
+    return keys
+
+
+def _entry_inside(block: Block, path: str, keys: list[str], entry: tuple[int, ...]) -> list[str]:
+    """Return the names that lead to an entry of an array in a block."""
+    keys = _inside(block, path, keys)
+    inner: object = block
+    for key in keys[:-1]:
+        inner = inner.__dict__[key] if isinstance(inner, Value) else None
+    if not isinstance(inner, Value):
+        raise UnknownNameError(
+            f"found an entry of {keys[-1]!r}; expected a whole start value, as the FMU has no variable of the entry's "
+            "own. Name it alone.",
+            block=path,
+        )
+    array = np.asarray(inner.__dict__[keys[-1]])
+    if array.dtype.kind not in "iuf":
+        raise UnknownNameError(f"{keys[-1]!r} has no entries that are numbers. Name it alone.", block=path)
+    try:
+        place = index_of(entry, array.shape, keys[-1])
+    except UnknownNameError as error:
+        raise error.at(block=path) from None
+    return [*keys[:-1], elements(keys[-1], array.shape)[int(np.ravel_multi_index(place, array.shape))]]
