@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
-import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -22,14 +21,15 @@ from ...blocks.core import CompilerError
 from ...fmus.export import SUFFIXES, compile_shared, describe_compiler
 from ...fmus.platform import cache_folder, native_platform
 from ..flat import EXACT_LOOP, FlatDiagram, TickPattern
+from .generated_text import make_visible
 from .grouping import Tables, make_tables
 from .kernels import write_kernels
+from .reordered import put_in_order
 
 LARGEST = 6_000
 """Operations of a function up to which it is compiled as a whole: the compiler's time grows faster than they do."""
 _FLAGS = ("-fno-math-errno", "-fno-trapping-math", "-fno-builtin-pow")
 # Nobody reads errno, so that sine and cosine of one angle are one call; a power of two stays a power in every bit.
-_HELPER = re.compile(r"^(?=casadi_real\b)", re.MULTILINE)  # a line that defines one
 MASTER = "loopwright_run"
 
 
@@ -252,7 +252,7 @@ def _write_straight(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]])
         return TickCode(ticks, True, libraries[0])
 
     count = sum(function.n_instructions() for function in functions.values())
-    return TickSources([make_visible(generator.dump())], count, True, make)
+    return TickSources([put_in_order(make_visible(generator.dump()))], count, True, make)
 
 
 def _write_grouped(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickSources:
@@ -278,11 +278,6 @@ def rename(function: Any, name: str) -> Any:
         return ca.Function(name, symbols, ca.cse(function.call(symbols)))
     symbols = function.mx_in()
     return ca.Function(name, symbols, function.call(symbols))
-
-
-def make_visible(source: str) -> str:
-    """Return C code of CasADi whose functions can be found in a library; its small helpers are inlined."""
-    return "#define GCC_HASCLASSVISIBILITY\n" + _HELPER.sub("static inline ", source)
 
 
 def address_of(library: ctypes.CDLL, name: str) -> int:

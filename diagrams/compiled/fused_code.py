@@ -21,10 +21,10 @@ from .code import (
     compile_loops,
     compile_ticks,
     load_compiled,
-    make_visible,
     master_source,
     rename,
 )
+from .generated_text import make_visible
 from .hybrid_code import FUSING
 from .reordered import reorder
 

@@ -23,11 +23,11 @@ from .code import (
     find_loops,
     load_compiled,
     loop_functions,
-    make_visible,
     read_sources,
     rename,
     write_loops,
 )
+from .generated_text import make_visible
 from .grouped_parts import Differences, GroupedPart, find_differences
 from .grouping import make_part_tables, make_tables
 from .kernels import write_kernels

@@ -13,6 +13,7 @@ import casadi as ca
 
 from ...blocks.core import CompilerError
 from ..flat import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE, TRUE_OF
+from .generated_text import BODY, READ, WRITE
 
 _SCRATCH = 8192  # numbers that a kernel keeps on the stack
 _SINGLE = {
@@ -35,9 +36,6 @@ _HEAD = """#include <float.h>
 #define VISIBLE __attribute__((visibility("default")))
 #endif
 """
-_READ = re.compile(r"arg\[(\d+)\]\?\s*arg\[\1\]\[(\d+)\]\s*:\s*0")
-_WRITE = re.compile(r"if\s*\(res\[(\d+)\]!=0\)\s*res\[\1\]\[(\d+)\]=")
-_BODY = re.compile(r"^static\s+int\s+(casadi_f\d+)\(const\s+casadi_real\*\*\s*arg,[^\n]*\{\n(.*?)^\}", re.M | re.S)
 _NAME = re.compile(
     r"^CASADI_SYMBOL_EXPORT\s+int\s+k(\d+)\(const\s+casadi_real[^\n]*\n\s*return\s+(casadi_f\d+)\(", re.M
 )
@@ -109,12 +107,12 @@ def write_kernels(functions: Mapping[int, Any]) -> Kernels:
         arguments = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
         generator.add(ca.Function(f"k{i}", arguments, function.call(arguments)))
     code = re.sub(r"^casadi_real (casadi_\w+\()", r"static inline casadi_real \1", generator.dump(), flags=re.M)
-    written, names = dict(_BODY.findall(code)), {int(i): name for i, name in _NAME.findall(code)}
+    written, names = dict(BODY.findall(code)), {int(i): name for i, name in _NAME.findall(code)}
     scalar = []
     for i, key in enumerate(keys):
         function, name = functions[key], names[i]
         last = function.n_in() - 1
-        body = _WRITE.sub(r"r\1[\2]=", _READ.sub(lambda m: f"i{m[1]}[{m[2]}]", written[name]))
+        body = WRITE.sub(r"r\1[\2]=", READ.sub(lambda m: f"i{m[1]}[{m[2]}]", written[name]))
         body = body.replace("  return 0;\n", "")
         if function.is_a("SXFunction") and not re.search(r"\b(arg|res|iw|w)\b", body):
             scalar.append(name)

@@ -1,4 +1,4 @@
-"""A C function of scalar operations with its operations in another order: what can begin first comes first.
+"""C functions of scalar operations with their operations in another order: what can begin first comes first.
 
 A processor looks a few hundred operations ahead. CasADi writes the operations of one result after those of another, so
 that long chains that don't wait for each other would be gone through one after the other.
@@ -7,15 +7,34 @@ that long chains that don't wait for each other would be gone through one after 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
+
+from .generated_text import BODY
 
 _ASSIGNED = re.compile(r"(a\d+)=(.*);")
-_RESULT = re.compile(r"if \(res\[(\d+)\]!=0\) res\[\1\]\[(\d+)\]=(a\d+);")
-_ARGUMENT = re.compile(r"(arg\[\d+\])\? \1(\[\d+\]) : 0")
+_RESULT = re.compile(r"res\[(\d+)\]\[(\d+)\]=(a\d+);")
 _VARIABLE = re.compile(r"\ba\d+\b")
 _FUNCTION = re.compile(r"(\w+)\(")
 _CYCLES = {"sin": 45, "cos": 45, "tanh": 40, "sqrt": 15, "exp": 40, "log": 40, "pow": 60, "atan2": 60}
 _SIMPLE, _DIVISION = 4, 13  # cycles
 _CIRCLE = ("sin", "cos")
+
+
+def put_in_order(source: str) -> str:
+    """Return C code of `make_visible` with the operations of each function in the order in which they can begin.
+
+    Every operation is the one it was, so all bits stay. Functions with other statements than assignments stay as they
+    are.
+    """
+
+    def ordered(found: re.Match[str]) -> str:
+        lines = _order(found[2])
+        if lines is None:
+            return found[0]
+        head = found[0][: found.start(2) - found.start()]
+        return f"{head}{lines.operations}{lines.results}  return 0;\n}}"
+
+    return BODY.sub(ordered, source)
 
 
 def reorder(source: str, name: str, limit: str) -> str | None:
@@ -24,7 +43,7 @@ def reorder(source: str, name: str, limit: str) -> str | None:
     Parameters
     ----------
     source : str
-        C code of one function whose arguments are all given, and whose results are all wanted.
+        C code of one function, as `make_visible` returns it.
     name : str
         Name of the new function, ``static int name(const double **arg, double **res)``. It returns 0, or 1 without
         having written anything, where an argument of a sine or a cosine is not below a limit.
@@ -36,9 +55,30 @@ def reorder(source: str, name: str, limit: str) -> str | None:
     str or None
         None where the function has other statements than assignments.
     """
-    _, begun, body = source.partition("static int casadi_f0(")
-    body, ended, _ = body.partition("{\n")[2].partition("  return 0;\n}")
-    if not begun or not ended:
+    found = BODY.search(source)
+    lines = None if found is None else _order(found[2])
+    if lines is None:
+        return None
+    is_far = " || ".join(f"!(fabs({angle}) < {limit})" for angle in dict.fromkeys(lines.angles)) or "0"
+    return (
+        f"static int {name}(const double **arg, double **res) {{\n{lines.operations}  if ({is_far}) return 1;\n"
+        f"{lines.results}  return 0;\n}}\n"
+    )
+
+
+@dataclass(frozen=True)
+class _Lines:
+    """A function's statements: its operations, the results that are written, and the angles of sines and cosines."""
+
+    operations: str
+    results: str
+    angles: list[str]
+
+
+def _order(body: str) -> _Lines | None:
+    """Return the statements of a function in another order; None where some are no assignments."""
+    body, ended, _ = body.partition("  return 0;\n")
+    if not ended:
         return None
     values: list[str] = []
     begins: list[int] = []
@@ -50,13 +90,13 @@ def reorder(source: str, name: str, limit: str) -> str | None:
         if line.startswith("casadi_real ") or not line:
             continue
         if found := _RESULT.fullmatch(line):
-            results.append(f"  res[{found[1]}][{found[2]}] = v{now[found[3]]};")
+            results.append(f"  res[{found[1]}][{found[2]}]=v{now[found[3]]};\n")
             continue
         if not (found := _ASSIGNED.fullmatch(line)):
             return None
         variable, value = found.groups()
         needed = [now[a] for a in _VARIABLE.findall(value)]
-        value = _ARGUMENT.sub(r"\1\2", _VARIABLE.sub(lambda a: f"v{now[a[0]]}", value))
+        value = _VARIABLE.sub(lambda a: f"v{now[a[0]]}", value)
         begins.append(max((ends[i] for i in needed), default=0))
         ends.append(begins[-1] + _cycles(value) if needed else 0)
         if (called := _FUNCTION.match(value)) and called[1] in _CIRCLE:
@@ -64,12 +104,7 @@ def reorder(source: str, name: str, limit: str) -> str | None:
         now[variable] = len(values)
         values.append(value)
     order = sorted(range(len(values)), key=lambda i: (ends[i], i))
-    lines = [f"  const double v{i} = {values[i]};" for i in order]
-    is_far = " || ".join(f"!(fabs({angle}) < {limit})" for angle in dict.fromkeys(angles)) or "0"
-    return "\n".join([
-        f"static int {name}(const double **arg, double **res) {{", *lines, f"  if ({is_far}) return 1;", *results,
-        "  return 0;", "}\n",
-    ])  # fmt: skip
+    return _Lines("".join(f"  const double v{i}={values[i]};\n" for i in order), "".join(results), angles)
 
 
 def _cycles(value: str) -> int:

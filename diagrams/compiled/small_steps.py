@@ -10,7 +10,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .code import make_visible, read_sources, rename
+from .code import read_sources, rename
+from .generated_text import make_visible
 
 STEPS = {"rk4": "step_rk4", "RK23": "step_rk23", "RK45": "step_rk45"}
 """Names of the C functions, by method."""
