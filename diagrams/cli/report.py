@@ -151,6 +151,9 @@ def report_command(arguments: argparse.Namespace) -> int:
             say("loopwright: interrupted; nothing is written.", sys.stderr)
             return 130
         say(f"{diagram.name}: {len(report.numbers())} numbers in {time.perf_counter() - began:.1f} s", sys.stderr)
+        for section in report.sections:
+            if section.key == KEY and not section.tables:
+                say(f"loopwright: the worst case is missing: {section.text[0]}", sys.stderr)
         try:
             files = write_report(report, out, pdf=arguments.pdf, json=arguments.json, paper=arguments.paper)
         except OSError as error:

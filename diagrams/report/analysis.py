@@ -132,7 +132,7 @@ def analyse(
         A worst case of this diagram, of `Diagram.worst_case`, or a TOML file with a table ``[worst_case]``, which may
         be that of ``requirements``, too: it gets a section, with a run that confirms it, and a line on the first page.
         The limits that it was looked for with get verdicts of their own. Limits of its numbers fail where it is
-        unstable.
+        unstable. One that can't be looked for, as at a wire without a loop, is left out with the reason.
     progress : callable, optional
         Told the key of each section before it is made, and of the injection check each measurement, too.
     workers : int, optional
@@ -189,9 +189,8 @@ def analyse(
     made = Report("", sections).numbers()
     reviewed = None if asked is None else review(case, asked, made, loops_measured, searched, touched)
     if only is None or asked is not None:
-        found = None if searched is None else searched.found
         more = [] if touched is None or not touched.contacts else [contacts_on_first_page(touched)]
-        sections = (summary(case, reviewed, made, found, more), *sections)
+        sections = (summary(case, reviewed, made, searched, more), *sections)
     name = diagram.name if experiment is None else f"Experiment {experiment.letter}: {diagram.name}"
     lines = {str(key): str(text) for key, text in (about or {}).items()}
     title = lines.pop("title", f"Design report: {name}")

@@ -29,7 +29,7 @@ from .section_contact import ReportedContacts
 from .section_injection import REFUTED
 from .section_measured import MEASURED, MeasuredLoop
 from .section_steps import key_of_step
-from .section_worst_case import ReportedWorstCase
+from .section_worst_case import MissingWorstCase, ReportedWorstCase
 from .stability import Stability
 from .variant import Cut, Variant
 
@@ -69,7 +69,7 @@ def review(
     asked: Requirements,
     numbers: Mapping[str, Number],
     measured: Sequence[MeasuredLoop] = (),
-    worst_case: ReportedWorstCase | None = None,
+    worst_case: ReportedWorstCase | MissingWorstCase | None = None,
     contacts: ReportedContacts | None = None,
 ) -> Review:
     """Return the verdicts on requirements.
@@ -84,7 +84,7 @@ def review(
         All numbers of the report by their dotted paths.
     measured : sequence of MeasuredLoop
         Loops that were measured; limits of their margins hold for the measured ones, too.
-    worst_case : ReportedWorstCase, optional
+    worst_case : ReportedWorstCase or MissingWorstCase, optional
         The worst case of the report.
     contacts : ReportedContacts, optional
         Its contacts, with the limits that are required of them.

@@ -11,7 +11,6 @@ from ..frequency import Number
 from ..linearization import Linearization
 from ..report_writing import Judged, Section, Table, Texts
 from ..requirements import Limit, RequirementResult, Review, Verdict
-from ..studies import WorstCase
 from .case import Case
 from .review import weakest
 from .section_contact import KEY as CONTACT
@@ -19,6 +18,7 @@ from .section_loops import ROWS
 from .section_measured import MEASURED
 from .section_steps import NAMES
 from .section_worst_case import KEY as WORST_CASE
+from .section_worst_case import MissingWorstCase, ReportedWorstCase
 from .stability import unstable_first
 from .variant import Implementation, Variant
 
@@ -39,7 +39,7 @@ def summary(
     case: Case,
     reviewed: Review | None,
     numbers: Mapping[str, Number],
-    worst_case: WorstCase | None = None,
+    worst_case: ReportedWorstCase | MissingWorstCase | None = None,
     more: Sequence[Table] = (),
 ) -> Section:
     """Return the first section of a report.
@@ -52,7 +52,7 @@ def summary(
         The verdicts on its requirements.
     numbers : mapping of str to Number
         All numbers of the report by their dotted paths.
-    worst_case : WorstCase, optional
+    worst_case : ReportedWorstCase or MissingWorstCase, optional
         The worst case that has a section.
     more : sequence of Table
         Tables behind that of the loops.
@@ -154,9 +154,11 @@ def _weakest(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
         yield TEXTS.line("why_not", titles=[v.title for v, _ in others])
 
 
-def _worst_case(found: WorstCase) -> str:
+def _worst_case(reported: ReportedWorstCase | MissingWorstCase) -> str:
     """Return the line on a worst case: its number, its growth, or the reason why it could not be analysed."""
-    worst = found.worst
+    if isinstance(reported, MissingWorstCase):
+        return TEXTS.line("no_worst_case", reason=reported.problem)
+    found, worst = reported.found, reported.found.worst
     number = worst.numbers.get(worst.loop, {}).get(worst.quantity)
     shown = "" if number is None else print_unit(number.unit)
     return TEXTS.line(

@@ -94,12 +94,16 @@ def find_reported(
     stairs: str | None,
     tell: Callable[[str], None],
     wires: Mapping[str, str],
-) -> ReportedWorstCase:
+) -> ReportedWorstCase | MissingWorstCase:
     """Return the worst case of a report: one that was found, or one that a file asks for, with its run."""
     if isinstance(given, WorstCaseTask):
         options = {} if stairs is None else {"stairs": stairs}
         asked = None if requirements is None else _name_wires(requirements, wires, given.loops)
-        given = given.find(diagram, asked, at=at, progress=lambda line: tell(f"{KEY}: {line}"), **options)
+        task = given
+        try:
+            given = task.find(diagram, asked, at=at, progress=lambda line: tell(f"{KEY}: {line}"), **options)
+        except LoopwrightError as error:
+            return MissingWorstCase(task.find_limits(diagram, asked), error.message)
     try:
         return ReportedWorstCase(given, given.confirm())
     except LoopwrightError as error:
@@ -123,6 +127,38 @@ def _name_wires(requirements: Requirements, wires: Mapping[str, str], loops: tup
     made = copy(requirements)
     made.loops = {names.get(name, name): limits for name, limits in requirements.loops.items()}
     return made
+
+
+@dataclass(frozen=True)
+class MissingWorstCase:
+    """Worst case that a file asks for, and that could not be looked for.
+
+    Attributes
+    ----------
+    limits : mapping
+        Limits that it was to be looked for with, by loops and numbers.
+    problem : str
+        The reason, with the file and the entry.
+    """
+
+    limits: Mapping[tuple[str, ...], Mapping[str, Limit | None]]
+    problem: str
+
+    def outcomes(self) -> dict[str, StudyCase]:
+        """Return no case."""
+        return {}
+
+    def results(self) -> Iterator[RequirementResult]:
+        """Yield an open verdict on each limit."""
+        for loop, limits in self.limits.items():
+            for quantity, limit in limits.items():
+                if limit is not None:
+                    place = ", ".join(loop)
+                    yield RequirementResult(quantity, place, KEY, limit, Verdict.UNDECIDED, Reason.NOT_ANALYSED)
+
+    def section(self) -> Section:
+        """Return the section, which has the reason alone."""
+        return Section(KEY, "Worst case", (TEXTS.line("missing", message=self.problem),))
 
 
 @dataclass(frozen=True)
@@ -200,8 +236,10 @@ def _ranges(found: WorstCase) -> Table:
     return Table("Ranges of the parameters", ("parameter", "from", "to", "values"), tuple(rows))
 
 
-def worst_case_of(reported: ReportedWorstCase) -> Section:
+def worst_case_of(reported: ReportedWorstCase | MissingWorstCase) -> Section:
     """Return the section on a worst case: its parameters, its number beside the nominal one, its run, and a scatter."""
+    if isinstance(reported, MissingWorstCase):
+        return reported.section()
     found, run = reported.found, reported.run
     nominal, worst = reported.outcomes().values()
     origins = {case.origin for case in found.cases}
@@ -235,4 +273,4 @@ def worst_case_of(reported: ReportedWorstCase) -> Section:
     plots = []
     if any(np.ndim(value) == 0 for value in worst.parameters.values()):
         plots.append(Plot("worst_case", TEXTS.line("scatter"), found.plot()))
-    return Section("worst_case", "Worst case", tuple(text), tuple(tables), tuple(plots), numbers)
+    return Section(KEY, "Worst case", tuple(text), tuple(tables), tuple(plots), numbers)

@@ -59,6 +59,7 @@ class Study:
         self._bases: dict[int, Linearization] = {}
         self._loops: dict[int, dict[tuple[str, ...], StateSpace]] = {}
         self._asked: dict[int, tuple[WiredDiagram, OperatingPoint]] = {}
+        self.has_no_loop = False  # at a wire of the diagram as it is
 
     # --- cases --------------------------------------------------------------------------------------------------------
 
@@ -83,7 +84,7 @@ class Study:
                 return self._take(start, self.measure, self.measure(diagram, asked))
             if not parameters:
                 self._bases[place] = linearize(diagram, asked, **self.options)
-                self._loops[place] = {wires: self._bases[place].loop(*wires) for wires in self.goal.loops}
+                self._loops[place] = self._open_loops(self._bases[place])
             base = self._bases.get(place)
             if base is None:
                 raise OptionError("the diagram as it is can't be analysed at this operating point.", block=diagram.name)
@@ -93,6 +94,14 @@ class Study:
             return self._judge(start, base, diagram, at, self._loops[place] if not parameters else {})
         except LoopwrightError as error:
             return replace(start, reason=str(error))
+
+    def _open_loops(self, base: Linearization) -> dict[tuple[str, ...], StateSpace]:
+        """Return the loops of the diagram as it is, and note where it has none."""
+        try:
+            return {wires: base.loop(*wires) for wires in self.goal.loops}
+        except LoopwrightError:
+            self.has_no_loop = True
+            raise
 
     def _take(self, case: Case, measure: Measure, number: Number) -> Case:
         """Return a case with a number that is no loop's."""

@@ -200,7 +200,9 @@ def find_worst_case(
     nominal = study.run({}, CaseOrigin.NOMINAL)
     if all(case.state is CaseState.FAILED for case in nominal):
         raise OptionError(
-            f"the diagram as it is can't be analysed: {nominal[0].reason} Mend that first.", block=diagram.name
+            f"the diagram as it is can't be analysed: {nominal[0].reason} Mend that first.",
+            block=diagram.name,
+            port="loop" if study.has_no_loop else "",
         )
     for sample in drawn:
         study.run(sample.parameters, CaseOrigin.SAMPLE)

@@ -10,7 +10,7 @@ from typing import Any, Self
 from ...blocks.core import LoopwrightError, OptionError
 from ..flat import WiredDiagram
 from ..linearization import find_signal
-from ..requirements import Requirements, TomlFile
+from ..requirements import Limit, Requirements, TomlFile
 from ..sweeps import Box, read_samples
 from ..wiring import find_parameter
 from .cases import Goal, make_goal
@@ -157,11 +157,16 @@ class WorstCaseTask:
             Told a line for every case.
         **options
             Of `Diagram.worst_case`, such as ``at``.
+
+        Raises
+        ------
+        OptionError
+            As `check`; or the diagram as it is can't be analysed. It names the file, the line and the entry.
         """
         self.check(diagram, requirements)
         given = {key: value for key, value in self.options.items() if key != "quantity"}
         quantity, limits = self._asked(diagram, requirements)
-        with _Placed(self.file, TABLE, KEYS):
+        with _Placed(self.file, TABLE):
             return find_worst_case(
                 diagram, self.ranges or None, self.loops or None, quantity=quantity, requirements=limits,
                 progress=progress, **given, **options,
@@ -181,22 +186,31 @@ class WorstCaseTask:
             return None, requirements
         return ("disk_margin" if quantity is None and limits is None else quantity), limits
 
+    def find_limits(
+        self, diagram: WiredDiagram, requirements: Requirements | None = None
+    ) -> Mapping[tuple[str, ...], Mapping[str, Limit | None]]:
+        """Return the limits that the worst case is looked for with, by the wires of the loops and the numbers' names.
+
+        A number without a limit has None.
+        """
+        return {} if "contact" in self.options else self._goal(diagram, requirements).loops
+
     def _goal(self, diagram: WiredDiagram, requirements: Requirements | None) -> Goal:
         quantity, limits = self._asked(diagram, requirements)
         return make_goal(self.loops, quantity, limits, diagram.name)
 
 
 class _Placed:
-    """Names the file and the line in errors about an entry: all errors, or those about some options."""
+    """Names the file and the line in errors about an entry."""
 
-    def __init__(self, file: TomlFile, key: str, ports: tuple[str, ...] | None = None):
-        self.file, self.key, self.ports = file, key, ports
+    def __init__(self, file: TomlFile, key: str):
+        self.file, self.key = file, key
 
     def __enter__(self) -> None:
         return None
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if isinstance(error, LoopwrightError) and (self.ports is None or error.port in self.ports):
+        if isinstance(error, LoopwrightError):
             known = error.port if error.port in KEYS else ""
             key = ".".join(part for part in (self.key, known) if part)
             raise self.file.error(error.message, key) from None

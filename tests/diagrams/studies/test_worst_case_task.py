@@ -1,6 +1,7 @@
 """Worst cases that a TOML file asks for: in the report, and on the command line."""
 
 import math
+import re
 
 import pytest
 
@@ -122,6 +123,50 @@ def test_limits_that_an_unstable_case_breaks_fail(tmp_path):
     report = analyse(make_pi_loop(), requirements=file, only=("inner",))
     (searched,) = [r for r in report.review.results if r.variant == "worst_case"]
     assert (searched.verdict, searched.reason) == (Verdict.FAILED, Reason.UNSTABLE)
+
+
+def make_two_rates():
+    """A lag under a drive that is renewed three times while an outer loop is renewed once."""
+    lag = Integrator(name="lag")
+
+    @subsystem(sample_time=0.01)
+    def drive(y, wanted):
+        return Gain(gain=3.0, name="gain")(wanted - y).named("u")
+
+    @subsystem(sample_time=0.03)
+    def outer(y):
+        return Gain(gain=-0.5, name="outer_gain")(y).named("wanted")
+
+    return Diagram("loop", lag(drive(lag.y, outer(lag.y))))
+
+
+RENEWED = """
+ms = 3.0
+
+[worst_case]
+count = 4
+loop = "u"
+
+[worst_case.ranges]
+"drive.gain.gain" = [1.0, 3.0]
+"""
+
+
+def test_a_wire_without_a_loop_is_named_with_its_entry_and_leaves_the_rest_of_the_report(tmp_path):
+    file = write(tmp_path, RENEWED)
+    words = r"limits.toml, line 5: worst_case.loop: .* 'u' is renewed 3 times in the model's period of 0.03 s"
+    with pytest.raises(OptionError, match=words):
+        WorstCaseTask.read(file).find(make_two_rates())
+    report = analyse(make_two_rates(), requirements=file, only=("poles",))
+    plain = analyse(make_two_rates(), requirements=read_requirements(write(tmp_path, "ms = 3.0")), only=("poles",))
+    sections = {section.key: section for section in report.sections}
+    assert list(sections) == ["summary", "poles", "worst_case"]
+    assert report.numbers() == plain.numbers()
+    assert re.search(words, str(sections["worst_case"].text[0]))
+    (searched,) = [r for r in report.review.results if r.variant == "worst_case"]
+    assert (searched.quantity, searched.loop) == ("ms", "u")
+    assert (searched.verdict, searched.reason) == (Verdict.UNDECIDED, Reason.NOT_ANALYSED)
+    assert len(report.review.results) == len(plain.review.results) + 1
 
 
 @pytest.fixture
