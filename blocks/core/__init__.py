@@ -3,6 +3,7 @@
 from . import arithmetic, source
 from .arithmetic import Gain, Product, Sum, check_shapes, shape_of
 from .block import SOLVED, Block
+from .brief import brief, count_of, enumerate_some
 from .collection import without_collection
 from .errors import (
     AlgebraicLoopError,
@@ -116,12 +117,15 @@ __all__ = [
     "WiringError",
     "arithmetic",
     "as_signal",
+    "brief",
     "check_name",
     "check_shapes",
     "close_names",
     "convert_unit",
+    "count_of",
     "describe_mismatch",
     "elements",
+    "enumerate_some",
     "identity",
     "is_before",
     "lay_out",

@@ -9,6 +9,7 @@ from itertools import accumulate, pairwise
 
 import numpy as np
 
+from .brief import brief, enumerate_some
 from .ports import Shape
 
 
@@ -50,6 +51,9 @@ class Layout:
 
     slices: dict[str, slice]
     shapes: dict[str, Shape]
+
+    def __repr__(self) -> str:
+        return brief("layout of a vector", f"{self.total} entries", enumerate_some(self.slices))
 
     @staticmethod
     def of(shapes: Mapping[str, Shape], offset: int = 0) -> Layout:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from ...blocks import AdmittanceFilter, ForceProjection, PathProjection
-from ...blocks.core import Array, Finding, OptionError, UnknownNameError
+from ...blocks.core import Array, Finding, OptionError, UnknownNameError, brief
 from ...fmus.running import Derivation
 from ..linearization import check_options, operating_point
 from .compliance_loop import SIDES
@@ -79,6 +79,16 @@ class Contact:
     scale: float = 1.0
     ports: Ports = field(default=Ports("plant", "external_force", "position", "velocity"), repr=False)
     measured: str | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        along = self.side or "[" + ", ".join(f"{v:.4g}" for v in self.direction) + "]"
+        facts = (
+            f"plant {self.plant}",
+            f"direction {along}",
+            f"T = {self.sample_time:g} s" if self.sample_time else "continuous",
+        )
+        then = ".stability_limit(), .admittance(omega), .passivity()"
+        return brief(f"contact of {self.diagram.name!r}", *facts, then=then)
 
     @property
     def sample_time(self) -> float:

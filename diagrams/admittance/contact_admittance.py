@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...blocks.core import Array, Finding, OptionError
+from ...blocks.core import Array, Finding, OptionError, brief, count_of
 from .contact_loop import Joined, close_loop, join_environment
 from .contact_parts import ContactParts
 
@@ -39,6 +39,13 @@ class ContactAdmittance:
     rendered: np.ndarray
     target: np.ndarray | None
     findings: tuple[Finding, ...] = ()
+
+    def __repr__(self) -> str:
+        facts = (
+            count_of(len(self.omega), "frequency").replace("frequencys", "frequencies"),
+            "with a target" if self.target is not None else "",
+        )
+        return brief("admittance at a contact, m/(N s)", *facts, then=".omega, .rendered, .target")
 
 
 BESIDE = 0.05

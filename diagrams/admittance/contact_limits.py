@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, OptionError, on_one_thread
+from ...blocks.core import ConfirmationError, Finding, OptionError, brief, on_one_thread
 from ..frequency import Number
 from .contact_arguments import check_property, read_density, read_number, read_positive
 from .contact_loop import ClosedLoop, Modes, close_loop, controller_rows, join_environment, split_modes
@@ -92,6 +92,16 @@ class ContactLimit:
     findings: tuple[Finding, ...] = ()
     second_look: float = math.nan
 
+    def __repr__(self) -> str:
+        held = ", ".join(f"{name} {value:g}" for name, value in self.environment.items())
+        limit = f"{self.vary} {self.value:.6g} {self.unit}"
+        facts = (
+            limit,
+            f"at {self.frequency:.4g} rad/s" if self.frequency == self.frequency else "",
+            held and f"with {held}",
+        )
+        return brief("limit of coupled stability", *facts, then=".value, .frequency, .confirmed_by")
+
     @property
     def number(self) -> Number:
         """The limit as a number of a report."""
@@ -121,6 +131,10 @@ class ContactMap:
     y_values: np.ndarray
     growth: np.ndarray
     limits: tuple[ContactLimit, ...]
+
+    def __repr__(self) -> str:
+        facts = f"{len(self.y_values)} × {len(self.x_values)} growth rates over {self.y} and {self.x}"
+        return brief("map of coupled stability", facts, then=".growth, .limits")
 
 
 @dataclass(frozen=True, eq=False)

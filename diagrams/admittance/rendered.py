@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import Array, Finding, OptionError
+from ...blocks.core import Array, Finding, OptionError, brief
 from ..frequency import read_matrices
 from .compliance_loop import AdmittanceLoop, hold_force
 from .coupled import close_loop
@@ -77,6 +77,15 @@ class Passivity:
     caveat: str
     tolerance: float = 1e-9
     findings: tuple[Finding, ...] = ()
+
+    def __repr__(self) -> str:
+        first = f"Re Y < 0 from {self.frequency:.6g} rad/s" if self.intervals else "Re Y ≥ 0"
+        facts = (
+            first,
+            f"from {self.scanned[0]:.4g} to {self.scanned[1]:.4g} rad/s",
+            "" if self.stable else "unstable alone",
+        )
+        return brief("sign of an admittance's real part", *facts, then=".intervals, .caveat")
 
 
 def target_admittance(loop: AdmittanceLoop, omega: Array) -> Array:

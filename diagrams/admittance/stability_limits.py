@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Array, ConfirmationError, Finding, OptionError, near, on_one_thread
+from ...blocks.core import Array, ConfirmationError, Finding, OptionError, brief, near, on_one_thread
 from ..frequency import Number
 from .compliance_loop import AdmittanceLoop
 from .coupled import crossing_frequency, growth_rate, growth_rate_by_control
@@ -81,6 +81,16 @@ class StabilityLimit:
     environment: dict[str, float] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
 
+    def __repr__(self) -> str:
+        held = ", ".join(f"{name} {value:g}" for name, value in self.environment.items())
+        limit = f"{self.over} {self.value:.6g} {self.unit}"
+        facts = (
+            limit,
+            f"at {self.frequency:.4g} rad/s" if self.frequency == self.frequency else "",
+            held and f"with {held}",
+        )
+        return brief("limit of coupled stability", *facts, then=".value, .frequency, .confirmed_by")
+
     @property
     def number(self) -> Number:
         """The limit as a number of a report."""
@@ -109,6 +119,10 @@ class StabilityMap:
     y_values: np.ndarray
     growth: np.ndarray
     limits: tuple[StabilityLimit, ...]
+
+    def __repr__(self) -> str:
+        facts = f"{len(self.y_values)} × {len(self.x_values)} growth rates over {self.y} and {self.x}"
+        return brief("map of coupled stability", facts, then=".growth, .limits")
 
 
 def rule_of_thumb(loop: AdmittanceLoop, damping: float = 0.0) -> float:

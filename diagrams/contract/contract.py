@@ -15,6 +15,7 @@ from ...blocks.core import (
     SampleTimeError,
     Shape,
     ShapeError,
+    brief,
     near,
 )
 from ...blocks.tracing import trace
@@ -55,6 +56,10 @@ class BlockReport:
     unseen: Mapping[str, frozenset[tuple[str, str]]] = field(default_factory=dict)
     swallowed: Mapping[str, frozenset[tuple[str, str]]] = field(default_factory=dict)
     quiet: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        facts = f"{self.block} keeps the contract of a block", f"{len(self.checks)} checks"
+        return brief("check of a block", *facts, then="print(…) shows all")
 
     def __str__(self) -> str:
         lines = [f"{self.block} keeps the contract of a block."]

@@ -8,6 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from ...blocks.core import brief
 from ..flat import FlatDiagram
 from ..wiring import join
 from .links import Links
@@ -91,6 +92,14 @@ class CouplingReport:
     connections: tuple[CoupledConnection, ...]
     order: tuple[str, ...]
     loops: tuple[tuple[str, ...], ...]
+
+    def __repr__(self) -> str:
+        facts = (
+            str(self.scheme),
+            f"{len(self.connections)} connections",
+            f"{len(self.loops)} loops of feedthrough" * bool(self.loops),
+        )
+        return brief("coupling of FMUs", *facts, then="print(…) shows all")
 
     def __str__(self) -> str:
         rows = [("from", "to", "kind", "step in s", "held from", "steps", "mean delay in s")]

@@ -15,7 +15,7 @@ from typing import Any, Self, TypeVar, cast, overload
 
 import numpy as np
 
-from ...blocks.core import Block
+from ...blocks.core import Block, brief, count_of
 from ..wiring import Checked, Structure
 from . import functions
 from .block_functions import BlockFunctions
@@ -60,6 +60,14 @@ class FlatDiagram(FlatLayout):
     """
 
     checked: Checked
+
+    def __repr__(self) -> str:
+        facts = (
+            count_of(len(self.table.blocks), "block"),
+            count_of(self.states.total, "state"),
+            f"base {float(self.base):g} s",
+        )
+        return brief("flat diagram", *facts, then=".states, .log, .function")
 
     @property
     def layout(self) -> FlatLayout:

@@ -23,7 +23,7 @@ from .clocks import EVERY, TickPattern, in_order
 from .plant_ticks import find_plant_ticks, takes_any_step
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class StateLayout(Layout):
     """Where the states of blocks stand: by the block's path, and within a block by the state's name.
 

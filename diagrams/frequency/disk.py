@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, ParameterError
+from ...blocks.core import ConfirmationError, Finding, ParameterError, brief
 from .carried import carries_findings
 from .confirm import confirm_limit, confirm_peak, refuse_singular
 from .features import Features, scan
@@ -58,6 +58,11 @@ class DiskMargin:
     destabilizing: tuple[complex, ...]
     destabilizing_alpha: float
     findings: tuple[Finding, ...] = ()
+
+    def __repr__(self) -> str:
+        gains = f"gains of {self.gain_low:.4g} to {self.gain_high:.4g}"
+        facts = f"α = {self.alpha} at {self.frequency}", gains, f"phases to ±{self.phase_deg:.4g}°"
+        return brief("disk margin", *facts, then=".alpha, .frequency, .destabilizing")
 
 
 @carries_findings

@@ -9,7 +9,7 @@ import numpy as np
 from control import StateSpace, feedback
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, brief, count_of
 from . import loop_plots
 
 if TYPE_CHECKING:
@@ -46,6 +46,15 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
 
     linearization: Model | None = None
     wires: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        sampling = f"T = {self.dt:g} s" if self.dt else "continuous"
+        facts = count_of(self.nstates, "state"), sampling, count_of(len(self.findings), "finding") * bool(self.findings)
+        then = "margins(loop), loop.bode(), loop.nyquist(), print(…) shows its matrices"
+        return brief(f"loop at {', '.join(self.wires)}" if self.wires else "loop", *facts, then=then)
+
+    def _repr_html_(self) -> None:
+        """Return None: a notebook shows the short text; python-control's matrices grow with the states."""
 
     def bode(
         self,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Finding
+from ...blocks.core import Finding, brief
 from .number import MARK, Number
 
 NEAR = 1e-12
@@ -94,6 +94,13 @@ class Margins:
     encirclements: int
     dt: float = 0.0
     findings: tuple[Finding, ...] = ()
+
+    def __repr__(self) -> str:
+        names = ("gain_margin_high", "phase_margin_deg", "disk_margin", "ms")
+        told = [f"{name} {number}" for name, number in self.numbers().items() if name in names] if self.stable else []
+        poles = ", ".join(f"{p:.4g}" for p in self.unstable_poles[:3])
+        facts = "stable" if self.stable else f"the closed loop is unstable, poles {poles}", *told
+        return brief("margins", *facts, then="print(…) shows all")
 
     def numbers(self) -> dict[str, Number]:
         """Return the single numbers by name, in the order of the report."""

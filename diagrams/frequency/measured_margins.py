@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, brief
 
 if TYPE_CHECKING:
     from control import FrequencyResponseData
@@ -85,6 +85,14 @@ class MeasuredMargins:
     ms: Interval
     crossover: Interval
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        facts = (
+            f"phase_margin_deg {self.phase_margin_deg}",
+            f"gain_margin_high {self.gain_margin_high}",
+            f"ms {self.ms}",
+        )
+        return brief("measured margins", *facts, then="print(…) shows all")
 
     def __str__(self) -> str:
         rows = [f"{f.name:18s} {getattr(self, f.name)}" for f in fields(self) if f.name != "notes"]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, ParameterError, on_one_thread
+from ...blocks.core import ConfirmationError, Finding, ParameterError, brief, on_one_thread
 from .carried import carries_findings
 from .confirm import confirm_limit, confirm_no_limit, refuse_singular
 from .disk import disk_gains, sensitivity_at
@@ -82,6 +82,12 @@ class PeriodicMargins:
     renewals: int
     dt: float
     findings: tuple[Finding, ...] = ()
+
+    def __repr__(self) -> str:
+        facts = f"period {self.dt:g} s", "stable" if self.stable else "the closed loop is unstable"
+        names = ("gain_margin_high", "phase_margin_deg", "disk_margin")
+        told = [f"{name} {getattr(self, name)}" for name in names] if self.stable else []
+        return brief("margins of a periodic loop", *facts, *told, then="print(…) shows all")
 
     def numbers(self) -> dict[str, Number]:
         """Return the single numbers by name."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, ParameterError
+from ...blocks.core import ConfirmationError, ParameterError, brief
 from .carried import carries_findings
 from .number import Number
 from .state_space import Matrices, make_state_space, read_matrices
@@ -38,6 +38,10 @@ class GangOfFour:
     PS: StateSpace
     CS: StateSpace
     T: StateSpace
+
+    def __repr__(self) -> str:
+        facts = f"{self.S.nstates} states", f"T = {self.S.dt:g} s" if self.S.dt else "continuous"
+        return brief("gang of four", *facts, then=".S, .PS, .CS, .T")
 
 
 @carries_findings

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ...blocks.core import Finding, LoopwrightError, OptionError
+from ...blocks.core import Finding, LoopwrightError, OptionError, brief, count_of
 from ...fmus.running import Derivation, DerivativeMethod
 from ..flat import NONE, TickPattern, WiredDiagram
 from ..frequency import loop_class
@@ -108,6 +108,11 @@ class Linearization:
     plants: str | None = field(default=None, repr=False)
     step: float | Fraction | None = field(default=None, repr=False)
     stairs: str | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        kind = f"sampled, T = {self.dt:g} s" if self.dt else "continuous"
+        facts = kind, count_of(len(self.states), "state"), count_of(len(self.findings), "finding")
+        return brief(f"linear model of {self.diagram.name!r}", *facts, then="model.loop('wire'), .A, .findings")
 
     @property
     def how(self) -> dict[str, str]:

@@ -38,7 +38,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, brief
 from ..flat import FlatDiagram, WiredDiagram
 from ..linearization import PointLike, find_signal, operating_point, ticks_to_renewal
 from ..results import OperatingPoint, PointOrigin, Snapshot
@@ -110,6 +110,15 @@ class FrequencyResponse:
     """Whether v is constant between two samples, or nothing is sampled; if not, −v/u is no loop."""
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        w = self.omega
+        facts = (
+            f"{w.size} frequencies",
+            f"{w.min():.4g} to {w.max():.4g} rad/s" if w.size else "",
+            f"{int(self.settled.sum())} settled",
+        )
+        return brief(f"measured frequency response at {self.wire!r}", *facts, then=".L, .S, .T, measured_margins(…)")
 
     @property
     def S(self) -> FrequencyResponseData:  # noqa: N802

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, OptionError, SimulationError
+from ...blocks.core import LoopwrightError, OptionError, SimulationError, brief
 from ..flat import FlatDiagram, WiredDiagram
 from ..linearization import (
     Linearization,
@@ -92,6 +92,14 @@ class StepResponse:
     held: bool
     prediction: np.ndarray | None
     final: np.ndarray | None = None
+
+    def __repr__(self) -> str:
+        facts = (
+            f"height {self.size:g}",
+            f"{self.t.size} samples to {self.t[-1] if self.t.size else 0:.4g} s",
+            f"{len(self.outputs)} outputs",
+        )
+        return brief(f"response to a step at {self.wire!r}", *facts, then=".t, .v, .y, .prediction")
 
     def answer(self, to_output: bool = False, *, linear: bool = False) -> np.ndarray:
         """Return the response per unit of the step: −v/size, the loop's at the wire, or that of the first output.

@@ -27,6 +27,7 @@ from ...blocks import (
     SmoothStep,
     Step,
 )
+from ...blocks.core import brief
 from ...fmus import Fmu
 from ...fmus.models import gantry
 from ..diagram import Diagram
@@ -75,6 +76,11 @@ class Experiment:
     duration: float
     options: Mapping[str, Any]
     path: Path
+
+    def __repr__(self) -> str:
+        return brief(
+            f"{self.title!r}", f"{self.duration:g} s", repr(self.diagram), then=".simulate(), .diagram, .options"
+        )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "options", MappingProxyType(dict(self.options)))

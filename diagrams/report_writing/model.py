@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from ...blocks.core import brief
 from ..frequency import Number
 from ..requirements import Review, Verdict
 
@@ -24,6 +25,10 @@ class Table:
     note: str = ""
     details: bool = False
     digits: int = 6
+
+    def __repr__(self) -> str:
+        facts = f"{len(self.rows)} rows", ", ".join(map(str, self.columns))
+        return brief(f"table {self.title!r}", *facts, then=".rows")
 
 
 class Judged(str):
@@ -51,6 +56,9 @@ class Plot:
     ahead: bool = False
     details: bool = False
 
+    def __repr__(self) -> str:
+        return brief(f"figure {self.key!r}", self.caption[:80], then=".figure")
+
 
 @dataclass(frozen=True, eq=False)
 class Section:
@@ -64,6 +72,15 @@ class Section:
     numbers: Mapping[str, Number] = field(default_factory=dict)
     """By path within the section, such as ``par.sampled_d0.phase_margin_deg``."""
     sections: tuple[Section, ...] = ()
+
+    def __repr__(self) -> str:
+        facts = (
+            f"{len(self.tables)} tables",
+            f"{len(self.plots)} figures",
+            f"{len(self.numbers)} numbers",
+            f"{len(self.sections)} parts",
+        )
+        return brief(f"section {self.title!r}", *facts, then=".text, .tables, .plots, .sections")
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +103,11 @@ class Document:
     sections: tuple[Section, ...]
     meta: Mapping[str, Any] = field(default_factory=dict)
     review: Review | None = None
+
+    def __repr__(self) -> str:
+        verdict = "" if self.review is None else self.review.verdict.value
+        facts = f"{len(self.sections)} sections", f"{len(self.numbers())} numbers", verdict
+        return brief(f"report {self.title!r}", *facts, then=".numbers(), .sections, .save(…)")
 
     def numbers(self) -> dict[str, Number]:
         """Return every number by its dotted path, such as ``inner.par.sampled_d0.phase_margin_deg``."""

@@ -9,7 +9,7 @@ from .html import to_html
 from .model import Document
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Report(Document):
     """A design report of a diagram.
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
-from ...blocks.core import OptionError, near
+from ...blocks.core import OptionError, brief, near
 from .contact_limits import ContactLimits, read_contacts
 from .limits import SENSES, STEP_SENSES, Limit, make_limit
 
@@ -110,6 +110,13 @@ class LoopLimits:
         self.step = None if step is None else StepLimits.of(step)
         self.variants: Mapping[str, LoopLimits] = MappingProxyType(_variants(variants))
 
+    def __repr__(self) -> str:
+        told = [f"{name} {limit}" for name, limit in self.limits.items()]
+        more = "limits of steps" if self.step else "", f"{len(self.variants)} variants" if self.variants else ""
+        return brief(self._kind, *told, *more, then=".limits, .step, .variants")
+
+    _kind: ClassVar[str] = "limits of a loop"
+
     @staticmethod
     def _names() -> tuple[str, ...]:
         return (*SENSES, "step", "variants")
@@ -157,6 +164,8 @@ class Requirements(LoopLimits):
     >>> {name: str(limit) for name, limit in asked.limits_of(["u"], "sampled_d1").items()}
     {'phase_margin_deg': '≥ 45', 'ms': '≤ 1.6'}
     """
+
+    _kind = "requirements"
 
     def __init__(
         self,

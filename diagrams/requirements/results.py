@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from ...blocks.core import brief
 from ..frequency import Number
 from .limits import Limit, Reason, Verdict
 
@@ -83,6 +84,10 @@ class Review:
     """
 
     results: tuple[RequirementResult, ...]
+
+    def __repr__(self) -> str:
+        told = [f"{len(self.of(verdict))} {verdict.value}" for verdict in Verdict if self.of(verdict)]
+        return brief(f"review of {len(self.results)} requirements", *told, then=".results, .of(Verdict.FAILED)")
 
     @property
     def verdict(self) -> Verdict:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ...blocks.core import Finding, OptionError
+from ...blocks.core import Finding, OptionError, brief, count_of, enumerate_some, shorten
 from ..flat import FlatDiagram
 from .saved_state import StateLayout, layout_of
 
@@ -127,4 +127,17 @@ class OperatingPoint:
     free: tuple[FreeDirection, ...] = ()
     """Directions that a trim left free, to first order: with targets or fixed states for them it is unique."""
     residuals: Mapping[str, float] = field(default_factory=dict, repr=False)
+
+    def __repr__(self) -> str:
+        moves = f"residual {self.residual:.3g}" + (f" by {self.largest}" if self.largest else "")
+        found = enumerate_some(f"{name} = {shorten(value)}" for name, value in self.parameters.items())
+        facts = (
+            self.how.value,
+            count_of(self.x.size, "state"),
+            moves,
+            found,
+            count_of(len(self.free), "free direction") * bool(self.free),
+        )
+        return brief(f"operating point at t = {self.t:.9g} s", *facts, then="diagram.linearize(point)")
+
     """Remainder of each equation of a trim by name, largest first, relative to 1 + the size of its quantity."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from ...blocks.core import Layout, OptionError, PortUnit, UnknownNameError
 from ..wiring import CheckedDiagram, Wire, split_entry
+from .short_text import describe_run
 from .signal_names import Place, Places, entries, place_of, resolve
 from .snapshot import Snapshot
 from .stored import Occurrence, PathLike, Stopped, header, prepare, read, write
@@ -88,12 +89,13 @@ class Run:
     """The complete state at the end, for ``simulate(…, start=)``; None where an FMU can't save its state."""
     recipe: Mapping[str, Any] = field(default_factory=dict, repr=False)
     """Options of the run (step, solver, tolerances, start), with which an instant of it can be found again."""
-
     _places: Places = field(init=False, default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         if not self.diagram_name:
             object.__setattr__(self, "diagram_name", getattr(self.diagram, "name", ""))
+
+    __repr__ = describe_run
 
     @classmethod
     def open(cls, path: PathLike) -> Run:
@@ -192,9 +194,7 @@ class Run:
     def _find_columns(self, full: str) -> np.ndarray | None:
         """Return the columns of a signal in ``data``, in its shape; None if not all were recorded."""
         where = entries(full, self.layout, self.wires)
-        if self._position is None:
-            return where
-        where = self._position[where]
+        where = where if self._position is None else self._position[where]
         return where if np.all(where >= 0) else None
 
     def __getitem__(self, name: str) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, brief, shorten
 from ..flat import FlatDiagram
 from .stored import Stopped, own_version
 
@@ -58,6 +58,11 @@ class RunState:
     version: int = VERSION
     made_by: str = field(default_factory=own_version)
 
+    def __repr__(self) -> str:
+        ended = "" if self.stopped is None else f"stopped by {self.stopped.block}"
+        facts = f"t = {self.t:.9g} s", f"tick {self.tick} of {float(self.base):g} s", ended
+        return brief(f"state of a run of {self.diagram!r}", *facts, then="diagram.simulate(…, start=state)")
+
 
 def layout_of(flat: FlatDiagram) -> StateLayout:
     """Return the layout of a saved state: two diagrams with equal layouts can exchange states."""
@@ -76,7 +81,7 @@ def check_fits(state: RunState, flat: FlatDiagram, name: str) -> None:
     """
     if not isinstance(state, RunState):
         raise OptionError(
-            f"found {state!r}; expected a saved state. Give run.final_state, or the result of Simulation.save().",
+            f"found {shorten(state)}; expected a saved state. {_next_step(state)}",
             block=name,
             port="start",
         )
@@ -108,6 +113,13 @@ def check_fits(state: RunState, flat: FlatDiagram, name: str) -> None:
                     block=name,
                     port="start",
                 )
+
+
+def _next_step(state: object) -> str:
+    t = getattr(state, "t", None)
+    if isinstance(t, float):  # an instant of a run, which lacks the FMUs' states and the solver's
+        return f"Give diagram.operating_point({t!r}), which runs to that instant, or the final_state of a run until it."
+    return "Give run.final_state, the result of Simulation.save(), or an operating point."
 
 
 def not_open_error(opened: bool | None, name: str) -> OptionError:

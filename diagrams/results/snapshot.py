@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ...blocks.core import brief, count_of
 from ..wiring import Wire, index_of, split_entry
 from .signal_names import resolve
 
@@ -38,6 +39,11 @@ class Snapshot:
     """The named wires: two of one short name are told apart by their source."""
     run: RecordedRun | None = field(default=None, repr=False, compare=False)
     """The run that it comes from."""
+
+    def __repr__(self) -> str:
+        of = f" of {self.run.diagram_name!r}" if self.run is not None and self.run.diagram_name else ""
+        facts = count_of(len(self.values), "signal"), count_of(self.state.size, "state")
+        return brief(f"instant t = {self.t:.9g} s{of}", *facts, then="instant['name'], diagram.linearize(instant)")
 
     def __getitem__(self, name: str) -> Any:
         full, entry = split_entry(resolve(name, self.names, self.values), self.values)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -64,13 +65,14 @@ class Interrupted(KeyboardInterrupt):
     Attributes
     ----------
     run : Run
-        The run until the last sample before the interrupt.
+        The run until the last sample before the interrupt. It has no ``final_state``; its messages say so.
     """
 
     def __init__(self, run: Run):
         where = f"at t = {run.t[-1]:.9g} s" if len(run.t) else "before the first sample"
         super().__init__(f"interrupted {where}")
-        self.run = run
+        told = f"This run was interrupted {where}, within a step: it has no final_state to go on from."
+        self.run = run if told in run.messages else replace(run, messages=(*run.messages, told))
 
     def __reduce__(self) -> tuple[type[Interrupted], tuple[Run]]:
         return type(self), (self.run,)

@@ -170,9 +170,10 @@ class RunOptions:
                 raise OptionError(f"it is no option of a run. {near(name, known)}", block=block, port=name)
         if "start" in options and options["start"] is None:
             raise OptionError(
-                "found None; expected a state or an operating point. A run has no final_state if it has ended between "
-                "two ticks, or an FMU can't turn its state into bytes (canSerializeFMUState). Leave out start to begin "
-                "at t = 0.",
+                "found None; expected a state or an operating point. A run has no final_state if it was interrupted or "
+                "has failed (run.messages tells when), has ended between two ticks, or an FMU can't turn its state "
+                "into bytes (canSerializeFMUState). Leave out start to begin at t = 0; to go on after an interrupt, "
+                "run in parts and keep the final_state of each, or Simulation.save().",
                 block=block,
                 port="start",
             )

@@ -8,6 +8,7 @@ from fractions import Fraction
 
 import numpy as np
 
+from ...blocks.core import brief
 from ..coupling import Plant
 from ..exchange import ExchangedBlock
 from ..results import Occurrence, Stopped
@@ -84,6 +85,9 @@ class SimulationView:
     plants: Mapping[str, Plant]
     exchanged: Mapping[str, ExchangedBlock]
     _position: Position = field(repr=False)
+
+    def __repr__(self) -> str:
+        return brief("a run in the making", f"t = {self._position.t:.9g} s", then=".t, .x, .w")
 
     @classmethod
     def of(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import UnknownNameError, near
+from ...blocks.core import UnknownNameError, brief, enumerate_some, near
 from ..flat import WiredDiagram
 from ..frequency import MarginSlope, Number, margin_slopes
 from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize
@@ -60,6 +60,11 @@ class Sensitivity:
     is_exact: bool = True
     kink: bool = False
     rest_lost: bool = False
+
+    def __repr__(self) -> str:
+        change = f"{self.per_percent.value:+.4g} per 1 %"
+        facts = f"of {self.quantity} = {self.number} by {self.parameter} = {self.value:g} {self.unit}".rstrip(), change
+        return brief("sensitivity", *facts, then=".slope, .per_percent")
 
     @property
     def per_percent(self) -> Number:
@@ -118,6 +123,12 @@ class Sensitivities(Sequence[Sensitivity]):
     without_effect: tuple[str, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
     model: Linearization | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        names = enumerate_some(dict.fromkeys(row.parameter for row in self.rows))
+        facts = names if self.rows else "none", "" if self.stable else "the closed loop is unstable"
+        then = "print(…) shows all, .of('disk_margin'), .plot()"
+        return brief(f"sensitivities of the loop at {', '.join(self.wires)}", *facts, then=then)
 
     def __len__(self) -> int:
         return len(self.rows)

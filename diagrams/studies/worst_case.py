@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, brief, enumerate_some
 from ..flat import WiredDiagram
 from ..requirements import Requirements
 from ..sweeps import Box, Samples, read_samples
@@ -65,6 +65,13 @@ class WorstCase:
     points: tuple[Any, ...] = field(repr=False)
     options: Mapping[str, Any] = field(default_factory=dict, repr=False)
     measure: Measure | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        found = enumerate_some(f"{name} = {_short(value)}" for name, value in self.worst.parameters.items())
+        facts = describe(self.worst), found
+        return brief(
+            f"worst of {len(self.cases)} cases", *facts, then="print(…) tells more, .diagram, .confirm(), .plot()"
+        )
 
     @property
     def parameters(self) -> Mapping[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, near
+from ...blocks.core import OptionError, brief, enumerate_some, near
 from ..wiring import CheckedDiagram, find_parameter
 
 KINDS = ("grid", "latin")
@@ -138,6 +138,10 @@ class Samples(Sequence[Sample]):
     axes: Mapping[str, tuple[Any, ...]] | None = None
     seed: int = 0
     boxes: Mapping[str, Box] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        facts = f"{len(self)} samples of {enumerate_some(self.names)}", "" if self.axes is None else "a grid"
+        return brief("samples", *facts, then="samples[0].parameters")
 
     def __len__(self) -> int:
         return len(self.rows)

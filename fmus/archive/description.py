@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuFileError, Layout
+from ...blocks.core import FmuFileError, Layout, brief
 from ..host_state import FOLDER
 from .binaries import find_binary, judge_name
 from .exchange import ExchangeInfo, read_exchange
@@ -102,6 +102,13 @@ class FmuDescription:
     model_version: str = ""
     """Version of the model, as its description says."""
     """Whether there is a co-simulation interface; ``identifier`` and ``binary`` are else those of model exchange."""
+
+    def __repr__(self) -> str:
+        kinds = "co-simulation" * self.co_simulation, "model exchange" * bool(self.model_exchange)
+        facts = f"FMI {self.fmi}", " and ".join(filter(None, kinds)), f"{len(self.variables)} variables"
+        return brief(
+            f"description of {self.file.name!r}", *facts, then=".variables, .states, loopwright.fmus.examine(file)"
+        )
 
     def layout(self, names: Iterable[str]) -> Layout:
         """Return the layout of some variables in a flat vector, one after the other."""

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import Any
 
+from ...blocks.core import brief
 from ..archive import FmuFault, FmuFinding, FmuSeverity
 from .summary import INTERFACES
 from .trial import RUNS
@@ -84,6 +85,11 @@ class FmuDiagnosis:
     summary: Mapping[str, Any] = field(default_factory=dict)
     counts: Mapping[str, int] = field(default_factory=dict)
     trials: tuple[FmuTrial, ...] = ()
+
+    def __repr__(self) -> str:
+        return brief(
+            f"examination of {self.file!r}", self.headline.translate(_CONTROL), then="print(…) shows all, .findings"
+        )
 
     @property
     def runs(self) -> bool:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import DefinitionError, ParameterError, parse_unit
+from ...blocks.core import DefinitionError, ParameterError, brief, parse_unit
 
 Causality = Literal["input", "output", "parameter", "local"]
 Variability = Literal["continuous", "discrete", "fixed", "tunable"]
@@ -246,6 +246,10 @@ class ModelSpec:
     jump: ca.Function | None = None
     integrator: Integrator = "rk4"
     tolerance: float = 1e-8
+
+    def __repr__(self) -> str:
+        facts = f"{len(self.states)} states", f"{len(self.inputs)} inputs", f"{len(self.outputs)} outputs"
+        return brief(f"model {self.name!r} for an FMU", *facts, then="build(model, out=…)")
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z_]\w*", self.name, re.ASCII) or len(self.name) > 100:

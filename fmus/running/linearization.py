@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ...blocks.core import FmuError, Layout, ParameterError, UnknownNameError, elements, near
+from ...blocks.core import FmuError, Layout, ParameterError, UnknownNameError, brief, elements, near
 from ..archive import FmuDescription
 from ..calls import FmuBlock, LoadedFmu
 from ..isolation import open_fmu
@@ -54,6 +54,10 @@ class FmuLinearization:
     """Method by which the derivatives were computed."""
     uncertainty: np.ndarray
     """Estimated error of each entry of [[A, B], [C, D]]; zero if the FMU computed the derivatives."""
+
+    def __repr__(self) -> str:
+        facts = f"{len(self.states)} states", f"{len(self.inputs)} inputs", f"{len(self.outputs)} outputs", self.how
+        return brief(f"linear model of an FMU at t = {self.t:.9g} s", *facts, then=".A, .B, .C, .D, .uncertainty")
 
     @property
     def how(self) -> str:

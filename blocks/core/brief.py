@@ -1,0 +1,35 @@
+"""Short texts of results, for a cell of a notebook or an error: the kind, the facts that matter, and next steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+def brief(kind: str, *facts: str, then: str = "") -> str:
+    """Return a short text of a value; facts that are empty are left out.
+
+    Examples
+    --------
+    >>> brief("run of 'drive'", "11 samples from 0 to 1 s", "", then="run['y']")
+    "<run of 'drive': 11 samples from 0 to 1 s; run['y']>"
+    """
+    told = ", ".join(fact for fact in facts if fact)
+    return f"<{kind}{': ' if told else ''}{told}{'; ' if then else ''}{then}>"
+
+
+def enumerate_some(names: Iterable[str], most: int = 4) -> str:
+    """Return some names in a row, and the number of the others.
+
+    Examples
+    --------
+    >>> enumerate_some(["x", "y", "z"], most=2)
+    'x, y and 1 more'
+    """
+    found = list(names)
+    more = f" and {len(found) - most} more" if len(found) > most else ""
+    return ", ".join(found[:most]) + more
+
+
+def count_of(n: int, noun: str) -> str:
+    """Return a number of things: ``"1 state"``, ``"3 states"``."""
+    return f"{n} {noun}{'' if n == 1 else 's'}"

@@ -1,0 +1,104 @@
+"""Short texts of results: a cell of a notebook shows the kind, the facts that matter, and next steps."""
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import Gain, Integrator, OptionError, StateSpace, Step
+from loopwright.diagrams import (
+    Diagram,
+    Interrupted,
+    Requirements,
+    check_block,
+    disk_margin,
+    gang_of_four,
+    margins,
+    periodic_margins,
+    sensitivity,
+    subsystem,
+)
+
+LONGEST = 300
+
+
+def drive(ki=0.3):
+    """Return a sampled PI controller around a damped oscillator."""
+    A, B = np.array([[0.0, 1.0], [-9.0, -0.6]]), np.array([0.0, 9.0])
+    plant = StateSpace(A=A, B=B, C=np.array([1.0, 0.0]), D=0.0, name="plant")
+
+    @subsystem(sample_time=0.02)
+    def control(e):
+        return Gain(gain=0.2, name="kp")(e) + Gain(gain=ki, name="ki")(Integrator(name="i")(e))
+
+    e = (Step(times=0.1, values=1.0, name="step") - plant.y).named("e")
+    return Diagram("drive", plant(control(e).named("u")).named("y"))
+
+
+@pytest.fixture(scope="module")
+def diagram():
+    return drive()
+
+
+@pytest.fixture(scope="module")
+def run(diagram):
+    return diagram.simulate(2.0, progress=False)
+
+
+def test_texts_of_a_run_say_its_samples_and_next_steps(run):
+    found = repr(run)
+    assert found.startswith("<run of 'drive': 101 samples from 0 to 2 s, 10 signals (named: y, u, e), interpreted; ")
+    assert "run['y']" in found
+    assert repr(run.at(1.0)).startswith("<instant t = 1 s of 'drive': 10 signals, 7 states; ")
+    assert repr(run.final_state) == (
+        "<state of a run of 'drive': t = 2 s, tick 100 of 0.02 s; diagram.simulate(…, start=state)>"
+    )
+
+
+def test_texts_of_results_are_short_and_say_units_or_next_steps(diagram, run):
+    model = diagram.linearize()
+    loop = model.loop("u")
+    shown = [
+        *(run, run.at(1.0), run.final_state, diagram.trim(), diagram.flatten(), diagram.flatten().log, diagram.draw()),
+        *(model, loop, margins(loop), disk_margin(loop), periodic_margins(loop), gang_of_four(loop, loop)),
+        *(margins(drive(ki=2.0).linearize().loop("u")), diagram.sensitivity("u", ["kp.gain"])),
+        *(diagram.sensitivity("u", ["kp.gain"])[0], Requirements(ms=2.0), check_block(Gain(gain=1.0))),
+        diagram.worst_case({"kp.gain": (0.1, 0.3)}, "u", count=2, starts=0),
+        diagram.sweep({"kp.gain": (0.1, 0.3)}, 0.1, signals="y", progress=False, workers=1, compile=False),
+    ]
+    for value in shown:
+        found = repr(value)
+        assert len(found) <= LONGEST, found
+        assert found.count("\n") < 10
+        assert found.startswith("<")
+        assert found.endswith(">")
+        assert "array(" not in found
+    assert loop._repr_html_() is None
+    assert "unstable, poles" in repr(shown[13])
+    assert "margins(loop)" in repr(loop)
+    assert repr(margins(loop)).startswith("<margins: stable, gain_margin_high 2.84646, phase_margin_deg 42.8762 deg, ")
+
+
+def test_the_loop_is_a_state_space_still(diagram):
+    loop = diagram.linearize().loop("u")
+    assert "states=3" in repr(sensitivity(loop)).replace(" ", "")
+    assert "A = " in str(loop)
+
+
+def test_an_instant_of_a_run_is_refused_in_short_with_a_next_step(diagram, run):
+    with pytest.raises(OptionError, match=r"drive.start: found <instant t = 1 s .*diagram.operating_point\(1.0\)") as e:
+        diagram.simulate(1.0, start=run.at(1.0), progress=False)
+    assert len(str(e.value)) < 400
+    point = diagram.operating_point(1.0)
+    on = diagram.simulate(1.0, start=point, progress=False)
+    np.testing.assert_allclose(on["y"][-1], run["y"][-1], rtol=1e-5)
+
+
+def test_an_interrupted_run_says_when_and_that_it_has_no_final_state(diagram, run):
+    error = Interrupted(run)
+    assert error.run.messages[-1] == (
+        "This run was interrupted at t = 2 s, within a step: it has no final_state to go on from."
+    )
+    assert error.run.messages[-1] in repr(error.run)
+    again, (same,) = error.__reduce__()
+    assert len(again(same).run.messages) == len(error.run.messages)
+    with pytest.raises(OptionError, match=r"interrupted or has failed \(run.messages tells when\).*run in parts"):
+        diagram.simulate(1.0, start=None, progress=False)
