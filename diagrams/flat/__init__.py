@@ -6,7 +6,7 @@ from .clock_sets import is_exact, kinds_of
 from .clocks import EVERY, NONE, ClockSets, TickPattern, bits_of, ticks_after
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator
 from .flat_diagram import EXACT_LOOP, FlatDiagram
-from .flatten import renumber
+from .flatten import renumber, write_numbers
 from .functions import indicators_of
 from .layout import FlatEvent, StateLayout
 from .logic import TRUE, is_true
@@ -73,4 +73,5 @@ __all__ = [
     "takes_any_step",
     "ticks_after",
     "trace_schedule",
+    "write_numbers",
 ]

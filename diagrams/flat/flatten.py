@@ -135,6 +135,12 @@ def renumber(flat: FlatDiagram, blocks: Mapping[str, Block]) -> FlatDiagram:
     """
     table = flat.table.with_blocks(blocks)
     p, x0 = flat.p.copy(), flat.x0.copy()
+    write_numbers(flat, blocks, p, x0)
+    return flat.with_numbers(table, p, x0)
+
+
+def write_numbers(flat: FlatDiagram, blocks: Mapping[str, Block], p: np.ndarray, x0: np.ndarray) -> None:
+    """Write the parameters and start values of blocks into those of a flattened diagram; see `renumber`."""
     for path, block in blocks.items():
         if path not in flat.checked.traced:
             continue
@@ -142,7 +148,6 @@ def renumber(flat: FlatDiagram, blocks: Mapping[str, Block]) -> FlatDiagram:
         inputs = flat.checked.traced[path].inputs
         if values := [np.ravel(port.start_value(block, inputs)) for port in block.states.values()]:
             x0[flat.states.slices[path]] = np.concatenate(values)
-    return flat.with_numbers(table, p, x0)
 
 
 def _input_shape(table: Structure, checked: Checked, path: str, port: str) -> Shape:

@@ -1,7 +1,19 @@
 """Runs of one diagram side by side in the lanes of vectors: code of its ticks and of its FMUs' equations."""
 
-from .lane_code import LaneCode, compile_lanes
-from .lane_runs import LaneEnd, LaneRuns, LaneStart, make_room
+from .lane_code import LaneCode, LaneStarts, compile_lanes
+from .lane_runs import LaneEnd, LaneRuns, LaneStart, LaneVectors, make_room
 from .no_lanes import NoLanesError
+from .start_code import StartSource
 
-__all__ = ["LaneCode", "LaneEnd", "LaneRuns", "LaneStart", "NoLanesError", "compile_lanes", "make_room"]
+__all__ = [
+    "LaneCode",
+    "LaneEnd",
+    "LaneRuns",
+    "LaneStart",
+    "LaneStarts",
+    "LaneVectors",
+    "NoLanesError",
+    "StartSource",
+    "compile_lanes",
+    "make_room",
+]

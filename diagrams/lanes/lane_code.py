@@ -19,6 +19,7 @@ from ..compiled import LARGEST, load_compiled
 from ..flat import TRUE, FlatDiagram, TickPattern
 from .lane_plants import LanePlant, read_plant
 from .no_lanes import NoLanesError
+from .start_code import StartSource, write_start
 from .vector_code import write_vectors
 
 # A product and a sum of one expression are fused, whatever the optimizer does; more of it gains nothing.
@@ -37,7 +38,9 @@ class LaneSizes:
     log: int
 
 
-def write_lanes(ticks: Sequence[Any], plants: Sequence[LanePlant], sizes: LaneSizes, count: int) -> str:
+def write_lanes(
+    ticks: Sequence[Any], plants: Sequence[LanePlant], sizes: LaneSizes, count: int, start: StartSource | None = None
+) -> str:
     """Write the C code that goes over ticks with a vector of runs.
 
     Parameters
@@ -50,6 +53,8 @@ def write_lanes(ticks: Sequence[Any], plants: Sequence[LanePlant], sizes: LaneSi
         Entries of the vectors.
     count : int
         Runs in a vector.
+    start : StartSource, optional
+        Functions from which runs start.
     """
     parts = [f"#define LANES {count}\n", f"#define TRUTH {TRUE!r}\n"]
     parts += [f"#define N_{name.upper()} {size}\n" for name, size in vars(sizes).items()]
@@ -78,6 +83,8 @@ def write_lanes(ticks: Sequence[Any], plants: Sequence[LanePlant], sizes: LaneSi
         f"#define KEEP_PLANTS {' '.join(keep)}\n",
         read_source("lanes.c"),
     ]
+    if start is not None:
+        parts.append(write_start(start, plants))
     return "".join(parts)
 
 
@@ -104,6 +111,8 @@ class LaneCode:
         Runs in a vector.
     library : CDLL
         The library, which is loaded as long as this lives.
+    starts : LaneStarts or None
+        Functions of the start of runs; None if it can't be computed over vectors.
     """
 
     run: Any
@@ -112,13 +121,41 @@ class LaneCode:
     sizes: LaneSizes
     count: int
     library: ctypes.CDLL
+    starts: LaneStarts | None = None
 
 
-_COMPILED: WeakKeyDictionary[FlatDiagram, dict[int, LaneCode]] = WeakKeyDictionary()
+@dataclass(frozen=True, eq=False)
+class LaneStarts:
+    """C functions of the start of a vector of runs; each takes addresses of vectors.
+
+    Attributes
+    ----------
+    tick : callable
+        ``(x, w, p, x_next, z, log, ok)``: the tick with which they begin.
+    outputs : callable
+        ``(plants, z, w)``: outputs of the FMUs at their inputs in z, which they keep; z may be None.
+    values : list of callable
+        ``(x, w, p, left, values)``, as `StartSource` has them.
+    sizes : list of int
+        Number of values of each.
+    """
+
+    tick: Any
+    outputs: Any
+    values: list[Any]
+    sizes: list[int]
+
+
+_COMPILED: WeakKeyDictionary[FlatDiagram, dict[Any, LaneCode]] = WeakKeyDictionary()
 _COMPILING = Lock()
 
 
-def compile_lanes(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], count: int) -> LaneCode:
+def compile_lanes(
+    flat: FlatDiagram,
+    acting: Sequence[frozenset[TickPattern]],
+    count: int,
+    start: StartSource | None = None,
+) -> LaneCode:
     """Compile the code that goes over ticks with a vector of runs, unless the cache has it.
 
     Parameters
@@ -129,6 +166,8 @@ def compile_lanes(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], c
         The sets of clocks that act together at some tick.
     count : int
         Runs in a vector.
+    start : StartSource, optional
+        Functions from which runs start.
 
     Raises
     ------
@@ -137,12 +176,15 @@ def compile_lanes(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], c
     """
     with _COMPILING:
         known = _COMPILED.setdefault(flat.origin, {})
-        if count not in known:
-            known[count] = _compile(flat.origin, acting, count)
-        return known[count]
+        key = count, None if start is None else start.key
+        if key not in known:
+            known[key] = _compile(flat.origin, acting, count, start)
+        return known[key]
 
 
-def _compile(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], count: int) -> LaneCode:
+def _compile(
+    flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], count: int, start: StartSource | None
+) -> LaneCode:
     if flat.hybrid:
         raise NoLanesError("it has continuous states")
     if flat.loops.slices:
@@ -162,14 +204,27 @@ def _compile(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], count:
     sizes = LaneSizes(
         *(first.numel_in(1), first.numel_in(2), first.numel_out(1), first.numel_in(3), first.numel_out(2))
     )
-    source = write_lanes(ticks, [*plants.values()], sizes, count)
+    begin = None if start is None else StartSource(_share(start.tick), start.values, start.key)
+    source = write_lanes(ticks, [*plants.values()], sizes, count, begin)
     try:
         library = load_compiled(source, (*processor_flags(), *FLAGS), describe_processor())
     except (CompilerError, FmuError) as error:
         raise NoLanesError(str(error).rstrip(".")) from error
     run = library["loopwright_lanes"]
     run.restype = None
-    return LaneCode(run, {clocks: i for i, clocks in enumerate(acting)}, plants, sizes, count, library)
+    starts = None if begin is None else _bind_starts(library, begin)
+    return LaneCode(run, {clocks: i for i, clocks in enumerate(acting)}, plants, sizes, count, library, starts)
+
+
+def _bind_starts(library: ctypes.CDLL, source: StartSource) -> LaneStarts:
+    def bind(name: str, count: int) -> Any:
+        function = library[f"loopwright_{name}"]
+        function.restype, function.argtypes = None, [ctypes.c_void_p] * count
+        return function
+
+    sizes = [sum(function.numel_out(i) for i in range(function.n_out())) for function in source.values]
+    values = [bind(f"start{i}", 5) for i in range(len(sizes))]
+    return LaneStarts(bind("first_tick", 7), bind("first_outputs", 3), values, sizes)
 
 
 def _share(tick: Any) -> Any:

@@ -63,6 +63,15 @@ static inline void ${name}_step($name *self, double now, double h, int64_t n, co
     $outputs
 }
 
+/* Outputs at the start, with the inputs in z; without z with those at hand. */
+static void ${name}_look($name *self, const vec *z, vec *w) {
+    vec t[1], y[AT_LEAST_1($n_y)];
+    if (z) { $inputs }
+    t[0] = splat(0.0);
+    ${name}_outputs(t, self->x, self->u, self->p, self->outputs, y);
+    $outputs
+}
+
 static void ${name}_go_on($name *self, mask which, int from) {
     for (int i = 0; i < $n_x; i++) self->x[i] = choose(which, splat(self->x[i][from]), self->x[i]);
 }
@@ -88,6 +97,8 @@ class LanePlant:
         Entries of w, and what they are: an entry of "x", "u" or "y".
     references : sequence of int
         Value references of the parameters, inputs and states, in this order, then of the integrator's step and kind.
+    entries : mapping of int to slice
+        Where the values of these stand among the numbers of a run, by value reference; without the integrator's.
     """
 
     derivative: Any
@@ -95,6 +106,7 @@ class LanePlant:
     inputs: Sequence[tuple[int, int]]
     outputs: Sequence[tuple[int, str, int]]
     references: Sequence[int]
+    entries: Mapping[int, slice]
 
     @cached_property
     def width(self) -> int:
@@ -159,8 +171,11 @@ def read_plant(path: str, block: Fmu, inputs: Mapping[str, slice], outputs: Mapp
     settings = {v.name: i for i, v in enumerate(found.variables) if v.name in _SETTINGS}
     numbers = sorted({*of_kind["fixed"], *of_kind["tunable"]} - {*settings.values()})
     references = [*numbers, *of_kind["input"], *of_kind["state"], *of_kind["discrete"]]
+    entries, at = dict[int, slice](), 0
+    for reference in references:
+        entries[reference] = slice(at, at := at + found.variables[reference].size)
     references += [settings[name] for name in _SETTINGS[:2]]
-    return LanePlant(found.derivative, found.output, ins, outs, references)
+    return LanePlant(found.derivative, found.output, ins, outs, references, entries)
 
 
 def _places(found: WrittenEquations, variable: FmuVariable) -> list[int]:

@@ -62,6 +62,62 @@ class LaneEnd:
     last: np.ndarray
 
 
+class LaneVectors:
+    """The numbers of a vector of runs at their first tick; each array has a column for each lane.
+
+    Parameters
+    ----------
+    code : LaneCode
+        The code.
+    columns : int
+        Entries of the log that are kept.
+
+    Attributes
+    ----------
+    p, x, w, z : ndarray
+        As `LaneStart` has them.
+    plants : ndarray
+        Parameters, inputs and states of the FMUs, one after the other.
+    row : ndarray
+        The entries of the log that are kept.
+    steps : tuple of float
+        Longest step of each FMU's integrator in s.
+    messages : list of tuple of str
+        What the start of each run has told.
+    """
+
+    def __init__(self, code: LaneCode, columns: int):
+        sizes, count = code.sizes, code.count
+        self.p, self.x, self.w, self.z = (make_room(n, count) for n in (sizes.p, sizes.x, sizes.w, sizes.z))
+        self.plants = make_room(sum(plant.width for plant in code.plants.values()), count)
+        self.row = make_room(columns, count)
+        self.steps: tuple[float, ...] = ()
+        self.messages: list[tuple[str, ...]] = []
+
+    @classmethod
+    def of(cls, code: LaneCode, starts: Sequence[LaneStart]) -> LaneVectors:
+        """Return the numbers of runs that were started one by one; their steps are equal."""
+        found = cls(code, starts[0].row.size)
+        for lane, start in enumerate(starts):
+            for name in ("p", "x", "w", "z", "row"):
+                getattr(found, name)[:, lane] = getattr(start, name)
+            found.plants[:, lane] = np.concatenate([np.zeros(0), *(start.plants[path] for path in code.plants)])
+            found.messages.append(start.messages)
+        found.steps = starts[0].steps
+        found.fill()
+        return found
+
+    @property
+    def count(self) -> int:
+        """Number of runs."""
+        return len(self.messages)
+
+    def fill(self) -> None:
+        """Let lanes without a run of their own repeat the first one."""
+        for values in (self.p, self.x, self.w, self.z, self.plants, self.row):
+            values[:, self.count :] = values[:, :1]
+
+
 class LaneRuns:
     """A vector of runs of one diagram, at most as many as the code has lanes.
 
@@ -69,8 +125,8 @@ class LaneRuns:
     ----------
     code : LaneCode
         The code.
-    starts : sequence of LaneStart
-        The runs; their steps are equal.
+    vectors : LaneVectors
+        The runs' numbers, which change as they go on.
     columns : ndarray
         Entries of the log that are kept.
     every : int
@@ -79,21 +135,14 @@ class LaneRuns:
         Entries of the log that end a run where they are true.
     """
 
-    def __init__(
-        self, code: LaneCode, starts: Sequence[LaneStart], *, columns: np.ndarray, every: int, stops: Sequence[int]
-    ):
+    def __init__(self, code: LaneCode, vectors: LaneVectors, *, columns: np.ndarray, every: int, stops: Sequence[int]):
         self._code, self._columns = code, np.ascontiguousarray(columns, dtype=np.int64)
         self._stops = np.array([*stops], dtype=np.int64)
-        self._steps = np.array(starts[0].steps)
-        width, count = code.count, len(starts)
-        filled = [*starts, *[starts[0]] * (width - count)]  # lanes without a run of their own repeat one
-        plants = [np.concatenate([np.zeros(0), *(start.plants[path] for path in code.plants)]) for start in filled]
-        self._vectors = [
-            _aligned(np.stack(values, axis=1))
-            for values in (*([getattr(s, name) for s in filled] for name in "pxwz"), plants, [s.row for s in filled])
-        ]
-        p, x, w, z, plant, last = (vector.ctypes.data for vector in self._vectors)
-        self._last, self._count = self._vectors[-1], count
+        self._steps = np.array(vectors.steps, dtype=float)
+        width, count = code.count, vectors.count
+        self._vectors, self._last, self._count = vectors, _aligned(vectors.row), count
+        numbers = vectors.p, vectors.x, vectors.w, vectors.z, vectors.plants, self._last
+        p, x, w, z, plant, last = (vector.ctypes.data for vector in numbers)
         self._structure = _structure(width)(
             every=every, skip=every - 1, columns=self._columns.size, stops=self._stops.size,
             column=self._columns.ctypes.data, stop=self._stops.ctypes.data, p=p, x=x, w=w, z=z, plant=plant,

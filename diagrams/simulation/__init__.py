@@ -1,9 +1,9 @@
 """The loop over ticks, and between them."""
 
 from .engine import Engine
-from .initialize import find_initial_state, find_start_values, values_from_left
+from .initialize import START_SETTLED, find_initial_state, find_start_values, values_from_left
 from .progress import Interrupted, progress_bar
-from .run_options import KeptKeywords, RunKeywords, RunOptions, default_step, refuse_rest, ticks_in
+from .run_options import START_EXCHANGES, KeptKeywords, RunKeywords, RunOptions, default_step, refuse_rest, ticks_in
 from .simulated_diagram import SimulatedDiagram
 from .simulation import Simulation, simulate
 from .start_at_point import apply_point, copy_states
@@ -12,6 +12,8 @@ from .view import SimulationView
 from .workspace import Workspace
 
 __all__ = [
+    "START_EXCHANGES",
+    "START_SETTLED",
     "Engine",
     "Interrupted",
     "KeptKeywords",

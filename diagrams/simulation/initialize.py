@@ -24,7 +24,8 @@ from .workspace import Workspace
 _MAX_PASSES = 100  # over inputs and outputs of the FMUs at the start
 _PLAIN_PASSES = 10
 """Passes before the outputs of the FMUs are sought from those before."""
-_SETTLED = 1e-13  # relative change of an input between two passes, a few hundred ulps
+START_SETTLED = 1e-13
+"""Relative change of an input between two passes, at most, with which the start is found: a few hundred ulps."""
 _BEFORE_START = -1e-300  # s; nearer to 0 than any time of a source that is not 0
 
 Taps = dict[tuple[str, str], Callable[[Any], Any]]
@@ -90,9 +91,9 @@ def initialize(
                 block=moved,
                 t=0.0,
             )
-        found = not workspace.looped or np.allclose(last, workspace.here.x, rtol=_SETTLED, atol=_SETTLED)
+        found = not workspace.looped or np.allclose(last, workspace.here.x, rtol=START_SETTLED, atol=START_SETTLED)
         agreed = passes_on != "agree" or bool((before == workspace.z).all())
-        agreed = agreed or np.allclose(before, workspace.z, rtol=_SETTLED, atol=0.0, equal_nan=True)
+        agreed = agreed or np.allclose(before, workspace.z, rtol=START_SETTLED, atol=0.0, equal_nan=True)
         if found and agreed:
             break
         if passes == most:
@@ -126,8 +127,8 @@ def _set_initial_states(workspace: Workspace) -> None:
         x[where] = x[flat.states.slices[path]]
 
 
-def find_initial_state(flat: FlatDiagram, path: str, inputs: dict[str, Any]) -> np.ndarray:
-    """Return the initial state that a block computes from the columns at its inputs, flat.
+def find_initial_state(flat: FlatDiagram, path: str, inputs: dict[str, Any], block: Block | None = None) -> np.ndarray:
+    """Return the initial state that a block, or another one in its place, computes from its inputs' columns, flat.
 
     Raises
     ------
@@ -137,7 +138,8 @@ def find_initial_state(flat: FlatDiagram, path: str, inputs: dict[str, Any]) -> 
     trace = flat.checked.traced[path]
     for port, column in inputs.items():
         _check_finite(flat, path, port, column)
-    return _initial(path, flat.table.blocks[path], bundle("u", shaped_inputs(trace, inputs)), trace.states)
+    block = flat.table.blocks[path] if block is None else block
+    return _initial(path, block, bundle("u", shaped_inputs(trace, inputs)), trace.states)
 
 
 def _check_finite(flat: FlatDiagram, path: str, port: str, column: Any) -> None:
@@ -192,9 +194,8 @@ def _initial(path: str, block: Any, u: Any, states: Mapping[str, tuple[int, ...]
 
 def _unsolved_start(workspace: Workspace, last: np.ndarray) -> SimulationError:
     flat, x = workspace.flat, workspace.here.x
-    path = next(
-        (p for p, s in flat.states.slices.items() if not np.allclose(last[s], x[s], rtol=_SETTLED, atol=_SETTLED)), ""
-    )
+    moved = ~np.isclose(last, x, rtol=START_SETTLED, atol=START_SETTLED)
+    path = next((p for p, s in flat.states.slices.items() if moved[s].any()), "")
     loops = "\n".join(flat.start_order.loops)
     return SimulationError(
         f"its initial state depends on itself, and is not found: after {_MAX_PASSES * 10} passes it still changes.\n"
@@ -206,7 +207,7 @@ def _unsolved_start(workspace: Workspace, last: np.ndarray) -> SimulationError:
 def _unsettled(workspace: Workspace, before: np.ndarray) -> SimulationError:
     flat, z = workspace.flat, workspace.z
     slices = flat.plant_inputs.slices
-    name = next(n for n, s in slices.items() if not np.allclose(before[s], z[s], rtol=_SETTLED, atol=0.0))
+    name = next(n for n, s in slices.items() if not np.allclose(before[s], z[s], rtol=START_SETTLED, atol=0.0))
     path, port = flat.ports[name]
     delay = flat.table.blocks[path].transport
     own, step = (

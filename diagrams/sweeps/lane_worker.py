@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from time import perf_counter
@@ -13,14 +14,15 @@ import numpy as np
 from ...blocks.core import LoopwrightError
 from ...fmus.calls import FmuInstance
 from ..flat import EVERY, ClockSets, is_exact, kinds_of, ticks_after
-from ..lanes import LaneCode, LaneEnd, LaneRuns, LaneStart, NoLanesError, compile_lanes, make_room
+from ..lanes import LaneCode, LaneEnd, LaneRuns, LaneStart, LaneVectors, NoLanesError, compile_lanes, make_room
 from ..results import Run, Stopped, machine_memory
-from ..simulation import StopConditions
+from ..simulation import START_EXCHANGES, StopConditions
 from .bound_run import BoundRun, Tell
 from .outcome import Outcome
 from .plan import Plan, Worker
 from .samples import Sample
 from .variation import Numbers
+from .vector_start import StartSearch, VectorStart
 
 DIFFER = (
     "Side by side in vector lanes: values differ from those of single runs by rounding, which some motions magnify."
@@ -82,9 +84,11 @@ class LaneWorker(Worker):
                 yield _note(self.run(sample, tell), f"Not side by side in vector lanes: {found}.")
             return
         started = perf_counter()
-        ready: dict[tuple[float, ...], list[tuple[Sample, LaneStart]]] = {}
         alone: list[tuple[Sample, str | None]] = []
-        for sample, own in group:
+        vectors, places = found.start_together([own for _, own in group])
+        together = [([group[place][0] for place in places], vectors)] if vectors is not None else []
+        ready: dict[tuple[float, ...], list[tuple[Sample, LaneStart]]] = {}
+        for sample, own in (pair for place, pair in enumerate(group) if place not in places):
             try:
                 start = found.start(own)
             except NoLanesError as reason:
@@ -96,8 +100,11 @@ class LaneWorker(Worker):
                     alone.append((sample, None))
                 else:
                     ready.setdefault(start.steps, []).append((sample, start))
-        for runs in ready.values():
-            for (sample, _), run in zip(runs, found.run([start for _, start in runs], tell, started), strict=True):
+        together += [
+            ([sample for sample, _ in runs], found.gather([start for _, start in runs])) for runs in ready.values()
+        ]
+        for samples, vectors in together:
+            for sample, run in zip(samples, found.run(vectors, tell, started), strict=True):
                 if run is None:
                     alone.append((sample, None))
                 else:
@@ -112,7 +119,7 @@ class LaneWorker(Worker):
         if isinstance(found, str) or (found is not None and found.bound is bound):
             return found
         try:
-            made = _Lanes(bound, self.plan.lanes)
+            made = _Lanes(bound, self.plan.lanes, agrees=self._options.start_exchange == START_EXCHANGES[0])
         except NoLanesError as reason:
             self._found[numbers.key] = text = str(reason)
             return text
@@ -124,7 +131,7 @@ class LaneWorker(Worker):
 class _Lanes:
     """The lanes of the runs of one bound diagram."""
 
-    def __init__(self, bound: BoundRun, count: int):
+    def __init__(self, bound: BoundRun, count: int, *, agrees: bool):
         self.bound, engine, flat = bound, bound.engine, bound.flat
         if not bound.is_compiled:
             told = next(iter(engine.messages), "compile=True was not asked for")
@@ -145,12 +152,30 @@ class _Lanes:
         needed = 3 * 8 * count * (len(self._ticks) // bound.recorder.every + 2) * len(self._columns)
         if needed > 0.3 * machine_memory():
             raise NoLanesError(f"the samples of {count} runs at a time would take {needed / 2**30:.0f} GiB")
-        self._code: LaneCode = compile_lanes(flat, acting, count)
+        search = StartSearch(bound) if agrees else None
+        self._code: LaneCode = compile_lanes(flat, acting, count, None if search is None else search.source)
         width, every = max(1, len(self._columns)), bound.recorder.every
         self._chunk = max(1, min(len(self._ticks), every * _BYTES // (8 * width * count)))
         self._span = min(_FIRST, self._chunk)
         self._room = make_room(self._chunk // every + 1, width, count)
         self._stops = StopConditions(flat, engine.workspace.log, str)
+        self._start: VectorStart | None = None
+        if search is not None and self._code.starts is not None:
+            with suppress(NoLanesError):  # of the FMUs' own numbers; each start says it of its own
+                start = VectorStart(search, self._code, self._columns, self._stops.entries)
+                for path, step in start.steps.items():
+                    self._refuse_fine(path, step)
+                self._start = start
+
+    def start_together(self, group: Sequence[Numbers[Any]]) -> tuple[LaneVectors | None, list[int]]:
+        """Return runs at their first tick, and which of a group these are; the others are started one by one."""
+        if self._start is None or not len(self._ticks):
+            return None, []
+        return self._start.find(group)
+
+    def gather(self, starts: Sequence[LaneStart]) -> LaneVectors:
+        """Return the vectors of runs that were started one by one."""
+        return LaneVectors.of(self._code, starts)
 
     def start(self, numbers: Numbers[Any]) -> LaneStart | None:
         """Return a run's numbers at its first tick; None if it ends there.
@@ -171,20 +196,23 @@ class _Lanes:
             instance = engine.plants[path]
             assert isinstance(instance, FmuInstance)
             plants[path], step = plant.read(instance)
-            if self._widths.max() > _MOST_SUBSTEPS * step:
-                raise NoLanesError(f"{path} integrates with {step:g} s, more than {_MOST_SUBSTEPS} substeps in a tick")
+            self._refuse_fine(path, step)
             steps.append(step)
         here = workspace.here
         vectors = here.x.copy(), here.w.copy(), workspace.z.copy(), here.p.copy()
         return LaneStart(*vectors, plants, tuple(steps), rows[0], bound.take_messages())
 
-    def run(self, starts: Sequence[LaneStart], tell: Tell, started: float) -> Iterator[Run | None]:
+    def _refuse_fine(self, path: str, step: float) -> None:
+        if self._widths.max() > _MOST_SUBSTEPS * step:
+            raise NoLanesError(f"{path} integrates with {step:g} s, more than {_MOST_SUBSTEPS} substeps in a tick")
+
+    def run(self, vectors: LaneVectors, tell: Tell, started: float) -> Iterator[Run | None]:
         """Yield the runs; None for one that has failed."""
         bound, n = self.bound, len(self._columns)
         runs = LaneRuns(
-            self._code, starts, columns=self._columns, every=bound.recorder.every, stops=self._stops.entries
+            self._code, vectors, columns=self._columns, every=bound.recorder.every, stops=self._stops.entries
         )
-        kept = [[start.row[None]] for start in starts]
+        kept = [[row[None]] for row in np.ascontiguousarray(vectors.row.T[: vectors.count])]
         room = self._room
         k, total = 0, len(self._ticks)
         while k < total and runs.is_going:
@@ -199,8 +227,8 @@ class _Lanes:
                 self._span = max(1, self._span // 2)
             k = end
             tell(float(self._times[k]))
-        for start, parts, end_of in zip(starts, kept, runs.ends(), strict=True):
-            yield None if end_of.failed else self._make_run(parts, end_of, started, (*start.messages, DIFFER))
+        for told, parts, end_of in zip(vectors.messages, kept, runs.ends(), strict=True):
+            yield None if end_of.failed else self._make_run(parts, end_of, started, (*told, DIFFER))
 
     def _make_run(self, parts: Sequence[np.ndarray], end: LaneEnd, started: float, messages: Sequence[str]) -> Run:
         """Return a run from its rows, of which those after its end are left out."""

@@ -84,11 +84,16 @@ class Box:
 
         A box of numbers gives a float, one of arrays an array.
         """
-        low, high = np.array(self.low, dtype=float), np.array(self.high, dtype=float)
-        part = np.array(fraction, dtype=float).reshape(low.shape if np.ndim(fraction) else ())
-        found = low ** (1.0 - part) * high**part if self.scale == "log" else low + part * (high - low)
-        found = np.where(part == 0.0, low, np.where(part == 1.0, high, np.clip(found, low, high)))
+        part = np.array(fraction, dtype=float)
+        found = self.at_all(part.reshape(1, *(np.shape(self.low) if part.ndim else ())))[0]
         return float(found) if found.ndim == 0 else found
+
+    def at_all(self, fractions: np.ndarray) -> np.ndarray:
+        """Return the values at fractions of the range, one of each in a row; a row is as `at` takes it."""
+        low, high = np.array(self.low, dtype=float), np.array(self.high, dtype=float)
+        part = fractions.reshape(len(fractions), *([1] * low.ndim)) if fractions.ndim == 1 else fractions
+        found = low ** (1.0 - part) * high**part if self.scale == "log" else low + part * (high - low)
+        return np.where(part == 0.0, low, np.where(part == 1.0, high, np.clip(found, low, high)))
 
 
 @dataclass(frozen=True)
@@ -240,12 +245,10 @@ def latin(parameters: Mapping[str, Any], count: int, *, seed: int = 0) -> Sample
     generator = np.random.default_rng(np.random.SeedSequence(check_seed(seed)))
     fractions = qmc.LatinHypercube(sum(box.size for box in boxes.values()), seed=generator).random(int(count))
     ends = np.cumsum([box.size for box in boxes.values()])[:-1]
-    parts = [np.split(row, ends) for row in fractions]
-    rows = tuple(
-        tuple(box.at(part if np.ndim(box.low) else part[0]) for box, part in zip(boxes.values(), row, strict=True))
-        for row in parts
-    )
-    return Samples(tuple(boxes), rows, None, int(seed), boxes)
+    parts = zip(boxes.values(), np.split(fractions, ends, axis=1), strict=True)
+    columns = [box.at_all(part.reshape(len(part), *np.shape(box.low))) for box, part in parts]
+    rows = zip(*(column.tolist() if column.ndim == 1 else [*column] for column in columns), strict=True)
+    return Samples(tuple(boxes), tuple(rows), None, int(seed), boxes)
 
 
 def table(rows: Any, *, seed: int = 0) -> Samples:

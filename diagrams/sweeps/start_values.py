@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
 
 from ...blocks.core import Block
-from ..flat import NONE, Bound, FlatDiagram, Instant, bind_function, evaluate, is_true
+from ..flat import NONE, FlatDiagram, Instant, bind_function, evaluate, is_true
 from ..simulation import Workspace, find_initial_state, values_from_left
 
 Port = tuple[str, str]
@@ -89,55 +91,93 @@ class StartValues:
     def _functions(self, left: dict[Port, np.ndarray]) -> _Functions:
         key = tuple(left)
         if key not in self._bound:
-            self._bound[key] = _Functions(self._workspace, self._starting, left)
+            self._bound[key] = _Functions(self._workspace, trace_start(self._workspace.flat, left))
         return self._bound[key]
 
 
 class _Functions:
-    """The traced functions of a start, bound to a run's vectors, with some sources as they are just before t = 0."""
+    """The functions of a start, bound to a run's vectors."""
 
-    def __init__(self, workspace: Workspace, starting: list[str], left: dict[Port, np.ndarray]):
-        flat, here = workspace.flat, workspace.here
-        self.places, n = dict[Port, slice](), 0
-        for port, values in left.items():
-            self.places[port] = slice(n, n + values.size)
-            n += values.size
-        self.left = np.zeros(n)
+    def __init__(self, workspace: Workspace, functions: StartFunctions):
+        here, self.places = workspace.here, functions.places
+        self.left = np.zeros(sum(where.stop - where.start for where in self.places.values()))
         vectors = [here.x, here.w, here.p, self.left]
-        symbols = [ca.MX.sym(name, v.size) for name, v in zip(("x", "w", "p", "left"), vectors, strict=True)]
-        x, w, p, before_start = symbols
+        self.order = tuple(functions.inputs)
+        self.inputs = {path: (bind_function(f, vectors), names) for path, (f, names) in functions.inputs.items()}
+        self.held, self.gates = (
+            None if f is None else bind_function(f, vectors) for f in (functions.held, functions.gates)
+        )
 
-        def run(**options: Any) -> Instant:
-            return evaluate(flat, flat.blocks, NONE, 0.0, x, w, p, opened=True, **options)
 
-        def tapped(where: slice) -> Callable[[Any], Any]:
-            return lambda column: before_start[where]
+@dataclass(frozen=True, eq=False)
+class StartFunctions:
+    """The functions of a start, each of ``(x, w, p, left)``, with some sources as they are just before t = 0.
 
-        taps = {port: tapped(where) for port, where in self.places.items()}
-        found: dict[str, dict[str, Any]] = {}
+    Attributes
+    ----------
+    places : mapping of (str, str) to slice
+        Where the outputs of these sources stand in ``left``.
+    inputs : mapping of str to (casadi.Function, list of str)
+        Inputs of the blocks that start from them, with their ports, in the order in which the states are computed.
+    held, gates : casadi.Function or None
+        The first held outputs, and the signals that enable or trigger subsystems.
+    """
 
-        def before(path: str, inputs: dict[str, Any]) -> None:
-            if path in starting and path not in found:
-                found[path] = dict(inputs)
+    places: Mapping[Port, slice]
+    inputs: Mapping[str, tuple[Any, list[str]]]
+    held: Any
+    gates: Any
 
-        def bind(columns: list[Any]) -> Bound:
-            dense = [ca.densify(ca.MX(column)) for column in columns]
-            function = ca.Function("start", symbols, dense)
-            with suppress(RuntimeError):  # of a table
-                function = function.expand()
-            return bind_function(function, vectors)
 
-        at_left = run(order=flat.start_order.steps, before=before, taps=taps) if starting else None
-        self.order = tuple(found)
-        self.inputs: dict[str, tuple[Bound, list[str]]] = {}
-        for path, inputs in found.items():
-            made = {name: column for name, column in inputs.items() if column is not None}
-            self.inputs[path] = bind([*made.values()]), [*made]
-        self.held = self.gates = None
-        if flat.held.slices or flat.gates.slices:
-            now = run()
-            if flat.held.slices:
-                self.held = bind([now.held[name] for name in flat.held.slices])
-            if flat.gates.slices:
-                at_left = run(taps=taps)
-                self.gates = bind([at_left.control(name) for name in flat.gates.slices])
+_TRACED: WeakKeyDictionary[FlatDiagram, dict[tuple[Port, ...], StartFunctions]] = WeakKeyDictionary()
+
+
+def trace_start(flat: FlatDiagram, left: Mapping[Port, np.ndarray]) -> StartFunctions:
+    """Return the functions of a diagram's start, with the sources of which ``left`` has the values before t = 0."""
+    known, key = _TRACED.setdefault(flat.origin, {}), tuple(left)
+    if key not in known:
+        known[key] = _trace_start(flat, left)
+    return known[key]
+
+
+def _trace_start(flat: FlatDiagram, left: Mapping[Port, np.ndarray]) -> StartFunctions:
+    starting = [path for path in flat.checked.traced if flat.table.blocks[path].starts_from_inputs]
+    places, n = dict[Port, slice](), 0
+    for port, values in left.items():
+        places[port] = slice(n, n + values.size)
+        n += values.size
+    sizes = {"x": flat.width, "w": flat.plant_outputs.total, "p": flat.p.size, "left": n}
+    symbols = [ca.MX.sym(name, size) for name, size in sizes.items()]
+    x, w, p, before_start = symbols
+
+    def run(**options: Any) -> Instant:
+        return evaluate(flat, flat.blocks, NONE, 0.0, x, w, p, opened=True, **options)
+
+    def tapped(where: slice) -> Callable[[Any], Any]:
+        return lambda column: before_start[where]
+
+    taps = {port: tapped(where) for port, where in places.items()}
+    found: dict[str, dict[str, Any]] = {}
+
+    def before(path: str, inputs: dict[str, Any]) -> None:
+        if path in starting and path not in found:
+            found[path] = dict(inputs)
+
+    def make(columns: list[Any]) -> Any:
+        function = ca.Function("start", symbols, [ca.densify(ca.MX(column)) for column in columns])
+        with suppress(RuntimeError):  # of a table
+            function = function.expand()
+        return function
+
+    if starting:
+        run(order=flat.start_order.steps, before=before, taps=taps)
+    made = {path: {name: c for name, c in inputs.items() if c is not None} for path, inputs in found.items()}
+    ins = {path: (make([*columns.values()]), [*columns]) for path, columns in made.items()}
+    held = gates = None
+    if flat.held.slices:
+        now = run()
+        held = make([now.held[name] for name in flat.held.slices])
+    if flat.gates.slices:
+        at_left = run(taps=taps)
+        gates = make([at_left.control(name) for name in flat.gates.slices])
+    return StartFunctions(places, ins, held, gates)

@@ -1,15 +1,12 @@
 """Sweeps side by side in vector lanes: near single runs to a stated bound, with failures that harm nobody."""
 
-import functools
 import warnings
 
-import casadi as ca
 import numpy as np
 import pytest
 
 from loopwright.blocks import (
     Block,
-    Compare,
     Constant,
     Gain,
     Input,
@@ -17,9 +14,6 @@ from loopwright.blocks import (
     Lookup1D,
     OptionError,
     Output,
-    Step,
-    StopCondition,
-    UnitDelay,
 )
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.sweeps import final, lane_worker, maximum, mean, minimum, settling_time
@@ -28,65 +22,15 @@ from loopwright.diagrams.sweeps.lane_worker import DIFFER
 from loopwright.diagrams.sweeps.samples import Sample
 from loopwright.diagrams.sweeps.sweep import make_plan
 from loopwright.diagrams.sweeps.workers import make_worker
-from loopwright.fmus import Fmu, ModelSpec, Variable, build_fmu
-from loopwright.fmus.models import bouncing_ball, dc_motor, mass_spring_damper, scara
+from loopwright.fmus import Fmu
+from loopwright.fmus.models import bouncing_ball
+from support.lanes import QUIET, STEP, T, loop, three_plants
 
-QUIET = {"progress": False}
-T, STEP = 0.01, 2.5e-3
 LANES = 4
 NEAR = 1e-12
 """Difference of a run in a lane from a single one, of the largest value: some thousand roundings of a stable loop."""
 PAPER = 1e-10
 """The difference that docs/sweeps.md states for the experiments of the paper, whose friction is steep near rest."""
-
-
-@functools.lru_cache(maxsize=1)
-def lag():
-    """An FMU of dx/dt = (gain u − x − bend x²) / lag, x(0) = 0, that puts out x, 2 x + u and x + 1."""
-    t, x, u, p = ca.SX.sym("t"), ca.SX.sym("x"), ca.SX.sym("u"), ca.SX.sym("p", 3)
-    numbers = {"gain": ("tunable", 1.0), "lag": ("tunable", 0.2), "bend": ("fixed", 0.0)}
-    return build_fmu(
-        ModelSpec(
-            name="lag",
-            description="A lag",
-            inputs=(Variable("u", "input"),),
-            outputs=(Variable("mixed", "output"), Variable("shifted", "output")),
-            parameters=tuple(Variable(name, "parameter", kind, start=v) for name, (kind, v) in numbers.items()),
-            states=(Variable("x", "output", start=0.0, state=True),),
-            derivative=ca.Function("f", [t, x, u, p], [(p[0] * u - x - p[2] * x * x) / p[1]]),
-            output=ca.Function("g", [t, x, u, p], [ca.vertcat(2.0 * x + u, x + 1.0)]),
-            internal_step=STEP,
-        )
-    )
-
-
-def loop(*, stops=False, slow=1, more=None, loops="error"):
-    """The lag under a proportional controller of reference 1, with a counter at a lower rate."""
-    plant = Fmu(lag(), name="plant")
-
-    @subsystem(sample_time=T, name="box")
-    def box(x, reference):
-        u = Gain(gain=2.0, name="kp")(reference - x)
-        if stops:
-            StopCondition(name="stop")(Compare(">", name="above")(x, 0.5))
-        return u if more is None else more(u)
-
-    @subsystem(sample_time=slow * T, offset=T if slow > 1 else 0.0, name="slow")
-    def counter(x):
-        kept = UnitDelay(initial_value=0.1, name="kept")
-        kept(x + 0.5 * kept.y)
-        return kept.y
-
-    force = box(plant.x, Step(times=0.0, values=1.0, name="reference"))
-    call = plant(u=force)
-    signals = (
-        plant.x.named("x"),
-        plant.mixed.named("mixed"),
-        plant.shifted.named("shifted"),
-        force.named("u"),
-        counter(plant.x).named("k"),
-    )
-    return Diagram("lag_loop", call, *signals, loops=loops)
 
 
 def exact_states(gain, lag, kp, ticks):
@@ -278,33 +222,6 @@ def test_results_in_lanes_are_stored_apart_from_those_of_single_runs(tmp_path):
         run(values)
 
 
-def three_plants():
-    """An arm, a motor and a mass, the motor of FMI 2, in two rates; the arm's external force is no port."""
-    arm, motor, mass = (
-        Fmu(model.build(fmi=fmi), name=model.__name__.rpartition(".")[2], start=start, ports=ports)
-        for model, fmi, start, ports in (
-            (scara, 3, {"external_force": [0.5, -1.0]}, ["motor_torque", "joint_angle", "position"]),
-            (dc_motor, 2, {"load_torque": 0.01}, ["voltage", "speed", "angle", "torque"]),
-            (mass_spring_damper, 3, {}, None),
-        )
-    )  # fmt: skip
-
-    @subsystem(sample_time=T, name="box")
-    def box(angle, speed, position, reference):
-        torque = Gain(gain=np.diag([3.0, 2.0]), name="arm_gain")(reference - angle)
-        return torque, Gain(gain=0.2, name="motor_gain")(8.0 - speed), -4.0 * position
-
-    @subsystem(sample_time=2 * T, name="slow")
-    def slow(position):
-        return Gain(gain=0.1, name="slow_gain")(position)
-
-    angle, reference = arm.joint_angle, Constant(value=(0.3, -0.4), name="reference")
-    torque, voltage, force = box(angle, motor.speed, mass.position, reference + slow(arm.position))
-    calls = arm(motor_torque=torque), motor(voltage=voltage), mass(force=force)
-    signals = arm.position.named("tip"), motor.angle.named("angle"), mass.acceleration.named("a")
-    return Diagram("three", *calls, *signals)
-
-
 @pytest.mark.slow
 def test_several_plants_with_vectors_of_ports_run_in_one_loop():
     diagram = three_plants()
@@ -358,7 +275,8 @@ def test_what_the_start_of_a_run_has_told_belongs_to_that_run(monkeypatch):
 
     monkeypatch.setattr(BoundRun, "begin", begin)
     samples = [{"kp.gain": gain} for gain in (1.0, 1.5, 3.0)]
-    found = loop().sweep(None, 0.1, samples=samples, reduce={"end": final("x")}, lanes=LANES, workers=1, **QUIET)
+    options = {"start_exchange": "once", "workers": 1}  # such runs are started one by one
+    found = loop().sweep(None, 0.1, samples=samples, reduce={"end": final("x")}, lanes=LANES, **options, **QUIET)
     texts = [outcome.messages for outcome in found.outcomes]
     assert [len(text) for text in texts] == [2, 2, 2]
     assert len({text[0] for text in texts}) == 3

@@ -11,6 +11,7 @@ from loopwright.diagrams.sweeps.bound_run import BoundRun
 from loopwright.diagrams.sweeps.plan import Worker
 from loopwright.diagrams.sweeps.samples import Sample
 from loopwright.diagrams.sweeps.sweep import make_plan
+from loopwright.diagrams.sweeps.workers import make_worker
 
 KEPT = {"xi": final("xi"), "force": maximum("motor_force")}
 
@@ -21,15 +22,15 @@ def samples(count):
     return [Sample(k, {names[0]: float(f), names[1]: float(200.0 * f)}, k) for k, f in enumerate(fractions)]
 
 
-def count_calls(worker, sample):
-    """Return how many functions of Python a run calls; functions of C are not counted."""
+def count_calls(worker, *given):
+    """Return how many functions of Python some runs call; functions of C are not counted."""
     seen = []
     sys.setprofile(lambda frame, event, argument: seen.append(1) if event == "call" else None)
     try:
-        outcome = worker.run(sample)
+        outcomes = [*worker.run_all(given)]
     finally:
         sys.setprofile(None)
-    assert outcome.failure is None
+    assert all(outcome.failure is None for outcome in outcomes)
     return len(seen)
 
 
@@ -68,3 +69,12 @@ def test_two_threads_set_up_twice(diagram, monkeypatch):
     found = diagram.sweep(parameters, 0.02, reduce=KEPT, workers=2, progress=False)
     assert not found.failures
     assert len(made) <= 2
+
+
+def test_runs_side_by_side_are_started_together(diagram):
+    with make_worker(make_plan(diagram, 0.002, (), KEPT, (), {}, lanes=8)) as worker:
+        assert worker.can_compile(samples(1)[0])
+        given = samples(24)
+        [*worker.run_all(given[:8])]
+        found = count_calls(worker, *given[8:])
+    assert found / 16 < 200  # 317 where each run is started by itself
