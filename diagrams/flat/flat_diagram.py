@@ -215,7 +215,14 @@ class FlatDiagram(FlatLayout):
 
     def pack(self, path: str, block: Block) -> np.ndarray:
         """Return the entries of p of a block if it had the parameters of another one, of equal structure."""
-        return self.checked.traced[path].pack(block, sample_time_of(self.table, path))
+        times = self._sample_times
+        if path not in times:
+            times[path] = sample_time_of(self.table, path)
+        return self.checked.traced[path].pack(block, times[path])
+
+    @_shared
+    def _sample_times(self) -> dict[str, float]:
+        return {}
 
     def symbols(self) -> dict[str, Any]:
         """Return fresh symbols of t, x, w and p, by these names: arguments of `evaluate`."""

@@ -20,7 +20,7 @@ import platform
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from io import FileIO
 from pathlib import Path
@@ -390,6 +390,7 @@ def _index_from_json(index: int | dict[str, list[int | None]] | None) -> int | s
     return slice(*index["slice"]) if isinstance(index, dict) else index
 
 
+@cache
 def own_version() -> str:
     """Return the version of loopwright that is installed."""
     try:

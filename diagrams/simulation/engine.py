@@ -128,7 +128,7 @@ class Engine:
     def initialize(self) -> None:
         """Find values of everything at t = 0; the plants are then ready to be stepped."""
         self.steps.bind()
-        if self._compile is True and self.continuous is None and self.flat.by_block:
+        if self._compile is True and self.continuous is None and (self.flat.by_block or not self._fuse):
             from .compiled_ticks import bind_evaluations
 
             self.workspace.native = bind_evaluations(self.workspace, every=self.every_tick)

@@ -6,8 +6,9 @@ block, across the borders of subsystems.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from fractions import Fraction
 
 from ...blocks.core import (
@@ -116,7 +117,9 @@ class Structure:
 
     def with_blocks(self, blocks: Mapping[str, Block]) -> Structure:
         """Return a structure with other blocks in some places; it shares all dictionaries but that of the blocks."""
-        return replace(self, blocks={**self.blocks, **blocks})
+        found = copy.copy(self)
+        found.__dict__["blocks"] = {**self.blocks, **blocks}
+        return found
 
     def clock(self, subsystem: str) -> SubsystemSettings | None:
         """Return the subsystem whose sample time holds in one: itself, or the nearest around it; None without any."""

@@ -48,7 +48,7 @@ def test_a_run_of_a_sweep_calls_few_functions_of_python_and_none_for_each_tick(d
                 worker.run(sample)
             found[ticks] = count_calls(worker, last)
     assert found[2] == found[500]
-    assert found[2] < 450  # 960, and one a tick, where start values, columns and ticks are looked up in every run
+    assert found[2] < 375  # 960, and one a tick, where start values, columns and ticks are looked up in every run
 
 
 def test_start_values_are_set_in_one_call_and_a_run_of_others_is_a_single_run(diagram):
@@ -78,3 +78,10 @@ def test_runs_side_by_side_are_started_together(diagram):
         [*worker.run_all(given[:8])]
         found = count_calls(worker, *given[8:])
     assert found / 16 < 200  # 317 where each run is started by itself
+
+
+def test_the_first_tick_of_a_compiled_run_is_evaluated_in_c(diagram):
+    with diagram.simulation(compile=True) as simulation:
+        assert simulation._engine.workspace.native
+    with diagram.simulation(compile=False) as simulation:
+        assert not simulation._engine.workspace.native
