@@ -58,7 +58,7 @@ from .frequency import (
     sampled_poles,
     sensitivity,
 )
-from .linearization import Kink, Linearization, MeanSlope, StepsOnly, ZeroSlope
+from .linearization import InexactDerivatives, Kink, Linearization, MeanSlope, RefutedDerivatives, StepsOnly, ZeroSlope
 from .measure import FrequencyResponse, StepResponse
 from .paper import Channel, Fig3Diagram, Rig, experiments, fig3
 from .report import analyse
@@ -106,6 +106,7 @@ __all__ = [
     "FrequencyResponse",
     "GainCrossover",
     "GangOfFour",
+    "InexactDerivatives",
     "Interrupted",
     "InterruptedSweep",
     "Kink",
@@ -123,6 +124,7 @@ __all__ = [
     "PhaseCrossover",
     "Plot",
     "Reduction",
+    "RefutedDerivatives",
     "Report",
     "Requirements",
     "Review",

@@ -33,6 +33,9 @@ class ExchangedBlock(Protocol):
     refused: SimulationError | None
     """Error of an input that was out of its range in a trial step."""
 
+    is_built_here: bool
+    """Whether Loopwright has built it, so that its derivatives need no check."""
+
     @property
     def messages(self) -> Sequence[str]:
         """Messages of the run so far."""
@@ -253,10 +256,14 @@ class ExchangeEvaluator:
         if not {NEXT, GUARDS, *self._outputs}.issuperset(names):
             return None
         ports = [name for name in names if name in self._outputs]
-        J = self.block.slopes(ports, rates=NEXT in names, t=t, x=x, u=u)
+        J = self.slopes(ports, rates=NEXT in names, t=t, x=x, u=u)
         if J is None:
             J = self.differences(names, t, x, u)
         return np.hstack([np.full((len(J), 1), math.nan), J])
+
+    def slopes(self, ports: Sequence[str], *, rates: bool, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
+        """Return the block's own derivative of outputs and rates by (x, u); None: it has none."""
+        return self.block.slopes(ports, rates=rates, t=t, x=x, u=u)
 
     def differences(
         self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray, scale: float = 1.0

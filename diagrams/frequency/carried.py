@@ -7,9 +7,9 @@ from dataclasses import fields, is_dataclass, replace
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar, cast
 
-from ...blocks.core import Finding
+from ...blocks.core import ConfirmationError, Finding
 from .number import Number
-from .state_space import findings_of
+from .state_space import findings_of, inexactness_of
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -20,11 +20,27 @@ def carries_findings(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> R:
-        made = function(*args, **kwargs)
         given = [*args, *kwargs.values()]
+        try:
+            made = function(*args, **kwargs)
+        except ConfirmationError as error:
+            for system in given:
+                _say_how_exact(error, cast("Any", system))
+            raise
         return with_findings(made, tuple(f for system in given for f in findings_of(cast("Any", system))))
 
     return run
+
+
+def _say_how_exact(error: ConfirmationError, system: Any) -> None:
+    """Add to an error that its system is not known well enough, if it isn't."""
+    inexactness = inexactness_of(system)
+    if inexactness:
+        why = "; ".join(map(str, findings_of(system)))
+        error.add(
+            f" The loop itself is known to {inexactness:.1g} of its largest entry alone"
+            f"{f' ({why})' if why else ', by differences of an FMU'}: a pole and a zero that cancel may seem apart."
+        )
 
 
 def with_findings(value: R, findings: tuple[Finding, ...]) -> R:

@@ -40,12 +40,15 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
         The model that it was made from.
     wires : tuple of str
         The wires that are cut.
+    inexactness : float
+        Estimated error of its matrices, relative to their largest entry: that of the linear models of FMUs.
     findings, notes : tuple
         Effects that limit it; see `Linearization.loop`.
     """
 
     linearization: Model | None = None
     wires: tuple[str, ...] = ()
+    inexactness: float = 0.0
 
     def __repr__(self) -> str:
         sampling = f"T = {self.dt:g} s" if self.dt else "continuous"

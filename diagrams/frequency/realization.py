@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...blocks.core import ParameterError
-from .state_space import read_coefficients, read_matrices
+from .state_space import inexactness_of, read_coefficients, read_matrices
 from .transfer_functions import Coefficients
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class Realization:
     The shift z − 1 keeps a loop accurate far below the sampling frequency, where several poles at z = 1 would cancel
     all digits. Frequencies and points of the contour are given as s in both cases: p = exp(s T) − 1. ``hidden`` are
     the poles, in the plane of p, that the reduction has removed; ``coefficients`` those of the transfer function in z
-    that was realized.
+    that was realized. ``inexactness`` is the relative error of the entries as they were given.
     """
 
     A: np.ndarray
@@ -47,6 +47,7 @@ class Realization:
     dt: float
     hidden: np.ndarray
     coefficients: Coefficients | None = None
+    inexactness: float = 0.0
 
     @classmethod
     def of(cls, loop: LinearSystem, *, delay: int = 0) -> Realization:
@@ -99,9 +100,10 @@ class Realization:
             D = np.where(np.abs(D) <= STRUCTURE * size, 0.0, D)
         for _ in range(int(delay)):
             A, B, C, D = _delay_inputs(A, B, C, D)
-        made = cls(*_balance(A, B, C), D, float(dt), np.zeros(0)).reduce()
+        made = cls(*_balance(A, B, C), D, float(dt), np.zeros(0), None, inexactness_of(loop)).reduce()
         # scaled once more, with input and output: rounding in A alone may have set the first scales
-        return cls(*_scale(made.A, made.B, made.C), D, made.dt, made.hidden, read_coefficients(loop))
+        A, B, C = _scale(made.A, made.B, made.C)
+        return replace(made, A=A, B=B, C=C, coefficients=read_coefficients(loop))
 
     @property
     def order(self) -> int:
@@ -144,14 +146,20 @@ class Realization:
         return (self.D + self.C @ x)[:, 0, 0], -slope * rate * (self.C @ twice)[:, 0, 0]
 
     def error(self, omega: float) -> float:
-        """Return an estimate of the relative rounding error of L at ω.
+        """Return an estimate of the relative error of L at ω.
 
-        It is the difference to the adjoint solution, and what the rounding of a transfer function's coefficients makes.
+        It is the difference to the adjoint solution, and what the rounding of a transfer function's coefficients makes,
+        or the inexactness of the entries.
         """
         s = np.array([1j * omega])
-        direct = self.matrix(s)[0]
-        adjoint = self.D + (_transpose(self).C @ _transpose(self)._states(s))[0].T
+        states, costates = self._states(s)[0], _transpose(self)._states(s)[0].T
+        direct, adjoint = self.D + self.C @ states, self.D + costates @ self.B
         given = 0.0 if self.coefficients is None else self.coefficients.error(complex(np.exp(s[0] * self.dt)))
+        if self.inexactness:
+            A, B, C, D = (np.abs(M) for M in (self.A, self.B, self.C, self.D))
+            A, x, y = A + (np.eye(len(A)) if self.dt else 0.0), np.abs(states), np.abs(costates)
+            moved = float(np.max(y @ A @ x + y @ B + C @ x + D))
+            given += self.inexactness * moved / (float(np.max(np.abs(direct))) + 1e-300)
         return given + 1e-13 + 10 * float(np.max(np.abs(direct - adjoint)) / (np.max(np.abs(direct)) + 1e-300))
 
     def closed_matrix(self, factor: complex | np.ndarray = 1.0) -> np.ndarray:
@@ -188,7 +196,8 @@ class Realization:
 
     def delay_once(self) -> Realization:
         """Return this sampled system with one more sample of delay."""
-        return Realization(*_delay_inputs(self.A, self.B, self.C, self.D), self.dt, self.hidden)
+        A, B, C, D = _delay_inputs(self.A, self.B, self.C, self.D)
+        return replace(self, A=A, B=B, C=C, D=D, coefficients=None)
 
     def reduce(self) -> Realization:
         """Return the controllable and observable part; the poles of the rest go to ``hidden``."""
@@ -241,7 +250,8 @@ class Realization:
         """Return a part of this system if its response is the same, with ``hidden`` added; else this system."""
         if part.order == self.order:
             return self
-        part = Realization(*_scale(part.A, part.B, part.C), self.D, self.dt, np.concatenate([self.hidden, hidden]))
+        A, B, C = _scale(part.A, part.B, part.C)
+        part = replace(self, A=A, B=B, C=C, hidden=np.concatenate([self.hidden, hidden]))
         poles = self.logarithm(np.linalg.eigvals(self.A))
         size = np.abs(poles[np.isfinite(poles)])
         top = min(10 * size.max(initial=1.0), self.nyquist)
@@ -250,7 +260,7 @@ class Realization:
         size = np.max(np.abs(before), axis=(1, 2)) + 1e-300
         # far above 1 an error does not show in the closed loop, and integrators amplify rounding
         worst = np.max(np.abs(before - after), axis=(1, 2)) / (size * np.maximum(1.0, np.sqrt(size)))
-        return part if np.max(worst) < 1e-9 else self
+        return part if np.max(worst) < max(1e-9, 100 * self.inexactness) else self
 
     def _solve(self, s: np.ndarray, right: np.ndarray) -> np.ndarray:
         return np.linalg.solve(self.point(s)[:, None, None] * np.eye(self.order) - self.A, right)
@@ -260,7 +270,7 @@ class Realization:
 
 
 def _transpose(r: Realization) -> Realization:
-    return Realization(r.A.T, r.C.T, r.B.T, r.D.T, r.dt, r.hidden)
+    return replace(r, A=r.A.T, B=r.C.T, C=r.B.T, D=r.D.T, coefficients=None)
 
 
 def _delay_inputs(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Matrices:
@@ -319,7 +329,7 @@ def _keep_connected(r: Realization, tolerance: float) -> tuple[Realization, np.n
     keep = reached & seen
     if keep.all():
         return r, np.zeros(0)
-    part = Realization(r.A[np.ix_(keep, keep)], r.B[keep], r.C[:, keep], r.D, r.dt, r.hidden)
+    part = replace(r, A=r.A[np.ix_(keep, keep)], B=r.B[keep], C=r.C[:, keep])
     return part, np.linalg.eigvals(r.A[np.ix_(~keep, ~keep)])
 
 
@@ -328,23 +338,24 @@ def _split_uncontrollable(r: Realization) -> tuple[Realization, np.ndarray]:
     if not r.order:
         return r, np.zeros(0)
     size = np.linalg.norm(r.B, axis=0)
-    new = _range(r.B / np.where(size > 0, size, 1.0), 1.0)
+    hidden = max(HIDDEN, 10 * r.inexactness)
+    new = _range(r.B / np.where(size > 0, size, 1.0), hidden)
     Q = new
     while new.shape[1] and Q.shape[1] < r.order:
         reached = r.A @ new
         for _ in range(2):
             reached = reached - Q @ (Q.T @ reached)
-        new = _range(reached, r.scale)
+        new = _range(reached, hidden * r.scale)
         Q = np.hstack([Q, new])
     if Q.shape[1] == r.order:
         return r, np.zeros(0)
     whole, _ = np.linalg.qr(np.hstack([Q, np.eye(r.order)]))
     rest = whole[:, Q.shape[1] :]
-    part = Realization(Q.T @ r.A @ Q, Q.T @ r.B, r.C @ Q, r.D, r.dt, r.hidden)
+    part = replace(r, A=Q.T @ r.A @ Q, B=Q.T @ r.B, C=r.C @ Q)
     return part, np.linalg.eigvals(rest.T @ r.A @ rest)
 
 
-def _range(M: np.ndarray, scale: float) -> np.ndarray:
+def _range(M: np.ndarray, least: float) -> np.ndarray:
     """Return an orthonormal basis of the columns that are larger than a hidden coupling."""
     U, sigma, _ = np.linalg.svd(M, full_matrices=False)
-    return np.asarray(U[:, sigma > HIDDEN * scale])
+    return np.asarray(U[:, sigma > least])

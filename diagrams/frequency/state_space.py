@@ -68,6 +68,11 @@ def make_state_space(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray,
     return control.ss(A, B, C, D, dt)
 
 
+def inexactness_of(system: LinearSystem) -> float:
+    """Return the error of a system's matrices, relative to their largest entry: of a loop with FMUs; else 0."""
+    return float(getattr(system, "inexactness", 0.0))
+
+
 def findings_of(system: LinearSystem) -> tuple[Finding, ...]:
     """Return the findings that a system carries: of a loop of a diagram those on it, else none."""
     found: tuple[Finding, ...] = getattr(system, "findings", ())

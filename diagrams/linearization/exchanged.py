@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, cast
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from ...blocks.core import FmuError, Layout
-from ...fmus.running import Derivation, DerivativeMethod, FmuLinearization, find_exchange_slopes
+from ...blocks.core import Finding, FmuError, Layout
+from ...fmus.running import Derivation, DerivativeMethod, FmuLinearization, check_exchange_slopes, find_exchange_slopes
 from ..exchange import ExchangeEvaluator
 from ..flat import Evaluators, FlatDiagram
 from ..results import OperatingPoint
 from ..wiring import join
+from .findings import InexactDerivatives, RefutedDerivatives
 
 if TYPE_CHECKING:
     from ...fmus.running import Fmu
@@ -31,14 +32,46 @@ class PointEvaluator(ExchangeEvaluator):
         self._wired = [port for port in self._inputs.slices if (path, port) in flat.table.wires]
         self.error = 0.0
         """Largest estimated error of a derivative so far; 0 where the FMU computes them."""
-
-    @property
-    def derivation(self) -> Derivation:
-        """Method by which the derivatives are computed."""
+        self.noise = 0.0
+        """The same error, relative to the largest derivative beside it."""
         exchange = self._fmu.description.exchange
         directional = exchange is not None and exchange.has_derivatives
-        method = DerivativeMethod.DIRECTIONAL if directional else DerivativeMethod.DIFFERENCES
-        return Derivation(method, "model_exchange")
+        self.derivation = Derivation(
+            DerivativeMethod.DIRECTIONAL if directional else DerivativeMethod.DIFFERENCES, "model_exchange"
+        )
+        """Method by which the derivatives are computed."""
+        self._checked = set[tuple[str, ...]]()
+
+    def differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
+        """Return the derivative of `evaluate`; the FMU's own is held against differences where it is asked for first.
+
+        Where it is plainly wrong, differences stand in for it from then on.
+        """
+        made = super().differentiate(names, t, x, u)
+        if made is None or names in self._checked:
+            return made
+        self._checked.add(names)
+        if self.derivation.method is not DerivativeMethod.DIRECTIONAL or self.block.is_built_here:
+            return made
+        found = check_exchange_slopes(
+            self._fmu, self._wired, lambda x, u: self.evaluate(names, t, x, u), x, u, made[:, 1:]
+        )
+        if found.is_wrong:
+            self.derivation = found.describe(self.derivation)
+            return super().differentiate(names, t, x, u)
+        if not self.derivation.gap >= found.gap:
+            self.derivation = found.describe(self.derivation)
+        self._note(float(np.max(found.error, initial=0.0)), made[:, 1:])
+        return made
+
+    def slopes(self, ports: Sequence[str], *, rates: bool, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
+        """Return the FMU's own derivatives; None where they are refuted."""
+        return None if self.derivation.refuted else super().slopes(ports, rates=rates, t=t, x=x, u=u)
+
+    def _note(self, error: float, J: np.ndarray) -> None:
+        self.error = max(self.error, error)
+        if error:
+            self.noise = max(self.noise, error / float(np.max(np.abs(J), initial=error)))
 
     def differences(
         self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray, scale: float = 1.0
@@ -47,12 +80,11 @@ class PointEvaluator(ExchangeEvaluator):
         if x.size and not self._fmu.description.states:  # its states have no names by which they could be moved
             found = super().differences(names, t, x, u)
             error = float(np.abs(found - super().differences(names, t, x, u, 2.0)).max(initial=0.0))
-            self.error = max(self.error, error)
-            return found
-        found, error = find_exchange_slopes(
-            self._fmu, self._wired, lambda x, u: self.evaluate(names, t, x, u).copy(), x, u
-        )
-        self.error = max(self.error, error)
+        else:
+            found, error = find_exchange_slopes(
+                self._fmu, self._wired, lambda x, u: self.evaluate(names, t, x, u).copy(), x, u
+            )
+        self._note(error, found)
         return found
 
 
@@ -92,6 +124,21 @@ def derivations_at(flat: FlatDiagram, at: OperatingPoint) -> tuple[dict[str, Der
     """Return how the FMUs in model exchange were differentiated at a point, and the largest estimated error."""
     found = cast("Mapping[str, PointEvaluator]", evaluators_at(flat, at) or {})
     return {path: e.derivation for path, e in found.items()}, max((e.error for e in found.values()), default=0.0)
+
+
+def findings_on(derivations: Mapping[str, Derivation]) -> list[Finding]:
+    """Return findings on the FMUs whose directional derivatives are not exact."""
+    return [
+        RefutedDerivatives(path, d.gap) if d.refuted else InexactDerivatives(path, d.gap)
+        for path, d in sorted(derivations.items())
+        if d.gap != 0.0
+    ]
+
+
+def noise_of(evaluators: Evaluators | None) -> tuple[float, float]:
+    """Return the largest known error of derivatives of FMUs in model exchange, by itself and relative to them."""
+    known = [e for e in (evaluators or {}).values() if isinstance(e, PointEvaluator)]
+    return max((e.error for e in known), default=0.0), max((e.noise for e in known), default=0.0)
 
 
 def _load(flat: FlatDiagram, at: OperatingPoint) -> Mapping[str, PointEvaluator]:

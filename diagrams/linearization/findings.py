@@ -7,6 +7,7 @@ loop, and by every number that is made from it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -206,6 +207,56 @@ class UnusualStart(Finding):
 
     def __str__(self) -> str:
         return "the start is unlike every later tick, as a block has a first tick of its own; linearize at a later time"
+
+
+@dataclass(frozen=True)
+class InexactDerivatives(Finding):
+    """Directional derivatives of an FMU that differ from differences of its own values.
+
+    Attributes
+    ----------
+    block : str
+        Path of the FMU.
+    gap : float
+        Largest distance, relative to the size of the derivatives; NaN where the values could not be computed.
+    """
+
+    block: str
+    gap: float
+
+    def __str__(self) -> str:
+        if math.isnan(self.gap):
+            return (
+                f"{self.block}: its directional derivatives could not be held against differences of its own values, "
+                "as it does not compute them beside this point"
+            )
+        return (
+            f"{self.block}: its directional derivatives are right to {self.gap:.2g} of their size alone, by "
+            "differences of its own values"
+        )
+
+
+@dataclass(frozen=True)
+class RefutedDerivatives(Finding):
+    """Directional derivatives of an FMU that are plainly wrong: differences of its own values stand in for them.
+
+    Attributes
+    ----------
+    block : str
+        Path of the FMU.
+    gap : float
+        Largest distance, relative to the size of the derivatives.
+    """
+
+    limits_numbers: ClassVar[bool] = False
+    block: str
+    gap: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.block}: its directional derivatives are wrong, by {self.gap:.2g} of their size; differences of its "
+            "own values stand in for them. Tell its makers"
+        )
 
 
 @dataclass(frozen=True)

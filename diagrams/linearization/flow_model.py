@@ -12,7 +12,9 @@ from ...blocks.core import Finding, OptionError, left_of
 from ...fmus.running import Derivation
 from ..flat import NONE, FlatDiagram, WiredDiagram, announcers
 from ..results import OperatingPoint
+from ..simulation import late_progress
 from .derivatives import LocalDerivatives
+from .exchanged import noise_of
 from .plant_models import join_matrices, states_of
 
 EQUILIBRIUM = 1e-9
@@ -40,8 +42,8 @@ def differentiate_flow(
     """Return the derivatives of x after the time h by x before it, by w and by d, and x after the time h.
 
     Only continuous states change. At an equilibrium, and everywhere where the flow is linear, the derivative is a
-    matrix exponential. Elsewhere the variational equation is integrated along the motion (DOP853 at 1e-12), from one
-    discontinuity of a source to the next.
+    matrix exponential. Elsewhere the variational equation is integrated along the motion, from one discontinuity of a
+    source to the next: by DOP853 at 1e-12, or at the error of the derivatives of FMUs where that is larger.
     """
     from scipy.linalg import expm
 
@@ -74,18 +76,23 @@ def differentiate_flow(
         from scipy.integrate import solve_ivp
 
         s = np.concatenate([start, np.hstack([np.eye(nc), np.zeros((nc, many))]).ravel()]).astype(F.dtype)
-        for begin, edge in _split_at_discontinuities(flat, t, end):
-            left = left_of(edge) if edge < end else edge
+        error, noise = noise_of(local.evaluators)
+        rtol, atol = np.full(s.size, 1e-12), np.full(s.size, 1e-14)
+        rtol[nc:], atol[nc:] = max(1e-12, noise), 1e-14 + error * h  # a derivative's own error can't be stepped away
+        with late_progress(f"linear model from t = {t:.6g} s", t, end) as tell:
+            for begin, edge in _split_at_discontinuities(flat, t, end):
+                left = left_of(edge) if edge < end else edge
 
-            def rates(time: float, s: np.ndarray, left: float = left) -> np.ndarray:
-                J, dx = differentiate(min(time, left), s[:nc])
-                V = s[nc:].reshape(nc, nc + many)
-                forced = J[:, :nc] @ V
-                forced[:, nc:] += J[:, nc:]
-                return np.concatenate([dx, forced.ravel()])
+                def rates(time: float, s: np.ndarray, left: float = left) -> np.ndarray:
+                    tell(time)
+                    J, dx = differentiate(min(time, left), s[:nc])
+                    V = s[nc:].reshape(nc, nc + many)
+                    forced = J[:, :nc] @ V
+                    forced[:, nc:] += J[:, nc:]
+                    return np.concatenate([dx, forced.ravel()])
 
-            found = solve_ivp(rates, (begin, edge), s, method="DOP853", rtol=1e-12, atol=1e-14)
-            s = np.asarray(found.y)[:, -1]
+                found = solve_ivp(rates, (begin, edge), s, method="DOP853", rtol=rtol, atol=atol)
+                s = np.asarray(found.y)[:, -1]
         final[xc] = s[:nc]
         whole = s[nc:].reshape(nc, nc + many)
     E, Ew, Ed = (np.asarray(M, dtype=F.dtype) for M in (np.eye(nx), np.zeros((nx, nw)), np.zeros((nx, m))))

@@ -24,7 +24,7 @@ from ..results import OperatingPoint
 from ..wiring import exact_time
 from .checks import check_loop, check_opening, refuse_transport_delays, replace_stairs
 from .derivatives import LocalDerivatives, find_signal
-from .exchanged import derivations_at, evaluators_at
+from .exchanged import derivations_at, evaluators_at, findings_on
 from .findings import EntryTaken
 from .flow_model import EQUILIBRIUM, Model, model_continuous
 from .inserted_blocks import find_cut_findings, name_inputs, split_consumers, split_inputs
@@ -152,6 +152,8 @@ class Linearization:
         system = (kind or StateSpace)(
             self.A, self.B, C, D, self.dt, name=name.replace(".", "_"), remove_useless_states=False, **names
         )
+        largest = max((float(np.max(np.abs(M), initial=0.0)) for M in (self.A, self.B, C, D)), default=0.0)
+        system.inexactness = self.uncertainty / largest if largest else 0.0
         system.findings = self.carried
         taken = (finding for finding in self.findings if isinstance(finding, EntryTaken))
         system.notes = tuple(map(str, dict.fromkeys((*self.carried, *taken))))
@@ -344,13 +346,14 @@ def _linearize(
         ins = outs = tuple(channels)
     known = means.replace_findings(find_kinks(flat, at)) if findings is None else findings
     entries = (EntryTaken(s.name, s.entry) for group in found for s in group if s.entry)
-    every = tuple(dict.fromkeys((*known, *model.findings, *at.free, *entries)))
+    outside, error = derivations_at(flat, at)
+    methods = {**outside, **model.derivations}
+    every = tuple(dict.fromkeys((*known, *model.findings, *findings_on(methods), *at.free, *entries)))
     ways = SignalPaths(flat, [s.port for s in found[2]])
     carried = ways.between(every, *([s.port for s in group] for group in found[:2]))
     if loop:
         carried += find_cut_findings(flat, at, [s.port for s in found[2]], carried)
     opaque = {p: Derivation(DerivativeMethod.BLOCK_DIFFERENCES) for p, b in flat.table.blocks.items() if b.opaque}
-    outside, error = derivations_at(flat, at)
     return Linearization(
         diagram,
         A,
@@ -363,7 +366,7 @@ def _linearize(
         outputs=outs,
         point=at,
         affine=model.affine,
-        derivations={**opaque, **outside, **model.derivations},
+        derivations={**opaque, **methods},
         uncertainty=max(model.uncertainty, error),
         memory=model.memory,
         openings=tuple(names[2]),

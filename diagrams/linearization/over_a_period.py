@@ -21,6 +21,7 @@ from ..results import OperatingPoint
 from .checks import check_coupling
 from .coupled_chain import CoupledChain, Step
 from .derivatives import SLOPE, LocalDerivatives, Numbers
+from .exchanged import noise_of
 from .findings import EventWithinPeriod, MemoryActs, UnusualStart
 from .flow_model import EQUILIBRIUM, Four, Model, differentiate_flow
 from .plant_models import (
@@ -290,7 +291,8 @@ class Chain:
                 self.flat.acting(last) - self.frozen, self.here.t, self.here.x, self.here.w
             )
             pairs = [(self._first_tick[e, a], later[e, a]) for e in "xzy" for a in "xwd"]
-            if any(np.max(np.abs(a - b), initial=0.0) > 1e-9 * (1 + np.max(np.abs(b), initial=0.0)) for a, b in pairs):
+            same = max(1e-9, 10.0 * noise_of(self.local.evaluators)[0])
+            if any(np.max(np.abs(a - b), initial=0.0) > same * (1 + np.max(np.abs(b), initial=0.0)) for a, b in pairs):
                 findings.append(UnusualStart())
         return findings
 

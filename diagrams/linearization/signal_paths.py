@@ -9,7 +9,7 @@ from typing import NamedTuple
 from ...blocks.core import Finding
 from ..flat import FlatDiagram
 from .block_slopes import slopes_of
-from .findings import BlockFinding, EventWithinPeriod
+from .findings import BlockFinding, EventWithinPeriod, InexactDerivatives
 
 
 class Node(NamedTuple):
@@ -105,7 +105,8 @@ class SignalPaths:
 
     def _ends(self, finding: Finding) -> tuple[set[Node], set[Node]] | None:
         """Return the inputs and the outputs of a block that a finding concerns; None where it concerns everything."""
-        if not isinstance(finding, BlockFinding | EventWithinPeriod) or finding.block not in self.flat.table.blocks:
+        kinds = BlockFinding | EventWithinPeriod | InexactDerivatives
+        if not isinstance(finding, kinds) or finding.block not in self.flat.table.blocks:
             return None
         path, block = finding.block, self.flat.table.blocks[finding.block]
         inputs = {Node(path, port, False) for port in block.inputs}

@@ -2,7 +2,7 @@
 
 from .engine import Engine
 from .initialize import START_SETTLED, find_initial_state, find_start_values, values_from_left
-from .progress import Interrupted, progress_bar
+from .progress import Interrupted, late_progress, progress_bar
 from .run_options import START_EXCHANGES, KeptKeywords, RunKeywords, RunOptions, default_step, refuse_rest, ticks_in
 from .simulated_diagram import SimulatedDiagram
 from .simulation import Simulation, simulate
@@ -29,6 +29,7 @@ __all__ = [
     "default_step",
     "find_initial_state",
     "find_start_values",
+    "late_progress",
     "progress_bar",
     "refuse_rest",
     "simulate",

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
 from ...fmus.build_notes import hear_builds
 from ..results import Run
+
+LATE = 2.0
+"""Time in s that some work takes before its progress is shown."""
 
 
 def _is_shown(show: bool | None) -> bool:
@@ -36,6 +40,23 @@ def progress_bar(
     with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(name, total=end - start)
         yield lambda t: bar.update(task, completed=t - start)
+
+
+@contextmanager
+def late_progress(name: str, start: float, end: float, show: bool | None = None) -> Iterator[Callable[[float], None]]:
+    """Yield a function that is told how far some work is; it is drawn as by `progress_bar` once it has taken 2 s."""
+    begun = time.monotonic()
+    with ExitStack() as stack:
+        tell: Callable[[float], None] | None = None
+
+        def note(t: float) -> None:
+            nonlocal tell
+            if tell is None and time.monotonic() - begun > LATE:
+                tell = stack.enter_context(progress_bar(name, start, end, show))
+            if tell is not None:
+                tell(t)
+
+        yield note
 
 
 @contextmanager

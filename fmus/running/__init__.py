@@ -1,10 +1,10 @@
 """The block `Fmu` and its linear model."""
 
 from .derivation import Derivation, DerivativeMethod
-from .exchange import find_exchange_slopes
+from .exchange import check_exchange_slopes, find_exchange_slopes
 from .fmu import Fmu
+from .fmu_point import FmuLinearization
 from .known_models import linearize_fmu
-from .linearization import FmuLinearization
 from .restored_point import RestoredPoint
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "Fmu",
     "FmuLinearization",
     "RestoredPoint",
+    "check_exchange_slopes",
     "find_exchange_slopes",
     "linearize_fmu",
 ]

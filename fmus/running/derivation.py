@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 
@@ -10,7 +11,7 @@ class DerivativeMethod(Enum):
     """Method for the derivatives of an FMU or a block."""
 
     DIRECTIONAL = "directional derivatives"
-    """Computed by the FMU: exact."""
+    """Computed by the FMU: exact, if differences of its own values say so, too."""
     DIFFERENCES = "differences"
     """Differences of the FMU's equations at the point."""
     STEP_DIFFERENCES = "differences of steps"
@@ -39,6 +40,11 @@ class Derivation:
         Number of states of an identified model.
     restarted : bool
         Whether the FMU was started anew for each difference, as it does not restore the states that it saves.
+    gap : float
+        Largest distance of the FMU's directional derivatives from differences of its own values, relative to their
+        size; 0 where they agree, NaN where they could not be compared.
+    refuted : bool
+        Whether that gap is so large that differences stand in for the derivatives that are wrong.
 
     Examples
     --------
@@ -51,11 +57,13 @@ class Derivation:
     held: bool = False
     order: int | None = None
     restarted: bool = False
+    gap: float = 0.0
+    refuted: bool = False
 
     @property
     def is_exact(self) -> bool:
-        """Whether the derivatives have no error but rounding."""
-        return self.method in (DerivativeMethod.DIRECTIONAL, DerivativeMethod.TRACED)
+        """Whether the derivatives have no error but rounding, as far as is known."""
+        return self.method in (DerivativeMethod.DIRECTIONAL, DerivativeMethod.TRACED) and self.gap == 0.0
 
     def __str__(self) -> str:
         text = self.method.value
@@ -65,6 +73,12 @@ class Derivation:
             text += f", order {self.order}"
         if self.held:
             text += ", held over a step by a matrix exponential"
+        if self.refuted:
+            text += f", as its directional derivatives are off by {self.gap:.2g} of their size"
+        elif math.isnan(self.gap):
+            text += ", which could not be compared with differences"
+        elif self.gap:
+            text += f", off by {self.gap:.2g} of their size"
         if self.restarted:
             text += ", each from a new start, as the FMU does not restore its state though it says so"
         return text

@@ -14,6 +14,7 @@ from ..archive import FmuDescription, FmuVariable
 from ..calls import ExchangeInstance, is_smooth
 from ..isolation import open_fmu
 from .differences import Column, differentiate
+from .slope_check import SlopeCheck, check_slopes
 
 INTERFACES = ("co_simulation", "model_exchange")
 """Interfaces of an FMU, as the parameter ``interface`` names them."""
@@ -219,3 +220,30 @@ def _states_in(block: ExchangeMembers) -> Iterator[tuple[FmuVariable, slice]]:
     about = block.description
     layout = about.layout(about.states).slices
     yield from ((about.find(name), layout[name]) for name in about.states)
+
+
+def check_exchange_slopes(
+    block: ExchangeMembers,
+    wired: Sequence[str],
+    values: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    x: np.ndarray,
+    u: np.ndarray,
+    J: np.ndarray,
+) -> SlopeCheck:
+    """Return the FMU's own derivatives ``J`` of values by (x, u), held against differences; see `check_slopes`.
+
+    Parameters are those of `find_exchange_slopes`.
+    """
+    places = Layout.of({p: v.shape for p, v in block.input_variables.items()}).slices
+    n = x.size
+    nominals, low, high = np.ones(n + u.size), np.full(n + u.size, -np.inf), np.full(n + u.size, np.inf)
+    moved = np.arange(n + u.size) < n
+    parts = list(_states_in(block))
+    for port, v in block.input_variables.items():
+        where = slice(n + places[port].start, n + places[port].stop)
+        moved[where] = port in wired and is_smooth(v)
+        parts.append((v, where))
+    for v, where in parts:
+        nominals[where] = np.ravel(v.nominals)
+        low[where], high[where] = (np.ravel(side) for side in v.limits)
+    return check_slopes(J, lambda at: values(at[:n], at[n:]), np.concatenate([x, u]), nominals, (low, high), moved)

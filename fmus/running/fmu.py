@@ -27,10 +27,12 @@ from ..archive import ArchiveLimits, FmuDescription, FmuVariable, OtherVariable,
 from ..calls import FmuInstance, StepOptions, check_offered
 from ..isolation import Isolation, check_isolation, open_fmu
 from .exchange import ExchangeMembers, choose_interface
-from .linearization import STEP, FmuLinearization, linear_model, step_difference
+from .fmu_point import FmuLinearization
+from .linearization import linear_model
 from .ports import FmuPorts, choose_ports, find_element
 from .replacement import check_replacement
 from .start_values import check_start, check_value, read_sized
+from .step_model import STEP, step_difference
 
 
 class Fmu(ExchangeMembers):
@@ -74,7 +76,6 @@ class Fmu(ExchangeMembers):
     interface: str | None = parameter(
         default=None, description="'co_simulation' or 'model_exchange'; None for co-simulation where it is offered"
     )
-
     limits: ArchiveLimits | None = parameter(default=None, description="limits of the file; None for the usual ones")
 
     def check(self) -> None:
@@ -82,9 +83,7 @@ class Fmu(ExchangeMembers):
         who = self.label
         if not isinstance(self.file, str | os.PathLike):
             raise ParameterError(f"found {self.file!r}; expected the path of an .fmu file.", block=who, port="file")
-        if self.ports is not None and (
-            isinstance(self.ports, str) or not all(isinstance(name, str) for name in self.ports)
-        ):
+        if isinstance(self.ports, str) or not all(isinstance(name, str) for name in self.ports or ()):
             raise ParameterError(
                 f"found {self.ports!r}; expected a list of names of variables.", block=who, port="ports"
             )
@@ -306,7 +305,8 @@ class Fmu(ExchangeMembers):
         The method is the first of these that the FMU supports: directional derivatives in model exchange
         (Continuous-Time Mode), in co-simulation (Step Mode); differences in model exchange, in co-simulation
         (Initialization Mode). The clauses are FMI 2.0, 2.1.9, 3.2.3, 4.2.4, and FMI 3.0, 2.2.11, 2.3.3, 3.2, 4.2. It
-        loads an instance of its own. Discrete states and parameters are constant.
+        loads an instance of its own. Discrete states and parameters are constant. Directional derivatives of an FMU
+        of others are held against differences, which stand in where they are plainly wrong (``derivation.refuted``).
 
         Parameters
         ----------

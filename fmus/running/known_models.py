@@ -12,7 +12,7 @@ import numpy as np
 
 from ...blocks.core import identity
 from .fmu import Fmu
-from .linearization import FmuLinearization
+from .fmu_point import FmuLinearization
 
 MOST = 512
 """Models that are kept at a time."""

@@ -1,0 +1,166 @@
+"""An operating point of an FMU, and its linear model there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from ...blocks.core import FmuError, Layout, ParameterError, UnknownNameError, brief, elements, near
+from ..archive import FmuDescription
+from ..calls import FmuBlock, LoadedFmu
+from ..isolation import open_fmu
+from .derivation import Derivation
+from .start_values import check_state
+
+
+@dataclass(frozen=True, eq=False)
+class FmuLinearization:
+    """Linear model of an FMU about an operating point (x0, u0) at the time t.
+
+    Ports of integers, Booleans and enumerations have no derivatives: their rows and columns are zero.
+
+    For the equations dx/dt = f + A (x − x0) + B (u − u0). For a step of length h with held inputs, the states after it
+    are f + A (x − x0) + B (u − u0). In both cases y = y0 + C (x − x0) + D (u − u0), for a step after it. At an
+    equilibrium f is zero, or x0 for a step.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    states: tuple[str, ...]
+    """Names of the states' elements, such as ``position[1]``."""
+    inputs: tuple[str, ...]
+    """Names of the elements of the input ports."""
+    outputs: tuple[str, ...]
+    """Names of the elements of the output ports."""
+    t: float
+    h: float | None
+    """Length of the step in s; None for a model of the equations."""
+    x0: np.ndarray
+    u0: np.ndarray
+    f: np.ndarray
+    y0: np.ndarray
+    derivation: Derivation
+    """Method by which the derivatives were computed."""
+    uncertainty: np.ndarray
+    """Estimated error of each entry of [[A, B], [C, D]]; zero if the FMU computed it, and differences agree."""
+
+    def __repr__(self) -> str:
+        facts = f"{len(self.states)} states", f"{len(self.inputs)} inputs", f"{len(self.outputs)} outputs", self.how
+        return brief(f"linear model of an FMU at t = {self.t:.9g} s", *facts, then=".A, .B, .C, .D, .uncertainty")
+
+    @property
+    def how(self) -> str:
+        """Text of `derivation`, such as ``"differences of steps"``."""
+        return str(self.derivation)
+
+
+class LinearizableFmu(FmuBlock, Protocol):
+    """Members of an FMU's block that its linear model needs."""
+
+    def start_value(self, description: FmuDescription, name: str, value: Any) -> Any:
+        """Return a start value in the variable's shape, after checking it."""
+
+
+class FmuPoint:
+    """An operating point, as values of the FMU's variables."""
+
+    def __init__(self, block: LinearizableFmu, t: float, state: Any, inputs: Any):
+        self.block, self.about, self.t = block, block.description, float(t)
+        about = self.about
+        self.states = list(about.states)
+        self.port_of = {v.name: port for port, v in {**block.input_variables, **block.output_variables}.items()}
+        self.inputs, self.outputs = (
+            [v.name for v in chosen.values()] for chosen in (block.input_variables, block.output_variables)
+        )
+        self.moved = [n for n in self.inputs if not about.find(n).is_integer]
+        self.sets_parameters = any(about.find(n).causality == "parameter" for n in self.inputs)
+        if not np.isfinite(self.t):
+            raise ParameterError(f"found {t!r}; expected a time in s.", block=block.label, port="t")
+        ports = {self.port_of[name]: name for name in self.inputs}
+        given_state = self._match_names(
+            state, {name: name for name in self.states}, "state", block.description.discrete_states
+        )
+        given_inputs = self._match_names(inputs, ports, "inputs", ())
+        # model exchange sets states that have no start value of their own, as those that other tools compute
+        self.given = {
+            n: check_state(about.find(n), v, block.label)
+            if n in about.states and about.find(n).start is None
+            else block.start_value(about, n, v)
+            for n, v in {**given_state, **given_inputs}.items()
+        }
+
+    def _match_names(self, given: Any, names: Mapping[str, str], port: str, more: tuple[str, ...]) -> dict[str, Any]:
+        if given is None:
+            return {}
+        if isinstance(given, Mapping):
+            known = {**names, **{name: name for name in more}}
+            for name in given:
+                if name not in known:
+                    raise UnknownNameError(f"found {name!r}. {near(name, known)}", block=self.block.label, port=port)
+            return {known[name]: value for name, value in given.items()}
+        vector, variables = np.ravel(np.asarray(given, dtype=float)), [self.about.find(n) for n in names.values()]
+        sizes = [v.size for v in variables]
+        if vector.size != sum(sizes):
+            raise ParameterError(
+                f"found {vector.size} numbers; expected {sum(sizes)}, the elements of {', '.join(names) or 'nothing'}.",
+                block=self.block.label,
+                port=port,
+            )
+        return Layout.of({v.name: v.shape for v in variables}).split(vector)
+
+    def check(self, found: np.ndarray) -> None:
+        """Refuse an operating point that the FMU does not accept."""
+        for name, part in self.about.layout(self.states).split(found).items():
+            if name in self.given and not np.allclose(part, self.given[name], rtol=1e-9, atol=0.0):
+                raise FmuError(
+                    f"its state was set to {self.given[name].tolist()}, but is {np.ravel(part).tolist()} when the FMU "
+                    f"has initialized at t = {self.t:.9g} s: an event there changes it, or its start value is only a "
+                    "guess. Choose a point that is not on an event.",
+                    block=self.block.label,
+                    port=name,
+                )
+
+    def elements(self, names: list[str], *, ports: bool = False) -> tuple[str, ...]:
+        """Return the names of all elements of variables."""
+        shapes = ((self.port_of[n] if ports else n, self.about.find(n).shape) for n in names)
+        return tuple(label for name, shape in shapes for label in elements(name, shape))
+
+    def widen(self, J: np.ndarray) -> np.ndarray:
+        """Return the matrix for all ports: rows and columns of integers are zero, as they have no derivatives."""
+        columns, rows = self.smooth([*self.states, *self.inputs]), self.smooth([*self.states, *self.outputs])
+        found = np.zeros((len(rows), len(columns)))
+        found[:, columns] = J
+        found[~rows] = 0.0
+        return found
+
+    def smooth(self, names: list[str]) -> np.ndarray:
+        """Return which elements of variables are real numbers."""
+        kinds = [np.full(v.size, not v.is_integer) for v in map(self.about.find, names)]
+        return np.concatenate(kinds) if kinds else np.zeros(0, dtype=bool)
+
+    def model(self, J: np.ndarray, x: np.ndarray, u: np.ndarray, values: np.ndarray, **more: Any) -> FmuLinearization:
+        """Return the linear model with this matrix [[A, B], [C, D]]."""
+        n = x.size
+        inputs, outputs = (self.elements(names, ports=True) for names in (self.inputs, self.outputs))
+        return FmuLinearization(
+            J[:n, :n], J[:n, n:], J[n:, :n], J[n:, n:], self.elements(self.states), inputs, outputs, self.t,
+            x0=x, u0=u, f=values[:n], y0=values[n:], **more,
+        )  # fmt: skip
+
+
+@contextmanager
+def initialize_at(point: FmuPoint, exchange: bool) -> Iterator[LoadedFmu]:
+    """Load the FMU and enter Initialization Mode at the operating point."""
+    instance = open_fmu(LoadedFmu, point.block, model_exchange=exchange)
+    try:
+        exact = {n: v for n, v in point.given.items() if point.about.find(n).initial == "exact"}
+        instance.initialize(None, start_time=point.t, values=exact)
+        yield instance
+    finally:
+        instance.close()

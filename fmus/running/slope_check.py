@@ -1,0 +1,215 @@
+"""Directional derivatives of an FMU, held against differences of its own values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+
+from ...blocks.core import LoopwrightError
+from .derivation import Derivation, DerivativeMethod
+
+SAME = 1e-10
+"""Distance between a derivative and its difference, relative to their size, that counts as none."""
+SHARP, CLEAR = 1e-9, 1e-6
+"""Errors of a difference, relative to the values, at which it needs no other length, and at which it can agree."""
+WRONG = 1e-4
+"""Distance beyond which a derivative is plainly wrong, if the difference is ten times better."""
+DIRECTIONS = 3
+"""Random directions in which a derivative is checked."""
+_LENGTHS = (1e-5, 1e-3, 1e-7)
+"""Relative lengths of differences, tried one after the other: long ones round less, short ones keep off kinks."""
+_EPS = float(np.finfo(float).eps)
+
+
+@dataclass(frozen=True, eq=False)
+class SlopeCheck:
+    """Directional derivatives after their check.
+
+    Attributes
+    ----------
+    J : ndarray
+        The derivatives, with differences in place of those that are plainly wrong.
+    error : ndarray
+        Estimated error of each entry; 0 where the derivative agrees with its difference.
+    gap : float
+        Largest distance of a derivative from its difference, relative to the size of the values' change; 0 if all
+        agree, NaN if the values could not be computed.
+    is_wrong : bool
+        Whether some derivatives are plainly wrong.
+    """
+
+    J: np.ndarray
+    error: np.ndarray = field(repr=False)
+    gap: float
+    is_wrong: bool
+
+    def describe(self, derivation: Derivation) -> Derivation:
+        """Return the method of the derivatives, after this check of directional ones."""
+        if self.is_wrong:
+            return replace(derivation, method=DerivativeMethod.DIFFERENCES, gap=self.gap, refuted=True)
+        return replace(derivation, gap=self.gap)
+
+
+def check_slopes(
+    J: np.ndarray,
+    values: Callable[[np.ndarray], np.ndarray],
+    at: np.ndarray,
+    nominals: np.ndarray,
+    limits: tuple[np.ndarray, np.ndarray],
+    moved: np.ndarray,
+) -> SlopeCheck:
+    """Hold derivatives against differences of the values, in a few random directions.
+
+    Only where a direction shows a gap, each column is looked at by itself. A derivative that is the slope to one side
+    of a kink is right.
+
+    Parameters
+    ----------
+    J : (n, m) ndarray
+        Derivatives of the values at ``at``.
+    values : callable
+        The values at an argument, shape (n,), in a new array.
+    at, nominals : (m,) ndarray
+        The argument, and sizes of its entries.
+    limits : pair of (m,) ndarray
+        Least and largest arguments.
+    moved : (m,) ndarray of bool
+        Entries that may be moved.
+    """
+    agreed = SlopeCheck(J, np.zeros(J.shape), 0.0, False)
+    checker = _Checker(values, at, nominals, limits, moved)
+    if not J.size or not checker.moved.any():
+        return agreed
+    try:
+        checker.base = np.array(values(at), dtype=float)
+        if all(checker.compare(J, v).agrees.all() for v in checker.directions()):
+            return agreed
+        return checker.check_columns(J)
+    except LoopwrightError:  # the FMU can't be evaluated beside this point: nothing is known
+        return SlopeCheck(J, agreed.error, np.nan, False)
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """A derivative along a direction and its difference, row by row."""
+
+    slope: np.ndarray
+    """The difference."""
+    error: np.ndarray
+    """Its own error."""
+    gap: np.ndarray
+    """Distance of the derivative from it, at a kink from the nearer side's."""
+    size: np.ndarray
+    """Size of the derivative."""
+    whole: np.ndarray
+    """Size of the derivative and of the values."""
+
+    @property
+    def is_close(self) -> np.ndarray:
+        return np.asarray(self.gap <= SAME * self.size + 3.0 * self.error)
+
+    @property
+    def agrees(self) -> np.ndarray:
+        return np.asarray(self.is_close & (self.error <= CLEAR * self.whole))
+
+    @property
+    def is_wrong(self) -> np.ndarray:
+        return np.asarray(~self.agrees & (self.gap > WRONG * self.size) & (self.gap > 10.0 * self.error))
+
+    def choose(self, other: _Comparison) -> _Comparison:
+        """Return, row by row, the comparison with the smaller error."""
+        better = (other.error < self.error) | ~np.isfinite(self.error)
+        pairs = ((getattr(other, f.name), getattr(self, f.name)) for f in fields(self))
+        return _Comparison(*(np.where(better, new, old) for new, old in pairs))
+
+
+class _Checker:
+    """Differences of values about a point."""
+
+    def __init__(
+        self,
+        values: Callable[[np.ndarray], np.ndarray],
+        at: np.ndarray,
+        nominals: np.ndarray,
+        limits: tuple[np.ndarray, np.ndarray],
+        moved: np.ndarray,
+    ):
+        self.values, self.at, self.base = values, at, np.zeros(0)
+        self.sizes = np.maximum(np.abs(at), nominals)
+        reach = 4.0 * max(_LENGTHS) * self.sizes
+        self.up, self.down = at + reach <= limits[1], at - reach >= limits[0]
+        self.moved = moved & (self.up | self.down)
+
+    def directions(self) -> Iterator[np.ndarray]:
+        """Yield directions that move all entries; those beside a limit away from it."""
+        rng = np.random.default_rng(0)
+        for _ in range(DIRECTIONS):
+            sign = np.where(self.up & self.down, rng.choice([-1.0, 1.0], self.at.size), np.where(self.up, 1.0, -1.0))
+            yield np.where(self.moved, sign * rng.uniform(0.5, 1.0, self.at.size) * self.sizes, 0.0)
+
+    def compare(self, J: np.ndarray, v: np.ndarray, *, every: bool = False) -> _Comparison:
+        """Compare the derivatives along a direction with differences, at the length that tells most.
+
+        ``every`` takes all lengths, also where the first ones agree.
+        """
+        found = self._compare_at(J, v, _LENGTHS[0])
+        for length in _LENGTHS[1:]:
+            if not every and np.all(found.is_close & (found.error <= SHARP * found.whole)):
+                break
+            found = found.choose(self._compare_at(J, v, length))
+        return found
+
+    def _compare_at(self, J: np.ndarray, v: np.ndarray, length: float) -> _Comparison:
+        """Compare with differences over one length.
+
+        Quotients over d, 2 d and 4 d are extrapolated twice, to order 6 in d, and to 3 where one side alone is there.
+        """
+        f0, by_slopes, size = self.base, J @ v, np.abs(J) @ np.abs(v)
+        both = bool(np.all((self.up & self.down) | (v == 0.0)))
+        ends = {k: self._value(k * length * v) for k in ((1, 2, 4, -1, -2, -4) if both else (1, 2, 4))}
+        largest = np.max(np.abs([f0, *ends.values()]), axis=0)
+        rounding = 4.0 * _EPS * (largest + size) / length  # of the values, and of the argument's steps
+        sides = []
+        for side in (1, -1) if both else (1,):
+            one, two, four = ((ends[side * k] - f0) / (side * k * length) for k in (1, 2, 4))
+            fine, coarse = 2 * one - two, 2 * two - four
+            last = (4 * fine - coarse) / 3
+            sides.append((last, 2.0 * np.abs(last - fine) + rounding))
+        slope, error = sides[0]
+        gap = np.abs(by_slopes - slope)
+        if both:
+            one, two, four = ((ends[k] - ends[-k]) / (2 * k * length) for k in (1, 2, 4))
+            fine, coarse = (4 * one - two) / 3, (4 * two - four) / 3
+            middle, middle_error = (16 * fine - coarse) / 15, 0.5 * np.abs(fine - coarse) + rounding
+            (up, up_error), (down, down_error) = sides
+            kink = np.abs(up - down) > 10.0 * (up_error + down_error)
+            below = np.abs(by_slopes - down) < gap
+            slope = np.where(kink, np.where(below, down, up), middle)
+            error = np.where(kink, np.where(below, down_error, up_error), middle_error)
+            gap = np.abs(by_slopes - slope)
+        size = np.maximum(size, np.abs(slope))
+        error = np.where(np.isfinite(slope) & np.isfinite(error), error, np.inf)
+        return _Comparison(slope, error, gap, size, size + np.abs(f0))
+
+    def _value(self, step: np.ndarray) -> np.ndarray:
+        return np.array(self.values(self.at + step), dtype=float)
+
+    def check_columns(self, J: np.ndarray) -> SlopeCheck:
+        """Compare each column by itself; put differences in place of entries that are plainly wrong."""
+        made, error, gap, wrong, unknown = J.copy(), np.zeros(J.shape), 0.0, False, False
+        for k in np.flatnonzero(self.moved):
+            v = np.zeros(self.at.size)
+            v[k] = self.sizes[k] if self.up[k] else -self.sizes[k]
+            found = self.compare(J, v, every=True)
+            known = np.isfinite(found.error)
+            unknown |= not known.all()
+            off, bad = known & ~found.agrees, known & found.is_wrong
+            if not off.any():
+                continue
+            error[off, k] = (found.gap + found.error)[off] / self.sizes[k]
+            gap = max(gap, float(np.max(found.gap[off] / found.size[off])))
+            made[bad, k], error[bad, k] = found.slope[bad] / v[k], found.error[bad] / self.sizes[k]
+            wrong |= bool(bad.any())
+        return SlopeCheck(made, error, np.nan if unknown and not gap else gap, wrong)

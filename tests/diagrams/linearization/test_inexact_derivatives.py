@@ -1,0 +1,115 @@
+"""Directional derivatives of FMUs of others, which are held against differences of the FMU's own values."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from loopwright.blocks import PID, Constant
+from loopwright.diagrams import Diagram, InexactDerivatives, RefutedDerivatives, margins, subsystem
+from loopwright.diagrams.linearization.exchanged import PointEvaluator
+from loopwright.fmus import Fmu
+from tests.support.misstated import A, B, misstated_fmu
+
+WAYS = ("model_exchange", "co_simulation")
+POINT = {"x": 0.3, "v": 0.2}
+DT = 0.01
+
+
+@pytest.fixture(scope="module", params=[2, 3])
+def file(request, tmp_path_factory):
+    return misstated_fmu(tmp_path_factory.mktemp(f"misstated{request.param}"), request.param)
+
+
+@pytest.fixture(scope="module")
+def file3(tmp_path_factory):
+    return misstated_fmu(tmp_path_factory.mktemp("misstated"), 3)
+
+
+@pytest.mark.parametrize("interface", WAYS)
+def test_the_uncertainty_is_the_error_of_the_derivatives(file, interface):
+    whole = np.block([[A, B], [np.eye(2), np.zeros((2, 1))], [A[1:], B[1:]]])
+    for e in (0.0, 5e-9, 1e-7, 1e-5):
+        model = Fmu(file, start={"e": e}).linear_model(state=POINT, interface=interface, exact=True)
+        found = np.block([[model.A, model.B], [model.C, model.D]])
+        error = np.abs(found - whole).max()
+        assert error == pytest.approx(100.0 * e, rel=1e-6, abs=1e-13)
+        assert np.all(np.abs(found - whole) <= 1.5 * model.uncertainty + 1e-13)
+        assert model.uncertainty.max() <= 1.5 * error
+        assert model.derivation.is_exact == (e == 0.0)
+        assert model.derivation.gap == pytest.approx(e, rel=0.5)
+
+
+@pytest.mark.parametrize("interface", WAYS)
+@pytest.mark.parametrize("e", [0.01, -1.0, -2.0])
+def test_derivatives_that_are_plainly_wrong_are_replaced_by_differences(file, interface, e):
+    model = Fmu(file, start={"e": e}).linear_model(state=POINT, interface=interface)
+    np.testing.assert_allclose(model.A, A, atol=1e-7)
+    np.testing.assert_allclose(model.B, B, atol=1e-7)
+    assert np.all(np.abs(model.A - A) <= model.uncertainty[:2, :2])
+    assert model.derivation.refuted
+    assert model.derivation.gap == pytest.approx(abs(e) / max(1.0, abs(1.0 + e)), rel=0.02)
+    assert not model.derivation.is_exact
+
+
+def sampled(file, interface, **start):
+    """Return a loop around it: a PI law of the speed at DT. The integral of the speed is hidden in the loop."""
+    plant = Fmu(file, interface=interface, name="plant", start=start)
+
+    @subsystem(sample_time=DT)
+    def controller(v):
+        return PID(kp=4.0, ki=20.0)(0.0, v)
+
+    return Diagram("loop", plant(u=controller(plant.v).named("u")))
+
+
+def held():
+    return expm(np.block([[A, B], [np.zeros((1, 3))]]) * DT)[:2]
+
+
+def test_a_model_along_a_motion_is_as_exact_as_the_derivatives_and_takes_no_more_of_them(file3, monkeypatch):
+    calls, differentiate = [], PointEvaluator.differentiate
+    monkeypatch.setattr(PointEvaluator, "differentiate", lambda *a: (calls.append(a[2]), differentiate(*a))[1])
+    for e in (5e-9, 1e-6):
+        diagram = sampled(file3, "model_exchange", e=e, rough=1.0)
+        point = diagram.operating_point(0.0, states={f"plant.{name}": value for name, value in POINT.items()})
+        calls.clear()
+        linear = diagram.linearize(point, inputs="u", outputs="plant.v")
+        assert len(calls) < 400  # with tolerances below the noise they were 20,000
+        own = [linear.states.index(f"plant.{name}") for name in "xv"]
+        exact = held()
+        error = np.abs(linear.B[own] - exact[:, 2:]).max()
+        assert 0.0 < error <= linear.uncertainty * DT
+        assert 10.0 * e < linear.uncertainty < 200.0 * e
+        (finding,) = linear.findings
+        assert isinstance(finding, InexactDerivatives)
+        assert (finding.block, finding.gap) == ("plant", linear.derivations["plant"].gap)
+        assert 0.1 * e < finding.gap < 2.0 * e
+
+
+@pytest.mark.parametrize("interface", WAYS)
+def test_margins_of_a_loop_with_a_hidden_integrator_are_those_of_exact_derivatives(file3, interface):
+    exact = margins(sampled(file3, interface).linearize().loop("u"))
+    assert exact.findings == ()
+    rough = margins(sampled(file3, interface, e=5e-9, rough=1.0).linearize().loop("u"))
+    assert [type(f) for f in rough.findings] == [InexactDerivatives]
+    for name in ("phase_margin_deg", "ms", "gain_margin_high"):
+        one, two = getattr(exact, name), getattr(rough, name)
+        assert abs(one.value - two.value) <= two.tolerance
+        assert one.tolerance < two.tolerance < 1e-4 * one.value
+
+
+@pytest.mark.parametrize("interface", WAYS)
+def test_a_diagram_says_that_derivatives_are_wrong_and_does_not_use_them(file3, interface):
+    wrong, right = (sampled(file3, interface, e=e).linearize() for e in (-2.0, 0.0))
+    np.testing.assert_allclose(wrong.A, right.A, atol=1e-8)
+    (finding,) = wrong.findings
+    assert isinstance(finding, RefutedDerivatives)
+    assert finding.gap == pytest.approx(2.0, rel=1e-3)
+    assert wrong.uncertainty < 1e-5
+
+
+def test_a_trim_and_a_stiff_run_do_not_depend_on_wrong_derivatives(file3):
+    plant = Fmu(file3, interface="model_exchange", name="plant", start={"e": -2.0})
+    diagram = Diagram("pushed", plant(u=Constant(value=3.0, name="force")))
+    point = diagram.trim(free=["force.value"], targets={"plant.x": 0.5})
+    assert point.parameters["force.value"] == pytest.approx(50.0, rel=1e-9)
