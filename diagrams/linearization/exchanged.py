@@ -120,10 +120,17 @@ def pass_on(at: OperatingPoint, variant: OperatingPoint) -> OperatingPoint:
     return variant
 
 
-def derivations_at(flat: FlatDiagram, at: OperatingPoint) -> tuple[dict[str, Derivation], float]:
-    """Return how the FMUs in model exchange were differentiated at a point, and the largest estimated error."""
+def derivations_at(
+    flat: FlatDiagram, at: OperatingPoint, others: Mapping[str, Derivation]
+) -> tuple[dict[str, Derivation], float]:
+    """Return how FMUs were differentiated at a point, and the largest estimated error of those in model exchange.
+
+    ``others`` are the methods of the other FMUs.
+    """
     found = cast("Mapping[str, PointEvaluator]", evaluators_at(flat, at) or {})
-    return {path: e.derivation for path, e in found.items()}, max((e.error for e in found.values()), default=0.0)
+    return {**{path: e.derivation for path, e in found.items()}, **others}, max(
+        (e.error for e in found.values()), default=0.0
+    )
 
 
 def findings_on(derivations: Mapping[str, Derivation]) -> list[Finding]:

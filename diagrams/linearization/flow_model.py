@@ -107,6 +107,12 @@ def size_of_change(change: np.ndarray, state: np.ndarray) -> float:
     return float(np.max(np.abs(change) / (1.0 + np.abs(state)), initial=0.0))
 
 
+def relative_error(error: float, *matrices: np.ndarray) -> float:
+    """Return an error relative to the largest entry of matrices; 0 where all are zero."""
+    largest = max((float(np.max(np.abs(M), initial=0.0)) for M in matrices), default=0.0)
+    return error / largest if largest else 0.0
+
+
 def _split_at_discontinuities(flat: FlatDiagram, t: float, end: float) -> Iterator[tuple[float, float]]:
     """Yield the parts of an interval between the discontinuities of the sources."""
     sources = announcers(flat)

@@ -26,7 +26,7 @@ from .checks import check_loop, check_opening, refuse_transport_delays, replace_
 from .derivatives import LocalDerivatives, find_signal
 from .exchanged import derivations_at, evaluators_at, findings_on
 from .findings import EntryTaken
-from .flow_model import EQUILIBRIUM, Model, model_continuous
+from .flow_model import EQUILIBRIUM, Model, model_continuous, relative_error
 from .inserted_blocks import find_cut_findings, name_inputs, split_consumers, split_inputs
 from .kinks import find_kinks
 from .loops_over_a_period import (
@@ -152,8 +152,7 @@ class Linearization:
         system = (kind or StateSpace)(
             self.A, self.B, C, D, self.dt, name=name.replace(".", "_"), remove_useless_states=False, **names
         )
-        largest = max((float(np.max(np.abs(M), initial=0.0)) for M in (self.A, self.B, C, D)), default=0.0)
-        system.inexactness = self.uncertainty / largest if largest else 0.0
+        system.inexactness = relative_error(self.uncertainty, self.A, self.B, C, D)
         system.findings = self.carried
         taken = (finding for finding in self.findings if isinstance(finding, EntryTaken))
         system.notes = tuple(map(str, dict.fromkeys((*self.carried, *taken))))
@@ -346,8 +345,7 @@ def _linearize(
         ins = outs = tuple(channels)
     known = means.replace_findings(find_kinks(flat, at)) if findings is None else findings
     entries = (EntryTaken(s.name, s.entry) for group in found for s in group if s.entry)
-    outside, error = derivations_at(flat, at)
-    methods = {**outside, **model.derivations}
+    methods, error = derivations_at(flat, at, model.derivations)
     every = tuple(dict.fromkeys((*known, *model.findings, *findings_on(methods), *at.free, *entries)))
     ways = SignalPaths(flat, [s.port for s in found[2]])
     carried = ways.between(every, *([s.port for s in group] for group in found[:2]))
