@@ -8,12 +8,15 @@ from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOp
 from .hybrid_code import compile_hybrid, find_hybrid_obstacle, write_hybrid
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
 from .native_tick import bind_call
+from .remote import REFUSED, UNDER_WAY
 from .watch import RECENT, Fired, Watch
 
 __all__ = [
     "FIXED",
     "LARGEST",
     "RECENT",
+    "REFUSED",
+    "UNDER_WAY",
     "BackgroundCode",
     "CompiledHybrid",
     "CompiledLoop",

@@ -310,7 +310,7 @@ def master() -> Any:
 
 def master_source() -> str:
     """Return the C text of the loop over ticks."""
-    return read_sources("newton.c", "master.c")
+    return read_sources("newton.c", "remote.c", "master.c")
 
 
 @lru_cache(maxsize=64)

@@ -30,6 +30,7 @@ from .reordered import reorder
 
 _LIMIT = "0x1p20"  # LW_FAST_LIMIT
 _MANY = 16  # kinds of ticks that are written twice
+_SYSTEM = "#define _POSIX_C_SOURCE 200809L"  # as `newton.c` asks for it, before anything is included
 _CASADI = re.compile(r"\b(_?(?:casadi|CASADI)_)")
 
 
@@ -82,7 +83,7 @@ def _compile(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], plants
     found = {} if flat.by_block else {clocks: flat.at_tick(clocks).last.fast for clocks in acting}
     straight = bool(found) and all(function.is_a("SXFunction") for function in found.values())
     functions = {clocks: rename(f, f"tick{i}") for i, (clocks, f) in enumerate(found.items())} if straight else {}
-    text = "\n".join([_write_ticks([*functions.values()]), models, steps, master_source()])
+    text = "\n".join([_SYSTEM, _write_ticks([*functions.values()]), models, steps, master_source()])
     library = load_compiled(text, (*processor_flags(), *FUSING), describe_processor())
     master = library[MASTER]
     master.restype = None

@@ -113,7 +113,7 @@ VISIBLE void loopwright_go(hybrid *h, const span *s, double *rows, outcome *out)
     out->rows = 0;
     out->reason = DONE;
     while (g.i < s->count) {
-        if (h->l.halt) {
+        if (is_halted(&h->l)) {
             out->reason = HALTED;
             break;
         }

@@ -34,7 +34,10 @@ from .kernels import write_kernels
 from .small_steps import STEPS, write_steps
 from .step_outputs import may_fail_at_steps
 
-_SOURCES = ("newton.c", "master.c", "problem.c", "methods.c", "radau.c", "events.c", "instants.c", "hybrid.c")
+_SOURCES = (
+    *("newton.c", "remote.c", "master.c", "problem.c", "methods.c", "radau.c", "events.c", "instants.c"),
+    "hybrid.c",
+)
 
 _FLAGS = ("-fno-unroll-loops",)  # vectors are short: a sixth less for the compiler
 FUSING = ("-finline-functions", "-freciprocal-math", "-fno-tree-vectorize", "-fno-tree-slp-vectorize")

@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from ...fmus.calls import NEAR, NativeStep
+from ...fmus.calls import NEAR, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
 from ..flat import TRUE, TickPattern
 from .code import GroupedTick, StraightTick, TickCode, master
 from .native_tick import at, bind_native
+from .remote import RemotePlants
 
 
 class Reason(IntEnum):
@@ -53,7 +54,7 @@ class _Plant(ctypes.Structure):
         ("step", ctypes.c_void_p),
         ("inputs", _Transfer),
         ("outputs", _Transfer),
-        *((name, ctypes.c_void_p) for name in ("now", "width", "final", "flags", "reached", "changed")),
+        *((name, ctypes.c_void_p) for name in ("now", "width", "final", "flags", "reached", "changed", "far")),
     ]
 
 
@@ -68,6 +69,7 @@ class LoopStructure(ctypes.Structure):
         ("skip", ctypes.c_int64),
         ("halt", ctypes.c_int32),
         ("loops", ctypes.c_void_p),
+        ("apart", ctypes.c_void_p),
     ]
 
 
@@ -120,8 +122,8 @@ class Outcome:
         The reason.
     plant : int
         The FMU that it is about, by its place.
-    stage : {0, 1, 2}
-        What failed: setting the inputs, the step, reading the outputs.
+    stage : {0, 1, 2, 3, 4}
+        What failed: setting the inputs, the step, reading the outputs; then those of an FMU in another process.
     status : int
         Status of that call.
     """
@@ -143,8 +145,8 @@ class CompiledLoop:
         The ticks.
     arguments, results : sequence of ndarray
         The vectors (t, x, w, p) and (x_next, z, log, ok) of the run.
-    plants : sequence of NativeStep
-        The steps of the FMUs.
+    plants : sequence of NativeStep or RemoteStep
+        The steps of the FMUs, in this process or in others.
     columns : ndarray or None
         Entries of the log that a sample keeps; None for the first ``width``.
     width : int
@@ -162,7 +164,7 @@ class CompiledLoop:
         code: TickCode,
         arguments: Sequence[np.ndarray],
         results: Sequence[np.ndarray],
-        plants: Sequence[NativeStep],
+        plants: Sequence[NativeStep | RemoteStep],
         *,
         columns: np.ndarray | None,
         width: int,
@@ -172,6 +174,7 @@ class CompiledLoop:
     ):
         self._kept: list[Any] = [code, arguments, results, plants, columns]
         self._watched: list[tuple[HostState, ctypes.c_bool]] = []
+        self._remote = RemotePlants()
         t, x, _, _ = arguments
         x_next, _, log, ok = results
         self.kinds = {clocks: i for i, clocks in enumerate(code.ticks)}
@@ -194,6 +197,7 @@ class CompiledLoop:
             truth=TRUE,
             near=NEAR,
         )
+        self.structure.apart = self._remote.address
         if code.loops:
             solvers = [self.bind_loops(code, clocks, arguments, (loops or {}).get(clocks)) for clocks in code.ticks]
             self.structure.loops = self._address(solvers, NewtonStructure)
@@ -245,7 +249,11 @@ class CompiledLoop:
             halvings=options.halvings,
         )
 
-    def _plant(self, step: NativeStep) -> ctypes.Structure:
+    def _plant(self, step: NativeStep | RemoteStep) -> ctypes.Structure:
+        if isinstance(step, RemoteStep):
+            return _Plant(
+                now=step.now, width=step.width, flags=step.flags, reached=step.reached, far=self._remote.add(step)
+            )
         inputs, outputs = (
             _Transfer()
             if call is None
@@ -266,14 +274,15 @@ class CompiledLoop:
 
         C sets rounding mode and traps back after each step; the working folder is set back at the end.
         """
-        return self._guard() if self._watched else nullcontext()
+        return self._guard() if self._watched or self._remote.address else nullcontext()
 
     @contextmanager
     def _guard(self) -> Iterator[None]:
         with ExitStack() as stack:
             for host, _ in self._watched:
                 stack.enter_context(host)
-            yield
+            with self._remote.guard():
+                yield
         for host, changed in self._watched:
             if changed:
                 host.note_modes()

@@ -2,7 +2,7 @@
 
    It knows no diagram: a tick is a function pointer with the addresses of its arguments and results. On anything out of
    the ordinary it returns at that tick; Python, which has the same numbers before it, says what has happened. It stands
-   behind `newton.c`. */
+   behind `newton.c` and `remote.c`. */
 
 typedef int (*set_or_get2)(void *instance, const uint32_t *references, size_t count, double *values);
 typedef int (*set_or_get3)(void *instance, const uint32_t *references, size_t count, double *values, size_t size);
@@ -18,7 +18,7 @@ typedef struct {
     size_t size;
 } transfer;
 
-/* An FMU in this process; flags are event, terminate, early return, and one that is never set. */
+/* An FMU, in this process or in another one; flags are event, terminate, early return, and one that is never set. */
 typedef struct {
     int32_t version;
     void *instance;
@@ -29,6 +29,7 @@ typedef struct {
     bool *flags;
     double *reached;
     bool *changed; /* set where it changes modes of the processor, which are set back; NULL: it is known not to */
+    remote *far;   /* its process; NULL: this one */
 } plant;
 
 typedef struct {
@@ -44,10 +45,11 @@ typedef struct {
     int64_t skip;           /* samples to leave out before the next one that is kept */
     volatile int32_t halt;  /* not 0: return before the next tick */
     newton *loops;          /* of each kind of tick; NULL: no algebraic loops */
+    apart *apart;           /* of FMUs in other processes; NULL: there are none */
 } loop;
 
 enum { DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED };
-enum { INPUTS, STEP, OUTPUTS };
+enum { INPUTS, STEP, OUTPUTS, UNDER_WAY, REFUSED }; /* the last ones of an FMU in another process */
 
 /* A fused loop stands in one unit with the code of its ticks, and of FMUs; then these are no calls by address. */
 #ifndef CALL_TICK
@@ -121,13 +123,48 @@ static inline int64_t read_plant(const plant *p, double now, double width, doubl
     return DONE;
 }
 
-/* Step all FMUs, one after the other. */
+/* Let the FMUs in other processes begin their steps, all of them or none. */
+static inline int64_t begin_apart(const loop *l, double now, double width, outcome *out) {
+    for (int64_t j = 0; j < l->plants; j++)
+        if (l->fmus[j].far && !fill_all(l->fmus[j].far)) {
+            out->plant = j;
+            out->stage = REFUSED;
+            return out->status = 0, FMU_FAILED;
+        }
+    for (int64_t j = 0; j < l->plants; j++) {
+        const plant *p = l->fmus + j;
+        if (!p->far) continue;
+        *p->now = now;
+        *p->width = width;
+        post(p->far);
+    }
+    return DONE;
+}
+
+/* Wait for the end of such a step; where it is out of the ordinary, Python ends it. */
+static inline int64_t end_apart(const loop *l, const plant *p, double now, double width, outcome *out) {
+    if (take_reply(p->far, l->apart) && !(p->flags[1] | p->flags[2]) &&
+        !(fabs(*p->reached - now - width) > width * l->near) && spread_all(p->far))
+        return look_at_clock(l->apart), DONE;
+    out->stage = UNDER_WAY;
+    return out->status = 0, FMU_FAILED;
+}
+
+/* Step all FMUs, one after the other; those in other processes step meanwhile. */
 static inline int64_t step_plants(const loop *l, double now, double width, outcome *out) {
+    if (l->apart) {
+        const int64_t reason = begin_apart(l, now, width, out);
+        if (reason != DONE) return reason;
+    }
     for (int64_t j = 0; j < l->plants; j++) {
         const plant *p = l->fmus + j;
         int64_t reason;
         out->plant = j;
         if (STEP_FUSED(j, p, now, width)) continue;
+        if (p->far) {
+            if ((reason = end_apart(l, p, now, width, out)) != DONE) return reason;
+            continue;
+        }
         const uint64_t own = p->changed ? modes() : 0;
         if ((reason = step_plant(p, now, width, out)) == DONE) reason = read_plant(p, now, width, l->near, out);
         if (p->changed && modes() != own) {
@@ -164,6 +201,9 @@ static inline int64_t record(loop *l, double t, double *rows, int64_t written) {
     return written + 1;
 }
 
+/* Whether Python is to have its turn before the next tick. */
+static inline bool is_halted(const loop *l) { return l->halt || (l->apart && l->apart->late); }
+
 static inline bool is_stopped(const loop *l) {
     for (int64_t j = 0; j < l->stops; j++)
         if (l->log[l->stop[j]] > l->truth) return true;
@@ -177,7 +217,7 @@ VISIBLE void loopwright_run(loop *l, int64_t count, const double *times, const d
     out->rows = 0;
     out->reason = DONE;
     for (i = 0; i < count; i++) {
-        if (l->halt) {
+        if (is_halted(l)) {
             out->reason = HALTED;
             break;
         }

@@ -2,6 +2,9 @@
 
    A loop that is not solved, is not determined, or meets a value that is not finite is left to Python. */
 
+#ifndef _POSIX_C_SOURCE
+#define _POSIX_C_SOURCE 200809L /* of the system: clock_gettime and poll */
+#endif
 #include <math.h>
 #include <stdbool.h>
 #include <stddef.h>

@@ -4,7 +4,7 @@ from .coupled_steps import CoupledSteps, Effort, tells_slopes
 from .links import Links
 from .loops import note_loops
 from .options import Coupling, Scheme, refuse_exchanged, to_coupling
-from .plant_steps import PlantSteps, step_all
+from .plant_steps import PlantSteps, end_all, runs_apart, step_all
 from .plants import Plant, load_plants, note_fine_steps
 from .report import CoupledConnection, CouplingReport, HeldFrom, LinkKind, report_coupling
 from .rollback import accept_steps, try_steps
@@ -24,11 +24,13 @@ __all__ = [
     "Scheme",
     "Search",
     "accept_steps",
+    "end_all",
     "load_plants",
     "note_fine_steps",
     "note_loops",
     "refuse_exchanged",
     "report_coupling",
+    "runs_apart",
     "step_all",
     "tells_slopes",
     "to_coupling",

@@ -166,9 +166,20 @@ def step_all(plants: Iterable[Plant], t: float, h: float) -> None:
         except SimulationError as error:
             failure = error
             break
-    for plant in begun:
+    end_all([plant.finish_step for plant in begun], failure)
+
+
+def end_all(ends: Iterable[Callable[[], None]], failure: SimulationError | None = None) -> None:
+    """End steps that have begun, each of them; then raise an error, by the rule of `step_all`.
+
+    Parameters
+    ----------
+    failure : SimulationError, optional
+        Error with which one could not begin.
+    """
+    for end in ends:
         try:
-            plant.finish_step()
+            end()
         except SimulationError as error:
             failure = error if failure is None or asks_to_end(failure) else failure
     if failure is not None:

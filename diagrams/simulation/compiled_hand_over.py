@@ -1,18 +1,26 @@
-"""Between Python and C: plans of the solver, and domains of indicators, are handed over and taken back."""
+"""Between Python and C: plans of the solver, domains of indicators, and plants are handed over and taken back."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from itertools import groupby
 
 import numpy as np
 
-from ..compiled import RECENT, Fired, MethodOptions, Watch
+from ...fmus.calls import FmuInstance, NativeStep, RemoteStep
+from ..compiled import RECENT, REFUSED, UNDER_WAY, Fired, MethodOptions, Watch
+from ..coupling import Plant, end_all, runs_apart, step_all
 from ..events import Domains
 from .continuous import Continuous
 from .solver_setup import next_instant
 
+OBSTACLES = (
+    "ports that are no Float64 in this process, texts, or options of its steps, or it runs in a process of its own on "
+    "a platform where C can't ask it"
+)
+"""Reasons for which C can't step a plant."""
 _MOST_EDGES = 100_000  # discontinuities of sources in a call
 
 
@@ -91,3 +99,76 @@ def restore_plans(continuous: Continuous, methods: Sequence[MethodOptions], step
         continuous.solver.restore(saved)
     elif "planned" in saved:
         continuous.solver.restore({"planned": steps[0]})
+
+
+def plants_for_c(plants: Mapping[str, Plant]) -> dict[str, FmuInstance]:
+    """Return the plants that C can step, by path: in this process, or in others."""
+    return {
+        path: plant for path, plant in plants.items() if isinstance(plant, FmuInstance) and step_in_c(plant) is not None
+    }
+
+
+def step_in_c(plant: FmuInstance) -> NativeStep | RemoteStep | None:
+    """Return the step of a plant as C takes it."""
+    return plant.native or plant.remote
+
+
+def steps_in_c(plants: Iterable[FmuInstance]) -> list[NativeStep | RemoteStep]:
+    """Return the steps of plants, all of which C can step."""
+    found = list[NativeStep | RemoteStep]()
+    for plant in plants:
+        step = step_in_c(plant)
+        assert step is not None
+        found.append(step)
+    return found
+
+
+def step_plants(plants: Sequence[FmuInstance], t: float, h: float) -> None:
+    """Step all plants from t over h, both in s, by Python."""
+    if len(plants) > 1 and any(map(runs_apart, plants)):
+        step_all(plants, t, h)
+    else:
+        for plant in plants:
+            plant.step(t, h)
+
+
+def end_steps(plants: Sequence[FmuInstance], first: int, stage: int, status: int, t: float, h: float) -> None:
+    """Go on with steps from t over h, both in s, from the plant on that C could not go beyond.
+
+    Parameters
+    ----------
+    plants : sequence of FmuInstance
+        All plants; those before the first one have taken their steps.
+    first : int
+        Place of that plant.
+    stage, status : int
+        How far C has come with it; see `Outcome`.
+
+    Raises
+    ------
+    SimulationError
+        Of the first plant that fails, once no other one is under way.
+    """
+    if stage == REFUSED:
+        step_plants(plants, t, h)
+        return
+    apart = any(map(runs_apart, plants))
+    rest = list[Callable[[], None]]()
+    for plant in plants[first:]:
+        if runs_apart(plant):
+            rest.append(partial(plant.finish_remote, t, h))
+        elif plant is plants[first]:
+            rest.append(partial(_judge, plant, stage, status, t, h))
+        else:
+            rest.append(partial(plant.step, t, h))
+    assert apart or stage != UNDER_WAY
+    if apart:
+        end_all(rest)
+    else:
+        for end in rest:
+            end()
+
+
+def _judge(plant: FmuInstance, stage: int, status: int, t: float, h: float) -> None:
+    plant.judge_native(stage, status, t, h)
+    plant.read(t + h)

@@ -26,10 +26,12 @@ from ..results import Occurrence, Recorder
 from ..solvers import AutoSolver
 from .compiled_hand_over import (
     active_method,
+    end_steps,
     find_edges,
     hand_over_domains,
     methods_of,
     planned_steps,
+    plants_for_c,
     restore_plans,
     take_back_domains,
 )
@@ -62,7 +64,7 @@ class HybridTicks:
     continuous : Continuous
         Its solver and events.
     plants : mapping of str to FmuInstance
-        The plants by path, bound, in this process.
+        The plants by path, bound.
     steps : PlantSteps
         Their steps, as Python takes them.
     stops : sequence of int
@@ -266,12 +268,8 @@ class HybridTicks:
 
     def _judge(self, found: HybridOutcome, now: float, h: float) -> None:
         """Go on from the call of an FMU that the loop could not go beyond."""
-        plants = [*self._plants.values()]
-        plant = plants[found.plant]
-        plant.judge_native(found.stage, found.status if found.reason is HybridReason.FMU_FAILED else 0, now, h)
-        plant.read(now + h)
-        for other in plants[found.plant + 1 :]:
-            other.step(now, h)
+        status = found.status if found.reason is HybridReason.FMU_FAILED else 0
+        end_steps([*self._plants.values()], found.plant, found.stage, status, now, h)
 
     def _is_held(self) -> bool:
         """Whether an indicator is held in contact, or events wait for the end of a fixed step: Python goes on then."""
@@ -362,9 +360,7 @@ def make_hybrid(
     fuse : bool, default False
         Compile them for the processor of this machine.
     """
-    native = {
-        path: plant for path, plant in plants.items() if isinstance(plant, FmuInstance) and plant.native is not None
-    }
+    native = plants_for_c(plants)
     reason = find_hybrid_obstacle(workspace.flat, continuous.solver.name)
     reason = reason or find_obstacle_at_ticks(workspace.flat, plants, native, regular=regular)
     if reason is None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core import CompilerError, SimulationError
-from ...fmus.calls import FmuInstance, NativeStep
+from ...fmus.calls import FmuInstance
 from ..compiled import (
     BackgroundCode,
     CompiledLoop,
@@ -28,6 +28,7 @@ from ..coupling import Plant
 from ..flat import EVERY, EXACT_LOOP, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of, ticks_after
 from ..results import Recorder
 from .algebraic_loops import HALVINGS, ITERATIONS, ROUNDING, SINGULAR, TOLERANCE
+from .compiled_hand_over import OBSTACLES, end_steps, plants_for_c, step_plants, steps_in_c
 from .diagnosis import forget_trials
 from .workspace import Workspace
 
@@ -82,7 +83,7 @@ class CompiledTicks:
     workspace : Workspace
         The run's numbers.
     plants : mapping of str to FmuInstance
-        The plants by path, bound, in this process.
+        The plants by path, bound.
     stops : sequence of int
         Entries of the log that end the run where they are true.
     every : bool
@@ -166,7 +167,9 @@ class CompiledTicks:
                 k = int(window.ticks[at - 1])
                 if arrived(k):
                     return True
-            if at < stop or not found.ticks:  # Python looks at this tick
+            if found.reason is Reason.HALTED and found.ticks:
+                self._chunk = max(1, self._chunk // 2)
+            elif at < stop or not found.ticks:  # Python looks at this tick
                 following = int(window.ticks[at])
                 self._take_tick(k, following, found, recorder)
                 k, at = following, at + 1
@@ -208,19 +211,15 @@ class CompiledTicks:
         """Go through a tick at which the loop has returned: from the call on that it could not go beyond."""
         workspace, base = self._workspace, self._flat.base
         now, h = before * base.numerator / base.denominator, float(base * (k - before))
-        t, first = k * base.numerator / base.denominator, 0
+        t = k * base.numerator / base.denominator
         try:
             if found.reason is Reason.NOT_OK:
-                first = len(self._plants)
                 forget_trials(self._flat)  # an interrupt of a block of Python is raised
             elif found.reason in (Reason.FMU_FAILED, Reason.FMU_FLAGS):
                 status = found.status if found.reason is Reason.FMU_FAILED else 0
-                plant = self._plants[found.plant]
-                plant.judge_native(found.stage, status, now, h)
-                plant.read(t)
-                first = found.plant + 1
-            for other in self._plants[first:]:
-                other.step(now, h)
+                end_steps(self._plants, found.plant, found.stage, status, now, h)
+            else:
+                step_plants(self._plants, now, h)
         except SimulationError as error:
             raise error.at(t=t) from error.__cause__
         workspace.here.t[0] = t
@@ -232,16 +231,12 @@ def bind_loop(
     workspace: Workspace, plants: Iterable[FmuInstance], code: TickCode, recorder: Recorder, stops: Sequence[int]
 ) -> CompiledLoop:
     """Return the loop over ticks in C, bound to the numbers of a run, its plants, and the samples that it keeps."""
-    steps, entries, here = list[NativeStep](), recorder.entries, workspace.here
-    for plant in plants:
-        native = plant.native
-        assert native is not None
-        steps.append(native)
+    entries, here = recorder.entries, workspace.here
     return CompiledLoop(
         code,
         [here.t, here.x, here.w, here.p],
         [workspace.x_next, workspace.z, workspace.log, workspace.ok],
-        steps,
+        steps_in_c(plants),
         columns=entries,
         width=workspace.log.size if entries is None else len(entries),
         every=recorder.every,
@@ -292,7 +287,7 @@ def make_compiled(
     fuse : bool, default False
         Compile ticks and plants of our own together, for the processor of this machine.
     """
-    native = _native(plants)
+    native = plants_for_c(plants)
     reason = find_obstacle(workspace.flat) or find_obstacle_at_ticks(workspace.flat, plants, native, regular=regular)
     if reason is None:
         try:
@@ -312,7 +307,9 @@ def _fuse(flat: FlatDiagram, native: Mapping[str, FmuInstance], *, every: bool) 
     for path, plant in native.items():
         block, step = flat.table.blocks[path], plant.native
         assert isinstance(block, Fmu)
-        assert step is not None
+        if step is None:
+            plants[path] = FusedPlant(None, (), ())
+            continue
         file = block.description.file if _is_plain(block) else None
         to, of = (() if ports is None else ports.read_references() for ports in (step.inputs, step.outputs))
         plants[path] = FusedPlant(file, to, of)
@@ -342,7 +339,7 @@ class LaterTicks:
     """
 
     def __init__(self, workspace: Workspace, plants: Mapping[str, Plant], stops: Sequence[int], *, every: bool):
-        self._workspace, self._native, self._stops, self._every = workspace, _native(plants), stops, every
+        self._workspace, self._native, self._stops, self._every = workspace, plants_for_c(plants), stops, every
         self.code = BackgroundCode(workspace.flat, kinds_of(workspace.flat, every=every))
 
     def take_over(self) -> CompiledTicks | None:
@@ -373,16 +370,9 @@ def make_later(
 ) -> LaterTicks | None:
     """Return ticks that C takes over from where a run is long enough; None where it can't. See `make_compiled`."""
     flat = workspace.flat
-    if find_obstacle(flat) or find_obstacle_at_ticks(flat, plants, _native(plants), regular=regular):
+    if find_obstacle(flat) or find_obstacle_at_ticks(flat, plants, plants_for_c(plants), regular=regular):
         return None
     return LaterTicks(workspace, plants, stops, every=every)
-
-
-def _native(plants: Mapping[str, Plant]) -> dict[str, FmuInstance]:
-    """Return the plants that C can step, by path."""
-    return {
-        path: plant for path, plant in plants.items() if isinstance(plant, FmuInstance) and plant.native is not None
-    }
 
 
 def find_obstacle_at_ticks(
@@ -395,5 +385,5 @@ def find_obstacle_at_ticks(
         return "an FMU takes longer steps than from one tick to the next, or a coupling is asked for that iterates"
     for path in plants:
         if path not in native:
-            return f"the FMU {path!r} runs in a process of its own, or has ports that are no Float64, or options"
+            return f"the FMU {path!r} has {OBSTACLES}"
     return None

@@ -95,6 +95,22 @@ class FmuVariable:
         found = np.abs(np.broadcast_to(np.asarray(given, dtype=float), self.shape))
         return np.where(found > 0.0, found, 1.0)
 
+    @property
+    def range_of_type(self) -> tuple[float, float] | None:
+        """Least and greatest number for which `complaint` is empty; None if some whole number between is none."""
+        if self.type == "Float64":
+            return -math.inf, math.inf
+        if self.type == "Float32":
+            limit = float(np.finfo(np.float32).max)
+            return -limit, limit
+        low, high = (0, 1) if self.type == "Boolean" else _INTEGERS.get(self.type, _INTEGERS["Int64"])
+        if self.items:
+            known = {*self.items.values()}
+            if len(known) != max(known) - min(known) + 1:
+                return None
+            low, high = max(low, min(known)), min(high, max(known))
+        return float(max(low, -_EXACT)), float(min(high, _EXACT))
+
     def complaint(self, values: np.ndarray) -> str:
         """Return the reason why values can't be those of this type, as "found …; expected …"; empty if they can.
 

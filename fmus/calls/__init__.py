@@ -1,13 +1,13 @@
 """FMI calls into a library that is loaded in this process."""
 
-from .bound_calls import BoundCalls, Call, bind_functions, exported_name, list_prototypes
+from .bound_calls import BoundCalls, Call, ChildFace, ChildRequest, bind_functions, exported_name, list_prototypes
 from .evaluated_exchange import is_smooth
 from .exchange_instance import ExchangeInstance
 from .fmi_calls import ERROR, WARNING, FmiCalls, Log
 from .fmu_block import FmuBlock
 from .instance import FmuInstance
 from .loaded_library import CALLS, LoadedFmu, MakeCalls
-from .native_step import NativeStep
+from .native_step import NativeStep, RemoteStep, SharedValues
 from .saved_state import FmuState
 from .step_failures import NEAR
 from .step_options import StepOptions, StepTime, check_offered
@@ -19,6 +19,8 @@ __all__ = [
     "WARNING",
     "BoundCalls",
     "Call",
+    "ChildFace",
+    "ChildRequest",
     "ExchangeInstance",
     "FmiCalls",
     "FmuBlock",
@@ -28,6 +30,8 @@ __all__ = [
     "Log",
     "MakeCalls",
     "NativeStep",
+    "RemoteStep",
+    "SharedValues",
     "StepOptions",
     "StepTime",
     "bind_functions",

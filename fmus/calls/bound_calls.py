@@ -8,13 +8,65 @@ import types
 import typing
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 Call = tuple[Callable[..., int], tuple[Any, ...]]
 """A C function, and its arguments."""
 STATUS = ("OK", "warning", "discard", "error", "fatal", "pending")
 WARNING, DISCARD, ERROR, FATAL, PENDING = range(1, 6)
 """Statuses of FMI's functions (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3)."""
+
+
+class ChildFace(Protocol):
+    """A process that runs calls of a library, as whoever asks for them without `BoundCalls` sees it.
+
+    Attributes
+    ----------
+    name : str
+        The FMU.
+    number : int
+        Number of the last request.
+    arrived : bool
+        Whether the reply to it has been seen, though nobody has finished it yet.
+    """
+
+    name: str
+    number: int
+    arrived: bool
+
+    def check_alive(self, call: str) -> None:
+        """Raise the error of a process that has ended before a call."""
+
+    def give_up(self) -> None:
+        """End the process after an interrupt in a call."""
+
+
+class ChildRequest(NamedTuple):
+    """Calls in another process: who runs them, by which words in shared memory, and which pipes.
+
+    Attributes
+    ----------
+    process : ChildFace
+        The process.
+    sequence : int
+        Number of the calls.
+    words : int
+        Address of the words.
+    commands, replies : int
+        Pipes to wake the process, and to be woken.
+    ordered : bool
+        False where each request and reply is announced in the pipes.
+    looks : int
+        Most looks at a reply before one sleeps.
+    """
+
+    process: ChildFace
+    sequence: int
+    words: int
+    commands: int
+    replies: int
+    ordered: bool
+    looks: int
 
 
 class BoundCalls:
@@ -51,6 +103,11 @@ class BoundCalls:
     def runner(self) -> Callable[[], int]:
         """Return `run` as a function, for a caller to whom each lookup counts."""
         return self.run
+
+    @property
+    def request(self) -> ChildRequest | None:
+        """The calls as a request to another process; None where they run in this one, or C can't ask for them."""
+        return None
 
     def warned_places(self) -> list[int]:
         """Return the places of the calls that gave a warning, where `run` has returned 1."""

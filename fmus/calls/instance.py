@@ -122,14 +122,15 @@ class FmuInstance(StepFailures):
         ins, outs = Transfer(self.fmi, "Set", self._inputs, inputs), Transfer(self.fmi, "Get", self._outputs, outputs)
         call = self.fmi.step_call(self._now, self._width, self._final)
         plain = ins.is_plain and outs.is_plain and not ins.has_limits
+        careful = needs_care(self.description, self.block.stepping)
         if self.fmi.in_process:
             self.step, self.exchange, self.read = (self._bind_plain if plain else self._bind_typed)(ins, outs, call)
         else:
             shared = SharedSteps(self, ins, outs, call)
             self.step, self.exchange, self.read = shared.bind_step(), shared.exchange, shared.read
             self.start_step, self.finish_step = shared.start, shared.finish
+            self._shared = None if careful or self._texts.variables else shared
         self._call = call
-        careful = needs_care(self.description, self.block.stepping)
         plain = plain and self.fmi.in_process and not careful and not self._texts.variables
         self._native = (call, ins, outs) if plain else None
         if careful:

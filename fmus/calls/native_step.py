@@ -1,9 +1,9 @@
-"""An FMU in this process: its step as addresses, for a loop in C, and its start values in two bound calls."""
+"""The step of an FMU as addresses, for a loop in C, and start values in two bound calls."""
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,9 +11,10 @@ import numpy as np
 
 from ..archive import FmuDescription
 from ..host_state import HostState
+from .bound_calls import ChildRequest
 from .fmi_calls import FmiCalls, StepCall
 from .texts import waits_for_initialization
-from .transfer import Transfer
+from .transfer import Transfer, TypeGroup
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,79 @@ def native_step(
         kept=(now, width, final, call, ins, outs),
         host=host,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class SharedValues:
+    """Values of one type between the vector of a run and memory that is shared with another process.
+
+    Attributes
+    ----------
+    vector : ndarray
+        The run's vector.
+    shared : ndarray
+        Values in the shared memory.
+    index : ndarray of int, or None
+        Their places in the vector; None for all of them in order.
+    low, high : ndarray or None
+        Of inputs: the least and the greatest of each value; None without limits.
+    """
+
+    vector: np.ndarray
+    shared: np.ndarray
+    index: np.ndarray | None
+    low: np.ndarray | None
+    high: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class RemoteStep:
+    """A step in another process as C asks for it; numbers are addresses.
+
+    Attributes
+    ----------
+    request : ChildRequest
+        The calls.
+    inputs, outputs : sequence of SharedValues
+        Values to be copied before and after them.
+    now, width, flags, reached : int
+        As those of `NativeStep`.
+    kept : tuple
+        Whatever must live as long as the addresses.
+    """
+
+    request: ChildRequest
+    inputs: Sequence[SharedValues]
+    outputs: Sequence[SharedValues]
+    now: int
+    width: int
+    flags: int
+    reached: int
+    kept: tuple[Any, ...]
+
+
+def remote_step(
+    request: ChildRequest, now: ctypes.c_double, width: ctypes.c_double, call: StepCall, ins: Transfer, outs: Transfer
+) -> RemoteStep | None:
+    """Return a step of a library in another process as addresses; None where inputs are of an odd enumeration."""
+    at = ctypes.addressof
+    given, found = ([_share(of, group) for group in of.groups if group.size] for of in (ins, outs))
+    low, high = ins.limits
+    for i, values in enumerate(given):
+        group = [group for group in ins.groups if group.size][i]
+        limits = group.limits
+        if limits is None:
+            return None
+        least, most = np.maximum(limits[0], low[group.index]), np.minimum(limits[1], high[group.index])
+        if group.is_integer or np.isfinite(least).any() or np.isfinite(most).any():
+            given[i] = SharedValues(values.vector, values.shared, values.index, least, most)
+    kept = (now, width, call, ins, outs)
+    return RemoteStep(request, given, found, at(now), at(width), at(call.flags), at(call.reached), kept)
+
+
+def _share(of: Transfer, group: TypeGroup) -> SharedValues:
+    index = None if group.is_whole else np.ascontiguousarray(group.index, dtype=np.int64)
+    return SharedValues(of.vector, group.buffer[: group.size], index, None, None)
 
 
 def _transfer(of: Transfer) -> NativeTransfer | None:

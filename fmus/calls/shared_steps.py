@@ -11,6 +11,7 @@ import numpy as np
 from ..archive import FmuVariable
 from .bound_calls import WARNING, BoundCalls
 from .fmi_calls import FmiCalls, StepCall
+from .native_step import RemoteStep, remote_step
 from .stepped_instance import SteppedInstance as Judge
 from .transfer import Transfer, UnfitError
 
@@ -82,6 +83,19 @@ class SharedSteps:
                 here[:] = there
 
         return step
+
+    @property
+    def remote(self) -> RemoteStep | None:
+        """The step as addresses, for a loop in C; None where C can't ask for it."""
+        request, instance = self._step.request, self.instance
+        if request is None:
+            return None
+        return remote_step(request, instance.now, instance.width, self.call, self.ins, self.outs)
+
+    def take_over(self, t: float, h: float) -> None:
+        """Go on with a step from t over h, both in s, that C has begun: `finish` ends it."""
+        self._t, self._h = t, h
+        self.instance.is_stepping = True
 
     def start(self, t: float, h: float) -> None:
         """Set the inputs, and begin a step from a time over a length, both in s."""

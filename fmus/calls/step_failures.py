@@ -12,6 +12,8 @@ from ...blocks.core import FmuRuntimeError
 from ..archive import FmuVariable
 from .fmi_calls import DISCARD, ERROR, FATAL, PENDING, WARNING, StepCall
 from .loaded_library import LoadedFmu
+from .native_step import RemoteStep
+from .shared_steps import SharedSteps
 from .stepped_instance import SteppedInstance
 from .transfer import OutOfRangeError, Transfer, UnfitError
 
@@ -32,6 +34,7 @@ class StepFailures(LoadedFmu):
     _now: ctypes.c_double
     _width: ctypes.c_double
     _call: StepCall | None = None
+    _shared: SharedSteps | None = None
     _has_retried = _has_been_off = False
     ends_run = False
     """Whether the FMU has asked to end the simulation."""
@@ -212,6 +215,8 @@ class StepFailures(LoadedFmu):
     def judge_native(self, stage: int, status: int, t: float, h: float) -> None:
         """Judge a step in C from t over h, both in s, that was out of the ordinary: raise its error, or accept it.
 
+        It is one of a library in this process; for others see `finish_remote`.
+
         Parameters
         ----------
         stage : {0, 1, 2}
@@ -230,6 +235,17 @@ class StepFailures(LoadedFmu):
         elif stage == 1:
             self.judge("a step", status, t)
         self.check_flags(self._call, t, h)
+
+    @property
+    def remote(self) -> RemoteStep | None:
+        """Its step in another process as C asks for it; None in this one, and where a step is more than its calls."""
+        return None if self._shared is None else self._shared.remote
+
+    def finish_remote(self, t: float, h: float) -> None:
+        """End a step from t over h, both in s, that C has begun in another process, and get the outputs."""
+        assert self._shared is not None
+        self._shared.take_over(t, h)
+        self._shared.finish()
 
     def note_retry(self, t: float, h: float, count: int) -> None:
         """Keep the message of the first step that was discarded."""

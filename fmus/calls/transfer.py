@@ -31,6 +31,11 @@ class Transfer:
         Variables by port.
     vector : array
         Values of all ports, one after the other.
+
+    Attributes
+    ----------
+    limits : tuple of ndarray
+        Least and greatest value of each entry of the vector; infinite without one.
     """
 
     def __init__(self, fmi: FmiCalls, verb: str, ports: dict[str, FmuVariable], vector: np.ndarray):
@@ -47,9 +52,8 @@ class Transfer:
         )
         self._bounded = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
         # A signal at its bound that was converted from another unit may be off by a rounding.
-        self._low, self._high = (
-            b[self._bounded] for b in (low - _ROUNDED * np.abs(low), high + _ROUNDED * np.abs(high))
-        )
+        self.limits = low - _ROUNDED * np.abs(low), high + _ROUNDED * np.abs(high)
+        self._low, self._high = (limit[self._bounded] for limit in self.limits)
 
     @property
     def plain_call(self) -> tuple[Callable[..., int], tuple[Any, ...]] | None:
@@ -188,6 +192,17 @@ class TypeGroup:
         self._kept = kept  # as long as its address is in the arguments
         self.function = fmi.value_function(verb, type_)
         self.arguments = fmi.value_arguments(kept, len(references), self.buffer.ctypes.data, self.size)
+
+    @property
+    def limits(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Least and greatest values (n,) of the type; None of an enumeration whose numbers have gaps."""
+        low, high = list[np.ndarray](), list[np.ndarray]()
+        for variable in self.ports.values():
+            if (found := variable.range_of_type) is None:
+                return None
+            low.append(np.full(variable.size, found[0]))
+            high.append(np.full(variable.size, found[1]))
+        return np.concatenate(low), np.concatenate(high)
 
     def check_and_fill(self, vector: np.ndarray) -> None:
         """Copy the values of the vector into the buffer."""

@@ -6,7 +6,6 @@ import ctypes
 import json
 import mmap
 import os
-import select
 import shutil
 import signal
 import struct
@@ -22,10 +21,11 @@ from typing import Any, NoReturn
 import numpy as np
 
 from ...blocks.core import FmuEnd, FmuError, FmuProcessError
-from ..calls import printf
+from ..calls import ChildRequest, printf
 from . import wire
 from .endings import copy_files, count_cores, read_end
 from .output import ChildOutput
+from .pipes import is_readable, make_poll
 from .wire import (
     CAUSE,
     CHILD_SLEEPS,
@@ -61,6 +61,8 @@ class ChildProcess:
         Private folder; its ``fmu`` is the copy of the files, its ``work`` the working folder.
     told : callable
         Takes status and text of the FMU's log messages.
+    arrived : bool
+        Whether C has seen the reply to the last request, which nobody has finished yet.
     used : bool
         Whether it can't be used again, since a call has failed or was interrupted.
     """
@@ -69,7 +71,7 @@ class ChildProcess:
         self.name, self.size, self.memory_limit, self.output_limit = name, size, int(memory), int(output)
         self.told: Callable[[int, str], None] = lambda status, text: None
         self.lose: Callable[[FmuProcessError], FmuProcessError] = lambda error: error
-        self.used, self.alive = False, False
+        self.used = self.alive = self.arrived = False
         self.folder = Path(tempfile.mkdtemp(prefix="loopwright-fmu-"))
         self._peak = 0
         self._output = ChildOutput(self.folder)
@@ -126,9 +128,7 @@ class ChildProcess:
             )
         commands, replies = self._process.stdin, self._process.stdout
         self._in, self._out = (pipe.fileno() for pipe in (commands, replies) if pipe is not None)
-        self._poll = select.poll() if hasattr(select, "poll") else None
-        if self._poll is not None:
-            self._poll.register(self._out, select.POLLIN)
+        self._poll = make_poll(self._out)
         self.alive = True
 
     @property
@@ -184,7 +184,7 @@ class ChildProcess:
             With the text of the child's exception.
         """
         self._call = call
-        self._check_alive(call)
+        self.check_alive(call)
         memory, words, file = self._memory, self.words, str(self.folder / "mail")
         wire.write_message(memory, words, file, [operation, *arguments], blobs)
         self.post(MAIL)
@@ -208,7 +208,7 @@ class ChildProcess:
         """Begin to run a bound sequence, or to read the mailbox."""
         words = self.words
         if not self.alive:
-            self._check_alive(self._place_name(sequence))
+            self.check_alive(self._place_name(sequence))
         words[SEQUENCE] = sequence
         words[REQUEST] = self.number = self.number + 1
         wire.order_memory()
@@ -224,7 +224,7 @@ class ChildProcess:
 
     def finish(self, sequence: int, seconds: float) -> int:
         """Return the status of a sequence that was posted; see `failed_place`."""
-        words, number, get, patience = self.words, self.number, self.words.__getitem__, self.patience
+        number, get, patience = self.number, self.words.__getitem__, self.patience
         try:
             for _ in range(patience.looks):
                 if get(REPLY) == number:
@@ -238,9 +238,21 @@ class ChildProcess:
         except BaseException:  # an interrupt: the reply is still to come
             self.give_up()
             raise
-        if words[MESSAGES]:
+        return self.collect()
+
+    def collect(self) -> int:
+        """Return the status of a sequence whose reply is there."""
+        self.arrived = False
+        if self.words[MESSAGES]:
             self.fetch_messages()
-        return words[STATUS]
+        return self.words[STATUS]
+
+    def request_of(self, sequence: int) -> ChildRequest | None:
+        """Return a bound sequence as C asks for it; None where C can't sleep for its reply."""
+        if os.name != "posix":
+            return None
+        looks = _LOOKS if self._watches else 0
+        return ChildRequest(self, sequence, self._base, self._in, self._out, wire.ORDERED, looks)
 
     def give_up(self) -> None:
         """End the process after an interrupt in a call."""
@@ -254,7 +266,7 @@ class ChildProcess:
         wire.order_memory()
         arrived = wire.ORDERED  # else the byte in the pipe says that the reply is written
         while words[REPLY] != number or not arrived:
-            if self._is_readable(_LOOK):
+            if is_readable(self._poll, self._out, _LOOK):
                 arrived = True
                 if not os.read(self._out, 4096) and words[REPLY] != number:
                     self._fail(self._place_name(sequence))
@@ -264,23 +276,6 @@ class ChildProcess:
                 if time.monotonic() >= deadline:
                     self._fail(self._place_name(sequence), FmuEnd.TIMEOUT, seconds=seconds)
         words[PARENT_SLEEPS] = 0
-
-    def _is_readable(self, seconds: float) -> bool:
-        if self._poll is not None:
-            return bool(self._poll.poll(seconds * 1000))
-        import _winapi  # not tried
-        import msvcrt
-
-        handle, end = msvcrt.get_osfhandle(self._out), time.monotonic() + seconds  # type: ignore[attr-defined]
-        while True:
-            try:
-                if _winapi.PeekNamedPipe(handle, 0)[0]:  # type: ignore[attr-defined]
-                    return True
-            except OSError:
-                return True  # closed: reading says so
-            if time.monotonic() >= end:
-                return False
-            time.sleep(0.0005)
 
     @property
     def failed_place(self) -> int:
@@ -307,7 +302,8 @@ class ChildProcess:
 
     # ---- the end ----
 
-    def _check_alive(self, call: str) -> None:
+    def check_alive(self, call: str) -> None:
+        """Raise the error of a process that has ended before a call."""
         if not self.alive:
             text = f"the process of the FMU {self.name!r} has ended before {call}. Run it again."
             raise self.lose(FmuProcessError(text, call=call, cause=FmuEnd.LOST))

@@ -17,6 +17,7 @@ from ..calls import (
     WARNING,
     BoundCalls,
     Call,
+    ChildRequest,
     FmiCalls,
     Log,
     bind_functions,
@@ -62,8 +63,14 @@ class RemoteBoundCalls(BoundCalls):
 
     def finish(self) -> int:
         """Wait for the child, and return the status."""
-        status = self._process.finish(self._sequence, self._seconds)
+        process = self._process
+        status = process.collect() if process.arrived else process.finish(self._sequence, self._seconds)
         return self._note(status) if status else 0
+
+    @property
+    def request(self) -> ChildRequest | None:
+        """The calls as a request to the child; None where C can't sleep for its reply."""
+        return self._process.request_of(self._sequence)
 
     def _note(self, status: int) -> int:
         if status == WARNING:

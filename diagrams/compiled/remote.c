@@ -1,0 +1,210 @@
+/* FMUs in processes of their own: requests and replies are words in the memory that both sides share.
+
+   A request is posted, then its reply is watched for a while, then slept for. Whatever is out of the ordinary is left to
+   Python with the request as it is: under way, or answered. It stands behind `newton.c` and before `master.c`. */
+
+#ifndef _WIN32
+#include <errno.h>
+#include <poll.h>
+#include <time.h>
+#include <unistd.h>
+#endif
+
+/* Places of words, as `wire.py` has them. */
+enum { AT_REQUEST = 0, AT_REPLY = 8, CHILD_SLEEPS = 16, PARENT_SLEEPS = 24, AT_SEQUENCE = 32, AT_STATUS = 33, AT_MESSAGES = 40 };
+enum { FEWEST = 4, RAREST = 1024 };
+enum { SLICE = 50, TURN = 100 }; /* ms to sleep for a reply, and of a call, before Python has its turn */
+
+enum { FLOAT64, FLOAT32, INT8, UINT8, INT16, UINT16, INT32, UINT32, INT64, UINT64, BOOL8 };
+#define EXACT 9007199254740992.0 /* size up to which a float64 holds every integer */
+
+/* Values of one type, between the vector of the run and the memory that is shared. */
+typedef struct {
+    int64_t kind, count;
+    const int64_t *index; /* places in the vector; NULL: the first ones */
+    double *vector;
+    void *shared;
+    const double *low, *high; /* of inputs, limits of each value; NULL: none */
+} values;
+
+enum { IDLE, POSTED, ARRIVED };
+
+typedef struct {
+    uint64_t *words;
+    uint64_t sequence, number;
+    int32_t commands, replies; /* pipes */
+    int32_t ordered;           /* false: each request and reply is announced by a byte in a pipe */
+    int32_t state;
+    int64_t most, looks, left, pause; /* see `wire.Patience` */
+    int64_t inputs, outputs;
+    const values *to, *from;
+} remote;
+
+/* Of all such FMUs of a run: the time at which Python has its turn, in ms; 0 before the first step. */
+typedef struct {
+    int64_t until;
+    int64_t late;
+} apart;
+
+#define READ(word) __atomic_load_n(&(word), __ATOMIC_ACQUIRE)
+#define WRITE(word, value) __atomic_store_n(&(word), value, __ATOMIC_RELEASE)
+#define FENCE() __atomic_thread_fence(__ATOMIC_SEQ_CST)
+
+static inline void relax(void) {
+#if defined(__x86_64__)
+    __builtin_ia32_pause();
+#elif defined(__aarch64__)
+    __asm__ volatile("yield");
+#endif
+}
+
+#define EACH(type, expression)                                                                                         \
+    do {                                                                                                               \
+        type *at = (type *)v->shared;                                                                                  \
+        for (int64_t i = 0; i < v->count; i++) {                                                                       \
+            double *of = v->vector + (v->index ? v->index[i] : i);                                                     \
+            expression;                                                                                                \
+        }                                                                                                              \
+    } while (0)
+#define FOR_KIND(PUT)                                                                                                  \
+    switch (v->kind) {                                                                                                 \
+    case FLOAT64: EACH(double, PUT(double)); break;                                                                    \
+    case FLOAT32: EACH(float, PUT(float)); break;                                                                      \
+    case INT8: EACH(int8_t, PUT(int8_t)); break;                                                                       \
+    case UINT8: EACH(uint8_t, PUT(uint8_t)); break;                                                                    \
+    case INT16: EACH(int16_t, PUT(int16_t)); break;                                                                    \
+    case UINT16: EACH(uint16_t, PUT(uint16_t)); break;                                                                 \
+    case INT32: EACH(int32_t, PUT(int32_t)); break;                                                                    \
+    case UINT32: EACH(uint32_t, PUT(uint32_t)); break;                                                                 \
+    case INT64: EACH(int64_t, PUT(int64_t)); break;                                                                    \
+    case UINT64: EACH(uint64_t, PUT(uint64_t)); break;                                                                 \
+    default: EACH(uint8_t, PUT(bool)); break;                                                                          \
+    }
+#define TAKE(type) at[i] = (type)*of
+#define GIVE(type) *of = (double)(type)at[i]
+
+/* Copy inputs to the shared memory; false where a value doesn't surely fit, and nothing is said about it here. */
+static inline bool fill(const values *v) {
+    if (v->kind == FLOAT64 && !v->index && !v->low) {
+        memcpy(v->shared, v->vector, (size_t)v->count * sizeof(double));
+        return true;
+    }
+    for (int64_t i = 0; v->low && i < v->count; i++) {
+        const double x = v->vector[v->index ? v->index[i] : i];
+        if (x < v->low[i] || x > v->high[i]) return false;
+        if (v->kind > FLOAT32 && !(x == rint(x))) return false;
+    }
+    FOR_KIND(TAKE)
+    return true;
+}
+
+/* Copy outputs from the shared memory; false where the vector can't hold one. */
+static inline bool spread(const values *v) {
+    if (v->kind == FLOAT64 && !v->index) {
+        memcpy(v->vector, v->shared, (size_t)v->count * sizeof(double));
+        return true;
+    }
+    if (v->kind == INT64)
+        for (int64_t i = 0; i < v->count; i++) {
+            const int64_t x = ((const int64_t *)v->shared)[i];
+            if (x > (int64_t)EXACT || x < -(int64_t)EXACT) return false;
+        }
+    if (v->kind == UINT64)
+        for (int64_t i = 0; i < v->count; i++)
+            if (((const uint64_t *)v->shared)[i] > (uint64_t)EXACT) return false;
+    FOR_KIND(GIVE)
+    return true;
+}
+
+#ifdef _WIN32 /* such FMUs are never given to C there */
+static inline int64_t milliseconds(void) { return 0; }
+static inline void post(remote *r) { (void)r; }
+static inline bool answers(remote *r, apart *a) { return (void)r, (void)a, false; }
+#else
+static inline int64_t milliseconds(void) {
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return now.tv_sec * INT64_C(1000) + now.tv_nsec / 1000000;
+}
+
+/* Let the child begin; a pipe that is closed shows while its reply is waited for. */
+static inline void post(remote *r) {
+    uint64_t *words = r->words;
+    words[AT_SEQUENCE] = r->sequence;
+    WRITE(words[AT_REQUEST], ++r->number);
+    r->state = POSTED;
+    FENCE();
+    if (!r->ordered || READ(words[CHILD_SLEEPS]))
+        while (write(r->commands, "w", 1) < 0 && errno == EINTR) continue;
+}
+
+/* Sleep until the reply is there; false if it has not come in time, or never will. */
+static bool sleep_for_reply(remote *r, apart *a) {
+    uint64_t *words = r->words;
+    const int64_t end = milliseconds() + SLICE;
+    int64_t left = SLICE;
+    bool told = r->ordered;
+    char bytes[4096];
+    WRITE(words[PARENT_SLEEPS], 1);
+    FENCE();
+    while (!told || READ(words[AT_REPLY]) != r->number) {
+        struct pollfd pipe = {r->replies, POLLIN, 0};
+        const int found = left > 0 ? poll(&pipe, 1, (int)left) : 0;
+        if (found > 0) {
+            if (read(r->replies, bytes, sizeof bytes) <= 0) break;
+            told = true;
+        } else if (found < 0 && errno == EINTR)
+            a->late = 1; /* Ctrl-C, perhaps: Python looks after this tick */
+        else
+            break;
+        left = end - milliseconds();
+    }
+    WRITE(words[PARENT_SLEEPS], 0);
+    return told && READ(words[AT_REPLY]) == r->number;
+}
+
+/* Wait for a reply. Where watching was in vain it is tried again after ever longer pauses. */
+static inline bool answers(remote *r, apart *a) {
+    for (int64_t n = r->looks; n > 0; n--) {
+        if (READ(r->words[AT_REPLY]) == r->number) {
+            r->pause = FEWEST;
+            return true;
+        }
+        relax();
+    }
+    if (r->looks) {
+        r->looks = 0;
+        r->left = r->pause;
+        r->pause = 2 * r->pause < RAREST ? 2 * r->pause : RAREST;
+    } else if (--r->left <= 0)
+        r->looks = r->most;
+    return sleep_for_reply(r, a);
+}
+#endif
+
+static inline bool fill_all(const remote *r) {
+    for (int64_t i = 0; i < r->inputs; i++)
+        if (!fill(r->to + i)) return false;
+    return true;
+}
+
+/* Take the reply to a step; false if Python must look at it. */
+static inline bool take_reply(remote *r, apart *a) {
+    if (!answers(r, a)) return false;
+    r->state = ARRIVED;
+    return !r->words[AT_MESSAGES] && !r->words[AT_STATUS];
+}
+
+static inline bool spread_all(remote *r) {
+    for (int64_t i = 0; i < r->outputs; i++)
+        if (!spread(r->from + i)) return false;
+    r->state = IDLE;
+    return true;
+}
+
+/* Note the time after a step: a call is over before Python has waited long for its turn. */
+static inline void look_at_clock(apart *a) {
+    const int64_t now = milliseconds();
+    if (!a->until) a->until = now + TURN;
+    if (now >= a->until) a->late = 1;
+}

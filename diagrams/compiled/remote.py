@@ -1,0 +1,121 @@
+"""FMUs in processes of their own, as the loop in C asks them for steps."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from ...fmus.calls import ChildFace, RemoteStep, SharedValues
+from .native_tick import at
+
+UNDER_WAY, REFUSED = 3, 4
+"""Stages at which such an FMU is left to Python: its step has begun, or no step has, as an input doesn't fit."""
+_KINDS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "b1")
+_FEWEST = 4  # `wire.FEWEST`
+_IDLE, _POSTED, _ARRIVED = range(3)
+
+
+class _Values(ctypes.Structure):
+    _fields_ = [
+        ("kind", ctypes.c_int64),
+        ("count", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("index", "vector", "shared", "low", "high")),
+    ]
+
+
+class RemoteStructure(ctypes.Structure):
+    """The requests to one process, as C knows them."""
+
+    _fields_ = [
+        ("words", ctypes.c_void_p),
+        ("sequence", ctypes.c_uint64),
+        ("number", ctypes.c_uint64),
+        *((name, ctypes.c_int32) for name in ("commands", "replies", "ordered", "state")),
+        *((name, ctypes.c_int64) for name in ("most", "looks", "left", "pause", "inputs", "outputs")),
+        ("to", ctypes.c_void_p),
+        ("from", ctypes.c_void_p),
+    ]
+
+
+class _Apart(ctypes.Structure):
+    _fields_ = [("until", ctypes.c_int64), ("late", ctypes.c_int64)]
+
+
+class RemotePlants:
+    """The FMUs of a loop that are in processes of their own.
+
+    Attributes
+    ----------
+    structure : ctypes.Structure
+        What they have in common, as C knows it.
+    """
+
+    def __init__(self) -> None:
+        self.structure = _Apart()
+        self._all: list[tuple[ChildFace, RemoteStructure]] = []
+        self._kept: list[Any] = []
+
+    @property
+    def address(self) -> int | None:
+        """Address of what they have in common; None if there are none."""
+        return ctypes.addressof(self.structure) if self._all else None
+
+    def add(self, step: RemoteStep) -> int:
+        """Take an FMU, and return the address of its structure."""
+        asked = step.request
+        made = RemoteStructure(
+            words=asked.words,
+            sequence=asked.sequence,
+            commands=asked.commands,
+            replies=asked.replies,
+            ordered=asked.ordered,
+            most=asked.looks,
+            left=_FEWEST,
+            pause=_FEWEST,
+            inputs=len(step.inputs),
+            outputs=len(step.outputs),
+            to=self._values(step.inputs),
+        )
+        setattr(made, "from", self._values(step.outputs))
+        self._kept.append(step)
+        self._all.append((asked.process, made))
+        return ctypes.addressof(made)
+
+    def _values(self, values: Sequence[SharedValues]) -> int:
+        array = (_Values * max(1, len(values)))()
+        for place, one in zip(array, values, strict=False):
+            index, low, high = (None if v is None else np.ascontiguousarray(v) for v in (one.index, one.low, one.high))
+            self._kept += [index, low, high]
+            place.kind, place.count = _KINDS.index(one.shared.dtype.str[1:]), one.shared.size
+            place.vector, place.shared = at(one.vector), at(one.shared)
+            place.index, place.low, place.high = (None if v is None else at(v) for v in (index, low, high))
+        self._kept.append(array)
+        return ctypes.addressof(array)
+
+    @contextmanager
+    def guard(self) -> Iterator[None]:
+        """Let C make the requests meanwhile.
+
+        Raises
+        ------
+        FmuProcessError
+            If a process has ended before.
+        """
+        self.structure.until = self.structure.late = 0
+        for process, structure in self._all:
+            process.check_alive("its next step")
+            structure.number, structure.state = process.number, _IDLE
+        try:
+            yield
+        except BaseException:  # an interrupt: replies are still to come
+            for process, structure in self._all:
+                process.number = structure.number
+                if structure.state != _IDLE:
+                    process.give_up()
+            raise
+        for process, structure in self._all:
+            process.number, process.arrived = structure.number, structure.state == _ARRIVED

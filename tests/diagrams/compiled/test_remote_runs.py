@@ -1,0 +1,308 @@
+"""FMUs in processes of their own under a loop in C: the bits and the words of interpreted runs. The zoo's is y' = u."""
+
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import (
+    Block,
+    Compare,
+    FmuEnd,
+    FmuProcessError,
+    FmuRuntimeError,
+    Integrator,
+    Output,
+    Sine,
+    StopCondition,
+)
+from loopwright.diagrams import Diagram, Interrupted, subsystem
+from loopwright.fmus import Fmu, Isolation, StepOptions, build_fmu
+from loopwright.fmus.isolation import count_processes, end_idle
+from support.exported import mass_spring_damper
+from support.typed_fmus import typed_fmu
+from support.zoo import zoo_fmu
+
+SHORT = Isolation(step_time=0.5, start_time=0.5)
+QUIET = {"progress": False}
+ROUNDED = 1e-12  # of sums of some thousand steps
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("zoo")
+
+
+@pytest.fixture(autouse=True)
+def nothing_left():
+    """No test leaves a process behind."""
+    yield
+    end_idle()
+    assert count_processes() == (0, 0)
+
+
+def zoo(file, name="plant", isolate=SHORT, **options):
+    return Fmu(file, name=name, isolate=isolate, **options)
+
+
+def loop(*plants, period=0.01):
+    """Each plant under a proportional controller: y is multiplied by 1 − 2·period at each tick."""
+
+    def controlled(plant):
+        @subsystem(sample_time=period, name=f"{plant.name}_controller")
+        def controller(y):
+            return 2.0 * (1.0 - y)
+
+        return plant(u=controller(plant.y))
+
+    return Diagram("loop", *map(controlled, plants))
+
+
+def simulate(made, duration, in_c, **options):
+    run = made.simulate(duration, compile=in_c, **QUIET, **options)
+    assert run.tier == ("compiled" if in_c else "interpreted"), run.messages
+    return run
+
+
+def both(made, duration, **options):
+    return (simulate(made, duration, c, **options) for c in (False, True))
+
+
+def assert_same_bits(first, second):
+    assert first.t.tobytes() == second.t.tobytes()
+    assert first.data.tobytes() == second.data.tobytes()
+    assert first.stopped == second.stopped
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_loop_with_an_isolated_fmu_is_compiled(folder, fmi):
+    """1 − y is multiplied by 1 − 2·0.01 in each step, as the input is held over it."""
+    one, two = both(loop(zoo(zoo_fmu(folder, fmi))), 5.0)
+    assert_same_bits(one, two)
+    assert np.allclose(1.0 - two["plant.y"], 0.98 ** np.arange(501), atol=ROUNDED)
+
+
+def test_several_fmus_here_and_there_share_their_ticks(folder, cache):
+    file = zoo_fmu(folder, 3)
+    plants = [zoo(file, "a"), zoo(file, "b", False), zoo(file, "c"), zoo(file, "d", False)]
+    one, two = both(loop(*plants), 1.0)
+    assert_same_bits(one, two)
+    for name in "abcd":
+        assert np.allclose(1.0 - two[f"{name}.y"], 0.98 ** np.arange(101), atol=ROUNDED)
+    mass = Fmu(build_fmu(mass_spring_damper()), name="mass", isolate=True)
+    assert_same_bits(*both(Diagram("d", mass(force=Sine(name="s", frequency=3.0))), 0.5, step=1e-3))
+
+
+def test_they_step_at_the_same_time(folder):
+    """Each step sleeps for 20 ms: ten of two plants take 0.2 s side by side, 0.4 s one after the other."""
+    file = zoo_fmu(folder, 3, "step slow")
+    made = loop(zoo(file, "a"), zoo(file, "b"))
+    simulate(made, 0.01, True)
+    with made.simulation(compile=True) as s:
+        began = time.perf_counter()
+        s.advance(0.1)
+        assert time.perf_counter() - began < 0.36
+        assert s.run().tier == "compiled"
+
+
+def test_it_works_where_memory_is_not_written_in_order(folder, monkeypatch):
+    """There every request and reply is announced by a byte in a pipe; so it is for replies that Python takes."""
+    end_idle()
+    monkeypatch.setattr("loopwright.fmus.isolation.wire.ORDERED", False)
+    run = simulate(loop(zoo(zoo_fmu(folder, 3))), 1.0, True)
+    assert np.allclose(1.0 - run["plant.y"], 0.98 ** np.arange(101), atol=ROUNDED)
+    warned = simulate(loop(zoo(zoo_fmu(folder, 3, "step warning 0.5"))), 1.0, True)
+    assert warned.data.tobytes() == run.data.tobytes()
+    with pytest.raises(FmuProcessError, match="SIGSEGV"):
+        simulate(loop(zoo(zoo_fmu(folder, 3, "step segfault 0.05"))), 1.0, True)
+
+
+FAULTS = [
+    "step segfault", "step divide_trapped", "step exit0", "step deaf_hang", "get segfault", "step log_hang",
+    "step error", "step discard", "step fatal", "step minus", "step no_memory",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("beside", [False, True], ids=["alone", "beside"])
+@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.drawn
+def test_a_fault_is_told_as_in_an_interpreted_run(folder, fault, fmi, beside):
+    file = zoo_fmu(folder, fmi, f"{fault} 0.05")
+    isolate = Isolation(memory=200e6, step_time=0.5) if "memory" in fault else SHORT
+    others = [zoo(zoo_fmu(folder, fmi), "other")] if beside else []
+    found = []
+    for in_c in (False, True):
+        with pytest.raises((FmuProcessError, FmuRuntimeError)) as caught:
+            loop(zoo(file, isolate=isolate), *others).simulate(0.2, compile=in_c, **QUIET)
+        found.append(caught.value)
+    one, two = found
+    assert type(one) is type(two)
+    assert (str(one), one.block, one.t) == (str(two), two.block, two.t)
+    assert getattr(one, "cause", None) is getattr(two, "cause", None)
+    assert_same_bits(one.run, two.run)
+    assert two.run.tier == "compiled"
+    assert np.allclose(1.0 - two.run["plant.y"], 0.98 ** np.arange(len(two.run.t)), atol=ROUNDED)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("fault", ["warning", "print", "slow", "rounding", "thread", "fork_on", "odd_log", "leak"])
+@pytest.mark.drawn
+def test_an_odd_fmu_runs_on_in_c_and_its_words_are_told_once(folder, fault, fmi):
+    made = loop(zoo(zoo_fmu(folder, fmi, f"step {fault} 0.05")))
+    one, two = both(made, 0.2)
+    assert_same_bits(one, two)
+    told = [[m for m in run.messages if "t =" in m or "warning" in m or "printed" in m] for run in (one, two)]
+    assert told[0] == told[1]
+    if fault == "warning":
+        assert len([m for m in told[1] if "a step" in m]) == 1
+
+
+class Late(Block):
+    """A value from 20 ms on, 1 before it."""
+
+    value: float
+    y = Output()
+
+    def output(self, t, x, u):
+        return np.where(t < 0.0195, 1.0, self.value)
+
+
+LAST = {
+    "Float64": 0.1, "Float32": 0.1, "Int8": -128, "UInt8": 200, "Int16": -32768, "UInt16": 65535, "Int32": -(2**31),
+    "UInt32": 2**32 - 1, "Int64": -(2**53), "UInt64": 2**53, "Boolean": 0, "Real": -1e300, "Integer": 2**31 - 1,
+}  # fmt: skip
+
+
+def typed(folder, fmi, **values):
+    """An FMU with ports of many types, each with a value of its own from 20 ms on; the outputs repeat the inputs."""
+    whole = Fmu(typed_fmu(folder, fmi), name="plant")
+    names = [name for name in whole.inputs if name[2:] in LAST]
+    plant = whole.replace(ports=[*names, *("y" + name[1:] for name in names)])
+    given = {name: values.get(name, LAST[name[2:]]) for name in names}
+    return Diagram("d", plant(**{name: Late(name=f"of_{name}", value=float(v)) for name, v in given.items()})), given
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_numbers_of_every_type_pass_through(folder, fmi):
+    made, given = typed(folder, fmi)
+    one, two = both(made, 0.05, step=0.01)
+    assert_same_bits(one, two)
+    for name, value in given.items():
+        held = np.float32(value) if name == "u_Float32" else value
+        assert two[f"plant.y{name[1:]}"].tolist() == [1.0, 1.0, 1.0, held, held, held]
+
+
+@pytest.mark.parametrize(
+    ("port", "value"), [("u_Int8", 0.5), ("u_Int8", 128.0), ("u_Int64", 2.0**53 + 2.0), ("u_Boolean", 2.0),
+                        ("u_Float32", 1e39), ("u_UInt16", -1.0)]
+)  # fmt: skip
+@pytest.mark.drawn(3)
+def test_an_input_that_does_not_fit_is_told_as_in_an_interpreted_run(folder, port, value):
+    made, _ = typed(folder, 3, **{port: value})
+    found = []
+    for in_c in (False, True):
+        with pytest.raises(FmuRuntimeError, match=rf"^plant\.{port}, t = 0\.02 s: found ") as caught:
+            made.simulate(0.05, step=0.01, compile=in_c, **QUIET)
+        found.append(caught.value)
+    assert str(found[0]) == str(found[1])
+    assert_same_bits(found[0].run, found[1].run)
+
+
+@pytest.mark.parametrize("in_c", [False, True])
+def test_a_crash_between_two_advances_is_told(folder, in_c):
+    with loop(zoo(zoo_fmu(folder, 3))).simulation(compile=in_c) as s:
+        s.advance(0.5)
+        os.kill(s._engine.plants["plant"].fmi.process.pid, signal.SIGKILL)
+        with pytest.raises(FmuProcessError, match="SIGKILL") as caught:
+            s.advance(0.5)
+        assert caught.value.cause is FmuEnd.CRASH
+        assert caught.value.t == pytest.approx(0.5)
+
+
+def test_states_go_between_the_forms(cache):
+    """Saved compiled, restored interpreted, and the other way; two branches from one state."""
+    force = Sine(name="force", frequency=3.0)
+    made = Diagram("d", Fmu(build_fmu(mass_spring_damper()), name="mass", isolate=True)(force=force))
+    whole = simulate(made, 1.0, True, step=0.01)
+    for first, second in ((True, False), (False, True)):
+        with made.simulation(compile=first, step=0.01) as s:
+            s.advance(0.5)
+            state = s.save()
+            s.advance(0.5)
+            assert s.run().data.tobytes() == whole.data.tobytes()
+            s.restore(state)
+            s.advance(0.5)
+            assert s.run().data.tobytes() == whole.data[50:].tobytes()
+        with made.simulation(compile=second, step=0.01, start=state) as s:
+            s.advance(0.5)
+            assert s.run().data.tobytes() == whole.data[50:].tobytes()
+
+
+def test_the_change_over_makes_no_difference(folder):
+    made = loop(zoo(zoo_fmu(folder, 3)), period=1e-4)
+    one = simulate(made, 1.0, False)
+    auto = made.simulate(1.0, compile="auto", **QUIET)
+    assert auto.data.tobytes() == one.data.tobytes()
+    simulate(made, 0.1, True)
+    assert made.simulate(1.0, compile="auto", **QUIET).tier == "both"
+
+
+def test_a_run_is_streamed_and_stopped(folder, tmp_path):
+    made = loop(zoo(zoo_fmu(folder, 3)))
+    y = zoo(zoo_fmu(folder, 3))(u=1.0)
+    stopping = Diagram("stop", y, StopCondition(name="end")(Compare(name="c")(y, 0.255)))
+    one, two = both(stopping, 1.0, step=0.01)
+    assert_same_bits(one, two)
+    assert two.t[-1] == pytest.approx(0.26)
+    whole = simulate(made, 1.0, True)
+    streamed = simulate(made, 1.0, True, to=tmp_path / "run")
+    assert streamed.data.tobytes() == whole.data.tobytes()
+
+
+@pytest.fixture
+def interruptible():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize(("fault", "within"), [("", 0.25), ("step slow", 0.25), ("step deaf_hang 0.1", 0.4)])
+def test_ctrl_c_ends_a_run_soon(folder, interruptible, fault, within):
+    made = loop(zoo(zoo_fmu(folder, 3, fault), isolate=True), period=1e-3 if not fault else 0.01)
+    simulate(made, 0.05, True)
+    sent = []
+
+    def send():
+        sent.append(time.perf_counter())
+        os.kill(os.getpid(), signal.SIGINT)
+
+    timer = threading.Timer(0.5, send)
+    timer.start()
+    try:
+        with pytest.raises(Interrupted) as caught:
+            made.simulate(1e5, compile=True, record=["plant.y"], every=100, **QUIET)
+    finally:
+        timer.cancel()
+    assert time.perf_counter() - sent[0] < within
+    assert len(caught.value.run.t) > 0
+
+
+def test_other_couplings_are_interpreted_and_say_so(folder):
+    plant = zoo(zoo_fmu(folder, 3), "b", stepping=StepOptions(rollback=True))(u=1.0)
+    run = Diagram("d", plant).simulate(0.1, compile=True, step=0.01, **QUIET)
+    assert run.tier == "interpreted"
+    assert any("'b' has" in message for message in run.messages)
+
+
+def test_fmus_stand_beside_continuous_states(folder):
+    """x' = −x with the plant integrating it: y = 1 − x but for the inputs that are held over each step."""
+    x = Integrator(name="x", initial_value=1.0)
+    plants = [zoo(zoo_fmu(folder, 3), name)(u=x.y) for name in "ab"]
+    one, two = both(Diagram("d", x(-1.0 * x.y), *plants), 1.0, step=0.01, solver="rk4")
+    assert_same_bits(one, two)
+    held = 0.01 * np.concatenate([[0.0], np.cumsum(np.exp(-two.t[:-1]))])
+    assert np.allclose(two["a.y"], held, atol=1e-9)
