@@ -1,6 +1,7 @@
 """Plants of a run: loaded, stepped between their communication points, and coupled with one another."""
 
 from .coupled_steps import CoupledSteps, Effort, tells_slopes
+from .fixed_points import find_fixed_point
 from .links import Links
 from .loops import note_loops
 from .options import Coupling, Scheme, refuse_exchanged, to_coupling
@@ -25,6 +26,7 @@ __all__ = [
     "Search",
     "accept_steps",
     "end_all",
+    "find_fixed_point",
     "load_plants",
     "note_fine_steps",
     "note_loops",

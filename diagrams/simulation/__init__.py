@@ -1,7 +1,8 @@
 """The loop over ticks, and between them."""
 
+from .diagnosis import START_SETTLED
 from .engine import Engine
-from .initialize import START_SETTLED, find_initial_state, find_start_values, values_from_left
+from .initialize import find_initial_state, find_start_values, values_from_left
 from .progress import Interrupted, late_progress, progress_bar
 from .run_options import START_EXCHANGES, KeptKeywords, RunKeywords, RunOptions, default_step, refuse_rest, ticks_in
 from .simulated_diagram import SimulatedDiagram

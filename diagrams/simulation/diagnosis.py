@@ -1,4 +1,7 @@
-"""The block that made a value that is not finite: the instant is evaluated again, block by block, with numbers."""
+"""Errors that name a block: one that made a value that is not finite, and one whose values at the start are not found.
+
+For the first the instant is evaluated again, block by block, with numbers.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,9 @@ import numpy as np
 from ...blocks.core import NonFiniteError, SimulationError
 from ...blocks.tracing import GUARDS, NEXT, bundle, raise_failure
 from ..flat import Evaluators, FlatDiagram, Instant, TickPattern, Vectors, evaluate, evaluate_apart
+
+START_SETTLED = 1e-13
+"""Relative change of a value at the start between two passes that is rounding: a few hundred ulps."""
 
 
 def failure(
@@ -132,6 +138,44 @@ def inputs_text(inputs: dict[str, Any]) -> str:
 def _non_finite(path: str, port: str, values: np.ndarray, hint: str) -> NonFiniteError:
     return NonFiniteError(
         f"found {values.tolist()}; expected finite numbers. This is the first block that made such a value. {hint}",
+        block=path,
+        port=port,
+    )
+
+
+def unsolved_start(flat: FlatDiagram, last: np.ndarray, x: np.ndarray, passes: int) -> SimulationError:
+    """Return the error of initial states that depend on themselves; ``last`` are those of the pass before."""
+    path = next(
+        (
+            p
+            for p, s in flat.states.slices.items()
+            if not np.allclose(last[s], x[s], rtol=START_SETTLED, atol=START_SETTLED)
+        ),
+        "",
+    )
+    loops = "\n".join(flat.start_order.loops)
+    return SimulationError(
+        f"its initial state depends on itself, and is not found: after {passes} passes it still changes.\n"
+        f"{loops}\nGive it an initial_value, or one to another block of this loop.",
+        block=path or flat.start_order.torn[0][0],
+    )
+
+
+def unsettled(flat: FlatDiagram, before: np.ndarray, z: np.ndarray, passes: int) -> SimulationError:
+    """Return the error of inputs of FMUs or delays that depend on their outputs; ``before`` are those a pass before."""
+    slices = flat.plant_inputs.slices
+    changed = (n for n, s in slices.items() if not np.allclose(before[s], z[s], rtol=START_SETTLED, atol=0.0))
+    name = next(changed, next(iter(slices)))
+    path, port = flat.ports[name]
+    delay = flat.table.blocks[path].transport
+    own, step = (
+        ("its own output", "Give it an initial_value.")
+        if delay
+        else ("the FMU's own outputs", "Put a UnitDelay(initial_value=…) on one of the wires between.")
+    )
+    return SimulationError(
+        f"its value at the start depends on {own}, and is not found: after {passes} passes it "
+        f"still changes, from {before[slices[name]].tolist()} to {z[slices[name]].tolist()}. {step}",
         block=path,
         port=port,
     )

@@ -14,18 +14,21 @@ import numpy as np
 
 from ...blocks.core import Block, LoopwrightError, NonFiniteError, SimulationError
 from ...blocks.tracing import bundle, initial_state
-from ..coupling import Links, Plant, Search
+from ..coupling import Links, Plant, find_fixed_point
 from ..exchange import ExchangedBlocks
 from ..flat import NONE, FlatDiagram, Instant, evaluate, evaluate_apart, indicators_of, is_true
-from .diagnosis import inputs_text, shaped_inputs
+from .diagnosis import START_SETTLED, inputs_text, shaped_inputs, unsettled, unsolved_start
 from .transport_delays import Delays
 from .workspace import Workspace
 
-_MAX_PASSES = 100  # over inputs and outputs of the FMUs at the start
 _PLAIN_PASSES = 10
-"""Passes before the outputs of the FMUs are sought from those before."""
-START_SETTLED = 1e-13
-"""Relative change of an input between two passes, at most, with which the start is found: a few hundred ulps."""
+"""Passes over inputs and outputs at the start, and one for each plant, before it is decided how to go on."""
+_MOST_PASSES = 100
+"""Most passes where each brings the values nearer; ten times as many with loops in the initial states."""
+_LOOKED_BACK = 4
+"""Passes over which the rate is taken at which values come nearer."""
+_ROUNDS = 5
+"""Most searches, each for other values of the outputs that are no real numbers."""
 _BEFORE_START = -1e-300  # s; nearer to 0 than any time of a source that is not 0
 
 Taps = dict[tuple[str, str], Callable[[Any], Any]]
@@ -43,8 +46,9 @@ def initialize(
     """Find values of everything at t = 0.
 
     In Initialization Mode an FMU's outputs follow its inputs at once (FMI 3.0, 2.3.3). Outputs are passed on
-    until inputs change by no more than rounding; after some passes the next outputs are sought from those before, which
-    finds them where they would run away, too.
+    until inputs change by no more than rounding. Where some passes show that this takes many more, or leads away, the
+    values that a pass returns unchanged are found by `find_fixed_point`. So are initial states that depend on
+    themselves.
 
     Initial states that are computed from inputs are those of the instant before: a source that jumps at t = 0 has its
     value from the left there, so that a derivative sees the jump, as it sees one at any later time.
@@ -53,55 +57,191 @@ def initialize(
     their inputs stay, "once", or "none", where the inputs of FMUs keep their start values. ``set_start`` computes the
     initial states and first held outputs from the values at hand; `find_start_values` by default.
     """
-    flat, set_start = workspace.flat, set_start or find_start_values
-    acting = flat.acting(0)
+    set_start = set_start or find_start_values
     workspace.here.t[0] = 0.0
     if delays is not None:
         delays.outputs_at(0.0, workspace.here.w)
-    passes, last = 0, np.full(flat.width, np.nan)
-    jump, nothing = workspace.bind_jump() if exchanged else None, np.zeros(len(flat.events))
+    start = _Start(workspace, plants, delays, take_inputs, exchanged, passes_on, set_start)
+    while not start.passes_agree():
+        if not start.comes_nearer():
+            start.search()
+            return
 
-    def look() -> None:
-        if jump is not None:
-            jump(nothing)
 
-    most = _MAX_PASSES * (10 if workspace.looped else 1)
-    search: Search | None = None
-    while True:
-        assumed = workspace.here.w.copy()
-        set_start(workspace)
-        workspace.evaluate(acting)
-        workspace.check(acting)
-        before = workspace.z.copy()
-        if passes_on != "none":
-            take_inputs()
-            for plant in plants.values():
+class _Start:
+    """The values of a run at t = 0, as they are sought.
+
+    A pass takes the outputs w of the plants, and the initial states x where these depend on themselves, to new ones.
+    """
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        plants: Mapping[str, Plant],
+        delays: Delays | None,
+        take_inputs: Callable[[], None],
+        exchanged: ExchangedBlocks,
+        passes_on: str,
+        set_start: Callable[[Workspace], None],
+    ):
+        self.workspace, self.plants, self.delays = workspace, plants, delays
+        self.take_inputs, self.exchanged, self.passes_on, self.set_start = take_inputs, exchanged, passes_on, set_start
+        self.passes, self.moved = 0, ""
+        self.acting = workspace.flat.acting(0)
+        self._most = _MOST_PASSES * (10 if workspace.looped else 1)
+        self._few = _PLAIN_PASSES + len(plants)  # a value passes a chain of plants by one with each pass
+        self._jump = workspace.bind_jump() if exchanged else None
+        self._nothing = np.zeros(len(workspace.flat.events))
+        self._last, self._before = np.full(workspace.flat.width, np.nan), workspace.z.copy()
+        self._solved, self._ran_away = True, False
+        self._at: tuple[np.ndarray, np.ndarray] = (workspace.here.w.copy(), workspace.here.x.copy())
+        self._changing = [np.zeros(len(values), dtype=bool) for values in self._at]
+        self._first = self._at
+        self._lengths: list[float] = []
+
+    def go_on(self) -> None:
+        """Make one pass.
+
+        Raises
+        ------
+        SimulationError
+            A value that is not finite, or a guard that fails.
+        """
+        workspace, delays = self.workspace, self.delays
+        self._at = (workspace.here.w.copy(), workspace.here.x.copy())
+        self.set_start(workspace)
+        workspace.evaluate(self.acting)
+        workspace.check(self.acting)
+        self._before = workspace.z.copy()
+        if self.passes_on != "none":
+            self.take_inputs()
+            for plant in self.plants.values():
                 plant.exchange()
         if delays is not None:
             delays.begin(workspace.z, workspace.here.w)
-        moved = exchanged.exchange(workspace.here.x, look) if exchanged else ""
-        workspace.evaluate(acting)
-        passes += 1
-        if moved and passes < most:
-            continue
-        if moved:
-            raise SimulationError(
-                f"its states and inputs at the start depend on its own outputs, and are not found: after {passes} "
-                "passes they still change. Put a UnitDelay(initial_value=…) on one of the wires between.",
-                block=moved,
+        self.moved = self.exchanged.exchange(workspace.here.x, self._look) if self.exchanged else ""
+        workspace.evaluate(self.acting)
+
+    def _look(self) -> None:
+        if self._jump is not None:
+            self._jump(self._nothing)
+
+    def passes_agree(self) -> bool:
+        """Make one pass, and return whether it has changed nothing but by rounding."""
+        workspace = self.workspace
+        try:
+            self.go_on()
+        except SimulationError:
+            if self.passes < 2:  # it is not the passes that have led there
+                raise
+            self._ran_away = True
+            return False
+        self.passes += 1
+        if self.passes == 1:
+            self._first = (workspace.here.w.copy(), workspace.here.x.copy())
+        if self.moved:
+            return False
+        x, z, before = workspace.here.x, workspace.z, self._before
+        self._solved = not workspace.looped or np.allclose(self._last, x, rtol=START_SETTLED, atol=START_SETTLED)
+        agreed = self.passes_on != "agree" or bool((before == z).all())
+        agreed = agreed or np.allclose(before, z, rtol=START_SETTLED, atol=0.0, equal_nan=True)
+        self._last = x.copy()
+        return self._solved and agreed
+
+    def comes_nearer(self) -> bool:
+        """Whether further passes will end the search: each brings the values nearer by a small enough factor."""
+        if self._ran_away:
+            return False
+        now = (self.workspace.here.w, self.workspace.here.x)
+        changed = [before != after for before, after in zip(self._at, now, strict=True)]
+        if self.passes > 1:
+            self._changing = [known | new for known, new in zip(self._changing, changed, strict=True)]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            parts = [np.abs(after - before)[new] / np.maximum(np.abs(before), np.abs(after))[new]
+                     for before, after, new in zip(self._at, now, changed, strict=True)]  # fmt: skip
+        self._lengths.append(float(np.max(np.concatenate(parts), initial=0.0)))
+        if self.passes < self._few:
+            return True
+        if self.passes >= self._most:
+            return False
+        if not any(np.any(new & known) for new, known in zip(changed, self._unknowns, strict=True)):
+            return True  # whole numbers alone
+        first, last = self._lengths[-_LOOKED_BACK], self._lengths[-1]
+        if not 0.0 < last < first:
+            self._ran_away = last > 0.0
+            return last == 0.0
+        more = np.log(0.1 * START_SETTLED / last) / np.log(last / first) * (_LOOKED_BACK - 1)
+        return bool(self.passes + more <= self._most)
+
+    @property
+    def _unknowns(self) -> tuple[np.ndarray, np.ndarray]:
+        """Entries of w and x that a pass changes, and takes."""
+        w, x = self._changing
+        flat = self.workspace.flat
+        return w & Links(flat).smooth_outputs, x & bool(self.workspace.looped or self.exchanged)
+
+    def search(self) -> None:
+        """Find the values that a pass returns unchanged.
+
+        Raises
+        ------
+        SimulationError
+            If there are none.
+        """
+        here = self.workspace.here
+        if self._ran_away:
+            here.w[:], here.x[:] = self._first
+        for _ in range(_ROUNDS):
+            stays = self._find_smooth()
+            if stays:
+                return
+            if stays is None:
+                break
+        self.go_on()
+        raise self._failure()
+
+    def _find_smooth(self) -> bool | None:
+        """Find the values of the real numbers, and return whether the others stay; None without such values."""
+        here = self.workspace.here
+        w, x = here.w.copy(), here.x.copy()
+        of_w, of_x = self._unknowns
+        guess = np.concatenate([w[of_w], x[of_x]])
+
+        def put(values: np.ndarray) -> None:
+            here.w[of_w], here.x[of_x] = np.split(values, [np.count_nonzero(of_w)])
+
+        def make(values: np.ndarray) -> np.ndarray:
+            here.w[:], here.x[:] = w, x
+            put(values)
+            try:
+                self.go_on()
+            except SimulationError:  # no value at such numbers, which a search need not come to
+                return np.full(len(values), np.nan)
+            self.passes += 1
+            return np.concatenate([here.w[of_w], here.x[of_x]])
+
+        found = find_fixed_point(make, guess)
+        if found is None:
+            here.w[:], here.x[:] = w, x
+            return None
+        make(found)
+        stays = bool(np.all((here.w == w)[~of_w & self._changing[0]]))
+        put(found)  # a steep function would magnify the rounding of its values
+        self.workspace.evaluate(self.acting)
+        return stays
+
+    def _failure(self) -> SimulationError:
+        if self.moved:
+            return SimulationError(
+                "its states and inputs at the start depend on its own outputs, and are not found: after "
+                f"{self.passes} passes they still change. Put a UnitDelay(initial_value=…) on a wire between them.",
+                block=self.moved,
                 t=0.0,
             )
-        found = not workspace.looped or np.allclose(last, workspace.here.x, rtol=START_SETTLED, atol=START_SETTLED)
-        agreed = passes_on != "agree" or bool((before == workspace.z).all())
-        agreed = agreed or np.allclose(before, workspace.z, rtol=START_SETTLED, atol=0.0, equal_nan=True)
-        if found and agreed:
-            break
-        if passes == most:
-            raise _unsettled(workspace, before) if found else _unsolved_start(workspace, last)
-        if plants and passes >= _PLAIN_PASSES:
-            search = search or Search(Links(flat).smooth_outputs, np.ones(flat.plant_outputs.total))
-            workspace.here.w[:] = search.next(assumed, workspace.here.w)
-        last = workspace.here.x.copy()
+        flat = self.workspace.flat
+        if not self._solved or not flat.plant_inputs.slices:
+            return unsolved_start(flat, self._at[1], self.workspace.here.x, self.passes)
+        return unsettled(flat, self._before, self.workspace.z, self.passes)
 
 
 def find_start_values(workspace: Workspace) -> None:
@@ -190,37 +330,6 @@ def _initial(path: str, block: Any, u: Any, states: Mapping[str, tuple[int, ...]
         raise SimulationError(
             f"its initial(u) failed: {what} {inputs_text(u._asdict())} Expected {expected}.", block=path, t=0.0
         ) from error
-
-
-def _unsolved_start(workspace: Workspace, last: np.ndarray) -> SimulationError:
-    flat, x = workspace.flat, workspace.here.x
-    moved = ~np.isclose(last, x, rtol=START_SETTLED, atol=START_SETTLED)
-    path = next((p for p, s in flat.states.slices.items() if moved[s].any()), "")
-    loops = "\n".join(flat.start_order.loops)
-    return SimulationError(
-        f"its initial state depends on itself, and is not found: after {_MAX_PASSES * 10} passes it still changes.\n"
-        f"{loops}\nGive it an initial_value, or one to another block of this loop.",
-        block=path or flat.start_order.torn[0][0],
-    )
-
-
-def _unsettled(workspace: Workspace, before: np.ndarray) -> SimulationError:
-    flat, z = workspace.flat, workspace.z
-    slices = flat.plant_inputs.slices
-    name = next(n for n, s in slices.items() if not np.allclose(before[s], z[s], rtol=START_SETTLED, atol=0.0))
-    path, port = flat.ports[name]
-    delay = flat.table.blocks[path].transport
-    own, step = (
-        ("its own output", "Give it an initial_value.")
-        if delay
-        else ("the FMU's own outputs", "Put a UnitDelay(initial_value=…) on one of the wires between.")
-    )
-    return SimulationError(
-        f"its value at the start depends on {own}, and is not found: after {_MAX_PASSES} passes it "
-        f"still changes, from {before[slices[name]].tolist()} to {z[slices[name]].tolist()}. {step}",
-        block=path,
-        port=port,
-    )
 
 
 def values_from_left(workspace: Workspace) -> Taps:
