@@ -13,7 +13,7 @@ from .logic import TRUE, is_true
 from .plant_ticks import own_step, takes_any_step
 from .program import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE_OF, Ids, Operation, PartProgram, Program, TickProgram
 from .stages import Bound, Evaluators, Schedule, bind_function, evaluate_apart
-from .total_derivative import Derivative
+from .total_derivative import Derivative, size_of_motion
 from .trace_stages import trace_schedule
 from .vectors import Vectors, join_columns, loop_mismatch, next_x, plant_inputs, rates
 from .wired_diagram import WiredDiagram
@@ -70,6 +70,7 @@ __all__ = [
     "plant_inputs",
     "rates",
     "renumber",
+    "size_of_motion",
     "takes_any_step",
     "ticks_after",
     "trace_schedule",

@@ -170,8 +170,7 @@ class Derivative:
                 0.0,
             )
         values = self(*arguments, evaluators=evaluators)
-        sizes = [np.abs(d) / (1.0 + np.abs(a)) for a, d in zip(arguments, direction, strict=True)]
-        size = max(float(np.max(s, initial=0.0)) for s in sizes)
+        size = max(size_of_motion(a, d) for a, d in zip(arguments, direction, strict=True))
         if size == 0.0:
             return values, [np.zeros_like(v) for v in values], 0.0
 
@@ -202,6 +201,12 @@ class Derivative:
                 vector[:] = value.ravel(order="F")
 
         return Bound(call, into)
+
+
+def size_of_motion(value: np.ndarray, slope: np.ndarray) -> float:
+    """Return the largest slope, relative to 1 + the size of the value; entries that stand may be no numbers."""
+    moves = slope != 0.0
+    return float(np.max(np.abs(slope[moves]) / (1.0 + np.abs(value[moves])), initial=0.0))
 
 
 def _slope(expression: Any, symbol: Any, entries: Sequence[int] | None) -> Any:

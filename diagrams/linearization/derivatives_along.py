@@ -17,7 +17,17 @@ from weakref import WeakKeyDictionary
 import casadi as ca
 import numpy as np
 
-from ..flat import Apart, Derivative, FlatDiagram, Schedule, TickPattern, evaluate, loop_mismatch, trace_schedule
+from ..flat import (
+    Apart,
+    Derivative,
+    FlatDiagram,
+    Schedule,
+    TickPattern,
+    evaluate,
+    loop_mismatch,
+    size_of_motion,
+    trace_schedule,
+)
 from ..results import OperatingPoint
 from .derivatives import SLOPE, LocalDerivatives, Numbers
 from .flow_model import EQUILIBRIUM
@@ -185,8 +195,7 @@ class DerivativesAlong(LocalDerivatives):
         point = at.plants[path]
         moving = [*point["state"].values(), *point["inputs"].values(), z[middle.inputs], at.z[middle.inputs]]
         moving.append(at.w[middle.outputs])
-        sizes = [np.max(np.abs(slope_of(v)) / (1.0 + np.abs(v)), initial=0.0) for v in moving]
-        size = float(max(sizes, default=0.0))
+        size = max((size_of_motion(np.asarray(v), slope_of(v)) for v in moving), default=0.0)
         if size * self.scale <= ROUNDING:
             return middle
 

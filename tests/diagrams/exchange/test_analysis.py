@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import Constant, FmuError, Gain
+from loopwright.blocks import PID, Constant, FmuError, Gain
 from loopwright.diagrams import Diagram, experiments, subsystem
+from loopwright.diagrams.linearization import differentiate_loop
 from loopwright.diagrams.report import analyse
 from loopwright.fmus import Fmu, bouncing_ball, gantry, mass_spring_damper
 
@@ -161,3 +162,25 @@ def test_a_report_of_fig3_has_the_numbers_of_co_simulation(cache, tmp_path):
     assert len(stepped) > 50
     for name, value in stepped.items():
         assert exchanged[name] == pytest.approx(value, rel=1e-9, abs=1e-12), name
+
+
+def test_a_loop_has_its_slopes_by_the_parameters_of_its_controller(file):
+    plant = Fmu(file, interface="model_exchange", name="plant")
+
+    @subsystem(sample_time=0.02)
+    def controller(y):
+        return PID(kp=2.0, ki=3.0, name="pi")(0.0, y)
+
+    model = Diagram("loop", plant(force=controller(plant.position).named("u"))).linearize()
+    by_kp, by_ki = differentiate_loop(model, ["u"], ["controller.pi.kp", "controller.pi.ki"])
+    A, _, C, _ = by_kp.matrices  # the row of C is -kp at the position
+    position, integral = model.states.index("plant.position"), model.states.index("controller.pi.integral")
+    expected = np.zeros_like(C)
+    expected[0, position] = C[0, position] / 2.0
+    np.testing.assert_allclose(by_kp.slopes[2], expected, atol=1e-9)
+    assert abs(expected[0, position]) == pytest.approx(1.0)
+    steps = A[integral, position] / 3.0  # the integral of ki e
+    assert by_ki.slopes[0][integral, position] == pytest.approx(steps, rel=1e-9)
+    assert abs(steps) == pytest.approx(0.02, rel=1e-9)
+    found = model.diagram.sensitivity("u")
+    assert {"controller.pi.kp", "controller.pi.ki"}.isdisjoint(found.without_effect)
