@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from difflib import SequenceMatcher
-from typing import Protocol
+from typing import Protocol, Self
 
 from ...blocks.core import (
     Block,
     FmuError,
     Input,
+    LoopwrightError,
     Output,
     ShapeError,
     State,
@@ -50,6 +51,8 @@ class _WithVariables(Protocol):
     def input_variables(self) -> Mapping[str, FmuVariable]: ...
     @property
     def output_variables(self) -> Mapping[str, FmuVariable]: ...
+    def replace(self, **changes: object) -> Self:
+        """Return the block with other parameters."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +65,45 @@ class _Misfit:
 
 def check_replacement(fmu: _WithVariables, old: Block, wired: Collection[str], read: Collection[str]) -> None:
     """Refuse an FMU that doesn't fit the wires of a block, port by port; see `Block.check_place`."""
-    misfits, rename = list[_Misfit](), dict[str, str]()
     try:
-        ports_before = old.inputs, old.outputs
+        old.inputs, old.outputs  # noqa: B018
     except FmuError:  # its file has changed or is gone
         return
+    misfits, rename = _find_misfits(fmu, old, wired, read)
+    if not misfits:
+        return
+    both = _find_names(fmu, old, wired, read, rename) if rename else {}
+    kinds = {misfit.error for misfit in misfits if misfit.error is not UnwiredInputError or not both}
+    lines = "\n".join(f"- {misfit.text}" for misfit in misfits)
+    advice = "Wire what is extra, give it a value in start=, or take another FMU."
+    if both:
+        advice = f"Perhaps only names differ: Fmu({str(fmu.file)!r}, rename={both!r})."
+        left = _find_misfits(fmu.replace(rename=both), old, wired, read)[0]
+        advice += " Wire what is then extra, or give it a value in start=." if left else ""
+    raise (kinds.pop() if len(kinds) == 1 else WiringError)(
+        f"{fmu.drawn_as} does not fit the wires of {old.drawn_as}:\n{lines}\n{advice}", block=old.name or fmu.label
+    )
+
+
+def _find_names(
+    fmu: _WithVariables, old: Block, wired: Collection[str], read: Collection[str], rename: Mapping[str, str]
+) -> dict[str, str]:
+    """Return the names with which an FMU fits, but for inputs that are extra; empty if there are none."""
+    both = {**{a: b for a, b in fmu.rename.items() if a not in rename}, **rename}
+    try:
+        renamed = fmu.replace(rename=both)
+    except LoopwrightError:  # another port has such a name already
+        return {}
+    left = [misfit for misfit in _find_misfits(renamed, old, wired, read)[0] if misfit.error is not UnwiredInputError]
+    return {} if left else both
+
+
+def _find_misfits(
+    fmu: _WithVariables, old: Block, wired: Collection[str], read: Collection[str]
+) -> tuple[list[_Misfit], dict[str, str]]:
+    """Return the ports that don't fit, and names for those that may only be called otherwise."""
+    misfits, rename = list[_Misfit](), dict[str, str]()
+    ports_before = old.inputs, old.outputs
     for side, ports, before, used, variables in (
         ("input", fmu.inputs, ports_before[0], wired, fmu.input_variables),
         ("output", fmu.outputs, ports_before[1], read, fmu.output_variables),
@@ -88,17 +125,7 @@ def check_replacement(fmu: _WithVariables, old: Block, wired: Collection[str], r
             misfits += _compare(side, name, *pair, converts=fmu.convert_units)
         pairs = _match({n: before[n] for n in missing}, {n: ports[n] for n in spare if n not in before})
         rename |= {variables[new].name: name for name, new in pairs.items()}
-    if not misfits:
-        return
-    kinds = {misfit.error for misfit in misfits if misfit.error is not UnwiredInputError or not rename}
-    lines = "\n".join(f"- {misfit.text}" for misfit in misfits)
-    advice = "Wire what is extra, give it a value in start=, or take another FMU."
-    if rename:
-        both = {**{a: b for a, b in fmu.rename.items() if a not in rename}, **rename}
-        advice = f"Perhaps only names differ: Fmu({str(fmu.file)!r}, rename={both!r})."
-    raise (kinds.pop() if len(kinds) == 1 else WiringError)(
-        f"{fmu.drawn_as} does not fit the wires of {old.drawn_as}:\n{lines}\n{advice}", block=old.name or fmu.label
-    )
+    return misfits, rename
 
 
 def _text(side: str, name: str, port: Input | Output | State) -> str:

@@ -60,6 +60,17 @@ def test_other_names_are_said_with_the_rename_that_helps(diagram, file, tmp_path
     assert np.isfinite(run["plant.position"]).all()
 
 
+def test_a_rename_that_does_not_help_is_not_suggested(diagram, file, tmp_path):
+    changes = (r'"motor_force\[', '"F_motor['), (r'"velocity\[', '"motor_force[')
+    with pytest.raises(WiringError, match="Wire what is extra") as e:
+        diagram.replace(plant=Fmu(edited(file, tmp_path, *changes)))  # an output has the name of the missing input
+    assert "rename=" not in str(e.value)
+    changes = (r'"motor_force\[', '"F_motor['), (r'(?s)(name="position\[.\]".{0,300}?unit=)"m"', r'\1"mm"')
+    with pytest.raises(WiringError, match="found the unit mm") as e:
+        diagram.replace(plant=Fmu(edited(file, tmp_path, *changes)))
+    assert "Perhaps only names differ" not in str(e.value)
+
+
 def test_another_unit_is_said_with_its_factor(diagram, file, tmp_path):
     other = edited(file, tmp_path, (r'(?s)(name="position\[.\]".{0,300}?unit=)"m"', r'\1"mm"'))
     with pytest.raises(UnitError, match=r"- output position: found the unit mm; expected m: .*by a factor of 0\.001"):
