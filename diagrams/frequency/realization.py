@@ -70,6 +70,12 @@ class Realization:
         try:
             A, B, C, D, dt = read_matrices(loop)
         except Exception as error:
+            if hasattr(loop, "omega"):
+                raise ParameterError(
+                    f"found a {type(loop).__name__}, measured data without poles; expected a control.StateSpace. The "
+                    "margins of data are measured_margins(data), with their uncertainty.",
+                    block=name,
+                ) from error
             raise ParameterError(
                 f"found {type(loop).__name__}, which python-control can't turn into a state space ({error}); expected "
                 "a control.StateSpace. Make one with control.ss(A, B, C, D, dt).",

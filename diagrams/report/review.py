@@ -37,6 +37,12 @@ STABLE = Limit(-math.inf, 0.0)
 MANY = 10.0
 """Times of its own uncertainty that a measurement has to be off by to refute a linear model."""
 
+HAS_NONE = (
+    "the wire is renewed several times in the period of all clocks, so that S and T change frequencies there and have "
+    "no value at a single one; limit disk_margin, gain_margin_high or phase_margin_deg, which the loop has"
+)
+"""Reason why a periodically time-varying loop lacks a number, with a next step."""
+
 
 def check_names(case: Case, asked: Requirements, measured: Collection[str] = ()) -> None:
     """Refuse names in requirements that the diagram does not have.
@@ -116,8 +122,10 @@ def _results(case: Case, asked: Requirements, numbers: Mapping[str, Number]) -> 
                 found = _worst(numbers, f"inner.{key}.{v.key}", name, limit)
                 if found is None and name not in own and _has_channels(numbers, f"inner.{key}"):
                     continue  # a general limit of single loops
-                reason = Reason.PERIODIC if _is_periodic(numbers, f"inner.{key}.{v.key}") else Reason.NO_NUMBER
-                result = RequirementResult(name, key, v.key, limit, Verdict.UNDECIDED, reason)
+                is_periodic = _is_periodic(numbers, f"inner.{key}.{v.key}")
+                reason, said = (Reason.PERIODIC, HAS_NONE) if is_periodic else (Reason.NO_NUMBER, "")
+                detail = said if found is None else ""
+                result = RequirementResult(name, key, v.key, limit, Verdict.UNDECIDED, reason, detail=detail)
                 yield _with(state, result, found, _refuted(numbers, key, v.key))
             step = asked.step_of(names, v.key)
             if step is not None and key in wires:

@@ -82,6 +82,7 @@ def test_margins_of_a_fast_wire_are_the_periodic_ones_and_others_are_not_decided
         assert is_stable(factor * gain.number.value) is stable
     for name in ("ms", "bandwidth"):
         assert (found["voltage", name].verdict, found["voltage", name].reason) == (Verdict.UNDECIDED, Reason.PERIODIC)
+        assert "limit disk_margin" in found["voltage", name].as_dict()["detail"]
         assert found["current_wanted", name].verdict is not Verdict.UNDECIDED
     assert report.review.verdict is Verdict.UNDECIDED
     rows = [row for row in report.sections[0].tables[0].rows if row[0].verdict is Verdict.UNDECIDED]
