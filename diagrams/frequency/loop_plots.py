@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError, with_unit
+from ...blocks.core import OptionError, shorten, with_unit
 from ..results import BLUE, DARK, GREEN, GREY, PURPLE, STONE, VERMILION, legend_above, new_figure, style
 from .realization import Realization
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 COLORS = (BLUE, VERMILION, GREEN, PURPLE, DARK)
 LINES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
 POINTS = 800
+BELOW = 1 - 1e-6
+"""Part of π/T up to which a sampled loop is drawn."""
 FAR = 8.0
 """Largest part of the plane that a Nyquist plot shows: the real and imaginary part up to this."""
 
@@ -108,19 +110,50 @@ def _span(loops: Sequence[Any], omega: ArrayLike | None) -> list[np.ndarray]:
         if omega is None:
             spans.append(Realization.of(loop).grid(low, high, POINTS))
             continue
-        asked = np.atleast_1d(np.asarray(omega, dtype=float))
-        if not (asked.size and np.all(np.isfinite(asked)) and np.all(asked > 0.0)):
-            raise OptionError(f"found {omega!r}; expected positive frequencies in rad/s. Give some.", port="omega")
-        dt = float(loop.dt or 0.0)
-        shown = asked[asked < np.pi / dt] if dt else asked
+        asked = _read_omega(omega)
+        limit = _limit(loop)
+        shown = asked[asked < limit]
         if not shown.size:
             raise OptionError(
-                f"found {omega!r} rad/s, none below π/T = {np.pi / dt:.6g} rad/s of the loop sampled every {dt:g} s; "
-                "expected one at least. Give lower ones, or leave the loop out.",
+                f"found {shorten(omega)} rad/s, none below π/T = {limit:.6g} rad/s of the loop sampled every "
+                f"{float(loop.dt):g} s; expected one at least. Give lower ones, or leave the loop out.",
                 port="omega",
             )
-        spans.append(shown)
+        spans.append(
+            np.append(shown, limit * BELOW) if shown.size < asked.size and shown[-1] < limit * BELOW else shown
+        )
     return spans
+
+
+def _read_omega(omega: Any) -> np.ndarray:
+    """Return frequencies that were given, in ascending order, each once."""
+    try:
+        asked = np.unique(np.asarray(omega, dtype=float))
+    except (TypeError, ValueError):
+        asked = np.zeros(0)
+    if not (asked.size and np.all(np.isfinite(asked)) and np.all(asked > 0.0)):
+        raise OptionError(f"found {shorten(omega)}; expected positive frequencies in rad/s. Give some.", port="omega")
+    return asked
+
+
+def _limit(loop: Any) -> float:
+    """Return half the sampling frequency of a loop in rad/s; infinite of a continuous one, and of data."""
+    dt = 0.0 if is_measured(loop) else float(loop.dt or 0.0)
+    return float(np.pi) / dt if dt else np.inf
+
+
+def _note_ends(axes: Axes, loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | None) -> None:
+    """Say in a figure which loops end at π/T although higher frequencies were asked for."""
+    if omega is None:
+        return
+    highest = _read_omega(omega)[-1]
+    cut = [
+        f"{name} at π/T = {_limit(loop):.4g} rad/s"
+        for name, loop in zip(names, loops, strict=True)
+        if highest >= _limit(loop)
+    ]
+    if cut:
+        axes.set_title("Ends: " + ", ".join(cut), loc="left", fontsize="small")
 
 
 def _look(i: int, loop: Any) -> dict[str, Any]:
@@ -164,6 +197,7 @@ def bode(loops: Sequence[Any], omega: ArrayLike | None, labels: Sequence[str] | 
         gain.set_ylabel(with_unit("|L|", "dB" if db else "1"))
         phase.set_ylabel(with_unit("phase of L", "deg"))
         phase.set_xlabel(with_unit("frequency", "Hz") if hz else with_unit("ω", "rad/s"))
+        _note_ends(gain, loops, names, omega)
         _legend(figure, gain)
     return figure
 
@@ -200,6 +234,7 @@ def nyquist(loops: Sequence[Any], omega: ArrayLike | None, labels: Sequence[str]
         axes.axhline(0.0, color=GREY, linewidth=0.6, zorder=0)
         axes.axvline(0.0, color=GREY, linewidth=0.6, zorder=0)
         axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="Re L", ylabel="Im L")
+        _note_ends(axes, loops, names, omega)
         _legend(figure, axes)
     return figure
 
@@ -228,6 +263,7 @@ def nichols(loops: Sequence[Any], omega: ArrayLike | None, labels: Sequence[str]
         axes.set(
             xlim=(left, right), ylim=(low, high), xlabel=with_unit("phase of L", "deg"), ylabel=with_unit("|L|", "dB")
         )
+        _note_ends(axes, loops, names, omega)
         _legend(figure, axes)
     return figure
 
@@ -263,8 +299,9 @@ def four(systems: Sequence[Mapping[str, Any]], names: Sequence[str], omega: Arra
             own = [found[key] for found in systems]
             spans = _span([found["L"] for found in systems], omega)
             for i, (system, w) in enumerate(zip(own, spans, strict=True)):
-                if omega is None:  # closed loops have resonances of their own
-                    w = Realization.of(system).grid(float(w[0]), float(w[-1]), POINTS)
+                if omega is None:  # closed loops have resonances of their own, up to π/T
+                    top = _limit(system) * BELOW if system.dt else float(w[-1])
+                    w = Realization.of(system).grid(float(w[0]), top, POINTS)
                 axes.plot(w, np.abs(response(system, w)), label=names[i], **_look(i, system))
             axes.set_xscale("log")
             axes.set_yscale("log")
@@ -273,5 +310,6 @@ def four(systems: Sequence[Mapping[str, Any]], names: Sequence[str], omega: Arra
                 axes.axhline(1.0, color=GREY, linewidth=0.8, zorder=0)
         for axes in panels[1]:
             axes.set_xlabel(with_unit("ω", "rad/s"))
+        _note_ends(panels[0, 0], [found["L"] for found in systems], names, omega)
         _legend(figure, panels[0, 0])
     return figure

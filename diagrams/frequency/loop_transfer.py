@@ -74,7 +74,8 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
         *others : control.StateSpace, control.TransferFunction or control.FrequencyResponseData
             Further loops.
         omega : array_like, optional
-            Frequencies in rad/s; without them those around the crossovers. A sampled loop ends at π/T.
+            Frequencies in rad/s, in any order; without them those around the crossovers. A sampled loop ends at π/T,
+            and the figure says so where higher ones were asked for.
         labels : sequence of str, optional
             A label for each loop, in place of their names.
         db : bool

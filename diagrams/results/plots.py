@@ -154,6 +154,10 @@ def save(figure: Figure, stem: Path) -> tuple[Path, Path]:
     return files
 
 
+LONG = 21
+"""Letters of a name with its unit that fit beside the axes of one signal; a longer one stands above them."""
+
+
 def named_signals(run: RecordedSignals, names: Iterable[object]) -> list[str]:
     """Return names of signals that are given one by one or in lists; without any, those of all named wires.
 
@@ -211,7 +215,9 @@ def plot_signals(run: RecordedSignals, names: Sequence[str], axes: Sequence[Axes
     ]
     with style():
         if axes is None:
-            figure = new_figure(0.5 + 1.35 * len(names))
+            figure = new_figure(
+                0.5 + 1.35 * len(names) + 0.2 * sum(_is_long(name, units) for name, *_, units in signals)
+            )
             axes = list(figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0])
         rows: list[Axes] = list(np.ravel(np.asarray(axes, dtype=object)))
         if len(rows) != len(names):
@@ -219,11 +225,17 @@ def plot_signals(run: RecordedSignals, names: Sequence[str], axes: Sequence[Axes
                 f"found {len(rows)} axes for {len(names)} signals; expected one for each. Make as many, or give none."
             )
         for ax, (name, values, vector, units) in zip(rows, signals, strict=True):
+            long = _is_long(name, units)
             for i, column in enumerate(values.T):
                 unit = f" [{units[i]}]" if vector and len(set(units)) > 1 and units[i] else ""
-                ax.plot(run.t, column, marker=marker_of(run), label=f"{name}[{i + 1}]{unit}" if vector else name)
-            common = units[0] if units and len(set(units)) == 1 else None
-            ax.set_ylabel(f"{name} [{common}]" if common else name)
+                entry = f"{'' if long else name}[{i + 1}]{unit}"
+                ax.plot(run.t, column, marker=marker_of(run), label=entry if vector else name)
+            common = _common(units)
+            if long:  # beside the axes it would run into its neighbours
+                ax.set_title(name, loc="left", fontsize="medium")
+                ax.set_ylabel(common)
+            else:
+                ax.set_ylabel(f"{name} {common}".rstrip())
             if vector:
                 ax.legend(loc="best", ncols=min(values.shape[1], 3))
         rows[-1].set_xlabel("t [s]")
@@ -233,6 +245,16 @@ def plot_signals(run: RecordedSignals, names: Sequence[str], axes: Sequence[Axes
         result: Figure = top
         result.align_ylabels()
     return result
+
+
+def _common(units: Sequence[str]) -> str:
+    """Return the unit of all entries in brackets; "" where they differ, or have none."""
+    return f"[{units[0]}]" if units and units[0] and len(set(units)) == 1 else ""
+
+
+def _is_long(name: str, units: Sequence[str]) -> bool:
+    """Whether a name with its unit is too long for the side of the axes."""
+    return len(f"{name} {_common(units)}") > LONG
 
 
 def _size(run: RecordedSignals, name: str) -> int:

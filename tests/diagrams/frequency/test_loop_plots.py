@@ -239,6 +239,20 @@ def test_a_sampled_step_response_has_its_last_sample(end):
     assert figure.axes[0].lines[0].get_xdata()[-1] == pytest.approx(end, rel=1e-12)
 
 
+def test_frequencies_beyond_a_sampled_loop_end_at_half_its_sampling_frequency_and_the_figure_says_so(sampled):
+    figure = sampled.bode(omega=[200.0, 100.0, 1.0, 10.0, 1.0])  # in any order, one twice
+    w, _ = curve(figure.axes[0])
+    np.testing.assert_allclose(w, [1.0, 10.0, 100.0, np.pi / 0.02], rtol=2e-6)
+    assert w[-1] < np.pi / 0.02
+    assert figure.axes[0].get_title(loc="left") == "Ends: L(u) at π/T = 157.1 rad/s"
+    assert not sampled.bode(omega=[1.0, 100.0]).axes[0].get_title(loc="left")
+
+
+def test_the_gang_of_four_goes_to_half_the_sampling_frequency(sampled):
+    for axes in sampled.gang_of_four("y").axes:
+        assert curve(axes)[0][-1] == pytest.approx(np.pi / 0.02, rel=2e-6)
+
+
 @pytest.mark.parametrize("kind", ["bode", "nyquist", "nichols"])
 def test_frequencies_that_all_lie_beyond_a_sampled_loop_are_refused(sampled, kind):
     with pytest.raises(OptionError, match=r"omega: found .* none below π/T = 157\.08 rad/s"):
