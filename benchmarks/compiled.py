@@ -9,6 +9,7 @@ anew at every tick, and its largest error against the exponential of a matrix.
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 
 import numpy as np
 from scipy.linalg import expm
@@ -16,7 +17,8 @@ from scipy.linalg import expm
 from loopwright.blocks import TransferFunction, UnitDelay
 from loopwright.diagrams import Diagram, experiments, subsystem
 
-TICKS = 4000
+TICKS, TURNS, LAG_TURNS = 4000, 7, 5
+SOLVERS = ("rk4", "RK45", "auto", "Radau")
 
 
 def lags() -> Diagram:
@@ -45,49 +47,60 @@ def exact_lags(ticks: int) -> np.ndarray:
     return np.array(found)
 
 
-def measure_lags() -> None:
-    """Print one row for each solver."""
-    print("\nsolver      interpreted, µs/tick   compiled, µs/tick   ratio   error interpreted   compiled")
-    for solver in ("rk4", "RK45", "auto", "Radau"):
-        diagram, times, errors = lags(), [], []
-        for form, ticks in ((False, 1000), (True, 100_000)):
-            run = diagram.simulate(1.0, solver=solver, compile=form, progress=False)
-            errors.append(np.max(np.abs(run["second.y"] - exact_lags(1000))))
-            with diagram.simulation(solver=solver, compile=form) as simulation:
-                simulation.advance(0.1)
-                best = np.inf
-                for _ in range(5):
-                    started = time.thread_time()
-                    simulation.advance(ticks * 1e-3)
-                    best = min(best, time.thread_time() - started)
-                    simulation.run(final=False)
-                times.append(best / ticks * 1e6)
-        print(
-            f"{solver:10}  {times[0]:20.2f}  {times[1]:18.2f}  {times[0] / times[1]:6.0f}   {errors[0]:17.1e}  "
-            f"{errors[1]:9.1e}"
-        )
+def measure_lags(solver: str) -> tuple[list[float], list[float], list[float]]:
+    """Return the times of ticks in s, interpreted and compiled, turn by turn, and the largest error of each form."""
+    diagram, errors = lags(), []
+    times: list[list[float]] = [[], []]
+    forms = ((False, 1000), (True, 100_000))
+    for form, _ in forms:
+        run = diagram.simulate(1.0, solver=solver, compile=form, progress=False)
+        errors.append(float(np.max(np.abs(run["second.y"] - exact_lags(1000)))))
+    with ExitStack() as stack:
+        simulations = [stack.enter_context(diagram.simulation(solver=solver, compile=form)) for form, _ in forms]
+        for simulation in simulations:
+            simulation.advance(0.1)
+        for _ in range(LAG_TURNS):
+            for simulation, (_, ticks), found in zip(simulations, forms, times, strict=True):
+                started = time.thread_time()
+                simulation.advance(ticks * 1e-3)
+                found.append((time.thread_time() - started) / ticks)
+                simulation.run(final=False)
+    return times[0], times[1], errors
+
+
+def measure_experiment(letter: str) -> tuple[list[float], list[float], bool]:
+    """Return the times of ticks in s, interpreted and compiled, turn by turn, and whether all bits are the same."""
+    diagram = experiments.EXPERIMENTS[letter]().diagram
+    times: dict[bool, list[float]] = {False: [], True: []}
+    runs = {}
+    with diagram.simulation(compile=False) as first, diagram.simulation(compile=True) as second:
+        simulations = {False: first, True: second}
+        for _ in range(TURNS):
+            for form, simulation in simulations.items():
+                started = time.perf_counter()
+                simulation.advance(TICKS * 1e-3)
+                times[form].append((time.perf_counter() - started) / TICKS)
+                runs[form] = simulation.run(final=False)
+    return times[False], times[True], runs[False].data.tobytes() == runs[True].data.tobytes()
 
 
 def main() -> int:
     """Print one row for each experiment, and one for each solver of a continuous plant; 1 if a bit differs."""
     print("experiment  interpreted, µs/tick   compiled, µs/tick   ratio   same bits")
     worst = 0
-    for letter, make in experiments.EXPERIMENTS.items():
-        diagram = make().diagram
-        best, runs = {False: float("inf"), True: float("inf")}, {}
-        with diagram.simulation(compile=False) as first, diagram.simulation(compile=True) as second:
-            simulations = {False: first, True: second}
-            for _ in range(7):
-                for form, simulation in simulations.items():
-                    started = time.perf_counter()
-                    simulation.advance(TICKS * 1e-3)
-                    best[form] = min(best[form], time.perf_counter() - started)
-                    runs[form] = simulation.run(final=False)
-        same = runs[False].data.tobytes() == runs[True].data.tobytes()
+    for letter in experiments.EXPERIMENTS:
+        *times, same = measure_experiment(letter)
         worst |= not same
-        interpreted, compiled = (best[form] / TICKS * 1e6 for form in (False, True))
+        interpreted, compiled = (min(found) * 1e6 for found in times)
         print(f"{letter:10}  {interpreted:20.2f}  {compiled:18.2f}  {interpreted / compiled:6.2f}   {same}")
-    measure_lags()
+    print("\nsolver      interpreted, µs/tick   compiled, µs/tick   ratio   error interpreted   compiled")
+    for solver in SOLVERS:
+        *times, errors = measure_lags(solver)
+        interpreted, compiled = (min(found) * 1e6 for found in times)
+        print(
+            f"{solver:10}  {interpreted:20.2f}  {compiled:18.2f}  {interpreted / compiled:6.0f}   {errors[0]:17.1e}  "
+            f"{errors[1]:9.1e}"
+        )
     return worst
 
 

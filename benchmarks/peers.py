@@ -19,6 +19,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -328,14 +329,20 @@ ROWS: dict[str, dict[str, tuple[str, Callable[[], Timed]]]] = {
 TURNS = 3
 
 
-def measure(exact: np.ndarray, tools: dict[str, tuple[str, Callable[[], Timed]]]) -> None:
-    """Print the rows of some tools, which take turns; the first one is what the others are compared with."""
-    found: dict[str, list[float]] = {}
-    ends: dict[str, str] = {}
+@dataclass(frozen=True)
+class Row:
+    """A tool's times of a tick in s, turn by turn; without any, its end says why. Else it is the largest error."""
+
+    times: list[float]
+    end: str
+
+
+def measure(exact: np.ndarray, tools: dict[str, tuple[str, Callable[[], Timed]]]) -> dict[str, Row]:
+    """Return the rows of some tools, which take turns."""
+    found = {name: Row([], "not installed") for name in tools}
     for _ in range(TURNS):
         for name, (package, run) in tools.items():
             if importlib.util.find_spec(package) is None:
-                ends[name] = "not installed"
                 continue
             try:
                 with contextlib.redirect_stdout(io.StringIO()):
@@ -343,29 +350,37 @@ def measure(exact: np.ndarray, tools: dict[str, tuple[str, Callable[[], Timed]]]
             except Exception as error:  # a peer of another version: its row says so
                 if package == "loopwright":
                     raise
-                ends[name] = f"{type(error).__name__}: {str(error).splitlines()[0][:60]}"
+                found[name] = Row([], f"{type(error).__name__}: {str(error).splitlines()[0][:60]}")
                 continue
-            found.setdefault(name, []).append(took * 1e6)
-            ends[name] = f"{np.abs(y - exact[: len(y)]).max():.1e}"
-    first = found[next(iter(tools))]
-    for name in tools:
-        times = found.get(name)
-        if times is None:
-            print(f"  {name:42}       –   {ends[name]}")
+            found[name] = Row([*found[name].times, took], f"{np.abs(y - exact[: len(y)]).max():.1e}")
+    return found
+
+
+def show(rows: dict[str, Row]) -> None:
+    """Print rows; the first one is what the others are compared with."""
+    first, *_ = rows.values()
+    for name, row in rows.items():
+        if len(row.times) < TURNS:
+            print(f"  {name:42}       –   {row.end}")
             continue
-        ratios = np.divide(times, first)
+        ratios = np.divide(row.times, first.times)
         spread = f"{ratios.min():7.1f} to {ratios.max():7.1f}"
-        print(f"  {name:42} {np.median(times):7.2f}  {np.median(ratios):8.1f}  {spread}   {ends[name]}")
+        print(f"  {name:42} {np.median(row.times) * 1e6:7.2f}  {np.median(ratios):8.1f}  {spread}   {row.end}")
+
+
+def silence() -> None:
+    """Let tools keep their warnings to themselves."""
+    warnings.simplefilter("ignore")
+    logging.disable(logging.WARNING)
 
 
 def main() -> None:
     """Print one row for each tool."""
-    warnings.simplefilter("ignore")
-    logging.disable(logging.WARNING)
+    silence()
     exact = solve_exactly()
     for title, tools in ROWS.items():
         print(f"{title:44} µs/tick  of the first  its spread          largest error")
-        measure(exact, tools)
+        show(measure(exact, tools))
 
 
 if __name__ == "__main__":
