@@ -15,6 +15,7 @@ import numpy as np
 
 from ...blocks.core import FmuFileError, Layout, brief
 from ..host_state import FOLDER
+from .aliases import find_aliases
 from .binaries import find_binary, judge_name
 from .exchange import ExchangeInfo, read_exchange
 from .faults import FmuFault, FmuFinding
@@ -56,6 +57,8 @@ class FmuDescription:
     """Other variables, by name: texts, binaries, clocks and negated aliases, which no wire carries."""
     elements: Elements = field(default_factory=dict)
     """Array and index, from 0 on, of each scalar that was gathered."""
+    aliases: dict[str, str] = field(default_factory=dict)
+    """First name of each input and parameter by its further names; a wire is for the first."""
     complaints: tuple[str, ...] = ()
     """Rules of the standard that the description breaks, as FMPy's validation words them."""
     unit_complaints: tuple[str, ...] = ()
@@ -78,6 +81,8 @@ class FmuDescription:
     fixed_internal_step: float | None = None
     """Fixed step of the FMU's own integrator in s (fixedInternalStepSize of FMI 3.0), or None; steps must be multiples
     of it."""
+    stop_time: float | None = None
+    """End of the default experiment in s, beyond which some FMUs take no step unless they are told a later one."""
     dependencies: Feedthrough = field(default_factory=dict)
     """Variables that each output depends on, as the model structure says."""
     states: dict[str, str] = field(default_factory=dict)
@@ -97,11 +102,11 @@ class FmuDescription:
     exchange: ExchangeInfo | None = None
     """The model-exchange interface, if there is one with a library for this platform."""
     co_simulation: bool = True
+    """Whether there is a co-simulation interface; ``identifier`` and ``binary`` are else those of model exchange."""
     generation_tool: str = ""
     """Tool that made it, as its description says."""
     model_version: str = ""
     """Version of the model, as its description says."""
-    """Whether there is a co-simulation interface; ``identifier`` and ``binary`` are else those of model exchange."""
 
     def __repr__(self) -> str:
         kinds = "co-simulation" * self.co_simulation, "model exchange" * bool(self.model_exchange)
@@ -300,10 +305,12 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
             other[v.name] = read_other(v, dropped.get(v.name, {}))
     variables, elements = gather(scalars, frozenset(other))
     states, order = find_states(model, scalars, variables, elements)
+    variables, aliases = find_aliases(variables)
     return {
         "variables": variables,
         "other": other,
         "elements": elements,
+        "aliases": aliases,
         "dependencies": read_feedthrough(model),
         "states": states,
         "state_order": order,
@@ -322,6 +329,7 @@ def _capabilities(root: Any, version: str) -> dict[str, Any]:
     state = "FMUstate" if two else "FMUState"
     derivative = "providesDirectionalDerivative" if two else "providesDirectionalDerivatives"
     fixed = None if steps is None or two else steps.get("fixedInternalStepSize")
+    experiment = root.find("DefaultExperiment")
     return {
         "can_save": _flag(steps, f"canGetAndSet{state}"),
         "can_serialize": _flag(steps, f"canGetAndSet{state}") and _flag(steps, f"canSerialize{state}"),
@@ -331,9 +339,17 @@ def _capabilities(root: Any, version: str) -> dict[str, Any]:
         "interpolates_inputs": _flag(steps, "canInterpolateInputs" if two else "providesIntermediateUpdate"),
         "variable_step": _flag(steps, "canHandleVariableCommunicationStepSize"),
         "fixed_internal_step": None if fixed is None else float(fixed),
+        "stop_time": None if experiment is None else _number(experiment.get("stopTime")),
         "model_exchange": None if exchange is None else exchange.get("modelIdentifier"),
         "model_exchange_has_derivatives": _flag(exchange, derivative),
     }
+
+
+def _number(text: str | None) -> float | None:
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        return None
 
 
 def _flag(interface: Any, name: str) -> bool:

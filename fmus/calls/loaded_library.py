@@ -145,8 +145,8 @@ class LoadedFmu:
         Parameters
         ----------
         stop_time : float, optional
-            End of the run in s; None if it is open. Some FMUs refuse to step beyond it, even after the state of a
-            longer run has been restored.
+            End of the run in s; None for that of the stepping options, if any. Some FMUs refuse to step beyond it,
+            even after the state of a longer run has been restored.
         start_time : float
             Start of the run in s.
         values : mapping of str to array, optional
@@ -156,7 +156,8 @@ class LoadedFmu:
         given = self._given = {**self.block.start, **(values or {})}
         try:
             self._configure(given)
-            tolerance = self.block.stepping.tolerance
+            tolerance, stop = self.block.stepping.tolerance, self.block.stepping.stop_time
+            stop_time = stop if stop_time is None else stop_time
             self.fmi.set_up(start_time, stop_time, tolerance)
             in_mode = {n: v for n, v in given.items() if waits_for_initialization(self.description, n)}
             early = {n: v for n, v in given.items() if n not in (*self.description.structural, *in_mode)}

@@ -135,6 +135,15 @@ class StepFailures(LoadedFmu):
         action = f"the step from t = {t:.9g} s by {h:g} s"
         if status == PENDING:
             action = f"{action} was still pending after {self.fmi.patience:g} s: it"
+        stop = self.description.stop_time
+        if stop is not None and self.block.stepping.stop_time is None and t + h > stop * (1 + ROUNDED):
+            return self.report(
+                action,
+                status,
+                t,
+                f"Its default experiment ends at {stop:g} s, beyond which some FMUs take no step. Tell it a later end: "
+                "stepping=StepOptions(stop_time=…).",
+            )
         if status != DISCARD:
             return self.report(action, status, t)
         steps = "" if self.block.variable_step else " from the start: this FMU takes steps of one length only"

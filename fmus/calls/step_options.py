@@ -50,6 +50,9 @@ class StepOptions:
     communication_step : float or Fraction, optional
         Seconds between two communication points of the FMU, a multiple of the run's base. None: at the ticks of the
         subsystems that it is wired to, or at those of the run's ``step``.
+    stop_time : float, optional
+        End of the experiment in s that the FMU is told (stopTimeDefined). Some FMUs take no step beyond it, or beyond
+        their default experiment without it. None: it is open.
 
     Raises
     ------
@@ -65,6 +68,7 @@ class StepOptions:
     input_derivatives: bool = False
     time: StepTime | str = StepTime.MULTIPLIED
     communication_step: float | Fraction | None = None
+    stop_time: float | None = None
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -82,6 +86,12 @@ class StepOptions:
             raise ParameterError(
                 f"found {step!r}; expected seconds, positive, or None. Give a multiple of the ticks, such as 0.01.",
                 port="stepping.communication_step",
+            )
+        stop = self.stop_time
+        if stop is not None and (isinstance(stop, bool) or not isinstance(stop, float | int) or math.isnan(stop)):
+            raise ParameterError(
+                f"found {stop!r}; expected seconds, or None. Give the end of the longest run, such as 100.0.",
+                port="stepping.stop_time",
             )
         if isinstance(self.retries, bool) or not isinstance(self.retries, int) or not 0 <= self.retries <= 50:
             raise ParameterError(

@@ -29,7 +29,7 @@ from ..isolation import Isolation, check_isolation, open_fmu
 from .exchange import ExchangeMembers, choose_interface
 from .fmu_point import FmuLinearization
 from .linearization import linear_model
-from .ports import FmuPorts, choose_ports, find_element
+from .ports import FmuPorts, choose_ports, find_element, other_name
 from .replacement import check_replacement
 from .start_values import check_start, check_value, read_sized
 from .step_model import STEP, step_difference
@@ -260,9 +260,9 @@ class Fmu(ExchangeMembers):
         UnknownNameError
             For a name that is no input, and for an input that no wire carries.
         """
-        others = self.description.other
+        left_out = self.description.other, self.description.aliases
         for name in kwargs:
-            if name in others and name not in self.inputs:
+            if any(name in names for names in left_out) and name not in self.inputs:
                 raise UnknownNameError(self._no_port(name), block=self.label)
         return super().__call__(*args, **kwargs)
 
@@ -276,6 +276,8 @@ class Fmu(ExchangeMembers):
 
     def _no_port(self, name: str) -> str:
         """Return the text of an error: it has no such output, or a port that no wire carries."""
+        if name in self.description.aliases:
+            return other_name(self.description, name)
         other = self.description.other.get(name)
         if other is None:
             return f"it has no output {name!r}. {near(name, self.outputs)}"

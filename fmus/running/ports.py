@@ -71,6 +71,8 @@ def choose_ports(
             known.append(name)
             texts[names.get(name, name)] = text
     for old in names:
+        if old not in known and old in description.aliases:
+            raise ParameterError(other_name(description, old), block=label, port="rename")
         if old not in known:
             raise UnknownNameError(f"it has no port {old!r} to rename. {near(old, known)}", block=label, port="rename")
     return FmuPorts(*both, texts)
@@ -100,8 +102,17 @@ def _side(variable: FmuVariable) -> int | None:
     return 1 if variable.causality in ("output", "local", "calculatedParameter") else None
 
 
+def other_name(description: FmuDescription, alias: str) -> str:
+    """Return the text of an error on a further name of an input or parameter."""
+    first = description.aliases[alias]
+    kind = description.find(first).causality
+    return f"{alias!r} is another name of its {kind} {first!r}, and the two are one variable. Use {first!r}."
+
+
 def _check_chosen(description: FmuDescription, chosen: tuple[str, ...], label: str) -> None:
     for name in chosen:
+        if name in description.aliases:
+            raise ParameterError(other_name(description, name), block=label, port="ports")
         other = description.other.get(name)
         if other is not None and other.is_text and other.causality in ("output", "local", "calculatedParameter"):
             continue

@@ -25,6 +25,14 @@ def check_start(description: FmuDescription, start: Mapping[str, Any], label: st
     parts: dict[str, dict[str, Any]] = {}
     for name, value in start.items():
         checked = check_value(description, name, value, label)
+        first = description.aliases.get(name, "")
+        if first in start and not np.array_equal(check_value(description, first, start[first], label), checked):
+            raise ParameterError(
+                f"found {value!r} for {name!r}, and {start[first]!r} for {first!r}; expected one value, as these are "
+                f"two names of one variable. Leave {name!r} out.",
+                block=label,
+                port=f"start.{name}",
+            )
         array = description.elements[name][0] if name in description.elements else name
         if array == name or name in description.variables:
             found[name] = checked

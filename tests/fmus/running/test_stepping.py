@@ -530,6 +530,36 @@ def test_the_tolerance_is_told(events):
     assert simulate(told, level=Constant(value=0.0))["plant.tolerance"][-1] == 1e-7
 
 
+ENDING = (
+    """
+typedef struct { double t, end; } instance;
+int fmi2SetupExperiment(void *p, int with, double tolerance, double start, int defined, double stop) {
+    ((instance *)p)->end = defined ? stop : 0.05; return 0; }
+int fmi2DoStep(void *p, double t, double h, int f) {
+    instance *c = p; c->t = t + h; return c->t > c->end + 1e-9 ? 3 : 0; }
+"""
+    + values("fmi2", "Get", "Real", "double", {1: "c->t"}),
+    """<CoSimulation modelIdentifier="small" canHandleVariableCommunicationStepSize="true"/>
+<DefaultExperiment startTime="0" stopTime="0.05"/><ModelVariables>
+<ScalarVariable name="y" valueReference="1" causality="output"><Real/></ScalarVariable></ModelVariables>
+<ModelStructure><Outputs><Unknown index="1"/></Outputs></ModelStructure>""",
+)
+
+
+def test_an_fmu_that_ends_with_its_experiment_is_told_a_later_end(cache, tmp_path):
+    file = small_fmu(tmp_path, "fmi2", *ENDING)
+    untold = Diagram("d", Fmu(file, name="plant")())
+    with pytest.raises(FmuRuntimeError, match=r"Its default experiment ends at 0\.05 s.*stop_time=") as caught:
+        untold.simulate(0.1, step=0.01, progress=False)
+    assert caught.value.run.t[-1] == pytest.approx(0.05)
+    plant = Fmu(file, name="plant", stepping=StepOptions(stop_time=0.1))
+    told = Diagram("d", plant())
+    run = told.simulate(0.1, step=0.01, progress=False)
+    assert run["plant.y"] == pytest.approx(run.t)
+    with pytest.raises(FmuRuntimeError, match=r"Look at the last samples"):
+        told.simulate(0.2, step=0.01, progress=False)
+
+
 THROUGH = (
     """
 typedef struct { double u, y; int running; } instance;
@@ -560,6 +590,7 @@ def test_values_are_exchanged_at_the_start_as_chosen(folder, way, first):
     ("options", "text"),
     [
         ({"tolerance": 0.0}, r"stepping\.tolerance: found 0\.0; expected a positive number"),
+        ({"stop_time": "late"}, r"stepping\.stop_time: found 'late'; expected seconds, or None"),
         ({"retries": 1000}, r"stepping\.retries: found 1000; expected an integer from 0 to 50"),
         ({"event_mode": "yes"}, r"stepping\.event_mode: found 'yes'; expected True or False"),
         ({"time": "exact"}, r"stepping\.time: found 'exact'; expected 'multiplied' or 'added'"),
