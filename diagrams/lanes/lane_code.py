@@ -185,8 +185,8 @@ def compile_lanes(
 def _compile(
     flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], count: int, start: StartSource | None
 ) -> LaneCode:
-    if flat.hybrid:
-        raise NoLanesError("it has continuous states")
+    if between := _between_ticks(flat):
+        raise NoLanesError(between)
     if flat.loops.slices:
         raise NoLanesError("it has algebraic loops")
     if flat.apart:
@@ -225,6 +225,20 @@ def _bind_starts(library: ctypes.CDLL, source: StartSource) -> LaneStarts:
     sizes = [sum(function.numel_out(i) for i in range(function.n_out())) for function in source.values]
     values = [bind(f"start{i}", 5) for i in range(len(sizes))]
     return LaneStarts(bind("first_tick", 7), bind("first_outputs", 3), values, sizes)
+
+
+def _between_ticks(flat: FlatDiagram) -> str:
+    """Return what happens between ticks, as a clause; empty where nothing does."""
+    if flat.continuous.size:
+        path = next(p for p, where in flat.states.slices.items() if where.start <= flat.continuous[0] < where.stop)
+        return f"it has continuous states, those of {path}"
+    if flat.outside:
+        return f"{flat.outside[0]} is evaluated from outside"
+    if flat.events:
+        event = flat.events[0]
+        kind = "a subsystem that is enabled or triggered" if event.subsystem else "a block that has events"
+        return f"{event.path} is {kind} in continuous time; give it, or a subsystem around it, a sample_time"
+    return "it has a transport delay in continuous time" if flat.hybrid else ""
 
 
 def _share(tick: Any) -> Any:

@@ -84,8 +84,26 @@ class BoundRun:
     @property
     def is_possible(self) -> bool:
         """Whether its runs can follow each other: each leaves nothing behind for the next one."""
-        opaque = any(self.flat.table.blocks[path].opaque for path in self.flat.checked.traced)
-        return self.engine.can_begin_anew and not opaque
+        return not self.obstacle
+
+    @property
+    def obstacle(self) -> str:
+        """Why its runs can't follow each other, as a clause; empty if they can."""
+        engine, flat = self.engine, self.flat
+        if opaque := [path for path in flat.checked.traced if flat.table.blocks[path].opaque]:
+            return f"{opaque[0]} is evaluated by Python, and may keep something of a run"
+        if engine.can_begin_anew:
+            return ""
+        if engine.exchanged:
+            return (
+                f"{next(iter(engine.exchanged.blocks))} is an FMU in model exchange, loaded for each"
+            )
+        if engine.coupled is not None:
+            return "their FMUs are coupled by another scheme than 'jacobi'"
+        for path, plant in engine.plants.items():
+            if not (isinstance(plant, FmuInstance) and plant.native is not None):
+                return f"{path} takes more calls than one for a step, and is loaded for each of them"
+        return f"Python's solver goes between their ticks ({' '.join(engine.messages) or 'compile=True'})"
 
     def fits(self, numbers: Numbers[Any]) -> bool:
         """Whether a run with the numbers of a sample can follow: the solver has the same tolerances and step limits."""

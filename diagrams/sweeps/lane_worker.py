@@ -78,7 +78,7 @@ class LaneWorker(Worker):
         """Yield the outcomes of samples that share their functions."""
         numbers = group[0][1]
         bound = self._bind(numbers) if self._repeats else None
-        found = "each of them needs a set-up of its own" if bound is None else self._lanes(numbers, bound)
+        found = self._alone if bound is None else self._lanes(numbers, bound)
         if bound is None or isinstance(found, str):
             for sample, _ in group:
                 yield _note(self.run(sample, tell), f"Not side by side in vector lanes: {found}.")

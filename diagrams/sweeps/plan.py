@@ -80,6 +80,16 @@ class Plan:
         return all(find_limits(plant) is None and is_built_here(plant.description.digest) for plant in self._plants)
 
     @property
+    def obstacle(self) -> str:
+        """Why its runs can't follow each other in a thread, as a clause; empty if nothing of the plan forbids it."""
+        if "start" in self.options and self.options["start"] is not None:
+            return "they go on from a state, start="
+        for path, block in self.diagram.scheduled.blocks.items():
+            if isinstance(block, Fmu) and not (find_limits(block) is None and is_built_here(block.description.digest)):
+                return f"{path} was not built by Loopwright on this machine, or runs in a process of its own"
+        return ""
+
+    @property
     def is_alone(self) -> bool:
         """Whether a process can run one sample at a time: an FMU of another tool is loaded in it."""
         return not all(find_limits(p) is not None or is_built_here(p.description.digest) for p in self._plants)
@@ -107,6 +117,8 @@ class Worker:
         self._bound: OrderedDict[Any, BoundRun] = OrderedDict()
         self._known_units: tuple[Layout, dict[str, str]] | None = None
         self._repeats = self._options.start is None and plan.runs_in_threads
+        self._alone = "" if self._repeats else plan.obstacle
+        """Why each run needs a set-up of its own, as a clause, where it does."""
 
     def __enter__(self) -> Worker:
         return self
@@ -178,9 +190,11 @@ class Worker:
             bound = BoundRun(numbers.diagram, self.plan.duration, self._options)
             try:
                 bound.__enter__()
-            except SimulationError:  # at these numbers; others may do
+            except SimulationError as error:  # at these numbers; others may do
+                self._alone = f"the diagram's own numbers give no start ({error})"
                 return None
             if not bound.is_possible:
+                self._alone = bound.obstacle
                 bound.__exit__(None, None, None)
                 self._repeats = self._repeats and numbers.key is not None
                 return None

@@ -14,6 +14,7 @@ from loopwright.blocks import (
     Lookup1D,
     OptionError,
     Output,
+    Sine,
 )
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.sweeps import final, lane_worker, maximum, mean, minimum, settling_time
@@ -169,34 +170,53 @@ class Odd(Block):
         return 2.0 * u.u
 
 
-def test_runs_that_cannot_go_side_by_side_go_by_themselves_and_say_why():
-    def notes(diagram, table, duration=0.1, **options):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            found = diagram.sweep(
-                None, duration, samples=table, signals="x", lanes=LANES, workers=1, **QUIET, **options
-            )
-        assert not found.failures
-        bare = diagram.sweep(None, duration, samples=table, signals="x", workers=1, **QUIET, **options)
-        assert found["x"].tobytes() == bare["x"].tobytes()
-        (text,) = (text for text in found.messages if text.startswith("Not side by side in vector lanes: "))
-        assert DIFFER not in found.messages
-        return text
+def notes(diagram, table, duration=0.1, **options):
+    """Return why runs don't go side by side; they have the bits of a sweep without lanes."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = diagram.sweep(None, duration, samples=table, signals="x", lanes=LANES, workers=1, **QUIET, **options)
+    assert not found.failures
+    bare = diagram.sweep(None, duration, samples=table, signals="x", workers=1, **QUIET, **options)
+    assert found["x"].tobytes() == bare["x"].tobytes()
+    (text,) = (text for text in found.messages if text.startswith("Not side by side in vector lanes: "))
+    assert DIFFER not in found.messages
+    return text
 
+
+def test_runs_that_cannot_go_side_by_side_go_by_themselves_and_say_why():
     table = [{"kp.gain": 1.0}, {"kp.gain": 1.5}]
     assert "don't go from tick to tick in C" in notes(loop(), table, compile=False)
     assert "integrator chooses its steps" in notes(loop(), [{**row, "plant.integrator": 2} for row in table])
     assert "more than 10000 substeps" in notes(loop(), [{**row, "plant.internal_step": 1e-8} for row in table], 0.01)
-    assert "set-up of its own" in notes(loop(more=lambda u: Odd(name="odd")(u)), table)
+    assert "box.odd is evaluated by Python" in notes(loop(more=lambda u: Odd(name="odd")(u)), table)
     assert "whole number of ticks" in notes(loop(), table, 0.105)
     rates = Diagram(
         "rates", Gain(gain=1.0, name="kp")(Integrator(name="held")(Constant(value=1.0, name="one"))).named("x")
     )
-    assert "it has continuous states" in notes(rates, table, step=T)
+    assert "it has continuous states, those of held." in notes(rates, table, step=T)
     assert "it has algebraic loops" in notes(loop(more=around, loops="solve"), table)
     assert "no scalar operations" in notes(
         loop(more=Lookup1D(breakpoints=(-9.0, 0.0, 9.0), values=(-9.0, 0.0, 4.0))), table
     )
+
+
+def test_why_each_run_needs_a_set_up_of_its_own_is_told():
+    table = [{"kp.gain": 1.0}, {"kp.gain": 1.5}]
+    isolated = loop()
+    isolated = isolated.replace({"plant": isolated["plant"].replace(isolate=True)})
+    assert "plant was not built by Loopwright on this machine, or runs in a process" in notes(isolated, table)
+    assert "they go on from a state" in notes(loop(), table, start=loop().operating_point(0.05))
+
+
+@pytest.mark.parametrize(("kind", "port"), [("triggered", "trigger"), ("enabled", "enable")])
+def test_a_subsystem_that_acts_between_ticks_is_named(kind, port):
+    mode = {"triggered": "rising", "enabled": "held"}[kind]
+    latch = subsystem(name="latch", **{kind: mode})(lambda u: Gain(gain=1.0, name="kp")(u))
+    wave = Sine(frequency=30.0, name="wave")
+    diagram = Diagram("events", latch(wave, **{port: wave}).named("x"))
+    text = notes(diagram, [{"kp.gain": 1.0}, {"kp.gain": 1.5}], step=T)
+    assert "latch is a subsystem that is enabled or triggered in continuous time" in text
+    assert "sample_time" in text
 
 
 def test_lanes_are_a_number_that_processors_have():
