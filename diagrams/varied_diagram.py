@@ -60,7 +60,8 @@ class VariedDiagram(SimulatedDiagram):
         seed : int
             Seed of the sweep; each sample has one of its own, which depends on this one and its place alone.
         seeds : list of str
-            Parameters that take the sample's seed, such as ``"noise.seed"``; these runs are interpreted by default.
+            Parameters that take the sample's seed, such as ``"noise.seed"``. Where a seed is fixed in a
+            block's equations, these runs are interpreted by default.
         signals : list of str
             Signals whose samples are kept.
         reduce : mapping of str to callable, optional

@@ -99,6 +99,9 @@ class Block(Value, Wireable):
     converts_units: ClassVar[bool | None] = None
     """True where a wire to or from the block is converted if its ends are in different units of one dimension; False
     where the block's user could ask for that."""
+    computed_from: ClassVar[frozenset[str]] = frozenset()
+    """Parameters, such as a seed, that the equations see through ``constants(T, method)`` alone, which then depends
+    on neither T nor the method: another value of theirs changes numbers, and no code."""
     stops: ClassVar[str | None] = None
     """Name of a scalar output that ends the run, without an error, at the first instant at which it is above 0.5."""
     transport: ClassVar[bool] = False

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Self
 
 import numpy as np
@@ -273,6 +273,7 @@ class BandLimitedNoise(Source):
     mean: float = parameter(default=0.0, description="mean value")
     seed: int = parameter(default=0, minimum=0, description="another seed gives another, independent noise")
     y = Output()
+    computed_from = frozenset({"seed"})
 
     @classmethod
     def from_density(cls, *, density: float, sample_time: float, **parameters: Any) -> Self:
@@ -283,14 +284,23 @@ class BandLimitedNoise(Source):
         """Return the time of the next value."""
         return next_edge(t, self.sample_time, 0.0)
 
+    def constants(self, T: float, method: str) -> dict[str, np.ndarray]:
+        """Return the keys of the rounds: numbers of a run, so that another seed changes no code."""
+        return {"keys": np.array(_keys(self.seed))}
+
+    @cached_property
+    def keys(self) -> np.ndarray:
+        """The keys of the rounds, of 24 bits each."""
+        return np.array(_keys(self.seed))
+
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the value that is held at t."""
         number, _, _ = period_of(t, self.sample_time, 0.0)
         low, high = number, np.floor(number / _HALF)
         low = low - _HALF * high
         high = high - _HALF * np.floor(high / _HALF)
-        for key in _keys(self.seed):
-            v = low + key
+        for k in range(_ROUNDS):
+            v = low + self.keys[k]
             v = v - _HALF * np.floor(v / _HALF)
             v = high + np.floor(v * (2.0 * v + 1.0) / 4096.0)  # the middle bits of a product depend on all of v
             high, low = low, v - _HALF * np.floor(v / _HALF)

@@ -76,7 +76,7 @@ class Traced:
 def constants_of(block: Block, T: float, method: str) -> dict[str, Any]:
     """Return the block's precomputed numbers, in order of their names."""
     compute: Callable[..., dict[str, Any]] | None = getattr(block, "constants", None)
-    if compute is None or not np.isfinite(T):
+    if compute is None or not (np.isfinite(T) or block.computed_from):
         return {}
     made = compute(T, method)
     if not isinstance(made, Mapping):

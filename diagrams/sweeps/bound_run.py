@@ -95,9 +95,7 @@ class BoundRun:
         if engine.can_begin_anew:
             return ""
         if engine.exchanged:
-            return (
-                f"{next(iter(engine.exchanged.blocks))} is an FMU in model exchange, loaded for each"
-            )
+            return f"{next(iter(engine.exchanged.blocks))} is an FMU in model exchange, loaded for each"
         if engine.coupled is not None:
             return "their FMUs are coupled by another scheme than 'jacobi'"
         for path, plant in engine.plants.items():

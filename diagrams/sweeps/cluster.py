@@ -187,6 +187,7 @@ def run_on_cluster(plan: Plan, samples: Sequence[Sample], client: Any) -> Genera
     packed = client.submit(deliver, parcel, key=f"loopwright-sweep-{key}")
     files = [client.submit(deliver, data, key=f"loopwright-fmu-{digest}") for digest, data in contents.items()]
     size = max(1, min(_MOST, len(samples) // (_CHUNKS * threads)))
+    size = -(-size // plan.lanes) * plan.lanes  # no vector is broken up
 
     def submit(some: Sequence[Sample]) -> Any:
         return client.submit(run_chunk, key, packed, [*contents], list(some), *files, pure=False)

@@ -26,8 +26,11 @@ from .revision import key_of, parts_of
 from .samples import Sample, read_samples
 from .store import Store
 from .threads import run_in_threads
+from .variation import is_number
 from .workers import make_worker
 
+_ASKED = 4
+"""Samples asked whether their runs are compiled: one with a value that is refused does not decide for the others."""
 _LANES = 8
 _MANY_LANES = (2, 4, 8, 16)
 _REFUSED = {
@@ -148,7 +151,7 @@ def make_plan(
     paths = [find_parameter(diagram, path) for path in ((seeds,) if isinstance(seeds, str) else seeds)]
     if isinstance(record := options.get("record"), Iterable) and not isinstance(record, str):
         options = {**options, "record": tuple(record)}  # for each of the runs
-    compiled = not paths  # a seed is a fixed number in the code, which would be compiled anew for every sample
+    compiled = all(is_number(diagram, path) for path in paths)  # else each sample would be compiled anew
     plan = Plan(
         diagram, duration, {"compile": compiled, **options}, chosen, reductions, tuple(paths), _check_lanes(lanes)
     )
@@ -194,7 +197,7 @@ def _run(plan: Plan, samples: Sequence[Sample], workers: int, client: Any) -> Ge
             for k in range(0, len(samples), worker.width):
                 yield from worker.run_all(samples[k : k + worker.width])
             return
-        if worker.can_compile(samples[0]):
+        if any(worker.can_compile(sample) for sample in samples[:_ASKED]):
             with closing(run_in_threads(plan, samples, min(workers, len(samples)), worker)) as stream:
                 yield from stream
             return

@@ -81,7 +81,7 @@ class Variation(Generic[D]):
         names: dict[str, list[str]] = {}
         scheduled = self._diagram.scheduled.blocks
         for name, value in parameters.items():
-            place = self._place(name)
+            place = self.place(name)
             if place is None or isinstance(value, Block):
                 other.add(name)
                 continue
@@ -114,7 +114,7 @@ class Variation(Generic[D]):
             self._descriptions[path] = block.description
         return self._descriptions[path]
 
-    def _place(self, name: str) -> tuple[str, list[str]] | None:
+    def place(self, name: str) -> tuple[str, list[str]] | None:
         """Return the block and the names within it of a parameter that may be a number; None where it changes more."""
         if name not in self._places:
             self._places[name] = self._find_place(name)
@@ -163,3 +163,9 @@ def _has_elements(block: Fmu, name: str) -> bool:
     """Whether start values name elements of an array, which are merged with those of the array."""
     about = block.description
     return any(about.elements[given][0] == name for given in block.start if given in about.elements)
+
+
+def is_number(diagram: SimulatedDiagram, path: str) -> bool:
+    """Whether a parameter of a block changes numbers of a run alone, though it is no float, such as a noise's seed."""
+    place = Variation(diagram).place(path)
+    return place is not None and place[1][0] in type(diagram.scheduled.blocks[place[0]]).computed_from

@@ -255,7 +255,8 @@ def _reads_sample_time(block: Block, trace: Traced) -> bool:
     position = sum(int(np.size(value)) for _, value in traced_parameters(block))
     last = trace.function.n_in() - 1
     columns = (trace.function.jac_sparsity(i, last).get_col() for i in range(trace.function.n_out()))
-    return hasattr(block, "constants") or any(position in column for column in columns)
+    computes = hasattr(block, "constants") and not block.computed_from
+    return computes or any(position in column for column in columns)
 
 
 def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, shared: dict[Any, Traced]) -> Traced:

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core import Block, DefinitionError, Layout, LoopwrightError, ParameterSpec, Port, Shape
-from ...blocks.tracing import GUARDS, NEXT, Traced, trace, traced_parameters
+from ...blocks.tracing import GUARDS, NEXT, Traced, constants_of, trace, traced_parameters
 from .html_page import block_text
 from .model import EventSpec, Integrator, ModelSpec, Variable
 from .package import build_fmu
@@ -100,7 +100,8 @@ class _BlockEquations:
         columns = ca.vertsplit(self.u, inputs.cuts) if traced.inputs else []
         x = self.x[[self._rows.index(i) for i in range(len(self._rows))]] if self._rows else self.x
         # a continuous model has no sample time
-        self._arguments = [self.t, x, *columns, ca.vertcat(self.p, 0.0)]
+        constants = [np.ravel(value) for value in constants_of(block, np.nan, traced.method).values()]
+        self._arguments = [self.t, x, *columns, ca.vertcat(self.p, 0.0, *constants)]
         names = (*traced.outputs, NEXT, GUARDS)
         self._made = dict(zip(names, f.call(self._arguments), strict=True))
 

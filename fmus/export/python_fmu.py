@@ -154,7 +154,7 @@ def _kind(block: Block, name: str) -> str:
             block=name,
         )
     for equation in ("constants", "initial"):
-        if hasattr(block, equation):
+        if hasattr(block, equation) and not (equation == "constants" and block.computed_from):
             raise DefinitionError(
                 f"it has {equation}(…), which an FMU with Python inside can't have; move it into the equations.",
                 block=name,

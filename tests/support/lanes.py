@@ -5,7 +5,7 @@ import functools
 import casadi as ca
 import numpy as np
 
-from loopwright.blocks import Compare, Constant, Gain, Step, StopCondition, UnitDelay
+from loopwright.blocks import BandLimitedNoise, Compare, Constant, Gain, Step, StopCondition, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, ModelSpec, Variable, build_fmu
 from loopwright.fmus.models import dc_motor, mass_spring_damper, scara
@@ -89,3 +89,10 @@ def three_plants():
     calls = arm(motor_torque=torque), motor(voltage=voltage), mass(force=force)
     signals = arm.position.named("tip"), motor.angle.named("angle"), mass.acceleration.named("a")
     return Diagram("three", *calls, *signals)
+
+
+def noisy():
+    """The lag under noise of a seed, in two rates."""
+
+    noise = BandLimitedNoise(sample_time=3 * T, variance=0.04, seed=5, name="noise")
+    return loop(more=lambda u: u + noise.y, slow=3)

@@ -25,7 +25,7 @@ from loopwright.diagrams.sweeps.sweep import make_plan
 from loopwright.diagrams.sweeps.workers import make_worker
 from loopwright.fmus import Fmu
 from loopwright.fmus.models import bouncing_ball
-from support.lanes import QUIET, STEP, T, loop, three_plants
+from support.lanes import QUIET, STEP, T, loop, noisy, three_plants
 
 LANES = 4
 NEAR = 1e-12
@@ -300,6 +300,51 @@ def test_what_the_start_of_a_run_has_told_belongs_to_that_run(monkeypatch):
     texts = [outcome.messages for outcome in found.outcomes]
     assert [len(text) for text in texts] == [2, 2, 2]
     assert len({text[0] for text in texts}) == 3
+
+
+def test_noise_has_the_seed_of_each_sample_in_its_lane():
+    diagram = noisy()
+    options = {"signals": ["x", "u", "k"], "seeds": "noise.seed", "seed": 3, **QUIET}
+    found = diagram.sweep({"kp.gain": [1.5] * 6 + [2.0]}, 0.3, lanes=LANES, workers=1, **options)
+    assert ran_in_lanes(found)
+    assert len({*found["x"][:, -1].tolist()}) == 7
+    alone = diagram.sweep({"kp.gain": [1.5] * 6 + [2.0]}, 0.3, compile=False, workers=1, **options)
+    for name in options["signals"]:
+        largest = np.abs(alone[name]).max()
+        assert np.abs(found[name] - alone[name]).max() <= NEAR * largest, name
+    threads = diagram.sweep({"kp.gain": [1.5] * 6 + [2.0]}, 0.3, lanes=LANES, workers=2, **options)
+    assert threads["x"].tobytes() == found["x"].tobytes()
+
+
+def test_a_sweep_in_lanes_that_was_interrupted_goes_on_with_what_is_missing(tmp_path, monkeypatch):
+    table = [{"kp.gain": g, "plant.gain": 1.0 + g} for g in np.linspace(0.5, 1.5, 11)]
+    options = {"signals": "x", "lanes": LANES, "workers": 1, **QUIET}
+    whole = loop().sweep(None, 0.2, samples=table, **options)
+    judge, judged = lane_worker.LaneWorker._judge, []
+
+    def interrupt(worker, sample, make):
+        judged.append(sample.index)
+        if len(judged) == 6:
+            raise KeyboardInterrupt
+        return judge(worker, sample, make)
+
+    monkeypatch.setattr(lane_worker.LaneWorker, "_judge", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        loop().sweep(None, 0.2, samples=table, to=tmp_path / "kept", **options)
+    again = loop().sweep(None, 0.2, samples=table, to=tmp_path / "kept", **options)
+    assert again.reused == 5
+    assert judged[6:] == [*range(5, 11)]  # no run that was kept is made again
+    assert again["x"].tobytes() == whole["x"].tobytes()  # other neighbours in their lanes change no bit
+    assert ran_in_lanes(again)
+
+
+def test_a_first_sample_that_is_refused_leaves_the_others_side_by_side_in_threads():
+    table = [{"kp.gain": g} for g in ("much", 1.0, 1.5, 2.0)]
+    found = loop().sweep(None, 0.1, samples=table, signals="x", lanes=LANES, workers=2, **QUIET)
+    assert found.failed.tolist() == [True, False, False, False]
+    assert ran_in_lanes(found)
+    alone = loop().sweep(None, 0.1, samples=table, signals="x", lanes=LANES, workers=1, **QUIET)
+    assert found["x"][1:].tobytes() == alone["x"][1:].tobytes()
 
 
 class EndedError(Exception):

@@ -26,6 +26,9 @@ from loopwright.blocks import (
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.sweeps import final, maximum, mean, minimum, settling_time
 from loopwright.diagrams.sweeps.plan import Worker
+from loopwright.diagrams.sweeps.samples import Samples
+from loopwright.diagrams.sweeps.sweep import make_plan
+from loopwright.diagrams.sweeps.workers import make_worker
 
 QUIET = {"progress": False}
 INTERPRETED = {"progress": False, "compile": False, "workers": 1}
@@ -361,18 +364,46 @@ def test_seeds_belong_to_samples_and_not_to_workers():
     assert longer["y"][:3].tobytes() == one["y"].tobytes()
 
 
-def test_a_sweep_with_seeds_compiles_nothing_by_default(monkeypatch):
-    from loopwright.diagrams.compiled import code
+class Dice(Block):
+    """A number that depends on a seed, which is fixed in its equations."""
 
+    seed: int = parameter(default=0)
+    y = Output()
+
+    def output(self, t, x, u):
+        return 0.1 * (self.seed % 1009) + 0.0 * t
+
+
+def gained(source):
     @subsystem(sample_time=T, name="box")
     def box(u):
         return Gain(gain=0.731, name="gain")(u)
 
+    return Diagram("noisy", box(source).named("y"))
+
+
+def test_a_seed_that_is_fixed_in_the_code_compiles_nothing_by_default(monkeypatch):
+    from loopwright.diagrams.compiled import code
+
     monkeypatch.setattr(code, "load_compiled", lambda *_: pytest.fail("it compiles"))
-    diagram = Diagram("noisy", box(BandLimitedNoise(sample_time=T, name="noise").y).named("y"))
-    found = diagram.sweep({"gain.gain": (1.0, 1.0)}, 0.1, seeds="noise.seed", signals="y", workers=1, **QUIET)
+    diagram = gained(Dice(name="dice").y)
+    found = diagram.sweep({"gain.gain": (1.0, 1.0)}, 0.1, seeds="dice.seed", signals="y", workers=1, **QUIET)
     assert not found.failures
     assert not np.array_equal(found["y"][0], found["y"][1])
+
+
+def test_a_seed_of_noise_is_a_number_of_the_run_and_one_code_serves_all():
+    diagram = gained(BandLimitedNoise(sample_time=T, name="noise").y)
+    plan = make_plan(diagram, 0.2, ["y"], None, "noise.seed", {})
+    samples = Samples(("box.gain.gain",), ((1.0,), (1.0,), (2.0,)), None, 7)
+    with make_worker(plan) as worker:
+        found = [worker.run(sample) for sample in samples]
+        assert len(worker._bound) == 1
+        assert next(iter(worker._bound.values())).is_compiled
+    for sample, outcome in zip(samples, found, strict=True):
+        single = diagram.replace(plan.parameters_of(sample)).simulate(0.2, compile=False, **QUIET)
+        assert outcome.signals["y"].tobytes() == single["y"].tobytes()
+    assert not np.array_equal(found[0].signals["y"], found[1].signals["y"])
 
 
 @pytest.mark.parametrize(

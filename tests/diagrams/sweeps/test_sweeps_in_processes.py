@@ -15,8 +15,10 @@ import pytest
 from loopwright.diagrams import experiments
 from loopwright.diagrams.sweeps import Sample, final
 from loopwright.diagrams.sweeps.cluster import Parcel
+from loopwright.diagrams.sweeps.lane_worker import DIFFER
 from loopwright.diagrams.sweeps.plan import Plan, Worker
 from loopwright.fmus import Fmu, gantry
+from support.lanes import noisy
 from support.swept import double_end, fragile
 
 QUIET = {"progress": False}
@@ -193,3 +195,14 @@ except InterruptedSweep as error:
     assert (process.returncode, err) == (0, "")
     assert float(ended) - interrupted < 3.0  # s; a run of this sweep takes 0.3 s in C, 1.5 s interpreted
     assert 0 < int(done) < 3000 == int(rows)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_lanes_on_a_cluster_give_the_bits_of_lanes_here(cluster):
+    parameters = {"kp.gain": np.linspace(0.5, 1.5, 23)}
+    options = {"signals": "x", "lanes": 4, "seeds": "noise.seed", **QUIET}
+    there, here = (noisy().sweep(parameters, 0.3, **options, **more) for more in ({"client": cluster}, {"workers": 1}))
+    assert not there.failures
+    assert DIFFER in there.messages
+    assert there["x"].tobytes() == here["x"].tobytes()
