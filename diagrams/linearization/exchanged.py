@@ -5,6 +5,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 from weakref import WeakKeyDictionary
 
@@ -40,7 +41,7 @@ class PointEvaluator(ExchangeEvaluator):
             DerivativeMethod.DIRECTIONAL if directional else DerivativeMethod.DIFFERENCES, "model_exchange"
         )
         """Method by which the derivatives are computed."""
-        self._checked = set[tuple[str, ...]]()
+        self._checked, self._differenced = set[tuple[str, ...]](), set[tuple[str, ...]]()
 
     def differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
         """Return the derivative of `evaluate`; the FMU's own is held against differences where it is asked for first.
@@ -51,7 +52,7 @@ class PointEvaluator(ExchangeEvaluator):
         if made is None or names in self._checked:
             return made
         self._checked.add(names)
-        if self.derivation.method is not DerivativeMethod.DIRECTIONAL or self.block.is_built_here:
+        if names in self._differenced or self.block.is_built_here:
             return made
         found = check_exchange_slopes(
             self._fmu, self._wired, lambda x, u: self.evaluate(names, t, x, u), x, u, made[:, 1:]
@@ -85,6 +86,8 @@ class PointEvaluator(ExchangeEvaluator):
                 self._fmu, self._wired, lambda x, u: self.evaluate(names, t, x, u).copy(), x, u
             )
         self._note(error, found)
+        self._differenced.add(names)
+        self.derivation = replace(self.derivation, method=DerivativeMethod.DIFFERENCES)
         return found
 
 

@@ -200,7 +200,8 @@ def model_step(
     way : {None, "equations", "step", "identified"}
         "equations" takes the matrix exponential of the equations' Jacobians under held inputs, which is exact at an
         equilibrium; "step" differences the step itself; "identified" takes pulse responses from rest. None takes the
-        first at an equilibrium, else the second, and the third if the FMU allows neither.
+        first at an equilibrium, else the second; where the FMU does not allow that, the first with its error, or the
+        third.
 
     Raises
     ------
@@ -231,12 +232,16 @@ def model_step(
         except FmuError as error:
             if way == "step":
                 raise
-            try:
-                return _identify_model(flat, at, path, z, h)
-            except FmuError as last:
-                raise last from error
-        m, derivation = step, step.derivation
-        C, D = _outputs_before(flat, at, path, equations, step, z)
+            if equations is None:
+                try:
+                    return _identify_model(flat, at, path, z, h)
+                except FmuError as last:
+                    raise last from error
+            m = _hold_in_motion(flat, at, path, z, h, equations)
+            derivation, C, D = replace(equations.derivation, held=True), equations.C, equations.D
+        else:
+            m, derivation = step, step.derivation
+            C, D = _outputs_before(flat, at, path, equations, step, z)
     names = _prefix_names(path, m.states)
     after = (m.C, m.D[:, wired]) if isinstance(m, FmuLinearization) else None
     following = {
@@ -303,6 +308,23 @@ def _hold_inputs(m: FmuLinearization, h: float) -> _HeldStep:
     change = whole[:, -1]
     A, B, f, y = whole[:, :n], whole[:, n:-1], m.x0 + change, m.y0 + m.C @ change
     return _HeldStep(A, B, m.x0, f, y, m.states, m.uncertainty * h)
+
+
+def _hold_in_motion(
+    flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray, h: float, m: FmuLinearization
+) -> _HeldStep:
+    """Return the model of a step with held inputs from the equations, at a point that moves.
+
+    The distance to such a model from the equations at the end of the step is its uncertainty.
+    """
+    held = _hold_inputs(m, h)
+    after = _states_after(fmu_at(flat, path), at, path, held.f)
+    point = {**at.plants[path], "t": at.plants[path]["t"] + h, "state": after}
+    later = linearize_equations(flat, replace(at, plants={**at.plants, path: point}), path, z)
+    end = _hold_inputs(later, h)
+    parts = ((held.A, end.A), (held.B, end.B), (m.C, later.C), (m.D, later.D))
+    apart = max(float(np.max(np.abs(a - b), initial=0.0)) for a, b in parts)
+    return replace(held, uncertainty=held.uncertainty + apart)
 
 
 def _outputs_before(

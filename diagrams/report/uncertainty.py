@@ -86,7 +86,8 @@ def widened(wire: str, part: LoopPart) -> Section:
     changed: dict[int, Number] = {}
     numbers, text = dict(part.section.numbers), list(part.section.text)
     for (v, cut), own in part.numbers.items():
-        if all(derivation.is_exact for derivation in v.model.derivations.values()):
+        exact = all(derivation.is_exact for derivation in v.model.derivations.values())
+        if exact and not v.model.uncertainty:
             continue
         w = [n.value for n in own.values() if n.unit == "rad/s" and 0 < n.value < math.inf]
         if not w:

@@ -119,6 +119,16 @@ class FmuDescription:
         """Return the layout of some variables in a flat vector, one after the other."""
         return Layout.of({name: self.find(name).shape for name in names})
 
+    def has_slopes(self, variable: FmuVariable) -> bool:
+        """Whether directional derivatives of a variable may be asked for: of outputs and of the states' derivatives."""
+        known = {key for v in self.variables.values() if v.causality == "output" for key in v.keys}
+        known |= {key for name in self.states.values() for key in self.find(name).keys}
+        return known.issuperset(variable.keys)
+
+    def find_state(self, variable: FmuVariable) -> str | None:
+        """Return the name of the continuous state that a variable is, by its own or another name; else None."""
+        return next((name for name in self.states if self.find(name).keys == variable.keys), None)
+
     def find(self, name: str) -> FmuVariable:
         """Return a variable, or a scalar that was gathered into an array.
 

@@ -58,6 +58,11 @@ class FmuVariable:
         return self.references[0]
 
     @property
+    def keys(self) -> tuple[tuple[str, int], ...]:
+        """Type and value reference of each scalar, or of the array: alike for all names of a variable."""
+        return tuple((self.type, reference) for reference in self.references)
+
+    @property
     def size(self) -> int:
         """Number of elements."""
         return math.prod(self.shape)

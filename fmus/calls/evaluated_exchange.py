@@ -224,16 +224,32 @@ class EvaluatedExchange(SavedExchange):
         return self._discarded
 
     def slopes(self, ports: Sequence[str], *, rates: bool, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
-        """Return the derivative of an `evaluation` by (x, u); None if the FMU computes no directional derivatives."""
+        """Return the derivative of an `evaluation` by (x, u); None if the FMU computes no directional derivatives.
+
+        Those of local variables may not be asked for (FMI 2.0, 2.1.9; FMI 3.0, 2.2.11), but of states they are known.
+        """
         about = self.description
         if not self.about.has_derivatives or (self._x.size and not about.states):
             return None
-        self.evaluation(ports, rates=rates)(t, x, u)
         outputs = [self.block.output_variables[port] for port in ports]
+        asked = [v.type == "Float64" and about.has_slopes(v) for v in outputs]
+        states = [None if is_asked else about.find_state(v) for v, is_asked in zip(outputs, asked, strict=True)]
+        if any(
+            v.type == "Float64" and not a and name is None for v, a, name in zip(outputs, asked, states, strict=True)
+        ):
+            return None
+        self.evaluation(ports, rates=rates)(t, x, u)
         unknown = [*outputs, *(about.find(name) for name in about.states.values() if rates)]
-        smooth = [v for v in unknown if v.type == "Float64"]
-        rows = np.concatenate([np.zeros(0, dtype=bool), *(np.full(v.size, v.type == "Float64") for v in unknown)])
+        asked += [True] * (len(unknown) - len(asked))
+        smooth = [v for v, is_asked in zip(unknown, asked, strict=True) if is_asked]
+        parts = (np.full(v.size, is_asked) for v, is_asked in zip(unknown, asked, strict=True))
+        rows = np.concatenate([np.zeros(0, dtype=bool), *parts])
         J = np.zeros((rows.size, x.size + u.size))
+        first, where = 0, about.layout(about.states).slices
+        for v, name in zip(outputs, states, strict=True):
+            if name is not None:
+                J[first : first + v.size, where[name]] = np.eye(v.size)
+            first += v.size
         column = 0
         known = [(about.find(name), True) for name in about.states]
         known += [(v, port in self._smooth and v.type == "Float64") for port, v in self._ports.items()]

@@ -112,13 +112,15 @@ def _linearize_by_directions(point: FmuPoint, instance: LoadedFmu) -> FmuLineari
     point.check(x)
     values = _values(point, instance)
     unknowns = [*(about.states[n] for n in point.states), *point.outputs]
-    smooth = [n for n in unknowns if not about.find(n).is_integer]
+    asked = [not (v := about.find(n)).is_integer and about.has_slopes(v) for n in unknowns]
+    smooth = [n for n, is_asked in zip(unknowns, asked, strict=True) if is_asked]
     found = []
     for name in (*point.states, *point.moved):
         with _mode_of(point, instance, name):
             size = about.find(name).size
             found += [instance.directional_derivative(smooth, [name], seed) for seed in np.eye(size).tolist()]
-    rows = point.smooth(unknowns)
+    sizes = [about.find(n).size for n in unknowns]
+    rows = np.repeat(asked, sizes)
     part = np.zeros((values.size, len(found)))
     part[rows] = np.array(found).reshape(len(found), -1).T if found else 0.0
     derivation = Derivation(DerivativeMethod.DIRECTIONAL, _interface_name(instance.model_exchange))
@@ -127,6 +129,19 @@ def _linearize_by_directions(point: FmuPoint, instance: LoadedFmu) -> FmuLineari
         checked = _check(point, instance, part[rows], rows)
         part[rows], uncertainty[rows] = checked.J, checked.error
         derivation = checked.describe(derivation)
+    others = point.smooth(unknowns) & ~rows
+    first, where = 0, about.layout(point.states).slices
+    for name, size in zip(unknowns, sizes, strict=True):
+        state = about.find_state(about.find(name))
+        if state is not None and others[first]:
+            part[first : first + size, where[state]] = np.eye(size)
+            others[first : first + size] = False
+        first += size
+    if others.any():  # local variables
+        if not instance.model_exchange:
+            _initialize_anew(point, instance)
+        J, error = _differences(point, instance, values)
+        part[others], uncertainty[others] = J[others], error[others]
     J = point.widen(part)
     return point.model(J, x, u, values, h=None, derivation=derivation, uncertainty=point.widen(uncertainty))
 
@@ -156,14 +171,19 @@ def _check(point: FmuPoint, instance: LoadedFmu, J: np.ndarray, rows: np.ndarray
     try:
         at = np.concatenate([instance.values(point.states), instance.values(point.moved)])
         if not instance.model_exchange:
-            instance.reset()
-            given = {n: v for n, v in point.given.items() if about.find(n).initial == "exact"}
-            instance.initialize(None, start_time=point.t, values=given)
+            _initialize_anew(point, instance)
     except FmuError:
         return SlopeCheck(J, np.zeros(J.shape), np.nan, is_wrong=False)
     limits = [np.concatenate([np.ravel(v.limits[side]) for v in variables]) for side in (0, 1)]
     nominals = np.concatenate([np.ravel(v.nominals) for v in variables])
     return check_slopes(J, values, at, nominals, (limits[0], limits[1]), np.concatenate(moved))
+
+
+def _initialize_anew(point: FmuPoint, instance: LoadedFmu) -> None:
+    """Go back to Initialization Mode at the operating point."""
+    given = {n: v for n, v in point.given.items() if point.about.find(n).initial == "exact"}
+    instance.reset()
+    instance.initialize(None, start_time=point.t, values=given)
 
 
 @contextmanager
@@ -188,6 +208,14 @@ def _linearize_by_differences(point: FmuPoint, instance: LoadedFmu) -> FmuLinear
     x, u = instance.values(point.states), instance.values(point.inputs)
     point.check(x)
     values = _values(point, instance)
+    J, uncertainty = map(point.widen, _differences(point, instance, values))
+    derivation = Derivation(DerivativeMethod.DIFFERENCES, _interface_name(instance.model_exchange))
+    return point.model(J, x, u, values, h=None, derivation=derivation, uncertainty=uncertainty)
+
+
+def _differences(point: FmuPoint, instance: LoadedFmu, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives of `_values` by states and inputs, and their errors, by differences."""
+    x = instance.values(point.states)
     at = np.concatenate([x, instance.values(point.moved)])
     column = Column(point.about, [*point.states, *point.moved], at, EQUATIONS)
 
@@ -204,6 +232,4 @@ def _linearize_by_differences(point: FmuPoint, instance: LoadedFmu) -> FmuLinear
                 instance.set_values({name: column.part(name, column.at)})
         return found
 
-    J, uncertainty = map(point.widen, differentiate(column, values, evaluate))
-    derivation = Derivation(DerivativeMethod.DIFFERENCES, _interface_name(instance.model_exchange))
-    return point.model(J, x, u, values, h=None, derivation=derivation, uncertainty=uncertainty)
+    return differentiate(column, values, evaluate)

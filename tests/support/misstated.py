@@ -97,8 +97,19 @@ _REALS = (  # name, reference, causality, variability, initial, start, derivativ
 _SAVES = ' canHandleVariableCommunicationStepSize="true"'
 
 
-def misstated_fmu(folder, fmi, changes=()):
-    """Build it into a folder, for a version of FMI, and return its path."""
+_HIDING = (
+    ("made = rate(c, c->x, c->v); return &made;", "made = r == 9 ? 3.0 * c->x : rate(c, c->x, c->v); return &made;"),
+    ("v = 0.0, u = 0.0;", "v = 0.0, u = 0.0; for (size_t i = 0; i < n; i++) if (f[i] == 1 || f[i] == 9) return 3;"),
+    ("{ return calloc(1, sizeof(instance)); }", "{ instance *c = calloc(1, sizeof(instance)); c->x = 0.1; return c; }"),
+)
+
+
+def misstated_fmu(folder, fmi, changes=(), *, hides_state=False):
+    """Build it into a folder, for a version of FMI, and return its path.
+
+    With ``hides_state`` x is a local variable that starts at 0.1, without an exact start value, and so is w = 3 x;
+    directional derivatives of local variables are an error, as in the FMUs of Dymola.
+    """
     prefix = f"fmi{fmi}"
     names = {
         "RATES": "GetDerivatives" if fmi == 2 else "GetContinuousStateDerivatives",
@@ -107,7 +118,18 @@ def misstated_fmu(folder, fmi, changes=()):
     source = f"#define FMI {fmi}\n#define PASTE(a, b) a##b\n#define NAME(end) PASTE({prefix}, end)\n" + _SOURCE
     for key, end in names.items():
         source = source.replace(f"NAME({key})", f"{prefix}{end}")
-    description = _describe2() if fmi == 2 else _describe3()
+    reals = _REALS
+    if hides_state:
+        hidden = ("x", 1, "local", "continuous", "calculated", None, None)
+        reals = (hidden, *_REALS[1:], ("w", 9, "local", "continuous", "calculated", None, None))
+        for before, after in _HIDING:
+            assert before in source
+            source = source.replace(before, after)
+    description = (_describe2 if fmi == 2 else _describe3)(reals)
+    if hides_state:
+        description = description.replace(
+            f'<{"Unknown index" if fmi == 2 else "Output valueReference"}="1" dependencies="1"/>', ""
+        )
     for before, after in changes:
         assert (before in source) + (before in description) == 1, before
         source, description = source.replace(before, after), description.replace(before, after)
@@ -119,9 +141,9 @@ def _attributes(initial, start, derivative):
     return found, f' initial="{initial}"' if initial else "", f' derivative="{derivative}"' if derivative else ""
 
 
-def _describe3():
+def _describe3(reals):
     rows = []
-    for name, reference, causality, variability, initial, start, derivative in _REALS:
+    for name, reference, causality, variability, initial, start, derivative in reals:
         start, initial, derivative = _attributes(initial, start, derivative)
         rows.append(
             f'<Float64 name="{name}" valueReference="{reference}" causality="{causality}" variability="{variability}"'
@@ -140,9 +162,9 @@ def _describe3():
     )
 
 
-def _describe2():
+def _describe2(reals):
     rows = []
-    for name, reference, causality, variability, initial, start, derivative in _REALS:
+    for name, reference, causality, variability, initial, start, derivative in reals:
         start, initial, derivative = _attributes(initial, start, derivative)
         rows.append(
             f'<ScalarVariable name="{name}" valueReference="{reference}" causality="{causality}" '

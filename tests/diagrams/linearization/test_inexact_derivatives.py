@@ -113,3 +113,29 @@ def test_a_trim_and_a_stiff_run_do_not_depend_on_wrong_derivatives(file3):
     diagram = Diagram("pushed", plant(u=Constant(value=3.0, name="force")))
     point = diagram.trim(free=["force.value"], targets={"plant.x": 0.5})
     assert point.parameters["force.value"] == pytest.approx(50.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("interface", WAYS)
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_local_variables_as_ports_have_slopes_though_the_fmu_may_not_be_asked_for_them(tmp_path, fmi, interface):
+    file = misstated_fmu(tmp_path, fmi, hides_state=True)
+    plant = Fmu(file, interface=interface, ports=["u", "v", "x", "w"], name="plant")
+    model = plant.linear_model(state={"x": 0.3, "v": 0.2})
+    np.testing.assert_array_equal(model.A, A)
+    rows = dict(zip(model.outputs, np.hstack([model.C, model.D]), strict=True))
+    np.testing.assert_array_equal(rows["x"], [1.0, 0.0, 0.0])
+    np.testing.assert_allclose(rows["w"], [3.0, 0.0, 0.0], atol=1e-8)
+    assert 0.0 < model.uncertainty.max() < 1e-7
+
+    @subsystem(sample_time=DT)
+    def controller(y):
+        return PID(kp=4.0, ki=20.0)(0.0, y)
+
+    diagram = Diagram("loop", plant(u=controller(plant["x"]).named("u")))  # a state does not feed through
+    linear = diagram.linearize(inputs="u", outputs=["plant.x", "plant.w"])  # it moves: it starts at x = 0.1
+    assert not linear.is_equilibrium
+    own = [linear.states.index(f"plant.{name}") for name in "xv"]
+    exact = held()
+    kp = np.array([[0.0, 0.0], [0.0, 0.0]]) - 4.0 * exact[:, 2:] @ [[1.0, 0.0]]
+    np.testing.assert_allclose(linear.A[np.ix_(own, own)], exact[:, :2] + kp, atol=1e-8)
+    assert linear.uncertainty < 1e-6
