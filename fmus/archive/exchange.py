@@ -123,12 +123,12 @@ def _read_dependencies(root: ET.Element, model: Any) -> dict[Key, frozenset[Key]
             for name, names in given.items()
             if name in known
         }
-    given = {
+    listed = {
         _key(unknown.variable): None if unknown.dependencies is None else frozenset(map(_key, unknown.dependencies))
         for unknown in (*model.outputs, *model.derivatives)
     }
     states = [_key(v.variable.derivative) for v in model.derivatives if v.variable.derivative is not None]
-    return {**given, **{key: frozenset([key]) for key in states}}  # a state follows nothing else at once
+    return {**listed, **{key: frozenset([key]) for key in states}}  # a state follows nothing else at once
 
 
 def _key(variable: Any) -> Key:
