@@ -20,7 +20,7 @@ import casadi as ca
 from ...blocks.core import CompilerError
 from ...fmus.export import SUFFIXES, compile_shared, describe_compiler
 from ...fmus.platform import cache_folder, native_platform
-from ..flat import EXACT_LOOP, FlatDiagram, TickPattern
+from ..flat import EXACT_LOOP, FlatDiagram, TickPattern, share_terms
 from .generated_text import make_visible
 from .grouping import Tables, make_tables
 from .kernels import write_kernels
@@ -194,7 +194,7 @@ def write_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> 
 def loop_functions(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> dict[frozenset[TickPattern], Any]:
     """Return the equations of the algebraic loops at ticks: their mismatch, and its derivative."""
     found = {clocks: flat.loop_equations(clocks) for clocks in acting} if flat.loops.slices else {}
-    return {c: rename(made.fast, f"loops{i}") for i, (c, made) in enumerate(found.items()) if made is not None}
+    return {c: share_terms(made.fast, f"loops{i}") for i, (c, made) in enumerate(found.items()) if made is not None}
 
 
 def write_loops(loops: Mapping[frozenset[TickPattern], Any]) -> str:
@@ -244,7 +244,7 @@ def _write_straight(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]])
         return None
     generator, functions = ca.CodeGenerator("ticks.c"), {}
     for i, (clocks, function) in enumerate(found.items()):
-        functions[clocks] = rename(function, f"tick{i}")
+        functions[clocks] = share_terms(function, f"tick{i}")
         generator.add(functions[clocks])
 
     def make(libraries: Sequence[ctypes.CDLL]) -> TickCode:
@@ -269,15 +269,6 @@ def _write_grouped(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) 
 
     count = sum(f.n_instructions() for key, f in functions.items() if key not in opaque)
     return TickSources([kernels.source], count, kernels.exact, make)
-
-
-def rename(function: Any, name: str) -> Any:
-    """Return a function under another name; of operations on scalars, each is done once."""
-    if function.is_a("SXFunction"):
-        symbols = function.sx_in()
-        return ca.Function(name, symbols, ca.cse(function.call(symbols)))
-    symbols = function.mx_in()
-    return ca.Function(name, symbols, function.call(symbols))
 
 
 def address_of(library: ctypes.CDLL, name: str) -> int:

@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 import casadi as ca
 
 from ...fmus.export import describe_processor, inline_model, own_functions, processor_flags
-from ..flat import FlatDiagram, TickPattern
+from ..flat import FlatDiagram, TickPattern, share_terms
 from .code import (
     MASTER,
     StraightTick,
@@ -22,7 +22,6 @@ from .code import (
     compile_ticks,
     load_compiled,
     master_source,
-    rename,
 )
 from .generated_text import make_visible
 from .hybrid_code import FUSING
@@ -82,7 +81,7 @@ def _compile(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], plants
     models, steps, inside = _write_models(plants)
     found = {} if flat.by_block else {clocks: flat.at_tick(clocks).last.fast for clocks in acting}
     straight = bool(found) and all(function.is_a("SXFunction") for function in found.values())
-    functions = {clocks: rename(f, f"tick{i}") for i, (clocks, f) in enumerate(found.items())} if straight else {}
+    functions = {clocks: share_terms(f, f"tick{i}") for i, (clocks, f) in enumerate(found.items())} if straight else {}
     text = "\n".join([_SYSTEM, _write_ticks([*functions.values()]), models, steps, master_source()])
     library = load_compiled(text, (*processor_flags(), *FUSING), describe_processor())
     master = library[MASTER]

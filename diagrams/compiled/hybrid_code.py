@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from ...fmus.export import describe_processor, processor_flags
-from ..flat import NONE, FlatDiagram, TickPattern
+from ..flat import NONE, FlatDiagram, TickPattern, share_terms
 from .code import (
     GroupedTick,
     StraightTick,
@@ -24,7 +24,6 @@ from .code import (
     load_compiled,
     loop_functions,
     read_sources,
-    rename,
     write_loops,
 )
 from .generated_text import make_visible
@@ -207,14 +206,14 @@ def write_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *,
 
 
 def _write_straight(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridSources:
-    ticks = {clocks: rename(flat.at_tick(clocks).last.fast, f"tick{i}") for i, clocks in enumerate(kinds)}
+    ticks = {clocks: share_terms(flat.at_tick(clocks).last.fast, f"tick{i}") for i, clocks in enumerate(kinds)}
     others = {"flow": flat.flow.last.fast}
     if stiff:
         looped = bool(flat.active_loops(NONE))
         others["slope"] = flat.jacobian_with_loops.fast if looped else _sparse_slope(flat)
     if flat.events:
         others |= {"indicators": flat.indicators.last.fast, "jump": flat.jump.last.fast}
-    others = {name: rename(function, name) for name, function in others.items()}
+    others = {name: share_terms(function, name) for name, function in others.items()}
     generator = ca.CodeGenerator("hybrid.c")
     for function in (*ticks.values(), *others.values()):
         check_size(function)

@@ -10,7 +10,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .code import read_sources, rename
+from ..flat import share_terms
+from .code import read_sources
 from .generated_text import make_visible
 
 STEPS = {"rk4": "step_rk4", "RK23": "step_rk23", "RK45": "step_rk45"}
@@ -33,7 +34,7 @@ def write_steps(rates: Any, where: Sequence[int]) -> str:
     if not (0 < n <= _MOST_STATES and rates.is_a("SXFunction") and rates.n_instructions() <= _MOST_OPERATIONS):
         return ""
     generator = ca.CodeGenerator("rates.c")
-    generator.add(rename(rates, "rates"))
+    generator.add(share_terms(rates, "rates"))
     text = make_visible(generator.dump()).replace("static int casadi_f0(", "INLINE int casadi_f0(")
     numbers = f"#define N {n}\n#define WIDTH {rates.numel_in(1)}\n#define PLACES {', '.join(map(str, where))}\n"
     numbers += "#define INLINE static inline __attribute__((always_inline))\n"

@@ -5,6 +5,7 @@ from .announced import Announcer, Times, announcers
 from .clock_sets import is_exact, kinds_of
 from .clocks import EVERY, NONE, ClockSets, TickPattern, bits_of, ticks_after
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator
+from .fast_functions import share_terms
 from .flat_diagram import EXACT_LOOP, FlatDiagram
 from .flatten import renumber, write_numbers
 from .functions import indicators_of
@@ -70,6 +71,7 @@ __all__ = [
     "plant_inputs",
     "rates",
     "renumber",
+    "share_terms",
     "size_of_motion",
     "takes_any_step",
     "ticks_after",

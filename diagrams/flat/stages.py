@@ -34,15 +34,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from threading import Lock
 from typing import Any, Protocol, runtime_checkable
 
 import casadi as ca
 import numpy as np
 
 from ...blocks.core import Layout
-from ...blocks.tracing import has_large_product
 from .evaluation import Apart, Instant, no_evaluator
+from .fast_functions import share_terms, speed_up
 
 
 class Evaluator(Protocol):
@@ -70,9 +69,6 @@ class Evaluator(Protocol):
         A column by t that is not finite is computed by differences, where it is needed.
         """
         ...
-
-
-_EXPANDING = Lock()  # the option of CasADi that says whether to simplify is one for all threads
 
 
 @runtime_checkable
@@ -134,6 +130,12 @@ class TracedStage:
     def fast(self) -> Any:
         """The function as it is evaluated fastest, with the same results to the last bit; see `speed_up`."""
         return speed_up(self.function, simplify=not self.by_block)
+
+    @cached_property
+    def evaluated(self) -> Any:
+        """The function as it is evaluated in interpreted runs, and as it is compiled: see `share_terms`."""
+        plain = self.by_block or not self.fast.is_a("SXFunction")
+        return self.fast if plain else share_terms(self.fast)
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +270,7 @@ class Schedule:
             Evaluators of the blocks of opaque stages, by path.
         """
         if len(self.stages) == 1:
-            return bind_function(self.last.fast, arguments, results)
+            return bind_function(self.last.evaluated, arguments, results)
         c, calls, kept = np.zeros(self.width), list[Callable[[], None]](), list[Bound]()
         paths = set[str]()
         for stage in self.stages:
@@ -278,7 +280,7 @@ class Schedule:
                 paths.add(stage.path)
             else:
                 into = results if stage is self.last else [c[stage.makes]]
-                kept.append(bind_function(stage.fast, [*arguments, c], into))
+                kept.append(bind_function(stage.evaluated, [*arguments, c], into))
                 calls.append(kept[-1].call)
         return Bound(_one_after_the_other(calls), kept[-1].outputs, kept)
 
@@ -337,29 +339,6 @@ def bind_function(function: Any, arguments: Sequence[np.ndarray], results: Seque
     for i, vector in enumerate(made):
         buffer.set_res(i, _view(vector))
     return Bound(call, made, buffer)
-
-
-def speed_up(function: Any, *, simplify: bool = True) -> Any:
-    """Return a function in the form that is evaluated fastest: scalar operations.
-
-    Where a block looks up a table, or multiplies a large matrix, it is returned unchanged.
-
-    Parameters
-    ----------
-    simplify : bool
-        Simplify the operations of all blocks together, such as a sum with a zero: this may change the sign of a zero,
-        and rounding where a value is added and subtracted again. Else the results are those of the blocks, one by one.
-    """
-    if has_large_product(function):
-        return function
-    with _EXPANDING:
-        ca.GlobalOptions.setSimplificationOnTheFly(simplify)
-        try:
-            return function.expand()
-        except RuntimeError:
-            return function
-        finally:
-            ca.GlobalOptions.setSimplificationOnTheFly(True)
 
 
 def _view(vector: np.ndarray) -> Any:

@@ -10,7 +10,8 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core import Layout, ParameterError
-from .stages import Bound, Evaluator, Evaluators, OpaqueStage, Schedule, TracedStage, bind_function, speed_up
+from .fast_functions import speed_up
+from .stages import Bound, Evaluator, Evaluators, OpaqueStage, Schedule, TracedStage, bind_function
 
 By = tuple[str, Sequence[int] | None]
 """An argument of a schedule, and the entries by which it is differentiated; None for all."""
