@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,8 @@ from ..flat import FlatDiagram, TickPattern, WiredDiagram
 from ..results import OperatingPoint
 from .workspace import Workspace
 
+SAME = 1e-9
+"""Distance between two states of an FMU, absolute and relative, up to which it need not be set."""
 PASSES = 120
 """Most ticks that states without a value, such as those of a delay, get to take one."""
 
@@ -22,7 +24,7 @@ def apply_point(diagram: WiredDiagram, point: OperatingPoint) -> WiredDiagram:
     Raises
     ------
     FmuError
-        An FMU whose states can't be set at the start.
+        An FMU whose states can't be set at the start, and that starts in others.
     """
     changes: dict[str, Any] = dict(point.parameters)
     variant = diagram.replace(changes) if changes else diagram
@@ -32,12 +34,28 @@ def apply_point(diagram: WiredDiagram, point: OperatingPoint) -> WiredDiagram:
         try:
             blocks[path] = block.replace(start={**block.start, **known["state"]})
         except LoopwrightError as error:
+            there = _started_there(block, known)
+            if there is not None:
+                blocks[path] = there
+                continue
             raise FmuError(
                 f"a run can't start at this operating point, because a state can't be set at the FMU's start: "
                 f"{error.message} Run to it instead: diagram.operating_point(t).",
                 block=path,
             ) from error
     return variant.replace(blocks) if blocks else variant
+
+
+def _started_there(block: Any, known: Mapping[str, Any]) -> Any:
+    """Return an FMU that starts in its states at a point, as far as they can be set; None where the others differ."""
+    about, ports = block.description, block.input_variables
+    exact = {n: v for n, v in known["state"].items() if about.find(n).initial == "exact"}
+    made = block.replace(start={**block.start, **exact})
+    inputs = {ports[port].name: value for port, value in known["inputs"].items()}
+    with made.replace(start={**made.start, **inputs}).instantiate((), None, start_time=known["t"]) as instance:
+        found = instance.operating_point()["state"]
+    same = all(np.allclose(found[n], v, rtol=SAME, atol=SAME) for n, v in known["state"].items())
+    return made if same else None
 
 
 def _settable(diagram: WiredDiagram, point: OperatingPoint) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import PID, Constant
+from loopwright.blocks import PID, Constant, FmuError
 from loopwright.diagrams import Diagram, InexactDerivatives, RefutedDerivatives, margins, subsystem
 from loopwright.diagrams.linearization.exchanged import PointEvaluator
 from loopwright.fmus import Fmu
@@ -139,3 +139,14 @@ def test_local_variables_as_ports_have_slopes_though_the_fmu_may_not_be_asked_fo
     kp = np.array([[0.0, 0.0], [0.0, 0.0]]) - 4.0 * exact[:, 2:] @ [[1.0, 0.0]]
     np.testing.assert_allclose(linear.A[np.ix_(own, own)], exact[:, :2] + kp, atol=1e-8)
     assert linear.uncertainty < 1e-6
+
+
+def test_a_run_begins_at_the_start_itself_though_no_state_can_be_set_there(tmp_path):
+    plant = Fmu(misstated_fmu(tmp_path, 3, hides_state=True), interface="co_simulation", ports=["u", "x"], name="plant")
+    diagram = Diagram("pushed", plant(u=Constant(value=3.0, name="force")))
+    start, later = diagram.operating_point(0.0, step=0.01), diagram.operating_point(0.5, step=0.01)
+    run = diagram.simulate(0.5, step=0.01, start=start, progress=False)
+    exact = [0.03 + (expm(A * t) @ [0.07, 0.0])[0] for t in run.t]
+    np.testing.assert_allclose(run["plant.x"], exact, atol=1e-8)
+    with pytest.raises(FmuError, match="can't be set at the FMU's start"):
+        diagram.simulate(0.5, step=0.01, start=later, progress=False)
