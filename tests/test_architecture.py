@@ -223,7 +223,7 @@ PUBLIC = {
         AdmittanceLoop BlockReport Box Channel Comparison Contact ContactAdmittance ContactConfirmation ContactLimit ContactMap
         ContactTrial Coupling CouplingReport Diagram DiskMargin Drawing Failure Fig3Diagram FlatDiagram FrequencyResponse
         GainCrossover GangOfFour InexactDerivatives Interrupted InterruptedSweep Kink Layout Linearization Margins MeanSlope MeasuredMargins Number
-        NyquistCount Occurrence OperatingPoint Passivity PeriodicMargins PhaseCrossover Plot Reduction RefutedDerivatives Report Requirements Review
+        NyquistCount Occurrence OperatingPoint Passivity PassivityReason PeriodicMargins PhaseCrossover Plot PortPassivity Reduction RefutedDerivatives Report Requirements Review
         Rig Run RunConfirmation RunOptions RunState Sample SampledDesign Samples Section Sensitivities Sensitivity Simulation SimulationView Snapshot StabilityLimit
         StabilityMap StepResponse StepsOnly Stopped Subsystem SubsystemSettings Sweep Table TextSignal TrialMethod Verdict Wire
         WorstCase ZeroSlope analyse check_block compare_with_control complementary

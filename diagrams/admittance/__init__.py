@@ -8,6 +8,7 @@ from .contact_limits import ContactLimit, ContactMap
 from .contact_trials import TrialMethod
 from .coupled import crossing_frequency, growth_rate, poles
 from .moored_plant import hold_sources
+from .port_passivity import PassivityReason, PortPassivity
 from .rendered import Passivity, passivity, rendered_admittance, rendered_response, rendered_system, target_admittance
 from .shown_plant import check_plant, is_discrete
 from .stability_limits import (
@@ -29,6 +30,8 @@ __all__ = [
     "ContactMap",
     "ContactTrial",
     "Passivity",
+    "PassivityReason",
+    "PortPassivity",
     "StabilityLimit",
     "StabilityMap",
     "TrialMethod",

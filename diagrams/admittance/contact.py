@@ -27,6 +27,7 @@ from .contact_limits import ContactLimit, ContactMap, CoupledLoop, check_propert
 from .contact_loop import close_loop, join_environment
 from .contact_parts import ContactParts, take_apart
 from .contact_ports import Ports
+from .port_passivity import find_passivity
 from .rendered import CONTINUOUS, HIGHEST, LOWEST, OFF_PATH, PERIODIC, SAMPLED, Passivity, find_negative
 from .stability_limits import PER_DECADE
 
@@ -175,6 +176,7 @@ class Contact:
             + (PERIODIC if self.parts.ticks else "")
             + (OFF_PATH if off_path else ""),
             findings=self.findings,
+            port=find_passivity(self.parts, self.direction, stable=stable),
         )
 
     def loop(self, vary: str, **environment: float) -> CoupledLoop:

@@ -25,6 +25,7 @@ from ...blocks.core import Array, Finding, OptionError, brief
 from ..frequency import read_matrices
 from .compliance_loop import AdmittanceLoop, hold_force
 from .coupled import close_loop
+from .port_passivity import PortPassivity
 
 if TYPE_CHECKING:
     from control import FrequencyResponseData, StateSpace
@@ -68,6 +69,8 @@ class Passivity:
         Relative error of the frequencies.
     findings : tuple of Finding
         Kinks and stairs of the diagram that the loop leaves out.
+    port : PortPassivity, optional
+        Passivity against all passive environments, with the aliases of a sampled loop; that of a `Contact`.
     """
 
     frequency: float
@@ -77,6 +80,7 @@ class Passivity:
     caveat: str
     tolerance: float = 1e-9
     findings: tuple[Finding, ...] = ()
+    port: PortPassivity | None = None
 
     def __repr__(self) -> str:
         first = f"Re Y < 0 from {self.frequency:.6g} rad/s" if self.intervals else "Re Y ≥ 0"

@@ -12,7 +12,7 @@ from ...blocks.core import LoopwrightError, OptionError
 from ..admittance import SIDES, Contact, ContactLimit, StabilityLimit, make_contact, try_limit
 from ..frequency import Number, with_findings
 from ..linearization import StepsOnly
-from ..report import Implementation, sign_of_admittance
+from ..report import SIGN_COLUMNS, Implementation, sign_of_admittance
 from ..report_writing import Plot, Section, Table, Texts
 from .report_case import PLANT, Fig3Case
 from .report_figures import TARGET, draw_admittances
@@ -73,7 +73,8 @@ def _side(variants: Mapping[Implementation, Contact], side: str, titles: Mapping
         *tried,
     )
     symbol = "along the path, ∥" if side == "par" else "across the path, ⊥"
-    text = (*TEXTS.paragraphs("asked_of", filter=a, scale=one.scale), one.passivity().caveat, *said)
+    seen = one.passivity()
+    text = (*TEXTS.paragraphs("asked_of", filter=a, scale=one.scale), seen.caveat, str(seen.port), *said)
     return Section(side, f"Direction {symbol}", text, tables, (_rendered(variants, side, titles),), numbers)
 
 
@@ -82,11 +83,10 @@ def _passivity(
 ) -> Table:
     rows = []
     for name, contact in variants.items():
-        number, spans, alone = sign_of_admittance(contact)
-        numbers[f"first_non_passive.{name}"] = number
-        rows.append((titles.get(name, name), number, spans, alone))
-    columns = ("variant", "first Re Y < 0 at", "all of Re Y < 0 [rad/s]", "stable alone")
-    return Table("Sign of Re Y(jω)", columns, tuple(rows))
+        row = sign_of_admittance(contact)
+        numbers[f"first_non_passive.{name}"] = row[0]
+        rows.append((titles.get(name, name), *row))
+    return Table("Sign of Re Y(jω)", ("variant", *SIGN_COLUMNS), tuple(rows))
 
 
 def _limits(variants: Mapping[Implementation, Contact], numbers: dict[str, Number], titles: Mapping[str, str]) -> Table:

@@ -19,7 +19,7 @@ from .case import OUTSIDE, Basis, Case, InjectionPlan
 from .disks import disk_numbers, disk_range
 from .parts import MakesSections, ReportKind, ReportPart
 from .points import point_of
-from .section_contact import sign_of_admittance
+from .section_contact import SIGN_COLUMNS, sign_of_admittance
 from .section_limits import LIMITS_TITLE
 from .section_poles import POLES_TITLE, list_poles
 from .section_subject import SUBJECT_TITLE
@@ -39,6 +39,7 @@ __all__ = [
     "POLES_TITLE",
     "REMARKS",
     "SENSITIVITY",
+    "SIGN_COLUMNS",
     "STEPS",
     "SUBJECT",
     "SUBJECT_TITLE",

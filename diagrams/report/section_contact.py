@@ -41,6 +41,8 @@ TRIED_DAMPING = 10.0
 """Damping of the environment whose limit is tried in the nonlinear run."""
 SPRING = 10.0
 """Spring in N/m that holds a mass."""
+SIGN_COLUMNS = ("first Re Y < 0 at", "all of Re Y < 0 [rad/s]", "stable alone", "passive")
+"""Columns of `sign_of_admittance`; the last is the verdict against all passive environments, with all aliases."""
 WIDE = 50.0
 """Factor of the limit of stiffness to both ends of a map, and of the damping k/ω that belongs to it."""
 
@@ -208,18 +210,18 @@ def _contact(name: str, contact: Contact, reported: ReportedContacts) -> Section
     reported.weakest.append(_find_weakest(name, required, numbers))
     tried, said, refuted = _tried(contact, required, numbers)
     reported.refuted |= {f"{KEY}.{name}.{path}" for path in refuted}
-    parts = contact.parts
+    parts, seen = contact.parts, contact.passivity()
     text = TEXTS.paragraphs(
         "place", port=f"{contact.plant}.{contact.ports.force}", measured=contact.measured, entry=contact.entry,
         t=contact.point.t,
         direction=", ".join(f"{v:.4g}" for v in contact.direction), derivation=str(contact.derivation),
-        sample_time=parts.sample_time, ticks=len(parts.ticks), caveat=contact.passivity().caveat,
+        sample_time=parts.sample_time, ticks=len(parts.ticks), caveat=f"{seen.caveat} {seen.port}",
     )  # fmt: skip
     plots = (_admittance(name, contact), *_map(name, contact, soft))
     return Section(name, f"Contact {name!r}", (*text, *said), (*tables, *tried), plots, numbers)
 
 
-def sign_of_admittance(contact: Contact) -> tuple[Number, str, str]:
+def sign_of_admittance(contact: Contact) -> tuple[Number, str, str, str]:
     """Return the first frequency at which Re Y is negative, all such spans, and whether the loop alone is stable.
 
     The number is confirmed by the sign of Re Y on its two sides.
@@ -233,13 +235,15 @@ def sign_of_admittance(contact: Contact) -> tuple[Number, str, str]:
             known = "Re Y changes its sign within rounding there"
     error = p.tolerance * p.frequency if math.isfinite(p.frequency) else 0.0
     spans = ", ".join(f"{low:.5g} … {high:.5g}" for low, high in p.intervals) or "none"
-    return Number(p.frequency, "rad/s", error, known, findings=p.findings), spans, "yes" if p.stable else "no"
+    number = Number(p.frequency, "rad/s", error, known, findings=p.findings)
+    passive = None if p.port is None else p.port.passive
+    return number, spans, "yes" if p.stable else "no", {True: "yes", False: "no", None: "–"}[passive]
 
 
 def _passivity(contact: Contact, numbers: dict[str, Number]) -> Table:
     rows = (sign_of_admittance(contact),)
     numbers["first_non_passive"] = rows[0][0]
-    return Table("Sign of Re Y(jω)", ("first Re Y < 0 at", "all of Re Y < 0 [rad/s]", "stable alone"), rows)
+    return Table("Sign of Re Y(jω)", SIGN_COLUMNS, rows)
 
 
 def _stiffness(contact: Contact, soft: ContactLimit, numbers: dict[str, Number]) -> Table:
