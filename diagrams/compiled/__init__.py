@@ -4,11 +4,13 @@ from .background import BackgroundCode
 from .code import LARGEST, TickCode, compile_ticks, find_obstacle, load_compiled, write_ticks
 from .fused import fuse
 from .fused_code import FusedPlant, compile_fused
+from .handed_over import HandedOver, find_exchange_obstacle
 from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOptions, Span
-from .hybrid_code import compile_hybrid, find_hybrid_obstacle, write_hybrid
+from .hybrid_code import HybridCode, compile_hybrid, find_hybrid_obstacle, write_hybrid
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
 from .native_tick import bind_call
 from .remote import REFUSED, UNDER_WAY
+from .staged import NativeExchange
 from .watch import RECENT, Fired, Watch
 
 __all__ = [
@@ -22,9 +24,12 @@ __all__ = [
     "CompiledLoop",
     "Fired",
     "FusedPlant",
+    "HandedOver",
+    "HybridCode",
     "HybridOutcome",
     "HybridReason",
     "MethodOptions",
+    "NativeExchange",
     "NewtonOptions",
     "Outcome",
     "Reason",
@@ -35,6 +40,7 @@ __all__ = [
     "compile_fused",
     "compile_hybrid",
     "compile_ticks",
+    "find_exchange_obstacle",
     "find_hybrid_obstacle",
     "find_obstacle",
     "fuse",

@@ -45,6 +45,7 @@ class BoundFunction:
         elif isinstance(compiled, GroupedPart):
             self.structure = self._bind_part(compiled, arguments, results)
         else:
+            assert isinstance(compiled, Differences)
             self.structure = self._bind_differences(compiled, arguments, results, typical)
 
     def _own(self, vector: np.ndarray) -> int | None:

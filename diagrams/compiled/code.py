@@ -25,6 +25,7 @@ from .generated_text import make_visible
 from .grouping import Tables, make_tables
 from .kernels import write_kernels
 from .reordered import put_in_order
+from .staged_functions import Staged
 
 LARGEST = 6_000
 """Operations of a function up to which it is compiled as a whole: the compiler's time grows faster than they do."""
@@ -90,7 +91,7 @@ class TickCode:
         What a run tells of its code.
     """
 
-    ticks: Mapping[frozenset[TickPattern], StraightTick | GroupedTick]
+    ticks: Mapping[frozenset[TickPattern], StraightTick | GroupedTick | Staged]
     exact: bool
     library: ctypes.CDLL
     loops: Mapping[frozenset[TickPattern], StraightTick] = field(default_factory=dict)

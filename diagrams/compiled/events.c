@@ -65,7 +65,7 @@ static inline bool fires_at(const watch *w, int64_t i, double before, double now
 /* Evaluate the indicators; false if one in an open subsystem is not finite. */
 static bool indicate(watch *w, problem *p, double t, const double *x) {
     if (!look(p, t, x)) return false;
-    call(&w->indicators);
+    if (call(&w->indicators)) return false;
     for (int64_t i = 0; i < w->m; i++)
         if (!isfinite(w->z[i]) && w->open[i] > 0.5) return false;
     return true;

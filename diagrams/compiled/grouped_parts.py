@@ -108,7 +108,7 @@ class Differences:
 def find_differences(part: PartProgram, continuous: np.ndarray, rates: GroupedPart, address: int) -> Differences:
     """Return the derivative of the rates by differences."""
     rows = _find_rows(part, continuous)
-    columns, first = _color(rows)
+    columns, first = color_columns(rows)
     ends = np.cumsum([0, *map(len, rows)])
     every = np.concatenate([np.zeros(0, dtype=np.int32), *rows])
     return Differences(
@@ -168,7 +168,7 @@ def _pattern_of(functions: Mapping[int, Any], op: Operation) -> list[list[list[t
     return found
 
 
-def _color(rows: Sequence[np.ndarray]) -> tuple[list[int], list[int]]:
+def color_columns(rows: Sequence[np.ndarray]) -> tuple[list[int], list[int]]:
     """Return the columns color by color, and where each begins; no two of a color have a common row."""
     taken = list[int]()  # of each color, the rows that its columns have, one bit for each
     members = list[list[int]]()

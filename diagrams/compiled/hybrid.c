@@ -12,7 +12,10 @@ static inline double begin_stretch(hybrid *h, progress *g, double end) {
     enter(h, g, h->t);
     int64_t e = g->e;
     while (e < s->edges && !is_before(h->t, s->edge[e])) e++;
-    const double edge = e < s->edges && is_before(s->edge[e], end) ? s->edge[e] : end;
+    double jump = e < s->edges ? s->edge[e] : INFINITY;
+    if (h->o) jump = smaller(jump, next_outside(h->o, h->t));
+    h->jump = jump;
+    const double edge = is_before(jump, end) ? jump : end;
     p->edge = p->stop = edge;
     p->left = larger(h->t, left_of(edge));
     for (int64_t i = 0; i < p->n; i++) m->x[i] = h->l.x[p->where[i]];
@@ -33,6 +36,7 @@ static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
         method *m = h->methods[h->active];
         if (!h->stepped) {
             if ((*steps)++ > h->budget || (h->w.m && h->w.logged > h->w.capacity / 2)) return SUSPENDED;
+            if (h->o && h->o->logged > h->o->capacity / 2) return SUSPENDED;
             keep_instant(h);
             h->planned = m->planned;
             if (take_step(m) != PASSED) return ask(h, ASK_BETWEEN);
@@ -73,9 +77,16 @@ static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
             memcpy(m->y, m->x, (size_t)m->n * sizeof(double));
         put_states(h, m->y);
         *h->l.t = h->to >= edge ? p->left : h->to;
-        if (h->accepts && accept(h) != DONE) return ask_for_step(h);
+        if (h->accepts && (h->accepts == 1 || h->to < end || h->found) && accept(h) != DONE) return ask_for_step(h);
         const double t = h->to;
         bool happened = h->found;
+        if (h->o) {
+            if (h->found && m->kind <= RK4) return ask_for_step(h);
+            const int told = tell_step(h);
+            if (told == LOST) return ask_for_step(h);
+            if (h->found || told == EVENT) return ask_here(h, t, h->found ? ASK_FIRE : ASK_SETTLE);
+            h->looked = t == end && !h->l.plants && is_before(end, h->jump) ? end : NAN;
+        }
         h->stepped = 0;
         if (h->found && p->loops) /* as the indicators saw them */
             for (int64_t i = 0; i < p->loops->n; i++) h->l.x[p->loops->where[i]] = h->solved[i];
@@ -84,9 +95,9 @@ static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
         if (t == edge && edge < end) { /* a discontinuity of a source */
             keep_instant(h);
             enter(h, g, t);
-            if (h->w.m) {
+            if (h->w.m || h->o) {
                 const int result = settle(h, t, false);
-                if (result == LOST) return ask(h, ASK_BETWEEN);
+                if (result == LOST) return ask(h, h->o ? ASK_SETTLE : ASK_BETWEEN);
                 happened |= result == EVENT;
             }
             if (evaluate(&h->l, h->between) != DONE) return ask(h, ASK_BETWEEN);

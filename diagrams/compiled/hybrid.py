@@ -13,69 +13,24 @@ import numpy as np
 from ..flat import NONE, FlatDiagram, TickPattern
 from .bound import BoundFunction, address
 from .hybrid_code import Between, HybridCode, hybrid_master
-from .loop import CompiledLoop, LoopStructure, NewtonOptions, OutcomeStructure, TickStructure
+from .hybrid_structures import HybridStructure, MethodStructure, ProblemStructure, SpanStructure
+from .loop import CompiledLoop, NewtonOptions, OutcomeStructure
 from .radau import radau_numbers
-from .watch import Fired, Watch, WatchStructure
+from .staged import NativeExchange
+from .staged_functions import Staged, StagedSlopes
+from .watch import Fired, Watch
 
 FIXED = ("euler", "heun", "rk4")
 _KINDS = {"euler": 0, "heun": 1, "rk4": 2, "RK23": 3, "RK45": 3, "DOP853": 4, "Radau": 5}
 _SECONDS = 0.05  # of a call, about, after which Ctrl-C has its turn
+_UNKNOWN = 20  # steps of the first call beside FMUs that may take any time
 
 
 class HybridReason(IntEnum):
     """Reasons for which the loop returns: those of `Reason`, and more."""
 
     DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED, SUSPENDED, ASK_BETWEEN, ASK_TICK, ENDED, LOOK = range(11)
-
-
-def _fields(kind: Any, names: str) -> list[tuple[str, Any]]:
-    return [(name, kind) for name in names.split()]
-
-
-_INT, _REAL, _AT = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
-
-
-class _Problem(ctypes.Structure):
-    _fields_ = [
-        *_fields(_INT, "n width"), ("where", _AT), ("flow", TickStructure), ("slope", TickStructure),
-        *_fields(_AT, "t x slopes"), ("entries", _INT), *_fields(_AT, "row column"),
-        *_fields(_REAL, "stop edge left at late"), *_fields(_AT, "loops here by_loops"),
-        *_fields(_INT, "rates jacobians"),
-    ]  # fmt: skip
-
-
-class _Method(ctypes.Structure):
-    _fields_ = [
-        *_fields(_INT, "kind n stages order extra"),
-        *_fields(_AT, "A B C E E3 P A_extra C_extra atol"),
-        *_fields(_REAL, "rtol longest exponent"),
-        ("of", _AT),
-        *_fields(_REAL, "planned t t_old h start"),
-        *_fields(_INT, "count done steps rejected segment"),
-        ("mark", _REAL),
-        *_fields(ctypes.c_int32, "sliver prepared"),
-        *_fields(_AT, "x x_old f y g K D J lu lu_complex Z W F error scale pivots pivots_complex"),
-        *_fields(_REAL, "h_of_lu h_before error_before tolerance"),
-        *_fields(ctypes.c_int32, "has_lu has_slope slope_is_new predicts"),
-        ("step", _AT),
-    ]
-
-
-class _Hybrid(ctypes.Structure):
-    _fields_ = [
-        ("l", LoopStructure), ("p", _Problem), ("w", WatchStructure), ("methods", _AT * 2),
-        *_fields(_INT, "active automatic accepts between budget inside begun stepped"), *_fields(_REAL, "t to"),
-        *_fields(_INT, "found hits misses easy"), ("before", _AT), ("outputs", _INT),
-        *_fields(_AT, "taken taken_first taken_states"), ("switched", _INT), ("solved", _AT), ("looked_at", _REAL),
-        *_fields(_AT, "z held"), ("inputs", _INT), ("planned", _REAL),
-    ]  # fmt: skip
-
-
-class _Span(ctypes.Structure):
-    _fields_ = [
-        ("count", _INT), *_fields(_AT, "times widths kinds lands"), ("beyond", _REAL), ("edges", _INT),
-        *_fields(_AT, "edge late"), ("room", _INT),
-    ]  # fmt: skip
+    ASK_REST, ASK_SETTLE, ASK_FIRE, OUTSIDE_FAILED = range(11, 15)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,9 +123,11 @@ class CompiledHybrid:
         For each event: the places of its block's states among the integrated ones.
     loops : NewtonOptions, optional
         Newton's method for the algebraic loops between ticks, where there are some.
-    accepts : bool
-        Whether blocks are to be evaluated after every step: they remember something, have guards, may fail, or FMUs
-        read them.
+    exchange : NativeExchange, optional
+        FMUs in model exchange, where there are some.
+    accepts : {0, 1, 2}
+        Whether blocks are to be evaluated after every step (1): they remember something, have guards, may fail, or FMUs
+        read them; or after every one that ends between ticks (2).
     held : pair of ndarray
         Inputs of FMUs as they are now, and as they are held from a tick to the next one; one array where nothing
         changes them between ticks.
@@ -188,9 +145,10 @@ class CompiledHybrid:
         step: float | None,
         spacing: float,
         own: Sequence[np.ndarray],
-        accepts: bool,
+        accepts: int,
         held: tuple[np.ndarray, np.ndarray],
         loops: NewtonOptions | None = None,
+        exchange: NativeExchange | None = None,
     ):
         self._kept: list[Any] = [code, loop, arguments, x_next]
         self.kinds: Mapping[frozenset[TickPattern], int] = loop.kinds
@@ -200,13 +158,17 @@ class CompiledHybrid:
         where = self._own(flat.continuous.astype(np.int64))
         slope = code.between.get("slope")
         slopes = np.zeros(0 if slope is None else n * n if loops else len(slope.pattern[0]))
-        self._hybrid = hybrid = _Hybrid(l=loop.structure, automatic=len(methods) > 1, accepts=accepts)
+        self._hybrid = hybrid = HybridStructure(l=loop.structure, automatic=len(methods) > 1, accepts=accepts)
+        self._exchange, hybrid.looked = exchange, np.nan
+        self._tolerances: list[np.ndarray] = []
         z, inputs = held
         if inputs is not z:
             hybrid.z, hybrid.held, hybrid.inputs = self._own(z), self._own(inputs), z.size
-        hybrid.budget = _budget(code.between["flow"].operations, methods, n)
+        hybrid.budget = self._largest_budget = _budget(code.between["flow"].operations, methods, n)
+        if exchange is not None:
+            hybrid.budget = min(hybrid.budget, _UNKNOWN)
         hybrid.between = self.kinds[NONE]
-        hybrid.p = _Problem(
+        hybrid.p = ProblemStructure(
             n=n,
             width=width,
             where=where,
@@ -231,7 +193,7 @@ class CompiledHybrid:
                 rows, columns = slope.pattern
                 hybrid.p.entries = len(rows)
                 hybrid.p.row, hybrid.p.column = (self._own(np.array([*v, 0], dtype=np.int64)) for v in (rows, columns))
-        of = ctypes.addressof(hybrid) + _Hybrid.p.offset
+        of = ctypes.addressof(hybrid) + HybridStructure.p.offset
         self.methods = [self._method(options, n, of, code.steps.get(options.name)) for options in methods]
         for i, method in enumerate(self.methods):
             hybrid.methods[i] = ctypes.addressof(method)
@@ -240,12 +202,21 @@ class CompiledHybrid:
         self.watch: Watch | None = None
         """The events; None without any."""
         if flat.events:
-            self.watch = Watch(flat, code.between, trial, arguments, x_next, spacing=spacing, step=step, own=own)
+            self.watch = Watch(
+                flat, code.between, trial, arguments, x_next, spacing=spacing, step=step, own=own, exchange=exchange
+            )
             hybrid.w = self.watch.structure
+        if exchange is not None:
+            jump = code.between["jump"]
+            assert isinstance(jump, Staged)
+            exchange.bind_jump(jump, [*arguments, self._zeros(len(flat.events))], [x_next])
+            hybrid.o = ctypes.addressof(exchange.structure)
         taken = [flat.taken_at(clocks) for clocks in self.kinds]
+        self.taken_states = self._zeros(width)
+        """All states that a tick leaves, before the events behind it."""
         hybrid.taken = self._own(np.concatenate([np.zeros(0), *taken]).astype(np.int64))
         hybrid.taken_first = self._own(np.cumsum([0, *map(len, taken)]).astype(np.int64))
-        hybrid.taken_states = self._own(np.zeros(width))
+        hybrid.taken_states = self._own(self.taken_states)
         self._outcome = OutcomeStructure()
         self._run, self._guard = hybrid_master()["loopwright_go"], loop.guard
         self._run.restype = None
@@ -255,6 +226,10 @@ class CompiledHybrid:
         """Forget the run before: methods have no step in mind, and no sign of stiffness has been seen."""
         for structure, content in self._fresh:
             ctypes.memmove(ctypes.addressof(structure), content, len(content))
+
+    def _zeros(self, n: int) -> np.ndarray:
+        self._kept.append(np.zeros(n))
+        return self._kept[-1]  # type: ignore[no-any-return]
 
     def _own(self, values: np.ndarray) -> int | None:
         self._kept.append(values)
@@ -267,18 +242,24 @@ class CompiledHybrid:
         results: Sequence[np.ndarray],
         typical: np.ndarray | None = None,
     ) -> Any:
+        if self._exchange is not None and isinstance(function, Staged):
+            return self._exchange.bind(function, arguments, results)
+        if self._exchange is not None and isinstance(function, StagedSlopes):
+            assert typical is not None
+            return self._exchange.bind_slopes(function, arguments, results, typical)
         bound = BoundFunction(function, arguments, results, typical)
         self._kept.append(bound)
         return bound.structure
 
-    def _method(self, options: MethodOptions, n: int, of: int, step: int | None) -> _Method:
+    def _method(self, options: MethodOptions, n: int, of: int, step: int | None) -> MethodStructure:
         import scipy.integrate
 
         name = options.name
-        made = _Method(
+        made = MethodStructure(
             kind=_KINDS[name], n=n, of=of, rtol=options.rtol, longest=options.longest, planned=np.nan, step=step
         )
-        made.atol = self._own(np.ascontiguousarray(np.broadcast_to(options.atol, (n,)), dtype=float))
+        self._tolerances.append(np.broadcast_to(options.atol, (n,)).astype(float))
+        made.atol = self._own(self._tolerances[-1])
         if name in ("RK23", "RK45", "DOP853"):
             of_scipy = getattr(scipy.integrate, name)
             stages = made.stages = of_scipy.n_stages
@@ -332,6 +313,24 @@ class CompiledHybrid:
             method.planned = np.nan if step is None else step
 
     @property
+    def left(self) -> float | None:
+        """Time in s from the left of the discontinuity that has been reached; None where there is none."""
+        problem = self._hybrid.p
+        return float(problem.left) if problem.edge == self._hybrid.t else None
+
+    def set_tolerances(self, methods: Sequence[MethodOptions]) -> None:
+        """Take other absolute tolerances of the methods."""
+        for vector, options in zip(self._tolerances, methods, strict=True):
+            vector[:] = options.atol
+
+    def limit_budget(self, spent: float) -> None:
+        """Let calls take fewer steps if one has taken long, in s; FMUs may take any time for an evaluation."""
+        if spent > 2 * _SECONDS:
+            self._hybrid.budget = max(1, int(self._hybrid.budget * _SECONDS / spent))
+        elif spent < 0.5 * _SECONDS:
+            self._hybrid.budget = min(2 * self._hybrid.budget, self._largest_budget)
+
+    @property
     def active(self) -> int:
         """Place of the method that goes on."""
         return int(self._hybrid.active)
@@ -374,7 +373,7 @@ class CompiledHybrid:
         rows : ndarray, shape (m, 1 + width)
             Samples: their time in s, then their values.
         """
-        given = _Span(
+        given = SpanStructure(
             count=len(span.widths),
             times=address(span.times),
             widths=address(span.widths),

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from ...fmus.export import describe_processor, processor_flags
-from ..flat import NONE, FlatDiagram, TickPattern, share_terms
+from ..flat import NONE, FlatDiagram, Schedule, TickPattern, share_terms
 from .code import (
     GroupedTick,
     StraightTick,
@@ -31,10 +31,11 @@ from .grouped_parts import Differences, GroupedPart, find_differences
 from .grouping import make_part_tables, make_tables
 from .kernels import write_kernels
 from .small_steps import STEPS, write_steps
+from .staged_functions import Staged, StagedSlopes
 from .step_outputs import may_fail_at_steps
 
 _SOURCES = (
-    *("newton.c", "remote.c", "master.c", "problem.c", "methods.c", "radau.c", "events.c", "instants.c"),
+    *("newton.c", "remote.c", "master.c", "exchange.c", "problem.c", "methods.c", "radau.c", "events.c", "instants.c"),
     "hybrid.c",
 )
 
@@ -66,7 +67,7 @@ class Compiled:
         return np.array(rows, dtype=np.int64), np.array(columns, dtype=np.int64)
 
 
-Between = Compiled | GroupedPart | Differences
+Between = Compiled | GroupedPart | Differences | Staged | StagedSlopes
 """A function between ticks that was compiled."""
 
 
@@ -145,9 +146,11 @@ def find_hybrid_obstacle(flat: FlatDiagram, solver: str) -> str | None:
     delayed = sorted({path for name in flat.plant_inputs.slices if blocks[path := flat.ports[name][0]].transport})
     if delayed:
         return f"the transport delay {delayed[0]!r} keeps its past in Python"
-    if flat.outside:
-        return f"the FMU {flat.outside[0]!r} in model exchange is evaluated by Python"
-    opaque = sorted(path for path in flat.checked.traced if blocks[path].opaque)
+    if flat.outside and flat.loops.slices:
+        return f"it has an algebraic loop beside the FMU {flat.outside[0]!r} in model exchange"
+    opaque = sorted(path for path in flat.checked.traced if blocks[path].opaque and path not in flat.outside)
+    if opaque and flat.outside:
+        return f"Python evaluates the block {opaque[0]!r} beside the FMU {flat.outside[0]!r} in model exchange"
     if opaque and flat.loops.slices:
         return f"it has an algebraic loop beside the block {opaque[0]!r}, which Python evaluates"
     return None
@@ -195,8 +198,9 @@ def write_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *,
     """
     kinds = (NONE, *(clocks for clocks in acting if clocks))
     grouped = flat.by_block and not flat.active_loops(NONE)
-    written = _write_grouped(flat, kinds, stiff=stiff) if grouped else _write_straight(flat, kinds, stiff=stiff)
-    loops, judged = loop_functions(flat, kinds), may_fail_at_steps(flat)
+    write = _write_staged if flat.outside else _write_grouped if grouped else _write_straight
+    written = write(flat, kinds, stiff=stiff)
+    loops, judged = loop_functions(flat, kinds), bool(flat.outside) or may_fail_at_steps(flat)
 
     def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
         code = replace(written.make(libraries), judged=judged)
@@ -229,6 +233,36 @@ def _write_straight(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], 
         return HybridCode(TickCode(straight, exact=False, library=library), between, made)
 
     return HybridSources([make_visible(generator.dump()) + steps], make)
+
+
+def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridSources:
+    """Write functions that go around FMUs in model exchange: one of C for each of their stages."""
+    schedules: dict[str, Schedule] = {f"tick{i}": flat.at_tick(clocks) for i, clocks in enumerate(kinds)}
+    schedules |= {"flow": flat.flow, "jump": flat.jump}
+    if flat.events:
+        schedules["indicators"] = flat.indicators
+    generator = ca.CodeGenerator("hybrid.c")
+    names: dict[str, list[str]] = {}
+    for name, schedule in schedules.items():
+        functions = Staged(schedule, ()).functions
+        names[name] = [f"{name}_{j}" for j in range(len(functions))]
+        for function, own in zip(functions, names[name], strict=True):
+            check_size(function)
+            generator.add(rename(function, own))
+
+    def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
+        library = libraries[0]
+        staged = {
+            name: Staged(schedule, [address_of(library, own) for own in names[name]])
+            for name, schedule in schedules.items()
+        }
+        ticks = {clocks: staged.pop(f"tick{i}") for i, clocks in enumerate(kinds)}
+        between: dict[str, Between] = {**staged}
+        if stiff:
+            between["slope"] = StagedSlopes.of(staged["flow"], flat.continuous)
+        return HybridCode(TickCode(ticks, exact=False, library=library), between)
+
+    return HybridSources([make_visible(generator.dump())], make)
 
 
 def _write_grouped(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridSources:

@@ -1,7 +1,7 @@
 /* One instant of a run with continuous states: its values from the right, the events that fire there, the tick. */
 
 /* Reasons, after those of the loop over ticks. */
-enum { SUSPENDED = HALTED + 1, ASK_BETWEEN, ASK_TICK, ENDED, LOOK };
+enum { SUSPENDED = HALTED + 1, ASK_BETWEEN, ASK_TICK, ENDED, LOOK, ASK_REST, ASK_SETTLE, ASK_FIRE, OUTSIDE_FAILED };
 
 /* Ticks and instants to be recorded. */
 typedef struct {
@@ -38,6 +38,9 @@ typedef struct hybrid {
     double *held;
     int64_t inputs;
     double planned;     /* step in s that the method had in mind before it took the last one */
+    outside *o;         /* FMUs in model exchange; NULL without any */
+    double jump;        /* first discontinuity of a source, or event of time of an FMU, behind the stretch's begin */
+    double looked;      /* tick at which they have been looked at, and before which nothing changes any more */
 } hybrid;
 
 typedef struct {
@@ -181,6 +184,49 @@ static bool count_instant(watch *w, double t) {
     return t - w->recent[(w->fired_times - SLIDES) % RECENT] > 1e-9 * w->step;
 }
 
+static inline void keep_instant(hybrid *h);
+
+/* Let FMUs see an instant that is reached; the states after it are taken over, those of events of their own. */
+static bool see(hybrid *h, int64_t look) {
+    outside *o = h->o;
+    o->look = look;
+    if (o->lost || o->failed || call(&o->jump)) return false;
+    memcpy(h->l.x, h->l.x_next, (size_t)h->l.states * sizeof(double));
+    memcpy(h->p.x, h->l.x, (size_t)h->l.states * sizeof(double));
+    return true;
+}
+
+/* Let FMUs act whose inputs have jumped, until none has. LOST: Python has to, from the last instant that was kept. */
+static int look_outside(hybrid *h, double t) {
+    outside *o = h->o;
+    const size_t size = (size_t)h->l.states * sizeof(double);
+    if (is_due(o, t)) return LOST;
+    for (int round = 0; round < ROUNDS; round++) {
+        bool acted = false;
+        if (o->logged + o->count > o->capacity) return LOST;
+        for (int64_t j = 0; j < o->count; j++) o->each[j].acted = 0;
+        double *row = o->log + o->logged * (2 + 2 * h->l.states);
+        memcpy(row + 2, h->l.x, size);
+        if (!see(h, TO_EVENTS)) return LOST;
+        for (int64_t j = 0; j < o->count; j++) {
+            const exchanged *e = o->each + j;
+            if (!e->acted) continue;
+            acted = true;
+            double *next = o->log + o->logged * (2 + 2 * h->l.states);
+            if (!memcmp(row + 2 + e->first, h->l.x + e->first, (size_t)e->states * sizeof(double))) continue;
+            if (next != row) memcpy(next + 2, row + 2, size);
+            next[0] = t;
+            next[1] = (double)j;
+            memcpy(next + 2 + h->l.states, h->l.x, size);
+            o->logged++;
+        }
+        if (!acted) return round ? EVENT : QUIET;
+        keep_instant(h); /* Python goes on from behind what has acted */
+        if (is_due(o, t)) return LOST;
+    }
+    return LOST;
+}
+
 /* Let the events in w->fires fire at t, and those that they make fire; jumps are evaluated at `at`, a few ulps later
    perhaps. LOST: Python has to; nothing that has happened here counts then. */
 static int fire(hybrid *h, double t, double at) {
@@ -268,12 +314,24 @@ static int fire_ahead(hybrid *h, double t) {
 /* Fire what has changed its domain at an instant; ahead: at a tick, to which events belong that are a few ulps later. */
 static int settle(hybrid *h, double t, bool ahead) {
     watch *w = &h->w;
-    if (!indicate(w, &h->p, t, here_states(h, w->x))) return LOST;
-    memcpy(w->later, w->z, (size_t)w->m * sizeof(double));
-    const bool any = take_domains(w, w->domain, w->now, w->fires);
-    memcpy(w->domain, w->now, (size_t)w->m * sizeof(double));
-    if (any) return fire(h, t, t);
-    return ahead ? fire_ahead(h, t) : QUIET;
+    const bool known = ahead && h->looked == t;
+    int result = QUIET;
+    h->looked = NAN;
+    for (int round = 0; round < 2; round++) {
+        if (w->m) {
+            if (!indicate(w, &h->p, t, here_states(h, w->x))) return LOST;
+            memcpy(w->later, w->z, (size_t)w->m * sizeof(double));
+            const bool any = take_domains(w, w->domain, w->now, w->fires);
+            memcpy(w->domain, w->now, (size_t)w->m * sizeof(double));
+            if (any) return fire(h, t, t);
+        }
+        if (round) return accept(h) == DONE ? EVENT : LOST;
+        if (w->m && ahead && (result = fire_ahead(h, t)) == LOST) return LOST;
+        if (!h->o || (known && result == QUIET)) return result;
+        const int outside = look_outside(h, t);
+        if (outside != EVENT) return outside == LOST ? LOST : result;
+    }
+    return LOST; /* not reached */
 }
 
 /* --- a tick -------------------------------------------------------------------------------------------------------- */
@@ -289,7 +347,24 @@ static int64_t ask(hybrid *h, int64_t reason) {
     *h->l.t = h->t;
     if (h->w.m) go_back(&h->w);
     h->inside = 0;
+    if (h->o) h->methods[h->active]->has_slope = 0;
+    return h->o && h->o->failed ? OUTSIDE_FAILED : reason;
+}
+
+/* Let Python go on at t, which the states have reached. */
+static int64_t ask_here(hybrid *h, double t, int64_t reason) {
+    h->t = t;
+    h->inside = 0;
+    h->methods[h->active]->has_slope = 0;
     return reason;
+}
+
+/* Tell FMUs that a step is complete. */
+static int tell_step(hybrid *h) {
+    if (!see(h, TO_STEP)) return LOST;
+    for (int64_t j = 0; j < h->o->count; j++)
+        if (h->o->each[j].asks || h->o->each[j].ended) return EVENT;
+    return QUIET;
 }
 
 /* Go back to before the last step, which Python takes again as it was taken. */
@@ -308,15 +383,16 @@ static inline int64_t land(hybrid *h, progress *g) {
     if (reason != DONE) return h->inside = 0, reason;
     keep_instant(h);
     enter(h, g, t);
-    if (h->w.m && kind != h->between && settle(h, t, true) == LOST) return ask(h, ASK_TICK);
+    if ((h->w.m || h->o) && kind != h->between && settle(h, t, true) == LOST) return ask(h, ASK_TICK);
     if (evaluate(l, kind) != DONE) return ask(h, ASK_TICK);
     memcpy(l->x, l->x_next, (size_t)l->states * sizeof(double));
-    if (h->w.m) {
+    if (h->w.m || h->o) {
         enter(h, g, t);
         double *states = (double *)l->log + h->outputs;
         memcpy(h->taken_states, states, (size_t)l->states * sizeof(double));
+        if (h->o) keep_instant(h);
         const int result = settle(h, t, false);
-        if (result == LOST) return ask(h, ASK_TICK);
+        if (result == LOST) return ask(h, h->o ? ASK_REST : ASK_TICK);
         if (result == EVENT)
             for (int64_t j = h->taken_first[kind]; j < h->taken_first[kind + 1]; j++)
                 states[h->taken[j]] = h->taken_states[h->taken[j]];
@@ -325,5 +401,5 @@ static inline int64_t land(hybrid *h, progress *g) {
     for (int64_t j = 0; j < h->inputs; j++) h->held[j] = h->z[j];
     g->out->rows = record(l, t, g->rows, g->out->rows);
     g->i++;
-    return is_stopped(l) ? STOPPED : DONE;
+    return is_stopped(l) || (h->o && has_news(h->o)) ? STOPPED : DONE;
 }

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from ..flat import TRUE, TickPattern
 from .code import GroupedTick, StraightTick, TickCode, master
 from .native_tick import at, bind_native
 from .remote import RemotePlants
+from .staged_functions import Staged
 
 
 class Reason(IntEnum):
@@ -136,6 +137,16 @@ class Outcome:
     status: int
 
 
+class StagedBinding(Protocol):
+    """Binds functions in stages to vectors; see `NativeExchange`."""
+
+    watched: list[tuple[HostState, ctypes.c_bool]]
+    """States of this process that FMUs may change, and whether C has seen that."""
+
+    def bind(self, staged: Staged, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> ctypes.Structure:
+        """Return a function bound to vectors, as C knows it."""
+
+
 class CompiledLoop:
     """The loop over ticks, bound to the numbers of a run.
 
@@ -157,6 +168,8 @@ class CompiledLoop:
         Entries of the log that end the run where they are true.
     loops : mapping, optional
         How the algebraic loops of each tick are solved, where there are some.
+    exchange : StagedBinding, optional
+        Binds ticks in stages.
     """
 
     def __init__(
@@ -171,10 +184,12 @@ class CompiledLoop:
         every: int,
         stops: Sequence[int],
         loops: Mapping[frozenset[TickPattern], NewtonOptions] | None = None,
+        exchange: StagedBinding | None = None,
     ):
-        self._kept: list[Any] = [code, arguments, results, plants, columns]
-        self._watched: list[tuple[HostState, ctypes.c_bool]] = []
         self._remote = RemotePlants()
+        self._kept: list[Any] = [code, arguments, results, plants, columns, exchange]
+        self._exchange = exchange
+        self._watched: list[tuple[HostState, ctypes.c_bool]] = [] if exchange is None else [*exchange.watched]
         t, x, _, _ = arguments
         x_next, _, log, ok = results
         self.kinds = {clocks: i for i, clocks in enumerate(code.ticks)}
@@ -215,8 +230,14 @@ class CompiledLoop:
         return ctypes.addressof(array)
 
     def _tick(
-        self, tick: StraightTick | GroupedTick, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
+        self,
+        tick: StraightTick | GroupedTick | Staged,
+        arguments: Sequence[np.ndarray],
+        results: Sequence[np.ndarray],
     ) -> ctypes.Structure:
+        if isinstance(tick, Staged):
+            assert self._exchange is not None
+            return self._exchange.bind(tick, arguments, results)
         bound = bind_native(tick, arguments, results)
         self._kept.append(bound)
         return TickStructure(bound.address, bound.arguments, bound.results, bound.iw, bound.w)

@@ -19,7 +19,8 @@ static inline void rate(problem *p, double t, const double *x, double *f) {
         return;
     }
     p->flow.results[0] = f;
-    call(&p->flow);
+    if (call(&p->flow))
+        for (int64_t i = 0; i < p->n; i++) f[i] = NAN;
 }
 
 static double norm_of(const double *e, const double *scale, int64_t n) {

@@ -12,6 +12,7 @@ import numpy as np
 from ..flat import bind_function
 from .code import GroupedTick, StraightTick
 from .grouping import PythonCall, Tables
+from .staged_functions import Staged
 
 _Tick = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4, ctypes.c_int)
 _Python = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64)
@@ -52,9 +53,10 @@ class NativeTick:
 
 
 def bind_native(
-    tick: StraightTick | GroupedTick, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
+    tick: StraightTick | GroupedTick | Staged, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
 ) -> NativeTick:
     """Return a tick bound to the vectors (t, x, w, p) and (x_next, z, log, ok) of a run."""
+    assert not isinstance(tick, Staged)
     if isinstance(tick, StraightTick):
         f = tick.function
         given, made = list_vectors(arguments, f.sz_arg()), list_vectors(results, f.sz_res())
@@ -81,7 +83,7 @@ def bind_native(
 
 
 def bind_call(
-    tick: StraightTick | GroupedTick, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
+    tick: StraightTick | GroupedTick | Staged, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
 ) -> Callable[[], None]:
     """Return a tick bound to the vectors of a run as a call from Python."""
     bound = bind_native(tick, arguments, results)

@@ -107,7 +107,7 @@ static bool differentiate(method *m, double t, const double *x) {
     p->jacobians++;
     m->slope_is_new = 1;
     if (!look(p, t < p->stop ? t : p->stop, x)) return m->has_slope;
-    call(&p->slope);
+    if (call(&p->slope)) return m->has_slope;
     if (p->loops && !lead_through_loops(p)) return m->has_slope;
     if (!all_finite(p->slopes, p->row ? p->entries : n * n)) return m->has_slope;
     if (p->row) {

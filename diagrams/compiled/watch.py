@@ -12,6 +12,8 @@ from ..flat import FlatDiagram
 from .bound import BoundFunction, address
 from .hybrid_code import Between
 from .loop import TickStructure
+from .staged import NativeExchange
+from .staged_functions import Staged
 
 _LOGGED = 2**22  # bytes of what has fired in a call
 _INSTANTS = 1100  # of a step that are looked at together, at most
@@ -64,6 +66,8 @@ class Watch:
         Fixed step of the method in s; None where it chooses its steps.
     own : sequence of ndarray
         For each event: the places of its block's states among the integrated ones.
+    exchange : NativeExchange, optional
+        FMUs in model exchange: Python lets all events fire then, as these are asked for theirs.
 
     Attributes
     ----------
@@ -84,6 +88,7 @@ class Watch:
         spacing: float,
         step: float | None,
         own: Sequence[np.ndarray],
+        exchange: NativeExchange | None = None,
     ):
         self._kept: list[Any] = []
         events, n = flat.events, flat.continuous.size
@@ -94,14 +99,19 @@ class Watch:
         z, opened, fired = np.zeros(m), np.zeros(m), np.zeros(m)
         for name, vectors in {"z": z, "open": opened, "fired": fired}.items():
             self._put(name, vectors)
-        self._bind("indicators", functions["indicators"], trial, [z, opened])
-        self._bind("jump", functions["jump"], [*here, fired], [x_next])
+        indicators = functions["indicators"]
+        if exchange is None:
+            self._bind("indicators", indicators, trial, [z, opened])
+            self._bind("jump", functions["jump"], [*here, fired], [x_next])
+        else:
+            assert isinstance(indicators, Staged)
+            self.structure.indicators = exchange.bind(indicators, trial, [z, opened])
         subsystems = flat.table.subsystems
         flags = {
             "rising": [e.direction != "falling" for e in events],
             "falling": [e.direction != "rising" for e in events],
             "hysteretic": [e.hysteresis > 0.0 for e in events],
-            "asks": [e.subsystem and subsystems[e.path].when == "reset" for e in events],
+            "asks": [bool(exchange) or (e.subsystem and subsystems[e.path].when == "reset") for e in events],
         }
         for name, values in flags.items():
             self._put(name, np.array(values, dtype=np.uint8))
@@ -122,8 +132,10 @@ class Watch:
         for name in ("now", "strict", "values", "later"):
             self._put(name, np.zeros(m))
         self._put("motion", np.zeros(6 * m))
-        for name in ("fires", "following"):
-            self._put(name, np.zeros(m, dtype=np.uint8))
+        self.fires = np.zeros(m, dtype=np.uint8)
+        """Which events fire, where C has left that to Python."""
+        self._put("fires", self.fires)
+        self._put("following", np.zeros(m, dtype=np.uint8))
 
     def _put(self, name: str, vector: np.ndarray) -> None:
         self._kept.append(vector)

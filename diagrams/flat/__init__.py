@@ -13,7 +13,7 @@ from .layout import FlatEvent, StateLayout
 from .logic import TRUE, is_true
 from .plant_ticks import own_step, takes_any_step
 from .program import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE_OF, Ids, Operation, PartProgram, Program, TickProgram
-from .stages import Bound, Evaluators, Schedule, bind_function, evaluate_apart
+from .stages import Bound, Evaluators, OpaqueStage, Schedule, bind_function, evaluate_apart
 from .total_derivative import Derivative, size_of_motion
 from .trace_stages import trace_schedule
 from .vectors import Vectors, join_columns, loop_mismatch, next_x, plant_inputs, rates
@@ -44,6 +44,7 @@ __all__ = [
     "Ids",
     "Instant",
     "Layout",
+    "OpaqueStage",
     "Operation",
     "PartProgram",
     "Program",

@@ -10,11 +10,30 @@ from itertools import groupby
 import numpy as np
 
 from ...fmus.calls import FmuInstance, NativeStep, RemoteStep
-from ..compiled import RECENT, REFUSED, UNDER_WAY, Fired, MethodOptions, Watch
-from ..coupling import Plant, end_all, runs_apart, step_all
+from ..compiled import (
+    RECENT,
+    REFUSED,
+    UNDER_WAY,
+    CompiledHybrid,
+    CompiledLoop,
+    Fired,
+    HandedOver,
+    HybridCode,
+    MethodOptions,
+    NativeExchange,
+    NewtonOptions,
+    TickCode,
+    Watch,
+)
+from ..coupling import Plant, PlantSteps, end_all, runs_apart, step_all
 from ..events import Domains
+from ..flat import NONE, FlatDiagram, TickPattern
+from ..results import Occurrence, Recorder
+from ..solvers import AutoSolver
+from .algebraic_loops import HALVINGS, ITERATIONS, ROUNDING, SINGULAR, TOLERANCE
 from .continuous import Continuous
-from .solver_setup import next_instant
+from .solver_setup import has_guards, next_instant, remembers
+from .workspace import Workspace
 
 OBSTACLES = (
     "ports that are no Float64 in this process, texts, or options of its steps, or it runs in a process of its own on "
@@ -22,6 +41,68 @@ OBSTACLES = (
 )
 """Reasons for which C can't step a plant."""
 _MOST_EDGES = 100_000  # discontinuities of sources in a call
+_METHODS = {"euler": "Euler", "heun": "Heun", "rk4": "Runge-Kutta 4", "RK23": "Bogacki-Shampine 3(2)",
+            "RK45": "Dormand-Prince 5(4)", "DOP853": "Dormand-Prince 8(5,3)", "Radau": "Radau IIA 5"}  # fmt: skip
+
+
+def bind_loop(
+    workspace: Workspace, plants: Iterable[FmuInstance], code: TickCode, recorder: Recorder, stops: Sequence[int],
+    exchange: NativeExchange | None = None,
+) -> CompiledLoop:  # fmt: skip
+    """Return the loop over ticks in C, bound to the numbers of a run, its plants, and the samples that it keeps."""
+    entries, here = recorder.entries, workspace.here
+    return CompiledLoop(
+        code,
+        [here.t, here.x, here.w, here.p],
+        [workspace.x_next, workspace.z, workspace.log, workspace.ok],
+        steps_in_c(plants),
+        columns=entries,
+        width=workspace.log.size if entries is None else len(entries),
+        every=recorder.every,
+        stops=stops,
+        loops={clocks: newton_options(workspace.flat, clocks) for clocks in code.loops},
+        exchange=exchange,
+    )
+
+
+def newton_options(flat: FlatDiagram, clocks: frozenset[TickPattern]) -> NewtonOptions:
+    """Return Newton's method for the algebraic loops at a tick at which some clocks act."""
+    return NewtonOptions(flat.active_loops(clocks), TOLERANCE, ROUNDING, SINGULAR, ITERATIONS, HALVINGS)
+
+
+def bind_hybrid(
+    code: HybridCode,
+    workspace: Workspace,
+    continuous: Continuous,
+    plants: Iterable[FmuInstance],
+    steps: PlantSteps,
+    recorder: Recorder,
+    stops: Sequence[int],
+    methods: Sequence[MethodOptions],
+) -> tuple[CompiledHybrid, HandedOver | None]:
+    """Return the loop in C, bound to the numbers of a run, and its blocks that are evaluated from outside."""
+    flat, here, domains, blocks = workspace.flat, workspace.here, continuous.domains, continuous.exchanged
+    handed = None if blocks is None else HandedOver(flat, blocks.blocks, blocks.evaluators, continuous.tell_input_event)
+    native, plants = None if handed is None else handed.native, [*plants]
+    ticks = bind_loop(workspace, plants, code.ticks, recorder, stops, native)
+    always = bool(plants) or workspace.looped or remembers(flat) or has_guards(flat)
+    judged = code.judged and not continuous.fixed
+    loop = CompiledHybrid(
+        code, flat, ticks, [here.t, here.x, here.w, here.p], workspace.x_next, methods,
+        step=float(flat.base) if continuous.fixed else None,
+        spacing=math.inf if domains is None else domains.spacing,
+        own=() if domains is None else domains.own,
+        accepts=1 if always or (judged and native is None) else 2 if judged else 0,
+        held=(workspace.z, steps.inputs),
+        loops=newton_options(flat, NONE) if flat.active_loops(NONE) else None,
+        exchange=native,
+    )  # fmt: skip
+    return loop, handed
+
+
+def name_methods(methods: Sequence[MethodOptions]) -> str:
+    """Return the methods in words."""
+    return ", and where it is stiff ".join(f"{_METHODS[m.name]} ({m.name})" for m in methods)
 
 
 def hand_over_domains(domains: Domains, watch: Watch) -> list[float]:
@@ -172,3 +253,71 @@ def end_steps(plants: Sequence[FmuInstance], first: int, stage: int, status: int
 def _judge(plant: FmuInstance, stage: int, status: int, t: float, h: float) -> None:
     plant.judge_native(stage, status, t, h)
     plant.read(t + h)
+
+
+def changes_method(workspace: Workspace, continuous: Continuous, t: float, h: float) -> bool:
+    """Decide, after signs of stiffness or of none in steps of h, whether another method goes on from t."""
+    solver = continuous.solver
+    assert isinstance(solver, AutoSolver)
+    continuous.enter(t)
+    told = len(solver.statistics.messages)
+    found = solver.decide(t, workspace.here.x[continuous.where], h)
+    workspace.messages += tuple(solver.statistics.messages[told:])
+    return found
+
+
+def is_held(continuous: Continuous) -> bool:
+    """Whether an indicator is held in contact, or events wait for the end of a fixed step: Python goes on then."""
+    return continuous.sliding.active or (continuous.domains is not None and continuous.domains.limits.holds)
+
+
+def tell_fired(continuous: Continuous, fired: Sequence[Fired]) -> None:
+    """Tell events that have fired in C."""
+    flat = continuous.flat
+    for one in fired:
+        event = flat.events[one.event]
+        of = None if event.subsystem else flat.states.of_block[event.path]
+        before, after = ({} if of is None else of.split(x) for x in (one.before, one.after))
+        continuous.on_event(Occurrence(one.t, event.path, event.name, before, after))
+
+
+# --- blocks that are evaluated from outside -------------------------------------------------------------------------
+
+
+def let_act(
+    workspace: Workspace, continuous: Continuous, t: float, left: float | None, fired: np.ndarray | None
+) -> bool:
+    """Let events act at an instant between ticks that C has come to; return whether a stop condition is true there.
+
+    Parameters
+    ----------
+    left : float or None
+        Where a discontinuity is at t: the time in s from the left of it, at which the events act.
+    fired : ndarray or None
+        Which events of indicators fire; None for events of blocks from outside alone.
+    """
+    if left is not None:
+        continuous.enter(t)
+        continuous.stand_left(t, left)
+        if fired is None:
+            continuous.settle(t)
+    elif fired is not None:
+        continuous.enter(t)
+    if fired is not None:
+        continuous.fire(t, fired)
+        workspace.messages += continuous.sliding.look(continuous.domains, t)
+    continuous.enter(t)
+    continuous.settle(t)
+    workspace.evaluate()
+    return continuous.is_stopped()
+
+
+def end_tick(
+    workspace: Workspace, continuous: Continuous, loop: CompiledHybrid, t: float, acting: frozenset[TickPattern]
+) -> None:
+    """Let events act behind a tick whose blocks C has evaluated."""
+    continuous.enter(t)
+    continuous.settle(t)
+    continuous.accept()
+    flat, taken = workspace.flat, workspace.flat.taken_at(acting)
+    workspace.log[flat.log.total :][taken] = loop.taken_states[taken]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
 from typing import Any
@@ -14,44 +13,47 @@ from ...fmus.calls import FmuInstance
 from ..compiled import (
     CompiledHybrid,
     Fired,
+    HandedOver,
     HybridOutcome,
     HybridReason,
     Span,
     compile_hybrid,
+    find_exchange_obstacle,
     find_hybrid_obstacle,
 )
 from ..coupling import Plant, PlantSteps
-from ..flat import EVERY, NONE, ClockSets, is_exact, kinds_of, ticks_after
-from ..results import Occurrence, Recorder
-from ..solvers import AutoSolver
+from ..flat import EVERY, ClockSets, is_exact, kinds_of, ticks_after
+from ..results import Recorder
 from .compiled_hand_over import (
     active_method,
+    bind_hybrid,
+    changes_method,
     end_steps,
+    end_tick,
     find_edges,
     hand_over_domains,
+    is_held,
+    let_act,
     methods_of,
+    name_methods,
     planned_steps,
     plants_for_c,
     restore_plans,
     take_back_domains,
+    tell_fired,
 )
 from .compiled_ticks import (
     FIRST,
     LARGEST_CHUNK,
     WISHED,
-    bind_loop,
     find_obstacle_at_ticks,
-    newton_options,
     tell_failure_once,
 )
 from .continuous import Continuous
-from .solver_setup import has_guards, remembers
 from .ticks import take_tick
 from .workspace import Workspace
 
 _KEPT = 5000  # events of which the limits may ask
-_METHODS = {"euler": "Euler", "heun": "Heun", "rk4": "Runge-Kutta 4", "RK23": "Bogacki-Shampine 3(2)",
-            "RK45": "Dormand-Prince 5(4)", "DOP853": "Dormand-Prince 8(5,3)", "Radau": "Radau IIA 5"}  # fmt: skip
 
 
 class HybridTicks:
@@ -107,11 +109,12 @@ class HybridTicks:
         self.start: float | None = None
         """Time in s after a tick that interpreted steps have come to, if C begins there."""
         self._fired: list[Fired] = []
+        self._handed: HandedOver | None = None
 
     @property
     def solver(self) -> str:
         """The methods in words."""
-        return ", and where it is stiff ".join(f"{_METHODS[m.name]} ({m.name})" for m in self._methods)
+        return name_methods(self._methods)
 
     def reaches(self, last: int) -> bool:
         """Whether times up to a tick are quotients of integers that a float64 holds."""
@@ -163,7 +166,7 @@ class HybridTicks:
             rows = recorder.room(t)
             loop.skip = recorder.skip
             started = perf_counter()
-            if self._is_held():
+            if is_held(self._continuous):
                 following = int(rest[0])
                 asked = HybridOutcome(0, 0, HybridReason.ASK_BETWEEN, 0, 0, 0, t)
                 ended = self._take_interval(loop, k, following, last, asked, recorder)
@@ -178,6 +181,12 @@ class HybridTicks:
             recorder.took(found.rows, loop.skip)
             self._tell(loop)
             t = found.t
+            if self._handed is not None:
+                loop.limit_budget(perf_counter() - started)
+                self._handed.tell()
+                if self._handed.has_news():
+                    self._take_back(loop)
+                    self._hand_over(loop, t)
             done, rest = rest[: found.ticks], rest[found.ticks :]
             if found.ticks:
                 k = int(done[-1])
@@ -188,7 +197,11 @@ class HybridTicks:
             if found.reason is HybridReason.ENDED:
                 return t
             if found.reason is HybridReason.LOOK:
-                self._decide(loop, t)
+                self._take_back(loop)
+                if changes_method(self._workspace, self._continuous, t, loop.looked_at()):
+                    self._hand_over(loop, t)
+            if found.reason in _ACTING and self._let_act(loop, found, recorder):
+                return t
             if found.reason in _ASKING:
                 following = int(rest[0])
                 ended = self._take_interval(loop, k, following, last, found, recorder)
@@ -246,61 +259,56 @@ class HybridTicks:
                     self._steps.go(k, following, last=following == last)
             elif found.reason in (HybridReason.FMU_FAILED, HybridReason.FMU_FLAGS):
                 self._judge(found, self._time_of(k), float(flat.base * (following - k)))
+            elif found.reason is HybridReason.OUTSIDE_FAILED and self._handed is not None:
+                self._handed.judge()
         except SimulationError as error:
             raise error.at(t=end) from error.__cause__
         if ended is None:
-            take_tick(workspace, continuous, self._plants, end, flat.acting(following))
+            if found.reason is HybridReason.ASK_REST:
+                end_tick(workspace, continuous, loop, end, flat.acting(following))
+            else:
+                take_tick(workspace, continuous, self._plants, end, flat.acting(following))
             self._steps.hold(following)
             recorder.row(end, workspace.log)
         self._hand_over(loop, end if ended is None else ended)
         return ended
 
-    def _decide(self, loop: CompiledHybrid, t: float) -> None:
-        """Decide, after signs of stiffness or of none, which method goes on from t."""
-        solver, h = self._continuous.solver, loop.looked_at()
-        assert isinstance(solver, AutoSolver)
+    def _let_act(self, loop: CompiledHybrid, found: HybridOutcome, recorder: Recorder) -> bool:
+        """Let events beside blocks from outside act at an instant between ticks; return whether the run ends there."""
         self._take_back(loop)
-        self._continuous.enter(t)
-        told = len(solver.statistics.messages)
-        if solver.decide(t, self._workspace.here.x[self._continuous.where], h):
-            self._workspace.messages += tuple(solver.statistics.messages[told:])
-            self._hand_over(loop, t)
+        fired = None
+        if found.reason is HybridReason.ASK_FIRE:
+            assert loop.watch is not None
+            fired = loop.watch.fires.astype(bool)
+        ended = let_act(self._workspace, self._continuous, found.t, loop.left, fired)
+        if ended:
+            recorder.row(found.t, self._workspace.log)
+        self._hand_over(loop, found.t)
+        return ended
 
     def _judge(self, found: HybridOutcome, now: float, h: float) -> None:
         """Go on from the call of an FMU that the loop could not go beyond."""
         status = found.status if found.reason is HybridReason.FMU_FAILED else 0
         end_steps([*self._plants.values()], found.plant, found.stage, status, now, h)
 
-    def _is_held(self) -> bool:
-        """Whether an indicator is held in contact, or events wait for the end of a fixed step: Python goes on then."""
-        continuous = self._continuous
-        return continuous.sliding.active or (continuous.domains is not None and continuous.domains.limits.holds)
-
     # --- between Python and C ----------------------------------------------------------------------------------------
 
     def _bind(self, recorder: Recorder) -> CompiledHybrid:
         if self._loop is None or recorder is not self._recorder:
-            workspace, here = self._workspace, self._workspace.here
-            ticks = bind_loop(workspace, self._plants.values(), self._code.ticks, recorder, self._stops)
-            self._recorder = recorder
-            continuous, domains = self._continuous, self._continuous.domains
-            accepts = bool(self._plants) or workspace.looped or remembers(self._flat) or has_guards(self._flat)
-            accepts = accepts or (self._code.judged and not continuous.fixed)
-            self._loop = CompiledHybrid(
-                self._code, self._flat, ticks, [here.t, here.x, here.w, here.p], workspace.x_next, self._methods,
-                step=float(self._flat.base) if continuous.fixed else None,
-                spacing=math.inf if domains is None else domains.spacing,
-                own=() if domains is None else domains.own,
-                accepts=accepts,
-                held=(workspace.z, self._steps.inputs),
-                loops=newton_options(self._flat, NONE) if self._flat.active_loops(NONE) else None,
+            self._loop, self._handed = bind_hybrid(
+                self._code, self._workspace, self._continuous, self._plants.values(), self._steps, recorder,
+                self._stops, self._methods,
             )  # fmt: skip
+            self._recorder = recorder
             self._kinds = ClockSets(self._flat.distinct, self._loop.kinds, other=0)
         return self._loop
 
     def _hand_over(self, loop: CompiledHybrid, t: float) -> None:
         """Let C go on from an instant that Python has come to."""
         loop.begin(t)
+        if self._handed is not None:
+            self._handed.hand_over()
+            loop.set_tolerances(methods_of(self._continuous))
         loop.plan(planned_steps(self._continuous, self._methods))
         loop.active = active_method(self._continuous, self._methods)
         if loop.watch is not None:
@@ -310,6 +318,8 @@ class HybridTicks:
     def _take_back(self, loop: CompiledHybrid) -> None:
         """Let Python go on from where C has come to."""
         restore_plans(self._continuous, self._methods, loop.planned)
+        if self._handed is not None and self._handed.take_back():
+            self._continuous.follow()
         if loop.watch is not None:
             assert self._continuous.domains is not None
             take_back_domains(self._continuous.domains, loop.watch, self._fired)
@@ -319,11 +329,7 @@ class HybridTicks:
         """Tell the events that have fired."""
         fired = loop.take_fired()
         self._fired = [*self._fired, *fired][-_KEPT:]
-        for one in fired:
-            event = self._flat.events[one.event]
-            of = None if event.subsystem else self._flat.states.of_block[event.path]
-            before, after = ({} if of is None else of.split(x) for x in (one.before, one.after))
-            self._continuous.on_event(Occurrence(one.t, event.path, event.name, before, after))
+        tell_fired(self._continuous, fired)
 
 
 _ASKING = frozenset(
@@ -333,8 +339,11 @@ _ASKING = frozenset(
         HybridReason.FMU_FAILED,
         HybridReason.FMU_FLAGS,
         HybridReason.NOT_OK,
+        HybridReason.ASK_REST,
+        HybridReason.OUTSIDE_FAILED,
     }
 )
+_ACTING = frozenset({HybridReason.ASK_SETTLE, HybridReason.ASK_FIRE})
 
 
 def make_hybrid(
@@ -362,6 +371,8 @@ def make_hybrid(
     """
     native = plants_for_c(plants)
     reason = find_hybrid_obstacle(workspace.flat, continuous.solver.name)
+    if reason is None and continuous.exchanged is not None:
+        reason = find_exchange_obstacle(continuous.exchanged.blocks)
     reason = reason or find_obstacle_at_ticks(workspace.flat, plants, native, regular=regular)
     if reason is None:
         try:

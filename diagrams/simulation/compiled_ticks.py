@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,6 @@ from ..compiled import (
     BackgroundCode,
     CompiledLoop,
     FusedPlant,
-    NewtonOptions,
     Outcome,
     Reason,
     TickCode,
@@ -27,8 +26,7 @@ from ..compiled import (
 from ..coupling import Plant
 from ..flat import EVERY, EXACT_LOOP, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of, ticks_after
 from ..results import Recorder
-from .algebraic_loops import HALVINGS, ITERATIONS, ROUNDING, SINGULAR, TOLERANCE
-from .compiled_hand_over import OBSTACLES, end_steps, plants_for_c, step_plants, steps_in_c
+from .compiled_hand_over import OBSTACLES, bind_loop, end_steps, plants_for_c, step_plants
 from .diagnosis import forget_trials
 from .workspace import Workspace
 
@@ -225,29 +223,6 @@ class CompiledTicks:
         workspace.here.t[0] = t
         workspace.tick(self._flat.acting(k))
         recorder.row(t, workspace.log)
-
-
-def bind_loop(
-    workspace: Workspace, plants: Iterable[FmuInstance], code: TickCode, recorder: Recorder, stops: Sequence[int]
-) -> CompiledLoop:
-    """Return the loop over ticks in C, bound to the numbers of a run, its plants, and the samples that it keeps."""
-    entries, here = recorder.entries, workspace.here
-    return CompiledLoop(
-        code,
-        [here.t, here.x, here.w, here.p],
-        [workspace.x_next, workspace.z, workspace.log, workspace.ok],
-        steps_in_c(plants),
-        columns=entries,
-        width=workspace.log.size if entries is None else len(entries),
-        every=recorder.every,
-        stops=stops,
-        loops={clocks: newton_options(workspace.flat, clocks) for clocks in code.loops},
-    )
-
-
-def newton_options(flat: FlatDiagram, clocks: frozenset[TickPattern]) -> NewtonOptions:
-    """Return Newton's method for the algebraic loops at a tick at which some clocks act."""
-    return NewtonOptions(flat.active_loops(clocks), TOLERANCE, ROUNDING, SINGULAR, ITERATIONS, HALVINGS)
 
 
 def bind_evaluations(workspace: Workspace, *, every: bool) -> dict[frozenset[TickPattern], Callable[[], None]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...blocks.core import OptionError, SimulationError, is_before, left_of
 from ..events import Domains, ManyInstants, Sliding
-from ..exchange import ExchangedBlocks, OutsideEvents
+from ..exchange import INPUT_EVENT, ExchangedBlocks, OutsideEvents
 from ..flat import announcers
 from ..results import Occurrence
 from ..solvers import AcceptedStep, Problem, make_solver
@@ -116,9 +116,11 @@ class Continuous(Trials, Memory):
             self._jump = workspace.bind_jump()
         self.outside: OutsideEvents | None = None
         """Events of blocks that are evaluated from outside; None without such blocks."""
+        self.exchanged = exchanged if exchanged else None
+        """Blocks that are evaluated from outside; None without any."""
         if exchanged:
-            self._exchanged, self._nominals = exchanged, np.zeros(0)
-            self.outside = OutsideEvents(exchanged, workspace.here.x, self._jump, self._tell_outside, self._follow)
+            self._nominals = np.zeros(0)
+            self.outside = OutsideEvents(exchanged, workspace.here.x, self._jump, self._tell_outside, self.follow)
         if self.delays is not None:
             self._driven = np.zeros(flat.plant_inputs.total)
             self._drive = workspace.plain(flat.driven, [self._driven], workspace.trial)
@@ -145,6 +147,11 @@ class Continuous(Trials, Memory):
             self.delays.outputs_at(t, here.w)
         self._synchronize()
 
+    def stand_left(self, t: float, left: float) -> None:
+        """Stand at an instant before the discontinuity there, at a time in s from the left."""
+        self._edge, self._left = t, left
+        self.workspace.here.t[0] = left
+
     def _synchronize(self) -> None:
         here, trial = self.workspace.here, self.workspace.trial
         trial.x[:] = here.x
@@ -161,7 +168,7 @@ class Continuous(Trials, Memory):
         """Take the domains of the indicators where a run begins, at t = 0 from the left; elsewhere as they are."""
         self.enter(float(self.workspace.here.t[0]))
         if self.outside is not None:
-            self._follow()
+            self.follow()
         if self.domains is not None:
             self.domains.begin(float(self.workspace.here.t[0]), self.workspace.here.x[self.where])
             if at_start:
@@ -187,7 +194,7 @@ class Continuous(Trials, Memory):
             if not fired.any():
                 self._end_events(t)
                 return True
-        self._fire(t, fired)
+        self.fire(t, fired)
         self.sliding.switched = True
         return True
 
@@ -205,11 +212,16 @@ class Continuous(Trials, Memory):
         states = (state_values(self.flat, path, x) for x in (before, self.workspace.here.x))
         self.on_event(Occurrence(t, path, name, *states))
 
-    def _follow(self) -> None:
+    def tell_input_event(self, t: float, path: str, before: np.ndarray, after: np.ndarray) -> None:
+        """Tell an event of an input of a block from outside, with all states before and after it."""
+        states = (state_values(self.flat, path, x) for x in (before, after))
+        self.on_event(Occurrence(t, path, INPUT_EVENT, *states))
+
+    def follow(self) -> None:
         """Take over what an event of a block from outside may have changed: states, and their nominal values."""
         self._synchronize()
-        if self.where.size and not self.fixed:
-            nominals = self._exchanged.nominals()
+        if self.where.size and not self.fixed and self.exchanged is not None:
+            nominals = self.exchanged.nominals()
             if not np.array_equal(nominals, self._nominals):
                 self._nominals = nominals
                 self.solver.set_absolute_tolerance(absolute_tolerances(self.flat, self._resolution[1], nominals))
@@ -232,12 +244,12 @@ class Continuous(Trials, Memory):
             return False
         here.t[0], here.x[self.where] = later, x
         self._synchronize()
-        self._fire(t, fired, later)
+        self.fire(t, fired, later)
         here.t[0] = t
         self._synchronize()
         return True
 
-    def _fire(self, t: float, fired: np.ndarray, at: float | None = None) -> None:
+    def fire(self, t: float, fired: np.ndarray, at: float | None = None) -> None:
         """Let events fire at the instant t; their jumps are evaluated there, or a few ulps later, ``at``."""
         assert self.domains is not None
         at = t if at is None else at
@@ -337,7 +349,7 @@ class Continuous(Trials, Memory):
             if found is None and wanted:
                 self.settle(t)
             if found is not None:
-                self._fire(t, found[1])
+                self.fire(t, found[1])
                 workspace.messages += self.sliding.look(self.domains, t)
             if t == edge and self.delays is not None:
                 self.delays.note_reached(t, from_source=not is_before(t, self._sources_edge))

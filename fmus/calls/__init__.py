@@ -7,7 +7,7 @@ from .fmi_calls import ERROR, WARNING, FmiCalls, Log
 from .fmu_block import FmuBlock
 from .instance import FmuInstance
 from .loaded_library import CALLS, LoadedFmu, MakeCalls
-from .native_step import NativeStep, RemoteStep, SharedValues
+from .native_step import NativeAction, NativeLook, NativeStep, RemoteStep, SharedValues
 from .saved_state import FmuState
 from .step_failures import NEAR
 from .step_options import StepOptions, StepTime, check_offered
@@ -29,6 +29,8 @@ __all__ = [
     "LoadedFmu",
     "Log",
     "MakeCalls",
+    "NativeAction",
+    "NativeLook",
     "NativeStep",
     "RemoteStep",
     "SharedValues",

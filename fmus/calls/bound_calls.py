@@ -7,6 +7,7 @@ import inspect
 import types
 import typing
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple, Protocol
 
@@ -85,12 +86,12 @@ class BoundCalls:
     """Bits of the places of the calls that gave a warning in the last run, the last bit for all behind it."""
 
     def __init__(self, calls: Sequence[Call]):
-        self._calls = tuple(calls)
+        self.calls = tuple(calls)
 
     def run(self) -> int:
         """Call the functions up to the first that fails; return its status, else 1 after a warning, else 0."""
         worst = 0
-        for place, (function, arguments) in enumerate(self._calls):
+        for place, (function, arguments) in enumerate(self.calls):
             status = function(*arguments)
             if status:
                 if status != WARNING:
@@ -111,7 +112,7 @@ class BoundCalls:
 
     def warned_places(self) -> list[int]:
         """Return the places of the calls that gave a warning, where `run` has returned 1."""
-        return [place for place in range(len(self._calls)) if self.warned & bit_of(place)]
+        return [place for place in range(len(self.calls)) if self.warned & bit_of(place)]
 
     def start(self) -> None:
         """Begin to run, if that can go on by itself; `finish` ends it."""
@@ -124,6 +125,50 @@ class BoundCalls:
 def bit_of(place: int) -> int:
     """Return the bit of a place; the last one of a word is for all places behind it."""
     return 1 << min(place, 62)
+
+
+class EventUpdate(NamedTuple):
+    """Answer of a round of the event iteration."""
+
+    again: bool
+    """Whether another round is needed."""
+    terminate: bool
+    nominals_changed: bool
+    states_changed: bool
+    next_time: float
+    """Time of the next time event in s, infinite without one."""
+
+
+class AnswersAt(NamedTuple):
+    """Addresses of the answers of ``update`` and ``complete``: flags of some bytes each, and a time in s."""
+
+    width: int
+    again: int
+    terminate: int
+    nominals: int
+    defined: int
+    next_time: int
+    wants: int
+    ends: int
+
+
+@dataclass(frozen=True)
+class EventCalls:
+    """Functions of events in model exchange with their arguments, to be bound, and what they have said."""
+
+    enter: Call | None  # None without modes, as in FMI 1.0
+    update: Call
+    leave: Call | None
+    complete: Call
+    """It tells a step of the solver that was accepted."""
+    final: Any
+    """Argument of ``complete``: whether no earlier state will be restored, a C value that can be changed."""
+    updated: Callable[[], EventUpdate]
+    """Answer of the last ``update``."""
+    completed: Callable[[], tuple[bool, bool]]
+    """Answer of the last ``complete``: whether Event Mode is wanted, and the end of the run."""
+    first: Callable[[], EventUpdate | None] = lambda: None  # answer of the initialization, in FMI 1.0
+    answers: AnswersAt | None = None  # where these answers stand; None where only the functions above can read them
 
 
 @cache

@@ -11,6 +11,7 @@ import numpy as np
 
 from .bound_calls import BoundCalls, Call
 from .fmi_calls import WARNING, FmiCalls
+from .native_step import ActionKind, NativeAction, call_action, copy_action, transfer_actions
 from .transfer import Transfer
 
 _Named = tuple[Callable[..., int], tuple[Any, ...], str]
@@ -60,6 +61,7 @@ class Evaluation:
         lazy: bool = True,
     ):
         self._time, self._inputs, self._index, self._outputs = time, inputs, index, outputs
+        self._states = states.values
         self.rates, self.indicators = derivatives if rates else None, indicators
         sizes = [outputs.vector.size, *(0 if v is None else v.values.size for v in (self.rates, indicators))]
         self.result = np.zeros(sum(sizes))
@@ -108,6 +110,29 @@ class Evaluation:
         if self.indicators is not None:
             self.result[self._indicators_at] = self.indicators.values
         return status, ""
+
+    def native(
+        self, t: np.ndarray, x: np.ndarray, u: np.ndarray, into: np.ndarray, order: np.ndarray, *, again: bool = False
+    ) -> list[NativeAction]:
+        """Return it as actions of C on vectors of the caller's; ``order`` is that of the FMU's states.
+
+        With ``again`` time and states need not be set.
+        """
+        (calls, names), take, give = self._running, ActionKind.TAKE, ActionKind.GIVE
+        placed = (1 + bool(self._states.size)) if again else 0
+        time = np.ctypeslib.as_array(ctypes.pointer(self._time), (1,))
+        made = [] if again else copy_action(take, t, np.zeros(1, int), time) + copy_action(take, x, order, self._states)
+        made += transfer_actions(self._inputs, u, self._index, take)
+        made += [call_action(call, name) for call, name in zip(calls.calls[placed:], names[placed:], strict=True)]
+        if not into.size:
+            return made
+        places = np.arange(into.size)
+        made += transfer_actions(self._outputs, into, places[self._outputs_at], give)
+        if self.rates is not None:
+            made += copy_action(give, into, places[self.rates_at][order], self.rates.values)
+        if self.indicators is not None:
+            made += copy_action(give, into, places[self._indicators_at], self.indicators.values)
+        return made
 
 
 class DirectEvaluation:

@@ -9,16 +9,18 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ...blocks.core import FmuRuntimeError, SimulationError
-from .bound_calls import DISCARD, WARNING, BoundCalls, Call
+from ..host_state import HostState
+from .bound_calls import DISCARD, WARNING, BoundCalls, Call, EventUpdate
 from .evaluated_exchange import EvaluatedExchange
 from .evaluation import Evaluation
-from .fmi_calls import EventUpdate
 from .fmu_block import FmuBlock, check_next_time
 from .loaded_library import MakeCalls
+from .native_step import ActionKind, NativeAction, NativeLook, call_action, copy_action, transfer_actions
 from .texts import Text, TextRecord
 from .transfer import Transfer, UnfitError
 
-_ROUNDS = 100  # of an event iteration
+ROUNDS = 100
+"""Rounds of an event iteration."""
 _SAME = 1e-12  # relative change of a continuous input that is no jump
 
 
@@ -156,17 +158,28 @@ class ExchangeInstance(EvaluatedExchange):
         """Go through Event Mode at an instant, and return the continuous states after it."""
         inputs = self._fill(u, t)
         self._check_limits(inputs, t)
+        event = self._event_evaluation(inputs)
+        self._u, self._discarded = u.copy(), ""
+        self._run(event, t, x, u)
+        self._check_computed(t)
+        return self._iterate(t, self._events.updated())
+
+    def _event_evaluation(self, inputs: Transfer) -> Evaluation:
+        """Return the calls that go into Event Mode, with all inputs, for a first round."""
         if self._event is None:
             calls = self._events
             sets = [((group.function, group.arguments), "setting the inputs") for group in inputs.groups]
-            more = [*sets, (calls.update, "the event iteration")]
+            more = [*sets, (calls.update, _UPDATING)]
             if calls.enter is not None:
                 more.insert(0, (calls.enter, "entering Event Mode"))
             self._event = self._bind((), False, bool(self.about.indicators), tuple(more))
-        self._u, self._discarded = u.copy(), ""
-        self._run(self._event, t, x, u)
-        self._check_computed(t)
-        return self._iterate(t, self._events.updated())
+        return self._event
+
+    def _step_evaluation(self) -> Evaluation:
+        """Return the calls that tell an accepted step of the solver."""
+        if self._completion is None:
+            self._completion = self._bind((), False, False, ((self._events.complete, "completing a step"),))
+        return self._completion
 
     def _check_limits(self, inputs: Transfer, t: float) -> None:
         """Refuse inputs out of the range that the FMU states, in a trial step only if it is accepted."""
@@ -196,9 +209,9 @@ class ExchangeInstance(EvaluatedExchange):
     def _iterate(self, t: float, made: EventUpdate | None = None) -> np.ndarray:
         """Update the discrete states until they settle, and return to Continuous-Time Mode."""
         calls, nominals = self._events, False
-        for _ in range(_ROUNDS):
+        for _ in range(ROUNDS):
             if made is None:
-                self._call_bound(calls.update, "the event iteration", t)
+                self._call_bound(calls.update, _UPDATING, t)
                 made = calls.updated()
             nominals |= made.nominals_changed
             if made.terminate:
@@ -207,13 +220,7 @@ class ExchangeInstance(EvaluatedExchange):
                 break
             made = None
         else:
-            raise FmuRuntimeError(
-                f"its discrete states don't settle at t = {t:.9g} s: after {_ROUNDS} rounds of the event iteration it "
-                f"still asks for another one{self._quote_messages()} Report it to its makers, or change the inputs "
-                "there.",
-                block=self.block.label,
-                t=t,
-            )
+            raise self._unsettled(t)
         assert made is not None
         self.next_time = check_next_time(self.block, made.next_time, t)
         x = self._get("get_states", *([] if calls.leave is None else [calls.leave]))
@@ -221,6 +228,14 @@ class ExchangeInstance(EvaluatedExchange):
             self.nominals = self._read_nominals()
         self._note_texts(t)
         return x
+
+    def _unsettled(self, t: float) -> FmuRuntimeError:
+        return FmuRuntimeError(
+            f"its discrete states don't settle at t = {t:.9g} s: after {ROUNDS} rounds of the event iteration it "
+            f"still asks for another one{self._quote_messages()} Report it to its makers, or change the inputs there.",
+            block=self.block.label,
+            t=t,
+        )
 
     def accept(self, t: float, x: np.ndarray, u: np.ndarray) -> bool:
         """Note an instant that the solver has reached; return whether the FMU wants an event there (step event)."""
@@ -238,10 +253,9 @@ class ExchangeInstance(EvaluatedExchange):
             self._note_texts(t)
         if not self.about.completes_steps:
             return changed
-        if self._completion is None:
-            self._completion = self._bind((), False, False, ((self._events.complete, "completing a step"),))
+        completion = self._step_evaluation()
         self._events.final.value = self._final
-        self._run(self._completion, t, x, u)
+        self._run(completion, t, x, u)
         self._check_computed(t)
         wants, terminate = self._events.completed()
         if terminate:
@@ -254,5 +268,111 @@ class ExchangeInstance(EvaluatedExchange):
             self.ends_run = True
             self.add_note(f"it asks to end the simulation at t = {t:.9g} s, {place} (terminateSimulation)")
 
+    # ---- for a loop in C ----
 
+    def find_native_obstacle(self) -> str | None:
+        """Return why a loop in C can't evaluate it; None if it can."""
+        if not self.fmi.in_process:
+            return "runs in a process of its own"
+        if self._texts.variables:
+            return "has outputs of texts, which are recorded at each step"
+        return None if self._events.answers is not None and self._events.leave is not None else "is one of FMI 1.0"
+
+    def native_evaluation(
+        self,
+        ports: Sequence[str],
+        *,
+        rates: bool,
+        indicators: bool,
+        t: np.ndarray,
+        x: np.ndarray,
+        u: np.ndarray,
+        into: np.ndarray,
+        again: bool,
+    ) -> list[NativeAction]:
+        """Return `bound_evaluation` as actions of C."""
+        self.evaluation(ports, rates=rates, indicators=indicators)
+        made = self._evaluations[tuple(ports), rates, indicators]
+        return made.native(t, x, u, into, self._order, again=again and self._is_own)
+
+    def native_look(self, t: np.ndarray, x: np.ndarray, u: np.ndarray, into: np.ndarray) -> NativeLook:
+        """Return `accept` and `handle_event` as actions of C, at what stands in t, x and u; states are written."""
+        inputs, nothing, take = self._fill(self._u, self.t), np.zeros(0), ActionKind.TAKE
+        index = np.concatenate([np.zeros(0, int), *(np.arange(s.start, s.stop) for s in map(self._place, self._wired))])
+        enter = [*transfer_actions(inputs, u, index, take)]
+        enter += self._event_evaluation(inputs).native(t, x, u, nothing, self._order)
+        complete = self._step_evaluation().native(t, x, u, nothing, self._order) if self.about.completes_steps else []
+        leave = []
+        if self._kept.size:
+            arguments = (
+                self.fmi.instance_argument,
+                ctypes.c_void_p(self._kept.ctypes.data),
+                ctypes.c_size_t(self._kept.size),
+            )
+            states = call_action((self.fmi.exchange_function("get_states"), arguments), _READING["get_states"])
+            leave = [states, *copy_action(ActionKind.GIVE, into, self._order, self._kept)]
+        calls = self._events
+        assert calls.leave is not None
+        assert calls.answers is not None
+        low, high, discrete = np.full(u.size, -math.inf), np.full(u.size, math.inf), np.zeros(u.size, dtype=bool)
+        low[index], high[index] = inputs.bounds
+        for port in self._wired:
+            discrete[self._places[port]] = port not in self._smooth
+        return NativeLook(
+            complete,
+            enter,
+            [call_action(calls.update, _UPDATING)],
+            [*leave, call_action(calls.leave, _READING["get_states"])],
+            calls.answers,
+            self._least,
+            self._relative,
+            discrete,
+            low,
+            high,
+        )
+
+    def _place(self, port: str) -> slice:
+        return self._places[port]
+
+    @property
+    def native_host(self) -> HostState | None:
+        """The state of this process, which a library that Loopwright has not built may change."""
+        return self.host if self._guarded else None
+
+    @property
+    def is_final(self) -> bool:
+        """Whether no earlier state will be restored."""
+        return self._final
+
+    @property
+    def reached_inputs(self) -> np.ndarray:
+        """Values of all inputs at the last instant that was reached."""
+        return self._u
+
+    def take_back(self, u: np.ndarray, next_time: float, *, read_nominals: bool) -> None:
+        """Go on from where a loop in C has come to."""
+        self._u, self.next_time, self._discarded = u.copy(), next_time, ""
+        if read_nominals:
+            self.nominals = self._read_nominals()
+
+    def take_end(self, t: float, *, in_event: bool) -> None:
+        """Note that the FMU has asked to end the simulation, to a loop in C."""
+        self._note_end(t, "in Event Mode" if in_event else "after a step of the solver")
+
+    def take_warning(self, action: str, t: float) -> None:
+        """Note a warning of the FMU, to a loop in C."""
+        self.log.warn(action, self.fmi.status_name(WARNING), t)
+
+    def judge_native(self, action: str, status: int, t: float) -> None:
+        """Raise the error of a call of C that has failed; without a status, of an event that has no end or no time."""
+        if not status:
+            check_next_time(self.block, self._events.updated().next_time, t)
+            raise self._unsettled(t)
+        if status != DISCARD:
+            raise self._error(action, status, t)
+        self._judge(status, [action], t, np.zeros(0))
+        self._check_computed(t)
+
+
+_UPDATING = "the event iteration"
 _READING = {"get_states": "reading the continuous states", "nominals": "reading the nominal values of the states"}

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from .fmi_calls import DISCARD, PENDING, EventCalls, EventUpdate, FmiCalls, Log, StepCall, TypeCalls
+from .bound_calls import EventCalls, EventUpdate
+from .fmi_calls import DISCARD, PENDING, FmiCalls, Log, StepCall, TypeCalls
 from .printf import Logger, format_message
 
 _LONGEST_WAIT = 0.01  # s between two looks at a step that is pending

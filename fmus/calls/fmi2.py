@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from .fmi_calls import DISCARD, PENDING, EventCalls, EventUpdate, FmiCalls, Log, StepCall, TypeCalls
+from .bound_calls import AnswersAt, EventCalls, EventUpdate
+from .fmi_calls import DISCARD, PENDING, FmiCalls, Log, StepCall, TypeCalls
 from .printf import Logger, format_message
 
 _LONGEST_WAIT = 0.01  # s between two looks at a step that is pending
@@ -191,4 +192,20 @@ class Fmi2Calls(FmiCalls):
             final,
             updated,
             lambda: (bool(flags[0]), bool(flags[1])),
+            answers=_answers_at(info, at),
         )
+
+
+def _answers_at(info: Any, flags: int) -> AnswersAt:
+    """Return where the answers of events stand in ``fmi2EventInfo``, and behind an address of two flags."""
+    start, kind = ctypes.addressof(info), type(info)
+    fields = (
+        "newDiscreteStatesNeeded",
+        "terminateSimulation",
+        "nominalsOfContinuousStatesChanged",
+        "nextEventTimeDefined",
+        "nextEventTime",
+    )
+    again, terminate, nominals, defined, time = (start + getattr(kind, name).offset for name in fields)
+    width = ctypes.sizeof(ctypes.c_int)
+    return AnswersAt(width, again, terminate, nominals, defined, time, flags, flags + width)

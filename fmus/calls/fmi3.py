@@ -9,7 +9,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
-from .fmi_calls import MOST_ROUNDS, EventCalls, EventUpdate, FmiCalls, Log, StepCall, TypeCalls
+from .bound_calls import AnswersAt, EventCalls, EventUpdate
+from .fmi_calls import MOST_ROUNDS, FmiCalls, Log, StepCall, TypeCalls
 
 _INTEGERS = {f"{sign}Int{bits}": getattr(ctypes, f"c_{sign.lower()}int{bits}")
              for sign in ("", "U") for bits in (8, 16, 32, 64)}  # fmt: skip
@@ -176,4 +177,5 @@ class Fmi3Calls(FmiCalls):
             final,
             updated,
             lambda: (flags[5], flags[6]),
+            answers=AnswersAt(1, at, at + 1, at + 2, at + 4, ctypes.addressof(t), at + 5, at + 6),
         )

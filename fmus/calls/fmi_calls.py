@@ -7,12 +7,25 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
 from ...blocks.core import FmuProcessError
-from .bound_calls import DISCARD, ERROR, FATAL, PENDING, STATUS, WARNING, BoundCalls, Call, allow_missing, exported_name
+from .bound_calls import (
+    DISCARD,
+    ERROR,
+    FATAL,
+    PENDING,
+    STATUS,
+    WARNING,
+    BoundCalls,
+    Call,
+    EventCalls,
+    EventUpdate,
+    allow_missing,
+    exported_name,
+)
 
 __all__ = ["DISCARD", "ERROR", "FATAL", "PENDING", "STATUS", "WARNING", "FmiCalls"]
 
@@ -32,24 +45,6 @@ class TypeCalls:
     ctype: type[Any]
 
 
-@dataclass(frozen=True)
-class EventCalls:
-    """Functions of events in model exchange with their arguments, to be bound, and what they have said."""
-
-    enter: Call | None  # None without modes, as in FMI 1.0
-    update: Call
-    leave: Call | None
-    complete: Call
-    """It tells a step of the solver that was accepted."""
-    final: Any
-    """Argument of ``complete``: whether no earlier state will be restored, a C value that can be changed."""
-    updated: Callable[[], EventUpdate]
-    """Answer of the last ``update``."""
-    completed: Callable[[], tuple[bool, bool]]
-    """Answer of the last ``complete``: whether Event Mode is wanted, and the end of the run."""
-    first: Callable[[], EventUpdate | None] = lambda: None  # answer of the initialization, in FMI 1.0
-
-
 @dataclass
 class StepCall:
     """The function that takes a step, with arguments that are made once, so that no call checks their types."""
@@ -62,18 +57,6 @@ class StepCall:
     """Flags ``event``, ``terminate``, ``early``; all false in FMI 2.0, which has none."""
     reached: ctypes.c_double
     """Time at which a step has ended, in s; NaN if the FMU does not say it, as in FMI 2.0."""
-
-
-class EventUpdate(NamedTuple):
-    """Answer of a round of the event iteration."""
-
-    again: bool
-    """Whether another round is needed."""
-    terminate: bool
-    nominals_changed: bool
-    states_changed: bool
-    next_time: float
-    """Time of the next time event in s, infinite without one."""
 
 
 class FmiCalls(ABC):

@@ -80,6 +80,13 @@ class Transfer:
         """Whether a port has a smallest or largest value."""
         return self._bounded.size > 0
 
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of each value of the vector, infinite without one."""
+        low, high = np.full(self.vector.size, -np.inf), np.full(self.vector.size, np.inf)
+        low[self._bounded], high[self._bounded] = self._low, self._high
+        return low, high
+
     def check_limits(self) -> None:
         """Refuse values out of the ranges that the FMU's description states.
 

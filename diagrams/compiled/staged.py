@@ -1,0 +1,303 @@
+"""Functions of a diagram in stages, with FMUs in model exchange between them, as C goes through them."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from ...blocks.tracing import GUARDS, NEXT
+from ...fmus.calls import NativeAction, NativeLook
+from ...fmus.host_state import HostState
+from ..flat import INDICATORS, JUMP, OpaqueStage
+from .code import address_of
+from .grouped_parts import color_columns
+from .loop import TickStructure
+from .native_tick import at, list_vectors
+from .staged_functions import Staged, StagedSlopes
+
+_LOGGED = 2**20  # bytes of events of inputs in a call
+_INT, _REAL, _AT = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+
+
+def _fields(kind: Any, names: str) -> list[tuple[str, Any]]:
+    return [(name, kind) for name in names.split()]
+
+
+class _Action(ctypes.Structure):
+    _fields_ = [
+        *_fields(_INT, "kind count"), ("function", _AT), ("arguments", ctypes.c_uint64 * 8),
+        *_fields(_AT, "vector index buffer"), ("type", _INT), *_fields(_REAL, "low high warned_at"),
+    ]  # fmt: skip
+
+
+class _Sequence(ctypes.Structure):
+    _fields_ = [("count", _INT), ("actions", _AT)]
+
+
+class _Exchanged(ctypes.Structure):
+    _fields_ = [
+        ("of", _AT), *_fields(_INT, "place states inputs first"), *_fields(_Sequence, "complete enter update leave"),
+        *_fields(_AT, "again terminate nominals defined wants ends time"), ("width", _INT),
+        *_fields(_AT, "u least relative low high discrete"), ("next_time", _REAL),
+        *_fields(_INT, "asks ended in_event"), ("end", _REAL), *_fields(_INT, "other_nominals acted"),
+        ("changed", _AT),
+    ]  # fmt: skip
+
+
+class _Outside(ctypes.Structure):
+    _fields_ = [
+        ("count", _INT), ("each", _AT), ("jump", TickStructure), *_fields(_INT, "look lost failed plant"),
+        ("action", _AT), ("status", _INT), ("at", _REAL), ("log", _AT), *_fields(_INT, "logged capacity"),
+    ]  # fmt: skip
+
+
+class _Stage(ctypes.Structure):
+    _fields_ = [
+        ("f", TickStructure), ("fmu", _AT), ("calls", _Sequence), *_fields(_AT, "t x u into"), ("made", _INT),
+    ]  # fmt: skip
+
+
+class _Schedule(ctypes.Structure):
+    _fields_ = [("count", _INT), ("stages", _AT)]
+
+
+class _Slopes(ctypes.Structure):
+    _fields_ = [
+        *_fields(_AT, "rates x dx before step typical"), *_fields(_INT, "n colors"),
+        *_fields(_AT, "where first columns rows_first rows"),
+    ]  # fmt: skip
+
+
+class NativeBlock(Protocol):
+    """A block that a loop in C evaluates; see `loopwright.fmus.calls.ExchangeInstance`."""
+
+    @property
+    def native_host(self) -> HostState | None:
+        """The state of this process, which a library that Loopwright has not built may change."""
+
+    def native_evaluation(
+        self,
+        ports: Sequence[str],
+        *,
+        rates: bool,
+        indicators: bool,
+        t: np.ndarray,
+        x: np.ndarray,
+        u: np.ndarray,
+        into: np.ndarray,
+        again: bool,
+    ) -> list[NativeAction]:
+        """Return an evaluation as actions of C."""
+
+    def native_look(self, t: np.ndarray, x: np.ndarray, u: np.ndarray, into: np.ndarray) -> NativeLook:
+        """Return all that a look at an instant that is reached may do."""
+
+
+class InputEvent(NamedTuple):
+    """An event of an input that has changed states: its time in s, its block, and the states before and after it."""
+
+    t: float
+    path: str
+    before: np.ndarray
+    after: np.ndarray
+
+
+class CallFailure(NamedTuple):
+    """A call that has failed: its block, its name (empty for an event without end), its status and its time in s."""
+
+    path: str
+    action: str
+    status: int
+    t: float
+
+
+class NativeExchange:
+    """Blocks that are evaluated from outside, as C knows them in a run.
+
+    Parameters
+    ----------
+    blocks : mapping
+        The blocks by path, loaded.
+    first : mapping
+        Where the states of each stand in the vector of all.
+    width : int
+        Number of all states.
+    library : CDLL
+        The library of `hybrid_master`.
+    """
+
+    def __init__(self, blocks: Mapping[str, NativeBlock], first: Mapping[str, int], width: int, library: ctypes.CDLL):
+        self._blocks, self._width, self._kept = blocks, width, list[Any]()
+        self._stages, self._slopes = (address_of(library, f"loopwright_{name}") for name in ("stages", "slopes"))
+        self.paths = [*blocks]
+        self._each = (_Exchanged * len(blocks))()
+        self._names = dict[int, str]()
+        """Names of calls by the address of their action."""
+        self._actions = list[tuple[str, ctypes.Array[_Action], list[NativeAction]]]()
+        self.watched: list[tuple[HostState, ctypes.c_bool]] = []
+        """States of this process that libraries may change, and whether C has seen that."""
+        self._log = np.zeros((max(4 * len(blocks), _LOGGED // (16 * (1 + width))), 2 + 2 * width))
+        self.structure = _Outside(
+            count=len(blocks),
+            each=ctypes.addressof(self._each),
+            log=at(self._log),
+            capacity=len(self._log),
+        )
+        for i, (path, block) in enumerate(blocks.items()):
+            e = self._each[i]
+            e.of, e.place, e.first, e.next_time = ctypes.addressof(self.structure), i, first[path], np.inf
+            if (host := block.native_host) is not None:
+                self.watched.append((host, ctypes.c_bool()))
+                e.changed = ctypes.addressof(self.watched[-1][1])
+        self._inputs = dict[str, np.ndarray]()
+        self._final = dict[str, Any]()
+
+    def _own(self, vector: np.ndarray) -> int | None:
+        self._kept.append(vector)
+        return at(vector)
+
+    # --- binding -----------------------------------------------------------------------------------------------------
+
+    def bind(self, staged: Staged, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> TickStructure:
+        """Return a schedule bound to vectors, as C knows it; valid as long as this lives."""
+        schedule, functions, addresses = staged.schedule, staged.functions, [*staged.addresses]
+        c = np.zeros(schedule.width)
+        vectors = [*arguments, c] if schedule.width else [*arguments]
+        made, seen = (_Stage * len(schedule.stages))(), set[str]()
+        last: Any = None
+        for structure, stage in zip(made, schedule.stages, strict=True):
+            if isinstance(stage, OpaqueStage):
+                self._bind_fmu(structure, stage, arguments[0], c, again=stage.path in seen)
+                seen.add(stage.path)
+                continue
+            f = functions.pop(0)
+            into = [*results] if stage is schedule.last else [c[stage.makes]]
+            given, last = list_vectors(vectors, f.sz_arg()), list_vectors(into, f.sz_res())
+            iw, w = np.zeros(f.sz_iw() + 1, dtype=np.int64), np.zeros(f.sz_w() + 1)
+            self._kept += [given, last, iw, w, vectors, into]
+            structure.f = TickStructure(
+                addresses.pop(0), ctypes.addressof(given), ctypes.addressof(last), at(iw), at(w)
+            )
+        found = _Schedule(len(made), ctypes.addressof(made))
+        self._kept += [made, found]
+        return TickStructure(self._stages, None, ctypes.addressof(last), ctypes.addressof(found), None)
+
+    def bind_slopes(
+        self, slopes: StagedSlopes, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], typical: np.ndarray
+    ) -> TickStructure:
+        """Return the derivative of rates bound to vectors."""
+        n = slopes.where.size
+        dx = np.zeros(n)
+        rates = self.bind(slopes.rates, arguments, [dx])
+        columns, first = color_columns(slopes.rows)
+        ends = np.cumsum([0, *map(len, slopes.rows)])
+        found = _Slopes(
+            rates=ctypes.addressof(rates),
+            x=at(arguments[1]),
+            dx=at(dx),
+            **{name: self._own(np.zeros(n)) for name in ("before", "step")},
+            typical=self._own(typical),
+            n=n,
+            colors=len(first) - 1,
+            where=self._own(slopes.where.astype(np.int64)),
+            first=self._own(np.array(first, dtype=np.int32)),
+            columns=self._own(np.array(columns, dtype=np.int32)),
+            rows_first=self._own(ends.astype(np.int32)),
+            rows=self._own(slopes.pattern[0].astype(np.int32)),
+        )
+        into = list_vectors(results, 1)
+        self._kept += [rates, found, into, dx, arguments, results]
+        return TickStructure(self._slopes, None, ctypes.addressof(into), ctypes.addressof(found), None)
+
+    def bind_jump(self, staged: Staged, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
+        """Bind the looks at an instant that is reached."""
+        self.structure.jump = self.bind(staged, arguments, results)
+
+    def _bind_fmu(self, structure: _Stage, stage: OpaqueStage, t: np.ndarray, c: np.ndarray, *, again: bool) -> None:
+        place = self.paths.index(stage.path)
+        block, fmu = self._blocks[stage.path], self._each[place]
+        x, u, into = c[stage.states], c[stage.inputs], c[stage.makes]
+        structure.fmu = ctypes.addressof(self._each) + place * ctypes.sizeof(_Exchanged)
+        structure.t, structure.x, structure.u, structure.into, structure.made = at(t), at(x), at(u), at(into), into.size
+        if stage.names == (JUMP,):
+            self._bind_look(fmu, stage.path, block.native_look(t, x, u, into), x.size)
+            return
+        ports = [name for name in stage.names if name not in (NEXT, GUARDS, INDICATORS)]
+        rates, indicators = NEXT in stage.names, INDICATORS in stage.names
+        actions = block.native_evaluation(
+            ports, rates=rates, indicators=indicators, t=t, x=x, u=u, into=into, again=again
+        )
+        structure.calls = self._sequence(stage.path, actions)
+
+    def _bind_look(self, fmu: _Exchanged, path: str, look: NativeLook, states: int) -> None:
+        fmu.states, fmu.inputs = states, look.least.size
+        for name in ("complete", "enter", "update", "leave"):
+            setattr(fmu, name, self._sequence(path, getattr(look, name)))
+        if look.complete:
+            self._final[path] = self._actions[-4][1][len(look.complete) - 1]
+        answers = look.answers
+        fmu.width, fmu.again, fmu.terminate, fmu.nominals = answers[:4]
+        fmu.defined, fmu.time, fmu.wants, fmu.ends = answers[4:]
+        self._inputs[path] = np.zeros(fmu.inputs)
+        fmu.u = self._own(self._inputs[path])
+        fmu.least, fmu.relative, fmu.low, fmu.high = (
+            self._own(np.ascontiguousarray(v)) for v in (look.least, look.relative, look.low, look.high)
+        )
+        fmu.discrete = self._own(look.discrete.astype(np.uint8))
+
+    def _sequence(self, path: str, actions: Sequence[NativeAction]) -> _Sequence:
+        made = (_Action * len(actions))()
+        for structure, action in zip(made, actions, strict=True):
+            structure.kind, structure.function, structure.type = action.kind, action.function, action.type
+            structure.count = len(action.arguments) or action.places.size
+            structure.arguments[: len(action.arguments)] = action.arguments
+            structure.vector, structure.index, structure.buffer = action.vector, self._own(action.places), action.buffer
+            structure.low, structure.high, structure.warned_at = action.low, action.high, np.nan
+            self._names[ctypes.addressof(structure)] = action.name
+        self._kept.append(made)
+        self._actions.append((path, made, [*actions]))
+        return _Sequence(len(made), ctypes.addressof(made) if actions else None)
+
+    # --- between Python and C ----------------------------------------------------------------------------------------
+
+    def hand_over(self, path: str, u: np.ndarray, next_time: float, *, asks: bool, ended: bool, final: bool) -> None:
+        """Let C go on with a block from an instant that Python has come to."""
+        fmu = self._each[self.paths.index(path)]
+        self._inputs[path][:] = u
+        fmu.next_time, fmu.asks, fmu.ended, fmu.other_nominals = next_time, asks, ended, False
+        self.structure.lost = self.structure.failed = 0
+        if path in self._final:
+            self._final[path].arguments[1] = final
+
+    def inputs_of(self, path: str) -> np.ndarray:
+        """Return the inputs of a block at the last instant that was reached."""
+        return self._inputs[path]
+
+    def state_of(self, path: str) -> Any:
+        """Return what C knows of a block: ``next_time``, ``asks``, ``ended``, ``in_event``, ``end`` and so on."""
+        return self._each[self.paths.index(path)]
+
+    def take_warnings(self) -> list[tuple[str, str, float]]:
+        """Return calls that have given a warning since the last time: block, name and time in s of the first one."""
+        found = []
+        for path, structures, actions in self._actions:
+            for structure, action in zip(structures, actions, strict=True):
+                if not np.isnan(structure.warned_at):
+                    found.append((path, action.name, structure.warned_at))
+                    structure.warned_at = np.nan
+        return sorted(found, key=lambda one: one[2])
+
+    def failure(self) -> CallFailure:
+        """Return the call that has failed."""
+        o = self.structure
+        name = "" if o.action is None else self._names[o.action]
+        return CallFailure(self.paths[o.plant], name, o.status, o.at)
+
+    def take_events(self) -> list[InputEvent]:
+        """Return the events since the last call."""
+        rows, w = self._log[: self.structure.logged].copy(), self._width
+        self.structure.logged = 0
+        return [InputEvent(float(r[0]), self.paths[int(r[1])], r[2 : 2 + w], r[2 + w :]) for r in rows]

@@ -1,0 +1,78 @@
+"""Functions of a diagram in stages, and the derivative of one, compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..flat import OpaqueStage, Schedule
+
+
+@dataclass(frozen=True, eq=False)
+class Staged:
+    """A schedule whose traced stages were compiled.
+
+    Attributes
+    ----------
+    schedule : Schedule
+        The schedule.
+    addresses : sequence of int
+        Addresses of the C functions of its traced stages, in their order.
+    """
+
+    schedule: Schedule
+    addresses: Sequence[int]
+
+    @property
+    def functions(self) -> list[Any]:
+        """The traced functions of its stages."""
+        return [stage.fast for stage in self.schedule.stages if not isinstance(stage, OpaqueStage)]
+
+    @property
+    def operations(self) -> int:
+        """Operations of one evaluation, without those of the FMUs."""
+        return sum(int(function.n_instructions()) for function in self.functions)
+
+    @property
+    def pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column of each entry: none, it is no derivative."""
+        return np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32)
+
+
+@dataclass(frozen=True, eq=False)
+class StagedSlopes:
+    """The derivative of staged rates by the integrated states, by differences.
+
+    Attributes
+    ----------
+    rates : Staged
+        The rates.
+    where : ndarray of int
+        Entries of x that are integrated.
+    rows : sequence of ndarray
+        Rates that may depend on each of them.
+    """
+
+    rates: Staged
+    where: np.ndarray
+    rows: Sequence[np.ndarray]
+
+    @staticmethod
+    def of(rates: Staged, where: np.ndarray) -> StagedSlopes:
+        """Return them for rates and the entries of x that are integrated."""
+        depends = rates.schedule.depends("dx", "x")[:, where]
+        return StagedSlopes(rates, where, [np.flatnonzero(column).astype(np.int32) for column in depends.T])
+
+    @property
+    def operations(self) -> int:
+        """Operations of one evaluation."""
+        return (1 + len(self.rows)) * self.rates.operations
+
+    @property
+    def pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column of each entry."""
+        columns = np.repeat(np.arange(len(self.where)), [len(own) for own in self.rows])
+        return np.concatenate([np.zeros(0, dtype=np.int32), *self.rows]), columns
