@@ -27,6 +27,7 @@ from ..compiled import (
 )
 from ..coupling import Plant, PlantSteps, end_all, runs_apart, step_all
 from ..events import Domains
+from ..exchange import INPUT_EVENT
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..results import Occurrence, Recorder
 from ..solvers import AutoSolver
@@ -82,7 +83,9 @@ def bind_hybrid(
 ) -> tuple[CompiledHybrid, HandedOver | None]:
     """Return the loop in C, bound to the numbers of a run, and its blocks that are evaluated from outside."""
     flat, here, domains, blocks = workspace.flat, workspace.here, continuous.domains, continuous.exchanged
-    handed = None if blocks is None else HandedOver(flat, blocks.blocks, blocks.evaluators, continuous.tell_input_event)
+    handed = (
+        None if blocks is None else HandedOver(flat, blocks.blocks, blocks.evaluators, partial(_tell_jump, continuous))
+    )
     native, plants = None if handed is None else handed.native, [*plants]
     ticks = bind_loop(workspace, plants, code.ticks, recorder, stops, native)
     always = bool(plants) or workspace.looped or remembers(flat) or has_guards(flat)
@@ -98,6 +101,10 @@ def bind_hybrid(
         exchange=native,
     )  # fmt: skip
     return loop, handed
+
+
+def _tell_jump(continuous: Continuous, t: float, path: str, before: np.ndarray, after: np.ndarray) -> None:
+    continuous.tell_outside(t, path, INPUT_EVENT, before, after)
 
 
 def name_methods(methods: Sequence[MethodOptions]) -> str:

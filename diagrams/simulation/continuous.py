@@ -10,7 +10,7 @@ import numpy as np
 
 from ...blocks.core import OptionError, SimulationError, is_before, left_of
 from ..events import Domains, ManyInstants, Sliding
-from ..exchange import INPUT_EVENT, ExchangedBlocks, OutsideEvents
+from ..exchange import ExchangedBlocks, OutsideEvents
 from ..flat import announcers
 from ..results import Occurrence
 from ..solvers import AcceptedStep, Problem, make_solver
@@ -120,7 +120,7 @@ class Continuous(Trials, Memory):
         """Blocks that are evaluated from outside; None without any."""
         if exchanged:
             self._nominals = np.zeros(0)
-            self.outside = OutsideEvents(exchanged, workspace.here.x, self._jump, self._tell_outside, self.follow)
+            self.outside = OutsideEvents(exchanged, workspace.here.x, self._jump, self.tell_outside, self.follow)
         if self.delays is not None:
             self._driven = np.zeros(flat.plant_inputs.total)
             self._drive = workspace.plain(flat.driven, [self._driven], workspace.trial)
@@ -208,14 +208,10 @@ class Continuous(Trials, Memory):
         """Let blocks from outside act that have events of their own at t; return whether any had."""
         return self.outside is not None and self.outside.settle(t)
 
-    def _tell_outside(self, t: float, path: str, name: str, before: np.ndarray) -> None:
-        states = (state_values(self.flat, path, x) for x in (before, self.workspace.here.x))
+    def tell_outside(self, t: float, path: str, name: str, before: np.ndarray, after: np.ndarray | None = None) -> None:
+        """Tell an event of a block from outside, with all states before and after it; the present ones by default."""
+        states = (state_values(self.flat, path, x) for x in (before, self.workspace.here.x if after is None else after))
         self.on_event(Occurrence(t, path, name, *states))
-
-    def tell_input_event(self, t: float, path: str, before: np.ndarray, after: np.ndarray) -> None:
-        """Tell an event of an input of a block from outside, with all states before and after it."""
-        states = (state_values(self.flat, path, x) for x in (before, after))
-        self.on_event(Occurrence(t, path, INPUT_EVENT, *states))
 
     def follow(self) -> None:
         """Take over what an event of a block from outside may have changed: states, and their nominal values."""
