@@ -248,7 +248,7 @@ def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *,
         names[name] = [f"{name}_{j}" for j in range(len(functions))]
         for function, own in zip(functions, names[name], strict=True):
             check_size(function)
-            generator.add(rename(function, own))
+            generator.add(share_terms(function, own))
 
     def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
         library = libraries[0]
