@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Self, TypeVar, cast, overload
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -115,8 +116,18 @@ class FlatDiagram(FlatLayout):
         return self._ticks[acting]
 
     def program_at(self, acting: frozenset[TickPattern]) -> TickProgram:
-        """Return a tick at which the given clocks act as calls of block functions, for grouped code."""
-        return functions.trace_tick_program(self, self.blocks, acting)
+        """Return a tick at which the given clocks act as calls of block functions, for grouped code.
+
+        It is large, and kept only as long as somebody holds it.
+        """
+        found = self._programs.get(acting)
+        if found is None:
+            found = self._programs[acting] = functions.trace_tick_program(self, self.blocks, acting)
+        return found
+
+    @_shared
+    def _programs(self) -> WeakValueDictionary[frozenset[TickPattern], TickProgram]:
+        return WeakValueDictionary()
 
     def part_program(self, name: str) -> PartProgram:
         """Return "flow", "indicators" or "jump" as calls of block functions, for grouped code."""
