@@ -33,8 +33,10 @@ class Ports:
         UnknownNameError, OptionError
             If a name denotes none, or position and velocity are not outputs of the block with the force port.
         """
-        plant, _, port = str(force).rpartition(".")
-        if plant not in diagram.blocks:
+        parts = str(force).split(".")  # an FMU's port may have a name with dots
+        pairs = [(".".join(parts[:cut]), ".".join(parts[cut:])) for cut in range(len(parts) - 1, 0, -1)]
+        plant, port = next((pair for pair in pairs if pair[0] in diagram.blocks), ("", ""))
+        if not plant:
             candidates = [f"{path}.{name}" for path, block in diagram.blocks.items() for name in block.inputs]
             raise UnknownNameError(
                 f"found no block with the input {force!r}. {near(str(force), candidates)}", block=diagram.name

@@ -300,7 +300,11 @@ def split_array(diagram: WiredDiagram, name: str) -> tuple[str, tuple[int, ...]]
     """Return the path of a parameter, and the entry of an array that is named behind it: ``"motor.denominator[1]"``."""
     path, keys = find_place(diagram.structure, name, diagram.name)
     block = diagram.structure.blocks[path]
-    known = cast("Fmu", block).description.variables if block.stepped and keys[0] == "start" else ()
+    known = (
+        cast("Fmu", block).description.variables
+        if (block.stepped or block.evaluated_outside) and keys[0] == "start"
+        else ()
+    )
     return (name, ()) if ".".join(keys[1:]) in known else split_entry(name, ())
 
 
@@ -338,7 +342,7 @@ def read_value(owner: Value, keys: list[str], label: str) -> float | np.ndarray:
     value = owner.__dict__[keys[0]]
     if len(keys) > 1 and isinstance(value, Value):
         return read_value(value, keys[1:], label)
-    if len(keys) > 1 and isinstance(owner, Block) and owner.stepped and keys[0] == "start":
+    if len(keys) > 1 and isinstance(owner, Block) and keys[0] == "start" and (owner.stepped or owner.evaluated_outside):
         name, variables = ".".join(keys[1:]), cast("Fmu", owner).description.variables
         if name not in variables:
             raise UnknownNameError(f"the FMU has no variable {name!r}. {near(name, variables)}", block=label)

@@ -95,7 +95,7 @@ def _find_structure(diagram: WiredDiagram, name: str) -> str:
         return f"{article} {last.replace('_', ' ')} of a subsystem"
     path, keys = split_path(diagram.structure, name, diagram.name)
     block: Any = diagram.structure.blocks[path]
-    if block.stepped and keys[0] == "start":
+    if (block.stepped or block.evaluated_outside) and keys[0] == "start":
         variable = block.description.find(".".join(keys[1:]))
         kind = "b" if variable.type == "Boolean" else "i" if variable.is_integer else "f"
     else:
@@ -108,7 +108,7 @@ def unit_of(diagram: WiredDiagram, parameter: str) -> str:
     """Return the declared unit of a parameter; "" where there is none."""
     path, keys = split_path(diagram.structure, parameter.partition("[")[0], diagram.name)
     block: Block = diagram.structure.blocks[path]
-    if block.stepped and keys[0] == "start":
+    if (block.stepped or block.evaluated_outside) and keys[0] == "start":
         about: Any = block
         variable = about.description.variables.get(".".join(keys[1:]))
         return str(getattr(variable, "unit", None) or "")
@@ -150,7 +150,7 @@ def read_parameter(diagram: WiredDiagram, name: str) -> Any:
     """Return the value of a parameter, or of an FMU's start value, by its full path; or of an entry of an array."""
     path, keys = split_path(diagram.structure, name, diagram.name)
     owner: Any = diagram.structure.blocks[path]
-    if owner.stepped and keys[0] == "start":
+    if (owner.stepped or owner.evaluated_outside) and keys[0] == "start":
         key = ".".join(keys[1:])
         known = owner.start.get(key)
         return owner.description.find(key).start if known is None else known

@@ -319,4 +319,8 @@ class _LostError(Exception):
 
 
 def _is_start_value(diagram: WiredDiagram, name: str) -> bool:
-    return any(name.startswith(f"{path}.start.") for path, block in diagram.blocks.items() if block.stepped)
+    return any(
+        name.startswith(f"{path}.start.")
+        for path, block in diagram.blocks.items()
+        if block.stepped or block.evaluated_outside
+    )

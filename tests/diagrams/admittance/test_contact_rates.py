@@ -18,6 +18,7 @@ from loopwright.blocks import (
     Output,
     State,
     TransferFunction,
+    UnknownNameError,
 )
 from loopwright.diagrams import Diagram, TrialMethod, subsystem
 from loopwright.fmus import Fmu, StepOptions, build, scara
@@ -260,6 +261,24 @@ def test_an_arm_with_a_slow_force_sensor_has_the_limit_of_its_own_matrices_and_o
     assert limit.value == pytest.approx(expected, rel=1e-8)
     found = here.confirm(limit, push=1e-8, method=method)
     assert found.below.measured < 0.0 < found.above.measured
+
+
+def test_ports_of_an_fmu_whose_names_have_dots_are_those_of_a_contact():
+    names = {"external_force": "tool.force", "position": "tool.position", "velocity": "tool.velocity"}
+    arm, push = Fmu(scara.build(), name="arm", rename=names), Constant(value=(0.0, 0.0), unit="N", name="push")
+
+    @subsystem(sample_time=1e-3)
+    def joints(angle, rate, force):
+        return JointController(name="law")(angle, rate, force)
+
+    torque = joints(arm.joint_angle, arm.joint_velocity, push)
+    made = Diagram("arm", arm(motor_torque=torque, **{"tool.force": push}))
+    here = made.contact("arm.tool.force", position="arm.tool.position", velocity="arm.tool.velocity", force=None,
+                        direction=(0.6, 0.8))  # fmt: skip
+    assert here.ports.plant == "arm"
+    assert here.ports.force == "tool.force"
+    with pytest.raises(UnknownNameError, match="found no block with the input 'leg.tool.force'"):
+        made.contact("leg.tool.force", direction=(0.6, 0.8))
 
 
 @pytest.mark.slow

@@ -1,12 +1,14 @@
 """Worst cases of numbers that are no loop's: limits of contacts, and functions of a user's own."""
 
+import control
 import numpy as np
 import pytest
 
-from loopwright.blocks import OptionError
-from loopwright.diagrams import Requirements
+from loopwright.blocks import Gain, OptionError
+from loopwright.diagrams import Diagram, Requirements
 from loopwright.diagrams.report import analyse
 from loopwright.diagrams.studies import CaseState, ConfirmationKind, WorstCaseTask
+from loopwright.fmus import Fmu, dc_motor
 from support.carts import DRAG, SHARE, TAU, M, cart_diagram
 from support.tuned_loops import make_pi_loop
 
@@ -122,3 +124,17 @@ damping = 2.0
     file.write_text(text.replace("damping", "dampng"), encoding="utf-8")
     with pytest.raises(OptionError, match=r"worst.toml, line 6: worst_case.contact: a contact's limit has no 'dampng'"):
         WorstCaseTask.read(file).find(cart_diagram())
+
+
+def test_start_values_of_an_fmu_in_model_exchange_are_varied():
+    """Without its default in the block, an FMU's parameter has that of its description."""
+    motor = Fmu(dc_motor.build(), name="motor", interface="model_exchange")
+    made = Diagram("loop", motor(voltage=Gain(gain=-3.0, name="kp")(motor.speed).named("u"), load_torque=0.0))
+    found = made.worst_case({"motor.inertia": [1e-5, 5e-5], "motor.start.inductance": [2e-3, 4e-3]}, "u",
+                            quantity="phase_margin_deg", samples="grid", starts=1, steps=2)  # fmt: skip
+    k, b, R = dc_motor.nominal.motor_constant, dc_motor.nominal.friction, dc_motor.nominal.resistance
+    for case in found.cases:
+        J = case.parameters.get("motor.start.inertia", dc_motor.nominal.inertia)
+        L = case.parameters.get("motor.start.inductance", dc_motor.nominal.inductance)
+        expected = control.margin(control.tf([3.0 * k], np.polyadd(np.polymul([L, R], [J, b]), [k * k])))[1]
+        assert case.value == pytest.approx(expected, abs=1e-4)
