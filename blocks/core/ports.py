@@ -254,7 +254,9 @@ class State(Port):
             start = start(block)
         value = np.asarray(0.0 if start is None else start, dtype=float)
         shape = shapes[self.like] if self.like else self.own_shape
-        return value if shape is None else np.array(np.broadcast_to(value, shape))
+        if shape is None or value.shape == shape:
+            return value.copy()
+        return np.array(np.broadcast_to(value, shape))
 
     def __get__(self, instance: Any, owner: type | None = None) -> Any:
         if instance is None:
