@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from ...blocks.core import Block, FmuError, Layout, LoopwrightError, OptionError
-from ...fmus.running import Derivation, FmuLinearization, linearize_fmu
+from ...fmus.platform import is_built_here
+from ...fmus.running import Derivation, FmuLinearization, linearize_fmu, step_gap
 from ..flat import FlatDiagram, StateLayout
 from ..results import OperatingPoint
 from ..wiring import join, stepped_blocks
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 WAYS = ("equations", "step", "identified")
 """Methods for the linear model of an FMU's step."""
+SOLVED, COARSE = 1e-9, 1e-5
+"""Distances of an FMU's step from its equations: up to which they are one, and beyond which the step is the model."""
 EQUILIBRIUM = 1e-9
 """Largest rate of a state in 1/s, relative to 1 + its size, of an FMU at rest."""
 
@@ -220,9 +223,10 @@ def model_step(
         if way == "equations":
             raise
         equations = None
-    if equations is not None and (way == "equations" or (way is None and _is_at_rest(equations))):
-        m, derivation = _hold_inputs(equations, h), replace(equations.derivation, held=True)
-        C, D = equations.C, equations.D
+    rests = equations is not None and (way == "equations" or (way is None and _is_at_rest(equations)))
+    held = _hold_at_rest(flat, at, path, z, h, way, equations) if equations is not None and rests else None
+    if equations is not None and held is not None:
+        m, derivation, C, D = held, replace(equations.derivation, held=True), equations.C, equations.D
     elif way == "identified" or not block.description.states:  # the FMU may have states that it doesn't show
         return _identify_model(flat, at, path, z, h)
     else:
@@ -250,22 +254,9 @@ def model_step(
         "inputs": _inputs(flat, at, path, z),
     }
     return PlantModel(
-        path,
-        m.A,
-        m.B[:, wired],
-        C,
-        D[:, wired],
-        m.x0,
-        m.f,
-        names,
-        mine,
-        w,
-        derivation,
-        _largest_error(m),
-        m.y0,
-        following,
-        after=after,
-    )
+        path, m.A, m.B[:, wired], C, D[:, wired], m.x0, m.f, names, mine, w, derivation, _largest_error(m), m.y0,
+        following, after=after,
+    )  # fmt: skip
 
 
 def _identify_model(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray, h: float) -> PlantModel:
@@ -308,6 +299,32 @@ def _hold_inputs(m: FmuLinearization, h: float) -> _HeldStep:
     change = whole[:, -1]
     A, B, f, y = whole[:, :n], whole[:, n:-1], m.x0 + change, m.y0 + m.C @ change
     return _HeldStep(A, B, m.x0, f, y, m.states, m.uncertainty * h)
+
+
+def _hold_at_rest(
+    flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray, h: float, way: str | None, m: FmuLinearization
+) -> _HeldStep | None:
+    """Return the model of a step from the equations, with its distance to the FMU's own step.
+
+    None where that step is another model: an FMU's own solver may be coarse, and a step of Euler's method is no matrix
+    exponential.
+    """
+    held, block = _hold_inputs(m, h), fmu_at(flat, path)
+    if way is not None or is_built_here(block.description.digest):
+        return held
+    point = {**at.plants[path], "inputs": _inputs(flat, at, path, z)}
+    try:
+        gap, error = step_gap(block, h=h, A=held.A, B=held.B, **point)
+    except FmuError:
+        return held
+    if gap <= 3.0 * error + SOLVED:
+        return held
+    settable = all(block.description.find(name).initial == "exact" for name in block.description.states)
+    if gap > max(COARSE, 10.0 * error) and settable:
+        return None
+    return replace(
+        held, uncertainty=held.uncertainty + gap * max(np.abs(held.A).max(), np.abs(held.B).max(initial=0.0))
+    )
 
 
 def _hold_in_motion(

@@ -226,14 +226,18 @@ class EvaluatedExchange(SavedExchange):
     def slopes(self, ports: Sequence[str], *, rates: bool, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
         """Return the derivative of an `evaluation` by (x, u); None if the FMU computes no directional derivatives.
 
-        Those of local variables may not be asked for (FMI 2.0, 2.1.9; FMI 3.0, 2.2.11), but of states they are known.
+        Those of local variables may not be asked for (FMI 2.0, 2.1.9; FMI 3.0, 2.2.11). Those of states are known; some
+        FMUs say that they are zero.
         """
         about = self.description
         if not self.about.has_derivatives or (self._x.size and not about.states):
             return None
         outputs = [self.block.output_variables[port] for port in ports]
-        asked = [v.type == "Float64" and about.has_slopes(v) for v in outputs]
-        states = [None if is_asked else about.find_state(v) for v, is_asked in zip(outputs, asked, strict=True)]
+        states = [about.find_state(v) for v in outputs]
+        asked = [
+            v.type == "Float64" and state is None and about.has_slopes(v)
+            for v, state in zip(outputs, states, strict=True)
+        ]
         if any(
             v.type == "Float64" and not a and name is None for v, a, name in zip(outputs, asked, states, strict=True)
         ):

@@ -4,7 +4,7 @@ from .derivation import Derivation, DerivativeMethod
 from .exchange import check_exchange_slopes, find_exchange_slopes
 from .fmu import Fmu
 from .fmu_point import FmuLinearization
-from .known_models import linearize_fmu
+from .known_models import linearize_fmu, step_gap
 from .restored_point import RestoredPoint
 
 __all__ = [
@@ -16,4 +16,5 @@ __all__ = [
     "check_exchange_slopes",
     "find_exchange_slopes",
     "linearize_fmu",
+    "step_gap",
 ]

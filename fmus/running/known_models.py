@@ -13,11 +13,31 @@ import numpy as np
 from ...blocks.core import identity
 from .fmu import Fmu
 from .fmu_point import FmuLinearization
+from .step_model import find_step_gap
 
 MOST = 512
 """Models that are kept at a time."""
 _KNOWN: OrderedDict[Any, FmuLinearization] = OrderedDict()
 _LOCK = Lock()
+
+
+_GAPS: OrderedDict[Any, tuple[float, float]] = OrderedDict()
+
+
+def step_gap(
+    block: Fmu, *, t: float, state: Mapping[str, Any], inputs: Mapping[str, Any], h: float, A: np.ndarray, B: np.ndarray
+) -> tuple[float, float]:
+    """Return how far a step of an FMU is from a linear model of it, and the error of that; see `find_step_gap`."""
+    key = identity(block), t, identity(state), identity(inputs), h, A.tobytes(), B.tobytes()
+    with _LOCK:
+        if key in _GAPS:
+            return _GAPS[key]
+    found = find_step_gap(block, h, t, state, inputs, A, B)
+    with _LOCK:
+        _GAPS[key] = found
+        while len(_GAPS) > MOST:
+            _GAPS.popitem(last=False)
+    return found
 
 
 def linearize_fmu(

@@ -112,7 +112,8 @@ def _linearize_by_directions(point: FmuPoint, instance: LoadedFmu) -> FmuLineari
     point.check(x)
     values = _values(point, instance)
     unknowns = [*(about.states[n] for n in point.states), *point.outputs]
-    asked = [not (v := about.find(n)).is_integer and about.has_slopes(v) for n in unknowns]
+    variables = [about.find(n) for n in unknowns]
+    asked = [not v.is_integer and about.has_slopes(v) and about.find_state(v) is None for v in variables]
     smooth = [n for n, is_asked in zip(unknowns, asked, strict=True) if is_asked]
     found = []
     for name in (*point.states, *point.moved):

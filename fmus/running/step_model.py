@@ -87,3 +87,54 @@ def _linearize_step(point: FmuPoint, instance: LoadedFmu, h: float, relative_ste
         back.free()
     derivation = Derivation(DerivativeMethod.STEP_DIFFERENCES, restarted=back.lied)
     return point.model(J, x, u, values, h=h, derivation=derivation, uncertainty=uncertainty)
+
+
+def find_step_gap(
+    block: LinearizableFmu, h: float, t: float, state: Any, inputs: Any, A: np.ndarray, B: np.ndarray
+) -> tuple[float, float]:
+    """Return how far a step is from a linear model of it, in one random direction, and the error of that distance.
+
+    Both are relative to the model's own motion. States that can't be set at the start are not moved.
+
+    Parameters
+    ----------
+    h, t, state, inputs
+        As of `Fmu.step_difference`.
+    A, B : ndarray
+        States after the step, by states before it and by inputs.
+
+    Raises
+    ------
+    FmuError
+        If the FMU can't take the steps.
+    """
+    point = FmuPoint(block, t, state, inputs)
+    about = point.about
+    with initialize_at(point, exchange=False) as instance:
+        found, names = {}, [*point.states, *point.inputs]
+
+        def step(moved: Mapping[str, Any]) -> np.ndarray:
+            instance.reset()
+            values = {n: v for n, v in {**point.given, **moved}.items() if about.find(n).initial == "exact"}
+            instance.initialize(None, start_time=point.t, values=values)
+            instance.begin()
+            instance.call("setting its inputs", instance.set_values, {n: moved[n] for n in point.inputs if n in moved})
+            if instance.call(f"a step by {h:g} s", instance.fmi.do_step, point.t, h, True):
+                raise FmuError("it ends its step early, so the step has no derivative.", block=block.label)
+            return instance.values(point.states)
+
+        at = np.concatenate([instance.values(point.states), instance.values(point.inputs)])
+        layout, rng = about.layout(names), np.random.default_rng(0)
+        settable = {n for n in names if about.find(n).initial == "exact" and not about.find(n).is_integer}
+        sizes = np.concatenate([np.ravel(about.find(n).nominals) * (n in settable or n in point.moved) for n in names])
+        v = STEP * np.where(sizes > 0.0, np.maximum(np.abs(at), sizes), 0.0) * rng.choice([-1.0, 1.0], at.size)
+        for k in (1, -1, 2, -2):
+            moved = layout.split(at + k * v)
+            found[k] = step({n: part for n, part in moved.items() if n in settable or n in point.moved})
+    near, far = (found[1] - found[-1]) / 2, (found[2] - found[-2]) / 4
+    slope, error = (4 * near - far) / 3, np.abs(near - far)
+    predicted = np.hstack([A, B]) @ v
+    size = float(np.max(np.abs(A) @ np.abs(v[: len(A)]) + np.abs(B) @ np.abs(v[len(A) :]), initial=0.0))
+    error += 4.0 * np.finfo(float).eps * np.max(np.abs([found[1], found[2]]), axis=0)
+    gap, own = (float(np.max(part, initial=0.0)) for part in (np.abs(slope - predicted), error))
+    return (gap / size, own / size) if size else (0.0, 0.0)

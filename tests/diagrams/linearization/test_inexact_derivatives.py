@@ -150,3 +150,15 @@ def test_a_run_begins_at_the_start_itself_though_no_state_can_be_set_there(tmp_p
     np.testing.assert_allclose(run["plant.x"], exact, atol=1e-8)
     with pytest.raises(FmuError, match="can't be set at the FMU's start"):
         diagram.simulate(0.5, step=0.01, start=later, progress=False)
+
+
+def test_a_coarse_solver_of_an_fmu_is_part_of_the_model_of_its_steps(tmp_path):
+    """A step of Euler's method is I + h A, no matrix exponential: 0.5 % of the plant's motion here."""
+    loop = "for (int i = 0; i < 100; i++) {"
+    euler = "double k = 100 * h; if (1) { double v = c->v; c->v += k * rate(c, c->x, v); c->x += k * v; } else " + loop
+    for changes, step in ((((loop, euler),), np.hstack([np.eye(2) + DT * A, DT * B])), ((), held())):
+        linear = sampled(misstated_fmu(tmp_path, 3, changes), "co_simulation").linearize(inputs="u")
+        own = [linear.states.index(f"plant.{name}") for name in "xv"]
+        np.testing.assert_allclose(linear.B[own], step[:, 2:], atol=1e-9)
+        assert np.abs(linear.B[own] - step[:, 2:]).max() <= linear.uncertainty + 1e-12
+        assert linear.derivations["plant"].held == (not changes)
