@@ -97,10 +97,28 @@ static inline unsigned call_fmu(const action *a) {
     }
 }
 
-/* Copy values into a buffer of another type; false if one doesn't fit. */
+static double given(const action *a, int64_t i) {
+    switch (a->type) {
+        case 1: return (double)((const float *)a->buffer)[i];
+        case 2: return (double)((const int8_t *)a->buffer)[i];
+        case 3: return (double)((const uint8_t *)a->buffer)[i];
+        case 4: return (double)((const int16_t *)a->buffer)[i];
+        case 5: return (double)((const uint16_t *)a->buffer)[i];
+        case 6: return (double)((const int32_t *)a->buffer)[i];
+        case 7: return (double)((const uint32_t *)a->buffer)[i];
+        case 8: return (double)((const int64_t *)a->buffer)[i];
+        default: return (double)((const uint64_t *)a->buffer)[i];
+    }
+}
+
+/* Copy values into a buffer of another type; false if one doesn't fit, or only Python knows whether it does. */
 static bool take_typed(const action *a) {
     for (int64_t i = 0; i < a->count; i++) {
         const double v = a->vector[a->index[i]];
+        if (a->low > a->high) { /* one of a list: what is there has been looked up */
+            if (v != given(a, i)) return false;
+            continue;
+        }
         if (a->type == 1) {
             if (isfinite(v) && fabs(v) > 3.4028234663852886e38) return false;
             ((float *)a->buffer)[i] = (float)v;
@@ -119,20 +137,6 @@ static bool take_typed(const action *a) {
         }
     }
     return true;
-}
-
-static double given(const action *a, int64_t i) {
-    switch (a->type) {
-        case 1: return (double)((const float *)a->buffer)[i];
-        case 2: return (double)((const int8_t *)a->buffer)[i];
-        case 3: return (double)((const uint8_t *)a->buffer)[i];
-        case 4: return (double)((const int16_t *)a->buffer)[i];
-        case 5: return (double)((const uint16_t *)a->buffer)[i];
-        case 6: return (double)((const int32_t *)a->buffer)[i];
-        case 7: return (double)((const uint32_t *)a->buffer)[i];
-        case 8: return (double)((const int64_t *)a->buffer)[i];
-        default: return (double)((const uint64_t *)a->buffer)[i];
-    }
 }
 
 /* Go through the actions of a sequence. DISCARD: the FMU can't compute it there. Anything else but OK has failed. */
@@ -217,9 +221,9 @@ static bool has_jumped(const exchanged *e, const double *u) {
 static void let_act(exchanged *e, double t, const double *u, double *into) {
     bool nominals = false;
     int rounds = 1;
+    if (!go_through_all(e, &e->enter, t)) return;
     e->acted = 1;
     memcpy(e->u, u, (size_t)e->inputs * sizeof(double));
-    if (!go_through_all(e, &e->enter, t)) return;
     for (;; rounds++) {
         nominals |= is_set(e, e->nominals);
         if (is_set(e, e->terminate)) note_end_of(e, t, true);

@@ -85,9 +85,11 @@ class HandedOver:
         first = {path: flat.states.slices[path].start for path in flat.outside}
         self.native = NativeExchange(self._blocks, first, flat.width, hybrid_master())
         """The blocks as C knows them."""
+        self._with_c = False
 
     def hand_over(self) -> None:
         """Let C go on from an instant that Python has come to."""
+        self._with_c = True
         for path, block in self._blocks.items():
             self.native.hand_over(
                 path,
@@ -101,6 +103,9 @@ class HandedOver:
     def take_back(self) -> bool:
         """Let Python go on from where C has come to; return whether nominal values have changed."""
         changed = False
+        if not self._with_c:  # Python has gone on, and has been interrupted
+            return changed
+        self._with_c = False
         for path, block in self._blocks.items():
             state = self.native.state_of(path)
             self._notes[path].wants_event = bool(state.asks)

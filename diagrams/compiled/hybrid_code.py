@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from ...fmus.export import describe_processor, processor_flags
-from ..flat import NONE, FlatDiagram, Schedule, TickPattern, share_terms
+from ..flat import NONE, FlatDiagram, OpaqueStage, Schedule, TickPattern, share_terms
 from .code import (
     GroupedTick,
     StraightTick,
@@ -242,18 +242,18 @@ def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *,
     if flat.events:
         schedules["indicators"] = flat.indicators
     generator = ca.CodeGenerator("hybrid.c")
-    names: dict[str, list[str]] = {}
+    functions: dict[str, list[Any]] = {}
     for name, schedule in schedules.items():
-        functions = Staged(schedule, ()).functions
-        names[name] = [f"{name}_{j}" for j in range(len(functions))]
-        for function, own in zip(functions, names[name], strict=True):
+        traced = [stage.fast for stage in schedule.stages if not isinstance(stage, OpaqueStage)]
+        functions[name] = [share_terms(function, f"{name}_{j}") for j, function in enumerate(traced)]
+        for function in functions[name]:
             check_size(function)
-            generator.add(share_terms(function, own))
+            generator.add(function)
 
     def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
         library = libraries[0]
         staged = {
-            name: Staged(schedule, [address_of(library, own) for own in names[name]])
+            name: Staged(schedule, functions[name], [address_of(library, f.name()) for f in functions[name]])
             for name, schedule in schedules.items()
         }
         ticks = {clocks: staged.pop(f"tick{i}") for i, clocks in enumerate(kinds)}

@@ -163,7 +163,7 @@ class NativeExchange:
 
     def bind(self, staged: Staged, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> TickStructure:
         """Return a schedule bound to vectors, as C knows it; valid as long as this lives."""
-        schedule, functions, addresses = staged.schedule, staged.functions, [*staged.addresses]
+        schedule, functions, addresses = staged.schedule, [*staged.functions], [*staged.addresses]
         c = np.zeros(schedule.width)
         vectors = [*arguments, c] if schedule.width else [*arguments]
         made, seen = (_Stage * len(schedule.stages))(), set[str]()

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..flat import OpaqueStage, Schedule
+from ..flat import Schedule
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,17 +19,15 @@ class Staged:
     ----------
     schedule : Schedule
         The schedule.
+    functions : sequence of casadi.Function
+        The functions of its traced stages, in their order, as they were compiled.
     addresses : sequence of int
-        Addresses of the C functions of its traced stages, in their order.
+        Addresses of their C functions.
     """
 
     schedule: Schedule
+    functions: Sequence[Any]
     addresses: Sequence[int]
-
-    @property
-    def functions(self) -> list[Any]:
-        """The traced functions of its stages."""
-        return [stage.fast for stage in self.schedule.stages if not isinstance(stage, OpaqueStage)]
 
     @property
     def operations(self) -> int:

@@ -351,7 +351,7 @@ class ExchangeInstance(EvaluatedExchange):
 
     def take_back(self, u: np.ndarray, next_time: float, *, read_nominals: bool) -> None:
         """Go on from where a loop in C has come to."""
-        self._u, self.next_time, self._discarded = u.copy(), next_time, ""
+        self._u, self.next_time = u.copy(), next_time
         if read_nominals:
             self.nominals = self._read_nominals()
 

@@ -238,13 +238,18 @@ BUFFER_TYPES = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8")
 
 
 def copy_action(
-    kind: ActionKind, vector: np.ndarray, index: np.ndarray, buffer: np.ndarray, *, boolean: bool = False
+    kind: ActionKind, vector: np.ndarray, index: np.ndarray, buffer: np.ndarray, *, type_: str = ""
 ) -> list[NativeAction]:
-    """Return the copy of some entries of a vector into a buffer, or back."""
+    """Return the copy of some entries of a vector into a buffer, or back; ``type_`` is that of the FMU's variables.
+
+    Python alone knows the items of an enumeration: no other value fits than what stands in the buffer.
+    """
     if not index.size:
         return []
     name, low, high = "u1" if buffer.dtype == bool else buffer.dtype.str[1:], 0.0, 1.0
-    if not boolean and buffer.dtype.kind in "iu":
+    if type_ == "Enumeration":
+        low, high = 1.0, 0.0
+    elif type_ != "Boolean" and buffer.dtype.kind in "iu":
         low, high = (float(side) for side in (np.iinfo(buffer.dtype).min, np.iinfo(buffer.dtype).max))
     return [
         NativeAction(
@@ -284,8 +289,8 @@ def transfer_actions(
 ) -> Iterable[NativeAction]:
     """Return the copies between a vector, where the ports stand at ``index``, and the buffers of a transfer."""
     for group in transfer.groups:
-        boolean = any(variable.type == "Boolean" for variable in group.ports.values())
-        yield from copy_action(kind, vector, index[group.index], group.buffer[: group.size], boolean=boolean)
+        type_ = next((variable.type for variable in group.ports.values()), "")
+        yield from copy_action(kind, vector, index[group.index], group.buffer[: group.size], type_=type_)
 
 
 @dataclass(frozen=True)
