@@ -9,7 +9,7 @@ from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOp
 from .hybrid_code import HybridCode, compile_hybrid, find_hybrid_obstacle, write_hybrid
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
 from .native_tick import bind_call
-from .remote import REFUSED, UNDER_WAY
+from .remote import REFUSED, UNDER_WAY, compile_other_side
 from .staged import NativeExchange
 from .watch import RECENT, Fired, Watch
 
@@ -39,6 +39,7 @@ __all__ = [
     "bind_call",
     "compile_fused",
     "compile_hybrid",
+    "compile_other_side",
     "compile_ticks",
     "find_exchange_obstacle",
     "find_hybrid_obstacle",

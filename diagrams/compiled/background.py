@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from threading import Thread
+from typing import Any
 
 from ...blocks.core import LoopwrightError
 from ..flat import FlatDiagram, TickPattern
@@ -27,6 +28,8 @@ class BackgroundCode:
         The diagram.
     acting : sequence of frozenset
         The sets of clocks that act together at some tick.
+    beside : callable, optional
+        Makes whatever else the run needs.
 
     Attributes
     ----------
@@ -38,8 +41,13 @@ class BackgroundCode:
         Why there is none: no compiler, one that fails, or a cache that does.
     """
 
-    def __init__(self, flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]):
-        self._flat, self._acting = flat.origin, acting  # other numbers change no code
+    def __init__(
+        self,
+        flat: FlatDiagram,
+        acting: Sequence[frozenset[TickPattern]],
+        beside: Callable[[], Any] = lambda: None,
+    ):
+        self._flat, self._acting, self._beside = flat.origin, acting, beside  # other numbers change no code
         self._sources: TickSources | None = None
         self._thread: Thread | None = None
         self._over = False
@@ -91,6 +99,7 @@ class BackgroundCode:
 
     def _load(self, sources: TickSources) -> None:
         try:
+            self._beside()
             self.code = sources.load()
         except (LoopwrightError, OSError) as error:  # the cache's folder may be gone, or hold what can't be loaded
             self._end(error)

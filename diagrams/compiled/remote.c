@@ -12,7 +12,7 @@
 
 /* Places of words, as `wire.py` has them. */
 enum { AT_REQUEST = 0, AT_REPLY = 8, CHILD_SLEEPS = 16, PARENT_SLEEPS = 24, AT_SEQUENCE = 32, AT_STATUS = 33, AT_MESSAGES = 40 };
-enum { FEWEST = 4, RAREST = 1024 };
+enum { FEWEST = 4, RAREST = 1024, PER_LOOK = 40 };
 enum { SLICE = 50, TURN = 100 }; /* ms to sleep for a reply, and of a call, before Python has its turn */
 
 enum { FLOAT64, FLOAT32, INT8, UINT8, INT16, UINT16, INT32, UINT32, INT64, UINT64, BOOL8 };
@@ -35,12 +35,12 @@ typedef struct {
     int32_t commands, replies; /* pipes */
     int32_t ordered;           /* false: each request and reply is announced by a byte in a pipe */
     int32_t state;
-    int64_t most, looks, left, pause; /* see `wire.Patience` */
+    int64_t most, looks, left, pause; /* see `wire.Patience`; looks take PER_LOOK ns each */
     int64_t inputs, outputs;
     const values *to, *from;
 } remote;
 
-/* Of all such FMUs of a run: the time at which Python has its turn, in ms; 0 before the first step. */
+/* Of all such FMUs of a run: the time at which Python has its turn, in ns; 0 before the first step. */
 typedef struct {
     int64_t until;
     int64_t late;
@@ -117,14 +117,43 @@ static inline bool spread(const values *v) {
 }
 
 #ifdef _WIN32 /* such FMUs are never given to C there */
-static inline int64_t milliseconds(void) { return 0; }
+static inline int64_t nanoseconds(void) { return 0; }
 static inline void post(remote *r) { (void)r; }
 static inline bool answers(remote *r, apart *a) { return (void)r, (void)a, false; }
 #else
-static inline int64_t milliseconds(void) {
+static inline int64_t nanoseconds(void) {
     struct timespec now;
     clock_gettime(CLOCK_MONOTONIC, &now);
-    return now.tv_sec * INT64_C(1000) + now.tv_nsec / 1000000;
+    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
+}
+
+/* Watch a word while it has a value, for the time of so many looks; return whether it has changed. */
+static inline bool watch_word(const uint64_t *word, uint64_t value, int64_t looks) {
+    if (!looks) return false;
+    for (int n = 0; n < 64; n++) {
+        if (READ(*word) != value) return true;
+        relax();
+    }
+    const int64_t end = nanoseconds() + looks * PER_LOOK;
+    do
+        for (int n = 0; n < 16; n++) {
+            if (READ(*word) != value) return true;
+            relax();
+        }
+    while (nanoseconds() < end);
+    return false;
+}
+
+/* Note whether watching was right: where it was in vain it is tried again after ever longer pauses. */
+static inline void note_watching(bool right, int64_t most, int64_t *looks, int64_t *left, int64_t *pause) {
+    if (right)
+        *pause = FEWEST;
+    else if (*looks) {
+        *looks = 0;
+        *left = *pause;
+        *pause = 2 * *pause < RAREST ? 2 * *pause : RAREST;
+    } else if (--*left <= 0)
+        *looks = most;
 }
 
 /* Let the child begin; a pipe that is closed shows while its reply is waited for. */
@@ -141,7 +170,7 @@ static inline void post(remote *r) {
 /* Sleep until the reply is there; false if it has not come in time, or never will. */
 static bool sleep_for_reply(remote *r, apart *a) {
     uint64_t *words = r->words;
-    const int64_t end = milliseconds() + SLICE;
+    const int64_t end = nanoseconds() + SLICE * INT64_C(1000000);
     int64_t left = SLICE;
     bool told = r->ordered;
     char bytes[4096];
@@ -157,28 +186,17 @@ static bool sleep_for_reply(remote *r, apart *a) {
             a->late = 1; /* Ctrl-C, perhaps: Python looks after this tick */
         else
             break;
-        left = end - milliseconds();
+        left = (end - nanoseconds()) / 1000000;
     }
     WRITE(words[PARENT_SLEEPS], 0);
     return told && READ(words[AT_REPLY]) == r->number;
 }
 
-/* Wait for a reply. Where watching was in vain it is tried again after ever longer pauses. */
+/* Wait for a reply. */
 static inline bool answers(remote *r, apart *a) {
-    for (int64_t n = r->looks; n > 0; n--) {
-        if (READ(r->words[AT_REPLY]) == r->number) {
-            r->pause = FEWEST;
-            return true;
-        }
-        relax();
-    }
-    if (r->looks) {
-        r->looks = 0;
-        r->left = r->pause;
-        r->pause = 2 * r->pause < RAREST ? 2 * r->pause : RAREST;
-    } else if (--r->left <= 0)
-        r->looks = r->most;
-    return sleep_for_reply(r, a);
+    const bool seen = watch_word(&r->words[AT_REPLY], r->number - 1, r->looks);
+    note_watching(seen, r->most, &r->looks, &r->left, &r->pause);
+    return (seen && READ(r->words[AT_REPLY]) == r->number) || sleep_for_reply(r, a);
 }
 #endif
 
@@ -204,7 +222,7 @@ static inline bool spread_all(remote *r) {
 
 /* Note the time after a step: a call is over before Python has waited long for its turn. */
 static inline void look_at_clock(apart *a) {
-    const int64_t now = milliseconds();
-    if (!a->until) a->until = now + TURN;
+    const int64_t now = nanoseconds();
+    if (!a->until) a->until = now + TURN * INT64_C(1000000);
     if (now >= a->until) a->late = 1;
 }

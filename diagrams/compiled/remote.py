@@ -5,11 +5,14 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
+from ...blocks.core import LoopwrightError
 from ...fmus.calls import ChildFace, RemoteStep, SharedValues
+from .code import load_compiled, read_sources
 from .native_tick import at
 
 UNDER_WAY, REFUSED = 3, 4
@@ -17,6 +20,15 @@ UNDER_WAY, REFUSED = 3, 4
 _KINDS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "b1")
 _FEWEST = 4  # `wire.FEWEST`
 _IDLE, _POSTED, _ARRIVED = range(3)
+
+
+@lru_cache(maxsize=1)
+def compile_other_side() -> str | None:
+    """Return the file of the library that makes the calls in the other process; None where it can't be compiled."""
+    try:
+        return load_compiled(read_sources("newton.c", "remote.c", "child.c"))._name
+    except LoopwrightError:
+        return None
 
 
 class _Values(ctypes.Structure):
@@ -67,6 +79,8 @@ class RemotePlants:
     def add(self, step: RemoteStep) -> int:
         """Take an FMU, and return the address of its structure."""
         asked = step.request
+        if (library := compile_other_side()) is not None:
+            asked.process.run_in_c(library)
         made = RemoteStructure(
             words=asked.words,
             sequence=asked.sequence,

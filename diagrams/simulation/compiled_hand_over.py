@@ -24,6 +24,7 @@ from ..compiled import (
     NewtonOptions,
     TickCode,
     Watch,
+    compile_other_side,
 )
 from ..coupling import Plant, PlantSteps, end_all, runs_apart, step_all
 from ..events import Domains
@@ -209,6 +210,12 @@ def steps_in_c(plants: Iterable[FmuInstance]) -> list[NativeStep | RemoteStep]:
         assert step is not None
         found.append(step)
     return found
+
+
+def prepare(plants: Mapping[str, FmuInstance]) -> Callable[[], object]:
+    """Return a function that compiles what the steps of plants need beside the code of a diagram."""
+    apart = any(map(runs_apart, plants.values()))
+    return compile_other_side if apart else lambda: None
 
 
 def step_plants(plants: Sequence[FmuInstance], t: float, h: float) -> None:

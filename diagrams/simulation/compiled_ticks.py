@@ -26,7 +26,7 @@ from ..compiled import (
 from ..coupling import Plant
 from ..flat import EVERY, EXACT_LOOP, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of, ticks_after
 from ..results import Recorder
-from .compiled_hand_over import OBSTACLES, bind_loop, end_steps, plants_for_c, step_plants
+from .compiled_hand_over import OBSTACLES, bind_loop, end_steps, plants_for_c, prepare, step_plants
 from .diagnosis import forget_trials
 from .workspace import Workspace
 
@@ -315,7 +315,7 @@ class LaterTicks:
 
     def __init__(self, workspace: Workspace, plants: Mapping[str, Plant], stops: Sequence[int], *, every: bool):
         self._workspace, self._native, self._stops, self._every = workspace, plants_for_c(plants), stops, every
-        self.code = BackgroundCode(workspace.flat, kinds_of(workspace.flat, every=every))
+        self.code = BackgroundCode(workspace.flat, kinds_of(workspace.flat, every=every), prepare(self._native))
 
     def take_over(self) -> CompiledTicks | None:
         """Return the ticks in C; None while there is no code."""

@@ -41,6 +41,9 @@ class ChildFace(Protocol):
     def give_up(self) -> None:
         """End the process after an interrupt in a call."""
 
+    def run_in_c(self, library: str) -> None:
+        """Let a library wait for requests and make bound calls there, where it can."""
+
 
 class ChildRequest(NamedTuple):
     """Calls in another process: who runs them, by which words in shared memory, and which pipes.

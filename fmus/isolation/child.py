@@ -23,6 +23,7 @@ from contextlib import suppress
 from typing import Any
 
 from . import wire
+from .in_c import TYPES, Server
 from .surroundings import has_room, kill_group, limit, look_around, move, print_to, resident
 from .wire import (
     CAUSE,
@@ -41,14 +42,6 @@ from .wire import (
     WAKE,
 )
 
-_TYPES: dict[str, Any] = {
-    t._type_: t
-    for t in (
-        *(ctypes.c_bool, ctypes.c_byte, ctypes.c_ubyte, ctypes.c_short, ctypes.c_ushort, ctypes.c_int, ctypes.c_uint),
-        *(ctypes.c_long, ctypes.c_ulong, ctypes.c_longlong, ctypes.c_ulonglong, ctypes.c_float, ctypes.c_double),
-        *(ctypes.c_char, ctypes.c_char_p, ctypes.c_void_p),
-    )
-}
 _LOOKS = 4000
 _PERIOD = 0.25  # s between two looks at memory, output and parent
 _KEPT_OUTPUT = 16 << 20  # bytes of output at which its file begins again
@@ -72,6 +65,9 @@ class Child:
         self.library: Any = None
         self.kept: list[Any] = []  # as long as the library may use it
         self.sequences: list[Callable[[], None]] = []
+        self.bound: list[list[tuple[Any, list[tuple[str, Any]]]]] = []
+        self.server: Server | None = None
+        """Waits for requests in C; None before `do_run_in_c`."""
         self.printf = importlib.import_module(".printf", __package__)
         self.before: list[Any] = []
         self.line: Any = None
@@ -85,16 +81,20 @@ class Child:
         words, sequences, last = self.words, self.sequences, 0
         get, patience = words.__getitem__, wire.Patience(_LOOKS, may=self.about["watches"])
         while True:
-            for _ in range(patience.looks):
-                if get(REQUEST) != last:
-                    patience.pause = wire.FEWEST
-                    break
+            if self.server is not None:
+                if not self.server.wait(last):
+                    self.leave()
             else:
-                patience.slept()
-                if not self.ordered:
-                    self._sleep(last)
-                while get(REQUEST) == last:
-                    self._sleep(last)
+                for _ in range(patience.looks):
+                    if get(REQUEST) != last:
+                        patience.pause = wire.FEWEST
+                        break
+                else:
+                    patience.slept()
+                    if not self.ordered:
+                        self._sleep(last)
+                    while get(REQUEST) == last:
+                        self._sleep(last)
             last = get(REQUEST)
             if get(SEQUENCE) == MAIL:
                 self._answer()
@@ -178,7 +178,7 @@ class Child:
     ) -> tuple[tuple[Any, list[Any]], list[bytes]]:
         """Call a function; return its result, texts that it has left, and the bytes of the buffers."""
         function = self.library[name]
-        function.restype = _TYPES[result] if result else None
+        function.restype = TYPES[result] if result else None
         data, buffers, texts = iter(blobs), [], []
         made: list[Any] = []
         for kind, value in arguments:
@@ -196,7 +196,7 @@ class Child:
             elif kind == "callbacks":
                 made.append(self._callbacks(value))
             else:
-                made.append(_TYPES[kind](_bytes(value) if kind in "zc" and value is not None else value))
+                made.append(TYPES[kind](_bytes(value) if kind in "zc" and value is not None else value))
         found = function(*made)
         found = found.decode("latin-1") if isinstance(found, bytes) else found
         if "nstantiate" in name:  # FMUs of FMI 1.0 and 2.0 may keep its texts and callbacks
@@ -224,24 +224,35 @@ class Child:
         """Bind functions to arguments in the shared memory, and return the number of the sequence."""
         data, bound = iter(blobs), []
         for name, arguments in calls:
-            made: list[Any] = []
+            made: list[tuple[str, Any]] = []
             for kind, value in arguments:
                 if kind == "shared":
-                    made.append(ctypes.c_void_p(self.base + value))
+                    made.append(("P", ctypes.c_void_p(self.base + value)))
                 elif kind == "constant":
                     raw = next(data)
-                    buffer = ctypes.create_string_buffer(raw, max(1, len(raw)))
-                    self.kept.append(buffer)
-                    made.append(buffer)
+                    made.append(("P", ctypes.create_string_buffer(raw, max(1, len(raw)))))
+                    self.kept.append(made[-1])
                 elif kind == "live":
-                    made.append(_TYPES[value[0]].from_buffer(self.memory, value[1]))
+                    made.append((value[0], TYPES[value[0]].from_buffer(self.memory, value[1])))
                 else:
-                    made.append(_TYPES[kind](value))
+                    made.append((kind, TYPES[kind](value)))
             function = self.library[name]
             function.restype = ctypes.c_int
-            bound.append((function, tuple(made)))
-        self.sequences.append(self._bind_run(bound))
+            bound.append((function, made))
+        self.bound.append(bound)
+        self.sequences.append(self._bind_run([(f, tuple(value for _, value in made)) for f, made in bound]))
+        if self.server is not None:
+            self.server.take(self.bound)
         return len(self.sequences) - 1, []
+
+    def do_run_in_c(self, library: str, blobs: list[bytes]) -> tuple[bool, list[bytes]]:
+        """Wait for requests and make bound calls in C from now on; return whether that is possible here."""
+        if self.server is None and self.is_own and os.name == "posix":
+            looks = _LOOKS if self.about["watches"] else 0
+            with suppress(OSError, AttributeError):  # an FMU may have taken all descriptors
+                self.server = Server(library, self.base, self.commands, self.replies, self.ordered, looks)
+                self.server.take(self.bound)
+        return self.server is not None, []
 
     def do_follow(
         self, place: int, references: list[int], n: int, component: int, blobs: list[bytes]
@@ -265,6 +276,9 @@ class Child:
     def do_unload(self, blobs: list[bytes]) -> tuple[list[str], list[bytes]]:
         """Unload the library, and return traces of the FMU in this process: with any, it is used no more."""
         self.sequences.clear()
+        self.bound.clear()
+        if self.server is not None:
+            self.server.take([])
         self.line = None
         handle, self.library = self.library._handle, None
         self.kept.clear()

@@ -26,20 +26,7 @@ from . import wire
 from .endings import copy_files, count_cores, read_end
 from .output import ChildOutput
 from .pipes import is_readable, make_poll
-from .wire import (
-    CAUSE,
-    CHILD_SLEEPS,
-    DATA,
-    MAIL,
-    MESSAGES,
-    PARENT_SLEEPS,
-    PLACE,
-    REPLY,
-    REQUEST,
-    SEQUENCE,
-    STATUS,
-    WAKE,
-)
+from .wire import CAUSE, CHILD_SLEEPS, DATA, MAIL, MESSAGES, PARENT_SLEEPS, PLACE, REPLY, REQUEST, SEQUENCE, STATUS
 
 _START = (
     "import sys, types; sys.path[:] = [p for p in sys.path if p]; m = types.ModuleType('loopwright_child'); "
@@ -47,6 +34,7 @@ _START = (
 )
 _LOOKS = 2000
 _LOOK = 0.05  # s between two looks at a process that does not answer
+_LOADING = 60.0  # s to load a small library of ours
 
 
 class ChildProcess:
@@ -71,7 +59,7 @@ class ChildProcess:
         self.name, self.size, self.memory_limit, self.output_limit = name, size, int(memory), int(output)
         self.told: Callable[[int, str], None] = lambda status, text: None
         self.lose: Callable[[FmuProcessError], FmuProcessError] = lambda error: error
-        self.used = self.alive = self.arrived = False
+        self.used = self.alive = self.arrived = self._runs_in_c = False
         self.folder = Path(tempfile.mkdtemp(prefix="loopwright-fmu-"))
         self._peak = 0
         self._output = ChildOutput(self.folder)
@@ -218,7 +206,7 @@ class ChildProcess:
     def wake(self, sequence: int) -> None:
         """Wake the child, which sleeps."""
         try:
-            os.write(self._in, WAKE)
+            os.write(self._in, wire.WAKE)
         except OSError as error:
             self._fail(self._place_name(sequence), error=error)
 
@@ -253,6 +241,12 @@ class ChildProcess:
             return None
         looks = _LOOKS if self._watches else 0
         return ChildRequest(self, sequence, self._base, self._in, self._out, wire.ORDERED, looks)
+
+    def run_in_c(self, library: str) -> None:
+        """Let the child wait for requests and make bound calls in C, by a library, where it can."""
+        if not self._runs_in_c:
+            self._runs_in_c = True
+            self.request("run_in_c", library, call="making its calls in C", seconds=_LOADING)
 
     def give_up(self) -> None:
         """End the process after an interrupt in a call."""

@@ -98,13 +98,17 @@ def check_end(run, t, at=None):
 # --- where it ends ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("compiled", [False, True], ids=["interpreted", "compiled"])
 @pytest.mark.parametrize("isolate", [False, True])
 @pytest.mark.parametrize("fmi", ["fmi3", "fmi2", "fmi1"])
-def test_a_run_ends_where_its_fmu_asks_for_that(files, fmi, isolate):
-    run = driven(files[fmi], 0.5, isolate=isolate).simulate(1.0, step=0.1, progress=False)
+@pytest.mark.drawn
+def test_a_run_ends_where_its_fmu_asks_for_that(files, fmi, isolate, compiled):
+    options = {"step": 0.1, "compile": compiled, "progress": False}
+    run = driven(files[fmi], 0.5, isolate=isolate).simulate(1.0, **options)
+    assert run.tier == ("compiled" if compiled else "interpreted")
     check_end(run, 0.5)
     assert len(run.t) == 6
-    within = driven(files[fmi], 0.53, isolate=isolate).simulate(1.0, step=0.1, progress=False)
+    within = driven(files[fmi], 0.53, isolate=isolate).simulate(1.0, **options)
     check_end(within, 0.53)
     assert len(within.t) == 7  # the FMU's outputs at its own end
 
