@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuRuntimeError, Layout
+from ...blocks.core import FmuRuntimeError, Layout, elements
 from ..archive import ExchangeInfo, FmuVariable
 from ..platform import is_built_here
 from .bound_calls import DISCARD, ERROR, FATAL, Call
@@ -23,6 +23,10 @@ from .loaded_library import MakeCalls
 from .transfer import OutOfRangeError, Transfer, UnfitError
 
 _NOTHING = nullcontext()
+_MOVED, _SAME, _MOST_PATTERNS = 1e-4, 1e-8, 50
+"""Relative distance by which a check of the model structure moves states and inputs; change that is none; patterns."""
+_CHECKED: set[str] = set()
+"""Digests of the FMUs whose model structure has been checked in this process."""
 
 
 class EvaluatedExchange(SavedExchange):
@@ -85,10 +89,16 @@ class EvaluatedExchange(SavedExchange):
         return evaluate
 
     def _bind(
-        self, ports: tuple[str, ...], rates: bool, indicators: bool, then: tuple[tuple[Call, str], ...] = ()
+        self,
+        ports: tuple[str, ...],
+        rates: bool,
+        indicators: bool,
+        then: tuple[tuple[Call, str], ...] = (),
+        *,
+        all_inputs: bool = False,
     ) -> Evaluation:
         outputs = {port: self.block.output_variables[port] for port in ports}
-        every = indicators or bool(then)
+        every = indicators or bool(then) or all_inputs
         used = {port: v for port, v in self._smooth.items() if self._is_needed(port, ports, rates, every)}
         index = [np.arange(self._places[p].start, self._places[p].stop) for p in used]
         inputs = self._allocate(sum(v.size for v in used.values()))
@@ -267,6 +277,63 @@ class EvaluatedExchange(SavedExchange):
                     J[rows, column] = self.call(purpose, self.fmi.directional_derivative, references, refs, seed, count)
                 column += 1
         return J
+
+    def _check_structure(self, t: float, x: np.ndarray, u: np.ndarray) -> None:
+        """Refuse a model structure that leaves out what outputs or derivatives follow; once for each FMU of others.
+
+        The order of evaluation and linear models rest on it. Everything that some values should not follow is moved.
+        """
+        about = self.description
+        if is_built_here(about.digest) or about.digest in _CHECKED or (x.size and not about.states):
+            return
+        ports = [p for p, v in self.block.output_variables.items() if v.type == "Float64" and is_smooth(v)]
+        rows = [self.block.output_variables[p] for p in ports]
+        rows += [about.find(name) for name in about.states.values()]
+        columns = [(about.find(name), None) for name in about.states]
+        columns += [(self._ports[port], port) for port in self._smooth]
+        if not rows or not columns:
+            return
+        declared = np.block([[self.about.pattern(of, v) for v, _ in columns] for of in rows])
+        bound = self._bind(tuple(ports), bool(about.states), False, all_inputs=True)
+        start = np.concatenate([x, *(u[self._places[port]] for _, port in columns if port is not None)])
+        nominals, low, high = (
+            np.concatenate([np.ravel(part) for part in parts])
+            for parts in zip(*((v.nominals, *v.limits) for v, _ in columns), strict=True)
+        )
+        step = _MOVED * np.maximum(np.abs(start), nominals) * np.random.default_rng(0).uniform(0.5, 1.0, start.size)
+        step = np.where(start + step <= high, step, np.where(start - step >= low, -step, 0.0))
+
+        def values(moved: np.ndarray) -> np.ndarray:
+            inputs, first = u.copy(), x.size
+            for v, port in columns:
+                if port is not None:
+                    inputs[self._places[port]] = moved[first : first + v.size]
+                    first += v.size
+            return self._run(bound, t, moved[: x.size], inputs).copy()
+
+        base, whole = values(start), np.abs(values(start + step))
+        for pattern in np.unique(declared, axis=0)[:_MOST_PATTERNS]:
+            mine, free = np.all(declared == pattern, axis=1), ~pattern & (step != 0.0)
+            least = _SAME * (np.abs(base) + whole)
+            off = mine & (np.abs(values(np.where(free, start + step, start)) - base) > least) if free.any() else []
+            if not np.any(off):
+                continue
+            values(start)
+            names = [label for v in rows for label in elements(v.name, v.shape)]
+            knowns = [label for v, _ in columns for label in elements(v.name, v.shape)]
+            row = int(np.flatnonzero(off)[0])
+            alone = (np.where(np.arange(start.size) == k, start + step, start) for k in np.flatnonzero(free))
+            sizes = [abs(values(moved)[row] - base[row]) for moved in alone]
+            k = int(np.flatnonzero(free)[int(np.argmax(sizes))])
+            raise FmuRuntimeError(
+                f"its model structure says that {names[row]!r} does not depend on {knowns[k]!r}; found a change of "
+                f"{max(sizes):.3g} where that moves by {step[k]:.3g}. The order of evaluation would be wrong. Take "
+                "interface='co_simulation' if it is offered, and tell its makers.",
+                block=self.block.label,
+                t=t,
+            )
+        values(start)
+        _CHECKED.add(about.digest)
 
     def _error(self, action: str, status: int, t: float) -> FmuRuntimeError:
         self.failed, self.fatal = status >= ERROR, status >= FATAL

@@ -92,6 +92,7 @@ class ExchangeInstance(EvaluatedExchange):
         self.nominals = self._read_nominals()
         for text in self.call("reading its texts", self._texts.go_back, self._began):
             self.add_note(text)
+        self._check_structure(self._began, x, self._u)
         return x
 
     @property
