@@ -289,7 +289,7 @@ class EvaluatedExchange(SavedExchange):
         ports = [p for p, v in self.block.output_variables.items() if v.type == "Float64" and is_smooth(v)]
         rows = [self.block.output_variables[p] for p in ports]
         rows += [about.find(name) for name in about.states.values()]
-        columns = [(about.find(name), None) for name in about.states]
+        columns: list[tuple[FmuVariable, str | None]] = [(about.find(name), None) for name in about.states]
         columns += [(self._ports[port], port) for port in self._smooth]
         if not rows or not columns:
             return
