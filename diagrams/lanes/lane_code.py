@@ -176,7 +176,7 @@ def compile_lanes(
     """
     with _COMPILING:
         known = _COMPILED.setdefault(flat.origin, {})
-        key = count, None if start is None else start.key
+        key = count, tuple(acting), None if start is None else start.key
         if key not in known:
             known[key] = _compile(flat.origin, acting, count, start)
         return known[key]

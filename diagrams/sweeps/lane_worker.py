@@ -13,7 +13,7 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError
 from ...fmus.calls import FmuInstance
-from ..flat import EVERY, ClockSets, is_exact, kinds_of, ticks_after
+from ..flat import EVERY, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of, ticks_after
 from ..lanes import LaneCode, LaneEnd, LaneRuns, LaneStart, LaneVectors, NoLanesError, compile_lanes, make_room
 from ..results import Run, Stopped, machine_memory
 from ..simulation import START_EXCHANGES, StopConditions
@@ -28,6 +28,8 @@ DIFFER = (
     "Side by side in vector lanes: values differ from those of single runs by rounding, which some motions magnify."
 )
 _MOST_SUBSTEPS = 10_000
+_MOST_KINDS = 32
+"""Sets of clocks that act together at some tick: the code has a function for each."""
 _BYTES = 2**20
 """Of the rows of a chunk, at most: C keeps them in the processor's cache."""
 _FIRST, _WISHED = 64, 0.05
@@ -141,9 +143,12 @@ class _Lanes:
         acting = kinds_of(flat, every=engine.every_tick)
         visited = [EVERY] if engine.every_tick else [*flat.visited]
         self._ticks = ticks_after(visited, 0, bound.count, bound.count) if bound.count else np.zeros(0, dtype=np.int64)
-        self._kinds = ClockSets(flat.distinct, {clocks: k for k, clocks in enumerate(acting)}).at(self._ticks)
-        if (self._kinds < 0).any():
-            raise NoLanesError("at some tick no clock acts, such as that at which they end, or a set that comes late")
+        self._kinds = _number(flat, acting, self._ticks)
+        while (missing := self._ticks[self._kinds < 0]).size:  # such as the last one, at which no clock may act
+            if len(acting) == _MOST_KINDS:
+                raise NoLanesError(f"more than {_MOST_KINDS} sets of clocks act together")
+            acting.append(flat.acting(int(missing[0])))
+            self._kinds = _number(flat, acting, self._ticks)
         ends, base = np.concatenate([[0], self._ticks]), flat.base
         self._times = ends * base.numerator / base.denominator
         self._widths = np.diff(ends) * base.numerator / base.denominator
@@ -241,6 +246,11 @@ class _Lanes:
             data, t = np.concatenate([data, end.last[None]]), np.append(t, self._times[last])
         stopped = Stopped(float(self._times[last]), self._stops.paths[end.by]) if end.stopped else None
         return self.bound.make_run(t.copy(), data, stopped, started, messages)
+
+
+def _number(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], ticks: np.ndarray) -> np.ndarray:
+    """Return which set of clocks acts at each of some ticks; −1 for another one."""
+    return ClockSets(flat.distinct, {clocks: k for k, clocks in enumerate(acting)}).at(ticks)
 
 
 def _itself(run: Run) -> Run:

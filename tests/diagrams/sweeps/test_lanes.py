@@ -302,6 +302,35 @@ def test_what_the_start_of_a_run_has_told_belongs_to_that_run(monkeypatch):
     assert len({text[0] for text in texts}) == 3
 
 
+def test_rates_that_rarely_meet_and_an_end_at_which_none_acts():
+    """y(n) = 0.5 y(n − 1) + k sin(t) at two rates, 20 and 30 ms, over 0.25 s: at its end neither acts."""
+
+    def counted(name, every):
+        @subsystem(sample_time=every * T, name=name)
+        def box(u):
+            kept = UnitDelay(name="kept")
+            kept(0.5 * kept.y + u)
+            return kept.y
+
+        return box
+
+    u = Gain(gain=1.0, name="k")(Sine(frequency=1.0, name="sine"))
+    diagram = Diagram("rates", counted("two", 2)(u).named("y2"), counted("three", 3)(u).named("y3"))
+    gains = (0.5, 1.0, 3.0)
+    found = diagram.sweep({"k.gain": gains}, 0.25, signals=["y2", "y3"], lanes=LANES, workers=1, **QUIET)
+    assert ran_in_lanes(found)
+    for name, every in (("y2", 2), ("y3", 3)):
+        for values, t, gain in zip(found[name], [o.t for o in found.outcomes], gains, strict=True):
+            y, wanted, k = 0.0, [], 0
+            for now in np.round(t / T).astype(int):
+                while k * every <= now:
+                    held, y = y, 0.5 * y + gain * np.sin(2 * np.pi * k * every * T)
+                    k += 1
+                wanted.append(held)
+            np.testing.assert_allclose(values, wanted, rtol=0, atol=1e-13)
+    assert found.outcomes[0].t[-1] == 0.25
+
+
 def test_noise_has_the_seed_of_each_sample_in_its_lane():
     diagram = noisy()
     options = {"signals": ["x", "u", "k"], "seeds": "noise.seed", "seed": 3, **QUIET}
