@@ -17,6 +17,7 @@ from ...fmus import Fmu
 from ...fmus.export import describe_processor, processor_flags
 from ..compiled import LARGEST, load_compiled
 from ..flat import TRUE, FlatDiagram, TickPattern
+from .flow_code import METHODS, FlowSource, write_flow
 from .lane_plants import LanePlant, read_plant
 from .no_lanes import NoLanesError
 from .start_code import StartSource, write_start
@@ -39,7 +40,12 @@ class LaneSizes:
 
 
 def write_lanes(
-    ticks: Sequence[Any], plants: Sequence[LanePlant], sizes: LaneSizes, count: int, start: StartSource | None = None
+    ticks: Sequence[Any],
+    plants: Sequence[LanePlant],
+    sizes: LaneSizes,
+    count: int,
+    start: StartSource | None = None,
+    flow: FlowSource | None = None,
 ) -> str:
     """Write the C code that goes over ticks with a vector of runs.
 
@@ -55,6 +61,8 @@ def write_lanes(
         Runs in a vector.
     start : StartSource, optional
         Functions from which runs start.
+    flow : FlowSource, optional
+        Rates of the continuous states.
     """
     parts = [f"#define LANES {count}\n", f"#define TRUTH {TRUE!r}\n"]
     parts += [f"#define N_{name.upper()} {size}\n" for name, size in vars(sizes).items()]
@@ -74,9 +82,16 @@ def write_lanes(
         steps.append(f"plant{i}_step(&of{i}, t0, h, substeps(h, l->steps[{i}]), z, w);")
         go_on.append(f"plant{i}_go_on(&of{i}, which, from);")
         keep.append(f"plant{i}_end(&of{i}, (vec *)l->plant + {first});")
+    states = ""
+    if flow is not None:
+        text, kept = write_flow(flow)
+        parts.append(text)
+        prepare.append(f"vec kept_flow[AT_LEAST_1({kept})]; flow_prepare(p, kept_flow);")
+        states = "step_states(t0, t1, to, x, w, p, kept_flow);"
     evaluate = f"switch (kind) {{ {' '.join(cases)} }}"
     parts += [
         f"#define PREPARE {' '.join(prepare)}\n",
+        f"#define STEP_STATES(t0, t1, to) {states}\n",
         f"#define STEP_PLANTS(t0, h) {' '.join(steps)}\n",
         f"#define EVALUATE(kind) {evaluate}\n",
         f"#define PLANTS_GO_ON(which, from) {' '.join(go_on)}\n",
@@ -113,6 +128,8 @@ class LaneCode:
         The library, which is loaded as long as this lives.
     starts : LaneStarts or None
         Functions of the start of runs; None if it can't be computed over vectors.
+    has_states : bool
+        Whether there are continuous states between ticks.
     """
 
     run: Any
@@ -122,6 +139,7 @@ class LaneCode:
     count: int
     library: ctypes.CDLL
     starts: LaneStarts | None = None
+    has_states: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +173,7 @@ def compile_lanes(
     acting: Sequence[frozenset[TickPattern]],
     count: int,
     start: StartSource | None = None,
+    method: str = "",
 ) -> LaneCode:
     """Compile the code that goes over ticks with a vector of runs, unless the cache has it.
 
@@ -168,6 +187,8 @@ def compile_lanes(
         Runs in a vector.
     start : StartSource, optional
         Functions from which runs start.
+    method : str
+        The method of fixed step that integrates continuous states; empty where there is none.
 
     Raises
     ------
@@ -176,16 +197,16 @@ def compile_lanes(
     """
     with _COMPILING:
         known = _COMPILED.setdefault(flat.origin, {})
-        key = count, tuple(acting), None if start is None else start.key
+        key = count, tuple(acting), method, None if start is None else start.key
         if key not in known:
-            known[key] = _compile(flat.origin, acting, count, start)
+            known[key] = _compile(flat.origin, acting, count, start, method)
         return known[key]
 
 
 def _compile(
-    flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], count: int, start: StartSource | None
+    flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], count: int, start: StartSource | None, method: str
 ) -> LaneCode:
-    if between := _between_ticks(flat):
+    if between := _between_ticks(flat, method):
         raise NoLanesError(between)
     if flat.loops.slices:
         raise NoLanesError("it has algebraic loops")
@@ -204,8 +225,14 @@ def _compile(
     sizes = LaneSizes(
         *(first.numel_in(1), first.numel_in(2), first.numel_out(1), first.numel_in(3), first.numel_out(2))
     )
+    flow = None
+    if flat.continuous.size:
+        rates = flat.flow.last.fast
+        if not rates.is_a("SXFunction"):
+            raise NoLanesError("its continuous blocks have tables or matrix products, which are no scalar operations")
+        flow = FlowSource(_share(rates), flat.continuous.tolist(), method)
     begin = None if start is None else StartSource(_share(start.tick), start.values, start.key)
-    source = write_lanes(ticks, [*plants.values()], sizes, count, begin)
+    source = write_lanes(ticks, [*plants.values()], sizes, count, begin, flow)
     try:
         library = load_compiled(source, (*processor_flags(), *FLAGS), describe_processor())
     except (CompilerError, FmuError) as error:
@@ -213,7 +240,9 @@ def _compile(
     run = library["loopwright_lanes"]
     run.restype = None
     starts = None if begin is None else _bind_starts(library, begin)
-    return LaneCode(run, {clocks: i for i, clocks in enumerate(acting)}, plants, sizes, count, library, starts)
+    return LaneCode(
+        run, {clocks: i for i, clocks in enumerate(acting)}, plants, sizes, count, library, starts, flow is not None
+    )
 
 
 def _bind_starts(library: ctypes.CDLL, source: StartSource) -> LaneStarts:
@@ -227,18 +256,26 @@ def _bind_starts(library: ctypes.CDLL, source: StartSource) -> LaneStarts:
     return LaneStarts(bind("first_tick", 7), bind("first_outputs", 3), values, sizes)
 
 
-def _between_ticks(flat: FlatDiagram) -> str:
-    """Return what happens between ticks, as a clause; empty where nothing does."""
-    if flat.continuous.size:
+def _between_ticks(flat: FlatDiagram, method: str) -> str:
+    """Return what happens between ticks that lanes don't do, as a clause; empty where nothing does."""
+    if flat.continuous.size and method not in METHODS:
         path = next(p for p, where in flat.states.slices.items() if where.start <= flat.continuous[0] < where.stop)
-        return f"it has continuous states, those of {path}"
+        return (
+            f"it has continuous states, those of {path}, and each run would choose its steps; give a solver of fixed "
+            "step, such as solver='rk4' with step="
+        )
     if flat.outside:
         return f"{flat.outside[0]} is evaluated from outside"
     if flat.events:
         event = flat.events[0]
         kind = "a subsystem that is enabled or triggered" if event.subsystem else "a block that has events"
         return f"{event.path} is {kind} in continuous time; give it, or a subsystem around it, a sample_time"
-    return "it has a transport delay in continuous time" if flat.hybrid else ""
+    for path in flat.checked.traced if flat.continuous.size else ():
+        if flat.table.blocks[path].memory and not flat.table.is_sampled(flat.table.subsystem_of[path]):
+            return f"{path} keeps a memory between ticks"
+    delays = {flat.ports[name][0] for name in flat.plant_inputs.slices}
+    delays = {path for path in delays if flat.table.blocks[path].transport}
+    return f"{min(delays)} is a transport delay in continuous time" if delays else ""
 
 
 def _share(tick: Any) -> Any:

@@ -34,7 +34,8 @@ static void keep_last(const lanes *l, mask which, const vec *log) {
 }
 
 VISIBLE void loopwright_lanes(lanes *l, int64_t count, const double *times, const double *widths, const int32_t *kinds,
-                              double *rows) {
+                              const double *ends, double *rows) {
+    (void)ends; /* vectors: times at the ends of ticks, where continuous states see sources from the left */
     vec x[AT_LEAST_1(N_X)], w[AT_LEAST_1(N_W)], z[AT_LEAST_1(N_Z)], p[AT_LEAST_1(N_P)];
     vec x_next[AT_LEAST_1(N_X)], log[AT_LEAST_1(N_LOG)], ok[1], t[1];
     mask alive;
@@ -45,6 +46,7 @@ VISIBLE void loopwright_lanes(lanes *l, int64_t count, const double *times, cons
     memcpy(p, l->p, sizeof(vec) * N_P);
     PREPARE
     for (int64_t i = 0; i < count; i++) {
+        STEP_STATES(times[i], times[i + 1], ((const vec *)ends)[i])
         STEP_PLANTS(times[i], widths[i])
         t[0] = splat(times[i + 1]);
         EVALUATE(kinds[i])

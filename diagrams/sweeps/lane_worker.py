@@ -13,7 +13,7 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError
 from ...fmus.calls import FmuInstance
-from ..flat import EVERY, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of, ticks_after
+from ..flat import EVERY, Announcer, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of, ticks_after
 from ..lanes import LaneCode, LaneEnd, LaneRuns, LaneStart, LaneVectors, NoLanesError, compile_lanes, make_room
 from ..results import Run, Stopped, machine_memory
 from ..simulation import START_EXCHANGES, StopConditions
@@ -121,7 +121,8 @@ class LaneWorker(Worker):
         if isinstance(found, str) or (found is not None and found.bound is bound):
             return found
         try:
-            made = _Lanes(bound, self.plan.lanes, agrees=self._options.start_exchange == START_EXCHANGES[0])
+            agrees = self._options.start_exchange == START_EXCHANGES[0]
+            made = _Lanes(bound, self.plan.lanes, str(self._options.solver).lower(), agrees=agrees)
         except NoLanesError as reason:
             self._found[numbers.key] = text = str(reason)
             return text
@@ -133,7 +134,7 @@ class LaneWorker(Worker):
 class _Lanes:
     """The lanes of the runs of one bound diagram."""
 
-    def __init__(self, bound: BoundRun, count: int, *, agrees: bool):
+    def __init__(self, bound: BoundRun, count: int, method: str, *, agrees: bool):
         self.bound, engine, flat = bound, bound.engine, bound.flat
         if not bound.is_compiled:
             told = next(iter(engine.messages), "compile=True was not asked for")
@@ -158,7 +159,8 @@ class _Lanes:
         if needed > 0.3 * machine_memory():
             raise NoLanesError(f"the samples of {count} runs at a time would take {needed / 2**30:.0f} GiB")
         search = StartSearch(bound) if agrees else None
-        self._code: LaneCode = compile_lanes(flat, acting, count, None if search is None else search.source)
+        source = None if search is None else search.source
+        self._code: LaneCode = compile_lanes(flat, acting, count, source, method if flat.continuous.size else "")
         width, every = max(1, len(self._columns)), bound.recorder.every
         self._chunk = max(1, min(len(self._ticks), every * _BYTES // (8 * width * count)))
         self._span = min(_FIRST, self._chunk)
@@ -196,6 +198,7 @@ class _Lanes:
         engine.take_first_tick(None, lambda t, log: rows.append(log[self._columns]))
         if engine.position.stopped is not None or not len(self._ticks):
             return None
+        edges = np.zeros(0, dtype=int) if engine.continuous is None else self._edges(engine.continuous.sources)
         plants, steps = dict[str, np.ndarray](), list[float]()
         for path, plant in self._code.plants.items():
             instance = engine.plants[path]
@@ -205,7 +208,28 @@ class _Lanes:
             steps.append(step)
         here = workspace.here
         vectors = here.x.copy(), here.w.copy(), workspace.z.copy(), here.p.copy()
-        return LaneStart(*vectors, plants, tuple(steps), rows[0], bound.take_messages())
+        return LaneStart(*vectors, plants, tuple(steps), rows[0], bound.take_messages(), edges)
+
+    def _edges(self, sources: Iterable[tuple[str, Announcer]]) -> np.ndarray:
+        """Return the places of the ticks at which sources are not smooth; between ticks a run's steps would be its own.
+
+        Raises
+        ------
+        NoLanesError
+            For a source that is not smooth between ticks.
+        """
+        base, end, found = self.bound.flat.base, self._times[-1], set[int]()
+        for path, source in sources:
+            t, seen = source.next_instant(0.0), 0
+            while t < end:
+                k = round(t * base.denominator / base.numerator)
+                if abs(t - k * base.numerator / base.denominator) > 4 * np.spacing(t) or getattr(source, "late", {}):
+                    raise NoLanesError(f"{path} is not smooth at t = {t:g} s, between ticks")
+                found.add(k)
+                t, seen = source.next_instant(t), seen + 1
+                if seen > len(self._ticks):
+                    raise NoLanesError(f"{path} is not smooth at instants between ticks")
+        return np.flatnonzero(np.isin(self._ticks, [*found]))
 
     def _refuse_fine(self, path: str, step: float) -> None:
         if self._widths.max() > _MOST_SUBSTEPS * step:
@@ -222,7 +246,7 @@ class _Lanes:
         k, total = 0, len(self._ticks)
         while k < total and runs.is_going:
             end, begun = min(k + self._span, total), perf_counter()
-            rows = runs.run(self._times[k : end + 1], self._widths[k:end], self._kinds[k:end], room)
+            rows = runs.run(self._times[k : end + 1], self._widths[k:end], self._kinds[k:end], room, k)
             for parts, lane in zip(kept, np.ascontiguousarray(room[:rows, :n].transpose(2, 0, 1)), strict=False):
                 parts.append(lane)
             took = perf_counter() - begun

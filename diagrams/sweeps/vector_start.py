@@ -41,7 +41,7 @@ class StartSearch:
         self.left: Mapping[Port, np.ndarray] = {}
         self.functions: StartFunctions | None = None
         self.source: StartSource | None = None
-        if not StartValues.fits(flat):
+        if flat.hybrid or not StartValues.fits(flat):
             return
         with LOADING:
             workspace = bound.engine.workspace

@@ -1,4 +1,4 @@
-"""Random diagrams of blocks that go side by side: each run in a lane is near the run by itself."""
+"""Random diagrams of blocks that go side by side, a third of them with continuous states: each run in a lane is near the run by itself."""
 
 from inspect import Parameter, Signature
 
@@ -26,6 +26,7 @@ from loopwright.blocks import (
     Sine,
     Step,
     Switch,
+    TransferFunction,
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, subsystem
@@ -43,7 +44,7 @@ class Chooser:
     """Draws blocks, wires and numbers; names are numbered."""
 
     def __init__(self, seed):
-        self.rng = np.random.default_rng([20260, seed])
+        self.rng, self.is_continuous = np.random.default_rng([20260, seed]), seed % 3 == 2
         self.count = 0
 
     def name(self, kind):
@@ -61,7 +62,12 @@ class Chooser:
         made = [
             lambda: Sine(frequency=self.number(0.5, 9), amplitude=self.number(0.5, 2), name=self.name("sine")),
             lambda: BandLimitedNoise(sample_time=self.pick((T, 3 * T)), variance=0.3, seed=5, name=self.name("noise")),
-            lambda: PulseTrain(period=self.pick((0.08, 0.11)), amplitude=high - low, base=low, name=self.name("pulse")),
+            lambda: PulseTrain(
+                period=self.pick((0.08, 0.12 if self.is_continuous else 0.11)),
+                amplitude=high - low,
+                base=low,
+                name=self.name("pulse"),
+            ),
             lambda: Step(times=self.pick((0.0, 0.05)), values=self.number(-2, 2), name=self.name("step")),
             lambda: Constant(value=self.number(-2, 2), name=self.name("one")),
         ]
@@ -132,6 +138,14 @@ def random_diagram(seed):
     calls = []
     plants = [Fmu(lag(), name=f"plant{i}", start={"lag": 0.05 + 0.1 * i}) for i in range(int(chooser.rng.integers(5)))]
     signals += [signal for plant in plants for signal in (plant.x * 0.5, plant.mixed * 0.2)]
+    if chooser.is_continuous:  # in continuous time, between sources, FMUs and controllers
+        for _ in range(int(chooser.rng.integers(1, 4))):
+            swing = (1.0, chooser.number(0.5, 5.0), chooser.number(4.0, 40.0))
+            parts = chooser.pick(signals), chooser.pick(signals)
+            y = TransferFunction(numerator=(swing[2],), denominator=swing, name=chooser.name("swing"))(
+                parts[0] - parts[1]
+            )
+            signals.append(0.5 * y)
     found = []
     for _ in range(int(chooser.rng.integers(1, 4))):
         found += chooser.subsystem(signals)
@@ -151,6 +165,8 @@ def test_random_diagrams_go_side_by_side_as_each_run_by_itself(seed):
     diagram, names = random_diagram(seed)
     table = [{"scale.value": value} for value in (0.6, 1.0, 1.37)]
     options = {"samples": table, "signals": names, "workers": 1, **QUIET}
+    if seed % 3 == 2:
+        options |= {"solver": ("rk4", "heun", "euler")[seed // 3 % 3], "step": T}
     found = diagram.sweep(None, DURATION, lanes=4, **options)
     alone = diagram.sweep(None, DURATION, compile=False, **options)
     assert not found.failures
