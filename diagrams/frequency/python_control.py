@@ -173,6 +173,9 @@ class _Judge:
         same = mine == theirs or abs(mine - theirs) <= SAME * abs(mine)
         if same:
             return Comparison(name, mine, theirs, function, "both", "they agree")
+        if name == "phase_margin_deg" and abs(mine + theirs) <= SAME * abs(mine):
+            text = "they agree but for the sign: rotations by as much either way end stability"
+            return Comparison(name, mine, theirs, function, "both", text)
         how = "our value is confirmed"
         if name in self.ours.numbers():
             how += " by " + self.ours.numbers()[name].confirmed_by
@@ -182,9 +185,8 @@ class _Judge:
             refuted = self._refute(name, mine, theirs)
         except (np.linalg.LinAlgError, ArithmeticError) as error:
             refuted, reason = "", f"theirs can't be judged ({error})"
-        return Comparison(
-            name, mine, theirs, function, "ours" if refuted else "neither is refuted", f"{refuted or reason}; {how}"
-        )
+        why = refuted or reason or "stability ends at both"
+        return Comparison(name, mine, theirs, function, "ours" if refuted else "neither is refuted", f"{why}; {how}")
 
     def _refute(self, name: str, mine: float, value: float) -> str:
         """Return the reason why a value is wrong, or "" if it may be right."""
@@ -200,6 +202,8 @@ class _Judge:
         if name == "encirclements":
             return "it is not Z − P of the eigenvalues"
         if name == "bandwidth":
+            if value == np.inf:
+                return "it says that |T| does not fall to 1/√2 of its low-frequency value, and it does"
             L = complex(r.response(value)[0][0]) if 0 < value <= r.nyquist else complex(np.nan)
             zero = self.scan.ends()[0][1]
             low = 1.0 if np.isinf(zero) else abs(zero / (1 + zero))

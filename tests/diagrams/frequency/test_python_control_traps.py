@@ -231,3 +231,12 @@ def test_its_disk_margin_is_asked_for_at_the_frequencies_where_it_is_least(dampi
     row = rows(control.sample_system(loop, period) if period else loop)["disk_margin"]
     assert row.right == "both"
     assert row.control == pytest.approx(row.value, rel=1e-7)
+
+
+def test_its_negative_phase_margin_is_ours_the_other_way():
+    """At the crossover of 3.5 (s + 0.5)(s − 1.5)/((s + 3)(s + 1)²) a lead ends stability; a real loop bears as much lag."""
+    loop = control.ss(control.zpk([-0.5, 1.5], [-3.0, -1.0, -1.0], 3.5))
+    row = rows(loop)["phase_margin_deg"]
+    assert row.control == pytest.approx(-row.value, rel=1e-6)
+    assert row.right == "both"
+    assert "sign" in row.why
