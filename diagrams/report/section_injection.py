@@ -38,8 +38,8 @@ def injected(case: Case) -> Section | None:
             break
         measured = {}
         refused = False  # by the wire itself: another one may be measured
-        for v in case.usable(Implementation.SAMPLED, Implementation.DELAYED):
-            if v.implementation.delay and not v.is_design:
+        for v in case.usable(Implementation.SAMPLED, Implementation.DELAYED, Implementation.OWN):
+            if v.implementation.delay and not (v.is_design or v.is_actual):
                 continue
             if Stability.of(v) is Stability.UNSTABLE:
                 text.append(TEXTS.line("unstable", variant=v.title, wire=wire))

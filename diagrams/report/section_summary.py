@@ -8,7 +8,7 @@ from typing import Any
 
 from ...blocks.core import LoopwrightError, print_unit
 from ..frequency import Number
-from ..linearization import Linearization
+from ..linearization import Linearization, find_signal
 from ..report_writing import Judged, Section, Table, Texts
 from ..requirements import Limit, RequirementResult, Review, Verdict
 from .case import Case
@@ -237,8 +237,9 @@ def _not_analysed(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
     if "inner" in case.keys and not case.loop_wires():
         yield TEXTS.line("no_loop")
         return
-    several = LOOP_NUMBERS[0] not in {path.rpartition(".")[2] for path in numbers}
-    sampled = any(case.usable(Implementation.SAMPLED, Implementation.DELAYED))
+    flat = actual.diagram.flatten_like(actual.point)
+    several = all(len(find_signal(flat, wire).entries) > 1 for wire in case.loop_wires().values())
+    sampled = any(case.usable(Implementation.SAMPLED, Implementation.DELAYED, Implementation.OWN))
     for key in ("steps", "injection"):
         if key in case.keys and not any(path.split(".")[0] == key for path in numbers):
             yield TEXTS.line("no_run", key=key, several=several, sampled=sampled)

@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, Gain, Integrator, Sine, StateSpace
-from loopwright.diagrams import Diagram, analyse
+from loopwright.blocks import Constant, Gain, Integrator, Relay, Sine, StateSpace, TransferFunction
+from loopwright.diagrams import Diagram, analyse, subsystem
 
 PARTS = ("subject", "operating_points", "poles", "inner", "steps", "sensitivity", "injection", "limits")
 
@@ -79,3 +79,29 @@ def test_a_diagram_without_loops_has_plain_poles_and_its_first_page_says_that_th
 def test_the_first_page_says_why_steps_and_injection_are_missing():
     assert "a wire with several entries has no single one" in said("channels")
     assert "measures sampled loops, and the diagram has none" in said("channels")
+
+
+@pytest.mark.slow
+def test_a_relay_at_rest_has_no_margins_and_its_wire_is_not_said_to_have_several_entries():
+    lag = TransferFunction(name="lag", numerator=[1.0], denominator=[1.0, 2.0, 1.0])
+
+    @subsystem(sample_time=0.01)
+    def switch(y):
+        relay = Relay(on_point=0.1, off_point=-0.1, on_value=1.0, off_value=-1.0, name="relay")
+        return relay(Constant(value=0.0, name="r") - y)
+
+    diagram = Diagram("switched", lag(switch(lag.y).named("u")))
+    assert [line for line in analyse(diagram).sections[0].text if "njection" in line] == [
+        "The injection check: the linear models were not measured."
+    ]
+
+
+def test_the_loop_as_it_is_is_measured_with_its_own_delay():
+    lag = TransferFunction(name="lag", numerator=[1.0], denominator=[1.0, 2.0, 1.0])
+
+    @subsystem(sample_time=0.05, delay=3)
+    def controller(y):
+        return 2.0 * (Constant(value=0.0, name="r") - y)
+
+    numbers = analyse(Diagram("slow", lag(controller(lag.y).named("u"))), only=("injection",)).numbers()
+    assert numbers["injection.u.sampled_own.deviation"].value < 1e-5
