@@ -92,7 +92,7 @@ def test_a_relay_at_rest_has_no_margins_and_its_wire_is_not_said_to_have_several
 
     diagram = Diagram("switched", lag(switch(lag.y).named("u")))
     assert [line for line in analyse(diagram).sections[0].text if "njection" in line] == [
-        "The injection check: the linear models were not measured."
+        "- The injection check: the linear models were not measured."
     ]
 
 
