@@ -3,7 +3,8 @@
     python benchmarks/isolation.py
 
 The machine must be quiet, with two cores free, for the first line; ``taskset -c 0`` before it gives the numbers of one
-core. Between two steps the caller works for some microseconds, as a controller does.
+core. Between two steps the caller works for some microseconds, as a controller does. The ticks are those of a whole
+diagram, everything recorded.
 """
 
 import argparse
@@ -12,6 +13,7 @@ import time
 
 import numpy as np
 
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, mass_spring_damper
 from loopwright.fmus.isolation import end_idle
 
@@ -50,6 +52,25 @@ def evaluations(file, isolate, count, work):
         return measure(lambda k: evaluate(1e-3 * k, x, u), count, work)
 
 
+def ticks(file, isolate, compiled, count):
+    """Return the times of ticks of a loop at 1 kHz in µs: means over parts of a run, each of so many ticks."""
+
+    @subsystem(sample_time=1e-3, name="controller")
+    def controller(position):
+        return 2.0 * (0.1 - position)
+
+    plant = Fmu(file, name="plant", isolate=isolate)
+    times = np.empty(10)
+    with Diagram("loop", plant(force=controller(plant.position))).simulation(compile=compiled) as run:
+        run.advance(0.5)
+        for k in range(len(times)):
+            began = NOW()
+            run.advance(1e-3 * count)
+            times[k] = (NOW() - began) / count
+        assert run.run().tier == ("compiled" if compiled else "interpreted")
+    return 1e6 * times
+
+
 def start(file, isolate):
     """Return the time of loading, initializing and one step in ms."""
     block = Fmu(file, isolate=isolate)
@@ -82,6 +103,9 @@ def main():
         some = count if work < 1e-4 else count // 10
         tell(f"step, {1e6 * work:.0f} µs of work between", *(steps(file, i, some, work) for i in (False, True)))
     tell("evaluation in model exchange", *(evaluations(file, i, count, 5e-6) for i in (False, True)))
+    for compiled in (False, True):
+        name = f"tick of a loop, {'compiled' if compiled else 'interpreted'}"
+        tell(name, *(ticks(file, i, compiled, max(count // 5, 100)) for i in (False, True)))
     inside, outside = ([start(file, isolate) for _ in range(5)] for isolate in (False, True))
     print(f"start to the first step in ms {np.median(inside):14.1f} {np.median(outside):9.1f}")
 

@@ -32,7 +32,7 @@ typedef struct {
     int64_t count;
     const sequence *sequences; /* without calls: Python's */
     int32_t commands, replies, ordered, watches;
-    int64_t most, looks, left, pause;
+    patience patience;
 } server;
 
 static inline int make_call(const bound_call *c) {
@@ -73,8 +73,8 @@ static inline void run_sequence(const sequence *s, uint64_t *words) {
 static inline bool await_request(server *s, uint64_t last) {
     uint64_t *words = s->words;
     char bytes[4096];
-    const bool seen = watch_word(&words[AT_REQUEST], last, s->looks);
-    note_watching(seen, s->most, &s->looks, &s->left, &s->pause);
+    const bool seen = watch_word(&words[AT_REQUEST], last, s->patience.looks);
+    note_watching(seen, &s->patience);
     if (seen) return true;
     bool told = s->ordered;
     while (!told || READ(words[AT_REQUEST]) == last) {

@@ -12,7 +12,7 @@
 
 /* Places of words, as `wire.py` has them. */
 enum { AT_REQUEST = 0, AT_REPLY = 8, CHILD_SLEEPS = 16, PARENT_SLEEPS = 24, AT_SEQUENCE = 32, AT_STATUS = 33, AT_MESSAGES = 40 };
-enum { FEWEST = 4, RAREST = 1024, PER_LOOK = 40 };
+enum { FEWEST = 4, RAREST = 1024, ROW = 64, PER_LOOK = 40 };
 enum { SLICE = 50, TURN = 100 }; /* ms to sleep for a reply, and of a call, before Python has its turn */
 
 enum { FLOAT64, FLOAT32, INT8, UINT8, INT16, UINT16, INT32, UINT32, INT64, UINT64, BOOL8 };
@@ -27,6 +27,11 @@ typedef struct {
     const double *low, *high; /* of inputs, limits of each value; NULL: none */
 } values;
 
+/* See `wire.Patience`; a look takes PER_LOOK ns. */
+typedef struct {
+    int64_t most, looks, left, pause, row;
+} patience;
+
 enum { IDLE, POSTED, ARRIVED };
 
 typedef struct {
@@ -35,7 +40,7 @@ typedef struct {
     int32_t commands, replies; /* pipes */
     int32_t ordered;           /* false: each request and reply is announced by a byte in a pipe */
     int32_t state;
-    int64_t most, looks, left, pause; /* see `wire.Patience`; looks take PER_LOOK ns each */
+    patience patience;
     int64_t inputs, outputs;
     const values *to, *from;
 } remote;
@@ -144,16 +149,20 @@ static inline bool watch_word(const uint64_t *word, uint64_t value, int64_t look
     return false;
 }
 
-/* Note whether watching was right: where it was in vain it is tried again after ever longer pauses. */
-static inline void note_watching(bool right, int64_t most, int64_t *looks, int64_t *left, int64_t *pause) {
-    if (right)
-        *pause = FEWEST;
-    else if (*looks) {
-        *looks = 0;
-        *left = *pause;
-        *pause = 2 * *pause < RAREST ? 2 * *pause : RAREST;
-    } else if (--*left <= 0)
-        *looks = most;
+/* Note whether watching was right: where it was in vain it is tried again after ever longer pauses, which only a long
+   row of successes makes short again: on one core a reply now and then comes while one watches. */
+static inline void note_watching(bool right, patience *p) {
+    if (right) {
+        if (++p->row >= ROW) p->pause = FEWEST;
+        return;
+    }
+    p->row = 0;
+    if (p->looks) {
+        p->looks = 0;
+        p->left = p->pause;
+        p->pause = 2 * p->pause < RAREST ? 2 * p->pause : RAREST;
+    } else if (--p->left <= 0)
+        p->looks = p->most;
 }
 
 /* Let the child begin; a pipe that is closed shows while its reply is waited for. */
@@ -194,8 +203,8 @@ static bool sleep_for_reply(remote *r, apart *a) {
 
 /* Wait for a reply. */
 static inline bool answers(remote *r, apart *a) {
-    const bool seen = watch_word(&r->words[AT_REPLY], r->number - 1, r->looks);
-    note_watching(seen, r->most, &r->looks, &r->left, &r->pause);
+    const bool seen = watch_word(&r->words[AT_REPLY], r->number - 1, r->patience.looks);
+    note_watching(seen, &r->patience);
     return (seen && READ(r->words[AT_REPLY]) == r->number) || sleep_for_reply(r, a);
 }
 #endif

@@ -47,7 +47,7 @@ class RemoteStructure(ctypes.Structure):
         ("sequence", ctypes.c_uint64),
         ("number", ctypes.c_uint64),
         *((name, ctypes.c_int32) for name in ("commands", "replies", "ordered", "state")),
-        *((name, ctypes.c_int64) for name in ("most", "looks", "left", "pause", "inputs", "outputs")),
+        *((name, ctypes.c_int64) for name in ("most", "looks", "left", "pause", "row", "inputs", "outputs")),
         ("to", ctypes.c_void_p),
         ("from", ctypes.c_void_p),
     ]

@@ -44,7 +44,7 @@ class _Server(ctypes.Structure):
         ("count", ctypes.c_int64),
         ("sequences", ctypes.c_void_p),
         *((name, ctypes.c_int32) for name in ("commands", "replies", "ordered", "watches")),
-        *((name, ctypes.c_int64) for name in ("most", "looks", "left", "pause")),
+        *((name, ctypes.c_int64) for name in ("most", "looks", "left", "pause", "row")),
     ]
 
 

@@ -318,11 +318,57 @@ def test_other_couplings_are_interpreted_and_say_so(folder):
     assert any("'b' has" in message for message in run.messages)
 
 
-def test_fmus_stand_beside_continuous_states(folder):
-    """x' = −x with the plant integrating it: y = 1 − x but for the inputs that are held over each step."""
+def beside(folder, fault=""):
+    """x' = −x, and plants that integrate it: y = 1 − x but for the inputs that are held over each step."""
     x = Integrator(name="x", initial_value=1.0)
-    plants = [zoo(zoo_fmu(folder, 3), name)(u=x.y) for name in "ab"]
-    one, two = both(Diagram("d", x(-1.0 * x.y), *plants), 1.0, step=0.01, solver="rk4")
-    assert_same_bits(one, two)
+    files = [zoo_fmu(folder, 3, fault), zoo_fmu(folder, 3)]
+    plants = [zoo(file, name)(u=x.y) for name, file in zip("ab", files, strict=True)]
+    return Diagram("d", x(-1.0 * x.y), *plants)
+
+
+@pytest.mark.parametrize("solver", ["rk4", "RK45"])
+def test_fmus_stand_beside_continuous_states(folder, solver):
+    one, two = both(beside(folder), 1.0, step=0.01, solver=solver)
+    if solver == "rk4":
+        assert_same_bits(one, two)
     held = 0.01 * np.concatenate([[0.0], np.cumsum(np.exp(-two.t[:-1]))])
-    assert np.allclose(two["a.y"], held, atol=1e-9)
+    assert np.allclose(two["a.y"], held, atol=1e-9 if solver == "rk4" else 1e-5)
+    assert np.allclose(two["b.y"], two["a.y"], atol=0)
+
+
+@pytest.mark.parametrize("fault", ["warning", "slow", "segfault", "error", "deaf_hang"])
+@pytest.mark.drawn(3)
+def test_faults_beside_continuous_states_are_told_as_in_an_interpreted_run(folder, fault):
+    made, found = beside(folder, f"step {fault} 0.05"), []
+    for in_c in (False, True):
+        options = {"step": 0.01, "solver": "rk4", "compile": in_c, **QUIET}
+        if fault in ("warning", "slow"):
+            run, text = made.simulate(0.1, **options), ""
+            text = [m for m in run.messages if "warning" in m]
+        else:
+            with pytest.raises((FmuProcessError, FmuRuntimeError)) as caught:
+                made.simulate(0.1, **options)
+            run, text = caught.value.run, str(caught.value)
+        assert run.tier == ("compiled" if in_c else "interpreted")
+        found.append((run, text))
+    assert_same_bits(found[0][0], found[1][0])
+    assert found[0][1] == found[1][1]
+
+
+def test_a_fused_run_asks_isolated_fmus_as_well(folder):
+    made = loop(zoo(zoo_fmu(folder, 3)))
+    run = made.simulate(1.0, fuse=True, **QUIET)
+    assert run.tier == "compiled"
+    assert np.allclose(1.0 - run["plant.y"], 0.98 ** np.arange(101), atol=ROUNDED)
+
+
+def test_two_runs_take_turns_at_their_processes(folder):
+    made = loop(zoo(zoo_fmu(folder, 3)))
+    whole = simulate(made, 1.0, True)
+    with made.simulation(compile=True) as one, made.simulation(compile=True) as two:
+        for _ in range(4):
+            one.advance(0.25)
+            two.advance(0.25)
+        for s in (one, two):
+            assert s.run().data.tobytes() == whole.data.tobytes()
+    assert count_processes() == (2, 2)
