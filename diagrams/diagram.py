@@ -76,7 +76,7 @@ class Diagram(VariedDiagram):
         """
         from .linearization import point_from_states, run_to
 
-        if states:
+        if not (states is None or (isinstance(states, dict) and not states)):
             return point_from_states(self, t, states, options)
         return run_to(self, t, options)
 

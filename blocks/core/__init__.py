@@ -1,6 +1,8 @@
 """The base of all blocks: ports, signals, values, units and errors."""
 
+from . import arguments as kinds
 from . import arithmetic, source
+from .arguments import accepts, check_argument
 from .arithmetic import Gain, Product, Sum, check_shapes, shape_of
 from .block import SOLVED, Block
 from .brief import brief, count_of, enumerate_some
@@ -115,9 +117,11 @@ __all__ = [
     "Value",
     "Wireable",
     "WiringError",
+    "accepts",
     "arithmetic",
     "as_signal",
     "brief",
+    "check_argument",
     "check_name",
     "check_shapes",
     "close_names",
@@ -128,6 +132,7 @@ __all__ = [
     "enumerate_some",
     "identity",
     "is_before",
+    "kinds",
     "lay_out",
     "left_of",
     "move_earlier",

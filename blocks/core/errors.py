@@ -298,7 +298,7 @@ class ConfirmationError(LoopwrightError, RuntimeError):
 
 def close_names(name: str, known: Iterable[str]) -> list[str]:
     """Return the known names that are close to ``name``, at most three."""
-    return difflib.get_close_matches(name, sorted({str(k) for k in known}), n=3, cutoff=0.5)
+    return difflib.get_close_matches(str(name), sorted({str(k) for k in known}), n=3, cutoff=0.5)
 
 
 def near(name: str, known: Iterable[str]) -> str:

@@ -170,6 +170,8 @@ def parse_unit(text: str) -> Unit:
     >>> parse_unit("mm").factor
     0.001
     """
+    if not isinstance(text, str):
+        raise UnitError(f"found {text!r}; expected the name of a unit, such as 'N.s/m'. Give a text.")
     return text.unit if isinstance(text, DefinedUnit) else _parse(text)
 
 

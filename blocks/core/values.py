@@ -161,7 +161,7 @@ def shorten(value: Any) -> str:
     """Return a parameter value as a short text, with numbers as people type them."""
     if isinstance(value, np.ndarray):
         return repr(value.tolist()) if value.size <= 12 else f"<{'×'.join(map(str, value.shape))} numbers>"
-    if isinstance(value, float) and value == int(value or 0) and abs(value) < 1e6:
+    if isinstance(value, float) and abs(value) < 1e6 and value == int(value):
         return str(int(value))
     return repr(value)
 

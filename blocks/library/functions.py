@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, Block, Input, Output, ParameterError, Shape, Signal, parameter
+from ..core import Array, Block, Input, Output, ParameterError, Shape, Signal, kinds, parameter, shorten
 
 
 class Function(Block):
@@ -102,6 +102,8 @@ class Function(Block):
 
     def _shapes(self, parameter: str, given: Any) -> dict[str, Shape | None]:
         """Return the names of ports with the shapes given; None for a shape that is not given."""
+        if kinds.names(given) and not isinstance(given, Mapping):
+            raise self._refuse(parameter, shorten(given), "names, such as ('a', 'b'), or shapes by name")
         named = given if isinstance(given, Mapping) else dict.fromkeys([given] if isinstance(given, str) else given)
         shapes: dict[str, Shape | None] = {}
         for name, shape in named.items():

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Block, ParameterError, SampleTimeError
+from ..core import Block, ParameterError, SampleTimeError, kinds, shorten
 
 
 def check_system(cls: type[Block], system: Any, kind: str, *, discrete: bool) -> float | None:
@@ -109,6 +109,12 @@ def check_names(block: Any, **numbers: int) -> None:
     """
     for parameter, n in numbers.items():
         names = getattr(block, parameter)
+        if names is not None and kinds.names(names):
+            raise ParameterError(
+                f"found {shorten(names)}; expected a name for each of the {n}. Give texts.",
+                block=block.label,
+                port=parameter,
+            )
         if names is not None and len(names) != n:
             raise ParameterError(
                 f"found {len(names)} names ({', '.join(map(str, names))}); expected {n}. Give one for each.",

@@ -85,7 +85,7 @@ class Requirement(Block):
     def check(self) -> None:
         """Refuse an empty text, an unknown reaction, and bounds that cross."""
         kinds = ("error", "record")
-        if not self.requirement.strip():
+        if not isinstance(self.requirement, str) or not self.requirement.strip():
             text = "found no text; expected the requirement in words, for the report of its violation. Write it."
             raise ParameterError(text, block=self.label, port="requirement")
         if self.on_violation not in kinds:

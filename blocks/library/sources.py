@@ -58,7 +58,7 @@ class SmoothStep(Source):
         """Refuse steps that overlap and lists of unequal length."""
         super().check()
         levels, starts, durations = (np.atleast_1d(v) for v in (self.levels, self.start_times, self.durations))
-        if not len(levels) - 1 == len(starts) == len(durations):
+        if starts.ndim > 1 or durations.ndim > 1 or not len(levels) - 1 == len(starts) == len(durations):
             raise ParameterError(
                 f"found {len(levels)} levels, {len(starts)} start times and {len(durations)} durations; expected one "
                 "start time and one duration for each step between two levels.",

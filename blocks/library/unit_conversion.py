@@ -40,7 +40,7 @@ class UnitConversion(Block):
                 block=self.label,
                 port="to_unit",
             ) from None
-        except ValueError:
+        except (ValueError, IndexError):
             factor = np.zeros(0)
         if not factor.size:
             raise ParameterError(

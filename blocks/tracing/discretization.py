@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..core import SampleTimeError
+from ..core import ParameterError, SampleTimeError, accepts, kinds
 
 Method = Literal["exact", "forward", "semi_implicit", "trapezoidal"]
 METHODS = ("exact", "forward", "semi_implicit", "trapezoidal")
@@ -14,10 +14,11 @@ METHODS = ("exact", "forward", "semi_implicit", "trapezoidal")
 
 def check_method(method: str) -> None:
     """Raise `SampleTimeError` unless ``method`` names a discretization."""
-    if method not in METHODS:
+    if not isinstance(method, str) or method not in METHODS:
         raise SampleTimeError(f"found the method {method!r}; expected one of {', '.join(METHODS)}.")
 
 
+@accepts(A=kinds.matrix, T=kinds.number, method=kinds.text)
 def hold(A: np.ndarray, T: float, method: str) -> tuple[np.ndarray, np.ndarray]:
     """Return Ad and Φ of x(t + T) = Ad x + Φ g for ẋ = A x + g with g held over T.
 
@@ -40,7 +41,12 @@ def hold(A: np.ndarray, T: float, method: str) -> tuple[np.ndarray, np.ndarray]:
         For another method, and for a trapezoidal step whose I − A T/2 is singular.
     """
     check_method(method)
+    A = np.atleast_2d(np.asarray(A, dtype=float))
     n = len(A)
+    if A.shape != (n, n):
+        raise ParameterError(
+            f"found a system matrix of shape {A.shape}; expected a square one.", block="hold", port="A"
+        )
     eye = np.eye(n)
     if method == "forward":
         return eye + T * A, T * eye

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...blocks.core import Array
+from ...blocks.core import Array, accepts, kinds
 from .compliance_loop import AdmittanceLoop, StateMatrices, check_environment, hold_force
+
+ROBOT = kinds.one_of_class(AdmittanceLoop, "an AdmittanceLoop(…), such as AdmittanceLoop.of(diagram)")
+"""Kind of the first argument of functions of a robot's admittance."""
 
 
 def close_loop(loop: AdmittanceLoop, **environment: Array) -> np.ndarray:
@@ -58,6 +61,7 @@ def _close_ideal_loop(
     return A
 
 
+@accepts(loop=ROBOT, stiffness=kinds.numbers, damping=kinds.numbers, mass=kinds.numbers, tool_mass=kinds.numbers)
 def poles(
     loop: AdmittanceLoop,
     *,
@@ -95,6 +99,7 @@ def poles(
     return values
 
 
+@accepts(loop=ROBOT, environment=kinds.numbers)
 def growth_rate(loop: AdmittanceLoop, **environment: Array) -> Array:
     """Return σ in 1/s: the coupled loop grows like exp(σ t), and is stable if σ < 0.
 
@@ -122,6 +127,7 @@ def to_rates(loop: AdmittanceLoop, values: np.ndarray) -> np.ndarray:
     return np.asarray(np.log(np.where(np.abs(values) < 1e-300, 1e-300, values)) / loop.sample_time)
 
 
+@accepts(loop=ROBOT, environment=kinds.number)
 def crossing_frequency(loop: AdmittanceLoop, **environment: Array) -> float:
     """Return the frequency of the pole that grows fastest, rad/s."""
     values = to_rates(loop, poles(loop, **environment))

@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import Array, Finding, OptionError, brief
+from ...blocks.core import Array, Finding, OptionError, accepts, brief, kinds
 from ..frequency import read_matrices
 from .compliance_loop import AdmittanceLoop, hold_force
-from .coupled import close_loop
+from .coupled import ROBOT, close_loop
 from .port_passivity import PortPassivity
 
 if TYPE_CHECKING:
@@ -92,12 +92,14 @@ class Passivity:
         return brief("sign of an admittance's real part", *facts, then=".intervals, .caveat")
 
 
+@accepts(loop=ROBOT, omega=kinds.numbers)
 def target_admittance(loop: AdmittanceLoop, omega: Array) -> Array:
     """Return the admittance of the admittance filter, m/(N s), at frequencies in rad/s."""
     s, a = 1j * np.asarray(omega, dtype=float), loop.admittance
     return loop.scale * s / (a.mass * s * s + a.effective_damping * s + a.stiffness)
 
 
+@accepts(loop=ROBOT, omega=kinds.numbers)
 def rendered_admittance(loop: AdmittanceLoop, omega: Array) -> Array:
     """Return the admittance that the environment feels, m/(N s).
 
@@ -126,6 +128,7 @@ def rendered_admittance(loop: AdmittanceLoop, omega: Array) -> Array:
     return _continuous_admittance(loop, w) if loop.implementation == "continuous" else _sampled_admittance(loop, w)
 
 
+@accepts(loop=ROBOT)
 def rendered_system(loop: AdmittanceLoop) -> StateSpace:
     """Return the rendered admittance as a `control.StateSpace`, from the force F to the velocity ṗ.
 
@@ -165,6 +168,7 @@ def rendered_system(loop: AdmittanceLoop) -> StateSpace:
     return control.ss(A, B_all, C, 0.0, dt, states=states, **names)
 
 
+@accepts(loop=ROBOT, omega=kinds.numbers)
 def rendered_response(loop: AdmittanceLoop, omega: Array) -> FrequencyResponseData:
     """Return the rendered admittance as `control.FrequencyResponseData`; see `rendered_admittance`."""
     import control
@@ -173,6 +177,7 @@ def rendered_response(loop: AdmittanceLoop, omega: Array) -> FrequencyResponseDa
     return control.frd(rendered_admittance(loop, w), w, inputs=[f"F_{loop.side}"], outputs=[f"velocity_{loop.side}"])
 
 
+@accepts(loop=ROBOT, low=kinds.number, high=kinds.number, per_decade=kinds.whole)
 def passivity(
     loop: AdmittanceLoop, *, low: float = LOWEST, high: float | None = None, per_decade: int = 200
 ) -> Passivity:
@@ -194,6 +199,12 @@ def passivity(
     """
     sampled = loop.implementation == "sampled"
     top = (math.pi / loop.sample_time * (1.0 - 1e-9) if sampled else HIGHEST) if high is None else high
+    if not 0.0 < low < top < math.inf:
+        raise OptionError(
+            f"found a scan from {low!r} to {top!r} rad/s; expected positive ends, the lower one first.",
+            block="passivity",
+            port="low",
+        )
     intervals = find_negative(lambda w: rendered_admittance(loop, w), low, top, per_decade)
     poles = np.linalg.eigvals(close_loop(loop))
     stable = bool(np.all(np.abs(poles) <= 1.0 + 1e-9) if sampled else np.all(poles.real <= 1e-6))

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Array, ConfirmationError, Finding, OptionError, brief, near, on_one_thread
+from ...blocks.core import Array, ConfirmationError, Finding, OptionError, accepts, brief, kinds, near, on_one_thread
 from ..frequency import Number
 from .compliance_loop import AdmittanceLoop
-from .coupled import crossing_frequency, growth_rate, growth_rate_by_control
+from .coupled import ROBOT, crossing_frequency, growth_rate, growth_rate_by_control
 
 SCANNED = {"stiffness": (1e-2, 1e8), "damping": (1e-3, 1e6), "mass": (1e-4, 1e4), "tool_mass": (1e-4, 1e4)}
 """Ends of the scan for each property, by default."""
@@ -125,6 +125,7 @@ class StabilityMap:
         return brief("map of coupled stability", facts, then=".growth, .limits")
 
 
+@accepts(loop=ROBOT, damping=kinds.number)
 def rule_of_thumb(loop: AdmittanceLoop, damping: float = 0.0) -> float:
     """Return the rule of thumb for the largest stiffness, k_e ≈ (d + b_e)/T_d, in N/m.
 
@@ -137,6 +138,9 @@ def rule_of_thumb(loop: AdmittanceLoop, damping: float = 0.0) -> float:
     return (d + damping) / (loop.sample_time * (0.5 + loop.delay))
 
 
+@accepts(
+    loop=ROBOT, over=kinds.text, low=kinds.number, high=kinds.number, per_decade=kinds.whole, environment=kinds.real
+)
 @on_one_thread
 def stability_limit(
     loop: AdmittanceLoop,
@@ -220,6 +224,7 @@ def stability_limit(
     )
 
 
+@accepts(loop=ROBOT, dampings=kinds.row)
 def stiffness_limits(loop: AdmittanceLoop, dampings: Sequence[float] = (0.0, 10.0, 100.0)) -> dict[str, StabilityLimit]:
     """Return the limits of the environment's stiffness: of the continuous loop, and sampled without and with a delay.
 
@@ -247,6 +252,7 @@ def stiffness_limits(loop: AdmittanceLoop, dampings: Sequence[float] = (0.0, 10.
     }
 
 
+@accepts(loop=ROBOT, x_values=kinds.numbers, y_values=kinds.numbers, x=kinds.text, y=kinds.text, environment=kinds.real)
 @on_one_thread
 def stability_map(
     loop: AdmittanceLoop,

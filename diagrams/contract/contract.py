@@ -15,7 +15,9 @@ from ...blocks.core import (
     SampleTimeError,
     Shape,
     ShapeError,
+    accepts,
     brief,
+    kinds,
     near,
 )
 from ...blocks.tracing import trace
@@ -73,6 +75,14 @@ class BlockReport:
         return "\n".join(lines)
 
 
+@accepts(
+    inputs=kinds.mapping,
+    shapes=kinds.mapping,
+    ticks=kinds.count,
+    seed=kinds.count,
+    kinds=kinds.names,
+    duration=kinds.number,
+)
 def check_block(
     block: Block,
     inputs: Mapping[str, object] | None = None,

@@ -56,7 +56,7 @@ class Coupling:
 
     def __post_init__(self) -> None:
         known = [scheme.value for scheme in Scheme]
-        if self.scheme not in known:
+        if not isinstance(self.scheme, str) or self.scheme not in known:
             raise OptionError(f"found scheme={self.scheme!r}. {near(str(self.scheme), known)}", port="coupling")
         for name in ("tolerance", "shortest", *(() if self.error is None else ("error",))):
             value = getattr(self, name)
@@ -64,7 +64,7 @@ class Coupling:
                 raise OptionError(f"found {name}={value!r}; expected a positive number.", port="coupling")
         if isinstance(self.passes, bool) or not isinstance(self.passes, int) or self.passes < 2:
             raise OptionError(f"found passes={self.passes!r}; expected a whole number from 2 on.", port="coupling")
-        if isinstance(self.order, str) or not all(isinstance(path, str) for path in self.order):
+        if not isinstance(self.order, list | tuple) or not all(isinstance(path, str) for path in self.order):
             raise OptionError(f"found order={self.order!r}; expected a list of paths of FMUs.", port="coupling")
         if self.order and self.scheme != Scheme.GAUSS_SEIDEL:
             raise OptionError(

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from html import escape
 from pathlib import Path
 
-from ...blocks.core import OptionError, Sum, near, write_text
+from ...blocks.core import OptionError, Sum, accepts, kinds, near, write_text
 from ..wiring import CheckedDiagram, Structure, stepped_blocks
 from .layout import Net, arrange
 from .nets import Border, Nets, Place
@@ -40,6 +40,7 @@ class Drawing:
     def __repr__(self) -> str:
         return f"<drawing, {len(self.svg)} characters of SVG>"
 
+    @accepts(path=kinds.path)
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the drawing to a file, ``.svg``, and return the file.
 
@@ -55,6 +56,7 @@ class Drawing:
         return file
 
 
+@accepts(subsystem=kinds.text, closed=kinds.either(kinds.flag, kinds.names))
 def draw(diagram: CheckedDiagram, *, subsystem: str = "", closed: bool | Iterable[str] | None = None) -> str:
     """Return the drawing of a diagram, or of the inside of one of its subsystems, as SVG.
 
@@ -87,8 +89,8 @@ def _find_closed(table: Structure, subsystem: str, closed: bool | Iterable[str] 
     if closed is None:
         inside = [
             p
-            for p, subsystem in table.subsystem_of.items()
-            if not subsystem or subsystem == subsystem or subsystem.startswith(subsystem + ".")
+            for p, owner in table.subsystem_of.items()
+            if not subsystem or owner == subsystem or owner.startswith(subsystem + ".")
         ]
         closed = len(inside) > MANY
     if isinstance(closed, bool):

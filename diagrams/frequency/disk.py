@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, ParameterError, brief
+from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, brief, kinds
 from .carried import carries_findings
 from .confirm import confirm_limit, confirm_peak, refuse_singular
 from .features import Features, scan
@@ -65,6 +65,7 @@ class DiskMargin:
         return brief("disk margin", *facts, then=".alpha, .frequency, .destabilizing")
 
 
+@accepts(delay=kinds.finite, skew=kinds.number)
 @carries_findings
 def disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> DiskMargin:
     """Return the disk margin of a loop with one channel, α = 1/max|S + (σ − 1)/2|.
@@ -90,6 +91,7 @@ def disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Dis
         return _compute_disk_margin(r, skew)
 
 
+@accepts(delay=kinds.finite, skew=kinds.number)
 @carries_findings
 def mimo_disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> DiskMargin:
     """Return the disk margin of a square loop with independent perturbations in all channels at once.
@@ -118,6 +120,7 @@ def mimo_disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -
         return _compute_disk_margin(r, skew)
 
 
+@accepts(plant=kinds.system, controller=kinds.system, where=kinds.text)
 @carries_findings
 def loop_at(plant: StateSpace, controller: StateSpace, where: str = "input") -> StateSpace:
     """Return the loop transfer matrix at the plant's input (C P), its output (P C), or both at once.

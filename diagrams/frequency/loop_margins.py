@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, get_type_hints
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, ParameterError, on_one_thread
+from ...blocks.core import ConfirmationError, ParameterError, accepts, kinds, on_one_thread
 from .carried import carries_findings
 from .confirm import (
     confirm_crossing,
@@ -33,6 +33,7 @@ EIGENVALUES = "closed-loop eigenvalues"
 GAINS = (1.5, 2.0, 5.0, 10.0, 100.0, 1e3)
 
 
+@accepts(delay=kinds.finite, skew=kinds.number)
 @carries_findings
 @on_one_thread
 def margins(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Margins:

@@ -9,7 +9,7 @@ import numpy as np
 from control import StateSpace, feedback
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError, brief, count_of
+from ...blocks.core import OptionError, accepts, brief, count_of, kinds
 from . import loop_plots
 
 if TYPE_CHECKING:
@@ -59,6 +59,7 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
     def _repr_html_(self) -> None:
         """Return None: a notebook shows the short text; python-control's matrices grow with the states."""
 
+    @accepts(labels=kinds.names, db=kinds.flag, hz=kinds.flag)
     def bode(
         self,
         *others: Any,
@@ -90,6 +91,7 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
         """
         return loop_plots.bode((self, *others), omega, labels, db=db, hz=hz)
 
+    @accepts(labels=kinds.names)
     def nyquist(self, *others: Any, omega: ArrayLike | None = None, labels: Sequence[str] | None = None) -> Figure:
         """Return the locus of L around −1, with all its crossings of the real axis up to 8 from the origin in view.
 
@@ -98,10 +100,12 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
         """
         return loop_plots.nyquist((self, *others), omega, labels)
 
+    @accepts(labels=kinds.names)
     def nichols(self, *others: Any, omega: ArrayLike | None = None, labels: Sequence[str] | None = None) -> Figure:
         """Return gain over phase, with contours of |T| in dB. See `bode` for the parameters."""
         return loop_plots.nichols((self, *others), omega, labels)
 
+    @accepts(t=kinds.numbers, labels=kinds.names)
     def step(self, *others: Any, t: float | None = None, labels: Sequence[str] | None = None) -> Figure:
         """Return the step response of the closed loop T = L/(1 + L), which is to follow the step.
 
@@ -125,6 +129,7 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
         closed = [closed_loop(loop) for loop in loops]
         return loop_plots.step(closed, names, t, max(map(_horizon, loops)))
 
+    @accepts(measured=kinds.text, labels=kinds.names)
     def gang_of_four(
         self, measured: str, *others: LoopTransfer, omega: ArrayLike | None = None, labels: Sequence[str] | None = None
     ) -> Figure:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError, brief
+from ...blocks.core import OptionError, accepts, brief, kinds
 
 if TYPE_CHECKING:
     from control import FrequencyResponseData
@@ -110,6 +110,7 @@ class _Curve:
     turn_error: np.ndarray
 
 
+@accepts(uncertainty=kinds.numbers)
 def measured_margins(data: Any, uncertainty: ArrayLike | None = None) -> MeasuredMargins:
     """Return the margins of a measured loop.
 
@@ -305,6 +306,7 @@ def _gain_margins(curve: _Curve) -> tuple[tuple[float, float, float], tuple[floa
     return lower, upper
 
 
+@accepts(file=kinds.path, dt=kinds.number)
 def read_frequency_data(file: str | os.PathLike[str], *, dt: float = 0.0) -> FrequencyResponseData:
     """Return the loop of a CSV file as `control.FrequencyResponseData`, with its attribute ``uncertainty``.
 

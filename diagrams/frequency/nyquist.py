@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, ParameterError
+from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, kinds
 from .carried import carries_findings
 from .features import Features, scan
 from .realization import Realization
@@ -41,6 +41,7 @@ class NyquistCount:
     findings: tuple[Finding, ...] = field(default=(), repr=False)
 
 
+@accepts(delay=kinds.finite)
 @carries_findings
 def nyquist_count(loop: LinearSystem, *, delay: int = 0) -> NyquistCount:
     """Count the clockwise encirclements of −1, and confirm them by the eigenvalues of open and closed loop.

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import ConfirmationError, ParameterError
+from ...blocks.core import ConfirmationError, ParameterError, accepts, kinds
 from .polynomials import divide, eulerian_polynomial, real_polynomial, relative_difference, remainder
 
 Integral = Literal["forward", "backward", "trapezoidal"]
@@ -20,6 +20,7 @@ AGREE = 1e-6
 """Largest difference of characteristic polynomials that agree, relative to the largest scaled coefficient."""
 
 
+@accepts(A=kinds.matrix, B=kinds.matrix, poles=kinds.roots, reach=kinds.number)
 def place(A: ArrayLike, B: ArrayLike, poles: Sequence[complex], *, reach: float = REACH) -> np.ndarray:
     """Return K that gives A − B K the poles, multiple ones included.
 
@@ -56,7 +57,7 @@ def place(A: ArrayLike, B: ArrayLike, poles: Sequence[complex], *, reach: float 
     array([[4., 4.]])
     """
     system, inputs = np.atleast_2d(np.asarray(A, dtype=float)), np.asarray(B, dtype=float)
-    inputs = inputs[:, None] if inputs.ndim == 1 else inputs
+    inputs = inputs.reshape(-1, 1) if inputs.ndim < 2 else inputs
     wanted = np.asarray(poles, dtype=complex)
     try:
         K = _place(system, inputs, wanted)
@@ -281,6 +282,7 @@ class SampledDesign:
         return all(abs(z) < 1 for z in self.poles_z)
 
 
+@accepts(gains=kinds.roots, sample_time=kinds.number, delay=kinds.finite, integral=kinds.text)
 def sampled_poles(
     gains: Sequence[float], sample_time: float, *, delay: int = 0, integral: Integral = "forward"
 ) -> SampledDesign:
@@ -318,6 +320,7 @@ def sampled_poles(
     )
 
 
+@accepts(poles=kinds.roots, sample_time=kinds.number, delay=kinds.finite, integral=kinds.text)
 def sampled_gains(
     poles: Sequence[complex], sample_time: float, *, delay: int = 0, integral: Integral = "forward"
 ) -> SampledDesign:
@@ -346,12 +349,11 @@ def sampled_gains(
         If the polynomial with these gains does not have the wanted roots.
     """
     wanted = np.asarray(poles, dtype=complex)
-    if wanted.ndim != 1 or not len(wanted) or not np.all(wanted.real < 0) or not np.isfinite(wanted).all():
-        raise ParameterError(
-            f"found {list(poles)!r}; expected poles in the left half plane, one for each gain, in 1/s. Give s, not z.",
-            block="sampled_gains",
-            port="poles",
+    if not np.all(wanted.real < 0) or not np.isfinite(wanted).all():
+        text = (
+            f"found {list(poles)!r}; expected poles in the left half plane, one for each gain, in 1/s. Give s, not z."
         )
+        raise ParameterError(text, block="sampled_gains", port="poles")
     w = np.expm1(wanted * sample_time) / sample_time
     asked = real_polynomial(w)
     base, parts = _affine_polynomial(len(w), sample_time, delay, integral)
@@ -388,10 +390,8 @@ def _affine_polynomial(gains: int, T: float, delay: int, integral: Integral) -> 
         )
     sums = {"forward": [1.0], "backward": [T, 1.0], "trapezoidal": [T / 2, 1.0]}
     if integral not in sums:
-        raise ParameterError(
-            f"found integral={integral!r}; expected 'forward', 'backward' or 'trapezoidal'. Choose one of them.",
-            block="sampled_design",
-        )
+        text = f"found integral={integral!r}; expected 'forward', 'backward' or 'trapezoidal'. Choose one of them."
+        raise ParameterError(text, block="sampled_design")
     base = np.array([1.0] + [0.0] * (chain + 1))
     for _ in range(int(delay)):
         base = np.polymul(base, [T, 1.0])

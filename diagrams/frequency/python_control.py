@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, ParameterError, on_one_thread
+from ...blocks.core import ConfirmationError, ParameterError, accepts, kinds, on_one_thread
 from .confirm import confirm_limit, pick_test_values
 from .crossings import Scan
 from .loop_margins import margins
@@ -54,6 +54,7 @@ class Comparison:
     why: str
 
 
+@accepts(delay=kinds.finite)
 def compare_with_control(loop: LinearSystem, *, delay: int = 0) -> tuple[Comparison, ...]:
     """Return each margin beside python-control's value, with a verdict and its reason.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ParameterError
+from ...blocks.core import LoopwrightError, ParameterError
 from .state_space import inexactness_of, read_coefficients, read_matrices
 from .transfer_functions import Coefficients
 
@@ -69,18 +69,8 @@ class Realization:
         name = str(getattr(loop, "name", None) or "loop")
         try:
             A, B, C, D, dt = read_matrices(loop)
-        except Exception as error:
-            if hasattr(loop, "omega"):
-                raise ParameterError(
-                    f"found a {type(loop).__name__}, measured data without poles; expected a control.StateSpace. The "
-                    "margins of data are measured_margins(data), with their uncertainty.",
-                    block=name,
-                ) from error
-            raise ParameterError(
-                f"found {type(loop).__name__}, which python-control can't turn into a state space ({error}); expected "
-                "a control.StateSpace. Make one with control.ss(A, B, C, D, dt).",
-                block=name,
-            ) from error
+        except LoopwrightError as error:
+            raise error.at(block=name) from None
         if dt is None or dt is True:
             raise ParameterError(
                 f"found dt={dt}; expected 0 (continuous) or the sample time in s. Set it: control.ss(A, B, C, D, dt).",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, ParameterError, brief
+from ...blocks.core import ConfirmationError, ParameterError, accepts, brief, kinds
 from .carried import carries_findings
 from .number import Number
 from .state_space import Matrices, make_state_space, read_matrices
@@ -56,6 +56,7 @@ def complementary(loop: LinearSystem) -> StateSpace:
     return _close_loop(loop, complementary=True)
 
 
+@accepts(plant=kinds.system, controller=kinds.system)
 @carries_findings
 def gang_of_four(plant: LinearSystem, controller: LinearSystem) -> GangOfFour:
     """Return S, PS, CS and T, all with the states of plant and controller.
@@ -97,6 +98,7 @@ def gang_of_four(plant: LinearSystem, controller: LinearSystem) -> GangOfFour:
     )
 
 
+@accepts(sample_time=kinds.finite, delay=kinds.finite)
 @carries_findings
 def delayed_hold(plant: LinearSystem, sample_time: float, delay: float = 0.0) -> StateSpace:
     """Return the exact sampled state space of a continuous plant behind a zero-order hold and a delay.
@@ -164,6 +166,7 @@ def _delay_hold(P: Matrices, sample_time: float, delay: float) -> Matrices:
     return Matrices(A, B, np.hstack([P.C, np.zeros((P.outputs, states - n))]), none, sample_time)
 
 
+@accepts(controller=kinds.system, largest=kinds.finite)
 @carries_findings
 def delayed_hold_margin(plant: LinearSystem, controller: LinearSystem, *, largest: float = 200.0) -> Number:
     """Return the smallest delay in s between controller and hold that ends the stability of a sampled loop.

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ...blocks.core import Finding
+from ...blocks.core import Finding, ParameterError
 from .transfer_functions import Coefficients, realize
 
 if TYPE_CHECKING:
@@ -56,8 +56,19 @@ def read_matrices(system: LinearSystem) -> Matrices:
         if form is not None:
             A = form.A + np.eye(len(form.A)) * sampled
             return Matrices(A, form.B, form.C, form.D, system.dt)
-    made = control.ss(system)
-    A, B, C, D = (np.asarray(getattr(made, name), dtype=float) for name in "ABCD")
+    try:
+        made = control.ss(system)
+        A, B, C, D = (np.asarray(getattr(made, name), dtype=float) for name in "ABCD")
+    except Exception as error:
+        if hasattr(system, "omega"):
+            raise ParameterError(
+                f"found a {type(system).__name__}, measured data without poles; expected a control.StateSpace. The "
+                "margins of data are measured_margins(data), with their uncertainty."
+            ) from error
+        raise ParameterError(
+            f"found {type(system).__name__}, which python-control can't turn into a state space ({error}); expected "
+            "a control.StateSpace. Make one with control.ss(A, B, C, D, dt)."
+        ) from error
     return Matrices(A, B, C, D, made.dt)
 
 

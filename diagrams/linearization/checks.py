@@ -17,7 +17,7 @@ def replace_stairs(diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint,
     """Return the stairs that are replaced by their mean slopes."""
     if stairs is None:
         return NO_STAIRS
-    if stairs != "gain":
+    if not isinstance(stairs, str) or stairs != "gain":
         raise OptionError(
             f'found stairs={stairs!r}; expected "gain", which takes stairs as their mean slope, or None. Choose one.',
             block=diagram.name,

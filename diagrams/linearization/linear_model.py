@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ...blocks.core import Finding, LoopwrightError, OptionError, brief, count_of
+from ...blocks.core import Finding, LoopwrightError, OptionError, accepts, brief, check_argument, count_of, kinds
 from ...fmus.running import Derivation, DerivativeMethod
 from ..flat import NONE, TickPattern, WiredDiagram
 from ..frequency import loop_class
@@ -110,8 +110,7 @@ class Linearization:
     stairs: str | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
-        kind = f"sampled, T = {self.dt:g} s" if self.dt else "continuous"
-        facts = kind, count_of(len(self.states), "state"), count_of(len(self.findings), "finding")
+        facts = f"T = {self.dt:g} s" if self.dt else "continuous", count_of(len(self.states), "state")
         return brief(f"linear model of {self.diagram.name!r}", *facts, then="model.loop('wire'), .A, .findings")
 
     @property
@@ -349,8 +348,7 @@ def _linearize(
     every = tuple(dict.fromkeys((*known, *model.findings, *findings_on(methods), *at.free, *entries)))
     ways = SignalPaths(flat, [s.port for s in found[2]])
     carried = ways.between(every, *([s.port for s in group] for group in found[:2]))
-    if loop:
-        carried += find_cut_findings(flat, at, [s.port for s in found[2]], carried)
+    carried += find_cut_findings(flat, at, [s.port for s in found[2]], carried) if loop else ()
     opaque = {p: Derivation(DerivativeMethod.BLOCK_DIFFERENCES) for p, b in flat.table.blocks.items() if b.opaque}
     return Linearization(
         diagram,
@@ -377,9 +375,11 @@ def _linearize(
 
 
 def _as_list(given: str | Iterable[str]) -> list[str]:
+    check_argument(given, kinds.names, "inputs, outputs and openings", "linearize")
     return [given] if isinstance(given, str) else list(given)
 
 
+@accepts(points=kinds.several, variants=kinds.several)
 def linearize_batch(
     diagram: WiredDiagram,
     points: Iterable[PointLike] = (None,),
@@ -391,10 +391,10 @@ def linearize_batch(
     for changes in variants:
         point: PointLike = None
         try:
-            variant = diagram.replace(changes) if changes else diagram
+            variant = diagram if isinstance(changes, dict) and not changes else diagram.replace(changes)
             for point in points:
                 made.append(linearize(variant, point, **options))
         except LoopwrightError as error:
-            error.add(f" (with {dict(changes)}, at {point!r})")
+            error.add(f" (with {changes}, at {point!r})")
             raise
     return made

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from ...blocks.core import Layout, OptionError, UnknownNameError, near
+from ...blocks.core import Layout, OptionError, UnknownNameError, accepts, kinds, near
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, PointOrigin, Snapshot, layout_of
 
@@ -166,6 +166,7 @@ def _check_found_again(diagram: WiredDiagram, given: Snapshot, found: OperatingP
         )
 
 
+@accepts("operating_point", t=kinds.real)
 def run_to(diagram: WiredDiagram, t: float, options: Mapping[str, Any]) -> OperatingPoint:
     """Run a diagram to a time in s, and return the operating point there."""
     from ..simulation import RunOptions, Simulation

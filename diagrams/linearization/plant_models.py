@@ -177,7 +177,7 @@ def model_equations(flat: FlatDiagram, at: OperatingPoint, way: str | None) -> l
 
 def check_way(way: str | None) -> None:
     """Refuse an unknown way of linearizing an FMU's step."""
-    if way not in (None, *WAYS):
+    if way is not None and (not isinstance(way, str) or way not in WAYS):
         raise OptionError(
             f"found plants={way!r}; expected one of {', '.join(map(repr, WAYS))}, or None. Choose one of them."
         )

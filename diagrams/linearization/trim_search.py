@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import Layout, OptionError, SimulationError, elements
+from ...blocks.core import Layout, OptionError, SimulationError, accepts, check_argument, elements, kinds
 from ..flat import (
     Apart,
     Derivative,
@@ -298,14 +298,20 @@ def trim(
     **options: Any,
 ) -> OperatingPoint:
     """Find an operating point; see `Diagram.trim`."""
-    if isinstance(free, str) or (free is not None and not isinstance(free, Mapping | Iterable)):
+    if free is not None and not isinstance(free, Mapping) and (isinstance(free, str) or kinds.names(free)):
         raise OptionError(
             f"found free={free!r}; expected names with bounds, or a list of names. Write, for instance, "
             "free={'force.value': (-10, 10)}.",
             block=diagram.name,
             port="free",
         )
-    asked: dict[str, Any] = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free or ())
+    targets, rates = ({} if given is None else given for given in (targets, rates))
+    for name, given, kind in (
+        ("targets", targets, kinds.mapping), ("rates", rates, kinds.mapping), ("fixed", fixed, kinds.names),
+        ("tolerance", tolerance, kinds.number),
+    ):  # fmt: skip
+        check_argument(given, kind, name, diagram.name)
+    asked: dict[str, Any] = dict(free) if isinstance(free, Mapping) else dict.fromkeys(() if free is None else free)
     guess = operating_point(diagram, at, options)
     base = diagram.replace(guess.parameters) if guess.parameters else diagram
     flat = base.flatten_like(guess)
@@ -313,12 +319,11 @@ def trim(
     parameters, base = free_parameters(base, {n: b for n, b in asked.items() if n not in states})
     flat = base.flatten_like(guess)
     bounds = {n: b for n, b in asked.items() if n in states}
-    target = read_targets(
-        flat, states, targets or {}, rates or {}, [fixed] if isinstance(fixed, str) else fixed, bounds
-    )
+    target = read_targets(flat, states, targets, rates, [fixed] if isinstance(fixed, str) else fixed, bounds)
     return _solve_trim(base, diagram, flat, guess, parameters, target, tolerance, PointOrigin.TRIM)
 
 
+@accepts("operating_point", states=kinds.mapping)
 def point_from_states(
     diagram: WiredDiagram, t: float, states: Mapping[str, Any], options: Mapping[str, Any]
 ) -> OperatingPoint:

@@ -11,7 +11,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, replace_file
+from ...blocks.core import OptionError, check_argument, kinds, replace_file
 from .stored import PathLike
 
 if TYPE_CHECKING:
@@ -122,6 +122,8 @@ def matlab_names(names: Sequence[str]) -> dict[str, str]:
 
 def select_signals(run: RecordedSignals, names: Sequence[str]) -> list[str]:
     """Return the signals to export, each once: those given, else all named wires, else all ports."""
+    for name in names:
+        check_argument(name, kinds.text, "names", run.diagram_name)
     every = run.names
     wires = [n for n in every if n in run.wires]
     return list(dict.fromkeys(names or wires or every))

@@ -10,7 +10,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import Layout, OptionError, PortUnit, UnknownNameError
+from ...blocks.core import Layout, OptionError, PortUnit, UnknownNameError, kinds
 from ..wiring import CheckedDiagram, Wire, split_entry
 from .short_text import describe_run
 from .signal_names import Place, Places, entries, place_of, resolve
@@ -114,7 +114,7 @@ class Run:
         OptionError
             If there is no run at that path.
         """
-        stored = read(Path(path))
+        stored = read(path)
         end, n = stored.end, len(stored.t)
         if end is None:
             until = f", until t = {stored.t[-1]:g} s" if n else ""
@@ -271,7 +271,7 @@ class Run:
         OptionError
             If t is not within the run, or the states were not recorded.
         """
-        if not (len(self.t) and self.t[0] <= t <= self.t[-1] * (1 + 1e-12) + 1e-12):
+        if not (len(self.t) and kinds.is_real(t) and self.t[0] <= t <= self.t[-1] * (1 + 1e-12) + 1e-12):
             span = f"{self.t[0]:g} s to {self.t[-1]:g} s" if len(self.t) else "nothing"
             raise OptionError(f"found t = {t!r}; the run holds {span}. Choose a time within.")
         k = int(np.searchsorted(self.t, t * (1 + 1e-12) + 1e-12, side="right")) - 1

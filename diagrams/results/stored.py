@@ -28,7 +28,7 @@ from typing import Any, TextIO, TypedDict, overload
 
 import numpy as np
 
-from ...blocks.core import Layout, OptionError, PortUnit
+from ...blocks.core import Layout, OptionError, PortUnit, check_argument, kinds
 from ..wiring import Wire
 
 FORMAT, VERSION = "loopwright run", 1
@@ -331,7 +331,7 @@ class Stored:
         return {name: unit if isinstance(unit, str) else tuple(unit) for name, unit in units if unit is not None}
 
 
-def read(folder: Path) -> Stored:
+def read(path: PathLike) -> Stored:
     """Open a stored run.
 
     Raises
@@ -339,7 +339,8 @@ def read(folder: Path) -> Stored:
     OptionError
         If there is none, or one of another version.
     """
-    place = os.fspath(folder)
+    check_argument(path, kinds.path, "path", "Run.open")
+    folder, place = Path(path), os.fspath(path)
     try:
         head: Header = json.loads((folder / HEADER).read_text(encoding="utf-8"))
         if head["format"] != FORMAT:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
+from ...blocks.core import check_argument, kinds
 from ...fmus.build_notes import hear_builds
 from ..results import Run
 
@@ -20,7 +21,8 @@ LATE = 2.0
 def _is_shown(show: bool | None) -> bool:
     """Whether progress is shown: where it is asked for; by default on a terminal and in a notebook with widgets."""
     if show is not None:
-        return show
+        check_argument(show, kinds.flag, "progress", "simulate")
+        return bool(show)
     widgets = "ipykernel" in sys.modules and find_spec("ipywidgets") is not None
     return sys.stderr.isatty() or widgets
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from typing import Any, Self, TypedDict
 
-from ...blocks.core import OptionError, near
+from ...blocks.core import OptionError, check_argument, kinds, near
 from ..coupling import Coupling
 from ..flat import FlatDiagram, WiredDiagram, takes_any_step
 from ..results import OperatingPoint, RunState
@@ -28,7 +28,7 @@ def check_start_exchange(value: str) -> str:
     OptionError
         For an unknown one.
     """
-    if value not in START_EXCHANGES:
+    if not isinstance(value, str) or value not in START_EXCHANGES:
         raise OptionError(
             f"found {value!r}; expected {', '.join(map(repr, START_EXCHANGES))}. Give one.", port="start_exchange"
         )
@@ -43,7 +43,7 @@ def check_compile(value: bool | str, *, fuse: bool = False) -> bool | str:
     OptionError
         For anything else.
     """
-    if value is True or value is False or value == "auto":
+    if value is True or value is False or (isinstance(value, str) and value == "auto"):
         return True if fuse and value == "auto" else value
     raise OptionError(f'found {value!r}; expected True, False or "auto". Give one.', port="compile")
 
@@ -71,6 +71,16 @@ class RunKeywords(KeptKeywords, total=False):
 
     to: str | os.PathLike[str] | None
     overwrite: bool
+
+
+_KINDS = {
+    "compile": kinds.either(kinds.flag, kinds.text),
+    "coupling": kinds.either(kinds.text, kinds.one_of_class(Coupling, "a Coupling(…)")),
+    "start_exchange": kinds.text,
+    "states": kinds.flag,
+    "overwrite": kinds.flag,
+}
+"""Kinds of options that nothing else checks before it reads them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +174,7 @@ class RunOptions:
         OptionError
             A name that is no option of a run; None for ``start``, which a run without a ``final_state`` has.
         """
+        check_argument(options, kinds.mapping, "options", block)
         known = [f.name for f in fields(cls)]
         for name in options:
             if name not in known:
@@ -177,6 +188,9 @@ class RunOptions:
                 block=block,
                 port="start",
             )
+        for name, kind in _KINDS.items():
+            if name in options:
+                check_argument(options[name], kind, name, block)
         return cls(**options)
 
     def apply_fuse(self, diagram: WiredDiagram) -> tuple[WiredDiagram, tuple[str, ...]]:

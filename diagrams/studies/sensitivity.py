@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import UnknownNameError, brief, enumerate_some, near
+from ...blocks.core import UnknownNameError, accepts, brief, enumerate_some, kinds, near
 from ..flat import WiredDiagram
 from ..frequency import MarginSlope, Number, margin_slopes
 from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize
@@ -139,7 +139,7 @@ class Sensitivities(Sequence[Sensitivity]):
     def __getitem__(self, key: Any) -> Any:
         if isinstance(key, int | slice):
             return self.rows[key]
-        if not (isinstance(key, tuple) and len(key) == 2):
+        if not (isinstance(key, tuple) and len(key) == 2 and all(isinstance(part, str) for part in key)):
             raise UnknownNameError(
                 f"found {key!r}; expected a parameter and a number, such as found['pid.kp', 'phase_margin_deg']."
             )
@@ -158,6 +158,7 @@ class Sensitivities(Sequence[Sensitivity]):
         """Names of the loop's numbers."""
         return tuple(dict.fromkeys(row.quantity for row in self.rows))
 
+    @accepts(quantity=kinds.text, count=kinds.count)
     def of(self, quantity: str, count: int | None = None) -> list[Sensitivity]:
         """Return the sensitivities of one number, the largest change per 1 % first.
 
@@ -210,6 +211,7 @@ class Sensitivities(Sequence[Sensitivity]):
         return figure
 
 
+@accepts("sensitivity", loop=kinds.names, parameters=kinds.names, delay=kinds.whole, skew=kinds.number)
 def find_sensitivities(
     diagram: WiredDiagram,
     loop: str | Iterable[str],

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, brief, enumerate_some
+from ...blocks.core import OptionError, accepts, brief, enumerate_some, kinds
 from ..flat import WiredDiagram
 from ..requirements import Requirements
 from ..sweeps import Box, Samples, read_samples
@@ -164,6 +164,7 @@ def _short(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
+@accepts("worst_case", loop=kinds.names, quantity=kinds.either(kinds.text, kinds.function), progress=kinds.function)
 def find_worst_case(
     diagram: WiredDiagram,
     parameters: Mapping[str, Any] | None,
@@ -197,7 +198,7 @@ def find_worst_case(
     else:
         assert not callable(quantity)
         goal = make_goal(loop, quantity, requirements, diagram.name)
-    if samples == "latin" and count is None:
+    if isinstance(samples, str) and samples == "latin" and count is None:
         count = 100
     drawn = read_samples(diagram, parameters, samples, count=count, seed=seed)
     check_parameters(diagram, drawn.names, "a worst case", blocks=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import OptionError, near, with_unit
+from ...blocks.core import OptionError, accepts, kinds, near, with_unit
 from ..results import BLUE, DARK, GREEN, PURPLE, VERMILION, legend_above, new_figure, style
 from ..sweeps import Box
 from .cases import Case, CaseOrigin, CaseState, Goal
@@ -17,14 +17,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@accepts("plot", parameters=kinds.names)
 def plot_cases(
     cases: Sequence[Case], worst: Case, goal: Goal, boxes: Mapping[str, Box], parameters: Sequence[str] | None = None
 ) -> Figure:
     """Return a scatter of the number over each parameter; see `WorstCase.plot`."""
     every = [name for name, value in worst.parameters.items() if isinstance(value, float | int)]
-    names = every if parameters is None else list(parameters)
-    for name in names:
-        if name not in every:
+    asked = [parameters] if isinstance(parameters, str) else list(every if parameters is None else parameters)
+    names = list[str]()
+    for name in asked:
+        found = [full for full in every if full == name] or [full for full in every if full.endswith(f".{name}")]
+        names += found[:1]
+        if len(found) != 1:
             raise OptionError(f"found no parameter {name!r} with one number in the study. {near(name, every)}")
     if not names:
         raise OptionError("found no parameter with one number; expected one to draw over. Look at table().")

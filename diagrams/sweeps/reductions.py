@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, accepts, kinds
 from ..results import Run
 
 KINDS = ("final", "maximum", "minimum", "mean", "settling_time")
@@ -65,21 +65,25 @@ def final(signal: str) -> Reduction:
     return _made("final", signal)
 
 
+@accepts(since=kinds.number)
 def maximum(signal: str, *, since: float = 0.0) -> Reduction:
     """Return the reduction to the largest sample of each entry, from a time in s on."""
     return _made("maximum", signal, since=since)
 
 
+@accepts(since=kinds.number)
 def minimum(signal: str, *, since: float = 0.0) -> Reduction:
     """Return the reduction to the smallest sample of each entry, from a time in s on."""
     return _made("minimum", signal, since=since)
 
 
+@accepts(since=kinds.number)
 def mean(signal: str, *, since: float = 0.0) -> Reduction:
     """Return the reduction to the mean over time, by the trapezoidal rule, from a time in s on."""
     return _made("mean", signal, since=since)
 
 
+@accepts(band=kinds.number, target=kinds.number, since=kinds.number)
 def settling_time(signal: str, *, band: float, target: float | None = None, since: float = 0.0) -> Reduction:
     """Return the reduction to the time after which a signal stays in a band around its target.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, UnknownNameError, near
+from ...blocks.core import OptionError, UnknownNameError, accepts, kinds, near
 from .outcome import Failure, Outcome
 from .samples import Samples
 
@@ -83,6 +83,7 @@ class Sweep:
         """Names of the reductions and signals that it holds."""
         return [*self._reductions, *self._signals]
 
+    @accepts("sweep[…]", name=kinds.text)
     def __getitem__(self, name: str) -> np.ndarray:
         """Return a reduction, shape (N, *shape), or the samples of a signal, (N, n, *shape).
 

@@ -43,7 +43,7 @@ class Box:
             low, high = np.array(self.low, dtype=float), np.array(self.high, dtype=float)
         except (TypeError, ValueError):
             raise OptionError(f"found a range from {self.low!r} to {self.high!r}; expected two numbers.") from None
-        if self.scale not in _SCALES:
+        if not isinstance(self.scale, str) or self.scale not in _SCALES:
             raise OptionError(f"found scale={self.scale!r}; expected {' or '.join(map(repr, _SCALES))}.")
         if low.shape != high.shape:
             raise OptionError(f"found ends of shapes {low.shape} and {high.shape}; expected equal shapes.")

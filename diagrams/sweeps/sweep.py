@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, one_thread
+from ...blocks.core import OptionError, accepts, kinds, one_thread
 from ..flat import FlatDiagram
 from ..results import Run, entries, machine_memory, resolve, select
 from ..simulation import SimulatedDiagram, Simulation, progress_bar
@@ -54,6 +54,7 @@ class InterruptedSweep(KeyboardInterrupt):
         self.sweep = sweep
 
 
+@accepts(duration=kinds.number, signals=kinds.names, seeds=kinds.names, progress=kinds.flag)
 def sweep(
     diagram: SimulatedDiagram,
     parameters: Mapping[str, Any] | None,

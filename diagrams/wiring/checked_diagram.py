@@ -7,7 +7,7 @@ from dataclasses import replace as replace_fields
 from fractions import Fraction
 from typing import Self
 
-from ...blocks.core import Block, OptionError, WiringError, check_name, without_collection
+from ...blocks.core import Block, OptionError, WiringError, check_argument, check_name, kinds, without_collection
 from ...blocks.tracing import check_method
 from .check import Checked, check
 from .delay_blocks import add_delay_blocks
@@ -49,7 +49,7 @@ class CheckedDiagram:
             )
         if not roots:
             raise WiringError("a diagram needs at least one call, such as plant(motor_force=u).", block=name)
-        if loops not in LOOPS:
+        if not isinstance(loops, str) or loops not in LOOPS:
             raise OptionError(
                 f"found loops={loops!r}; expected {' or '.join(map(repr, LOOPS))}.", block=name, port="loops"
             )
@@ -136,6 +136,8 @@ class CheckedDiagram:
         UnknownNameError, ParameterError, WiringError
             A name that isn't there, a value out of bounds, a block that doesn't fit the wires.
         """
+        if changes is not None:
+            check_argument(changes, kinds.mapping, "changes", self.name)
         table = apply_changes(self.structure, {**(changes or {}), **more}, self.name)
         return self.with_structure(table)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuFileError, Layout, brief
+from ...blocks.core import FmuFileError, Layout, accepts, brief, kinds
 from ..host_state import FOLDER
 from .aliases import find_aliases
 from .binaries import find_binary, judge_name
@@ -202,6 +202,7 @@ class FmuDescription:
         )
 
 
+@accepts(file=kinds.path, limits=kinds.one_of_class(ArchiveLimits, "ArchiveLimits(…)"))
 def read_description(
     file: str | os.PathLike[str], sizes: Mapping[str, int] | None = None, *, limits: ArchiveLimits | None = None
 ) -> FmuDescription:

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from ...blocks.core import FmuFileError
+from ...blocks.core import FmuFileError, accepts, kinds
 from ..archive import (
     ArchiveLimits,
     FmuArchive,
@@ -44,6 +44,7 @@ _RUNNERS = {
 }
 
 
+@accepts(file=kinds.path, run=kinds.flag, limits=kinds.one_of_class(ArchiveLimits, "ArchiveLimits(…)"))
 def doctor(
     file: str | os.PathLike[str], *, run: bool | None = None, limits: ArchiveLimits | None = None
 ) -> FmuDiagnosis:

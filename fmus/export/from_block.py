@@ -9,7 +9,7 @@ from typing import Any, cast
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import Block, DefinitionError, Layout, LoopwrightError, ParameterSpec, Port, Shape
+from ...blocks.core import Block, DefinitionError, Layout, LoopwrightError, ParameterSpec, Port, Shape, accepts, kinds
 from ...blocks.tracing import GUARDS, NEXT, Traced, constants_of, trace, traced_parameters
 from .html_page import block_text
 from .model import EventSpec, Integrator, ModelSpec, Variable
@@ -18,6 +18,7 @@ from .package import build_fmu
 _TINY = float(np.finfo(float).tiny)  # the least positive number that is not denormal
 
 
+@accepts(name=kinds.text)
 def model_spec(
     block: Block,
     *,
@@ -142,6 +143,7 @@ def _state(block: Block, name: str, shape: Shape, shapes: dict[str, Shape]) -> V
     )
 
 
+@accepts(name=kinds.text)
 def build(
     block: Block,
     out: Path | str | None = None,

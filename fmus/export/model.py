@@ -15,7 +15,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import DefinitionError, ParameterError, brief, parse_unit
+from ...blocks.core import DefinitionError, ParameterError, brief, kinds, parse_unit
 
 Causality = Literal["input", "output", "parameter", "local"]
 Variability = Literal["continuous", "discrete", "fixed", "tunable"]
@@ -259,17 +259,17 @@ class ModelSpec:
         check_file_name(self.name)
         for field in ("internal_step", "stop_time", "step_size"):
             value = getattr(self, field)
-            if not (math.isfinite(value) and value > 0):
+            if kinds.finite(value) or not value > 0:
                 raise ParameterError(
                     f"found {value!r}, expected a positive number of seconds.", block=self.name, port=field
                 )
-        if self.integrator not in INTEGRATORS:
+        if not isinstance(self.integrator, str) or self.integrator not in INTEGRATORS:
             raise ParameterError(
                 f"found {self.integrator!r}, expected one of {', '.join(INTEGRATORS)}.",
                 block=self.name,
                 port="integrator",
             )
-        if not 1e-14 <= self.tolerance <= 0.1:
+        if kinds.finite(self.tolerance) or not 1e-14 <= self.tolerance <= 0.1:
             raise ParameterError(
                 f"found {self.tolerance!r}, expected a number from 1e-14 to 0.1.", block=self.name, port="tolerance"
             )

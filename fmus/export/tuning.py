@@ -10,7 +10,7 @@ import zipfile
 from functools import lru_cache
 from pathlib import Path
 
-from ...blocks.core import FmuError
+from ...blocks.core import FmuError, FmuFileError, accepts, kinds
 from ..platform import cache_folder, is_built_here, native_platform, record_build
 from .compiler import compile_shared, describe_compiler, find_compiler
 from .package import FOLDERS2, fmi_headers, zip_files
@@ -30,6 +30,7 @@ def processor_flags() -> tuple[str, ...]:
     return (*_FLAGS, "-mcpu=native" if zig_or_other else "-march=native")
 
 
+@accepts(path=kinds.path)
 def tune(path: str | os.PathLike[str]) -> Path:
     """Return an FMU with its binary compiled anew for the processor of this machine.
 
@@ -49,6 +50,8 @@ def tune(path: str | os.PathLike[str]) -> Path:
         If there is no compiler, or it fails.
     """
     file = Path(path)
+    if not file.is_file():
+        raise FmuFileError(f"found no file {str(file)!r}; expected an FMU. Give its path.")
     content = file.read_bytes()
     if not is_built_here(hashlib.sha256(content).hexdigest()):
         raise FmuError(

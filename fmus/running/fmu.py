@@ -20,6 +20,7 @@ from ...blocks.core import (
     Signal,
     UnknownAttributeError,
     UnknownNameError,
+    kinds,
     near,
     parameter,
 )
@@ -83,14 +84,13 @@ class Fmu(ExchangeMembers):
         who = self.label
         if not isinstance(self.file, str | os.PathLike):
             raise ParameterError(f"found {self.file!r}; expected the path of an .fmu file.", block=who, port="file")
-        if isinstance(self.ports, str) or not all(isinstance(name, str) for name in self.ports or ()):
+        if self.ports is not None and (isinstance(self.ports, str) or kinds.names(self.ports)):
             raise ParameterError(
                 f"found {self.ports!r}; expected a list of names of variables.", block=who, port="ports"
             )
         check_isolation(self.isolate, who)
-        for old, new in self.rename.items():
-            if not isinstance(old, str) or not isinstance(new, str):
-                raise ParameterError(f"found {old!r}: {new!r}; expected two names.", block=who, port="rename")
+        if kinds.mapping(self.rename) or not all(isinstance(new, str) for new in self.rename.values()):
+            raise ParameterError(f"found {self.rename!r}; expected two names each.", block=who, port="rename")
         if not isinstance(self.limits, ArchiveLimits | None):
             raise ParameterError(f"found {self.limits!r}; expected ArchiveLimits(…).", block=who, port="limits")
         description, sizes = read_sized(self.file, self.start, self.limits, who)

@@ -297,7 +297,7 @@ def test_a_block_with_chosen_ports_is_a_value(file3):
     assert pickle.loads(pickle.dumps(plant)) == plant == plant.replace()
     assert plant != plant.replace(ports=None)
     assert [*plant.inputs] == ["u"]
-    with pytest.raises(ParameterError, match=r"^plant\.rename: found 'u_Int8': 3; expected two names"):
+    with pytest.raises(ParameterError, match=r"^plant\.rename: found {'u_Int8': 3}; expected two names"):
         plant.replace(rename={"u_Int8": 3})
 
 

@@ -1,0 +1,159 @@
+"""Wrong arguments of everything public: an error of Loopwright's own says what was found and what is expected."""
+
+import enum
+import inspect
+import warnings
+from contextlib import suppress
+
+import numpy as np
+import pytest
+
+import loopwright.blocks
+import loopwright.diagrams
+import loopwright.fmus
+from loopwright.blocks import Block, LoopwrightError, OptionError, Value
+from loopwright.diagrams import Diagram
+from support.library import CASES
+from support.public_calls import calls
+
+ROOMS = (loopwright.blocks, loopwright.diagrams, loopwright.fmus)
+WRONG = {
+    "None": None,
+    "text": "nonsense",
+    "nan": float("nan"),
+    "inf": float("inf"),
+    "complex": 1j,
+    "true": True,
+    "empty": [],
+    "matrix": np.zeros((2, 3)),
+    "mapping": {},
+    "object": object(),
+    "negative": -1,
+    "zero": 0,
+}
+LONG = {
+    ("Diagram.worst_case", "count", "None"),  # a hundred samples
+    ("Diagram.sweep", "workers", "None"),  # every core
+    ("Diagram.frequency_response", "frequencies", "true"),  # 1 rad/s
+}
+"""Arguments that are right, and take long."""
+RESULTS = {
+    "Array", "BlockReport", "Call", "Channel", "Comparison", "Contact", "ContactAdmittance", "ContactConfirmation",
+    "ContactLimit", "ContactMap", "ContactTrial", "CouplingReport", "DiskMargin", "Drawing", "Event", "Failure",
+    "Fig3Diagram", "FlatDiagram", "Frame", "FrequencyResponse", "GainCrossover", "GangOfFour", "InexactDerivatives",
+    "Input", "Kink", "Layout", "Linearization", "Margins", "MeanSlope", "MeasuredMargins", "Number", "NyquistCount",
+    "Occurrence", "OperatingPoint", "Output", "Passivity", "Path", "PortPassivity", "PeriodicMargins", "PhaseCrossover", "Plot",
+    "Reduction", "RefutedDerivatives", "Report", "Review", "Rig", "Run", "RunConfirmation", "RunOptions", "RunState",
+    "Sample", "SampledDesign", "Samples", "Section", "Sensitivities", "Sensitivity", "Signal", "Simulation",
+    "SimulationView", "Snapshot", "StabilityLimit", "StabilityMap", "State", "StepResponse", "StepsOnly", "Stopped",
+    "Subsystem", "SubsystemSettings", "Sweep", "Table", "TextSignal", "Unit", "Value", "Wire", "WorstCase", "ZeroSlope",
+    "FmuDescription", "FmuDiagnosis", "FmuFinding", "FmuInstance", "FmuLinearization", "FmuState", "FmuTrial",
+    "FmuVariable", "ModelSpec", "Variable", "AdmittanceLoop",
+}  # fmt: skip
+"""Classes whose objects functions return, or that are declarations; their makers are tested."""
+ELSEWHERE = {
+    "analyse": "Diagram.report; its options are tested with the report",
+    "build_fmu": "takes a ModelSpec, as build makes it",
+    "build_python": "takes the arguments of build",
+    "clear_cache": "takes none",
+    "confirm_sensitivity": "takes results of Diagram.sensitivity",
+    "fig3": "the paper's diagram, made by the experiments",
+    "parameter": "a declaration of a block's class",
+}
+NAMES = sorted(calls())
+
+
+def is_class_of_another_kind(value):
+    return issubclass(value, Exception | KeyboardInterrupt | enum.Enum | Block | Value)
+
+
+def public_callables():
+    found = set()
+    for room in ROOMS:
+        for name in room.__all__:
+            value = getattr(room, name)
+            if inspect.ismodule(value) or not callable(value):
+                continue
+            if inspect.isclass(value) and is_class_of_another_kind(value) and value not in (loopwright.fmus.Fmu,):
+                continue
+            found.add(name)
+    return found
+
+
+def test_every_public_callable_is_called_with_wrong_arguments():
+    called = {name.removeprefix("fmus.").partition(" ")[0].partition(".")[0] for name in NAMES}
+    missing = public_callables() - called - RESULTS - set(ELSEWHERE)
+    assert not missing, f"give {sorted(missing)} a line in tests/support/public_calls.py"
+
+
+@pytest.mark.slow
+def test_the_good_arguments_are_good():
+    """All that need no file are called once as they are."""
+    for name, make in calls().items():
+        function, good = make()
+        if "/nowhere" in str(good) or name in ("fmus.build", "Diagram.worst_case"):
+            continue
+        call(function, good)
+
+
+def call(function, arguments):
+    positional = [*arguments.pop("names")] if isinstance(arguments.get("names"), list) else []
+    if "names" in arguments:
+        positional = [arguments.pop("names")]
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        return function(*positional, **arguments)
+
+
+@pytest.mark.drawn(40)
+@pytest.mark.parametrize("wrong", WRONG)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_wrong_argument_ends_in_an_error_of_our_own_or_a_result(name, wrong, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    function, good = calls()[name]()
+    for argument in good:
+        if (name, argument, wrong) in LONG:
+            continue
+        with suppress(LoopwrightError):
+            call(function, {**good, argument: WRONG[wrong]})
+
+
+@pytest.mark.drawn(20)
+@pytest.mark.parametrize("wrong", WRONG)
+@pytest.mark.parametrize("block", [case[0] for case in CASES], ids=[type(case[0]).__name__ for case in CASES])
+def test_a_wrong_parameter_of_a_block_ends_in_an_error_of_our_own_or_a_block(block, wrong):
+    for name in block.parameters:
+        with suppress(LoopwrightError):
+            block.replace(**{name: WRONG[wrong]})
+
+
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (lambda d: loopwright.diagrams.margins(d.linearize().loop("u"), delay="2"), r"margins.delay: found '2'; expected"),
+        (lambda d: loopwright.diagrams.maximum("y", since=None), r"maximum.since: found None; expected a number"),
+        (lambda d: loopwright.diagrams.read_frequency_data(True), r"read_frequency_data.file: found True; expected a path"),
+        (lambda d: d.sensitivity("u", 3), r"parameters: found 3; expected a name, or a list of names"),
+        (lambda d: d.trim(tolerance="small"), r"drive.tolerance: found 'small'; expected a number"),
+        (lambda d: d.simulate(0.1, states="no", progress=False), r"drive.states: found 'no'; expected True or False"),
+        (lambda d: d.draw(subsystem="contrl"), r"no subsystem 'contrl'. Did you mean 'control'"),
+        (lambda d: d.sweep({"kp.gain": (1.0,)}, 0.1, signals=3), r"signals: found 3; expected a name, or a list"),
+        (lambda d: loopwright.diagrams.place(np.eye(2), [[1.0], [1.0]], None), r"place.poles: found None; expected a list"),
+    ],
+)  # fmt: skip
+def test_an_error_tells_who_found_what_and_expected_what(ask, message):
+    from support.public_calls import drive
+
+    with pytest.raises(OptionError, match=message):
+        ask(drive())
+
+
+def test_a_drawing_of_a_subsystem_counts_the_blocks_in_it(monkeypatch):
+    """Beyond some number of blocks subsystems are drawn closed: of those that are drawn."""
+    from loopwright.diagrams.drawing import svg
+    from support.public_calls import drive
+
+    monkeypatch.setattr(svg, "MANY", 5)  # the diagram has 7 blocks, its subsystem 4
+    assert isinstance(drive(), Diagram)
+    assert svg._find_closed(drive().structure, "", None, diagram="d") == {"control"}
+    assert svg._find_closed(drive().structure, "control", None, diagram="d") == set()
