@@ -22,31 +22,43 @@ def spend(diagram, duration, **options):
     return min(found), run
 
 
+def measure_impact(ball, *, isolate, form):
+    """Return the CPU seconds of an impact, and the number of impacts."""
+    both = []
+    for height in (0.05, 1e6):  # with impacts, and without
+        start = {"height": height, "restitution": 1.0}
+        plant = Fmu(ball, interface="model_exchange", name="ball", isolate=isolate, start=start)
+        both.append(spend(Diagram("ball", plant()), 40.0, step=0.05, compile=form))
+    (bouncing, run), (falling, _) = both
+    return (bouncing - falling) / len(run.events), len(run.events)
+
+
+def measure_tick(mass, *, isolate, form):
+    """Return the CPU seconds of a tick at which an input jumps, with the integration to the next one, and the tier."""
+
+    @subsystem(sample_time=0.01)
+    def controller(position):
+        return Gain(gain=-50.0, name="k")(position)
+
+    plant = Fmu(mass, interface="model_exchange", name="plant", isolate=isolate)
+    diagram = Diagram("loop", plant(force=controller(plant.position)))
+    count = 100_000 if form and not isolate else 1_000
+    (short, _), (long, run) = (spend(diagram, duration, compile=form) for duration in (1.0, 1.0 + count / 100))
+    return (long - short) / count, run.tier
+
+
 def main():
-    """Measure, and print a table."""
+    """Measure, and print a table: interpreted, compiled, and how many times as fast that is."""
     folder = Path(tempfile.mkdtemp())
     ball, mass = bouncing_ball.build(out=folder / "ball.fmu"), mass_spring_damper.build(out=folder / "mass.fmu")
+    print(f"{'':>34}  {'interpreted':>12}  {'compiled':>12}  ratio")
     for isolate in (False, True):
         place = "in a process of its own" if isolate else "in this process"
-        both = []
-        for height in (0.05, 1e6):  # with impacts, and without
-            start = {"height": height, "restitution": 1.0}
-            plant = Fmu(ball, interface="model_exchange", name="ball", isolate=isolate, start=start)
-            both.append(spend(Diagram("ball", plant()), 40.0, step=0.05))
-        (bouncing, run), (falling, _) = both
-        events = len(run.events)
-        print(f"{place}: {1e6 * (bouncing - falling) / events:.0f} µs an impact, of {events}")
-
-        @subsystem(sample_time=0.01)
-        def controller(position):
-            return Gain(gain=-50.0, name="k")(position)
-
-        plant = Fmu(mass, interface="model_exchange", name="plant", isolate=isolate)
-        diagram = Diagram("loop", plant(force=controller(plant.position)))
-        short, long = (spend(diagram, duration)[0] for duration in (1.0, 11.0))
-        print(
-            f"{place}: {1e6 * (long - short) / 1000:.0f} µs a tick whose input jumps, with the integration to the next"
-        )
+        impacts = [measure_impact(ball, isolate=isolate, form=form)[0] for form in (False, True)]
+        ticks, tiers = zip(*(measure_tick(mass, isolate=isolate, form=form) for form in (False, True)), strict=True)
+        for name, (before, after) in {"impact": impacts, "tick": ticks}.items():
+            shown = f"{1e6 * before:9.1f} µs  {1e6 * after:9.1f} µs  {before / after:5.1f}"
+            print(f"{name + ' ' + place:>34}  {shown if tiers[1] == 'compiled' else shown[:12] + '   not compiled'}")
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ typedef struct {
     int64_t logged, capacity;
     double *times, *seen, *gates, *domains; /* of a block of instants */
     double *x, *x_before, *now, *strict, *values, *motion, *later;
-    uint8_t *fires, *following;
+    uint8_t *fires, *following, *located; /* located: what fires at the instant that was found in a step */
 } watch;
 
 static void keep(watch *w) {

@@ -6,7 +6,7 @@
 
 enum { TAKE, GIVE, SET_TIME, CALL };
 enum { OK, WARNING, DISCARD };
-enum { TO_START, TO_STEP, TO_EVENTS };
+enum { TO_STEP, TO_EVENTS, TO_OTHERS };
 enum { EVENT_ROUNDS = 100 };
 
 typedef struct {
@@ -51,7 +51,7 @@ typedef struct outside {
     int64_t count;
     exchanged *each;
     tick jump;                  /* a look at the instant that is reached */
-    int64_t look;               /* purpose of the look */
+    int64_t look;               /* purpose of the look: a step is complete, events act, or those of other blocks alone */
     int64_t lost;               /* whether Python has to look */
     int64_t failed, plant;      /* whether a call has failed: `action` of `plant`, with a status, at `at` */
     const action *action;
@@ -250,7 +250,7 @@ static void look_at(const stage_of *g) {
     } else if (*g->t >= e->next_time || e->asks) {
         o->lost = 1;
     } else if (has_jumped(e, g->u)) {
-        if (is_within(e, g->u))
+        if (o->look == TO_EVENTS && is_within(e, g->u))
             let_act(e, *g->t, g->u, g->into);
         else
             o->lost = 1;

@@ -81,16 +81,21 @@ static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
         const double t = h->to;
         bool happened = h->found;
         if (h->o) {
-            if (h->found && m->kind <= RK4) return ask_for_step(h);
             const int told = tell_step(h);
             if (told == LOST) return ask_for_step(h);
-            if (h->found || told == EVENT) return ask_here(h, t, h->found ? ASK_FIRE : ASK_SETTLE);
+            if (!h->found && told == EVENT) return ask_here(h, t, ASK_SETTLE);
+            if (h->found) {
+                h->t = t;
+                h->acted = 0;
+                memcpy(h->w.located, h->w.fires, (size_t)h->w.m);
+                keep_instant(h);
+            }
             h->looked = t == end && !h->l.plants && is_before(end, h->jump) ? end : NAN;
         }
         h->stepped = 0;
         if (h->found && p->loops) /* as the indicators saw them */
             for (int64_t i = 0; i < p->loops->n; i++) h->l.x[p->loops->where[i]] = h->solved[i];
-        if (h->found && fire(h, t, t) == LOST) return ask(h, ASK_BETWEEN);
+        if (h->found && fire(h, t, t) == LOST) return ask(h, h->o ? h->acted ? ASK_SETTLE : ASK_FIRE : ASK_BETWEEN);
         h->t = t;
         if (t == edge && edge < end) { /* a discontinuity of a source */
             keep_instant(h);

@@ -209,7 +209,8 @@ class CompiledHybrid:
         if exchange is not None:
             jump = code.between["jump"]
             assert isinstance(jump, Staged)
-            exchange.bind_jump(jump, [*arguments, self._zeros(len(flat.events))], [x_next])
+            fired = np.zeros(0) if self.watch is None else self.watch.fired
+            exchange.bind_jump(jump, [*arguments, fired], [x_next])
             hybrid.o = ctypes.addressof(exchange.structure)
         taken = [flat.taken_at(clocks) for clocks in self.kinds]
         self.taken_states = self._zeros(width)

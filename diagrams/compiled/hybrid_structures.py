@@ -54,7 +54,8 @@ class HybridStructure(ctypes.Structure):
         *_fields(_INT, "active automatic accepts between budget inside begun stepped"), *_fields(_REAL, "t to"),
         *_fields(_INT, "found hits misses easy"), ("before", _AT), ("outputs", _INT),
         *_fields(_AT, "taken taken_first taken_states"), ("switched", _INT), ("solved", _AT), ("looked_at", _REAL),
-        *_fields(_AT, "z held"), ("inputs", _INT), ("planned", _REAL), ("o", _AT), *_fields(_REAL, "jump looked"),
+        *_fields(_AT, "z held"), ("inputs", _INT), ("planned", _REAL), ("o", _AT),
+        ("jump", _REAL), ("acted", _INT), ("looked", _REAL),
     ]  # fmt: skip
 
 

@@ -40,6 +40,7 @@ typedef struct hybrid {
     double planned;     /* step in s that the method had in mind before it took the last one */
     outside *o;         /* FMUs in model exchange; NULL without any */
     double jump;        /* first discontinuity of a source, or event of time of an FMU, behind the stretch's begin */
+    int64_t acted;      /* whether one has acted since an event was located */
     double looked;      /* tick at which they have been looked at, and before which nothing changes any more */
 } hybrid;
 
@@ -190,6 +191,7 @@ static inline void keep_instant(hybrid *h);
 static bool see(hybrid *h, int64_t look) {
     outside *o = h->o;
     o->look = look;
+    for (int64_t i = 0; i < h->w.m; i++) h->w.fired[i] = 0.0;
     if (o->lost || o->failed || call(&o->jump)) return false;
     memcpy(h->l.x, h->l.x_next, (size_t)h->l.states * sizeof(double));
     memcpy(h->p.x, h->l.x, (size_t)h->l.states * sizeof(double));
@@ -222,6 +224,7 @@ static int look_outside(hybrid *h, double t) {
         }
         if (!acted) return round ? EVENT : QUIET;
         keep_instant(h); /* Python goes on from behind what has acted */
+        h->acted = 1;
         if (is_due(o, t)) return LOST;
     }
     return LOST;
@@ -256,7 +259,12 @@ static int fire(hybrid *h, double t, double at) {
             log += row;
         }
         if (p->loops && !solve_loops(h->l.loops + h->between, h->l.x)) return LOST;
-        call(&w->jump);
+        if (h->o) {
+            h->o->look = TO_OTHERS;
+            if (call(&h->o->jump)) return LOST;
+        } else {
+            call(&w->jump);
+        }
         memcpy(h->l.x, h->l.x_next, (size_t)width * sizeof(double));
         memcpy(p->x, h->l.x, (size_t)width * sizeof(double));
         *w->fresh = 1.0;
@@ -273,8 +281,17 @@ static int fire(hybrid *h, double t, double at) {
                 if (w->fires[i] && is_contact(w, p, w->x, w->x_before, i)) return LOST;
         }
         if (!indicate(w, p, at, here_states(h, w->x))) return LOST;
-        const bool again = take_domains(w, w->domain, w->now, w->fires);
+        bool again = take_domains(w, w->domain, w->now, w->fires);
         memcpy(w->domain, w->now, (size_t)w->m * sizeof(double));
+        if (!again && h->o) {
+            const int outside = look_outside(h, at);
+            if (outside == LOST) return LOST;
+            if (outside == EVENT) {
+                if (!indicate(w, p, at, here_states(h, w->x))) return LOST;
+                again = take_domains(w, w->domain, w->now, w->fires);
+                memcpy(w->domain, w->now, (size_t)w->m * sizeof(double));
+            }
+        }
         if (!again) return accept(h) == DONE ? EVENT : LOST;
     }
     return LOST;

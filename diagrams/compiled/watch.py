@@ -34,7 +34,7 @@ class WatchStructure(ctypes.Structure):
         *_fields(_REAL, "spacing finest step"), ("state_size", _INT), ("state", _AT),
         *_fields(_AT, "domain low high slack size rounding largest counts latest fresh recent"), ("fired_times", _INT),
         ("kept", _AT), *_fields(_INT, "kept_times kept_log"), ("log", _AT), *_fields(_INT, "logged capacity"),
-        *_fields(_AT, "times seen gates domains x x_before now strict values motion later fires following"),
+        *_fields(_AT, "times seen gates domains x x_before now strict values motion later fires following located"),
     ]  # fmt: skip
 
 
@@ -67,7 +67,7 @@ class Watch:
     own : sequence of ndarray
         For each event: the places of its block's states among the integrated ones.
     exchange : NativeExchange, optional
-        FMUs in model exchange: Python lets all events fire then, as these are asked for theirs.
+        FMUs in model exchange: Python lets their events fire.
 
     Attributes
     ----------
@@ -106,12 +106,14 @@ class Watch:
         else:
             assert isinstance(indicators, Staged)
             self.structure.indicators = exchange.bind(indicators, trial, [z, opened])
+        self.fired = fired
+        """Which events fire in a jump, from 0 to 1."""
         subsystems = flat.table.subsystems
         flags = {
             "rising": [e.direction != "falling" for e in events],
             "falling": [e.direction != "rising" for e in events],
             "hysteretic": [e.hysteresis > 0.0 for e in events],
-            "asks": [bool(exchange) or (e.subsystem and subsystems[e.path].when == "reset") for e in events],
+            "asks": [e.path in flat.outside or (e.subsystem and subsystems[e.path].when == "reset") for e in events],
         }
         for name, values in flags.items():
             self._put(name, np.array(values, dtype=np.uint8))
@@ -132,10 +134,11 @@ class Watch:
         for name in ("now", "strict", "values", "later"):
             self._put(name, np.zeros(m))
         self._put("motion", np.zeros(6 * m))
-        self.fires = np.zeros(m, dtype=np.uint8)
-        """Which events fire, where C has left that to Python."""
-        self._put("fires", self.fires)
-        self._put("following", np.zeros(m, dtype=np.uint8))
+        for name in ("fires", "following"):
+            self._put(name, np.zeros(m, dtype=np.uint8))
+        self.located = np.zeros(m, dtype=np.uint8)
+        """Which events fire at an instant that was found in a step, where C has left that to Python."""
+        self._put("located", self.located)
 
     def _put(self, name: str, vector: np.ndarray) -> None:
         self._kept.append(vector)

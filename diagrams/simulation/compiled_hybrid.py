@@ -279,7 +279,7 @@ class HybridTicks:
         fired = None
         if found.reason is HybridReason.ASK_FIRE:
             assert loop.watch is not None
-            fired = loop.watch.fires.astype(bool)
+            fired = loop.watch.located.astype(bool)
         ended = let_act(self._workspace, self._continuous, found.t, loop.left, fired)
         if ended:
             recorder.row(found.t, self._workspace.log)

@@ -1,24 +1,52 @@
 """FMUs in model exchange in compiled runs: closed forms, matrix exponentials, and the numbers of interpreted runs."""
 
+import os
+import signal
+import threading
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
 from loopwright.blocks import (
+    Block,
+    Compare,
+    Constant,
+    Function,
     Gain,
+    Input,
+    LimitedIntegrator,
+    Relay,
+    SimulationError,
     Sine,
+    State,
     Step,
+    StopCondition,
     TransferFunction,
     UnitDelay,
 )
-from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus import Fmu, bouncing_ball, mass_spring_damper
+from loopwright.diagrams import Diagram, Interrupted, subsystem
+from loopwright.fmus import Fmu, bouncing_ball, build, mass_spring_damper
+from support.eventful import eventful_fmu
 
 T = 1e-3
 M = mass_spring_damper.nominal
 A = np.array([[0.0, 1.0], [-M.stiffness / M.mass, -M.damping / M.mass]])
 B = np.array([[0.0], [1.0 / M.mass]])
 START = 0.1
+
+
+class Car(Block):
+    """A car on one braked wheel with a friction of the slip that falls beyond its peak."""
+
+    torque = Input()
+    v = State(start=25.0, output=True)
+    omega = State(start=25.0 / 0.3, output=True)
+
+    def derivative(self, t, x, u):
+        slip = (x.v - 0.3 * x.omega) / x.v
+        force = 400.0 * 9.81 * 2 * 0.9 * 0.15 * slip / (0.15**2 + slip**2)
+        return -force / 400.0, 0.3 * force - u.torque
 
 
 @pytest.fixture(scope="module")
@@ -154,3 +182,194 @@ def test_impacts_fall_at_the_times_of_the_closed_form(files):
         t += 2.0 * v / g
     impacts = [event.t for event in compiled.events][::2]  # its indicator is crossed on the way down and up
     np.testing.assert_allclose(impacts, found, atol=1e-8)
+
+
+def relay_loop(files):
+    relay = Relay(on_point=0.02, off_point=-0.02, on_value=-5.0, off_value=5.0, name="relay")
+    plant = mass(files)
+    return Diagram("limit_cycle", plant(force=relay(plant.position)))
+
+
+@pytest.mark.parametrize("solver", ["RK45", "Radau", "rk4"])
+def test_events_of_other_blocks_whose_jumps_are_inputs_of_an_fmu(files, solver):
+    interpreted, compiled = both(lambda: relay_loop(files), 1.0, step=0.02, solver=solver)
+    assert len(compiled.events) >= 3
+    same(interpreted, compiled)
+
+
+def test_an_anti_lock_brake_whose_car_is_an_fmu(cache, tmp_path):
+    """A valve switches thousands of times a second: the torque into the FMU has kinks there, and no jumps."""
+    file = build(Car(name="car"), out=tmp_path / "car.fmu")
+
+    def make():
+        car, torque = (
+            Fmu(file, interface="model_exchange", isolate=False, name="car"),
+            LimitedIntegrator(lower=0.0, name="torque"),
+        )
+        valve = Relay(on_point=0.1701, off_point=0.1699, on_value=-1e7, off_value=1e7, name="valve")
+        slip = Function(lambda v, omega: 1.0 - 0.3 * omega / v, name="slip")(car.v, car.omega)
+        return Diagram("antilock", car(torque(valve(slip))))
+
+    interpreted, compiled = both(make, 0.03, step=0.01)
+    assert len(compiled.events) > 50
+    assert [e.event for e in interpreted.events] == [e.event for e in compiled.events]
+    np.testing.assert_allclose([e.t for e in interpreted.events], [e.t for e in compiled.events], atol=1e-6)
+    np.testing.assert_allclose(interpreted["car.v"], compiled["car.v"], rtol=1e-6)
+
+
+def test_an_fmu_of_co_simulation_beside_one_of_model_exchange(files):
+    def make():
+        sampled = Fmu(files[mass_spring_damper, 3], name="sampled", isolate=False, start={"position": 0.0})
+        plant = mass(files)
+
+        @subsystem(sample_time=T, name="controller")
+        def controller(y):
+            return Gain(gain=-20.0, name="gain")(y)
+
+        @subsystem(sample_time=T, name="other")
+        def other(y):
+            return Gain(gain=2.0, name="gain")(y)
+
+        return Diagram("two", plant(force=controller(sampled.position)), sampled(force=other(plant.position)))
+
+    same(*both(make, 0.1))
+
+
+def test_stop_conditions_at_ticks_and_between_them(files):
+    def make(sampled):
+        plant = mass(files)
+        force = Sine(frequency=1.0, amplitude=20.0, name="wave")
+
+        @subsystem(sample_time=0.01, name="hold")
+        def hold(u):
+            return Gain(gain=1.0, name="gain")(u)
+
+        above = Compare(relation=">", name="above")(plant.position, Constant(value=0.15, name="limit"))
+        return Diagram("stops", plant(force=hold(force) if sampled else force), StopCondition(name="stop")(above))
+
+    for sampled in (True, False):
+        interpreted, compiled = both(lambda s=sampled: make(s), 3.0, step=0.01 if sampled else 0.5)
+        assert compiled.stopped is not None
+        assert compiled.stopped.t == pytest.approx(interpreted.stopped.t, abs=1e-9)
+        assert compiled["plant.position"][-1] == pytest.approx(0.15, abs=1e-2 if sampled else 1e-6)
+
+
+def test_states_are_saved_in_one_tier_and_restored_in_the_other(files):
+    whole = pi_loop(mass(files)).simulate(0.1, compile=False, rtol=1e-8, atol=1e-10, progress=False)
+    options = {"rtol": 1e-8, "atol": 1e-10}
+    for first, second in ((False, True), (True, False)):
+        with pi_loop(mass(files)).simulation(compile=first, **options) as simulation:
+            simulation.advance(0.05)
+            saved = simulation.save()
+        with pi_loop(mass(files)).simulation(compile=second, **options) as simulation:
+            for _ in range(2):
+                simulation.restore(saved)
+                simulation.advance(0.05)
+            rest = simulation.run()
+        assert (rest.tier == "compiled") is second
+        np.testing.assert_allclose(rest["plant.position"][-50:], whole["plant.position"][-50:], atol=1e-9)
+
+
+def test_a_run_to_disk_and_an_interrupt(files, tmp_path, monkeypatch):
+    run = pi_loop(mass(files)).simulate(0.1, compile=True, to=tmp_path / "run", progress=False)
+    np.testing.assert_allclose(np.asarray(run["plant.position"]), exact_loop(101), atol=1e-7)
+    threading.Timer(0.2, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(Interrupted) as caught:
+        pi_loop(mass(files)).simulate(1e5, compile=True, record=["plant.position"], every=1000, progress=False)
+    assert caught.value.run.t[-1] > 0.0
+
+
+def test_long_runs_go_on_in_c_by_themselves(files):
+    run = pi_loop(mass(files)).simulate(10.0, record=["plant.position"], every=100, progress=False)
+    assert run.tier == "compiled"
+    np.testing.assert_allclose(run["plant.position"], exact_loop(10_001)[::100], atol=1e-7)
+
+
+@pytest.fixture(scope="module", params=[2, 3])
+def eventful(request, cache, tmp_path_factory):
+    return eventful_fmu(tmp_path_factory.mktemp("eventful"), request.param)
+
+
+def test_every_kind_of_event_of_an_fmu(eventful):
+    """ẋ = u + k with k = ⌊4 t⌋; x falls to 0 after a step that ends above 1, and n is taken over in Event Mode."""
+
+    def make(armed):
+        plant = Fmu(eventful, name="plant", isolate=False, start={"armed": armed})
+        wanted = Step(times=0.333, values=3.0, name="wanted")
+        return Diagram("d", plant(u=Constant(value=1.0, name="u"), n=wanted))
+
+    interpreted, compiled = both(lambda: make(0), 0.8, step=0.05)
+    same(interpreted, compiled)
+    np.testing.assert_array_equal(compiled["plant.m"], np.where(compiled.t >= 0.333, 3.0, 0.0))
+    assert [e.t for e in compiled.events if e.event == "time_event"] == [0.25, 0.5, 0.75]
+    interpreted, compiled = both(lambda: make(1), 1.0, step=0.05, solver="rk4")
+    assert any(e.event == "step_event" for e in compiled.events)
+    same(interpreted, compiled)
+
+
+def test_an_fmu_ends_a_compiled_run(eventful):
+    plant = Fmu(eventful, name="plant", isolate=False, start={"last": 3})
+    diagram = Diagram("d", plant(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
+    run = diagram.simulate(2.0, step=0.1, compile=True, progress=False)
+    assert run.tier == "compiled"
+    assert (run.stopped.t, run.stopped.block, run.t[-1]) == (0.75, "plant", 0.75)
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ("return 3;", "computing the derivatives of its states failed with fmi3Error at t = 0.3"),
+        ("return 2;", "The FMU discards what the solver tries: computing the derivatives of its states at t = 0"),
+        ("dx[0] = 0.0 / 0.0; return 0;", "the rate of plant.x = 0.2 is 1.5 there and is not finite just beyond"),
+    ],
+    ids=["error", "discard", "nan"],
+)
+def test_a_failure_in_c_is_told_as_interpreted(cache, tmp_path, fault, told):
+    file = eventful_fmu(tmp_path, 3, fault=f"if (c->t > 0.3) {{ {fault} }}")
+    plant = Fmu(file, name="plant", isolate=False)
+    diagram = Diagram("d", plant(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
+    with pytest.raises(SimulationError, match=told) as error:
+        diagram.simulate(1.0, step=0.1, compile=True, progress=False)
+    assert error.value.block == "plant"
+    assert error.value.t == pytest.approx(0.3, abs=0.1)
+    assert error.value.run.t[-1] >= 0.2
+    np.testing.assert_allclose(error.value.run["plant.x"], 0.5 * error.value.run.t + _risen(error.value.run.t))
+
+
+def _risen(t):
+    k = np.floor(4.0 * t)
+    return 0.25 * k * (k - 1) / 2 + k * (t - 0.25 * k)
+
+
+def test_a_discard_beyond_a_wall_makes_steps_smaller(cache, tmp_path):
+    """The rates can't be computed for x > 0.7, which x = 0.5 t + … reaches at t = 0.6 and no sooner."""
+    file = eventful_fmu(tmp_path, 3, fault="if (c->x > 0.7) return 2;")
+    plant = Fmu(file, name="plant", isolate=False)
+    diagram = Diagram("d", plant(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
+    run = diagram.simulate(0.5, step=0.5, compile=True, max_step=10.0, progress=False)
+    assert run.tier == "compiled"
+    assert run["plant.x"][-1] == pytest.approx(0.5, abs=1e-9)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_warning_in_c_is_told_once(cache, tmp_path, fmi):
+    getter = "int NAME(REAL_GET)(void *p, const unsigned r[], size_t n, double v[] SIZE) {\n    instance *c = p;"
+    values = (
+        "for (size_t i = 0; i < n; i++) v[i] = r[i] == 1 ? c->x : r[i] == 2 ? c->u + c->k : r[i] == 3 ? c->u : c->t"
+    )
+    warning = getter + f" if (c->t > 0.3) {{ if (!n) return 0; {values}; return 1; }}"
+    file = eventful_fmu(tmp_path, fmi, changes=[(getter, warning)])
+    plant = Fmu(file, name="plant", isolate=False)
+    diagram = Diagram("d", plant(u=Constant(value=0.5), n=Constant(value=0.0)))
+    run = diagram.simulate(1.0, step=0.1, compile=True, progress=False)
+    assert run.tier == "compiled"
+    (told,) = [m for m in run.messages if "Warning" in m]
+    assert told.startswith(f"plant: reading the outputs gave fmi{fmi}Warning at t = 0.")
+
+
+def test_obstacles_are_told(files, eventful):
+    plant = Fmu(files[mass_spring_damper, 3], interface="model_exchange", name="plant", isolate=True)
+    run = Diagram("d", plant(force=Sine(frequency=0.5, name="wave"))).simulate(
+        0.1, step=0.05, compile=True, progress=False
+    )
+    assert any("'plant' in model exchange runs in a process of its own" in message for message in run.messages)
