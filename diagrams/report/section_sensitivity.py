@@ -79,7 +79,9 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities) -> Section:
     if none:
         text.append(TEXTS.line("without", count=len(none), number=ROWS[first]))
     columns = ("parameter", "value", *(f"{ROWS[quantity]} per +1 %" for quantity in shown))
-    table = Table(f"Largest sensitivities at {wire}", columns, tuple(rows), digits=4)
+    table = Table(
+        f"Largest sensitivities at {wire}", columns, tuple(rows), digits=4, terms={"value": "parameter_value"}
+    )
     plot = figures.sensitivity_bars(f"sensitivity_{key}", wire, ROWS[first], bars)
     return Section(key, f"Sensitivity of {wire}", tuple(text), (table,), (plot,), numbers)
 

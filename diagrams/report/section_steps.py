@@ -121,7 +121,8 @@ def steps(case: Case) -> Section | None:
         return Section("steps", TITLE, tuple(dict.fromkeys(text))) if text else None
     tables = [Table("Step responses", ("step", "variant", "number", "co-simulation", "linear"), tuple(rows))]
     if effort:
-        tables.append(Table("Effort", ("step", "variant", "signal", "before", "largest change"), tuple(effort)))
+        tables.append(Table("Effort", ("step", "variant", "signal", "before", "largest change"), tuple(effort),
+                            terms={"before": "before_step"}))  # fmt: skip
     plots = [_plot(case, test, curves) for test, curves in found.items()]
     whole = (*TEXTS.paragraphs("responses"), *dict.fromkeys(text))
     return Section("steps", TITLE, whole, tuple(tables), tuple(plots), numbers)

@@ -82,7 +82,8 @@ def _requirements(case: Case, reviewed: Review) -> Table:
     ranked = sorted(reviewed.results, key=lambda r: (ORDER.index(r.verdict), _relative(r)))
     rows = tuple(_row(case, result) for result in ranked)
     columns = ("verdict", "requirement", "at", "variant", "required", "found", "distance")
-    return Table("Requirements", columns, rows, TEXTS.line("distance"), digits=DIGITS)
+    return Table("Requirements", columns, rows, TEXTS.line("distance"), digits=DIGITS,
+                 terms={"distance": "distance_to_limit"})  # fmt: skip
 
 
 def _relative(result: RequirementResult) -> float:
@@ -168,7 +169,8 @@ def _worst_case(reported: ReportedWorstCase | MissingWorstCase) -> str:
         cases=len(found.cases),
         quantity=words_of(worst.quantity),
         value=worst.value,
-        unit=f"{'' if shown in ('', '°') else ' '}{shown}",
+        unit=shown,
+        spaced=shown not in ("", "°"),
         growth=worst.growth,
         reason=worst.reason.rstrip("."),
     )

@@ -14,7 +14,7 @@ LEAST = 0.62
 """Smallest factor by which a figure is set smaller."""
 CAPTION = 0.065
 """Share of a page that a caption takes, with the space around it."""
-ROWS, WIDE_GAP = (12, 7), 0.26
+ROWS, WIDE_GAP = (12, 5), 0.19
 """Rows above which a table may go over to the next page to fill one: to fill a gap, and one of this share of a page."""
 TABLE_PART = 0.2
 """Share of a page that has to be free for the first part of such a table."""

@@ -16,7 +16,8 @@ class Table:
     """A table: a title, column headings, and rows of texts or numbers.
 
     One of ``details`` stands in the appendix. Numbers have ``digits`` significant digits at most, fewer where their
-    tolerance bears no more. Columns without a single entry are not shown.
+    tolerance bears no more. Columns without a single entry are not shown. ``terms`` names the definitions of numbers
+    that have no dotted path, by their columns.
     """
 
     title: str
@@ -25,6 +26,7 @@ class Table:
     note: str = ""
     details: bool = False
     digits: int = 6
+    terms: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         facts = f"{len(self.rows)} rows", ", ".join(map(str, self.columns))

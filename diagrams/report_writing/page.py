@@ -142,9 +142,11 @@ class Page:
             for path, number in numbers.items()
         ]
         tops = dict.fromkeys(path.partition(".")[0] for path in numbers)
-        terms = tuple(dict.fromkeys(term for term in known.values() if term is not None))
         numbering = _Numbering(numbers)
         sections = numbering.sections(report.sections, "", "")
+        details = numbering.details()
+        of_tables = (_term(term, more) for term in numbering.tables.terms)
+        terms = tuple(dict.fromkeys(term for term in (*known.values(), *of_tables) if term is not None))
         return cls(
             report.title,
             tuple(_about(report.meta)),
@@ -153,7 +155,7 @@ class Page:
             tuple(reasons),
             terms,
             not LOOP_TERMS.isdisjoint(term.term for term in terms),
-            numbering.details(),
+            details,
         )
 
 

@@ -84,6 +84,8 @@ class Numbered:
 
     def __init__(self, numbers: Mapping[str, Number]):
         self.count = 0
+        self.terms: dict[str, None] = {}
+        """Terms that numbers without a path lead to."""
         self.paths: dict[int, str] = {}
         self.equal: dict[Number, str] = {}
         for path, number in numbers.items():
@@ -114,7 +116,8 @@ class Numbered:
                 kind = "again" if again else "right" if right[i] else ""
                 kind = value.verdict.name.lower() if isinstance(value, Judged) else kind
                 unit = units[i] is None
-                cells.append(self._cell(value, kind, letters, table.digits, first=i == 0, with_unit=unit))
+                term = table.terms.get(table.columns[i], "")
+                cells.append(self._cell(value, kind, letters, table.digits, term, first=i == 0, with_unit=unit))
             rows.append(tuple(cells))
         said = tuple(NoteView(letters.get(method, ""), _said(*why)) for method, why in reasons.items())
         said += tuple(NoteView(MARK, text) for text in _left_out(table))
@@ -122,16 +125,19 @@ class Numbered:
         return TableView(self.count, table.title, tuple(headings), tuple(rows), table.note, said, is_long)
 
     def _cell(
-        self, value: Any, kind: str, letters: Mapping[str, str], digits: int, *, first: bool, with_unit: bool
+        self, value: Any, kind: str, letters: Mapping[str, str], digits: int, term: str, *, first: bool, with_unit: bool
     ) -> CellView:
         if not isinstance(value, Number):
             return CellView(cell(value), kind, first)
-        path = self.paths.get(id(value)) or self.equal.get(value)
+        path = self.paths.get(id(value)) or ("" if term else self.equal.get(value))
         text = quantity(value, digits) if with_unit else value_text(value, digits) + mark(value)
         why = reason(value) if value.given or not value.confirmed_by else f"confirmed by {reason(value)}"
         about = f"{path + ': ' if path else ''}{tolerance_text(value)}; {why}"
         letter = letters.get(_method(value), "")
-        return CellView(text, kind, False, True, anchor("n", path) if path else "", about, letter)
+        if term and not path:
+            self.terms[term] = None
+        place = anchor("n", path) if path else anchor("d", term) if term else ""
+        return CellView(text, kind, False, True, place, about, letter)
 
 
 def _without_empty_columns(table: Table) -> Table:

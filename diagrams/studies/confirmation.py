@@ -135,7 +135,10 @@ def _measure_margin(diagram: WiredDiagram, model: Linearization, case: Case, amp
     measured = np.asarray(response.L.frdata)[:, :, 0]
     here = float(response.omega[0])
     predicted = np.asarray(L(np.exp(1j * here * L.dt) if L.dt else 1j * here)).reshape(measured.shape)
-    value, expected = (_read_margin(M, case.quantity, here) for M in (measured, predicted))
+    if case.quantity == "bandwidth":
+        value, expected = _read_bandwidth(L, measured, predicted, here, case.value), case.value
+    else:
+        value, expected = (_read_margin(M, case.quantity, here) for M in (measured, predicted))
     off = float(response.uncertainty[0])
     room = (MARGIN_AGREEMENT + 10.0 * off) * max(abs(expected), abs(case.value))
     near = math.isfinite(value) and abs(value - expected) <= room and abs(expected - case.value) <= 5.0 * room
@@ -178,6 +181,15 @@ def _inside(omega: float, L: Any, name: str) -> float:
             "another number, such as quantity='disk_margin'.", block=name,
         )  # fmt: skip
     return min(omega, top)
+
+
+def _read_bandwidth(L: Any, measured: np.ndarray, predicted: np.ndarray, omega: float, value: float) -> float:
+    """Return the bandwidth with a measured L: beside the model's, |T| falls as the model's does."""
+    T, there = (abs(complex(M[0, 0]) / (1.0 + complex(M[0, 0]))) for M in (measured, predicted))
+    w = omega * np.array([0.999, 1.001])
+    ends = np.ravel(L(np.exp(1j * w * L.dt) if L.dt else 1j * w))
+    falls = float(np.diff(np.log(np.abs(ends / (1.0 + ends))))[0] / np.log(w[1] / w[0]))
+    return value * math.exp(-math.log(T / there) / falls) if T and there and falls else math.nan
 
 
 def _read_margin(L: np.ndarray, quantity: str, omega: float) -> float:

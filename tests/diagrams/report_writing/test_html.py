@@ -113,6 +113,48 @@ def test_a_number_leads_to_its_path_tolerance_confirmation_and_definition():
     assert reasons["why1"] == BY_EIGENVALUES
 
 
+def test_a_number_without_a_path_leads_to_the_definition_of_its_column():
+    left, named = Number(0.5, "1", 0.0, "", given=True), Number(0.25, "1", 0.0, "", given=True)
+    table = Table("T", ("name", "distance", "value"), (("a", left, named),), terms={"distance": "distance_to_limit"})
+    tree = parsed(to_html(Report("R", (Section("s", "S", ("Text.",), (table,), (), {"ms": named}),))))
+    (link,) = [a for a in tree.iter("a") if text_of(a) == "0.5"]
+    assert link.get("href") == "#d-distance_to_limit"
+    rows = {row.get("id"): row for row in tree.iter("tr") if row.get("id")}
+    assert "negative beyond the limit" in text_of(rows["d-distance_to_limit"])
+
+
+def test_keys_of_definitions_have_room_on_paper(tmp_path):
+    """The longest key and its definition don't overlap: all of the key stands left of the definition's text."""
+    keys = ("phase_margin_deg", "delay_margin_s", "disk_margin", "gain_crossover_1.phase_margin_deg", "residual")
+    numbers = {
+        f"inner.u.{key}": Number(45.0 + i, "deg", 0.0, "", given=True) for i, key in enumerate((*keys, "affine"))
+    }
+    report = Report("R", (Section("s", "S", ("Text.",), (), (), numbers),))
+    (file,) = write_report(report, tmp_path / "r.html", pdf=True)[1:]
+    document = pypdfium2.PdfDocument(file)
+    pages = [page.get_textpage() for page in document]
+    (page,) = [page for page in pages if "The rotation of L" in page.get_text_range()]
+    text = page.get_text_range()
+    begin = page.get_charbox(text.index("The rotation of L"))[0]
+    key = text.rindex("gain_crossover", 0, text.index("The rotation of L"))
+    right = max(page.get_charbox(i)[2] for i in range(key, text.index("The rotation of L")) if text[i].strip())
+    document.close()
+    assert right < begin
+
+
+def test_the_heading_of_the_details_does_not_stand_alone_at_the_end_of_a_page(tmp_path):
+    rows = tuple((f"package{i}", "1.0") for i in range(9))
+    for lines in (45, 58, 59):
+        table = Table("T", ("package", "version"), rows, details=True)
+        parts = Section("a", "First", ("Filling.",) * lines, (table,))
+        (file,) = write_report(Report("R", (parts,)), tmp_path / "r.html", pdf=True)[1:]
+        document = pypdfium2.PdfDocument(file)
+        pages = [page.get_textpage().get_text_range() for page in document]
+        document.close()
+        (last,) = [page for page in pages if "package0" in page]
+        assert "C Details" in re.sub(r"\s+", " ", last)
+
+
 def test_confirmations_stand_below_the_table_by_letters():
     html = to_html(report())
     assert re.search(r"66\.0612</a><sup>a</sup>", html)

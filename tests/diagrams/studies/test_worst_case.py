@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from loopwright.blocks import (
     Block,
@@ -271,3 +272,20 @@ def test_structure_is_no_parameter_of_a_study(name, kind):
     assert (caught.value.block, caught.value.port, told) == (head, last, [])
     with pytest.raises(OptionError, match=rf"{head}.{last}: found {kind} among the parameters of a sensitivity"):
         diagram.sensitivity("control.u", [name])
+
+
+@pytest.mark.slow
+def test_a_worst_bandwidth_is_confirmed_by_a_run_at_it():
+    """T = (p s + ki) a/(s² + a (1 + p) s + ki a); it was measured as NaN, and refuted."""
+    found = make_pi_loop(a=2.0).worst_case({"p.gain": [0.5, 1.0]}, "u", quantity="bandwidth", samples="grid", starts=0)
+    confirmed = found.confirm()
+    p = found.parameters.get("p.gain", 1.0)
+
+    def excess(w):
+        s = 1j * w
+        return abs((p * s + 0.5) * 2.0 / (s * s + 2.0 * (1.0 + p) * s + 1.0)) - math.sqrt(0.5)
+
+    expected = brentq(excess, 1e-2, 1e3)
+    assert found.worst.value == pytest.approx(expected, rel=1e-6)
+    assert confirmed.agrees
+    assert confirmed.measured == pytest.approx(expected, rel=1e-3)
