@@ -209,16 +209,16 @@ def _compile(
     if between := _between_ticks(flat, method):
         raise NoLanesError(between)
     if flat.loops.slices:
-        raise NoLanesError("it has algebraic loops")
+        raise NoLanesError(f"it has algebraic loops, such as through {next(iter(flat.loops.slices))}")
     if flat.apart:
-        raise NoLanesError("it has blocks that are evaluated from outside")
+        raise NoLanesError(f"{min(flat.apart)} is evaluated from outside")
     if flat.by_block:
         raise NoLanesError("its ticks have too many operations to be compiled as a whole")
     ticks = [flat.at_tick(clocks).last.fast for clocks in acting]
     if not all(tick.is_a("SXFunction") for tick in ticks):
-        raise NoLanesError("it has tables, matrix products or blocks of Python, which are no scalar operations")
-    if sum(tick.n_instructions() for tick in ticks) > LARGEST:
-        raise NoLanesError("its ticks have too many operations to be compiled as a whole")
+        raise NoLanesError(_no_scalars(flat))
+    if (operations := sum(tick.n_instructions() for tick in ticks)) > LARGEST:
+        raise NoLanesError(f"its ticks have {operations} operations, and at most {LARGEST} are compiled as a whole")
     ticks = [_share(tick) for tick in ticks]
     plants = {path: _plant(flat, path) for path in flat.plant_ticks}
     first = ticks[0]
@@ -229,7 +229,7 @@ def _compile(
     if flat.continuous.size:
         rates = flat.flow.last.fast
         if not rates.is_a("SXFunction"):
-            raise NoLanesError("its continuous blocks have tables or matrix products, which are no scalar operations")
+            raise NoLanesError(_no_scalars(flat))
         flow = FlowSource(_share(rates), flat.continuous.tolist(), method)
     begin = None if start is None else StartSource(_share(start.tick), start.values, start.key)
     source = write_lanes(ticks, [*plants.values()], sizes, count, begin, flow)
@@ -276,6 +276,16 @@ def _between_ticks(flat: FlatDiagram, method: str) -> str:
     delays = {flat.ports[name][0] for name in flat.plant_inputs.slices}
     delays = {path for path in delays if flat.table.blocks[path].transport}
     return f"{min(delays)} is a transport delay in continuous time" if delays else ""
+
+
+def _no_scalars(flat: FlatDiagram) -> str:
+    """Return which blocks are no scalar operations, as a clause."""
+    traced = flat.checked.traced
+    found = [path for path in traced if not traced[path].function.is_a("SXFunction")]
+    few = f"{', '.join(found[:3])}{' and others' if len(found) > 3 else ''}" if found else "it"
+    return (
+        f"{few} {'have' if len(found) > 1 else 'has'} a table or a large matrix product, which is no scalar operation"
+    )
 
 
 def _share(tick: Any) -> Any:

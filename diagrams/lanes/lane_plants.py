@@ -89,6 +89,8 @@ class LanePlant:
 
     Attributes
     ----------
+    path : str
+        The FMU's path.
     derivative, output : casadi.Function
         ``(t, x, u, p) -> dx`` and ``(t, x, u, p) -> y``.
     inputs : sequence of (int, int)
@@ -101,6 +103,7 @@ class LanePlant:
         Where the values of these stand among the numbers of a run, by value reference; without the integrator's.
     """
 
+    path: str
     derivative: Any
     output: Any
     inputs: Sequence[tuple[int, int]]
@@ -139,7 +142,8 @@ class LanePlant:
         *found, step, integrator = np.array(given, dtype=float)
         if self.derivative.numel_out(0) and integrator != _RK4:
             raise NoLanesError(
-                "an FMU's integrator chooses its steps, and lanes need steps of one length: integrator 1 (rk4)"
+                f"{self.path} chooses the steps of its integrator, and lanes need steps of one length: set its start "
+                f"value integrator, which is {integrator:g}, to 1 (rk4)"
             )
         return np.array(found), float(step)
 
@@ -175,7 +179,7 @@ def read_plant(path: str, block: Fmu, inputs: Mapping[str, slice], outputs: Mapp
     for reference in references:
         entries[reference] = slice(at, at := at + found.variables[reference].size)
     references += [settings[name] for name in _SETTINGS[:2]]
-    return LanePlant(found.derivative, found.output, ins, outs, references, entries)
+    return LanePlant(path, found.derivative, found.output, ins, outs, references, entries)
 
 
 def _places(found: WrittenEquations, variable: FmuVariable) -> list[int]:

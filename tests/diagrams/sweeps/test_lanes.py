@@ -187,7 +187,9 @@ def notes(diagram, table, duration=0.1, **options):
 def test_runs_that_cannot_go_side_by_side_go_by_themselves_and_say_why():
     table = [{"kp.gain": 1.0}, {"kp.gain": 1.5}]
     assert "don't go from tick to tick in C" in notes(loop(), table, compile=False)
-    assert "integrator chooses its steps" in notes(loop(), [{**row, "plant.integrator": 2} for row in table])
+    assert "plant chooses the steps of its integrator, and lanes need" in notes(
+        loop(), [{**row, "plant.integrator": 2} for row in table]
+    )
     assert "more than 10000 substeps" in notes(loop(), [{**row, "plant.internal_step": 1e-8} for row in table], 0.01)
     assert "box.odd is evaluated by Python" in notes(loop(more=lambda u: Odd(name="odd")(u)), table)
     assert "whole number of ticks" in notes(loop(), table, 0.105)
@@ -195,8 +197,8 @@ def test_runs_that_cannot_go_side_by_side_go_by_themselves_and_say_why():
         "rates", Gain(gain=1.0, name="kp")(Integrator(name="held")(Constant(value=1.0, name="one"))).named("x")
     )
     assert "it has continuous states, those of held, and each run would choose its steps" in notes(rates, table, step=T)
-    assert "it has algebraic loops" in notes(loop(more=around, loops="solve"), table)
-    assert "no scalar operations" in notes(
+    assert "it has algebraic loops, such as through box." in notes(loop(more=around, loops="solve"), table)
+    assert "box.lookup_1d has a table or a large matrix product, which is no scalar operation" in notes(
         loop(more=Lookup1D(breakpoints=(-9.0, 0.0, 9.0), values=(-9.0, 0.0, 4.0))), table
     )
 

@@ -171,10 +171,7 @@ def test_random_diagrams_go_side_by_side_as_each_run_by_itself(seed):
     alone = diagram.sweep(None, DURATION, compile=False, **options)
     assert not found.failures
     apart = [text for text in found.messages if "Not side by side" in text]
-    assert apart in (
-        [],
-        ["Not side by side in vector lanes: its ticks have too many operations to be compiled as a whole."],
-    )
+    assert all("operations, and at most" in text for text in apart)
     assert (DIFFER in found.messages) is not bool(apart)
     for name in names:
         largest = max(np.abs(alone[name]).max(), 1e-3)
