@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
-from ...blocks.core import FmuError, OptionError
+import numpy as np
+
+from ...blocks.core import FmuError, FmuRuntimeError, OptionError
+from ...fmus.calls import FmuInstance
 from ..results import RunState, layout_of
+from ..wiring import join
 from .engine import Engine
+
+SAME = 1e-6
+"""Distance of two outputs, absolute and relative, that an FMU which computes them anew may make."""
 
 
 def can_save(engine: Engine) -> bool:
@@ -54,9 +61,20 @@ def save_state(engine: Engine) -> RunState:
 
 
 def restore_state(engine: Engine, state: RunState) -> None:
-    """Put a run into a state that fits it."""
+    """Put a run into a state that fits it.
+
+    Raises
+    ------
+    FmuRuntimeError
+        An FMU that says that it has restored its state, and has not: an output stays as it was.
+    """
+    w = engine.workspace.here.w
     for path, plant in engine.plants.items():
+        before = w.copy()
         plant.restore(plant.deserialize(state.fmus[path]))
+        if isinstance(plant, FmuInstance):  # it reads its outputs anew
+            left = (w == before) & (np.abs(w - state.w) > SAME * (1.0 + np.abs(state.w)))
+            _check_outputs(engine, path, left, state)
     for path, block in engine.exchanged.blocks.items():
         block.restore_bytes(state.fmus[path])
     engine.workspace.restore(t=state.t, x=state.x, w=state.w, z=state.z, log=state.log)
@@ -66,3 +84,19 @@ def restore_state(engine: Engine, state: RunState) -> None:
     engine.steps.restore(state.plant_steps, state.tick)
     if engine.coupled is not None:
         engine.coupled.proposed = state.proposed_step
+
+
+def _check_outputs(engine: Engine, path: str, left: np.ndarray, state: RunState) -> None:
+    """Refuse a state of an FMU from which an output is ``left`` as it was before."""
+    outputs = engine.flat.plant_outputs.slices
+    for name in engine.flat.table.blocks[path].outputs:
+        where = outputs.get(join(path, name), slice(0, 0))
+        if left[where].any():
+            raise FmuRuntimeError(
+                "the FMU does not restore its state, although its function for that reports success: found its output "
+                f"{engine.workspace.here.w[where].tolist()}, as before; expected {state.w[where].tolist()}. Run again "
+                "from the start, and tell its makers.",
+                block=path,
+                port=name,
+                t=state.t,
+            )

@@ -1,4 +1,4 @@
-"""FMUs in model exchange whose model structure leaves out a dependency."""
+"""FMUs whose descriptions are wrong: dependencies that are left out, states that are not restored."""
 
 import numpy as np
 import pytest
@@ -42,3 +42,43 @@ def test_a_right_structure_and_one_that_says_nothing_run_as_the_equations_do(tmp
         run = damped(misstated_fmu(tmp_path, fmi, changes)).simulate(0.5, step=0.01, progress=False, rtol=1e-10)
         exact = [(expm(M * t) @ [0.0, 0.0, 1.0])[0] for t in run.t]
         np.testing.assert_allclose(run["plant.x"], exact, atol=1e-8)
+
+
+_KEEPING = """int fmi3GetFMUState(void *p, void **s) { if (!*s) *s = malloc(sizeof(instance)); KEEP return 0; }
+int fmi3SetFMUState(void *p, void *s) { RESTORE return 0; }
+int fmi3FreeFMUState(void *p, void **s) { free(*s); *s = 0; return 0; }
+int fmi3SerializedFMUStateSize(void *p, void *s, size_t *n) { *n = sizeof(instance); return 0; }
+int fmi3SerializeFMUState(void *p, void *s, unsigned char *b, size_t n) { memcpy(b, s, n); return 0; }
+int fmi3DeserializeFMUState(void *p, unsigned char *b, size_t n, void **s) {
+    *s = malloc(sizeof(instance)); memcpy(*s, b, sizeof(instance)); return 0; }
+static double *at("""
+_FLAG = 'canHandleVariableCommunicationStepSize="true"'
+
+
+@pytest.mark.parametrize("restores", [True, False])
+def test_a_state_that_is_not_restored_is_told_in_the_run_and_in_a_branch(tmp_path, restores):
+    copy = ("memcpy(*s, p, sizeof(instance));", "memcpy(p, s, sizeof(instance));") if restores else ("", "")
+    source = _KEEPING.replace("KEEP ", copy[0]).replace("RESTORE ", copy[1])
+    flags = f'{_FLAG} canGetAndSetFMUState="true" canSerializeFMUState="true"'
+    file = misstated_fmu(tmp_path, 3, [("static double *at(", source), (_FLAG, flags)])
+    plant = Fmu(file, interface="co_simulation", name="plant")
+    diagram = Diagram("pushed", plant(u=Constant(value=10.0, name="push")))
+    end = 0.1 - (expm(np.array([[0.0, 1.0], [-100.0, -1.0]])) @ [0.1, 0.0])[0]
+    with diagram.simulation(step=0.01) as simulation:
+        simulation.advance(0.5)
+        half = simulation.save()
+        simulation.advance(0.5)
+        if restores:
+            simulation.restore(half)
+            simulation.advance(0.5)
+            assert simulation.run()["plant.x"][-1] == pytest.approx(end, abs=1e-8)
+        else:
+            with pytest.raises(FmuRuntimeError, match="does not restore its state") as error:
+                simulation.restore(half)
+            assert (error.value.block, error.value.t) == ("plant", 0.5)
+    if restores:
+        run = diagram.simulate(0.5, start=half, step=0.01, progress=False)
+        assert run["plant.x"][-1] == pytest.approx(end, abs=1e-8)
+    else:
+        with pytest.raises(FmuRuntimeError, match="does not restore its state"):
+            diagram.simulate(0.5, start=half, step=0.01, progress=False)
