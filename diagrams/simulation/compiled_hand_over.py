@@ -37,11 +37,6 @@ from .continuous import Continuous
 from .solver_setup import has_guards, next_instant, remembers
 from .workspace import Workspace
 
-OBSTACLES = (
-    "ports that are no Float64 in this process, texts, or options of its steps, or it runs in a process of its own on "
-    "a platform where C can't ask it"
-)
-"""Reasons for which C can't step a plant."""
 _MOST_EDGES = 100_000  # discontinuities of sources in a call
 _METHODS = {"euler": "Euler", "heun": "Heun", "rk4": "Runge-Kutta 4", "RK23": "Bogacki-Shampine 3(2)",
             "RK45": "Dormand-Prince 5(4)", "DOP853": "Dormand-Prince 8(5,3)", "Radau": "Radau IIA 5"}  # fmt: skip

@@ -26,7 +26,7 @@ from ..compiled import (
 from ..coupling import Plant
 from ..flat import EVERY, EXACT_LOOP, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of, ticks_after
 from ..results import Recorder
-from .compiled_hand_over import OBSTACLES, bind_loop, end_steps, plants_for_c, prepare, step_plants
+from .compiled_hand_over import bind_loop, end_steps, plants_for_c, prepare, step_plants
 from .diagnosis import forget_trials
 from .workspace import Workspace
 
@@ -358,7 +358,7 @@ def find_obstacle_at_ticks(
         return f"it has {len(flat.distinct)} different clocks, and at most {CLOCKS} are compiled"
     if not regular:
         return "an FMU takes longer steps than from one tick to the next, or a coupling is asked for that iterates"
-    for path in plants:
+    for path, plant in plants.items():
         if path not in native:
-            return f"the FMU {path!r} has {OBSTACLES}"
+            return f"the FMU {path!r} has {plant.obstacle}" if isinstance(plant, FmuInstance) else f"{path!r} is no FMU"
     return None

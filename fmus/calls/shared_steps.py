@@ -85,6 +85,11 @@ class SharedSteps:
         return step
 
     @property
+    def has_request(self) -> bool:
+        """Whether C can ask for the step."""
+        return self._step.request is not None
+
+    @property
     def remote(self) -> RemoteStep | None:
         """The step as addresses, for a loop in C; None where C can't ask for it."""
         request, instance = self._step.request, self.instance

@@ -14,6 +14,7 @@ from .fmi_calls import DISCARD, ERROR, FATAL, PENDING, WARNING, StepCall
 from .loaded_library import LoadedFmu
 from .native_step import RemoteStep
 from .shared_steps import SharedSteps
+from .step_options import needs_care
 from .stepped_instance import SteppedInstance
 from .transfer import OutOfRangeError, Transfer, UnfitError
 
@@ -249,6 +250,19 @@ class StepFailures(LoadedFmu):
     def remote(self) -> RemoteStep | None:
         """Its step in another process as C asks for it; None in this one, and where a step is more than its calls."""
         return None if self._shared is None else self._shared.remote
+
+    @property
+    def obstacle(self) -> str:
+        """What keeps C from taking its steps, as "has …"; for one that is neither native nor remote."""
+        if needs_care(self.description, self.block.stepping):
+            return "steps with options (event mode, early return, input derivatives, rollback, times of its own)"
+        if self.block.text_variables:
+            return "texts among its ports, which are read after each step; leave them out by ports="
+        if self.fmi.in_process:
+            return "ports with limits, or that are no Float64, in this process; isolate=True compiles them"
+        if self._shared is not None and self._shared.has_request:
+            return "an input of an enumeration whose numbers have gaps"
+        return "a process of its own, which C can't ask for steps on this platform"
 
     def finish_remote(self, t: float, h: float) -> None:
         """End a step from t over h, both in s, that C has begun in another process, and get the outputs."""

@@ -182,9 +182,9 @@ LAST = {
 }  # fmt: skip
 
 
-def typed(folder, fmi, **values):
+def typed(folder, fmi, isolate=None, **values):
     """An FMU with ports of many types, each with a value of its own from 20 ms on; the outputs repeat the inputs."""
-    whole = Fmu(typed_fmu(folder, fmi), name="plant")
+    whole = Fmu(typed_fmu(folder, fmi), name="plant", isolate=isolate)
     names = [name for name in whole.inputs if name[2:] in LAST]
     plant = whole.replace(ports=[*names, *("y" + name[1:] for name in names)])
     given = {name: values.get(name, LAST[name[2:]]) for name in names}
@@ -311,11 +311,19 @@ def test_ctrl_c_ends_a_run_soon(folder, interruptible, fault):
     assert len(caught.value.run.t) > 0
 
 
-def test_other_couplings_are_interpreted_and_say_so(folder):
-    plant = zoo(zoo_fmu(folder, 3), "b", stepping=StepOptions(rollback=True))(u=1.0)
-    run = Diagram("d", plant).simulate(0.1, compile=True, step=0.01, **QUIET)
-    assert run.tier == "interpreted"
-    assert any("'b' has" in message for message in run.messages)
+def test_what_c_can_not_step_is_interpreted_and_the_reason_is_said(folder):
+    plants = {
+        "steps with options": zoo(zoo_fmu(folder, 3), stepping=StepOptions(rollback=True))(u=1.0),
+        "ports with limits, or that are no Float64, in this process": typed(folder, 3, isolate=False)[0],
+        "an input of an enumeration whose numbers have gaps": Fmu(typed_fmu(folder, 2), name="plant"),
+    }
+    for reason, plant in plants.items():
+        if isinstance(plant, Fmu):
+            plant = plant(**{name: np.ones(port.shape) if port.shape else 1.0 for name, port in plant.inputs.items()})
+        made = plant if isinstance(plant, Diagram) else Diagram("d", plant)
+        run = made.simulate(0.05, compile=True, step=0.01, **QUIET)
+        assert run.tier == "interpreted"
+        assert any(f"the FMU 'plant' has {reason}" in message for message in run.messages), run.messages
 
 
 def beside(folder, fault=""):
