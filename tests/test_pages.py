@@ -112,6 +112,7 @@ def test_the_page_on_frequencies_runs_and_its_numbers_are_those_it_gives(tmp_pat
     [
         "coupling",
         pytest.param("other_tools", marks=pytest.mark.slow),
+        pytest.param("reports", marks=pytest.mark.slow),
         pytest.param("worst_case", marks=pytest.mark.slow),
         pytest.param("sweeps", marks=pytest.mark.slow),
     ],
