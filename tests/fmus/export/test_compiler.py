@@ -1,5 +1,6 @@
 """Compilers that don't end, and a cache that can't be written."""
 
+import io
 import os
 import signal
 import subprocess
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from loopwright.blocks import CompilerError, FmuError
-from loopwright.fmus import gantry
+from loopwright.fmus import build_notes, gantry
 from loopwright.fmus.export import compiler as _compiler
 from loopwright.fmus.export.compiler import Compiler, compile_shared
 
@@ -106,3 +107,20 @@ def test_a_cache_that_can_not_be_written_is_named(where, tmp_path, monkeypatch):
     assert not isinstance(caught.value, CompilerError)
     assert str(caught.value).startswith(f"can't write the cache folder {where!r}: ")
     assert str(caught.value).endswith("Set LOOPWRIGHT_CACHE to a folder that can be written.")
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_terminal_is_told_of_a_build_that_takes_longer_and_is_clean_again(monkeypatch):
+    for out, late, shown in ((Terminal(), 0.01, True), (Terminal(), 100.0, False), (io.StringIO(), 0.0, False)):
+        monkeypatch.setattr("sys.stderr", out)
+        monkeypatch.setattr(build_notes, "LATE", late)
+        with build_notes.tell_build("compiling C code"):
+            while shown and not out.getvalue():
+                time.sleep(0.005)
+            told = out.getvalue()
+        assert told == ("compiling C code …" if shown else "")
+        assert out.getvalue() == (f"{told}\r{' ' * len(told)}\r" if shown else "")
