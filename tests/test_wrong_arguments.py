@@ -148,6 +148,46 @@ def test_an_error_tells_who_found_what_and_expected_what(ask, message):
         ask(drive())
 
 
+@pytest.mark.parametrize(
+    ("name", "argument", "misspelt", "right"),
+    [
+        ("Diagram.simulate", "solver", "RK54", "RK45"),
+        ("Diagram.simulate", "coupling", "jacoby", "jacobi"),
+        ("Diagram.simulate", "start_exchange", "agre", "agree"),
+        ("Diagram.simulate", "compile", "atuo", "auto"),
+        ("Diagram.simulate", "record", ["yy"], "'y'"),
+        ("Diagram.replace", "changes", {"kp.gian": 1.0}, "gain"),
+        ("Diagram.sampled", "method", "exakt", "exact"),
+        ("Diagram.linearize", "inputs", ["uu"], "'u'"),
+        ("Diagram.linearize", "plants", "equation", "equations"),
+        ("Diagram.linearize", "stairs", "gian", "gain"),
+        ("Diagram.trim", "free", ["kp.gian"], "gain"),
+        ("Diagram.trim", "targets", {"yy": 0.0}, "'y'"),
+        ("Diagram.sweep", "samples", "latim", "latin"),
+        ("Diagram.sweep", "signals", ["yy"], "'y'"),
+        ("Diagram.sensitivity", "parameters", ["kp.gian"], "gain"),
+        ("Diagram.worst_case", "quantity", "disc_margin", "disk_margin"),
+        ("Diagram.draw", "subsystem", "contrl", "control"),
+        ("Linearization.loop", "wire", "uu", "'u'"),
+        ("Sensitivities.of", "quantity", "mss", "ms"),
+        ("WorstCase.plot", "parameters", ["kp.gian"], "control.kp.gain"),
+        ("sampled_gains", "integral", "forwrd", "forward"),
+        ("loop_at", "where", "inpt", "input"),
+        ("stability_limit", "over", "stifness", "stiffness"),
+        ("Box", "scale", "lgo", "log"),
+        ("Coupling", "scheme", "gauss", "gauss_seidel"),
+        ("Requirements", "step", {"overshot": 0.1}, "overshoot"),
+        ("check_block", "kinds", ["sampeld"], "sampled"),
+        ("hold", "method", "exct", "exact"),
+        ("fmus.model_spec", "integrator", "rk5", "rk4"),
+    ],
+)
+def test_a_misspelt_text_is_told_with_the_right_one(name, argument, misspelt, right):
+    function, good = calls()[name]()
+    with pytest.raises(LoopwrightError, match=right):
+        call(function, {**good, argument: misspelt})
+
+
 def test_a_drawing_of_a_subsystem_counts_the_blocks_in_it(monkeypatch):
     """Beyond some number of blocks subsystems are drawn closed: of those that are drawn."""
     from loopwright.diagrams.drawing import svg

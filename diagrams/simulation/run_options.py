@@ -75,8 +75,6 @@ class RunKeywords(KeptKeywords, total=False):
 
 _KINDS = {
     "compile": kinds.either(kinds.flag, kinds.text),
-    "coupling": kinds.either(kinds.text, kinds.one_of_class(Coupling, "a Coupling(…)")),
-    "start_exchange": kinds.text,
     "states": kinds.flag,
     "overwrite": kinds.flag,
 }
@@ -223,7 +221,11 @@ class RunOptions:
         names = ("step", "solver", "rtol", "atol", "max_step", "start")
         found = {name: value for name in names if (value := getattr(self, name)) is not None}
         chosen = {"coupling": (self.coupling, "jacobi"), "start_exchange": (self.start_exchange, START_EXCHANGES[0])}
-        return found | {name: value for name, (value, default) in chosen.items() if value != default}
+        return found | {
+            name: value
+            for name, (value, default) in chosen.items()
+            if not (isinstance(value, str) and value == default)
+        }
 
 
 def ticks_in(duration: Any, base: Fraction, name: str) -> tuple[int, Fraction]:
