@@ -18,6 +18,7 @@ R = TypeVar("R")
 Kind = Callable[[Any], str]
 """Returns in words which values are expected; "" for a value of the kind."""
 _LONGEST = 80
+_BY_PLACE = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 
 
 def accepts(called: str = "", /, **kinds: Kind) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -38,11 +39,19 @@ def accepts(called: str = "", /, **kinds: Kind) -> Callable[[Callable[P, R]], Ca
 
     def wrap(function: Callable[P, R]) -> Callable[P, R]:
         signature, who = inspect.signature(function), called or function.__name__
+        parameters = {**signature.parameters}
+        names = [name for name, p in parameters.items() if p.kind in _BY_PLACE]
+        is_plain = not any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters.values())
 
         @wraps(function)
         def checked(*args: P.args, **kwargs: P.kwargs) -> R:
-            for name, value in signature.bind(*args, **kwargs).arguments.items():
-                kind, parameter = kinds.get(name), signature.parameters[name]
+            given: Mapping[str, Any]
+            if is_plain and len(args) <= len(names) and kwargs.keys() <= parameters.keys():
+                given = {**dict(zip(names, args, strict=False)), **kwargs}  # without the many calls of `bind`
+            else:
+                given = signature.bind(*args, **kwargs).arguments
+            for name, value in given.items():
+                kind, parameter = kinds.get(name), parameters[name]
                 if kind is None or value is parameter.default:
                     continue
                 if parameter.kind is parameter.VAR_KEYWORD:
