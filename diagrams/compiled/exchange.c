@@ -59,6 +59,7 @@ typedef struct outside {
     double at;
     double *log;                /* an event of inputs that has changed states: time, FMU, all states before and after it */
     int64_t logged, capacity;
+    int64_t warned;             /* whether a call has given its first warning */
 } outside;
 
 /* A stage of a schedule: a traced function, or an FMU with where its values stand. */
@@ -161,7 +162,7 @@ static unsigned go_through(exchanged *e, const sequence *s, double t) {
             const unsigned status = call_fmu(a);
             if (status == OK) continue;
             if (status == WARNING) {
-                if (isnan(a->warned_at)) a->warned_at = t;
+                if (isnan(a->warned_at)) a->warned_at = t, e->of->warned = 1;
                 continue;
             }
             e->of->plant = e->place, e->of->action = a, e->of->status = (int64_t)(int32_t)status, e->of->at = t;

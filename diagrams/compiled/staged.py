@@ -50,7 +50,7 @@ class _Exchanged(ctypes.Structure):
 class _Outside(ctypes.Structure):
     _fields_ = [
         ("count", _INT), ("each", _AT), ("jump", TickStructure), *_fields(_INT, "look lost failed plant"),
-        ("action", _AT), ("status", _INT), ("at", _REAL), ("log", _AT), *_fields(_INT, "logged capacity"),
+        ("action", _AT), ("status", _INT), ("at", _REAL), ("log", _AT), *_fields(_INT, "logged capacity warned"),
     ]  # fmt: skip
 
 
@@ -282,7 +282,10 @@ class NativeExchange:
 
     def take_warnings(self) -> list[tuple[str, str, float]]:
         """Return calls that have given a warning since the last time: block, name and time in s of the first one."""
-        found = []
+        found = list[tuple[str, str, float]]()
+        if not self.structure.warned:
+            return found
+        self.structure.warned = 0
         for path, structures, actions in self._actions:
             for structure, action in zip(structures, actions, strict=True):
                 if not np.isnan(structure.warned_at):
