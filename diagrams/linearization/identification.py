@@ -14,13 +14,15 @@ A feedthrough of the FMU acts on its outputs at the end of the step; it becomes 
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import FmuError, Layout
+from ...blocks.core import FmuError, Layout, identity
 from ...fmus.calls import LoadedFmu
 from ...fmus.isolation import open_fmu
 from ...fmus.running import Derivation, DerivativeMethod, RestoredPoint
@@ -71,6 +73,12 @@ class IdentifiedStep:
     uncertainty: float
 
 
+MOST = 128
+"""Models that are kept at a time."""
+_KNOWN: OrderedDict[Any, IdentifiedStep] = OrderedDict()
+_LOCK = Lock()
+
+
 def identify_step(
     block: Fmu, point: Mapping[str, Any], h: float, outputs: np.ndarray | None = None, samples: int = SAMPLES
 ) -> IdentifiedStep:
@@ -94,7 +102,30 @@ def identify_step(
     ------
     FmuError
         If the FMU does not come to rest with these inputs, or rests at other outputs, or its responses are noise.
+
+    Notes
+    -----
+    Each point of an FMU is identified once, however many loops are looked at; errors are not kept.
     """
+    _ = block.description  # an FMU whose file has changed is refused
+    now = tuple(identity(point[name]) for name in ("t", "inputs", "state"))
+    key = identity(block), now, h, None if outputs is None else np.asarray(outputs, dtype=float).tobytes(), samples
+    with _LOCK:
+        found = _KNOWN.get(key)
+    if found is None:
+        found = _identify(block, point, h, outputs, samples)
+        for part in (found.A, found.B, found.C, found.y0, found.singular_values):
+            part.setflags(write=False)
+        with _LOCK:
+            _KNOWN[key] = found
+            while len(_KNOWN) > MOST:
+                _KNOWN.popitem(last=False)
+    return found
+
+
+def _identify(
+    block: Fmu, point: Mapping[str, Any], h: float, outputs: np.ndarray | None, samples: int
+) -> IdentifiedStep:
     runner = _Runner(block, point, h)
     try:
         y0 = runner.settle()

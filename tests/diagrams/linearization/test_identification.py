@@ -47,6 +47,10 @@ def test_a_mass_on_a_spring_is_found_with_its_poles_and_feedthrough(tmp_path, sa
     poles = np.sort_complex(np.linalg.eigvals(m.A))
     np.testing.assert_allclose(poles, np.sort_complex([0.0, *np.linalg.eigvals(A)]), atol=1e-7)
     assert m.uncertainty <= 1e-9
+    again = identify_step(block, {"t": 0.0, "state": {}, "inputs": {"force": np.array(0.0)}}, H)
+    assert again is m  # a point is identified once
+    with pytest.raises(ValueError, match="read-only"):
+        m.A[0, 0] = 0.0
 
 
 @pytest.mark.slow
