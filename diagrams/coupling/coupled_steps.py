@@ -15,7 +15,7 @@ from .options import Coupling, Scheme
 from .plant_steps import PlantSteps, step_all
 from .plants import Plant
 from .rest import Rest, Sample, never
-from .rollback import Beginning, Rollback, accept_steps, save_plant, texts_of, try_steps
+from .rollback import Beginning, Rollback, accept_steps, find_taken_back, save_plant, texts_of, try_steps
 from .search import Search
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 4.0
@@ -93,6 +93,7 @@ class CoupledSteps:
         counts = coupling.scheme == Scheme.ITERATED or links.felt | ~passed.any(axis=1)
         self._counted = np.broadcast_to(counts, self._w.shape)[self._all_outputs]
         self._rollback = Rollback(links, w)
+        self._untried = {path for path in flat.plant_ticks if takes_any_step(flat.table.blocks[path])}
         self.proposed: float | None = None
         """Length in s of the next communication step, with adaptive steps."""
 
@@ -167,6 +168,8 @@ class CoupledSteps:
         self._rest.sample = sample
         if self.coupling.error is not None or self.coupling.scheme == Scheme.ITERATED:
             try_steps(self._plants.values())
+            if self._untried:
+                self._try_two_halves(t, h)
         if self.coupling.error is not None:
             return self._go_adaptively(t, end)
         ended = self._step(t, end, h)
@@ -331,6 +334,17 @@ class CoupledSteps:
         )
 
     # --- going back ---------------------------------------------------------------------------------------------------
+
+    def _try_two_halves(self, t: float, h: float) -> None:
+        """Refuse plants that take back a step when the next one begins; those that don't move are tried again later."""
+        start, made, plants = self._save(), [], [self._plants[path] for path in sorted(self._untried)]
+        for begin, length in ((t, 0.5 * h), (t + 0.5 * h, 0.5 * h), (t, h)):
+            if length == h:
+                self._restore(start)
+            step_all(plants, begin, length)
+            made.append(self._w.copy())
+        self._restore(start)
+        self._untried -= find_taken_back(self.links, sorted(self._untried), made, t)
 
     def _save(self) -> Beginning:
         plants = {path: save_plant(plant) for path, plant in self._plants.items()}

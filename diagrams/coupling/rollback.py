@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -76,6 +76,54 @@ class Rollback:
                 t=t,
             )
         self._open[mine] = open_ & ~(np.abs(stepped - expected) > allowed)
+
+
+TAKEN_BACK = 1e-3
+"""Part of a step's change by which two halves differ from one half, where an FMU takes the first one back."""
+
+
+def find_taken_back(links: Links, paths: Iterable[str], made: Sequence[np.ndarray], t: float) -> set[str]:
+    """Return the plants that have moved in a whole step; refuse those that take back the first of two halves.
+
+    A step behind a state that may be restored is not said to be final (noSetFMUStatePriorToCurrentPoint = false). There
+    are FMUs that go back to its beginning when the next one begins, although nothing has restored their state.
+
+    Parameters
+    ----------
+    links : Links
+        Names and sizes of the outputs.
+    paths : iterable of str
+        Plants that were tried, from one state and with the same inputs.
+    made : sequence of ndarray
+        Outputs of all plants after half a step, after two halves, and after a whole step.
+    t : float
+        Time in s at which these begin.
+
+    Raises
+    ------
+    FmuRuntimeError
+        If such an FMU takes its first half step back.
+    """
+    moved, (half, halves, whole) = set(), made
+    for path in paths:
+        mine = links.outputs[path]
+        change = np.abs(whole[mine] - half[mine])
+        moving = change > 1e3 * ROUNDING * (links.nominals[mine] + np.abs(half[mine]))
+        if not moving.any():
+            continue
+        moved.add(path)
+        if np.all(np.abs(halves[mine] - half[mine])[moving] <= TAKEN_BACK * change[moving]):
+            worst = int(np.argmax(change))
+            raise FmuRuntimeError(
+                "the FMU takes a step back when the next one begins, although its state was not restored: after two "
+                f"half steps found the output {halves[mine][worst]:.9g}, as after one; expected about "
+                f"{whole[mine][worst]:.9g}, as after a whole step. It takes noSetFMUStatePriorToCurrentPoint = false "
+                "for a rejection. Take coupling='gauss_seidel' or 'jacobi' without error=, which never go back.",
+                block=path,
+                port=links.name_of_output(mine.start + worst)[1],
+                t=t,
+            )
+    return moved
 
 
 @dataclass

@@ -66,3 +66,36 @@ def test_an_output_that_moves_late_is_compared_then(cache, make):
     diagram = make("").replace(constant=Step(times=0.05, values=1.0))
     with pytest.raises(FmuRuntimeError, match=r"^a\.\w+, t = 0\.05 s: the FMU does not restore its state"):
         diagram.simulate(0.1, step=0.01, progress=False, coupling=ADAPTIVE)
+
+
+# A step that is not final is kept as if it were to be rejected, and taken back when the next one begins.
+TAKING_BACK = (
+    SOURCE.replace("double t, u, y; }", "double t, u, y, before; int open; }")
+    .replace("instance *c = p; c->y =", "instance *c = p; if (c->open) c->y = c->before;\n    c->before = c->y; c->open = !no; c->y =")
+    .replace("RESTORE", "*c = *o; c->open = 0;")
+)  # fmt: skip
+
+
+def in_a_loop(file):
+    """a' = 1 − b − a, b' = a − b, as of `make`."""
+    a, b = Fmu(file, name="a"), Fmu(file, name="b")
+    return Diagram("loop", a(u=Gain(gain=-1.0)(b.y) + Constant(value=1.0)), b(u=a.y))
+
+
+@pytest.mark.parametrize("coupling", ["iterated", ADAPTIVE], ids=str)
+def test_an_fmu_that_takes_steps_back_by_itself_is_refused_where_steps_may_be_repeated(cache, tmp_path, coupling):
+    diagram = in_a_loop(small_fmu(tmp_path, "fmi2", TAKING_BACK, MODEL))
+    run = diagram.simulate(2.0, step=0.01, progress=False)
+    A = np.array([[-1.0, -1.0, 1.0], [1.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
+    assert [run["a.y"][-1], run["b.y"][-1]] == pytest.approx(expm(2.0 * A)[:2, 2], abs=5e-3)
+    with pytest.raises(FmuRuntimeError, match=r"^a\.y, t = 0 s: the FMU takes a step back when the next one begins"):
+        diagram.simulate(2.0, step=0.01, progress=False, coupling=coupling)
+
+
+def test_an_fmu_that_arrives_in_one_step_takes_nothing_back(cache, tmp_path):
+    """Its output is half its input after a step of any length: a = (1 − b)/2, b = a/2."""
+    source = SOURCE.replace("c->y = c->u + (c->y - c->u) * exp(-h)", "c->y = 0.5 * c->u").replace("RESTORE", "*c = *o;")
+    run = in_a_loop(small_fmu(tmp_path, "fmi2", source, MODEL)).simulate(
+        0.5, step=0.01, progress=False, coupling="iterated"
+    )
+    assert [run["a.y"][-1], run["b.y"][-1]] == pytest.approx([0.4, 0.2], abs=1e-3)
