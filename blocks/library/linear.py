@@ -42,8 +42,8 @@ class _StateSpace(Block):
     input_names: Names = parameter(default=None, description="names of the inputs, for python-control")
     output_names: Names = parameter(default=None, description="names of the outputs, for python-control")
     state_names: Names = parameter(default=None, description="names of the states, for python-control")
-    u = Input(shape=None, description="input: m numbers, or a scalar where B is one column")
-    y = Output(shape=None, description="output: p numbers, or a scalar where C is one row")
+    u = Input(shape=None, description="input: m numbers, or a scalar where B is n numbers")
+    y = Output(shape=None, description="output: p numbers, or a scalar where C is n numbers")
     x = State(start=lambda block: np.broadcast_to(block.initial_state, (len(block.A),)), description="state")
 
     def check(self) -> None:

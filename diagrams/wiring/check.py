@@ -152,6 +152,18 @@ def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[Port, Shape
     return traced, shapes
 
 
+def _next_step(found: Shape, expected: Shape | None) -> str:
+    """Return the next step where a signal has another shape: a scalar has no entry to index."""
+    if found:
+        return "Index the signal, or wire another one."
+    if expected and set(expected) == {1}:
+        return (
+            "A vector of one entry is no scalar: give the block parameters for a scalar (a matrix of one column or row "
+            "as a plain list of its numbers), or wire a vector."
+        )
+    return "Wire a signal of that shape."
+
+
 def _check_shapes(
     table: Structure, traced: dict[str, Traced], shapes: dict[Port, Shape], assumed: dict[Port, Shape]
 ) -> None:
@@ -170,7 +182,7 @@ def _check_shapes(
                 port=port,
             )
         raise ShapeError(
-            f"{wire} has shape {found}; expected {expected}. Index the signal, or wire another one.",
+            f"{wire} has shape {found}; expected {expected}. {_next_step(found, expected)}",
             block=path,
             port=port,
         )

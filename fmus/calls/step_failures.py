@@ -136,17 +136,8 @@ class StepFailures(LoadedFmu):
         action = f"the step from t = {t:.9g} s by {h:g} s"
         if status == PENDING:
             action = f"{action} was still pending after {self.fmi.patience:g} s: it"
-        stop = self.description.stop_time
-        if stop is not None and self.block.stepping.stop_time is None and t + h > stop * (1 + ROUNDED):
-            return self.report(
-                action,
-                status,
-                t,
-                f"Its default experiment ends at {stop:g} s, beyond which some FMUs take no step. Tell it a later end: "
-                "stepping=StepOptions(stop_time=…).",
-            )
         if status != DISCARD:
-            return self.report(action, status, t)
+            return self.report(action, status, t, self._beyond_the_end(t + h))
         steps = "" if self.block.variable_step else " from the start: this FMU takes steps of one length only"
         return self.report(
             f"{action} was discarded, as the FMU can't compute it: it",
@@ -154,6 +145,19 @@ class StepFailures(LoadedFmu):
             t,
             f"Take a smaller step{steps}, or check the FMU's inputs there.",
         )
+
+    def _beyond_the_end(self, end: float) -> str:
+        """Return the next step where a step ends in s beyond the end that the FMU knows; "" where it doesn't."""
+        told, default = self.block.stepping.stop_time, self.description.stop_time
+        stop = default if told is None else told
+        if stop is None or end <= stop * (1 + ROUNDED):
+            return ""
+        if told is None:
+            return (
+                f"Its default experiment ends at {stop:g} s, beyond which some FMUs take no step. Tell it a later end: "
+                "stepping=StepOptions(stop_time=…)."
+            )
+        return f"It was told the end {stop:g} s, by stepping=StepOptions(stop_time=…). Give a later one."
 
     def take_end(self, t: float, h: float, reached: float) -> None:
         """Note that the FMU asks to end the simulation, at a time in s within a step from t over h.

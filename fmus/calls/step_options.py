@@ -88,9 +88,9 @@ class StepOptions:
                 port="stepping.communication_step",
             )
         stop = self.stop_time
-        if stop is not None and (isinstance(stop, bool) or not isinstance(stop, float | int) or math.isnan(stop)):
+        if stop is not None and (isinstance(stop, bool) or not isinstance(stop, float | int) or not stop > 0.0):
             raise ParameterError(
-                f"found {stop!r}; expected seconds, or None. Give the end of the longest run, such as 100.0.",
+                f"found {stop!r}; expected seconds, positive, or None. Give the end of the longest run, such as 100.0.",
                 port="stepping.stop_time",
             )
         if isinstance(self.retries, bool) or not isinstance(self.retries, int) or not 0 <= self.retries <= 50:

@@ -556,7 +556,7 @@ def test_an_fmu_that_ends_with_its_experiment_is_told_a_later_end(cache, tmp_pat
     told = Diagram("d", plant())
     run = told.simulate(0.1, step=0.01, progress=False)
     assert run["plant.y"] == pytest.approx(run.t)
-    with pytest.raises(FmuRuntimeError, match=r"Look at the last samples"):
+    with pytest.raises(FmuRuntimeError, match=r"It was told the end 0\.1 s, by stepping=StepOptions\(stop_time"):
         told.simulate(0.2, step=0.01, progress=False)
 
 
@@ -590,7 +590,8 @@ def test_values_are_exchanged_at_the_start_as_chosen(folder, way, first):
     ("options", "text"),
     [
         ({"tolerance": 0.0}, r"stepping\.tolerance: found 0\.0; expected a positive number"),
-        ({"stop_time": "late"}, r"stepping\.stop_time: found 'late'; expected seconds, or None"),
+        ({"stop_time": "late"}, r"stepping\.stop_time: found 'late'; expected seconds, positive, or"),
+        ({"stop_time": -1.0}, r"stepping\.stop_time: found -1\.0; expected seconds, positive, or None"),
         ({"retries": 1000}, r"stepping\.retries: found 1000; expected an integer from 0 to 50"),
         ({"event_mode": "yes"}, r"stepping\.event_mode: found 'yes'; expected True or False"),
         ({"time": "exact"}, r"stepping\.time: found 'exact'; expected 'multiplied' or 'added'"),
