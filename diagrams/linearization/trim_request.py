@@ -262,10 +262,13 @@ def set_states(flat: FlatDiagram, at: OperatingPoint, states: Mapping[str, Any])
 # --- parameters ------------------------------------------------------------------------------------------------------
 
 
-def free_parameters(diagram: WiredDiagram, asked: Mapping[str, Any]) -> tuple[list[Free], WiredDiagram]:
+def free_parameters(
+    diagram: WiredDiagram, asked: Mapping[str, Any], *, by_start: bool = False
+) -> tuple[list[Free], WiredDiagram]:
     """Return the free parameters, and a diagram in whose equations all of them are symbols.
 
-    A trace takes an exact zero for structure, so a parameter that is zero starts beside it.
+    A trace takes an exact zero for structure, so a parameter that is zero starts beside it. ``by_start`` takes start
+    values of FMUs in model exchange, too, as those of FMUs that step: they are no symbols.
 
     Raises
     ------
@@ -283,7 +286,7 @@ def free_parameters(diagram: WiredDiagram, asked: Mapping[str, Any]) -> tuple[li
         low, high = _limit_bounds(block, keys, low, high)
         start = np.clip(np.ravel(np.asarray(value, dtype=float)), low, high)
         free = Free(f"{path}.{'.'.join(keys)}", path, keys, block, start, low, high, np.shape(value))
-        if not block.stepped:
+        if not block.stepped and not (by_start and block.evaluated_outside):
             start = np.where(start == 0.0, _move_off_zero(low, high), start)
             free.start = start
             moved[free.name] = free.shape_value(start)
@@ -291,7 +294,7 @@ def free_parameters(diagram: WiredDiagram, asked: Mapping[str, Any]) -> tuple[li
     diagram = diagram.replace(moved) if moved else diagram
     flat = diagram.flatten(None if diagram.has_clock else 1)
     for free in found:
-        if free.path in flat.checked.traced:
+        if free.path in flat.checked.traced and not (by_start and free.block.evaluated_outside):
             locate(free, diagram, flat)
     return found, diagram
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import UnknownNameError, accepts, brief, enumerate_some, kinds, near
+from ...blocks.core import LoopwrightError, UnknownNameError, accepts, brief, enumerate_some, kinds, near
 from ..flat import WiredDiagram
 from ..frequency import MarginSlope, Number, margin_slopes
 from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize
@@ -146,6 +147,9 @@ class Sensitivities(Sequence[Sensitivity]):
         name, quantity = key
         names = tuple(dict.fromkeys(row.parameter for row in self.rows))
         full = [n for n in names if n == name or n.endswith(f".{name}")]
+        if len(full) != 1 and self.model is not None:  # other short names, as those of FMUs' start values
+            with suppress(LoopwrightError):
+                full = [n for n in names if n == find_parameter(self.model.diagram, name)]
         if len(full) != 1:
             raise UnknownNameError(f"found no sensitivity to {name!r}. {near(str(name), names)}")
         for row in self.rows:

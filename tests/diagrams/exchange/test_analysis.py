@@ -184,3 +184,18 @@ def test_a_loop_has_its_slopes_by_the_parameters_of_its_controller(file):
     assert abs(steps) == pytest.approx(0.02, rel=1e-9)
     found = model.diagram.sensitivity("u")
     assert {"controller.pi.kp", "controller.pi.ki"}.isdisjoint(found.without_effect)
+
+
+def test_a_loop_has_its_slopes_by_parameters_of_the_fmu(file):
+    plant = Fmu(file, interface="model_exchange", name="plant", start={"position": 0.0})
+    force = PID(kp=20.0, ki=30.0, name="pi")(0.0, plant.position).named("u")
+    model = Diagram("loop", plant(force=force)).linearize()
+    by_k, by_d = differentiate_loop(model, ["u"], ["plant.stiffness", "plant.damping"])
+    position, speed = (model.states.index(f"plant.{name}") for name in ("position", "velocity"))
+    for found, column in ((by_k, position), (by_d, speed)):  # a = -k s - d v, with m = 1
+        expected = np.zeros_like(found.slopes[0])
+        expected[speed, column] = -1.0
+        np.testing.assert_allclose(found.slopes[0], expected, atol=1e-7)
+    found = model.diagram.sensitivity("u", ["plant.stiffness"])
+    short, full = (found[name, "ms"] for name in ("plant.stiffness", "plant.start.stiffness"))
+    assert short is full
