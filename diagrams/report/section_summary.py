@@ -11,6 +11,7 @@ from ..frequency import Number
 from ..linearization import Linearization, find_signal
 from ..report_writing import Judged, Section, Table, Texts
 from ..requirements import Limit, RequirementResult, Review, Verdict
+from ..studies import CaseState
 from .case import Case
 from .review import weakest
 from .section_contact import KEY as CONTACT
@@ -71,7 +72,7 @@ def summary(
     text += [_worst_case(worst_case)] if worst_case is not None else []
     loops = _loops(case, numbers)
     tables += [*([loops] if loops is not None else []), *more]
-    missing = list(dict.fromkeys(_not_analysed(case, numbers)))
+    missing = list(dict.fromkeys([*_not_analysed(case, numbers), *_not_confirmed(worst_case)]))
     if missing:
         text += [TEXTS.line("not_analysed"), *(f"- {line}" for line in missing)]
     return Section("summary", TITLE, tuple(text), tuple(tables))
@@ -174,6 +175,15 @@ def _worst_case(reported: ReportedWorstCase | MissingWorstCase) -> str:
         growth=worst.growth,
         reason=worst.reason.rstrip("."),
     )
+
+
+def _not_confirmed(reported: ReportedWorstCase | MissingWorstCase | None) -> Iterator[str]:
+    """Yield a line on a worst case that no run confirms."""
+    if isinstance(reported, ReportedWorstCase) and reported.found.worst.state is not CaseState.FAILED:
+        run = reported.run
+        if run is None or not run.agrees:
+            trial = "" if run is None else run.trial
+            yield TEXTS.line("worst_case_not_confirmed", trial=trial, problem=reported.problem)
 
 
 def _frequencies(path: str, numbers: Mapping[str, Number]) -> Iterator[Number]:

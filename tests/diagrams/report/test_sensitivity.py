@@ -1,7 +1,7 @@
 """The section on sensitivity to parameters, of a loop with a closed form."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from loopwright.blocks import OptionError
 from loopwright.diagrams import Requirements, Verdict, analyse
 from loopwright.diagrams.report_writing.definitions import definition
 from loopwright.diagrams.requirements import Reason
-from loopwright.diagrams.studies import CaseState
+from loopwright.diagrams.studies import CaseState, ConfirmationKind, RunConfirmation
 from support.tuned_loops import make_pi_loop, pi_phase_margin
 
 NOTHING = Requirements(stable=False, phase_margin_deg=1.0)
@@ -76,6 +76,25 @@ def test_a_stable_and_a_failed_worst_case_stand_on_the_first_page():
     assert (result.verdict, result.reason, result.detail) == (
         Verdict.UNDECIDED, Reason.NOT_ANALYSED, "No point of rest.",
     )  # fmt: skip
+
+
+def test_a_worst_case_that_no_run_confirms_is_told_on_the_first_page(monkeypatch):
+    diagram, found = worst_phase_margin()
+    page = partial(analyse, diagram, only=("subject",), worst_case=found, requirements=NOTHING)
+    refuted = RunConfirmation(ConfirmationKind.INJECTION, "u", 3.0, found.worst.value, 47.65, agrees=False)
+    monkeypatch.setattr(type(found), "confirm", lambda _: refuted)
+    text = "\n".join(map(str, page().sections[0].text))
+    assert "Not analysed, or known less well" in text
+    assert f"The worst case over the parameters: the run does not confirm it ({refuted.trial})." in text
+    monkeypatch.setattr(type(found), "confirm", lambda _: replace(refuted, agrees=True))
+    assert "confirm" not in "\n".join(map(str, page().sections[0].text))
+
+    def refuse(_):
+        raise OptionError("found a loop cut at 2 wires. Simulate found.diagram.")
+
+    monkeypatch.setattr(type(found), "confirm", refuse)
+    text = "\n".join(map(str, page().sections[0].text))
+    assert "The worst case over the parameters: no run confirms it: found a loop cut at 2 wires." in text
 
 
 def test_a_worst_case_of_another_diagram_is_refused():
