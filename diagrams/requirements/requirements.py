@@ -23,7 +23,8 @@ class StepLimits:
     input : str
         Wire to whose consumers the step is added; each loop's own wire without it.
     output : str
-        Wire that responds; without it the loop's own answer at the wire, as the complementary sensitivity T.
+        Wire that responds to a step at ``input``; without it the loop's own answer at the wire, as the complementary
+        sensitivity T.
     size : float, optional
         Height of the step in the wire's unit; small without it, 1e-2 of 1 + the signal's size.
     length : float, optional
@@ -108,6 +109,14 @@ class LoopLimits:
         found = {name: make_limit(name, given, SENSES[name]) for name, given in limits.items() if given is not None}
         self.limits: Mapping[str, Limit] = MappingProxyType(found)
         self.step = None if step is None else StepLimits.of(step)
+        if self.step is not None and (self.step.input or self.step.output):
+            named = "an input" if self.step.input else f"the output {self.step.output!r} without an input"
+            raise OptionError(
+                f"found {named}; expected neither here: a loop's own step is added at its wire, and its answer "
+                "is read there. Write a step from one wire to another at the top, with both: "
+                "step={'input': 'wish', 'output': 'y', …}, in a file [[step]].",
+                port="step.input" if self.step.input else "step.output",
+            )
         self.variants: Mapping[str, LoopLimits] = MappingProxyType(_variants(variants))
 
     def __repr__(self) -> str:

@@ -124,6 +124,12 @@ def test_the_step_of_a_loop_replaces_the_general_one_and_steps_between_wires_sta
         ({"step": {}}, "step: found no limit; expected some of overshoot, settling, rise, peak"),
         ({"step": {"overshot": 0.1}}, "a step response has no 'overshot'. Did you mean 'overshoot'"),
         ({"step": {"overshoot": 0.1, "size": 0}}, "step.size: found 0; expected a number that is not 0"),
+        (
+            {"step": {"overshoot": 0.1, "output": "z"}},
+            "step.output: found the output 'z' without an input; expected neither",
+        ),
+        ({"loops": {"u": {"step": {"rise": 0.1, "input": "z"}}}}, "loops.u.step.input: found an input; expected neither"),
+        ({"variants": {"sampled_d1": {"step": {"rise": 0.1, "output": "z"}}}}, "variants.sampled_d1.step.output: found"),
         ({"loops": {"u": 3}}, "loops.u: found 3; expected limits by name"),
         ({"loops": {"u": {"mss": 3}}}, "loops.u.mss: there is no requirement 'mss'. Did you mean 'ms'"),
         ({"numbers": {"poles.sampled_d0.slowest": -1.0}}, "found -1.0; expected two numbers, low and high"),
