@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
-from ...blocks.core import LoopwrightError, OptionError
+from ...blocks.core import LoopwrightError, OptionError, near
 from ..flat import WiredDiagram
 from ..linearization import find_signal
 from ..requirements import Limit, Requirements, TomlFile
@@ -22,6 +22,8 @@ TABLE = "worst_case"
 """Name of the table."""
 KEYS = ("ranges", "loop", "quantity", "requirements", "contact", "samples", "count", "seed", "starts", "steps", "delay")
 """Entries of the table."""
+RANGE = ("low", "high", "scale")
+"""Entries of a range that is a table."""
 STEP = 1e-3
 """Communication step in s with which signals of a diagram without a clock are looked up."""
 
@@ -211,7 +213,7 @@ class _Placed:
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         if isinstance(error, LoopwrightError):
-            known = error.port if error.port in KEYS else ""
+            known = error.port if self.key == TABLE and error.port in KEYS else ""
             key = ".".join(part for part in (self.key, known) if part)
             raise self.file.error(error.message, key) from None
 
@@ -224,13 +226,31 @@ def _flatten(file: TomlFile, given: Any, path: str = "") -> Iterator[tuple[str, 
         here = f"{path}.{key}" if path else str(key)
         if not isinstance(value, Mapping):
             yield here, value
-        elif {"low", "high"} <= value.keys() <= {"low", "high", "scale"}:
+        elif _is_range(value):
             try:
-                yield here, Box(**value)
+                yield here, _read_range(value)
             except LoopwrightError as error:
                 raise file.error(error.message, f"{TABLE}.ranges.{here}") from None
         else:
             yield from _flatten(file, value, here)
+
+
+def _is_range(value: Mapping[str, Any]) -> bool:
+    """Return whether a table is a range, with or without a mistake, and no parameters by their dotted keys.
+
+    A parameter that is called as an entry of a range has a list or a table, and no number.
+    """
+    return any(key in RANGE and not isinstance(entry, Mapping | list) for key, entry in value.items())
+
+
+def _read_range(value: Mapping[str, Any]) -> Box:
+    for key in value:
+        if key not in RANGE:
+            raise OptionError(f"a range has no {key!r}. {near(key, RANGE)}")
+    for end in RANGE[:2]:
+        if end not in value:
+            raise OptionError(f"found a range without {end!r}; expected both ends. Write {{low = 1, high = 9}}.")
+    return Box(**value)
 
 
 def _requirements(file: TomlFile, asked: Any) -> Requirements:

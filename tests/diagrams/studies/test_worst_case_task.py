@@ -77,12 +77,26 @@ def test_ranges_are_pairs_or_tables_and_keys_may_be_dotted(tmp_path):
         ("starts = 0", "requirements = {mss = 1.6}", r"line 5: worst_case.requirements.mss: there is no requirement 'mss'"),
         ("starts = 0", "requirements = {ms = 1.6}", r"line 1: worst_case: found quantity='phase_margin_deg' and requirem"),
         ("[0.5, 1.0, 2.0]", "{low = 2.0, high = 1.0}", r"line 8: worst_case.ranges.p.gain: found a range from 2.0 to 1.0"),
+        ("[0.5, 1.0, 2.0]", "{low = 1, hihg = 5}", r"line 8: worst_case.ranges.p.gain: a range has no 'hihg'. .*'high'"),
+        ("[0.5, 1.0, 2.0]", "{low = 1}", r"line 8: worst_case.ranges.p.gain: found a range without 'high'; expected both"),
     ],
 )  # fmt: skip
 def test_errors_name_the_line_and_the_entry(old, new, message, tmp_path):
     file = write(tmp_path, TABLE.replace(old, new))
     with pytest.raises(OptionError, match=message):
         WorstCaseTask.read(file).find(make_pi_loop())
+
+
+def test_a_setting_of_a_subsystem_is_named_once(tmp_path):
+    lag = Integrator(name="lag")
+
+    @subsystem(sample_time=0.01)
+    def c(y):
+        return Gain(gain=-1.0, name="p")(y).named("u")
+
+    task = WorstCaseTask.read(write(tmp_path, TABLE.replace("p.gain", "c.delay")))
+    with pytest.raises(OptionError, match=r"line 8: worst_case.ranges.c.delay: found a delay of a subsystem"):
+        task.check(Diagram("loop", lag(c(lag.y))))
 
 
 def test_requirements_of_the_file_are_made_worst_and_judged(tmp_path):
