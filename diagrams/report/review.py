@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from ...blocks.core import LoopwrightError, UnknownNameError, near
+from ...blocks.core import LoopwrightError, UnknownNameError, close_names, near
 from ..frequency import Number
 from ..linearization import find_signal
 from ..requirements import (
@@ -56,18 +56,30 @@ def check_names(case: Case, asked: Requirements, measured: Collection[str] = ())
     known = {*wires, *wires.values(), *case.extra_loops(), *measured}
     for name in asked.loops:
         if name not in known:
-            raise UnknownNameError(f"found requirements on a loop {name!r}; expected a loop of the report. "
-                                   f"{near(name, known)}", block=case.diagram.name)  # fmt: skip
+            error = UnknownNameError(
+                f"found requirements on a loop {name!r}; expected a loop of the report. {near(name, known)}",
+                block=case.diagram.name,
+            )
+            raise asked.error_at(error, f"loops.{name}")
     variants = {**dict.fromkeys(case.variants), **({MEASURED: None} if measured else {})}
     for key in asked.further_variants:
         if key not in variants:
-            raise UnknownNameError(f"found requirements on a variant {key!r}; expected one of the report. "
-                                   f"{near(key, variants)}", block=case.diagram.name)  # fmt: skip
+            error = UnknownNameError(
+                f"found requirements on a variant {key!r}; expected one of the report. {near(key, variants)}",
+                block=case.diagram.name,
+            )
+            owners = (f"loops.{name}" for name, of in asked.loops.items() if key in of.variants)
+            owner = "" if key in asked.variants else next(owners) + "."
+            raise asked.error_at(error, f"{owner}variants")
     flat = case.diagram.flatten(None if case.diagram.has_clock else STEP)
     for limits in asked.steps:
-        for wire in (limits.input, limits.output):
-            if wire:
-                find_signal(flat, wire)
+        for end, wire in (("input", limits.input), ("output", limits.output)):
+            try:
+                if wire:
+                    find_signal(flat, wire)
+            except LoopwrightError as error:
+                several = len(asked.steps) > 1 or asked.step is not None
+                raise asked.error_at(error, f"step.{end}" if not several else f"step, {end}") from None
 
 
 def review(
@@ -304,7 +316,8 @@ def _plain(
         return replace(result, verdict=Verdict.FAILED, reason=Reason.UNSTABLE)
     if of is not None and of.state is CaseState.FAILED:
         return replace(result, reason=Reason.NOT_ANALYSED, detail=of.reason)
-    return result
+    close = close_names(path, numbers)
+    return replace(result, detail=near(path, numbers)) if close else result
 
 
 def weakest(numbers: Mapping[str, Number], variants: Iterable[str]) -> tuple[str, Number] | None:

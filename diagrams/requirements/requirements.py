@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
 
-from ...blocks.core import OptionError, brief, near
+from ...blocks.core import LoopwrightError, OptionError, UnknownNameError, brief, near
 from .contact_limits import ContactLimits, read_contacts
 from .limits import SENSES, STEP_SENSES, Limit, make_limit
 
@@ -212,6 +212,7 @@ class Requirements(LoopLimits):
                 "'poles.sampled_d0.slowest' = [-100, -2] below it; in Python numbers={…: (-100, -2)}.",
                 port="numbers",
             )
+        self.place: Callable[[LoopwrightError, str], LoopwrightError] | None = None
         self.numbers: Mapping[str, Limit] = MappingProxyType(
             {
                 str(path): make_limit(repr(str(path)), given, None, f"numbers.{path}")
@@ -222,6 +223,13 @@ class Requirements(LoopLimits):
     @staticmethod
     def _names() -> tuple[str, ...]:
         return (*SENSES, "step", "loops", "variants", "numbers", "contact", "stable")
+
+    def error_at(self, error: LoopwrightError, key: str) -> LoopwrightError:
+        """Return an error about an entry: with the file and the line where the requirements are those of a file."""
+        if self.place is None:
+            return error
+        placed = self.place(error, key)
+        return UnknownNameError(placed.message) if isinstance(error, UnknownNameError) else placed
 
     @property
     def further_variants(self) -> tuple[str, ...]:

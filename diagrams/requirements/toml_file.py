@@ -59,7 +59,7 @@ class TomlFile:
         """
         file = Path(path).expanduser()
         try:
-            text = file.read_text(encoding="utf-8")
+            text = file.read_text(encoding="utf-8-sig")  # some editors put a mark of the byte order first
             return cls(file, tomllib.loads(text), text)
         except OSError as error:
             raise OptionError(
@@ -153,6 +153,7 @@ def read_requirements(path: str | os.PathLike[str] | TomlFile) -> Requirements:
         found = Requirements(**given)
     except OptionError as error:
         raise file.error_at(error) from None
+    found.place = file.error_at
     contacts = _requires_contacts(file.content.get("contact"))
     if (
         found.is_empty

@@ -240,11 +240,13 @@ def test_the_command_line_rounds_as_the_page_does():
 
 
 def test_a_single_number_is_judged_by_its_path_and_a_missing_one_is_not_decided():
-    ranges = {"inner.u.sampled_d0.mt": (0.0, 1.1), "inner.u.sampled_d0.nothing": (0.0, 1.0)}
+    ranges = {f"inner.u.sampled_d0.{name}": (0.0, 1.1) for name in ("mt", "nothing", "m_s")}
     report = analyse(loop(), only=PARTS, requirements=Requirements(numbers=ranges))
     found = by_quantity(report)
     assert found["inner.u.sampled_d0.mt"].verdict is Verdict.PASSED
     assert found["inner.u.sampled_d0.nothing"].verdict is Verdict.UNDECIDED
+    assert "'inner.u.sampled_d0.ms'" in found["inner.u.sampled_d0.m_s"].detail
+    assert "the report has no such number. Did you mean" in to_html(report)
 
 
 def test_an_unstable_diagram_fails_in_everything():
@@ -264,6 +266,23 @@ def test_an_unstable_diagram_fails_in_everything():
 def test_names_that_the_diagram_does_not_have_are_refused_before_anything_is_computed(asked, said):
     with pytest.raises(UnknownNameError, match=said):
         analyse(loop(), only=PARTS, requirements=Requirements(**asked))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("ms = 2.0\n[loops.w]\nms = 1.6\n", "line 2: loops.w: found requirements on a loop 'w'"),
+        ('ms = 2.0\nvariants = ["sampled_d2"]\n', "line 2: variants: found requirements on a variant 'sampled_d2'"),
+        ('[loops.u]\nvariants = ["sampled_d2"]\n', "line 2: loops.u.variants: found requirements on a variant"),
+        ('[step]\nrise = 0.1\ninput = "w"\n', "line 3: step.input: there is no signal 'w'"),
+        ('[[step]]\nrise = 1\n[[step]]\nrise = 1\ninput = "w"\n', "asked.toml: step, input: there is no signal 'w'"),
+    ],
+)
+def test_names_of_a_file_that_the_diagram_does_not_have_are_refused_with_their_line(text, said, tmp_path):
+    file = tmp_path / "asked.toml"
+    file.write_bytes(b"\xef\xbb\xbf" + text.encode())  # as some editors write it
+    with pytest.raises(UnknownNameError, match=said):
+        analyse(loop(), only=PARTS, requirements=file)
 
 
 # --- the command line ---------------------------------------------------------------------------------------------------
