@@ -314,6 +314,13 @@ def split_array(diagram: WiredDiagram, name: str) -> tuple[str, tuple[int, ...]]
 def locate(free: Free, diagram: WiredDiagram, flat: FlatDiagram) -> None:
     """Set the block, slice and packing of a free parameter of a traced block."""
     free.block = diagram.structure.blocks[free.path]
+    if free.block.evaluated_outside:
+        raise ParameterError(
+            "it is a start value of an FMU in model exchange; a trim frees those of FMUs in co-simulation. Give the "
+            "FMU interface='co_simulation', or try values with diagram.replace(…), one after the other.",
+            block=free.path,
+            port=".".join(free.keys),
+        )
     if ".".join(free.keys) not in dict(traced_parameters(free.block)):
         raise ParameterError(
             "it is structure: the equations were traced with this value; expected a parameter that they contain. Try "

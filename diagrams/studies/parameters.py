@@ -18,15 +18,17 @@ def list_parameters(diagram: WiredDiagram) -> tuple[list[str], dict[str, str]]:
 
     They are the numbers in traced equations that are not 0, and the parameters that an FMU's block sets.
     """
-    found, left_out = [], dict[str, str]()
+    found, left_out = list[str](), dict[str, str]()
     for path, block in sorted(diagram.blocks.items()):
-        if block.stepped:
+        if block.stepped or block.evaluated_outside:
             about: Any = block
+            known = len(found)
             for name in getattr(block, "start", {}):
                 variable = about.description.variables.get(name)
                 if variable is not None and variable.causality == "parameter" and _is_number(block, name):
                     found.append(f"{path}.start.{name}")
-            continue
+            if block.stepped or len(found) > known:
+                continue
         if block.opaque or block.evaluated_outside:
             left_out[path] = "its equations are evaluated from outside; name its parameters to difference them"
             continue

@@ -4,7 +4,7 @@ import control
 import numpy as np
 import pytest
 
-from loopwright.blocks import Gain, OptionError
+from loopwright.blocks import Gain, OptionError, ParameterError
 from loopwright.diagrams import Diagram, Requirements
 from loopwright.diagrams.report import analyse
 from loopwright.diagrams.studies import CaseState, ConfirmationKind, WorstCaseTask
@@ -138,3 +138,19 @@ def test_start_values_of_an_fmu_in_model_exchange_are_varied():
         L = case.parameters.get("motor.start.inductance", dc_motor.nominal.inductance)
         expected = control.margin(control.tf([3.0 * k], np.polyadd(np.polymul([L, R], [J, b]), [k * k])))[1]
         assert case.value == pytest.approx(expected, abs=1e-4)
+
+
+def test_parameters_that_an_fmu_in_model_exchange_sets_are_among_the_sensitivities_and_no_trim_frees_them():
+    """One derivative of the phase margin is that of the closed form, by central differences."""
+    motor = Fmu(dc_motor.build(), name="motor", interface="model_exchange", start={"inertia": 2e-5})
+    made = Diagram("loop", motor(voltage=Gain(gain=-3.0, name="kp")(motor.speed).named("u"), load_torque=0.0))
+    k, b, R = dc_motor.nominal.motor_constant, dc_motor.nominal.friction, dc_motor.nominal.resistance
+    L = dc_motor.nominal.inductance
+
+    def phase_margin(J):
+        return control.margin(control.tf([3.0 * k], np.polyadd(np.polymul([L, R], [J, b]), [k * k])))[1]
+
+    slope = made.sensitivity("u")["motor.inertia", "phase_margin_deg"].slope.value
+    assert slope == pytest.approx((phase_margin(2.002e-5) - phase_margin(1.998e-5)) / 4e-8, rel=1e-5)
+    with pytest.raises(ParameterError, match="a trim frees those of FMUs in co-simulation"):
+        made.trim(free={"motor.inertia": (1e-5, 1e-4)}, targets={"motor.speed": 0.0})
