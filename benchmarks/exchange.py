@@ -42,7 +42,7 @@ def measure_tick(mass, *, isolate, form):
 
     plant = Fmu(mass, interface="model_exchange", name="plant", isolate=isolate)
     diagram = Diagram("loop", plant(force=controller(plant.position)))
-    count = 100_000 if form and not isolate else 1_000
+    count = 1_000 if not form else 10_000 if isolate else 100_000
     (short, _), (long, run) = (spend(diagram, duration, compile=form) for duration in (1.0, 1.0 + count / 100))
     return (long - short) / count, run.tier
 

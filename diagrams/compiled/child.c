@@ -2,21 +2,25 @@
 
    What is no sequence of such calls is left to Python. It stands behind `newton.c` and `remote.c`. */
 
-enum { AT_PLACE = 34 };
-enum { MOST_BITS = 62 };
-
 /* A function of an FMU by its form, with its arguments: p is a pointer, n a number of elements, d a time, b a flag. */
-enum { TRANSFER_4, TRANSFER_5, STEP_INT, STEP_CHAR, STEP_3 };
+enum { TRANSFER_4, TRANSFER_5, STEP_INT, STEP_CHAR, STEP_3, TIME_1, VECTOR_3, MODE_1, UPDATE_2, UPDATE_7, DONE_INT, DONE_CHAR };
 typedef int (*transfer_4)(void *, void *, size_t, void *);
 typedef int (*transfer_5)(void *, void *, size_t, void *, size_t);
 typedef int (*step_int)(void *, double, double, int);
 typedef int (*step_char)(void *, double, double, char);
 typedef int (*step_3)(void *, double, double, bool, void *, void *, void *, void *);
+typedef int (*time_1)(void *, double);
+typedef int (*vector_3)(void *, void *, size_t);
+typedef int (*mode_1)(void *);
+typedef int (*update_2)(void *, void *);
+typedef int (*update_7)(void *, void *, void *, void *, void *, void *, void *);
+typedef int (*done_int)(void *, int, void *, void *);
+typedef int (*done_char)(void *, bool, void *, void *);
 
 typedef struct {
     int64_t form;
     void *function;
-    void *p[5];
+    void *p[7];
     uint64_t n[2];
     const double *now, *width;
     const void *flag;
@@ -42,6 +46,13 @@ static inline int make_call(const bound_call *c) {
     case TRANSFER_5: return ((transfer_5)c->function)(p[0], p[1], c->n[0], p[2], c->n[1]);
     case STEP_INT: return ((step_int)c->function)(p[0], *c->now, *c->width, *(const int *)c->flag);
     case STEP_CHAR: return ((step_char)c->function)(p[0], *c->now, *c->width, *(const char *)c->flag);
+    case TIME_1: return ((time_1)c->function)(p[0], *c->now);
+    case VECTOR_3: return ((vector_3)c->function)(p[0], p[1], c->n[0]);
+    case MODE_1: return ((mode_1)c->function)(p[0]);
+    case UPDATE_2: return ((update_2)c->function)(p[0], p[1]);
+    case UPDATE_7: return ((update_7)c->function)(p[0], p[1], p[2], p[3], p[4], p[5], p[6]);
+    case DONE_INT: return ((done_int)c->function)(p[0], *(const int *)c->flag, p[1], p[2]);
+    case DONE_CHAR: return ((done_char)c->function)(p[0], *(const bool *)c->flag, p[1], p[2]);
     default:
         return ((step_3)c->function)(p[0], *c->now, *c->width, *(const bool *)c->flag, p[1], p[2], p[3], p[4]);
     }

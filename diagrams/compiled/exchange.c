@@ -2,22 +2,24 @@
 
    An evaluation leaves all that an FMU keeps as it is. A look at an instant that is reached tells the FMU that a step is
    complete, or lets an event act whose inputs have jumped; events of time, of steps and of indicators are left to Python.
-   It stands behind `master.c`. */
+   An FMU in a process of its own is asked for all calls between two copies at once: its buffers are in the memory that
+   both share. It stands behind `remote.c` and `master.c`. */
 
-enum { TAKE, GIVE, SET_TIME, CALL };
-enum { OK, WARNING, DISCARD };
+enum { TAKE, GIVE, SET_TIME, CALL, ASK };
+enum { OK, WARNING, DISCARD, LOST_PROCESS };
 enum { TO_STEP, TO_EVENTS, TO_OTHERS };
 enum { EVENT_ROUNDS = 100 };
 
 typedef struct {
     int64_t kind, count;
     void *function;
-    uint64_t arguments[8];  /* as they stand in registers, the instance first */
+    uint64_t arguments[8];  /* as they stand in registers, the instance first; of a request its number */
     double *vector;         /* of a copy: entries index[0], index[1] and so on, of a type in the buffer */
     const int64_t *index;
     void *buffer;
     int64_t type;
-    double low, high, warned_at; /* warned_at: time of the first warning of this call, NaN without one */
+    double low, high;
+    double *warned_at;      /* time of the first warning of each call, NaN without one */
 } action;
 
 typedef struct {
@@ -44,6 +46,7 @@ typedef struct {
     double end;
     int64_t other_nominals, acted;
     bool *changed;              /* see `plant` in master.c */
+    remote *far;                /* its process; NULL: this one */
 } exchanged;
 
 /* All of them. */
@@ -55,11 +58,13 @@ typedef struct outside {
     int64_t lost;               /* whether Python has to look */
     int64_t failed, plant;      /* whether a call has failed: `action` of `plant`, with a status, at `at` */
     const action *action;
-    int64_t status;
+    int64_t call, status;       /* call: its place in the action */
     double at;
     double *log;                /* an event of inputs that has changed states: time, FMU, all states before and after it */
     int64_t logged, capacity;
     int64_t warned;             /* whether a call has given its first warning */
+    apart *apart;               /* of FMUs in other processes */
+    int (*wait)(int64_t);       /* Python waits for the late reply of an FMU; 0: it never comes, or not in time */
 } outside;
 
 /* A stage of a schedule: a traced function, or an FMU with where its values stand. */
@@ -96,6 +101,31 @@ static inline unsigned call_fmu(const action *a) {
         case 5: return ((call5)a->function)(p[0], p[1], p[2], p[3], p[4]);
         default: return ((call7)a->function)(p[0], p[1], p[2], p[3], p[4], p[5], p[6]);
     }
+}
+
+/* Note a warning of a call. */
+static inline void note_warning(exchanged *e, const action *a, int64_t call, double t) {
+    if (isnan(a->warned_at[call])) a->warned_at[call] = t, e->of->warned = 1;
+}
+
+/* Let another process make the calls of an action, and wait for it. */
+static unsigned ask_process(exchanged *e, const action *a, double t) {
+    remote *r = e->far;
+    outside *o = e->of;
+    r->sequence = a->arguments[0];
+    post(r);
+    if (!answers(r, o->apart) && !o->wait(e->place)) return LOST_PROCESS;
+    r->state = IDLE;
+    look_at_clock(o->apart);
+    const unsigned status = (unsigned)r->words[AT_STATUS];
+    const uint64_t places = r->words[AT_PLACE]; /* of a call that has failed, or bits of those that warn */
+    if (status == WARNING) {
+        for (int64_t i = 0; i < a->count; i++)
+            if (places >> (i < MOST_BITS ? i : MOST_BITS) & 1) note_warning(e, a, i, t);
+        return OK;
+    }
+    o->call = status ? (int64_t)places : 0;
+    return status;
 }
 
 static double given(const action *a, int64_t i) {
@@ -159,10 +189,11 @@ static unsigned go_through(exchanged *e, const sequence *s, double t) {
             else
                 for (int64_t i = 0; i < a->count; i++) a->vector[a->index[i]] = ((const double *)a->buffer)[i];
         } else {
-            const unsigned status = call_fmu(a);
+            if (a->kind != ASK) e->of->call = 0;
+            const unsigned status = a->kind == ASK ? ask_process(e, a, t) : call_fmu(a);
             if (status == OK) continue;
             if (status == WARNING) {
-                if (isnan(a->warned_at)) a->warned_at = t, e->of->warned = 1;
+                note_warning(e, a, 0, t);
                 continue;
             }
             e->of->plant = e->place, e->of->action = a, e->of->status = (int64_t)(int32_t)status, e->of->at = t;

@@ -118,6 +118,7 @@ class HandedOver:
 
     def tell(self) -> None:
         """Tell what has happened in C: warnings, and events of inputs that have changed states."""
+        self.native.remote.take_messages()
         for path, action, t in self.native.take_warnings():
             self._blocks[path].take_warning(action, t)
         for event in self.native.take_events():

@@ -37,6 +37,7 @@ static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
         if (!h->stepped) {
             if ((*steps)++ > h->budget || (h->w.m && h->w.logged > h->w.capacity / 2)) return SUSPENDED;
             if (h->o && h->o->logged > h->o->capacity / 2) return SUSPENDED;
+            if (h->o && h->o->apart && h->o->apart->late && *steps > 1) return SUSPENDED;
             keep_instant(h);
             h->planned = m->planned;
             if (take_step(m) != PASSED) return ask(h, ASK_BETWEEN);

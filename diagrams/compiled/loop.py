@@ -142,6 +142,8 @@ class StagedBinding(Protocol):
 
     watched: list[tuple[HostState, ctypes.c_bool]]
     """States of this process that FMUs may change, and whether C has seen that."""
+    remote: RemotePlants
+    """Processes that are asked for calls."""
 
     def bind(self, staged: Staged, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> ctypes.Structure:
         """Return a function bound to vectors, as C knows it."""
@@ -187,6 +189,7 @@ class CompiledLoop:
         exchange: StagedBinding | None = None,
     ):
         self._remote = RemotePlants()
+        self._remotes = [self._remote, *([] if exchange is None else [exchange.remote])]
         self._kept: list[Any] = [code, arguments, results, plants, columns, exchange]
         self._exchange = exchange
         self._watched: list[tuple[HostState, ctypes.c_bool]] = [] if exchange is None else [*exchange.watched]
@@ -295,15 +298,16 @@ class CompiledLoop:
 
         C sets rounding mode and traps back after each step; the working folder is set back at the end.
         """
-        return self._guard() if self._watched or self._remote.address else nullcontext()
+        return self._guard() if self._watched or any(r.address for r in self._remotes) else nullcontext()
 
     @contextmanager
     def _guard(self) -> Iterator[None]:
         with ExitStack() as stack:
             for host, _ in self._watched:
                 stack.enter_context(host)
-            with self._remote.guard():
-                yield
+            for remote in self._remotes:
+                stack.enter_context(remote.guard())
+            yield
         for host, changed in self._watched:
             if changed:
                 host.note_modes()

@@ -11,8 +11,9 @@
 #endif
 
 /* Places of words, as `wire.py` has them. */
-enum { AT_REQUEST = 0, AT_REPLY = 8, CHILD_SLEEPS = 16, PARENT_SLEEPS = 24, AT_SEQUENCE = 32, AT_STATUS = 33, AT_MESSAGES = 40 };
+enum { AT_REQUEST = 0, AT_REPLY = 8, CHILD_SLEEPS = 16, PARENT_SLEEPS = 24, AT_SEQUENCE = 32, AT_STATUS = 33, AT_PLACE = 34, AT_MESSAGES = 40 };
 enum { FEWEST = 4, RAREST = 1024, ROW = 64, PER_LOOK = 40 };
+enum { MOST_BITS = 62 }; /* places of calls that have bits of their own in a word */
 enum { SLICE = 50, TURN = 100 }; /* ms to sleep for a reply, and of a call, before Python has its turn */
 
 enum { FLOAT64, FLOAT32, INT8, UINT8, INT16, UINT16, INT32, UINT32, INT64, UINT64, BOOL8 };

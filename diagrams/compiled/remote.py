@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import LoopwrightError
-from ...fmus.calls import ChildFace, RemoteStep, SharedValues
+from ...fmus.calls import ERROR, BoundCalls, ChildFace, ChildRequest, RemoteStep, SharedValues
 from .code import load_compiled, read_sources
 from .native_tick import at
 
@@ -78,7 +78,14 @@ class RemotePlants:
 
     def add(self, step: RemoteStep) -> int:
         """Take an FMU, and return the address of its structure."""
-        asked = step.request
+        made = self.add_calls(step.request)
+        made.inputs, made.outputs, made.to = len(step.inputs), len(step.outputs), self._values(step.inputs)
+        setattr(made, "from", self._values(step.outputs))
+        self._kept.append(step)
+        return ctypes.addressof(made)
+
+    def add_calls(self, asked: ChildRequest) -> RemoteStructure:
+        """Take a process that is asked for calls, and return its structure, which lives as long as this."""
         if (library := compile_other_side()) is not None:
             asked.process.run_in_c(library)
         made = RemoteStructure(
@@ -90,14 +97,20 @@ class RemotePlants:
             most=asked.looks,
             left=_FEWEST,
             pause=_FEWEST,
-            inputs=len(step.inputs),
-            outputs=len(step.outputs),
-            to=self._values(step.inputs),
         )
-        setattr(made, "from", self._values(step.outputs))
-        self._kept.append(step)
         self._all.append((asked.process, made))
-        return ctypes.addressof(made)
+        return made
+
+    def note_status(self, structure: RemoteStructure | None, status: int) -> None:
+        """Note the status of a call that has failed: no other instance is made in a process after an error."""
+        for process, made in self._all:
+            process.used = process.used or (made is structure and not 0 <= status < ERROR)
+
+    def take_messages(self) -> None:
+        """Take the log messages of the processes."""
+        for process, _ in self._all:
+            if process.alive:
+                process.collect()
 
     def _values(self, values: Sequence[SharedValues]) -> int:
         array = (_Values * max(1, len(values)))()
@@ -133,3 +146,44 @@ class RemotePlants:
             raise
         for process, structure in self._all:
             process.number, process.arrived = structure.number, structure.state == _ARRIVED
+
+
+class LateReplies:
+    """Python's wait for replies that C has not seen in time: the process is slow, or hangs, or has ended.
+
+    Attributes
+    ----------
+    error : BaseException or None
+        Why a reply has not come: the error of the process, or an interrupt.
+    """
+
+    def __init__(self) -> None:
+        self.error: BaseException | None = None
+        self._asked: dict[int, tuple[RemoteStructure, dict[int, BoundCalls]]] = {}
+
+    def add(self, place: int, structure: RemoteStructure, sequence: int, calls: BoundCalls) -> None:
+        """Take calls that C will ask for."""
+        self._asked.setdefault(place, (structure, {}))[1][sequence] = calls
+
+    def check(self) -> None:
+        """Raise the error of a reply that has not come."""
+        error, self.error = self.error, None
+        if error is not None:
+            raise error
+
+    def wait(self, place: int) -> int:
+        """Wait for the reply of an FMU; return 0 if it never comes."""
+        structure, asked = self._asked[place]
+        calls = asked[structure.sequence]
+        assert calls.request is not None
+        calls.request.process.number = structure.number
+        try:
+            calls.finish()
+        except BaseException as error:  # C has to return first
+            self.error = error
+            return 0
+        return 1
+
+
+WAIT = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64)
+"""Kind of the function by which C asks for `LateReplies.wait`."""

@@ -9,13 +9,14 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ...blocks.tracing import GUARDS, NEXT
-from ...fmus.calls import NativeAction, NativeLook
+from ...fmus.calls import BoundCalls, NativeAction, NativeLook
 from ...fmus.host_state import HostState
 from ..flat import INDICATORS, JUMP, OpaqueStage
 from .code import address_of
 from .grouped_parts import color_columns
 from .loop import TickStructure
 from .native_tick import at, list_vectors
+from .remote import WAIT, LateReplies, RemotePlants
 from .staged_functions import Staged, StagedSlopes
 
 _LOGGED = 2**20  # bytes of events of inputs in a call
@@ -29,7 +30,7 @@ def _fields(kind: Any, names: str) -> list[tuple[str, Any]]:
 class _Action(ctypes.Structure):
     _fields_ = [
         *_fields(_INT, "kind count"), ("function", _AT), ("arguments", ctypes.c_uint64 * 8),
-        *_fields(_AT, "vector index buffer"), ("type", _INT), *_fields(_REAL, "low high warned_at"),
+        *_fields(_AT, "vector index buffer"), ("type", _INT), *_fields(_REAL, "low high"), ("warned_at", _AT),
     ]  # fmt: skip
 
 
@@ -43,14 +44,15 @@ class _Exchanged(ctypes.Structure):
         *_fields(_AT, "again terminate nominals defined wants ends time"), ("width", _INT),
         *_fields(_AT, "u least relative low high discrete"), ("next_time", _REAL),
         *_fields(_INT, "asks ended in_event"), ("end", _REAL), *_fields(_INT, "other_nominals acted"),
-        ("changed", _AT),
+        *_fields(_AT, "changed far"),
     ]  # fmt: skip
 
 
 class _Outside(ctypes.Structure):
     _fields_ = [
         ("count", _INT), ("each", _AT), ("jump", TickStructure), *_fields(_INT, "look lost failed plant"),
-        ("action", _AT), ("status", _INT), ("at", _REAL), ("log", _AT), *_fields(_INT, "logged capacity warned"),
+        ("action", _AT), *_fields(_INT, "call status"), ("at", _REAL), ("log", _AT),
+        *_fields(_INT, "logged capacity warned"), ("apart", _AT), ("wait", WAIT),
     ]  # fmt: skip
 
 
@@ -134,9 +136,11 @@ class NativeExchange:
         self._stages, self._slopes = (address_of(library, f"loopwright_{name}") for name in ("stages", "slopes"))
         self.paths = [*blocks]
         self._each = (_Exchanged * len(blocks))()
-        self._names = dict[int, str]()
+        self._names = dict[int, tuple[str, ...]]()
         """Names of calls by the address of their action."""
         self._actions = list[tuple[str, ctypes.Array[_Action], list[NativeAction]]]()
+        self._warned = list[tuple[str, tuple[str, ...], np.ndarray]]()
+        self.remote, self._late, self._far = RemotePlants(), LateReplies(), dict[str, Any]()
         self.watched: list[tuple[HostState, ctypes.c_bool]] = []
         """States of this process that libraries may change, and whether C has seen that."""
         self._log = np.zeros((max(4 * len(blocks), _LOGGED // (16 * (1 + width))), 2 + 2 * width))
@@ -145,6 +149,8 @@ class NativeExchange:
             each=ctypes.addressof(self._each),
             log=at(self._log),
             capacity=len(self._log),
+            apart=ctypes.addressof(self.remote.structure),
+            wait=WAIT(self._late.wait),
         )
         for i, (path, block) in enumerate(blocks.items()):
             e = self._each[i]
@@ -153,7 +159,7 @@ class NativeExchange:
                 self.watched.append((host, ctypes.c_bool()))
                 e.changed = ctypes.addressof(self.watched[-1][1])
         self._inputs = dict[str, np.ndarray]()
-        self._final = dict[str, Any]()
+        self._final, self._finals = dict[str, Any](), dict[str, Any]()
 
     def _own(self, vector: np.ndarray) -> int | None:
         self._kept.append(vector)
@@ -236,8 +242,9 @@ class NativeExchange:
         fmu.states, fmu.inputs = states, look.least.size
         for name in ("complete", "enter", "update", "leave"):
             setattr(fmu, name, self._sequence(path, getattr(look, name)))
-        if look.complete:
+        if look.complete and look.final is None:
             self._final[path] = self._actions[-4][1][len(look.complete) - 1]
+        self._finals[path] = look.final
         answers = look.answers
         fmu.width, fmu.again, fmu.terminate, fmu.nominals = answers[:4]
         fmu.defined, fmu.time, fmu.wants, fmu.ends = answers[4:]
@@ -253,24 +260,42 @@ class NativeExchange:
         for structure, action in zip(made, actions, strict=True):
             structure.kind, structure.function, structure.type = action.kind, action.function, action.type
             structure.count = len(action.arguments) or action.places.size
+            if action.bound is not None:
+                structure.count = len(action.names)
+                self._add_request(path, action.bound)
+            if action.names:
+                self._warned.append((path, action.names, np.full(len(action.names), np.nan)))
+                structure.warned_at = at(self._warned[-1][2])
             structure.arguments[: len(action.arguments)] = action.arguments
             structure.vector, structure.index, structure.buffer = action.vector, self._own(action.places), action.buffer
-            structure.low, structure.high, structure.warned_at = action.low, action.high, np.nan
-            self._names[ctypes.addressof(structure)] = action.name
+            structure.low, structure.high = action.low, action.high
+            self._names[ctypes.addressof(structure)] = action.names
         self._kept.append(made)
         self._actions.append((path, made, [*actions]))
         return _Sequence(len(made), ctypes.addressof(made) if actions else None)
+
+    def _add_request(self, path: str, calls: BoundCalls) -> None:
+        """Let C ask a process for calls."""
+        request, place = calls.request, self.paths.index(path)
+        assert request is not None
+        if path not in self._far:
+            self._far[path] = self.remote.add_calls(request)
+            self._each[place].far = ctypes.addressof(self._far[path])
+        self._late.add(place, self._far[path], request.sequence, calls)
 
     # --- between Python and C ----------------------------------------------------------------------------------------
 
     def hand_over(self, path: str, u: np.ndarray, next_time: float, *, asks: bool, ended: bool, final: bool) -> None:
         """Let C go on with a block from an instant that Python has come to."""
+        self._late.check()
         fmu = self._each[self.paths.index(path)]
         self._inputs[path][:] = u
         fmu.next_time, fmu.asks, fmu.ended, fmu.other_nominals = next_time, asks, ended, False
         self.structure.lost = self.structure.failed = 0
         if path in self._final:
             self._final[path].arguments[1] = final
+        elif self._finals.get(path) is not None:
+            self._finals[path].value = final
 
     def inputs_of(self, path: str) -> np.ndarray:
         """Return the inputs of a block at the last instant that was reached."""
@@ -286,17 +311,24 @@ class NativeExchange:
         if not self.structure.warned:
             return found
         self.structure.warned = 0
-        for path, structures, actions in self._actions:
-            for structure, action in zip(structures, actions, strict=True):
-                if not np.isnan(structure.warned_at):
-                    found.append((path, action.name, structure.warned_at))
-                    structure.warned_at = np.nan
+        for path, names, times in self._warned:
+            found += [(path, name, float(t)) for name, t in zip(names, times, strict=True) if not np.isnan(t)]
+            times[:] = np.nan
         return sorted(found, key=lambda one: one[2])
 
     def failure(self) -> CallFailure:
-        """Return the call that has failed."""
+        """Return the call that has failed.
+
+        Raises
+        ------
+        FmuProcessError
+            If the process of an FMU has ended.
+        """
+        self._late.check()
         o = self.structure
-        name = "" if o.action is None else self._names[o.action]
+        names = () if o.action is None else self._names[o.action]
+        name = names[min(o.call, len(names) - 1)] if names else ""
+        self.remote.note_status(self._far.get(self.paths[o.plant]), o.status)
         return CallFailure(self.paths[o.plant], name, o.status, o.at)
 
     def take_events(self) -> list[InputEvent]:

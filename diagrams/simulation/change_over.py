@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from ..coupling import Plant, PlantSteps
+from ..coupling import Plant, PlantSteps, runs_apart
 from .continuous import Continuous
 from .view import Position
 from .workspace import Workspace
@@ -19,6 +19,7 @@ _PATIENCE = 0.02  # s of interpreted ticks before which nobody thinks of a compi
 _PATIENCE_OF_WORK = 0.05  # s of counted work before which it says nothing about the rest
 _STEP, _EVENT, _OPERATION = 1e-4, 3e-4, 6e-8  # s of a solver's step, of an event, and of an operation in a step
 _LANDING, _SAMPLE = 6e-5, 5e-6  # s, at least, of a tick at which a solver begins anew, and of a sample
+_ROUND_TRIPS = 1e-4  # s more, of a step or a tick, for each FMU in model exchange in a process of its own
 _START, _COMPILING, _LARGE = 0.4, 1e-3, 2000  # s to begin with C, and to compile one of at most so many operations
 
 
@@ -152,7 +153,13 @@ class HybridChange:
         flat, count = self._continuous.flat, last - self._position.tick
         landed = count if self._every and (self._continuous.fixed or self._plants) else 0
         landed = max(landed, sum(count // clock.every for clock in flat.distinct))
-        return self._possible and _LANDING * min(landed, count) + _SAMPLE * count > self._limit and self._begin(last)
+        work = (_LANDING + self._round_trips) * min(landed, count) + _SAMPLE * count
+        return self._possible and work > self._limit and self._begin(last)
+
+    @property
+    def _round_trips(self) -> float:
+        blocks = self._continuous.exchanged
+        return 0.0 if blocks is None else _ROUND_TRIPS * sum(map(runs_apart, blocks.blocks.values()))
 
     def watch(self, last: int, note_due: Callable[[], None]) -> Callable[[float, bool], bool] | None:
         """Return the `Continuous.watch` of interpreted steps up to a tick, which counts their work.
@@ -163,10 +170,10 @@ class HybridChange:
         if not self._possible:
             return None
         position, before, first = self._position, self._work, self._position.t
-        end = position.time_of(last)
+        end, step = position.time_of(last), self._step + self._round_trips
 
         def tell(t: float, fires: bool) -> bool:
-            self._work += self._step + (_EVENT if fires else 0.0)
+            self._work += step + (_EVENT if fires else 0.0)
             if self._work < _PATIENCE_OF_WORK or t >= end or not self._possible or self.ticks is not None:
                 return False
             rest = (self._work - before) * (end - t) / (t - first)

@@ -29,17 +29,24 @@ class ChildFace(Protocol):
         Number of the last request.
     arrived : bool
         Whether the reply to it has been seen, though nobody has finished it yet.
+    alive, used : bool
+        Whether the process is there, and whether no other instance may be made in it.
     """
 
     name: str
     number: int
     arrived: bool
+    alive: bool
+    used: bool
 
     def check_alive(self, call: str) -> None:
         """Raise the error of a process that has ended before a call."""
 
     def give_up(self) -> None:
         """End the process after an interrupt in a call."""
+
+    def collect(self) -> int:
+        """Take the log messages of a request whose reply is there, and return its status."""
 
     def run_in_c(self, library: str) -> None:
         """Let a library wait for requests and make bound calls there, where it can."""

@@ -123,7 +123,7 @@ class Evaluation:
         time = np.ctypeslib.as_array(ctypes.pointer(self._time), (1,))
         made = [] if again else copy_action(take, t, np.zeros(1, int), time) + copy_action(take, x, order, self._states)
         made += transfer_actions(self._inputs, u, self._index, take)
-        made += [call_action(call, name) for call, name in zip(calls.calls[placed:], names[placed:], strict=True)]
+        made += call_actions(calls, names, placed)
         if not into.size:
             return made
         places = np.arange(into.size)
@@ -191,6 +191,14 @@ class DirectEvaluation:
                 worst = status
                 self.warned.append(self.actions[place])
         return worst, 0
+
+
+def call_actions(calls: BoundCalls, names: Sequence[str], first: int = 0) -> list[NativeAction]:
+    """Return bound calls from one on as actions of C: one each, or one request to another process for all of them."""
+    if (request := calls.request) is not None:
+        assert not first
+        return [NativeAction(ActionKind.ASK, tuple(names), arguments=(request.sequence,), bound=calls)]
+    return [call_action(call, name) for call, name in zip(calls.calls[first:], names[first:], strict=True)]
 
 
 def _values_call(fmi: FmiCalls, verb: str, references: Sequence[int], values: np.ndarray, action: str) -> list[_Named]:

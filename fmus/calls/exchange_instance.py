@@ -12,10 +12,10 @@ from ...blocks.core import FmuRuntimeError, SimulationError
 from ..host_state import HostState
 from .bound_calls import DISCARD, WARNING, BoundCalls, Call, EventUpdate
 from .evaluated_exchange import EvaluatedExchange
-from .evaluation import Evaluation
+from .evaluation import Evaluation, call_actions
 from .fmu_block import FmuBlock, check_next_time
 from .loaded_library import MakeCalls
-from .native_step import ActionKind, NativeAction, NativeLook, call_action, copy_action, transfer_actions
+from .native_step import ActionKind, NativeAction, NativeLook, copy_action, transfer_actions
 from .texts import Text, TextRecord
 from .transfer import Transfer, UnfitError
 
@@ -118,20 +118,24 @@ class ExchangeInstance(EvaluatedExchange):
 
     def _get(self, quantity: str, *then: Call) -> np.ndarray:
         """Return a vector of the FMU's for its states, and make further calls behind it."""
-        n = self._x.size
-        made, calls = np.zeros(n), [*then]
+        made = np.zeros(self._x.size)
+        bound = self._bind_reading(quantity, *then)
+        if bound.calls:
+            self._check(_READING[quantity], bound.run(), self.t)
+        if made.size:
+            made[self._order] = self._kept
+        return made
+
+    def _bind_reading(self, quantity: str, *then: Call) -> BoundCalls:
+        n, calls = self._x.size, [*then]
         if n:
             address, length = ctypes.c_void_p(self._kept.ctypes.data), ctypes.c_size_t(n)
             arguments = self.fmi.instance_argument, address, length
             calls.insert(0, (self.fmi.exchange_function(quantity), arguments))
-        if calls:
-            bound = self._bound.get((quantity, len(calls)))
-            if bound is None:
-                bound = self._bound[quantity, len(calls)] = self.fmi.bind(calls)
-            self._check(_READING[quantity], bound.run(), self.t)
-        if n:
-            made[self._order] = self._kept
-        return made
+        bound = self._bound.get((quantity, len(calls)))
+        if bound is None:
+            bound = self._bound[quantity, len(calls)] = self.fmi.bind(calls) if calls else BoundCalls(())
+        return bound
 
     def _fill(self, u: np.ndarray, t: float) -> Transfer:
         """Return the transfer of all wired inputs, discrete ones too, with their values."""
@@ -197,8 +201,11 @@ class ExchangeInstance(EvaluatedExchange):
         if self._discarded:
             raise self._error(f"{self._discarded}, where the solver has arrived:", DISCARD, t)
 
-    def _call_bound(self, call: Call, action: str, t: float) -> None:
-        self._check(action, self.fmi.bind([call]).run(), t)
+    def _bind_update(self) -> BoundCalls:
+        key = ("update", 1)
+        if key not in self._bound:
+            self._bound[key] = self.fmi.bind([self._events.update])
+        return self._bound[key]
 
     def _check(self, action: str, status: int, t: float) -> None:
         """Note a warning, once for each action; raise the error of a status that is worse."""
@@ -212,7 +219,7 @@ class ExchangeInstance(EvaluatedExchange):
         calls, nominals = self._events, False
         for _ in range(ROUNDS):
             if made is None:
-                self._call_bound(calls.update, _UPDATING, t)
+                self._check(_UPDATING, self._bind_update().run(), t)
                 made = calls.updated()
             nominals |= made.nominals_changed
             if made.terminate:
@@ -273,8 +280,8 @@ class ExchangeInstance(EvaluatedExchange):
 
     def find_native_obstacle(self) -> str | None:
         """Return why a loop in C can't evaluate it; None if it can."""
-        if not self.fmi.in_process:
-            return "runs in a process of its own"
+        if not self.fmi.in_process and self._bind_update().request is None:
+            return "runs in a process of its own, for which C can't wait on this system"
         if self._texts.variables:
             return "has outputs of texts, which are recorded at each step"
         return None if self._events.answers is not None and self._events.leave is not None else "is one of FMI 1.0"
@@ -303,18 +310,11 @@ class ExchangeInstance(EvaluatedExchange):
         enter = [*transfer_actions(inputs, u, index, take)]
         enter += self._event_evaluation(inputs).native(t, x, u, nothing, self._order)
         complete = self._step_evaluation().native(t, x, u, nothing, self._order) if self.about.completes_steps else []
-        leave = []
-        if self._kept.size:
-            arguments = (
-                self.fmi.instance_argument,
-                ctypes.c_void_p(self._kept.ctypes.data),
-                ctypes.c_size_t(self._kept.size),
-            )
-            states = call_action((self.fmi.exchange_function("get_states"), arguments), _READING["get_states"])
-            leave = [states, *copy_action(ActionKind.GIVE, into, self._order, self._kept)]
         calls = self._events
         assert calls.leave is not None
         assert calls.answers is not None
+        states = self._bind_reading("get_states", calls.leave)
+        leave = call_actions(states, [_READING["get_states"]] * len(states.calls))
         low, high, discrete = np.full(u.size, -math.inf), np.full(u.size, math.inf), np.zeros(u.size, dtype=bool)
         low[index], high[index] = inputs.bounds
         for port in self._wired:
@@ -322,9 +322,10 @@ class ExchangeInstance(EvaluatedExchange):
         return NativeLook(
             complete,
             enter,
-            [call_action(calls.update, _UPDATING)],
-            [*leave, call_action(calls.leave, _READING["get_states"])],
+            call_actions(self._bind_update(), [_UPDATING]),
+            [*leave, *copy_action(ActionKind.GIVE, into, self._order, self._kept)],
             calls.answers,
+            None if self.fmi.in_process else calls.final,
             self._least,
             self._relative,
             discrete,

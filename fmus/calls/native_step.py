@@ -12,7 +12,7 @@ import numpy as np
 
 from ..archive import FmuDescription
 from ..host_state import HostState
-from .bound_calls import AnswersAt, Call, ChildRequest
+from .bound_calls import AnswersAt, BoundCalls, Call, ChildRequest
 from .fmi_calls import FmiCalls, StepCall
 from .texts import waits_for_initialization
 from .transfer import Transfer, TypeGroup
@@ -191,9 +191,9 @@ def _address_of(function: Any) -> int:
 
 
 class ActionKind(IntEnum):
-    """Kinds of `NativeAction`: copy from a vector into a buffer, or back; set the time; call a function."""
+    """Kinds of `NativeAction`: copy into a buffer, or back; set the time; call a function; ask a process for calls."""
 
-    TAKE, GIVE, TIME, CALL = range(4)
+    TAKE, GIVE, TIME, CALL, ASK = range(5)
 
 
 class NativeAction(NamedTuple):
@@ -203,12 +203,14 @@ class NativeAction(NamedTuple):
     ----------
     kind : ActionKind
         Its kind.
-    name : str
-        Name of the call.
+    names : tuple of str
+        Names of the calls.
     function : int
         The function that is called; its first argument is the instance.
     arguments : tuple of int
         Its arguments, as they stand in registers; of `ActionKind.TIME` the instance, and where the time stands.
+    bound : BoundCalls or None
+        Of `ActionKind.ASK`: calls that another process makes.
     vector : int
         Of a copy: the vector of float64.
     places : ndarray of int64
@@ -222,9 +224,10 @@ class NativeAction(NamedTuple):
     """
 
     kind: ActionKind
-    name: str = ""
+    names: tuple[str, ...] = ()
     function: int = 0
     arguments: tuple[int, ...] = ()
+    bound: BoundCalls | None = None
     vector: int = 0
     places: np.ndarray = np.zeros(0, dtype=np.int64)
     buffer: int = 0
@@ -271,9 +274,9 @@ def call_action(call: Call, name: str) -> NativeAction:
     for argument in arguments[1:]:
         if isinstance(argument, ctypes.c_double):
             at = (_word_of(arguments[0]), ctypes.addressof(argument))
-            return NativeAction(ActionKind.TIME, name, _address_of(function), at)
+            return NativeAction(ActionKind.TIME, (name,), _address_of(function), at)
         words.append(_word_of(argument))
-    return NativeAction(ActionKind.CALL, name, _address_of(function), (_word_of(arguments[0]), *words))
+    return NativeAction(ActionKind.CALL, (name,), _address_of(function), (_word_of(arguments[0]), *words))
 
 
 def _word_of(argument: Any) -> int:
@@ -305,6 +308,8 @@ class NativeLook:
         Go into Event Mode with all inputs for a first round of updates, take another round, go back and get the states.
     answers : AnswersAt
         Where the answers stand.
+    final : object
+        C value that `complete` reads in another process: whether no earlier state will be restored.
     least, relative : ndarray
         Least change of each input that is a jump, by itself and relative to the input.
     discrete : ndarray of bool
@@ -318,6 +323,7 @@ class NativeLook:
     update: list[NativeAction]
     leave: list[NativeAction]
     answers: AnswersAt
+    final: Any
     least: np.ndarray
     relative: np.ndarray
     discrete: np.ndarray

@@ -19,7 +19,12 @@ TYPES: dict[str, Any] = {
     )
 }
 """C types by the letters of ctypes."""
-_FORMS = {"ppnp": 0, "ppnpn": 1, "pddi": 2, "pddc": 3, "pddcpppp": 4}
+_FORMS = {
+    form: place
+    for place, form in enumerate(
+        ("ppnp", "ppnpn", "pddi", "pddc", "pddcpppp", "pd", "ppn", "p", "pp", "ppppppp", "pipp", "pcpp")
+    )
+}
 """Forms of functions: pointers, numbers of elements, times, flags as int and as char; see `child.c`."""
 _LETTERS = {"P": "p", "L": "n", "Q": "n", "d": "d", "i": "i", "?": "c", "b": "c", "c": "c"}
 
@@ -28,7 +33,7 @@ class _Call(ctypes.Structure):
     _fields_ = [
         ("form", ctypes.c_int64),
         ("function", ctypes.c_void_p),
-        ("p", ctypes.c_void_p * 5),
+        ("p", ctypes.c_void_p * 7),
         ("n", ctypes.c_uint64 * 2),
         *((name, ctypes.c_void_p) for name in ("now", "width", "flag")),
     ]
@@ -110,7 +115,8 @@ def _call(function: Any, arguments: Arguments) -> _Call | None:
         made.p[i] = value.value if isinstance(value, ctypes.c_void_p) else ctypes.addressof(value)
     for i, value in enumerate(of["n"]):
         made.n[i] = value.value
-    if of["d"]:
-        made.now, made.width = map(ctypes.addressof, of["d"])
-        made.flag = ctypes.addressof((of["i"] or of["c"])[0])
+    for name, value in zip(("now", "width"), of["d"], strict=False):
+        setattr(made, name, ctypes.addressof(value))
+    if flags := of["i"] or of["c"]:
+        made.flag = ctypes.addressof(flags[0])
     return made

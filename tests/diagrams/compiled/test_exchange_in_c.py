@@ -45,8 +45,14 @@ class Car(Block):
         return -force / 400.0, 0.3 * force - u.torque
 
 
+@pytest.fixture(params=[False, pytest.param(True, marks=pytest.mark.slow)], ids=["here", "apart"])
+def isolate(request):
+    """Whether FMUs run in processes of their own."""
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def files(cache, tmp_path_factory):
+def built(cache, tmp_path_factory):
     """FMUs of the library by model and version of FMI."""
     folder = tmp_path_factory.mktemp("exchange")
     return {
@@ -56,8 +62,15 @@ def files(cache, tmp_path_factory):
     }
 
 
+@pytest.fixture
+def files(built, isolate):
+    return {**built, "isolate": isolate}
+
+
 def mass(files, fmi=3, name="plant", **options):
-    return Fmu(files[mass_spring_damper, fmi], interface="model_exchange", name=name, isolate=False, **options)
+    return Fmu(
+        files[mass_spring_damper, fmi], interface="model_exchange", name=name, isolate=files["isolate"], **options
+    )
 
 
 def both(make, duration, **options):
@@ -165,7 +178,10 @@ def test_impacts_fall_at_the_times_of_the_closed_form(files):
 
     def make():
         return Diagram(
-            "ball", Fmu(files[bouncing_ball, 3], interface="model_exchange", name="ball", isolate=False, start=start)()
+            "ball",
+            Fmu(
+                files[bouncing_ball, 3], interface="model_exchange", name="ball", isolate=files["isolate"], start=start
+            )(),
         )
 
     interpreted, compiled = both(make, 3.0, step=0.01)
@@ -193,13 +209,13 @@ def test_events_of_other_blocks_whose_jumps_are_inputs_of_an_fmu(files, solver):
     same(interpreted, compiled)
 
 
-def test_an_anti_lock_brake_whose_car_is_an_fmu(cache, tmp_path):
+def test_an_anti_lock_brake_whose_car_is_an_fmu(cache, tmp_path, isolate):
     """A valve switches thousands of times a second: the torque into the FMU has kinks there, and no jumps."""
     file = build(Car(name="car"), out=tmp_path / "car.fmu")
 
     def make():
         car, torque = (
-            Fmu(file, interface="model_exchange", isolate=False, name="car"),
+            Fmu(file, interface="model_exchange", isolate=isolate, name="car"),
             LimitedIntegrator(lower=0.0, name="torque"),
         )
         valve = Relay(on_point=0.1701, off_point=0.1699, on_value=-1e7, off_value=1e7, name="valve")
@@ -215,7 +231,7 @@ def test_an_anti_lock_brake_whose_car_is_an_fmu(cache, tmp_path):
 
 def test_an_fmu_of_co_simulation_beside_one_of_model_exchange(files):
     def make():
-        sampled = Fmu(files[mass_spring_damper, 3], name="sampled", isolate=False, start={"position": 0.0})
+        sampled = Fmu(files[mass_spring_damper, 3], name="sampled", isolate=files["isolate"], start={"position": 0.0})
         plant = mass(files)
 
         @subsystem(sample_time=T, name="controller")
@@ -293,11 +309,11 @@ def eventful(request, cache, tmp_path_factory):
     return eventful_fmu(tmp_path_factory.mktemp("eventful"), request.param)
 
 
-def test_every_kind_of_event_of_an_fmu(eventful):
+def test_every_kind_of_event_of_an_fmu(eventful, isolate):
     """ẋ = u + k with k = ⌊4 t⌋; x falls to 0 after a step that ends above 1, and n is taken over in Event Mode."""
 
     def make(armed):
-        plant = Fmu(eventful, name="plant", isolate=False, start={"armed": armed})
+        plant = Fmu(eventful, name="plant", isolate=isolate, start={"armed": armed})
         wanted = Step(times=0.333, values=3.0, name="wanted")
         return Diagram("d", plant(u=Constant(value=1.0, name="u"), n=wanted))
 
@@ -310,8 +326,8 @@ def test_every_kind_of_event_of_an_fmu(eventful):
     same(interpreted, compiled)
 
 
-def test_an_fmu_ends_a_compiled_run(eventful):
-    plant = Fmu(eventful, name="plant", isolate=False, start={"last": 3})
+def test_an_fmu_ends_a_compiled_run(eventful, isolate):
+    plant = Fmu(eventful, name="plant", isolate=isolate, start={"last": 3})
     diagram = Diagram("d", plant(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
     run = diagram.simulate(2.0, step=0.1, compile=True, progress=False)
     assert run.tier == "compiled"
@@ -327,9 +343,9 @@ def test_an_fmu_ends_a_compiled_run(eventful):
     ],
     ids=["error", "discard", "nan"],
 )
-def test_a_failure_in_c_is_told_as_interpreted(cache, tmp_path, fault, told):
+def test_a_failure_in_c_is_told_as_interpreted(cache, tmp_path, fault, told, isolate):
     file = eventful_fmu(tmp_path, 3, fault=f"if (c->t > 0.3) {{ {fault} }}")
-    plant = Fmu(file, name="plant", isolate=False)
+    plant = Fmu(file, name="plant", isolate=isolate)
     diagram = Diagram("d", plant(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
     with pytest.raises(SimulationError, match=told) as error:
         diagram.simulate(1.0, step=0.1, compile=True, progress=False)
@@ -344,10 +360,10 @@ def _risen(t):
     return 0.25 * k * (k - 1) / 2 + k * (t - 0.25 * k)
 
 
-def test_a_discard_beyond_a_wall_makes_steps_smaller(cache, tmp_path):
+def test_a_discard_beyond_a_wall_makes_steps_smaller(cache, tmp_path, isolate):
     """The rates can't be computed for x > 0.7, which x = 0.5 t + … reaches at t = 0.6 and no sooner."""
     file = eventful_fmu(tmp_path, 3, fault="if (c->x > 0.7) return 2;")
-    plant = Fmu(file, name="plant", isolate=False)
+    plant = Fmu(file, name="plant", isolate=isolate)
     diagram = Diagram("d", plant(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
     run = diagram.simulate(0.5, step=0.5, compile=True, max_step=10.0, progress=False)
     assert run.tier == "compiled"
@@ -355,24 +371,16 @@ def test_a_discard_beyond_a_wall_makes_steps_smaller(cache, tmp_path):
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
-def test_a_warning_in_c_is_told_once(cache, tmp_path, fmi):
+def test_a_warning_in_c_is_told_once(cache, tmp_path, fmi, isolate):
     getter = "int NAME(REAL_GET)(void *p, const unsigned r[], size_t n, double v[] SIZE) {\n    instance *c = p;"
     values = (
         "for (size_t i = 0; i < n; i++) v[i] = r[i] == 1 ? c->x : r[i] == 2 ? c->u + c->k : r[i] == 3 ? c->u : c->t"
     )
     warning = getter + f" if (c->t > 0.3) {{ if (!n) return 0; {values}; return 1; }}"
     file = eventful_fmu(tmp_path, fmi, changes=[(getter, warning)])
-    plant = Fmu(file, name="plant", isolate=False)
+    plant = Fmu(file, name="plant", isolate=isolate)
     diagram = Diagram("d", plant(u=Constant(value=0.5), n=Constant(value=0.0)))
     run = diagram.simulate(1.0, step=0.1, compile=True, progress=False)
     assert run.tier == "compiled"
     (told,) = [m for m in run.messages if "Warning" in m]
     assert told.startswith(f"plant: reading the outputs gave fmi{fmi}Warning at t = 0.")
-
-
-def test_obstacles_are_told(files, eventful):
-    plant = Fmu(files[mass_spring_damper, 3], interface="model_exchange", name="plant", isolate=True)
-    run = Diagram("d", plant(force=Sine(frequency=0.5, name="wave"))).simulate(
-        0.1, step=0.05, compile=True, progress=False
-    )
-    assert any("'plant' in model exchange runs in a process of its own" in message for message in run.messages)

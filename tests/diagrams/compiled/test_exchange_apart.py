@@ -1,0 +1,213 @@
+"""FMUs in model exchange that run in processes of their own, in compiled runs: bits and words, faults and interrupts."""
+
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from loopwright.blocks import Constant, FmuProcessError, FmuRuntimeError, UnitDelay
+from loopwright.diagrams import Diagram, Interrupted, subsystem
+from loopwright.fmus import Fmu, Isolation, mass_spring_damper
+from loopwright.fmus.isolation import count_processes, end_idle
+from support.eventful import eventful_fmu
+
+T = 1e-3
+M = mass_spring_damper.nominal
+A = np.array([[0.0, 1.0], [-M.stiffness / M.mass, -M.damping / M.mass]])
+B = np.array([[0.0], [1.0 / M.mass]])
+SHORT = Isolation(step_time=0.3, start_time=5.0)
+EXACT = {"rtol": 1e-9, "atol": 1e-12, "progress": False}
+
+
+@pytest.fixture(autouse=True)
+def nothing_left():
+    """No test leaves a process behind."""
+    yield
+    end_idle()
+    assert count_processes() == (0, 0)
+
+
+@pytest.fixture(scope="module")
+def mass(cache, tmp_path_factory):
+    return mass_spring_damper.build(out=tmp_path_factory.mktemp("apart") / "mass.fmu")
+
+
+def pi_loop(mass, isolate):
+    """A PI controller at 1 kHz around a mass on a spring."""
+    plant = Fmu(mass, interface="model_exchange", name="plant", isolate=isolate)
+
+    @subsystem(sample_time=T, name="controller")
+    def controller(y):
+        error = 1.0 - y
+        memory = UnitDelay(initial_value=0.0, name="integral")
+        return 20.0 * error + 50.0 * memory(memory.y + T * error)
+
+    return Diagram("loop", plant(force=controller(plant.position)))
+
+
+def exact_loop(n):
+    """Positions in that loop at n ticks, by the exponential of a matrix."""
+    step = expm(T * np.block([[A, B], [np.zeros((1, 3))]]))[:2]
+    x, integral, found = np.array([0.1, 0.0]), 0.0, []
+    for _ in range(n):
+        found.append(x[0])
+        error = 1.0 - x[0]
+        force, integral = 20.0 * error + 50.0 * integral, integral + T * error
+        x = step @ [*x, force]
+    return np.array(found)
+
+
+def eventful(file, start=None, isolate=SHORT):
+    plant = Fmu(file, name="plant", isolate=isolate, start=start or {})
+    return Diagram("d", plant(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
+
+
+def test_a_controlled_plant_is_that_of_the_matrix_exponential_with_the_bits_of_this_process(mass):
+    runs = [pi_loop(mass, isolate).simulate(0.1, compile=True, **EXACT) for isolate in (True, False)]
+    assert [run.tier for run in runs] == ["compiled", "compiled"]
+    assert runs[0].data.tobytes() == runs[1].data.tobytes()
+    np.testing.assert_allclose(runs[0]["plant.position"], exact_loop(101), rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("fmi", [pytest.param(2, marks=pytest.mark.slow), 3])
+def test_events_of_every_kind_are_those_of_this_process(cache, tmp_path, fmi):
+    file = eventful_fmu(tmp_path, fmi)
+    for start in ({"armed": 1}, {"last": 3}):
+        apart, here = (
+            eventful(file, start, isolate).simulate(2.0, step=0.05, compile=True, progress=False)
+            for isolate in (SHORT, False)
+        )
+        assert apart.tier == "compiled"
+        assert apart.data.tobytes() == here.data.tobytes()
+        assert [(e.t, e.event) for e in apart.events] == [(e.t, e.event) for e in here.events]
+        assert (apart.stopped is None) is ("armed" in start)
+
+
+@pytest.mark.slow
+def test_it_works_where_memory_is_not_written_in_order(mass, monkeypatch):
+    end_idle()
+    monkeypatch.setattr("loopwright.fmus.isolation.wire.ORDERED", False)
+    run = pi_loop(mass, True).simulate(0.1, compile=True, **EXACT)
+    np.testing.assert_allclose(run["plant.position"], exact_loop(101), rtol=0.0, atol=1e-9)
+
+
+FAULTS = {
+    "error": "return 3;",
+    "fatal": "return 4;",
+    "crash": "volatile int *nowhere = 0; *nowhere = 1;",
+    "hang": "for (;;) { volatile int never = 0; (void)never; }",
+    "exit": "exit(0);",
+}
+QUICK = {("error", 3), ("crash", 3), ("hang", 3)}
+
+
+@pytest.mark.parametrize(
+    ("fault", "fmi"),
+    [
+        pytest.param(fault, fmi, marks=[] if (fault, fmi) in QUICK else pytest.mark.slow)
+        for fault in FAULTS
+        for fmi in (2, 3)
+    ],
+)
+def test_a_fault_within_an_evaluation_is_told_as_in_an_interpreted_run(cache, tmp_path, fault, fmi):
+    file = eventful_fmu(tmp_path, fmi, fault=f"if (c->t > 0.3) {{ {FAULTS[fault]} }}")
+    found = []
+    for in_c in (False, True):
+        with pytest.raises((FmuProcessError, FmuRuntimeError)) as caught:
+            eventful(file).simulate(1.0, step=0.1, compile=in_c, progress=False)
+        found.append(caught.value)
+    one, two = found
+    assert type(one) is type(two)
+    assert (str(one), one.block) == (str(two), two.block)
+    assert one.t == pytest.approx(two.t, abs=1e-9)
+    assert getattr(one, "cause", None) is getattr(two, "cause", None)
+    assert two.run.tier == "compiled"
+    np.testing.assert_array_equal(one.run.t, two.run.t)
+    np.testing.assert_allclose(one.run.data, two.run.data, rtol=1e-9, atol=1e-12)
+    assert two.run.t[-1] >= 0.2
+
+
+@pytest.mark.parametrize("place", ["EnterEventMode", "CompletedIntegratorStep"])
+@pytest.mark.slow
+def test_a_crash_in_an_event_or_behind_a_step_is_told_as_in_an_interpreted_run(cache, tmp_path, place):
+    head = {
+        "EnterEventMode": "instance *c = p; MODE(CONTINUOUS); c->mode = EVENT; return 0;",
+        "CompletedIntegratorStep": "instance *c = p; MODE(CONTINUOUS);\n    c->steps++;",
+    }[place]
+    crash = head.replace("MODE(", f"if (c->t > 0.3) {{ {FAULTS['crash']} }} MODE(", 1)
+    file = eventful_fmu(tmp_path, 3, changes=[(head, crash)])
+    found = []
+    for in_c in (False, True):
+        with pytest.raises(FmuProcessError) as caught:
+            eventful(file).simulate(1.0, step=0.1, compile=in_c, progress=False)
+        found.append(caught.value)
+    assert str(found[0]) == str(found[1])
+    assert place in str(found[1])
+
+
+def test_a_warning_within_an_evaluation_is_told_once_and_the_run_goes_on_in_c(cache, tmp_path):
+    file = eventful_fmu(tmp_path, 3, fault="if (c->t > 0.3) { dx[0] = c->u + c->k; return 1; }")
+    one, two = (eventful(file).simulate(1.0, step=0.1, compile=in_c, progress=False) for in_c in (False, True))
+    assert two.tier == "compiled"
+    told = [[m for m in run.messages if "Warning" in m] for run in (one, two)]
+    assert told[0] == told[1]
+    assert len(told[1]) == 1
+    assert told[1][0].startswith("plant: computing the derivatives of its states gave fmi3Warning at t = 0.3")
+    np.testing.assert_allclose(one.data, two.data, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_evaluations_that_take_long_are_waited_for(cache, tmp_path):
+    slow = "if (c->t > 0.3 && c->t < 0.5) { for (volatile long i = 0; i < 60000000; i++) continue; }"
+    file = eventful_fmu(tmp_path, 3, fault=slow)
+    diagram = eventful(file, isolate=True)
+    run = diagram.simulate(0.6, step=0.1, compile=True, solver="heun", progress=False)
+    (quick := tmp_path / "quick").mkdir()
+    other = eventful(eventful_fmu(quick, 3)).simulate(0.6, step=0.1, compile=True, solver="heun", progress=False)
+    assert run.tier == "compiled"
+    assert run.data.tobytes() == other.data.tobytes()
+
+
+@pytest.mark.parametrize("fault", ["", "if (c->t > 1.0) for (;;) { volatile int never = 0; (void)never; }"])
+@pytest.mark.slow
+def test_ctrl_c_ends_a_run_soon(cache, tmp_path, fault):
+    file = eventful_fmu(tmp_path, 3, fault=fault)
+    diagram = eventful(file, isolate=True)
+    diagram.simulate(0.05, step=0.05, compile=True, progress=False)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    sent = []
+
+    def send():
+        sent.append(time.perf_counter())
+        os.kill(os.getpid(), signal.SIGINT)
+
+    timer = threading.Timer(0.5, send)
+    timer.start()
+    try:
+        with pytest.raises(Interrupted) as caught:
+            diagram.simulate(1e6, step=0.05, compile=True, record=["plant.x"], every=100, progress=False)
+    finally:
+        timer.cancel()
+        signal.signal(signal.SIGINT, before)
+    assert time.perf_counter() - sent[0] < 1.0  # 0.15 where the machine is quiet
+    assert len(caught.value.run.t) > 0
+    assert count_processes() == ((0, 0) if fault else (1, 1))  # one that has answered is used again
+
+
+@pytest.mark.one_tier
+def test_runs_that_are_long_for_a_process_of_their_own_are_compiled_by_themselves(mass):
+    run = pi_loop(mass, True).simulate(4.0, record=["plant.position"], every=100, progress=False)
+    assert run.tier == "compiled"
+    np.testing.assert_allclose(run["plant.position"], exact_loop(4001)[::100], rtol=0.0, atol=1e-6)
+    assert pi_loop(mass, True).simulate(0.1, progress=False).tier == "interpreted"
+
+
+def test_it_is_interpreted_where_c_can_not_wait_for_a_process(mass, monkeypatch):
+    monkeypatch.setattr("loopwright.fmus.isolation.process.ChildProcess.request_of", lambda self, sequence: None)
+    run = pi_loop(mass, True).simulate(0.01, compile=True, progress=False)
+    assert run.tier == "interpreted"
+    assert any("'plant' in model exchange runs in a process of its own" in message for message in run.messages)
