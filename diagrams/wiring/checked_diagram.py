@@ -135,10 +135,17 @@ class CheckedDiagram:
         ------
         UnknownNameError, ParameterError, WiringError
             A name that isn't there, a value out of bounds, a block that doesn't fit the wires.
+        OptionError
+            Two names of one parameter, or of one block.
+
+        Notes
+        -----
+        Blocks are replaced first, then whole parameters, then parts of them, in whatever order they are given:
+        ``{"plant.mass": 3, "plant": Fmu("other.fmu")}`` gives the other FMU a mass of 3.
         """
         if changes is not None:
             check_argument(changes, kinds.mapping, "changes", self.name)
-        table = apply_changes(self.structure, {**(changes or {}), **more}, self.name)
+        table = apply_changes(self.structure, [*(changes or {}).items(), *more.items()], self.name)
         return self.with_structure(table)
 
     def continuous(self) -> Self:

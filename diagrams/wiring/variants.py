@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace as replace_fields
 from typing import Any, TypeVar
 
-from ...blocks.core import Block, LoopwrightError, UnknownNameError, Value, WiringError, near
+from ...blocks.core import Block, LoopwrightError, OptionError, UnknownNameError, Value, WiringError, near
 from ...blocks.tracing import check_method
 from .entry_names import split_entry, with_entry
 from .parameter_names import OF_A_SUBSYSTEM, check_name, find_path, find_place
@@ -16,12 +16,36 @@ from .subsystems import check_delay, exact_offset, exact_time
 V = TypeVar("V", bound=Value)
 
 
-def apply_changes(table: Structure, changes: Mapping[str, object], diagram: str) -> Structure:
-    """Return the structure of a variant; see `Diagram.replace`."""
+def apply_changes(table: Structure, changes: Iterable[tuple[object, object]], diagram: str) -> Structure:
+    """Return the structure of a variant; see `Diagram.replace`.
+
+    Blocks come first, then whole parameters, then parts of them. So no change takes another one back, in any order.
+    """
     table = table.copy()
-    for path, value in changes.items():
-        _change(table, check_name(path, diagram), value, diagram)
+    named = [(check_name(name, diagram), value) for name, value in changes]
+    blocks = [isinstance(value, Block) and _names_block(table, path) for path, value in named]
+    given: dict[str, str] = {}
+    for (path, value), is_block in zip(named, blocks, strict=True):
+        if is_block and isinstance(value, Block):
+            full = find_path(path, table.blocks, "block", diagram)
+            _check_once(given, full, path, diagram)
+            value.check_place(table.blocks[full], *_used_ports(table, full))
+            table.blocks[full] = value.replace(name=full.rpartition(".")[2])
+    others = [one for one, is_block in zip(named, blocks, strict=True) if not is_block]
+    found = [(*_find_target(table, path, diagram), path, value) for path, value in others]
+    for full, keys, path, value in sorted(found, key=lambda one: (len(one[1]), "[" in "".join(one[1]))):
+        _check_once(given, ".".join([full, *keys]), path, diagram)
+        _change(table, full, keys, value)
     return table
+
+
+def _check_once(given: dict[str, str], full: str, path: str, diagram: str) -> None:
+    """Note a name under its full path; refuse a second one of the same block, parameter or setting."""
+    if full in given:
+        raise OptionError(
+            f"found two names of one parameter, {given[full]!r} and {path!r}; give it once.", block=diagram, port=full
+        )
+    given[full] = path
 
 
 def _find_owner(table: Structure, path: str) -> str:
@@ -32,27 +56,43 @@ def _find_owner(table: Structure, path: str) -> str:
     return found[0] if len(found) == 1 else ""
 
 
-def _change(table: Structure, path: str, value: object, diagram: str) -> None:
+def _names_block(table: Structure, path: str) -> bool:
+    """Whether a block given for a path takes a block's place, and is not the value of a parameter."""
     head, _, last = path.rpartition(".")
     owner = table.blocks.get(_find_owner(table, head)) if head else None
-    if isinstance(value, Block) and not (owner is not None and last in type(owner).parameter_specs):
-        full = find_path(path, table.blocks, "block", diagram)
-        value.check_place(table.blocks[full], *_used_ports(table, full))
-        table.blocks[full] = value.replace(name=full.rpartition(".")[2])
-    elif last in OF_A_SUBSYSTEM and (subsystem := _find_subsystem(table, head, last, diagram)) is not None:
-        table.subsystems[subsystem] = _change_subsystem(table.subsystems[subsystem], last, value)
-    elif path in table.blocks:
+    return owner is None or last not in type(owner).parameter_specs
+
+
+def _find_target(table: Structure, path: str, diagram: str) -> tuple[str, list[str]]:
+    """Return the path of a block or a subsystem, and the names that lead to a parameter of it; none for the block."""
+    head, _, last = path.rpartition(".")
+    if last in OF_A_SUBSYSTEM and (subsystem := _find_subsystem(table, head, last, diagram)) is not None:
+        return subsystem, [last]
+    if path in table.blocks:
+        return path, []
+    try:
+        return find_place(table, path, diagram)
+    except UnknownNameError:
+        if not (full := _find_owner(table, path)):
+            raise
+        return full, []
+
+
+def _change(table: Structure, path: str, keys: list[str], value: object) -> None:
+    """Change a parameter of the block, or a setting of the subsystem, at a path."""
+    if not keys:
         raise WiringError(
             f"found {value!r}; expected a block in its place, such as Fmu('other.fmu'), or the name of a parameter "
             f"({path}.…).",
             block=path,
         )
-    else:
-        full, keys = find_place(table, path, diagram)
-        try:
-            table.blocks[full] = change_parameter(table.blocks[full], keys, value)
-        except LoopwrightError as error:
-            raise error.at(block=full) from None
+    if path in table.subsystems:
+        table.subsystems[path] = _change_subsystem(table.subsystems[path], keys[0], value)
+        return
+    try:
+        table.blocks[path] = change_parameter(table.blocks[path], keys, value)
+    except LoopwrightError as error:
+        raise error.at(block=path) from None
 
 
 def _used_ports(table: Structure, path: str) -> tuple[set[str], set[str]]:

@@ -15,6 +15,7 @@ from loopwright.blocks import (
     Function,
     Gain,
     Integrator,
+    OptionError,
     ParameterError,
     PathProjection,
     SampleTimeError,
@@ -26,6 +27,7 @@ from loopwright.blocks import (
     Sum,
     TransportDelay,
     UnitDelay,
+    WiringError,
 )
 from loopwright.diagrams import Diagram, experiments, subsystem
 from support.hybrid_blocks import TIGHT, Ball, Lag, counting
@@ -137,6 +139,36 @@ def test_variants_change_neither_the_diagram_nor_each_other():
     diagram.continuous()
     diagram.sampled(0.1, method="forward")
     assert np.array_equal(diagram.simulate(0.5, progress=False).data, before)
+
+
+@pytest.mark.parametrize(
+    ("changes", "more"),
+    [
+        ({"control.kp.gain": 1.0, "kp.gain": 2.0}, {}),
+        ({"plant.D": 1.0, "D": 2.0}, {}),
+        ({"kp": Gain(gain=1.0), "control.kp": Gain(gain=2.0)}, {}),
+        ({"plant": StateSpace(A=A, B=B, C=B, D=0.0)}, {"plant": StateSpace(A=A, B=B, C=B, D=1.0)}),
+    ],
+)
+def test_two_names_of_one_thing_are_refused_in_any_order(changes, more):
+    for given in (changes, dict(reversed(changes.items()))):
+        with pytest.raises(OptionError, match="found two names of one parameter, .*; give it once"):
+            drive().replace(given, **more)
+
+
+def test_a_block_and_a_parameter_of_it_are_both_taken_in_any_order():
+    block = StateSpace(A=A, B=2 * B, C=np.array([0.0, 1.0]), D=0.0)
+    changes = {"plant.C": [3.0, 0.0], "plant": block, "plant.A[2,1]": -4.0, "plant.A": [[0.0, 1.0], [-5.0, -1.0]]}
+    for given in (changes, dict(reversed(changes.items()))):
+        plant = drive().replace(given)["plant"]
+        np.testing.assert_array_equal(plant.A, [[0.0, 1.0], [-4.0, -1.0]])
+        np.testing.assert_array_equal(plant.B, 2 * B)
+        np.testing.assert_array_equal(plant.C, [3.0, 0.0])
+
+
+def test_what_is_no_block_in_a_blocks_place_names_the_block():
+    with pytest.raises(WiringError, match=r"^control.kp: found 'x'; expected a block in its place"):
+        drive().replace({"kp": "x"})
 
 
 def test_a_transport_delay_becomes_one_by_samples():
