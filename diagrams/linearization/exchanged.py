@@ -112,7 +112,7 @@ def evaluators_at(flat: FlatDiagram, at: OperatingPoint) -> Evaluators | None:
         return None
     known = _KNOWN.get(at)
     if known is None or known[0] is not flat:
-        known = _KNOWN[at] = (flat, _load(flat, at))
+        known = _KNOWN[at] = (flat, load_evaluators(flat, at))
     return known[1]
 
 
@@ -151,7 +151,8 @@ def noise_of(evaluators: Evaluators | None) -> tuple[float, float]:
     return max((e.error for e in known), default=0.0), max((e.noise for e in known), default=0.0)
 
 
-def _load(flat: FlatDiagram, at: OperatingPoint) -> Mapping[str, PointEvaluator]:
+def load_evaluators(flat: FlatDiagram, at: OperatingPoint) -> Mapping[str, PointEvaluator]:
+    """Return new evaluators of the FMUs in model exchange at an operating point, as `evaluators_at` does."""
     held, stack = _Held(), ExitStack()
     weakref.finalize(held, stack.close)
     for path in flat.outside:

@@ -110,7 +110,7 @@ def differentiate_loop(
     for name in dict.fromkeys(parameters):
         whole, entry = split_array(model.diagram, name)
         try:
-            (free,), diagram = free_parameters(model.diagram, {whole: None}, by_start=True)
+            (free,), diagram = free_parameters(model.diagram, {whole: None})
             kind = _StartValues if free.where is None else _Traced
             found += kind(cut, free, diagram, find).slopes(free.find_entries(entry))
         except LoopwrightError as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -10,15 +10,20 @@ import numpy as np
 
 from ...blocks.core import FmuError, SimulationError, elements
 from ...fmus.running import FmuLinearization, linearize_fmu
-from ..flat import FlatDiagram, WiredDiagram
+from ..flat import Evaluators, FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
+from .exchanged import evaluators_at, load_evaluators
 from .identification import WATCHED, output_drift
 from .plant_models import plant_entries, plant_layout
 
 if TYPE_CHECKING:
     from ...fmus.running import Fmu
     from .trim_request import Free
+
+
+RELATIVE_STEP = 1e-5
+"""Step of a difference by a free parameter, relative to its size."""
 
 
 @dataclass(eq=False)
@@ -166,13 +171,71 @@ class Plants:
         """Write the derivatives by entry j of the i-th free parameter into a column of v."""
         d = 1e-5 * max(1.0, abs(float(q[i][j])))
         found = []
-        for side in (d, -d):
-            beside = [value.copy() for value in q]
-            beside[i][j] += side
+        sides, width = f.find_sides(q[i], j, d)
+        for value in sides if width else ():  # a parameter with one value only stays
+            beside = [*q[:i], value, *q[i + 1 :]]
             m, rates = self._evaluate_one(f.path, self.change_blocks(free, beside)[f.path], xp, z)
             found.append((rates, m.y0))
-        v.f_by_q[self.own[f.path], column] = (found[0][0] - found[1][0]) / (2 * d)
-        v.y_by_q[plant_entries(self.flat, f.path)[1], column] = (found[0][1] - found[1][1]) / (2 * d)
+        if width:
+            v.f_by_q[self.own[f.path], column] = (found[0][0] - found[1][0]) / width
+            v.y_by_q[plant_entries(self.flat, f.path)[1], column] = (found[0][1] - found[1][1]) / width
+
+
+class ExchangedPlants:
+    """FMUs in model exchange whose start values are free: evaluators of the FMUs with other values, and differences.
+
+    Parameters
+    ----------
+    diagram : Diagram
+        The diagram.
+    flat : FlatDiagram
+        The flattened diagram.
+    at : OperatingPoint
+        Where the search begins.
+    free : list of Free
+        All free parameters.
+    """
+
+    def __init__(self, diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, free: list[Free]):
+        self.diagram, self.at_start, self.free = diagram, at, free
+        self.mine = [i for i, f in enumerate(free) if f.block.evaluated_outside]
+        self.as_they_are = evaluators_at(flat, at)
+
+    def evaluators(self, q: Sequence[np.ndarray]) -> Evaluators | None:
+        """Return evaluators of the FMUs with values of the free parameters."""
+        if not self.mine:
+            return self.as_they_are
+        values = {self.free[i].name: self.free[i].shape_value(q[i]) for i in self.mine}
+        return load_evaluators(self.diagram.replace(values).flatten_like(self.at_start), self.at_start)
+
+    def differentiate(
+        self,
+        q: Sequence[np.ndarray],
+        values: Sequence[np.ndarray],
+        evaluate: Callable[[Evaluators | None], Sequence[np.ndarray]],
+    ) -> list[np.ndarray]:
+        """Return the derivatives of vectors by all free parameters: differences, zeros of those of other blocks.
+
+        Parameters
+        ----------
+        q : sequence of ndarray
+            Values of the free parameters.
+        values : sequence of ndarray
+            The vectors there.
+        evaluate : callable
+            Function from evaluators to the vectors.
+        """
+        columns = [np.zeros((v.size, sum(value.size for value in q))) for v in values]
+        first = np.cumsum([0, *(value.size for value in q)])
+        for i in self.mine:
+            for j in range(q[i].size):
+                beside, width = self.free[i].find_sides(q[i], j, RELATIVE_STEP * (abs(float(q[i][j])) or 1.0))
+                if width:  # a parameter with one value only stays
+                    ends = (evaluate(self.evaluators([*q[:i], value, *q[i + 1 :]])) for value in beside)
+                    high, low = ([np.ravel(v).copy() for v in values] for values in ends)
+                    for column, above, below in zip(columns, high, low, strict=True):
+                        column[:, first[i] + j] = (above - below) / width
+        return columns
 
 
 def check_drift(drift: Mapping[str, float], tolerance: float, name: str, t: float) -> None:

@@ -83,6 +83,12 @@ class Free:
         """Return the parameter's value from its entries."""
         return value.reshape(self.shape).copy() if self.shape else float(value[0])
 
+    def find_sides(self, value: np.ndarray, i: int, d: float) -> tuple[list[np.ndarray], float]:
+        """Return values with entry i greater, and less, by d or up to the bound, and the distance of the two."""
+        high, low = value.copy(), value.copy()
+        high[i], low[i] = min(value[i] + d, self.high[i]), max(value[i] - d, self.low[i])
+        return [high, low], float(high[i] - low[i])
+
     def is_at_bound(self, value: np.ndarray) -> bool:
         """Whether an entry is at a bound, within the accuracy of the search."""
         near = 1e-3 * np.where(np.isfinite(self.high - self.low), self.high - self.low, 0.0)
@@ -262,13 +268,11 @@ def set_states(flat: FlatDiagram, at: OperatingPoint, states: Mapping[str, Any])
 # --- parameters ------------------------------------------------------------------------------------------------------
 
 
-def free_parameters(
-    diagram: WiredDiagram, asked: Mapping[str, Any], *, by_start: bool = False
-) -> tuple[list[Free], WiredDiagram]:
+def free_parameters(diagram: WiredDiagram, asked: Mapping[str, Any]) -> tuple[list[Free], WiredDiagram]:
     """Return the free parameters, and a diagram in whose equations all of them are symbols.
 
-    A trace takes an exact zero for structure, so a parameter that is zero starts beside it. ``by_start`` takes start
-    values of FMUs in model exchange, too, as those of FMUs that step: they are no symbols.
+    A trace takes an exact zero for structure, so a parameter that is zero starts beside it. Start values of
+    FMUs are no symbols.
 
     Raises
     ------
@@ -286,7 +290,7 @@ def free_parameters(
         low, high = _limit_bounds(block, keys, low, high)
         start = np.clip(np.ravel(np.asarray(value, dtype=float)), low, high)
         free = Free(f"{path}.{'.'.join(keys)}", path, keys, block, start, low, high, np.shape(value))
-        if not block.stepped and not (by_start and block.evaluated_outside):
+        if not (block.stepped or block.evaluated_outside):
             start = np.where(start == 0.0, _move_off_zero(low, high), start)
             free.start = start
             moved[free.name] = free.shape_value(start)
@@ -294,7 +298,7 @@ def free_parameters(
     diagram = diagram.replace(moved) if moved else diagram
     flat = diagram.flatten(None if diagram.has_clock else 1)
     for free in found:
-        if free.path in flat.checked.traced and not (by_start and free.block.evaluated_outside):
+        if free.path in flat.checked.traced and not free.block.evaluated_outside:
             locate(free, diagram, flat)
     return found, diagram
 
@@ -303,24 +307,13 @@ def split_array(diagram: WiredDiagram, name: str) -> tuple[str, tuple[int, ...]]
     """Return the path of a parameter, and the entry of an array that is named behind it: ``"motor.denominator[1]"``."""
     path, keys = find_place(diagram.structure, name, diagram.name)
     block = diagram.structure.blocks[path]
-    known = (
-        cast("Fmu", block).description.variables
-        if (block.stepped or block.evaluated_outside) and keys[0] == "start"
-        else ()
-    )
+    known = cast("Fmu", block).description.variables if _is_start_value(block, keys) else ()
     return (name, ()) if ".".join(keys[1:]) in known else split_entry(name, ())
 
 
 def locate(free: Free, diagram: WiredDiagram, flat: FlatDiagram) -> None:
     """Set the block, slice and packing of a free parameter of a traced block."""
     free.block = diagram.structure.blocks[free.path]
-    if free.block.evaluated_outside:
-        raise ParameterError(
-            "it is a start value of an FMU in model exchange; a trim frees those of FMUs in co-simulation. Give the "
-            "FMU interface='co_simulation', or try values with diagram.replace(…), one after the other.",
-            block=free.path,
-            port=".".join(free.keys),
-        )
     if ".".join(free.keys) not in dict(traced_parameters(free.block)):
         raise ParameterError(
             "it is structure: the equations were traced with this value; expected a parameter that they contain. Try "
@@ -352,7 +345,7 @@ def read_value(owner: Value, keys: list[str], label: str) -> float | np.ndarray:
     value = owner.__dict__[keys[0]]
     if len(keys) > 1 and isinstance(value, Value):
         return read_value(value, keys[1:], label)
-    if len(keys) > 1 and isinstance(owner, Block) and keys[0] == "start" and (owner.stepped or owner.evaluated_outside):
+    if isinstance(owner, Block) and _is_start_value(owner, keys):
         name, variables = ".".join(keys[1:]), cast("Fmu", owner).description.variables
         if name not in variables:
             raise UnknownNameError(f"the FMU has no variable {name!r}. {near(name, variables)}", block=label)
@@ -375,7 +368,16 @@ def _limit_bounds(block: Block, keys: list[str], low: np.ndarray, high: np.ndarr
         least = spec.minimum if spec.above is None else np.nextafter(spec.above, np.inf)
         low = low if least is None else np.maximum(low, least)
         high = high if spec.maximum is None else np.minimum(high, spec.maximum)
+    if _is_start_value(block, keys):
+        variable = cast("Fmu", block).description.variables[".".join(keys[1:])]
+        low = low if variable.minimum is None else np.maximum(low, np.ravel(variable.minimum))
+        high = high if variable.maximum is None else np.minimum(high, np.ravel(variable.maximum))
     return low, high
+
+
+def _is_start_value(block: Block, keys: Sequence[str]) -> bool:
+    """Return whether a parameter is a start value of an FMU."""
+    return len(keys) > 1 and keys[0] == "start" and (block.stepped or block.evaluated_outside)
 
 
 def _move_off_zero(low: np.ndarray, high: np.ndarray) -> np.ndarray:

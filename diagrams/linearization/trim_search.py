@@ -33,7 +33,7 @@ from ..flat import (
 from ..results import FreeDirection, OperatingPoint, PointOrigin
 from .exchanged import evaluators_at
 from .operating_points import PointLike, operating_point, with_residual
-from .trim_plants import Plants, check_drift
+from .trim_plants import ExchangedPlants, Plants, check_drift
 from .trim_request import Free, Target, free_parameters, index_states, read_targets, set_states
 
 UNDETERMINED = 1e-10
@@ -54,7 +54,7 @@ class _Equations:
     def __init__(self, diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, free: list[Free], target: Target):
         self.diagram, self.flat, self.at, self.parameters, self.target = diagram, flat, at, free, target
         self.plants = Plants(flat, at, diagram)
-        self.evaluators = evaluators_at(flat, at)
+        self.exchanged = ExchangedPlants(diagram, flat, at, free)
         traced = flat.checked.traced
         self.sampled = flat.states.entries(p for p in flat.states.slices if traced[p].advance != "derivative")
         loops = flat.loops.entries(flat.loops.slices)
@@ -169,8 +169,9 @@ class _Equations:
             if f.where is not None:
                 p[f.where] = f.pack_value(value)
                 by_q[f.where, columns] = f.slope(value)
-        numbers = self.function(self.at.t, x, w, p, evaluators=self.evaluators)
+        numbers = self.function(self.at.t, x, w, p, evaluators=self.exchanged.evaluators(q))
         values, rest = numbers[:5], numbers[5:]
+        moved = self.exchanged.differentiate(q, values, lambda e: self.function(self.at.t, x, w, p, evaluators=e)[:5])
         many, where = 3 if self.parameters else 2, self.unknowns.slices
 
         def derivative(i: int) -> np.ndarray:
@@ -180,7 +181,7 @@ class _Equations:
             J[:, where["x"]] = by[0][:, self.free_x]
             J[:, where["w"]] = by[1]
             if self.parameters:
-                J[:, where["q"]] = by[2] @ by_q
+                J[:, where["q"]] = by[2] @ by_q + moved[i]
             return J
 
         rows, slopes = values[:4], [derivative(i) for i in range(4)]

@@ -4,7 +4,7 @@ import control
 import numpy as np
 import pytest
 
-from loopwright.blocks import Gain, OptionError, ParameterError
+from loopwright.blocks import Gain, OptionError
 from loopwright.diagrams import Diagram, Requirements
 from loopwright.diagrams.report import analyse
 from loopwright.diagrams.studies import CaseState, ConfirmationKind, WorstCaseTask
@@ -140,7 +140,7 @@ def test_start_values_of_an_fmu_in_model_exchange_are_varied():
         assert case.value == pytest.approx(expected, abs=1e-4)
 
 
-def test_parameters_that_an_fmu_in_model_exchange_sets_are_among_the_sensitivities_and_no_trim_frees_them():
+def test_parameters_that_an_fmu_in_model_exchange_sets_are_among_the_sensitivities():
     """One derivative of the phase margin is that of the closed form, by central differences."""
     motor = Fmu(dc_motor.build(), name="motor", interface="model_exchange", start={"inertia": 2e-5})
     made = Diagram("loop", motor(voltage=Gain(gain=-3.0, name="kp")(motor.speed).named("u"), load_torque=0.0))
@@ -152,5 +152,13 @@ def test_parameters_that_an_fmu_in_model_exchange_sets_are_among_the_sensitiviti
 
     slope = made.sensitivity("u")["motor.inertia", "phase_margin_deg"].slope.value
     assert slope == pytest.approx((phase_margin(2.002e-5) - phase_margin(1.998e-5)) / 4e-8, rel=1e-5)
-    with pytest.raises(ParameterError, match="a trim frees those of FMUs in co-simulation"):
-        made.trim(free={"motor.inertia": (1e-5, 1e-4)}, targets={"motor.speed": 0.0})
+
+
+@pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
+def test_a_trim_frees_a_parameter_of_an_fmu(interface):
+    """At rest the motor's torque is friction: k (V − k w)/R = b w."""
+    k, R, V, w = dc_motor.nominal.motor_constant, dc_motor.nominal.resistance, 5.0, 70.0
+    motor = Fmu(dc_motor.build(), name="motor", interface=interface, start={"friction": 1e-6})
+    made = Diagram("drive", motor(voltage=V, load_torque=0.0))
+    found = made.trim(["motor.friction"], {"motor.speed": w}, rates={"motor.angle": w})
+    assert found.parameters["motor.start.friction"] == pytest.approx(k * (V - k * w) / (R * w), rel=1e-9)
