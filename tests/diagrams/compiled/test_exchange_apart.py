@@ -198,6 +198,22 @@ def test_ctrl_c_ends_a_run_soon(cache, tmp_path, fault):
     assert count_processes() == ((0, 0) if fault else (1, 1))  # one that has answered is used again
 
 
+def test_a_saved_state_tells_the_fmu_that_steps_may_be_taken_back_and_a_crash_between_two_advances_is_told(mass):
+    with pi_loop(mass, True).simulation(compile=True) as simulation:
+        plant = simulation._engine.exchanged.blocks["plant"]
+        for saved in (False, True):
+            if saved:
+                simulation.save()
+            simulation.advance(0.01)
+            assert bool(plant._events.final.value) is not saved
+        assert not plant.fmi.process.arrived
+        os.kill(plant.fmi.process.pid, signal.SIGKILL)
+        with pytest.raises(FmuProcessError) as caught:
+            simulation.advance(0.01)
+    assert caught.value.block == "plant"
+    np.testing.assert_allclose(caught.value.run["plant.position"], exact_loop(21), rtol=0.0, atol=1e-6)
+
+
 @pytest.mark.one_tier
 def test_runs_that_are_long_for_a_process_of_their_own_are_compiled_by_themselves(mass):
     run = pi_loop(mass, True).simulate(4.0, record=["plant.position"], every=100, progress=False)

@@ -41,7 +41,10 @@ def exact(t, u=0.0):
     return u * t + 0.25 * k * (k - 1) / 2 + k * (t - 0.25 * k)
 
 
-@pytest.mark.parametrize("solver", ["RK45", "Radau", "BDF", "CVODE_Adams", "rk4", "euler"])
+RADAU = pytest.param("Radau", marks=pytest.mark.one_tier)  # its output `steps` counts the solver's, one less in C
+
+
+@pytest.mark.parametrize("solver", ["RK45", RADAU, "BDF", "CVODE_Adams", "rk4", "euler"])
 def test_a_solver_lands_on_time_events(file, solver):
     diagram = Diagram("d", plant(file)(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
     run = diagram.simulate(1.1, step=0.1, solver=solver, progress=False)
