@@ -321,7 +321,7 @@ class Diagram(VariedDiagram):
         Raises
         ------
         OptionError
-            No such subsystem, or a file that is no ``.svg``.
+            No such subsystem, a file that is no ``.svg``, or a folder that isn't there.
         """
         from .drawing import Drawing, draw
 

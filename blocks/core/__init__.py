@@ -37,7 +37,7 @@ from .errors import (
     close_names,
     near,
 )
-from .files import replace_file, write_text
+from .files import check_file, replace_file, write_text
 from .findings import Finding
 from .frozen import FrozenMapping
 from .instants import FINEST, is_before, left_of, move_earlier, next_edge, period_of, read_time, right_of
@@ -122,6 +122,7 @@ __all__ = [
     "as_signal",
     "brief",
     "check_argument",
+    "check_file",
     "check_name",
     "check_shapes",
     "close_names",

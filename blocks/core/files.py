@@ -9,6 +9,27 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from .errors import OptionError
+
+
+def check_file(path: str | os.PathLike[str]) -> Path:
+    """Return the file of a path that a user gave; find out, before anything is computed, whether it can be written.
+
+    Raises
+    ------
+    OptionError
+        A folder, or a file in a folder that isn't there or can't be written to.
+    """
+    file = Path(path).expanduser()
+    if file.is_dir():
+        raise OptionError(f"{str(path)!r} is a folder. Name a file in it.", port="path")
+    if not file.parent.is_dir():
+        raise OptionError(f"there is no folder {str(file.parent)!r}. Make it, or name another one.", port="path")
+    folder = Path(os.path.realpath(file)).parent
+    if (file.is_file() or not file.exists()) and not os.access(folder, os.W_OK):
+        raise OptionError(f"nothing can be written to {str(folder)!r}. Name another folder.", port="path")
+    return file
+
 
 @contextmanager
 def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:

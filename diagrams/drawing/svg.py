@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from html import escape
 from pathlib import Path
 
-from ...blocks.core import OptionError, Sum, accepts, kinds, near, write_text
+from ...blocks.core import OptionError, Sum, accepts, check_file, kinds, near, write_text
 from ..wiring import CheckedDiagram, Structure, stepped_blocks
 from .layout import Net, arrange
 from .nets import Border, Nets, Place
@@ -47,12 +47,12 @@ class Drawing:
         Raises
         ------
         OptionError
-            If the file has another ending.
+            If the file has another ending, or its folder isn't there.
         """
         file = Path(path)
         if file.suffix.lower() != ".svg":
             raise OptionError(f"found {str(path)!r}; expected a file for SVG; name it {file.stem}.svg.")
-        write_text(file, self.svg)
+        write_text(check_file(file), self.svg)
         return file
 
 

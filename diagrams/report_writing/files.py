@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from ...blocks.core import OptionError, replace_file, write_text
+from ...blocks.core import OptionError, check_file, replace_file, write_text
 from .html import to_html
 from .json import to_json
 from .model import Document
@@ -31,12 +31,7 @@ def check_files(path: str | os.PathLike[str] | None, *, pdf: bool, json: bool, p
         if file.suffix.lower() in (".pdf", ".json"):
             step = f" Name it {file.stem}.html, and ask for the {file.suffix[1:].upper()} beside it."
         raise OptionError(f"found {str(path)!r}; expected a file that ends in .html.{step}", port="path")
-    if file.is_dir():
-        raise OptionError(f"{str(path)!r} is a folder. Name a file in it.", port="path")
-    if not file.parent.is_dir():
-        raise OptionError(f"there is no folder {str(file.parent)!r}. Make it, or name another one.", port="path")
-    if not os.access(file.parent, os.W_OK):
-        raise OptionError(f"nothing can be written to {str(file.parent)!r}. Name another folder.", port="path")
+    check_file(path)
     if pdf:
         printer()
 

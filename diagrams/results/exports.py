@@ -11,7 +11,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, check_argument, kinds, replace_file
+from ...blocks.core import OptionError, check_argument, check_file, kinds, replace_file
 from .stored import PathLike
 
 if TYPE_CHECKING:
@@ -32,6 +32,8 @@ _TAKEN = {
 
 def to_csv(run: RecordedSignals, path: PathLike | IO[str], names: Sequence[str]) -> None:
     """Write signals as comma-separated values; see `Run.to_csv`."""
+    if isinstance(path, str | os.PathLike):
+        check_file(path)
     table = dict(columns(run, names))
     header = ",".join(["t", *table])
     rows = np.column_stack([run.t, *table.values()])
@@ -67,6 +69,7 @@ def to_xarray(run: RecordedSignals, names: Sequence[str]) -> Dataset:
 def to_parquet(run: RecordedSignals, path: PathLike, names: Sequence[str]) -> None:
     """Write signals as a Parquet file; see `Run.to_parquet`."""
     arrow, parquet = import_library("pyarrow"), import_library("pyarrow.parquet")
+    check_file(path)
     units = {"t": "s", **units_of_columns(run, names)}
     fields = [arrow.field(n, arrow.float64(), metadata={"unit": u} if u else None) for n, u in units.items()]
     schema = arrow.schema(fields, metadata={"diagram": run.diagram_name})
@@ -82,6 +85,7 @@ def to_mat(run: RecordedSignals, path: PathLike, names: Sequence[str]) -> None:
     """Write signals as a MATLAB file; see `Run.to_mat`."""
     from scipy.io import savemat
 
+    check_file(path)
     signals = select_signals(run, names)
     variables = matlab_names(signals)
     values = {v: flatten_samples(run[n]) for n, v in variables.items()}

@@ -322,8 +322,8 @@ class Run:
 
         Raises
         ------
-        UnknownNameError
-            For a name that was not recorded.
+        UnknownNameError, OptionError
+            For a name that was not recorded; for a folder that isn't there.
         """
         from .exports import to_csv
 
@@ -373,7 +373,7 @@ class Run:
         UnknownNameError
             For a name that was not recorded.
         OptionError
-            If pyarrow is not installed.
+            If pyarrow is not installed, or the folder isn't there.
         """
         from .exports import to_parquet
 
@@ -393,7 +393,7 @@ class Run:
         UnknownNameError
             For a name that was not recorded.
         OptionError
-            If a signal takes 2 GiB or more, which the format can't hold.
+            If the folder isn't there, or a signal takes 2 GiB or more, which the format can't hold.
         """
         from .exports import to_mat
 

@@ -254,6 +254,8 @@ def test_drawing_needs_no_matplotlib_and_shows_in_notebooks():
 def test_a_drawing_is_written_as_svg_only(tmp_path):
     drawing = pi_loop().draw(tmp_path / "pi.svg")
     assert (tmp_path / "pi.svg").read_text(encoding="utf-8") == drawing.svg
+    with pytest.raises(OptionError, match="there is no folder"):
+        pi_loop().draw(tmp_path / "nowhere" / "pi.svg")
     with pytest.raises(OptionError, match=r"name it pi\.svg"):
         pi_loop().draw(tmp_path / "pi.png")
 

@@ -60,6 +60,16 @@ def check_columns(run, table):
     assert same(table["η/ξ error"], run["box.e"])
 
 
+@pytest.mark.parametrize("kind", ["csv", "parquet", "mat"])
+def test_a_file_that_cannot_be_written_is_refused_by_the_path_that_was_given(kind, run, tmp_path):
+    write = getattr(run, f"to_{kind}")
+    with pytest.raises(OptionError, match=r"^path: there is no folder '.*nowhere'\. Make it, or name another one"):
+        write(tmp_path / "nowhere" / f"run.{kind}")
+    with pytest.raises(OptionError, match=rf"{tmp_path.name}' is a folder\. Name a file in it"):
+        write(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_csv_is_read_by_the_standard_library(run, tmp_path):
     run.to_csv(tmp_path / "run.csv")
     with open(tmp_path / "run.csv", encoding="utf-8", newline="") as file:
