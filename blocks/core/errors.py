@@ -297,8 +297,12 @@ class ConfirmationError(LoopwrightError, RuntimeError):
 
 
 def close_names(name: str, known: Iterable[str]) -> list[str]:
-    """Return the known names that are close to ``name``, at most three."""
-    return difflib.get_close_matches(str(name), sorted({str(k) for k in known}), n=3, cutoff=0.5)
+    """Return the known names that are close to ``name``, at most three; those that differ in case alone come first."""
+    plain: dict[str, list[str]] = {}
+    for one in sorted({str(k) for k in known}):
+        plain.setdefault(one.casefold(), []).append(one)
+    close = difflib.get_close_matches(str(name).casefold(), plain, n=3, cutoff=0.5)
+    return [one for folded in close for one in plain[folded]][:3]
 
 
 def near(name: str, known: Iterable[str]) -> str:

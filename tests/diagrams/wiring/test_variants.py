@@ -15,6 +15,7 @@ from loopwright.blocks import (
     Function,
     Gain,
     Integrator,
+    LoopwrightError,
     OptionError,
     ParameterError,
     PathProjection,
@@ -164,6 +165,19 @@ def test_a_block_and_a_parameter_of_it_are_both_taken_in_any_order():
         np.testing.assert_array_equal(plant.A, [[0.0, 1.0], [-4.0, -1.0]])
         np.testing.assert_array_equal(plant.B, 2 * B)
         np.testing.assert_array_equal(plant.C, [3.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "meant"),
+    [
+        (lambda: drive().replace({"CONTROL.Kp.Gain": 1.0}), "'control.kp.gain'"),
+        (lambda: StateSpace(a=A, B=B, C=B, D=0.0), "'A'"),
+        (lambda: drive().simulate(0.1)["PLANT.Y"], "'plant.y'"),
+    ],
+)
+def test_a_name_in_other_letters_has_the_name_that_was_meant_first(change, meant):
+    with pytest.raises(LoopwrightError, match=f"Did you mean {meant}"):
+        change()
 
 
 def test_what_is_no_block_in_a_blocks_place_names_the_block():
