@@ -65,7 +65,7 @@ def check_slopes(
     """Hold derivatives against differences of the values, in a few random directions.
 
     Only where a direction shows a gap, each column is looked at by itself. A derivative that is the slope to one side
-    of a kink is right.
+    of a kink is right; one between both sides, such as their mean, is kept, with its distance as its error.
 
     Parameters
     ----------
@@ -109,6 +109,8 @@ class _Comparison:
     """Size of the derivative and of the values."""
     rounding: np.ndarray
     """Part of the error that rounding makes."""
+    between: np.ndarray
+    """Whether the point is a kink, and the derivative lies between the slopes to its sides."""
 
     @property
     def is_close(self) -> np.ndarray:
@@ -120,7 +122,8 @@ class _Comparison:
 
     @property
     def is_wrong(self) -> np.ndarray:
-        return np.asarray(~self.agrees & (self.gap > WRONG * self.size) & (self.gap > 10.0 * self.error))
+        off = (self.gap > WRONG * self.size) & (self.gap > 10.0 * self.error)
+        return np.asarray(~self.agrees & off & ~self.between)
 
     def choose(self, other: _Comparison) -> _Comparison:
         """Return, row by row, the comparison with the smaller error."""
@@ -193,6 +196,7 @@ class _Checker:
             sides.append((last, 2.0 * np.abs(last - fine) + rounding))
         slope, error = sides[0]
         gap = np.abs(by_slopes - slope)
+        between = np.zeros(gap.shape, bool)
         if both:
             one, two, four = ((ends[k] - ends[-k]) / (2 * k * length) for k in (1, 2, 4))
             fine, coarse = (4 * one - two) / 3, (4 * two - four) / 3
@@ -203,9 +207,10 @@ class _Checker:
             slope = np.where(kink, np.where(below, down, up), middle)
             error = np.where(kink, np.where(below, down_error, up_error), middle_error)
             gap = np.abs(by_slopes - slope)
+            between = kink & (np.minimum(up, down) <= by_slopes) & (by_slopes <= np.maximum(up, down))
         size = np.maximum(size, np.abs(slope))
         error = np.where(np.isfinite(slope) & np.isfinite(error), error, np.inf)
-        return _Comparison(slope, error, gap, size, size + np.abs(f0), rounding)
+        return _Comparison(slope, error, gap, size, size + np.abs(f0), rounding, between)
 
     def _value(self, step: np.ndarray) -> np.ndarray:
         return np.array(self.values(self.at + step), dtype=float)
@@ -223,7 +228,8 @@ class _Checker:
             if not off.any():
                 continue
             error[off, k] = (found.gap + found.error)[off] / self.sizes[k]
-            gap = max(gap, float(np.max(found.gap[off] / found.size[off])))
+            size = np.maximum(found.size[off], np.finfo(float).tiny)  # 0 where both are none
+            gap = max(gap, float(np.max(found.gap[off] / size)))
             made[bad, k], error[bad, k] = found.slope[bad] / v[k], found.error[bad] / self.sizes[k]
             wrong |= bool(bad.any())
         return SlopeCheck(made, error, np.nan if unknown and not gap else gap, wrong)

@@ -46,9 +46,23 @@ def test_right_derivatives_agree_and_wrong_ones_are_found_to_the_entry(at):
 def test_at_a_kink_and_beside_one_either_slope_is_right():
     for J in (1.0, -1.0):
         assert check(np.abs, J, 0.0).gap == 0.0
-    assert check(np.abs, 0.0, 0.0).is_wrong
+    assert check(np.abs, 1.5, 0.0).is_wrong
     near = check(lambda x: np.abs(x - 1e-6), -1.0, 0.0)
     assert (near.gap, near.is_wrong) == (0.0, False)
+
+
+@pytest.mark.parametrize(("function", "J", "distance"), [(np.abs, 0.0, 1.0), (lambda x: np.maximum(x, 0.0), 0.5, 0.5)])
+def test_the_mean_of_the_slopes_to_both_sides_of_a_kink_is_kept_with_its_distance_to_them(function, J, distance):
+    found = check(function, J, 0.0)
+    assert not found.is_wrong
+    assert found.J[0, 0] == J
+    assert found.error[0, 0] == pytest.approx(distance)
+
+
+@pytest.mark.filterwarnings("error")
+def test_slopes_of_a_cubic_at_its_saddle_divide_by_nothing():
+    found = check(lambda x: np.array([-x[0] ** 3 + x[1] ** 3]), [[0.0, 0.0]], [0.0, 0.0])
+    assert (found.gap, found.is_wrong) == (0.0, False)
 
 
 def test_beside_a_limit_and_with_an_offset_differences_still_tell():
