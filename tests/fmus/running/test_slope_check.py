@@ -61,8 +61,21 @@ def test_the_mean_of_the_slopes_to_both_sides_of_a_kink_is_kept_with_its_distanc
 
 @pytest.mark.filterwarnings("error")
 def test_slopes_of_a_cubic_at_its_saddle_divide_by_nothing():
-    found = check(lambda x: np.array([-x[0] ** 3 + x[1] ** 3]), [[0.0, 0.0]], [0.0, 0.0])
+    found = check(lambda x: np.array([-(x[0] ** 3) + x[1] ** 3]), [[0.0, 0.0]], [0.0, 0.0])
     assert (found.gap, found.is_wrong) == (0.0, False)
+
+
+def test_stairs_refute_nothing_but_a_level_value_does():
+    def single(x):
+        return np.float64(np.float32(101325.0 + x[0]))  # steps of 0.0078
+
+    found = check(single, 1.0, 0.7)
+    assert not found.is_wrong
+    assert np.isnan(found.gap)
+    assert found.J[0, 0] == 1.0
+    level = check(lambda x: np.minimum(x, 0.5), 1.0, 0.7)
+    assert level.is_wrong
+    assert level.J[0, 0] == 0.0
 
 
 def test_beside_a_limit_and_with_an_offset_differences_still_tell():
