@@ -218,7 +218,7 @@ class InexactDerivatives(Finding):
     block : str
         Path of the FMU.
     gap : float
-        Largest distance, relative to the size of the derivatives; NaN where the values could not be computed.
+        Largest distance, relative to the size of the derivatives; NaN where it is not known.
     """
 
     block: str
@@ -228,7 +228,7 @@ class InexactDerivatives(Finding):
         if math.isnan(self.gap):
             return (
                 f"{self.block}: its directional derivatives could not be held against differences of its own values, "
-                "as it does not compute them beside this point"
+                "which are stairs, jump, or are not computed beside this point: their error is not known"
             )
         return (
             f"{self.block}: its directional derivatives are right to {self.gap:.2g} of their size alone, by "
