@@ -357,7 +357,9 @@ def find_obstacle_at_ticks(
     if len(flat.distinct) > CLOCKS:
         return f"it has {len(flat.distinct)} different clocks, and at most {CLOCKS} are compiled"
     if not regular:
-        return "an FMU takes longer steps than from one tick to the next, or a coupling is asked for that iterates"
+        return (
+            'an FMU takes longer steps than from one tick to the next, or a coupling other than "jacobi" is asked for'
+        )
     for path, plant in plants.items():
         if path not in native:
             return f"the FMU {path!r} has {plant.obstacle}" if isinstance(plant, FmuInstance) else f"{path!r} is no FMU"

@@ -239,7 +239,7 @@ class _Checker:
             known = np.isfinite(found.error) & (found.agrees | steady)
             stairs = known & found.is_wrong & (found.slope == 0.0)
             if stairs.any():
-                known = known & ~(stairs & self._rises(J[:, k], k))
+                known = known & ~(stairs & self._rises(J[:, k], int(k)))
             unknown |= not known.all()
             off, bad = known & ~found.agrees, known & found.is_wrong
             if not off.any():
