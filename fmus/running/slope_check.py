@@ -39,7 +39,7 @@ class SlopeCheck:
         Estimated error of each entry; 0 where the derivative agrees with its difference.
     gap : float
         Largest distance of a derivative from its difference, relative to the size of the values' change; 0 if all
-        agree, NaN if the values could not be computed.
+        agree, NaN if the values could not be computed, or their differences are no evidence.
     is_wrong : bool
         Whether some derivatives are plainly wrong.
     """
@@ -218,8 +218,11 @@ class _Checker:
     def _value(self, step: np.ndarray) -> np.ndarray:
         return np.array(self.values(self.at + step), dtype=float)
 
-    def _rises(self, slopes: np.ndarray, k: int) -> np.ndarray:
-        """Return the rows that follow their slopes over a long way, though they stand still over short ones."""
+    def _rises(self, slopes: np.ndarray, short: np.ndarray, k: int) -> np.ndarray:
+        """Return the rows that follow their slopes over a long way, though they hardly move so over ``short`` ones.
+
+        Values that are rounded more coarsely than double precision stand still over a short way.
+        """
         ends = self.at + np.outer((-_FAR, _FAR), np.eye(self.at.size)[k] * self.sizes[k])
         low, high = np.clip(ends, *self.limits)
         try:
@@ -227,7 +230,8 @@ class _Checker:
         except LoopwrightError:
             return np.zeros(slopes.shape, bool)
         expected = slopes * (high - low)[k]
-        return np.asarray(np.abs(rise - expected) <= _ALIKE * np.abs(expected))
+        far_off = np.abs(slopes - short) >= 0.5 * np.abs(slopes)
+        return np.asarray(far_off & (np.abs(rise - expected) <= _ALIKE * np.abs(expected)))
 
     def check_columns(self, J: np.ndarray) -> SlopeCheck:
         """Compare each column by itself; put differences in place of entries that are plainly wrong."""
@@ -236,10 +240,10 @@ class _Checker:
             v = np.zeros(self.at.size)
             v[k] = self.sizes[k] if self.up[k] else -self.sizes[k]
             found, steady = self._compare_at_all(J, v)
-            known = np.isfinite(found.error) & (found.agrees | steady)
-            stairs = known & found.is_wrong & (found.slope == 0.0)
-            if stairs.any():
-                known = known & ~(stairs & self._rises(J[:, k], int(k)))
+            known = np.isfinite(found.error) & (found.agrees | steady | found.between)
+            wrong_rows = known & found.is_wrong
+            if wrong_rows.any():
+                known = known & ~(wrong_rows & self._rises(J[:, k], found.slope / v[k], int(k)))
             unknown |= not known.all()
             off, bad = known & ~found.agrees, known & found.is_wrong
             if not off.any():

@@ -57,6 +57,8 @@ def test_the_mean_of_the_slopes_to_both_sides_of_a_kink_is_kept_with_its_distanc
     assert not found.is_wrong
     assert found.J[0, 0] == J
     assert found.error[0, 0] == pytest.approx(distance)
+    beside = check(lambda x: function(x - 1.0), J, 1.0)  # rounding makes one side or the other the nearer one
+    assert beside.error[0, 0] == pytest.approx(distance)
 
 
 @pytest.mark.filterwarnings("error")
@@ -73,6 +75,10 @@ def test_stairs_refute_nothing_but_a_level_value_does():
     assert not found.is_wrong
     assert np.isnan(found.gap)
     assert found.J[0, 0] == 1.0
+    assert not check(lambda x: single(x) - 1e-3 * x, 0.999, 0.7).is_wrong  # a part of it is in double precision
+    fine = check(lambda x: 1e12 * (1.0 + 1e-12 * x) - 1e12, 1.0, 0.5)
+    assert (fine.is_wrong, fine.J[0, 0]) == (False, 1.0)
+    assert check(lambda x: 2.0 * x, 1.9, 0.3).is_wrong
     level = check(lambda x: np.minimum(x, 0.5), 1.0, 0.7)
     assert level.is_wrong
     assert level.J[0, 0] == 0.0
