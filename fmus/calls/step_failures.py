@@ -261,7 +261,7 @@ class StepFailures(LoadedFmu):
         if needs_care(self.description, self.block.stepping):
             return "steps with options (event mode, early return, input derivatives, rollback, times of its own)"
         if self.block.text_variables:
-            return "texts among its ports, which are read after each step; leave them out by ports="
+            return "texts that are recorded, which are read after each step; leave them out by ports="
         if self.fmi.in_process:
             return "ports with limits, or that are no Float64, in this process; isolate=True compiles them"
         if self._shared is not None and self._shared.has_request:
