@@ -191,9 +191,10 @@ def test_a_failure_after_the_change_says_the_same(eager):
     assert eager == [1001]
 
 
-def test_another_value_is_refused():
-    with pytest.raises(OptionError, match="expected True, False or"):
-        sums().simulate(1.0, compile="yes", **QUIET)
+@pytest.mark.parametrize("value", ["yes", 1, None])
+def test_another_value_is_refused(value):
+    with pytest.raises(OptionError, match='expected True, False or "auto"'):
+        sums().simulate(1.0, compile=value, **QUIET)
 
 
 def test_the_docstring_of_simulate_names_every_option():
