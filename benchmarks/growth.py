@@ -67,8 +67,8 @@ def over_blocks() -> dict[str, list[float]]:
     """Return ns a block and tick, and s to compile."""
     found = [measured_in_c(chain, n, sampled=True) for n in BLOCKS]
     return {
-        "tick": [step / n * 1e9 for n, (_, step, _) in zip(BLOCKS, found, strict=True)],
-        "compile": [compiling for compiling, _, _ in found],
+        "tick": [step / n * 1e9 for n, (_, step, *_) in zip(BLOCKS, found, strict=True)],
+        "compile": [compiling for compiling, *_ in found],
     }
 
 
