@@ -14,7 +14,7 @@ from ...blocks.core import LoopwrightError, UnknownNameError, accepts, brief, en
 from ..flat import WiredDiagram
 from ..frequency import MarginSlope, Number, margin_slopes
 from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize
-from ..results import OperatingPoint
+from ..results import BLUE, DARK, VERMILION, OperatingPoint, new_figure, style
 from ..wiring import find_parameter
 from .parameters import check_parameters, list_parameters, unit_of
 
@@ -201,17 +201,20 @@ class Sensitivities(Sequence[Sensitivity]):
 
     def plot(self, quantity: str = "disk_margin", count: int = 8) -> Figure:
         """Return a bar for each of the largest changes per 1 % of a parameter."""
-        from matplotlib.figure import Figure
+        from matplotlib.ticker import MaxNLocator
 
         mine = self.of(quantity, count)[::-1]
-        figure = Figure(figsize=(6.4, 0.9 + 0.32 * max(len(mine), 1)), layout="constrained")
-        axes = figure.add_subplot()
         values = [row.per_percent.value for row in mine]
-        axes.barh([row.parameter for row in mine], values, color=["C0" if v >= 0 else "C3" for v in values])
-        axes.axvline(0.0, color="0.3", linewidth=0.8)
         unit = "" if not mine or mine[0].number.unit == "1" else f" in {mine[0].number.unit}"
-        axes.set_xlabel(f"change of {quantity}{unit} per 1 % of the parameter")
-        axes.grid(axis="x", alpha=0.3)
+        with style():
+            figure = new_figure(0.7 + 0.27 * max(len(mine), 1))
+            axes = figure.subplots()
+            axes.barh([row.parameter for row in mine], values, color=[BLUE if v >= 0 else VERMILION for v in values])
+            axes.axvline(0.0, color=DARK, linewidth=0.8)
+            axes.set_xlabel(f"change of {quantity}{unit} per 1 % of the parameter")
+            axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+            axes.grid(visible=False, axis="y")
+            figure.canvas.draw()  # sizes of letters are those of the style at the first drawing
         return figure
 
 

@@ -1,10 +1,14 @@
 """Sensitivities of margins to parameters of a diagram."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 
 from loopwright.blocks import UnknownNameError
 from loopwright.diagrams import experiments, margins
+from loopwright.diagrams.results import BLUE, VERMILION
 from loopwright.diagrams.studies import confirm_parameter, confirm_sensitivity, sensitivities_of
 from support import reviewed
 from support.tuned_loops import make_pi_loop, pi_phase_margin
@@ -36,6 +40,18 @@ def test_without_names_all_numbers_are_taken_and_zeros_are_told():
     assert "phase_margin_deg" in str(found)
     assert len(found.table()) == len(found)
     assert [t.get_text() for t in found.plot("ms").axes[0].get_yticklabels()]
+
+
+def test_a_plot_has_our_colours_and_labels_that_stand_apart():
+    figure = make_pi_loop().sensitivity("u", NAMES).plot("ms")
+    axes = figure.axes[0]
+    colours = {to_hex(bar.get_facecolor()).upper() for bar in axes.patches}
+    assert colours <= {BLUE, VERMILION}
+    figure.canvas.draw()
+    boxes = [label.get_window_extent() for label in axes.get_xticklabels() if label.get_text()]
+    inside = sorted((box.x0, box.x1) for box in boxes if axes.bbox.x0 - 1 <= (box.x0 + box.x1) / 2 <= axes.bbox.x1 + 1)
+    assert len(inside) > 2
+    assert all(before[1] + 3 < after[0] for before, after in pairwise(inside))
 
 
 def test_parameters_that_change_nothing_are_named():
