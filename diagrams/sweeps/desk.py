@@ -43,7 +43,8 @@ class Desk:
     ) -> Generator[Outcome, None, None]:
         """Yield the outcomes of workers, each called in a thread of its own, in the order in which they are ready.
 
-        The error of a worker is raised. Where the caller stops, the desk is closed, and the workers are waited for.
+        The error of a worker closes the desk and is raised. Where the caller stops, the desk is closed, and the workers
+        are waited for.
 
         Parameters
         ----------
@@ -59,6 +60,7 @@ class Desk:
             except BaseException as error:
                 if not self.is_closed:
                     self._ready.put(error)
+                    self._closed.set()  # here, as the caller may come to read it late: nobody starts another sample
             finally:
                 self._ready.put(None)
 
