@@ -13,6 +13,7 @@ import time
 
 import numpy as np
 
+from loopwright.blocks.core import Wanted
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, mass_spring_damper
 from loopwright.fmus.isolation import end_idle
@@ -47,7 +48,7 @@ def evaluations(file, isolate, count, work):
     """Return the times of evaluations in model exchange in µs: derivatives and outputs."""
     block = Fmu(file, interface="model_exchange", isolate=isolate)
     with block.exchange([*block.inputs]) as instance:
-        evaluate = instance.evaluation([*block.outputs], rates=True)
+        evaluate = instance.evaluation(Wanted((*block.outputs,), rates=True))
         x, u = np.zeros(2), np.ones(1)
         return measure(lambda k: evaluate(1e-3 * k, x, u), count, work)
 

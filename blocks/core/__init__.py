@@ -43,6 +43,7 @@ from .frozen import FrozenMapping
 from .instants import FINEST, is_before, left_of, move_earlier, next_edge, period_of, read_time, right_of
 from .layout import Layout, elements, lay_out
 from .one_thread import on_one_thread, one_thread
+from .outside import EvaluationVectors, Wanted
 from .parameters import ParameterSpec
 from .ports import Event, Input, Output, Port, PortUnit, Shape, State, number_inputs
 from .signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, check_name, recorder
@@ -77,6 +78,7 @@ __all__ = [
     "DefinitionError",
     "DoubleDriveError",
     "DuplicateNameError",
+    "EvaluationVectors",
     "Event",
     "Finding",
     "FmuEnd",
@@ -115,6 +117,7 @@ __all__ = [
     "UnknownNameError",
     "UnwiredInputError",
     "Value",
+    "Wanted",
     "Wireable",
     "WiringError",
     "accepts",

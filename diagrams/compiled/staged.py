@@ -8,10 +8,10 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ...blocks.tracing import GUARDS, NEXT
+from ...blocks.core import EvaluationVectors, Wanted
 from ...fmus.calls import BoundCalls, NativeAction, NativeLook
 from ...fmus.host_state import HostState
-from ..flat import INDICATORS, JUMP, OpaqueStage
+from ..flat import JUMP, OpaqueStage
 from .code import address_of
 from .grouped_parts import color_columns
 from .loop import TickStructure
@@ -80,21 +80,10 @@ class NativeBlock(Protocol):
     def native_host(self) -> HostState | None:
         """The state of this process, which a library that Loopwright has not built may change."""
 
-    def native_evaluation(
-        self,
-        ports: Sequence[str],
-        *,
-        rates: bool,
-        indicators: bool,
-        t: np.ndarray,
-        x: np.ndarray,
-        u: np.ndarray,
-        into: np.ndarray,
-        again: bool,
-    ) -> list[NativeAction]:
+    def native_evaluation(self, wanted: Wanted, vectors: EvaluationVectors, *, again: bool) -> list[NativeAction]:
         """Return an evaluation as actions of C."""
 
-    def native_look(self, t: np.ndarray, x: np.ndarray, u: np.ndarray, into: np.ndarray) -> NativeLook:
+    def native_look(self, vectors: EvaluationVectors) -> NativeLook:
         """Return all that a look at an instant that is reached may do."""
 
 
@@ -225,18 +214,14 @@ class NativeExchange:
     def _bind_fmu(self, structure: _Stage, stage: OpaqueStage, t: np.ndarray, c: np.ndarray, *, again: bool) -> None:
         place = self.paths.index(stage.path)
         block, fmu = self._blocks[stage.path], self._each[place]
-        x, u, into = c[stage.states], c[stage.inputs], c[stage.makes]
+        vectors = stage.vectors(t, c)
         structure.fmu = ctypes.addressof(self._each) + place * ctypes.sizeof(_Exchanged)
-        structure.t, structure.x, structure.u, structure.into, structure.made = at(t), at(x), at(u), at(into), into.size
+        structure.t, structure.x, structure.u, structure.into = map(at, vectors)
+        structure.made = vectors.into.size
         if stage.names == (JUMP,):
-            self._bind_look(fmu, stage.path, block.native_look(t, x, u, into), x.size)
+            self._bind_look(fmu, stage.path, block.native_look(vectors), vectors.x.size)
             return
-        ports = [name for name in stage.names if name not in (NEXT, GUARDS, INDICATORS)]
-        rates, indicators = NEXT in stage.names, INDICATORS in stage.names
-        actions = block.native_evaluation(
-            ports, rates=rates, indicators=indicators, t=t, x=x, u=u, into=into, again=again
-        )
-        structure.calls = self._sequence(stage.path, actions)
+        structure.calls = self._sequence(stage.path, block.native_evaluation(stage.wanted, vectors, again=again))
 
     def _bind_look(self, fmu: _Exchanged, path: str, look: NativeLook, states: int) -> None:
         fmu.states, fmu.inputs = states, look.least.size

@@ -14,9 +14,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ...blocks.core import SimulationError
+from ...blocks.core import EvaluationVectors, SimulationError, Wanted
 from ...blocks.tracing import GUARDS, NEXT
-from ..flat import INDICATORS, JUMP, FlatDiagram, no_evaluator
+from ..flat import JUMP, FlatDiagram, no_evaluator, sort_names
 
 _STEP = float(np.cbrt(np.finfo(float).eps))  # of a difference, relative to the nominal value
 Values = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
@@ -63,25 +63,14 @@ class ExchangedBlock(Protocol):
     def add_note(self, text: str) -> None:
         """Add a message of the run on this block."""
 
-    def evaluation(self, ports: Sequence[str], *, rates: bool = False, indicators: bool = False) -> Values:
+    def evaluation(self, wanted: Wanted) -> Values:
         """Return the call ``(t, x, u) -> values`` of outputs, rates of the states and indicators, one after the other.
 
         It leaves everything that the block keeps as it is.
         """
 
-    def bound_evaluation(
-        self,
-        ports: Sequence[str],
-        *,
-        rates: bool,
-        indicators: bool,
-        t: np.ndarray,
-        x: np.ndarray,
-        u: np.ndarray,
-        into: np.ndarray,
-        again: bool,
-    ) -> Callable[[], None]:
-        """Return the call that writes an `evaluation` at what stands in t, x and u into another vector.
+    def bound_evaluation(self, wanted: Wanted, vectors: EvaluationVectors, *, again: bool) -> Callable[[], None]:
+        """Return the call that reads and writes these vectors as an `evaluation` does its arguments and its result.
 
         With ``again`` another such call always comes right before it, at the same t and x.
         """
@@ -186,25 +175,17 @@ class ExchangeEvaluator:
     def _bind(self, names: tuple[str, ...]) -> Values:
         if names == (JUMP,):
             return self._jump
-        return self.block.evaluation(self._ports(names), rates=NEXT in names, indicators=INDICATORS in names)
+        return self.block.evaluation(self._wanted(names))
 
-    def _ports(self, names: tuple[str, ...]) -> list[str]:
-        ports = [name for name in names if name in self._outputs]
-        assert {*ports, NEXT, GUARDS, INDICATORS}.issuperset(names)
-        return ports
+    def _wanted(self, names: tuple[str, ...]) -> Wanted:
+        wanted = sort_names(names)
+        assert self._outputs.issuperset(wanted.outputs)
+        return wanted
 
-    def bind(
-        self,
-        names: tuple[str, ...],
-        t: np.ndarray,
-        x: np.ndarray,
-        u: np.ndarray,
-        into: np.ndarray,
-        *,
-        again: bool,
-    ) -> Callable[[], None]:
+    def bind(self, names: tuple[str, ...], vectors: EvaluationVectors, *, again: bool) -> Callable[[], None]:
         """Return `evaluate` bound to vectors; see `loopwright.diagrams.flat.stages.BindingEvaluator`."""
         if names == (JUMP,):
+            t, x, u, into = vectors
 
             def jump() -> None:
                 into[:] = self._jump(float(t[0]), x, u)
@@ -215,8 +196,7 @@ class ExchangeEvaluator:
         def call() -> None:  # the block is loaded after the functions are bound
             nonlocal made
             if made is None:
-                flags = {"rates": NEXT in names, "indicators": INDICATORS in names, "again": again}
-                made = self.block.bound_evaluation(self._ports(names), **flags, t=t, x=x, u=u, into=into)
+                made = self.block.bound_evaluation(self._wanted(names), vectors, again=again)
             made()
 
         return call
@@ -255,8 +235,8 @@ class ExchangeEvaluator:
         """
         if not {NEXT, GUARDS, *self._outputs}.issuperset(names):
             return None
-        ports = [name for name in names if name in self._outputs]
-        J = self.slopes(ports, rates=NEXT in names, t=t, x=x, u=u)
+        wanted = sort_names(names)
+        J = self.slopes(wanted.outputs, rates=wanted.rates, t=t, x=x, u=u)
         if J is None:
             J = self.differences(names, t, x, u)
         return np.hstack([np.full((len(J), 1), math.nan), J])

@@ -4,7 +4,7 @@ from ...blocks.core import Layout
 from .announced import Announcer, Times, announcers
 from .clock_sets import is_exact, kinds_of
 from .clocks import EVERY, NONE, ClockSets, TickPattern, bits_of, ticks_after
-from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator
+from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator, sort_names
 from .fast_functions import share_terms
 from .flat_diagram import EXACT_LOOP, FlatDiagram
 from .flatten import renumber, write_numbers
@@ -74,6 +74,7 @@ __all__ = [
     "renumber",
     "share_terms",
     "size_of_motion",
+    "sort_names",
     "takes_any_step",
     "ticks_after",
     "trace_schedule",

@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import Layout, SimulationError
+from ...blocks.core import Layout, SimulationError, Wanted
 from ...blocks.tracing import GUARDS, NEXT, size
 from ..wiring import OrderStep, Wire, join
 from .block_functions import BlockFunctions, call_block
@@ -359,6 +359,12 @@ class Instant:
             made.update({name: change(column) for name, column in made.items()})
         self.guards = [change(column) for column in self.guards]
         self.mismatch = [(change(made), change(taken)) for made, taken in self.mismatch]
+
+
+def sort_names(names: Sequence[str]) -> Wanted:
+    """Return the equations of an evaluation from outside by kind; there are no guards, and no `JUMP`."""
+    outputs = tuple(name for name in names if name not in (NEXT, GUARDS, INDICATORS))
+    return Wanted(outputs, NEXT in names, INDICATORS in names)
 
 
 def no_evaluator(path: str) -> SimulationError:

@@ -39,8 +39,8 @@ from typing import Any, Protocol, runtime_checkable
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import Layout
-from .evaluation import Apart, Instant, no_evaluator
+from ...blocks.core import EvaluationVectors, Layout, Wanted
+from .evaluation import Apart, Instant, no_evaluator, sort_names
 from .fast_functions import share_terms, speed_up
 
 
@@ -75,17 +75,8 @@ class Evaluator(Protocol):
 class BindingEvaluator(Protocol):
     """Evaluator that can be bound to vectors, so that a call costs no copies."""
 
-    def bind(
-        self,
-        names: tuple[str, ...],
-        t: np.ndarray,
-        x: np.ndarray,
-        u: np.ndarray,
-        into: np.ndarray,
-        *,
-        again: bool,
-    ) -> Callable[[], None]:
-        """Return the call that writes `Evaluator.evaluate` at what stands in t, x and u into another vector.
+    def bind(self, names: tuple[str, ...], vectors: EvaluationVectors, *, again: bool) -> Callable[[], None]:
+        """Return the call that reads and writes these vectors as `Evaluator.evaluate` does arguments and result.
 
         Parameters
         ----------
@@ -177,6 +168,15 @@ class OpaqueStage:
         if self.path not in evaluators:
             raise no_evaluator(self.path)
         return evaluators[self.path]
+
+    def vectors(self, t: np.ndarray, c: np.ndarray) -> EvaluationVectors:
+        """Return its parts of c."""
+        return EvaluationVectors(t, c[self.states], c[self.inputs], c[self.makes])
+
+    @property
+    def wanted(self) -> Wanted:
+        """Its ``names``, other than `JUMP`, sorted by kind."""
+        return sort_names(self.names)
 
     def run(self, evaluator: Evaluator, t: np.ndarray, c: np.ndarray) -> None:
         """Evaluate it at c, and write its part of c."""
@@ -363,7 +363,7 @@ def _call_of(
     stage: OpaqueStage, evaluator: Evaluator, t: np.ndarray, c: np.ndarray, *, again: bool
 ) -> Callable[[], None]:
     if isinstance(evaluator, BindingEvaluator):
-        return evaluator.bind(stage.names, t, c[stage.states], c[stage.inputs], c[stage.makes], again=again)
+        return evaluator.bind(stage.names, stage.vectors(t, c), again=again)
     return lambda: stage.run(evaluator, t, c)
 
 

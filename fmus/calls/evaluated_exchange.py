@@ -7,11 +7,10 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuRuntimeError, Layout, elements
+from ...blocks.core import EvaluationVectors, FmuRuntimeError, Layout, Wanted, elements
 from ..archive import ExchangeInfo, FmuVariable
 from ..platform import is_built_here
 from .bound_calls import DISCARD, ERROR, FATAL, Call
@@ -52,7 +51,7 @@ class EvaluatedExchange(SavedExchange):
         self._time = self.fmi.variable(ctypes.c_double)
         self._x, self._dx = (self._allocate(n) for _ in range(2))
         self._indicators = self._allocate(len(self.about.indicators))
-        self._evaluations: dict[Any, Evaluation] = {}
+        self._evaluations: dict[Wanted, Evaluation] = {}
         self._is_own = self.fmi.in_process and is_built_here(self.description.digest)
         self._guarded = self.fmi.in_process and not self._is_own
         self._is_placed = False
@@ -64,42 +63,27 @@ class EvaluatedExchange(SavedExchange):
     def _allocate(self, n: int) -> np.ndarray:
         return self.fmi.allocate(n, ctypes.c_double)
 
-    def evaluation(
-        self, ports: Sequence[str], *, rates: bool = False, indicators: bool = False
-    ) -> Callable[[float, np.ndarray, np.ndarray], np.ndarray]:
+    def evaluation(self, wanted: Wanted) -> Callable[[float, np.ndarray, np.ndarray], np.ndarray]:
         """Return the call ``(t, x, u) -> values`` that gets outputs, then derivatives, then indicators.
 
         The result is one array, written anew by each call: NaN where the FMU can't compute it there (discard).
-
-        Parameters
-        ----------
-        ports : sequence of str
-            Output ports.
-        rates, indicators : bool
-            Whether the derivatives of the states, and the event indicators, are wanted.
         """
-        key = (tuple(ports), rates, indicators)
-        if key not in self._evaluations:
-            self._evaluations[key] = self._bind(*key)
-        found = self._evaluations[key]
+        found = self._evaluation(wanted)
 
         def evaluate(t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
             return self._run(found, t, x, u)
 
         return evaluate
 
-    def _bind(
-        self,
-        ports: tuple[str, ...],
-        rates: bool,
-        indicators: bool,
-        then: tuple[tuple[Call, str], ...] = (),
-        *,
-        all_inputs: bool = False,
-    ) -> Evaluation:
-        outputs = {port: self.block.output_variables[port] for port in ports}
-        every = indicators or bool(then) or all_inputs
-        used = {port: v for port, v in self._smooth.items() if self._is_needed(port, ports, rates, every)}
+    def _evaluation(self, wanted: Wanted) -> Evaluation:
+        if wanted not in self._evaluations:
+            self._evaluations[wanted] = self._bind(wanted)
+        return self._evaluations[wanted]
+
+    def _bind(self, wanted: Wanted, then: tuple[tuple[Call, str], ...] = (), *, all_inputs: bool = False) -> Evaluation:
+        outputs = {port: self.block.output_variables[port] for port in wanted.outputs}
+        every = wanted.indicators or bool(then) or all_inputs
+        used = {port: v for port, v in self._smooth.items() if every or self._is_needed(port, wanted)}
         index = [np.arange(self._places[p].start, self._places[p].stop) for p in used]
         inputs = self._allocate(sum(v.size for v in used.values()))
         got = self._allocate(sum(v.size for v in outputs.values()))
@@ -111,38 +95,28 @@ class EvaluatedExchange(SavedExchange):
             index=np.concatenate([np.zeros(0, dtype=int), *index]),
             outputs=Transfer(self.fmi, "Get", outputs, got),
             derivatives=Vector("derivatives", self._dx),
-            rates=rates,
-            indicators=Vector("indicators", self._indicators) if indicators else None,
+            rates=wanted.rates,
+            indicators=Vector("indicators", self._indicators) if wanted.indicators else None,
             then=then,
             lazy=not self._is_own,
         )
 
-    def bound_evaluation(
-        self,
-        ports: Sequence[str],
-        *,
-        rates: bool,
-        indicators: bool,
-        t: np.ndarray,
-        x: np.ndarray,
-        u: np.ndarray,
-        into: np.ndarray,
-        again: bool,
-    ) -> Callable[[], None]:
-        """Return the call that writes an `evaluation` at what stands in t, x and u into another vector.
+    def bound_evaluation(self, wanted: Wanted, vectors: EvaluationVectors, *, again: bool) -> Callable[[], None]:
+        """Return the call that reads and writes these vectors as `evaluation` does its arguments and its result.
 
         An FMU that Loopwright has built reads and writes these vectors itself. With ``again`` another such call always
         comes right before it, at the same t and x, which need not be set anew.
         """
-        plain = self.evaluation(ports, rates=rates, indicators=indicators)
+        plain = self.evaluation(wanted)
+        t, x, u, into = vectors
 
         def copy() -> None:
             into[:] = plain(t[0], x, u)
 
-        made = self._bind_direct(tuple(ports), rates, indicators, t, x, u, into, again=False)
+        made = self._bind_direct(wanted, vectors, again=False)
         if made is None:
             return copy
-        short = self._bind_direct(tuple(ports), rates, indicators, t, x, u, into, again=True) if again else None
+        short = self._bind_direct(wanted, vectors, again=True) if again else None
 
         def call() -> None:
             if not self._running:
@@ -157,22 +131,11 @@ class EvaluatedExchange(SavedExchange):
 
         return call
 
-    def _bind_direct(
-        self,
-        ports: tuple[str, ...],
-        rates: bool,
-        indicators: bool,
-        t: np.ndarray,
-        x: np.ndarray,
-        u: np.ndarray,
-        into: np.ndarray,
-        *,
-        again: bool,
-    ) -> DirectEvaluation | None:
+    def _bind_direct(self, wanted: Wanted, vectors: EvaluationVectors, *, again: bool) -> DirectEvaluation | None:
         """Return an evaluation on vectors of the caller's; None where values have to be copied or converted."""
-        outputs = [self.block.output_variables[port] for port in ports]
+        outputs = [self.block.output_variables[port] for port in wanted.outputs]
         used = [port for port in self._places if port in self._smooth]
-        inputs = [port for port in used if self._is_needed(port, ports, rates, indicators)]
+        inputs = [port for port in used if wanted.indicators or self._is_needed(port, wanted)]
         variables = [*outputs, *(self._ports[port] for port in inputs)]
         places = [self._places[port] for port in inputs]
         adjoining = all(a.stop == b.start for a, b in pairwise(places))
@@ -182,23 +145,18 @@ class EvaluatedExchange(SavedExchange):
         return DirectEvaluation(
             self.fmi,
             time=self._time,
-            t=t,
-            x=x,
-            u=u[places[0].start : places[-1].stop] if places else u[:0],
-            into=into,
+            vectors=vectors._replace(u=vectors.u[places[0].start : places[-1].stop] if places else vectors.u[:0]),
             inputs=[r for port in inputs for r in self._ports[port].references],
             outputs=[r for v in outputs for r in v.references],
-            rates=rates,
-            indicators=len(self.about.indicators) if indicators else 0,
+            rates=wanted.rates,
+            indicators=len(self.about.indicators) if wanted.indicators else 0,
             again=again,
         )
 
-    def _is_needed(self, port: str, ports: Sequence[str], rates: bool, every: bool) -> bool:
-        """Whether an input has to be set: outputs and rates that are wanted may depend on it; or every input has."""
-        if every:
-            return True
-        unknown = [self.block.output_variables[name] for name in ports]
-        if rates:
+    def _is_needed(self, port: str, wanted: Wanted) -> bool:
+        """Whether outputs or rates that are wanted may depend on an input."""
+        unknown = [self.block.output_variables[name] for name in wanted.outputs]
+        if wanted.rates:
             unknown += [self.description.find(name) for name in self.description.states.values()]
             if not self.description.states:
                 return True
@@ -252,7 +210,7 @@ class EvaluatedExchange(SavedExchange):
             v.type == "Float64" and not a and name is None for v, a, name in zip(outputs, asked, states, strict=True)
         ):
             return None
-        self.evaluation(ports, rates=rates)(t, x, u)
+        self.evaluation(Wanted(tuple(ports), rates))(t, x, u)
         unknown = [*outputs, *(about.find(name) for name in about.states.values() if rates)]
         asked += [True] * (len(unknown) - len(asked))
         smooth = [v for v, is_asked in zip(unknown, asked, strict=True) if is_asked]
@@ -294,7 +252,7 @@ class EvaluatedExchange(SavedExchange):
         if not rows or not columns:
             return
         declared = np.block([[self.about.pattern(of, v) for v, _ in columns] for of in rows])
-        bound = self._bind(tuple(ports), bool(about.states), False, all_inputs=True)
+        bound = self._bind(Wanted(tuple(ports), bool(about.states)), all_inputs=True)
         start = np.concatenate([x, *(u[self._places[port]] for _, port in columns if port is not None)])
         nominals, low, high = (
             np.concatenate([np.ravel(part) for part in parts])

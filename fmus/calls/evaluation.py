@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ...blocks.core import EvaluationVectors
 from .bound_calls import BoundCalls, Call
 from .fmi_calls import WARNING, FmiCalls
 from .native_step import ActionKind, NativeAction, call_action, copy_action, transfer_actions
@@ -111,13 +112,12 @@ class Evaluation:
             self.result[self._indicators_at] = self.indicators.values
         return status, ""
 
-    def native(
-        self, t: np.ndarray, x: np.ndarray, u: np.ndarray, into: np.ndarray, order: np.ndarray, *, again: bool = False
-    ) -> list[NativeAction]:
+    def native(self, vectors: EvaluationVectors, order: np.ndarray, *, again: bool = False) -> list[NativeAction]:
         """Return it as actions of C on vectors of the caller's; ``order`` is that of the FMU's states.
 
         With ``again`` time and states need not be set.
         """
+        t, x, u, into = vectors
         (calls, names), take, give = self._running, ActionKind.TAKE, ActionKind.GIVE
         placed = (1 + bool(self._states.size)) if again else 0
         time = np.ctypeslib.as_array(ctypes.pointer(self._time), (1,))
@@ -142,8 +142,8 @@ class DirectEvaluation:
     ----------
     time : c_double
         The time, as an argument of the calls.
-    t, x, u, into : ndarray
-        Vectors of the time, of the states in the FMU's order, of the inputs that are set, and of the results.
+    vectors : EvaluationVectors
+        Its states are in the FMU's order, its inputs those that are set.
     again : bool
         Whether time and states need not be set.
     """
@@ -153,16 +153,14 @@ class DirectEvaluation:
         fmi: FmiCalls,
         *,
         time: ctypes.c_double,
-        t: np.ndarray,
-        x: np.ndarray,
-        u: np.ndarray,
-        into: np.ndarray,
+        vectors: EvaluationVectors,
         inputs: Sequence[int],
         outputs: Sequence[int],
         rates: bool,
         indicators: int,
         again: bool,
     ):
+        t, x, u, into = vectors
         n = x.size
         count = into.size - indicators - (n if rates else 0)
         slopes, last = into[count : count + n], into[into.size - indicators :]

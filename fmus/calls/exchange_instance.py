@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ...blocks.core import FmuRuntimeError, SimulationError
+from ...blocks.core import EvaluationVectors, FmuRuntimeError, SimulationError, Wanted
 from ..host_state import HostState
 from .bound_calls import DISCARD, WARNING, BoundCalls, Call, EventUpdate
 from .evaluated_exchange import EvaluatedExchange
@@ -177,13 +177,13 @@ class ExchangeInstance(EvaluatedExchange):
             more = [*sets, (calls.update, _UPDATING)]
             if calls.enter is not None:
                 more.insert(0, (calls.enter, "entering Event Mode"))
-            self._event = self._bind((), False, bool(self.about.indicators), tuple(more))
+            self._event = self._bind(Wanted(indicators=bool(self.about.indicators)), tuple(more))
         return self._event
 
     def _step_evaluation(self) -> Evaluation:
         """Return the calls that tell an accepted step of the solver."""
         if self._completion is None:
-            self._completion = self._bind((), False, False, ((self._events.complete, "completing a step"),))
+            self._completion = self._bind(Wanted(), ((self._events.complete, "completing a step"),))
         return self._completion
 
     def _check_limits(self, inputs: Transfer, t: float) -> None:
@@ -257,7 +257,7 @@ class ExchangeInstance(EvaluatedExchange):
             changed |= not np.array_equal(values, u[self._places[port]])
             self._u[self._places[port]] = values
         if self._texts.variables:
-            self.evaluation(())(t, x, u)
+            self.evaluation(Wanted())(t, x, u)
             self._note_texts(t)
         if not self.about.completes_steps:
             return changed
@@ -286,30 +286,18 @@ class ExchangeInstance(EvaluatedExchange):
             return "has outputs of texts, which are recorded at each step"
         return None if self._events.answers is not None and self._events.leave is not None else "is one of FMI 1.0"
 
-    def native_evaluation(
-        self,
-        ports: Sequence[str],
-        *,
-        rates: bool,
-        indicators: bool,
-        t: np.ndarray,
-        x: np.ndarray,
-        u: np.ndarray,
-        into: np.ndarray,
-        again: bool,
-    ) -> list[NativeAction]:
+    def native_evaluation(self, wanted: Wanted, vectors: EvaluationVectors, *, again: bool) -> list[NativeAction]:
         """Return `bound_evaluation` as actions of C."""
-        self.evaluation(ports, rates=rates, indicators=indicators)
-        made = self._evaluations[tuple(ports), rates, indicators]
-        return made.native(t, x, u, into, self._order, again=again and self._is_own)
+        return self._evaluation(wanted).native(vectors, self._order, again=again and self._is_own)
 
-    def native_look(self, t: np.ndarray, x: np.ndarray, u: np.ndarray, into: np.ndarray) -> NativeLook:
+    def native_look(self, vectors: EvaluationVectors) -> NativeLook:
         """Return `accept` and `handle_event` as actions of C, at what stands in t, x and u; states are written."""
-        inputs, nothing, take = self._fill(self._u, self.t), np.zeros(0), ActionKind.TAKE
+        inputs, take = self._fill(self._u, self.t), ActionKind.TAKE
+        u, without_result = vectors.u, vectors._replace(into=np.zeros(0))
         index = np.concatenate([np.zeros(0, int), *(np.arange(s.start, s.stop) for s in map(self._place, self._wired))])
         enter = [*transfer_actions(inputs, u, index, take)]
-        enter += self._event_evaluation(inputs).native(t, x, u, nothing, self._order)
-        complete = self._step_evaluation().native(t, x, u, nothing, self._order) if self.about.completes_steps else []
+        enter += self._event_evaluation(inputs).native(without_result, self._order)
+        complete = self._step_evaluation().native(without_result, self._order) if self.about.completes_steps else []
         calls = self._events
         assert calls.leave is not None
         assert calls.answers is not None
@@ -323,7 +311,7 @@ class ExchangeInstance(EvaluatedExchange):
             complete,
             enter,
             call_actions(self._bind_update(), [_UPDATING]),
-            [*leave, *copy_action(ActionKind.GIVE, into, self._order, self._kept)],
+            [*leave, *copy_action(ActionKind.GIVE, vectors.into, self._order, self._kept)],
             calls.answers,
             None if self.fmi.in_process else calls.final,
             self._least,

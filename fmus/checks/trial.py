@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuEnd, FmuFileError, FmuProcessError, LoopwrightError
+from ...blocks.core import FmuEnd, FmuFileError, FmuProcessError, LoopwrightError, Wanted
 from ..archive import ArchiveLimits, FmuDescription, FmuFault
 from ..isolation import Isolation
 from ..running import Fmu
@@ -139,7 +139,7 @@ def _evaluate(plant: Fmu, experiment: dict[str, Any]) -> str:
     start, _, _ = _times(plant.description, experiment)
     with plant.exchange([], start_time=start) as run:
         state = run.begin_exchange()
-        evaluate = run.evaluation(tuple(plant.outputs), rates=True, indicators=False)
+        evaluate = run.evaluation(Wanted(tuple(plant.outputs), rates=True))
         values = np.asarray(evaluate(start, state, np.zeros(0)), dtype=float)
     bad = [i for i, value in enumerate(values) if not math.isfinite(value)]
     n = len(values) - len(state)

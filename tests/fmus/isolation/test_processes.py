@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import FmuEnd, FmuProcessError, FmuRuntimeError, ParameterError
+from loopwright.blocks.core import Wanted
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu, Isolation
 from loopwright.fmus.isolation import count_processes, end_idle, find_limits
@@ -282,7 +283,7 @@ def test_a_crash_in_model_exchange_names_the_time(msd, wait):
     plant = Fmu(file, name="plant", interface="model_exchange", isolate=True)
     with plant.exchange([*plant.inputs]) as one:
         one.begin_exchange()
-        evaluate = one.evaluation([*plant.outputs], rates=True)
+        evaluate = one.evaluation(Wanted((*plant.outputs,), rates=True))
         evaluate(0.25, np.zeros(2), np.ones(1))
         os.kill(one.fmi.process.pid, signal.SIGKILL)
         time.sleep(wait)  # its pipe is closed, or it has ended
