@@ -1,12 +1,12 @@
 """The compiled loop: C code of a diagram's ticks and of what happens between them, and the masters that run it."""
 
 from .background import BackgroundCode
-from .code import LARGEST, TickCode, compile_ticks, find_obstacle, load_compiled, write_ticks
-from .fused import fuse
-from .fused_code import FusedPlant, compile_fused
+from .code import LARGEST, TickCode, compile_ticks, find_obstacle, write_ticks
+from .fused import FusedPlant, compile_fused, fuse
 from .handed_over import HandedOver, find_exchange_obstacle
 from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOptions, Span
 from .hybrid_code import HybridCode, compile_hybrid, find_hybrid_obstacle, write_hybrid
+from .libraries import load_compiled
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
 from .native_tick import bind_call
 from .remote import REFUSED, UNDER_WAY, compile_other_side

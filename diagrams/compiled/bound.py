@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from .grouped_parts import Differences, DifferencesStructure, GroupedPart, PartStructure, PythonTick
-from .hybrid_code import Between, Compiled
+from .hybrid_code import Between
+from .libraries import CompiledFunction
 from .loop import TickStructure
 from .native_tick import at, bind_python, list_vectors
 
@@ -19,7 +20,7 @@ class BoundFunction:
 
     Parameters
     ----------
-    compiled : Compiled, GroupedPart or Differences
+    compiled : CompiledFunction, GroupedPart or Differences
         The function.
     arguments, results : sequence of ndarray
         Its vectors.
@@ -40,7 +41,7 @@ class BoundFunction:
         typical: np.ndarray | None = None,
     ):
         self._kept: list[Any] = [compiled, arguments, results]
-        if isinstance(compiled, Compiled):
+        if isinstance(compiled, CompiledFunction):
             self.structure = self._bind_straight(compiled, arguments, results)
         elif isinstance(compiled, GroupedPart):
             self.structure = self._bind_part(compiled, arguments, results)
@@ -58,7 +59,7 @@ class BoundFunction:
         return ctypes.addressof(lists[0]), ctypes.addressof(lists[1])
 
     def _bind_straight(
-        self, compiled: Compiled, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
+        self, compiled: CompiledFunction, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
     ) -> TickStructure:
         f = compiled.function
         iw, w = np.zeros(f.sz_iw() + 1, dtype=np.int64), np.zeros(f.sz_w() + 1)

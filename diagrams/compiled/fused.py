@@ -1,11 +1,51 @@
-"""A diagram with its FMUs compiled for the processor of this machine."""
+"""A diagram that is compiled for the processor of this machine: its FMUs, or their equations in its ticks' code."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from weakref import WeakKeyDictionary
+
 from ...blocks.core import CompilerError, FmuError
-from ...fmus.export import tune
+from ...fmus.export import describe_processor, inline_model, own_functions, processor_flags, tune
 from ...fmus.platform import is_built_here
-from ..flat import WiredDiagram
+from ..flat import FlatDiagram, TickPattern, WiredDiagram, share_terms
+from .code import (
+    MASTER,
+    TickCode,
+    compile_loops,
+    compile_ticks,
+    master_source,
+)
+from .generated_text import write_functions
+from .hybrid_code import FUSING
+from .libraries import CompiledFunction, load_compiled
+from .reordered import reorder
+
+_LIMIT = "0x1p20"  # LW_FAST_LIMIT
+_MANY = 16  # kinds of ticks that are written twice
+_SYSTEM = "#define _POSIX_C_SOURCE 200809L"  # as `newton.c` asks for it, before anything is included
+_CASADI = re.compile(r"\b(_?(?:casadi|CASADI)_)")
+
+
+@dataclass(frozen=True)
+class FusedPlant:
+    """A plant that a fused loop steps.
+
+    Attributes
+    ----------
+    file : Path or None
+        Its FMU; None where its own functions are called.
+    inputs, outputs : tuple of int
+        Value references of the ports that the loop sets and gets.
+    """
+
+    file: Path | None
+    inputs: tuple[int, ...]
+    outputs: tuple[int, ...]
 
 
 def fuse(diagram: WiredDiagram) -> tuple[WiredDiagram, tuple[str, ...]]:
@@ -35,3 +75,85 @@ def fuse(diagram: WiredDiagram) -> tuple[WiredDiagram, tuple[str, ...]]:
     ]
     messages += [f"Not fused: {path} was not built by Loopwright on this machine." for path in kept]
     return (diagram.replace(changes) if changes else diagram), tuple(messages)
+
+
+_FUSED: WeakKeyDictionary[FlatDiagram, dict[tuple[FusedPlant, ...], TickCode]] = WeakKeyDictionary()
+
+
+def compile_fused(
+    flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], plants: Mapping[str, FusedPlant]
+) -> TickCode:
+    """Compile the ticks at which these sets of clocks act, the plants' equations, and the loop over both as one unit.
+
+    Parameters
+    ----------
+    plants : mapping of str to FusedPlant
+        The plants that the loop steps, by path, in order.
+
+    Raises
+    ------
+    CompilerError
+        If there is no compiler, or it fails.
+    FmuError
+        If the cache can't be written.
+    """
+    flat, key = flat.origin, tuple(plants.values())
+    known = _FUSED.setdefault(flat, {})
+    if key not in known or tuple(known[key].ticks) != tuple(acting):
+        known[key] = _compile(flat, acting, plants)
+    return known[key]
+
+
+def _compile(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], plants: Mapping[str, FusedPlant]) -> TickCode:
+    models, steps, inside = _write_models(plants)
+    found = {} if flat.by_block else {clocks: flat.at_tick(clocks).last.fast for clocks in acting}
+    straight = bool(found) and all(function.is_a("SXFunction") for function in found.values())
+    functions = {clocks: share_terms(f, f"tick{i}") for i, (clocks, f) in enumerate(found.items())} if straight else {}
+    text = "\n".join([_SYSTEM, _write_ticks([*functions.values()]), models, steps, master_source()])
+    library = load_compiled(text, (*processor_flags(), *FUSING), describe_processor())
+    master = library[MASTER]
+    master.restype = None
+    notes = tuple(f"Fused: the equations of {path} stand in the loop, compiled with the ticks." for path in inside)
+    if not functions:
+        return replace(compile_ticks(flat, acting), master=master, notes=notes)
+    bound = {clocks: CompiledFunction.find(f, library) for clocks, f in functions.items()}
+    notes += (
+        "Fused: the ticks are compiled for this processor; values differ by rounding, which some motions magnify.",
+    )
+    return TickCode(bound, True, library, compile_loops(flat, acting), master, notes)
+
+
+def _write_models(plants: Mapping[str, FusedPlant]) -> tuple[str, str, list[str]]:
+    """Return the equations of the plants, once for each file; how the loop steps them; and which they are."""
+    prefixes: dict[Path, str | None] = {}
+    texts, cases, inside = list[str](), list[str](), list[str]()
+    for i, (path, plant) in enumerate(plants.items()):
+        if (file := plant.file) is None:
+            continue
+        if file not in prefixes:
+            text = inline_model(file, f"m{i}")
+            prefixes[file] = None if text is None else f"m{i}"
+            texts.append(text or "")
+        if (prefix := prefixes[file]) is not None:
+            for name, references in (("inputs", plant.inputs), ("outputs", plant.outputs)):
+                texts.append(f"static const uint32_t {name}{i}[] = {{{', '.join(map(str, references)) or 0}}};\n")
+            ports = f"p, inputs{i}, {len(plant.inputs)}, outputs{i}, {len(plant.outputs)}"
+            cases.append(f"(j) == {i} ? {prefix}lw_inline_step(STEP_ARGUMENTS({ports}), now, width) : ")
+            inside.append(path)
+    steps = f"#define STEP_FUSED(j, p, now, width) ({''.join(cases)}false)\n" if cases else ""
+    return "\n".join(texts), steps, inside
+
+
+def _write_ticks(functions: Sequence[Any]) -> str:
+    """Return the C code of ticks: each as it is, and in another order, with elementary functions of our own."""
+    texts, others, cases = list[str](), list[str](), list[str]()
+    for i, function in enumerate(functions):
+        text = write_functions(function.name(), [function])
+        texts.append(_CASADI.sub(rf"t{i}\1", text))
+        if i < _MANY and (other := reorder(text, f"fast{i}", _LIMIT)) is not None:
+            others.append(_CASADI.sub(rf"t{i}\1", other))
+            one = f"(l)->ticks[{i}]"
+            cases.append(f"(kind) == {i} ? fast{i}({one}.arguments, {one}.results) && call(&{one}) : ")
+    before, after = own_functions("\n".join(others), "t")
+    chosen = f"#define CALL_TICK(l, kind) ({''.join(cases)}call((l)->ticks + (kind)))\n" if cases else ""
+    return "\n".join([*texts, before, *others, after, chosen])

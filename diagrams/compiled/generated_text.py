@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from typing import Any
+
+import casadi as ca
 
 READ = re.compile(r"arg\[(\d+)\]\?\s*arg\[\1\]\[(\d+)\]\s*:\s*0")
 """An entry of an argument, or 0 where the argument is left out."""
@@ -14,12 +18,23 @@ _HELPER = re.compile(r"^(?=casadi_real\b)", re.MULTILINE)  # a line that defines
 _CALL = re.compile(r"\b(casadi_f\d+)\(")
 
 
-def make_visible(source: str) -> str:
-    """Return C code of CasADi whose functions can be found in a library; its small helpers are inlined.
+def write_functions(name: str, functions: Iterable[Any]) -> str:
+    """Return the C code of CasADi functions that can be found in a library; its small helpers are inlined.
 
     The functions are called with all arguments and results that have entries. So those that others of them don't call
     ask no longer, at each number, whether its vector is there: a tick of many signals takes 5 % less time.
+
+    Parameters
+    ----------
+    name : str
+        Sets their helpers apart from those of other texts.
+    functions : iterable of casadi.Function
+        The functions, each under its own name.
     """
+    generator = ca.CodeGenerator(f"{name}.c")
+    for function in functions:
+        generator.add(function)
+    source = generator.dump()
     called = {name for _, body in BODY.findall(source) for name in _CALL.findall(body)}
 
     def without_questions(found: re.Match[str]) -> str:

@@ -6,30 +6,27 @@ import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import chain
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import casadi as ca
-import numpy as np
 
 from ...fmus.export import describe_processor, processor_flags
 from ..flat import NONE, FlatDiagram, OpaqueStage, Schedule, TickPattern, share_terms
 from .code import (
     GroupedTick,
-    StraightTick,
     TickCode,
-    address_of,
     check_size,
     find_loops,
-    load_compiled,
     loop_functions,
-    read_sources,
     write_loops,
 )
-from .generated_text import make_visible
+from .generated_text import write_functions
 from .grouped_parts import Differences, GroupedPart, find_differences
 from .grouping import make_part_tables, make_tables
 from .kernels import write_kernels
+from .libraries import CompiledFunction, address_of, load_compiled, read_sources
 from .small_steps import STEPS, write_steps
 from .staged_functions import Staged, StagedSlopes
 from .step_outputs import may_fail_at_steps
@@ -48,26 +45,7 @@ EMBEDDED = ("euler", "heun", "rk4", "RK23", "RK45", "DOP853", "Radau", "auto")
 """Solvers that there are in C."""
 
 
-@dataclass(frozen=True)
-class Compiled:
-    """A CasADi function that was compiled, and the address of its C function."""
-
-    function: Any
-    address: int
-
-    @property
-    def operations(self) -> int:
-        """Operations of one evaluation."""
-        return int(self.function.n_instructions())
-
-    @property
-    def pattern(self) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column of each entry of its first result that may not be 0."""
-        rows, columns = self.function.sparsity_out(0).get_triplet()
-        return np.array(rows, dtype=np.int64), np.array(columns, dtype=np.int64)
-
-
-Between = Compiled | GroupedPart | Differences | Staged | StagedSlopes
+Between = CompiledFunction | GroupedPart | Differences | Staged | StagedSlopes
 """A function between ticks that was compiled."""
 
 
@@ -218,21 +196,19 @@ def _write_straight(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], 
     if flat.events:
         others |= {"indicators": flat.indicators.last.fast, "jump": flat.jump.last.fast}
     others = {name: share_terms(function, name) for name, function in others.items()}
-    generator = ca.CodeGenerator("hybrid.c")
-    for function in (*ticks.values(), *others.values()):
+    functions = [*ticks.values(), *others.values()]
+    for function in functions:
         check_size(function)
-        generator.add(function)
-
     steps = "" if flat.active_loops(NONE) else write_steps(flat.flow.last.fast, flat.continuous.tolist())
 
     def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
         library = libraries[0]
-        straight = {c: StraightTick(ticks[c], address_of(library, f"tick{i}")) for i, c in enumerate(kinds)}
-        between = {name: Compiled(function, address_of(library, name)) for name, function in others.items()}
+        straight = {clocks: CompiledFunction.find(function, library) for clocks, function in ticks.items()}
+        between = {name: CompiledFunction.find(function, library) for name, function in others.items()}
         made = {method: address_of(library, step) for method, step in STEPS.items()} if steps else {}
         return HybridCode(TickCode(straight, exact=False, library=library), between, made)
 
-    return HybridSources([make_visible(generator.dump()) + steps], make)
+    return HybridSources([write_functions("hybrid", functions) + steps], make)
 
 
 def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridSources:
@@ -241,14 +217,12 @@ def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *,
     schedules |= {"flow": flat.flow, "jump": flat.jump}
     if flat.events:
         schedules["indicators"] = flat.indicators
-    generator = ca.CodeGenerator("hybrid.c")
     functions: dict[str, list[Any]] = {}
     for name, schedule in schedules.items():
         traced = [stage.fast for stage in schedule.stages if not isinstance(stage, OpaqueStage)]
         functions[name] = [share_terms(function, f"{name}_{j}") for j, function in enumerate(traced)]
         for function in functions[name]:
             check_size(function)
-            generator.add(function)
 
     def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
         library = libraries[0]
@@ -262,7 +236,7 @@ def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *,
             between["slope"] = StagedSlopes.of(staged["flow"], flat.continuous)
         return HybridCode(TickCode(ticks, exact=False, library=library), between)
 
-    return HybridSources([make_visible(generator.dump())], make)
+    return HybridSources([write_functions("hybrid", chain(*functions.values()))], make)
 
 
 def _write_grouped(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridSources:
@@ -270,19 +244,17 @@ def _write_grouped(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *
     names = ("flow", "indicators", "jump") if flat.events else ("flow",)
     parts = {name: flat.part_program(name) for name in names}
     every = [tick.program for tick in programs.values()] + [part.program for part in parts.values()]
-    functions = {key: f for program in every for key, f in program.functions.items()}
-    opaque = {id(flat.blocks.of(path, names)) for path, names in flat.order.steps if flat.table.blocks[path].opaque}
-    kernels = write_kernels({key: f for key, f in functions.items() if key not in opaque})
-    of_python = {key: f for key, f in functions.items() if key in opaque}
+    kernels = write_kernels(flat, every)
 
     def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
         library = libraries[0]
         tick, part, differences = (address_of(library, name) for name in _GROUPED)
-        ticks = {c: GroupedTick(make_tables(p, kernels.of), of_python, tick) for c, p in programs.items()}
+        ticks = {c: GroupedTick(make_tables(p, kernels.of), kernels.of_python, tick) for c, p in programs.items()}
         between: dict[str, Between] = {}
         for name, program in parts.items():
-            count = sum(functions[op.kernel].n_instructions() for op in program.operations if op.kernel in functions)
-            between[name] = GroupedPart(make_part_tables(program, kernels.of), of_python, count, part)
+            of = program.program.functions
+            count = sum(of[op.kernel].n_instructions() for op in program.operations if op.kernel in of)
+            between[name] = GroupedPart(make_part_tables(program, kernels.of), kernels.of_python, count, part)
         if stiff:
             rates = between["flow"]
             assert isinstance(rates, GroupedPart)

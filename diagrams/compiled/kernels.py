@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 
 from ...blocks.core import CompilerError
-from ..flat import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE, TRUE_OF
+from ..flat import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE, TRUE_OF, FlatDiagram, Program
 from .generated_text import BODY, READ, WRITE
 
 _SCRATCH = 8192  # numbers that a kernel keeps on the stack
@@ -70,21 +70,30 @@ class Kernels:
         The kernel of each kind of operation.
     exact : bool
         Whether all of them are operations on scalars, as they are interpreted.
+    operations : int
+        Operations of one evaluation of each.
+    of_python : mapping
+        CasADi functions of the blocks that Python evaluates, by key; they have no kernel.
     """
 
     source: str
     of: Mapping[int | str, Kernel]
     exact: bool
+    operations: int
+    of_python: Mapping[int, Any]
 
 
-def write_kernels(functions: Mapping[int, Any]) -> Kernels:
-    """Return the kernels of block functions, by key, and those of operations on single values.
+def write_kernels(flat: FlatDiagram, programs: Iterable[Program]) -> Kernels:
+    """Return the kernels of the block functions of programs, by key, and those of operations on single values.
 
     Raises
     ------
     CompilerError
         For a function that needs more memory than a kernel has.
     """
+    opaque = {id(flat.blocks.of(path, names)) for path, names in flat.order.steps if flat.table.blocks[path].opaque}
+    every = {key: f for program in programs for key, f in program.functions.items()}
+    functions = {key: f for key, f in every.items() if key not in opaque}
     bodies: dict[str, Kernel] = {}
     texts, found = list[str](), dict[int | str, Kernel]()
 
@@ -141,6 +150,8 @@ def write_kernels(functions: Mapping[int, Any]) -> Kernels:
         "\n".join([*parts, f"static const kernel kernels[] = {{{table}}};", _driver()]),
         found,
         len(scalar) == len(keys),
+        sum(function.n_instructions() for function in functions.values()),
+        {key: f for key, f in every.items() if key in opaque},
     )
 
 

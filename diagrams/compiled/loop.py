@@ -14,7 +14,7 @@ import numpy as np
 from ...fmus.calls import NEAR, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
 from ..flat import TRUE, TickPattern
-from .code import GroupedTick, StraightTick, TickCode, master
+from .code import CompiledTick, TickCode, master
 from .native_tick import at, bind_native
 from .remote import RemotePlants
 from .staged_functions import Staged
@@ -234,7 +234,7 @@ class CompiledLoop:
 
     def _tick(
         self,
-        tick: StraightTick | GroupedTick | Staged,
+        tick: CompiledTick,
         arguments: Sequence[np.ndarray],
         results: Sequence[np.ndarray],
     ) -> ctypes.Structure:

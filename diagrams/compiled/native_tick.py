@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from ..flat import bind_function
-from .code import GroupedTick, StraightTick
+from .code import CompiledTick
 from .grouping import PythonCall, Tables
+from .libraries import CompiledFunction
 from .staged_functions import Staged
 
 _Tick = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4, ctypes.c_int)
@@ -52,12 +53,10 @@ class NativeTick:
     kept: Any
 
 
-def bind_native(
-    tick: StraightTick | GroupedTick | Staged, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
-) -> NativeTick:
+def bind_native(tick: CompiledTick, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> NativeTick:
     """Return a tick bound to the vectors (t, x, w, p) and (x_next, z, log, ok) of a run."""
     assert not isinstance(tick, Staged)
-    if isinstance(tick, StraightTick):
+    if isinstance(tick, CompiledFunction):
         f = tick.function
         given, made = list_vectors(arguments, f.sz_arg()), list_vectors(results, f.sz_res())
         iw, w = np.zeros(f.sz_iw() + 1, dtype=np.int64), np.zeros(f.sz_w() + 1)
@@ -82,9 +81,7 @@ def bind_native(
     )
 
 
-def bind_call(
-    tick: StraightTick | GroupedTick | Staged, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
-) -> Callable[[], None]:
+def bind_call(tick: CompiledTick, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Callable[[], None]:
     """Return a tick bound to the vectors of a run as a call from Python."""
     bound = bind_native(tick, arguments, results)
     function = _Tick(bound.address)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError
 from ...fmus.calls import ERROR, BoundCalls, ChildFace, ChildRequest, RemoteStep, SharedValues
-from .code import load_compiled, read_sources
+from .libraries import load_compiled, read_sources
 from .native_tick import at
 
 UNDER_WAY, REFUSED = 3, 4

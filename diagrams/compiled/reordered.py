@@ -21,7 +21,7 @@ _CIRCLE = ("sin", "cos")
 
 
 def put_in_order(source: str) -> str:
-    """Return C code of `make_visible` with the operations of each function in the order in which they can begin.
+    """Return C code of `write_functions` with the operations of each function in the order in which they can begin.
 
     Every operation is the one it was, so all bits stay. Functions with other statements than assignments stay as they
     are.
@@ -43,7 +43,7 @@ def reorder(source: str, name: str, limit: str) -> str | None:
     Parameters
     ----------
     source : str
-        C code of one function, as `make_visible` returns it.
+        C code of one function, as `write_functions` returns it.
     name : str
         Name of the new function, ``static int name(const double **arg, double **res)``. It returns 0, or 1 without
         having written anything, where an argument of a sine or a cosine is not below a limit.

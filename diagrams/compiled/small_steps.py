@@ -7,12 +7,11 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from ..flat import share_terms
-from .code import read_sources
-from .generated_text import make_visible
+from .generated_text import write_functions
+from .libraries import read_sources
 
 STEPS = {"rk4": "step_rk4", "RK23": "step_rk23", "RK45": "step_rk45"}
 """Names of the C functions, by method."""
@@ -33,9 +32,9 @@ def write_steps(rates: Any, where: Sequence[int]) -> str:
     n = len(where)
     if not (0 < n <= _MOST_STATES and rates.is_a("SXFunction") and rates.n_instructions() <= _MOST_OPERATIONS):
         return ""
-    generator = ca.CodeGenerator("rates.c")
-    generator.add(share_terms(rates, "rates"))
-    text = make_visible(generator.dump()).replace("static int casadi_f0(", "INLINE int casadi_f0(")
+    text = write_functions("rates", [share_terms(rates, "rates")]).replace(
+        "static int casadi_f0(", "INLINE int casadi_f0("
+    )
     numbers = f"#define N {n}\n#define WIDTH {rates.numel_in(1)}\n#define PLACES {', '.join(map(str, where))}\n"
     numbers += "#define INLINE static inline __attribute__((always_inline))\n"
     named = _CASADI.sub(r"of_\1", text) + "#define RATES(a, r) of_casadi_f0(a, r, NULL, NULL, 0)\n"

@@ -12,8 +12,8 @@ from ...blocks.core import EvaluationVectors, Wanted
 from ...fmus.calls import BoundCalls, NativeAction, NativeLook
 from ...fmus.host_state import HostState
 from ..flat import JUMP, OpaqueStage
-from .code import address_of
 from .grouped_parts import color_columns
+from .libraries import address_of
 from .loop import TickStructure
 from .native_tick import at, list_vectors
 from .remote import WAIT, LateReplies, RemotePlants

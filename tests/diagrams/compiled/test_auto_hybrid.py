@@ -18,7 +18,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, Run, subsystem
-from loopwright.diagrams.compiled import code
+from loopwright.diagrams.compiled import libraries
 from loopwright.diagrams.simulation import change_over, compiled_hybrid, compiled_ticks
 from loopwright.fmus import Fmu, dc_motor
 from support.both_forms import assert_same_bits
@@ -137,7 +137,7 @@ def test_changes_of_the_method_that_are_left_out_are_told_once():
 
 def test_the_instant_of_the_change_depends_on_no_cache(little):
     bits = {thermostat().simulate(5.0, step=0.05, **QUIET).data.tobytes() for _ in range(2)}
-    code.load_compiled.cache_clear()
+    libraries.load_compiled.cache_clear()
     bits.add(thermostat().simulate(5.0, step=0.05, **QUIET).data.tobytes())
     assert len(bits) == 1
 

@@ -19,7 +19,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, Interrupted, Run, experiments, subsystem
-from loopwright.diagrams.compiled import code
+from loopwright.diagrams.compiled import code, libraries
 from loopwright.fmus import Fmu, dc_motor
 from support.random_cases import random_cases
 from support.random_linear import BASE, PERIOD, Matrices, diagram, specs
@@ -234,7 +234,7 @@ def test_what_cannot_be_compiled_is_interpreted_and_says_so():
 @pytest.fixture
 def fresh():
     """No library that this process has loaded counts."""
-    code.load_compiled.cache_clear()
+    libraries.load_compiled.cache_clear()
 
 
 def test_a_run_without_a_compiler_is_interpreted_and_says_so(monkeypatch, fresh):
@@ -273,11 +273,11 @@ def test_a_folder_that_others_can_write_is_not_trusted(tmp_path, monkeypatch, fr
 def test_a_library_that_was_cut_off_is_compiled_again(tmp_path, monkeypatch, fresh):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path))
     source = code.master_source()
-    library = code._library_of(source)
-    code.load_compiled(source)
+    library = libraries._library_of(source)
+    libraries.load_compiled(source)
     part = library.read_bytes()[: library.stat().st_size // 2]
     library.unlink()  # it is loaded, and must not change under this process
     library.write_bytes(part)
-    code.load_compiled.cache_clear()
-    assert code.MASTER in str(code.load_compiled(source)[code.MASTER].__name__)
+    libraries.load_compiled.cache_clear()
+    assert code.MASTER in str(libraries.load_compiled(source)[code.MASTER].__name__)
     assert library.stat().st_size > len(part)

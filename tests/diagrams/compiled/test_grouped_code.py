@@ -20,7 +20,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.compiled import code
+from loopwright.diagrams.compiled import libraries
 from loopwright.diagrams.flat import flat_diagram
 from support.both_forms import assert_same_bits, both
 from support.hybrid_blocks import counting
@@ -92,10 +92,10 @@ def test_a_large_diagram_is_never_traced_as_a_whole(monkeypatch):
 
 def test_the_code_knows_neither_the_number_of_blocks_nor_their_parameters(monkeypatch, tmp_path):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path))
-    code.load_compiled.cache_clear()
+    libraries.load_compiled.cache_clear()
     loops(70).simulate(0.1, compile=True, **QUIET)
     built = sorted((tmp_path / "compiled").iterdir())
-    code.load_compiled.cache_clear()
+    libraries.load_compiled.cache_clear()
     loops(80).replace({"box.pid7.kp": 3.5}).simulate(0.1, compile=True, **QUIET)
     assert sorted((tmp_path / "compiled").iterdir()) == built
 

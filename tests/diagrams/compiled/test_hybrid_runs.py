@@ -250,10 +250,10 @@ def test_a_run_to_disk_is_the_same(tmp_path):
 
 
 def test_a_run_without_a_compiler_is_interpreted_and_says_so(monkeypatch):
-    from loopwright.diagrams.compiled import code, hybrid_code
+    from loopwright.diagrams.compiled import hybrid_code, libraries
 
     monkeypatch.setenv("LOOPWRIGHT_CC", "no-such-compiler")
-    code.load_compiled.cache_clear()
+    libraries.load_compiled.cache_clear()
     hybrid_code.hybrid_master.cache_clear()
     run = oscillator(omega=3.0).simulate(1.0, compile=True, **QUIET)
     assert [m for m in run.messages if "no-such-compiler" in m]

@@ -1,0 +1,159 @@
+"""Libraries of generated C code: compiled, kept in the user's cache, and loaded; and the functions in them."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import shutil
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import CompilerError
+from ...fmus.export import SUFFIXES, compile_shared, describe_compiler
+from ...fmus.platform import cache_folder, native_platform
+
+_FLAGS = ("-fno-math-errno", "-fno-trapping-math", "-fno-builtin-pow")
+# Nobody reads errno, so that sine and cosine of one angle are one call; a power of two stays a power in every bit.
+
+
+@dataclass(frozen=True)
+class CompiledFunction:
+    """A CasADi function, and the C function of the same name in a library.
+
+    Attributes
+    ----------
+    function : casadi.Function
+        The function that was compiled.
+    address : int
+        Address of the C function.
+    """
+
+    function: Any
+    address: int
+
+    @classmethod
+    def find(cls, function: Any, library: ctypes.CDLL) -> CompiledFunction:
+        """Return a function that a library holds."""
+        return cls(function, address_of(library, function.name()))
+
+    @property
+    def operations(self) -> int:
+        """Operations of one evaluation."""
+        return int(self.function.n_instructions())
+
+    @property
+    def pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column of each entry of its first result that may not be 0."""
+        rows, columns = self.function.sparsity_out(0).get_triplet()
+        return np.array(rows, dtype=np.int64), np.array(columns, dtype=np.int64)
+
+
+def address_of(library: ctypes.CDLL, name: str) -> int:
+    """Return the address of a function in a library."""
+    address = ctypes.cast(library[name], ctypes.c_void_p).value
+    assert address is not None
+    return address
+
+
+def read_sources(*names: str) -> str:
+    """Return C sources of this package, one behind the other."""
+    return "\n".join(files(__package__).joinpath(name).read_text(encoding="utf-8") for name in names)
+
+
+@lru_cache(maxsize=64)
+def load_compiled(source: str, flags: tuple[str, ...] = (), known: str = "") -> ctypes.CDLL:
+    """Return the library of a C source, which is compiled unless the cache has it.
+
+    Parameters
+    ----------
+    source : str
+        The C text.
+    flags : tuple of str
+        Flags after those of every library.
+    known : str
+        Whatever else the code depends on, as the processor that flags ask for.
+
+    The key in the cache covers the source, the compiler with its version and flags, and the platform. A library is
+    loaded only from a folder that belongs to the user alone.
+
+    Raises
+    ------
+    CompilerError
+        If there is no compiler, it fails, or others can write to the folder.
+    FmuError
+        If the cache can't be written.
+    """
+    library = _library_of(source, flags, known)
+    if not _is_whole(library):
+        compile_shared({"code.c": source}, library, more_flags=(*_FLAGS, *flags))
+        size = _size_file(library)
+        made = size.with_suffix(f".{os.getpid()}")
+        made.write_text(str(library.stat().st_size))
+        os.replace(made, size)
+    return ctypes.CDLL(str(library))
+
+
+def is_kept(source: str) -> bool:
+    """Whether the cache has the library of a C source, so that it needs no compiler's run.
+
+    Raises
+    ------
+    CompilerError
+        If there is no compiler.
+    """
+    return _is_whole(_library_of(source))
+
+
+def _size_file(library: Path) -> Path:
+    return library.with_suffix(".size")
+
+
+def _is_whole(library: Path) -> bool:
+    """Whether a library is in the cache with its full length: to load a part of one ends Python."""
+    try:
+        return library.stat().st_size == int(_size_file(library).read_text())
+    except (OSError, ValueError):
+        return False
+
+
+def _library_of(source: str, flags: tuple[str, ...] = (), known: str = "") -> Path:
+    """Return the file of a source's library in the cache, whether it is there or not."""
+    platform = native_platform()
+    key = hashlib.sha256(
+        "\0".join((platform, *describe_compiler(platform), *_FLAGS, *flags, known, source)).encode()
+    ).hexdigest()
+    folder = cache_folder().absolute() / "compiled"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise CompilerError(
+            f"the folder of compiled diagrams can't be made: {error}. Set LOOPWRIGHT_CACHE to a folder of your own."
+        ) from error
+    _check_owner(folder)
+    return folder / f"{key[:40]}{SUFFIXES[platform.rpartition('-')[2]]}"
+
+
+def _check_owner(folder: Path) -> None:
+    """Refuse a folder that others than the user can write to: what stands there is run."""
+    if os.name != "posix":
+        return
+    was_open = folder.stat().st_mode & 0o022
+    with suppress(OSError):
+        folder.chmod(0o700)
+    found = folder.stat()
+    if found.st_uid != os.getuid() or found.st_mode & 0o022:
+        raise CompilerError(
+            f"the folder of compiled diagrams {str(folder)!r} belongs to user {found.st_uid} with permissions "
+            f"{found.st_mode & 0o777:o}; expected user {os.getuid()} and 700, since what stands there is run. Remove "
+            "it, or set LOOPWRIGHT_CACHE to a folder of your own."
+        )
+    if was_open:  # what others may have left there would be run, too
+        shutil.rmtree(folder)
+        folder.mkdir(mode=0o700)
