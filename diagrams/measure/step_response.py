@@ -39,6 +39,8 @@ CONSTANTS = 40.0
 """Time constants of the slowest other pole after which a linear model rests."""
 CHUNK = 500
 """Samples between two looks at a signal's growth."""
+LONG = 2000
+"""Ticks of a run from which on C is worth its start where a solver goes from one to the next; no chunk is so long."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,6 +197,8 @@ def step_response(
     options: dict[str, Any] = {"step": None if diagram.has_clock else base}
     if flat.hybrid:
         options |= {"rtol": 1e-9, "atol": 1e-12}
+        if sampled and count * every >= LONG:
+            options["compile"] = True
 
     begins = point if sampled or point.how is not PointOrigin.RUN else None
 

@@ -6,7 +6,7 @@ import pytest
 
 from loopwright.blocks import Gain, Integrator, OptionError, Saturation, SimulationError, Sine
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.measure import measure_step, step_response
+from loopwright.diagrams.measure import injection, measure_step, step_response
 from support.tuned_loops import make_slide, slide_slope
 
 
@@ -160,7 +160,7 @@ def test_a_saturation_makes_the_run_differ_from_its_prediction():
 
 def test_an_unstable_loop_ends_where_it_has_grown_and_names_the_wire():
     with pytest.raises(SimulationError, match=r"controller\..*grown to .* after a step of 0.1.*not stable there"):
-        step_response(sampled(gain=400.0), "controller.u", size=0.1, length=20.0)
+        step_response(sampled(gain=400.0), "controller.u", size=0.1, length=15.0)
 
 
 def test_a_wire_with_several_entries_asks_for_one():
@@ -172,3 +172,23 @@ def test_a_wire_with_several_entries_asks_for_one():
         step_response(spring(), "u", size=0, length=1.0)
     found = step_response(diagram, "u[1]", size=0.1, length=5.0)
     np.testing.assert_allclose(found.answer(), 1 - np.exp(-found.t), atol=1e-7)
+
+
+@pytest.mark.one_tier
+@pytest.mark.parametrize(
+    ("length", "tiers"), [(3.0, {"interpreted"}), pytest.param(20.0, {"compiled"}, marks=pytest.mark.slow)]
+)
+def test_a_long_run_with_a_solver_goes_in_c(length, tiers, monkeypatch):
+    """Its parts are short, and each alone begins with no C; the response is 1 − 0.97^k, that of x⁺ = 0.97 x + 0.03."""
+    found = []
+
+    class Watched(injection.Simulation):
+        def run(self, **options):
+            run = super().run(**options)
+            found.append(run.tier)
+            return run
+
+    monkeypatch.setattr(injection, "Simulation", Watched)
+    response = step_response(sampled(), "u", size=0.1, length=length)
+    assert set(found[1:]) == tiers
+    np.testing.assert_allclose(response.answer()[1:], 1 - 0.97 ** np.arange(len(response.t) - 1), atol=1e-9)
