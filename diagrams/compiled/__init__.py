@@ -9,7 +9,7 @@ from .hybrid_code import HybridCode, compile_hybrid, find_hybrid_obstacle, write
 from .libraries import load_compiled
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
 from .native_tick import bind_call
-from .remote import REFUSED, UNDER_WAY, compile_other_side
+from .remote import REFUSED, TOLD, UNDER_WAY, compile_other_side
 from .staged import NativeExchange
 from .watch import RECENT, Fired, Watch
 
@@ -18,6 +18,7 @@ __all__ = [
     "LARGEST",
     "RECENT",
     "REFUSED",
+    "TOLD",
     "UNDER_WAY",
     "BackgroundCode",
     "CompiledHybrid",

@@ -150,7 +150,7 @@ class CompiledHybrid:
         loops: NewtonOptions | None = None,
         exchange: NativeExchange | None = None,
     ):
-        self._kept: list[Any] = [code, loop, arguments, x_next]
+        self.ticks, self._kept = loop, list[Any]([code, arguments, x_next])
         self.kinds: Mapping[frozenset[TickPattern], int] = loop.kinds
         n, width = flat.continuous.size, flat.width
         _, x, w, p = arguments

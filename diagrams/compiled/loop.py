@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ...fmus.calls import NEAR, NativeStep, RemoteStep
+from ...fmus.calls import NEAR, FmuInstance, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
 from ..flat import TRUE, TickPattern
 from .code import CompiledTick, TickCode, master
@@ -55,7 +55,10 @@ class _Plant(ctypes.Structure):
         ("step", ctypes.c_void_p),
         ("inputs", _Transfer),
         ("outputs", _Transfer),
-        *((name, ctypes.c_void_p) for name in ("now", "width", "final", "flags", "reached", "changed", "far")),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("now", "width", "final", "flags", "reached", "changed", "far", "by_python", "quiet")
+        ),
     ]
 
 
@@ -123,8 +126,8 @@ class Outcome:
         The reason.
     plant : int
         The FMU that it is about, by its place.
-    stage : {0, 1, 2, 3, 4}
-        What failed: setting the inputs, the step, reading the outputs; then those of an FMU in another process.
+    stage : {0, 1, 2, 3, 4, 5}
+        What failed: setting the inputs, the step, reading the outputs; then those of FMUs that C does not call itself.
     status : int
         Status of that call.
     """
@@ -158,8 +161,8 @@ class CompiledLoop:
         The ticks.
     arguments, results : sequence of ndarray
         The vectors (t, x, w, p) and (x_next, z, log, ok) of the run.
-    plants : sequence of NativeStep or RemoteStep
-        The steps of the FMUs, in this process or in others.
+    plants : sequence of FmuInstance
+        The FMUs; Python takes the steps of those that are neither native nor remote.
     columns : ndarray or None
         Entries of the log that a sample keeps; None for the first ``width``.
     width : int
@@ -179,7 +182,7 @@ class CompiledLoop:
         code: TickCode,
         arguments: Sequence[np.ndarray],
         results: Sequence[np.ndarray],
-        plants: Sequence[NativeStep | RemoteStep],
+        plants: Sequence[FmuInstance],
         *,
         columns: np.ndarray | None,
         width: int,
@@ -188,7 +191,7 @@ class CompiledLoop:
         loops: Mapping[frozenset[TickPattern], NewtonOptions] | None = None,
         exchange: StagedBinding | None = None,
     ):
-        self._remote = RemotePlants()
+        self._remote, self._far = RemotePlants(), list[int | None]()
         self._remotes = [self._remote, *([] if exchange is None else [exchange.remote])]
         self._kept: list[Any] = [code, arguments, results, plants, columns, exchange]
         self._exchange = exchange
@@ -204,7 +207,7 @@ class CompiledLoop:
             stops=len(stops),
             every=every,
             ticks=self._address([self._tick(tick, arguments, results) for tick in code.ticks.values()], TickStructure),
-            fmus=self._address([self._plant(plant) for plant in plants], _Plant),
+            fmus=self._address([self._plant(j, plant) for j, plant in enumerate(plants)], _Plant),
             t=at(t),
             x=at(x),
             x_next=at(x_next),
@@ -273,11 +276,31 @@ class CompiledLoop:
             halvings=options.halvings,
         )
 
-    def _plant(self, step: NativeStep | RemoteStep) -> ctypes.Structure:
+    def _plant(self, place: int, plant: FmuInstance) -> ctypes.Structure:
+        step = plant.native or plant.remote
+        self._far.append(None)
+        if step is None:
+            return _Plant(by_python=self._remote.add_python(place, plant, None))
+        self._kept.append(step)
         if isinstance(step, RemoteStep):
+            far = self._far[-1] = self._remote.add(step)
             return _Plant(
-                now=step.now, width=step.width, flags=step.flags, reached=step.reached, far=self._remote.add(step)
-            )
+                now=step.now, width=step.width, flags=step.flags, reached=step.reached, far=far,
+                quiet=None if step.quiet is None else self._remote.add_quiet(step.quiet),
+                by_python=self._remote.add_python(place, plant, far) if step.is_careful else None,
+            )  # fmt: skip
+        return self._native(step)
+
+    def begun(self) -> list[bool]:
+        """Return for each FMU whether C has begun a step in another process whose end Python has to see to."""
+        return [far is not None and self._remote.has_begun(far) for far in self._far]
+
+    def check_steps(self) -> None:
+        """Raise the error of a step that Python has taken for the loop."""
+        if self._remote.by_python is not None:
+            self._remote.by_python.check()
+
+    def _native(self, step: NativeStep) -> ctypes.Structure:
         inputs, outputs = (
             _Transfer()
             if call is None

@@ -6,6 +6,7 @@
 
 typedef int (*set_or_get2)(void *instance, const uint32_t *references, size_t count, double *values);
 typedef int (*set_or_get3)(void *instance, const uint32_t *references, size_t count, double *values, size_t size);
+typedef int (*do_step1)(void *instance, double now, double width, char is_new);
 typedef int (*do_step2)(void *instance, double now, double width, int final);
 typedef int (*do_step3)(void *instance, double now, double width, bool final, bool *event, bool *terminate, bool *early,
                         double *reached);
@@ -30,6 +31,8 @@ typedef struct {
     double *reached;
     bool *changed; /* set where it changes modes of the processor, which are set back; NULL: it is known not to */
     remote *far;   /* its process; NULL: this one */
+    int (*by_python)(int64_t place, double now, double width); /* Python takes its steps; NULL: C does */
+    const quiet *quiet; /* ... but for those in which nothing is out of the ordinary; NULL: none */
 } plant;
 
 typedef struct {
@@ -45,11 +48,11 @@ typedef struct {
     int64_t skip;           /* samples to leave out before the next one that is kept */
     volatile int32_t halt;  /* not 0: return before the next tick */
     newton *loops;          /* of each kind of tick; NULL: no algebraic loops */
-    apart *apart;           /* of FMUs in other processes; NULL: there are none */
+    apart *apart;           /* of FMUs in other processes, or stepped by Python; NULL: there are none */
 } loop;
 
 enum { DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED };
-enum { INPUTS, STEP, OUTPUTS, UNDER_WAY, REFUSED }; /* the last ones of an FMU in another process */
+enum { INPUTS, STEP, OUTPUTS, UNDER_WAY, REFUSED, TOLD }; /* of an FMU in another process; of a step by Python */
 
 /* A fused loop stands in one unit with the code of its ticks, and of FMUs; then these are no calls by address. */
 #ifndef CALL_TICK
@@ -60,7 +63,7 @@ enum { INPUTS, STEP, OUTPUTS, UNDER_WAY, REFUSED }; /* the last ones of an FMU i
 #endif
 #define STEP_ARGUMENTS(p, to, n_to, from, n_from) \
     (p)->instance, to, n_to, (p)->inputs.values, SIZE(p, inputs), from, n_from, (p)->outputs.values, SIZE(p, outputs)
-#define SIZE(p, of) ((p)->version == 2 ? (p)->of.count : (p)->of.size)
+#define SIZE(p, of) ((p)->version < 3 ? (p)->of.count : (p)->of.size)
 
 typedef struct {
     int64_t ticks, rows; /* that were gone through, and recorded */
@@ -92,12 +95,13 @@ static inline void set_modes(uint64_t m) { (void)m; }
 #endif
 
 static inline int move(const plant *p, const transfer *of) {
-    if (p->version == 2)
+    if (p->version < 3)
         return ((set_or_get2)of->function)(p->instance, of->references, of->count, of->values);
     return ((set_or_get3)of->function)(p->instance, of->references, of->count, of->values, of->size);
 }
 
 static inline int step(const plant *p) {
+    if (p->version == 1) return ((do_step1)p->step)(p->instance, *p->now, *p->width, 1);
     if (p->version == 2) return ((do_step2)p->step)(p->instance, *p->now, *p->width, *(const int *)p->final);
     return ((do_step3)p->step)(p->instance, *p->now, *p->width, *(const bool *)p->final, p->flags, p->flags + 1,
                                p->flags + 2, p->reached);
@@ -123,19 +127,25 @@ static inline int64_t read_plant(const plant *p, double now, double width, doubl
     return DONE;
 }
 
+/* Whether C takes the next step of an FMU in another process. */
+static inline bool is_for_c(const plant *p, double now, double width) {
+    return p->far && (!p->by_python || is_quiet(p->quiet, now, width));
+}
+
 /* Let the FMUs in other processes begin their steps, all of them or none. */
 static inline int64_t begin_apart(const loop *l, double now, double width, outcome *out) {
     for (int64_t j = 0; j < l->plants; j++)
-        if (l->fmus[j].far && !fill_all(l->fmus[j].far)) {
+        if (is_for_c(l->fmus + j, now, width) && !fill_all(l->fmus[j].far)) {
             out->plant = j;
             out->stage = REFUSED;
             return out->status = 0, FMU_FAILED;
         }
     for (int64_t j = 0; j < l->plants; j++) {
         const plant *p = l->fmus + j;
-        if (!p->far) continue;
+        if (!is_for_c(p, now, width)) continue;
         *p->now = now;
-        *p->width = width;
+        *p->width = p->by_python ? now + width - now : width; /* parts of a step end where others begin */
+        if (p->quiet) tell_slopes(p->quiet, now);
         post(p->far);
     }
     return DONE;
@@ -144,10 +154,22 @@ static inline int64_t begin_apart(const loop *l, double now, double width, outco
 /* Wait for the end of such a step; where it is out of the ordinary, Python ends it. */
 static inline int64_t end_apart(const loop *l, const plant *p, double now, double width, outcome *out) {
     if (take_reply(p->far, l->apart) && !(p->flags[1] | p->flags[2]) &&
-        !(fabs(*p->reached - now - width) > width * l->near) && spread_all(p->far))
+        !(fabs(*p->reached - now - width) > width * l->near) && !(p->quiet && has_ended_loud(p->quiet)) &&
+        spread_all(p->far))
         return look_at_clock(l->apart), DONE;
     out->stage = UNDER_WAY;
     return out->status = 0, FMU_FAILED;
+}
+
+/* Let Python take a step of an FMU; return whether it has to go on from there. */
+static inline bool step_by_python(const loop *l, const plant *p, double now, double width, outcome *out) {
+    if (p->by_python(out->plant, now, width)) {
+        out->stage = TOLD;
+        out->status = 0;
+        return true;
+    }
+    look_at_clock(l->apart);
+    return false;
 }
 
 /* Step all FMUs, one after the other; those in other processes step meanwhile. */
@@ -161,8 +183,12 @@ static inline int64_t step_plants(const loop *l, double now, double width, outco
         int64_t reason;
         out->plant = j;
         if (STEP_FUSED(j, p, now, width)) continue;
-        if (p->far) {
+        if (p->far && p->far->state != IDLE) {
             if ((reason = end_apart(l, p, now, width, out)) != DONE) return reason;
+            continue;
+        }
+        if (p->by_python) {
+            if (step_by_python(l, p, now, width, out)) return FMU_FAILED;
             continue;
         }
         const uint64_t own = p->changed ? modes() : 0;

@@ -46,6 +46,20 @@ typedef struct {
     const values *to, *from;
 } remote;
 
+/* Steps of an FMU that are more than calls: C takes those at which nothing else is to be done. */
+typedef struct {
+    const double *until; /* time in s of the next event that is known ahead; before it C takes steps */
+    int64_t watched, sloped;
+    const double *vector;
+    const int64_t *watched_index, *sloped_index;
+    const double *taken;    /* values of inputs at whose changes events are */
+    double *last;           /* time, then values of the inputs whose slopes are told, at the step before; NaN: none */
+    double *line;           /* where the child reads lines: start, status, values, slopes; NULL: it takes slopes alone */
+    double *slopes;
+    const bool *event;      /* the step has ended with an event; NULL: it makes no difference */
+    const int64_t *changed; /* texts have changed; NULL: none are recorded */
+} quiet;
+
 /* Of all such FMUs of a run: the time at which Python has its turn, in ns; 0 before the first step. */
 typedef struct {
     int64_t until;
@@ -214,6 +228,37 @@ static inline bool fill_all(const remote *r) {
     for (int64_t i = 0; i < r->inputs; i++)
         if (!fill(r->to + i)) return false;
     return true;
+}
+
+enum { LINE_START, LINE_STATUS, LINE_VALUES };
+#define ROUNDED 1e-9 /* part of a step within which two times are one, as `stepping.py` has it */
+
+/* Whether a step has no events before it, within it or at its end, as far as that is known ahead. */
+static inline bool is_quiet(const quiet *q, double now, double width) {
+    if (!q || !(*q->until > now + width + ROUNDED * width)) return false;
+    for (int64_t i = 0; i < q->watched; i++)
+        if (q->vector[q->watched_index[i]] != q->taken[i]) return false;
+    return true;
+}
+
+/* Tell the slopes of inputs, from the differences to the step before. */
+static inline void tell_slopes(const quiet *q, double now) {
+    if (!q->sloped) return;
+    const bool known = now > q->last[0];
+    const double width = now - q->last[0];
+    if (q->line) q->line[LINE_START] = now;
+    for (int64_t i = 0; i < q->sloped; i++) {
+        const double u = q->vector[q->sloped_index[i]];
+        q->slopes[i] = known ? (u - q->last[1 + i]) / width : 0.0;
+        if (q->line) q->line[LINE_VALUES + i] = u;
+        q->last[1 + i] = u;
+    }
+    q->last[0] = now;
+}
+
+/* Whether Python has to look at a step that has ended. */
+static inline bool has_ended_loud(const quiet *q) {
+    return (q->event && *q->event) || (q->line && q->line[LINE_STATUS] > 1.0) || (q->changed && *q->changed);
 }
 
 /* Take the reply to a step; false if Python must look at it. */

@@ -1,4 +1,4 @@
-"""FMUs in processes of their own, as the loop in C asks them for steps."""
+"""FMUs that the loop in C does not call itself: it asks their processes for steps, or Python."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import LoopwrightError
-from ...fmus.calls import ERROR, BoundCalls, ChildFace, ChildRequest, RemoteStep, SharedValues
+from ...fmus.calls import ERROR, BoundCalls, ChildFace, ChildRequest, FmuInstance, QuietStep, RemoteStep, SharedValues
 from .libraries import load_compiled, read_sources
 from .native_tick import at
 
-UNDER_WAY, REFUSED = 3, 4
-"""Stages at which such an FMU is left to Python: its step has begun, or no step has, as an input doesn't fit."""
+UNDER_WAY, REFUSED, TOLD = 3, 4, 5
+"""Stages at which such an FMU is left to Python: its step has begun; no step has, as an input doesn't fit; Python has
+taken it, and the loop can't go on."""
 _KINDS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "b1")
 _FEWEST = 4  # `wire.FEWEST`
 _IDLE, _POSTED, _ARRIVED = range(3)
@@ -53,12 +54,21 @@ class RemoteStructure(ctypes.Structure):
     ]
 
 
+class _Quiet(ctypes.Structure):
+    _fields_ = [
+        ("until", ctypes.c_void_p),
+        *((name, ctypes.c_int64) for name in ("watched", "sloped")),
+        *((name, ctypes.c_void_p) for name in ("vector", "watched_index", "sloped_index", "taken", "last", "line")),
+        *((name, ctypes.c_void_p) for name in ("slopes", "event", "changed")),
+    ]
+
+
 class _Apart(ctypes.Structure):
     _fields_ = [("until", ctypes.c_int64), ("late", ctypes.c_int64)]
 
 
 class RemotePlants:
-    """The FMUs of a loop that are in processes of their own.
+    """The FMUs of a loop that are in processes of their own, or that Python steps.
 
     Attributes
     ----------
@@ -70,11 +80,13 @@ class RemotePlants:
         self.structure = _Apart()
         self._all: list[tuple[ChildFace, RemoteStructure]] = []
         self._kept: list[Any] = []
+        self.by_python: PythonSteps | None = None
+        """Steps that Python takes; None if there are none."""
 
     @property
     def address(self) -> int | None:
         """Address of what they have in common; None if there are none."""
-        return ctypes.addressof(self.structure) if self._all else None
+        return ctypes.addressof(self.structure) if self._all or self.by_python else None
 
     def add(self, step: RemoteStep) -> int:
         """Take an FMU, and return the address of its structure."""
@@ -83,6 +95,33 @@ class RemotePlants:
         setattr(made, "from", self._values(step.outputs))
         self._kept.append(step)
         return ctypes.addressof(made)
+
+    def add_quiet(self, quiet: QuietStep) -> int:
+        """Take what tells when C takes a step that may be more than its calls, and return its address."""
+        watched, sloped = (np.ascontiguousarray(v, dtype=np.int64) for v in (quiet.watched, quiet.sloped))
+        line = None if quiet.line is None else at(quiet.line)
+        behind = quiet.slopes if quiet.line is None else quiet.line[2 + sloped.size :]
+        slopes = None if behind is None else at(behind)
+        made = _Quiet(
+            at(quiet.until), watched.size, sloped.size, at(quiet.vector), at(watched), at(sloped), at(quiet.taken),
+            at(quiet.last), line, slopes, quiet.event or None, quiet.changed or None,
+        )  # fmt: skip
+        self._kept += [quiet, watched, sloped, made]
+        return ctypes.addressof(made)
+
+    def add_python(self, place: int, plant: FmuInstance, far: int | None) -> Any:
+        """Let Python take the steps of an FMU, and return the function for C; ``far`` is its structure, or None."""
+        if self.by_python is None:
+            self.by_python = PythonSteps()
+            self._kept.append(STEP(self.by_python.take))
+            self._step = self._kept[-1]
+        found = next(((p, r) for p, r in self._all if ctypes.addressof(r) == far), None)
+        self.by_python.add(place, plant, found)
+        return ctypes.cast(self._step, ctypes.c_void_p)
+
+    def has_begun(self, structure: int | None) -> bool:
+        """Whether C has asked a process for a step whose end Python has to see to."""
+        return any(ctypes.addressof(made) == structure and made.state != _IDLE for _, made in self._all)
 
     def add_calls(self, asked: ChildRequest) -> RemoteStructure:
         """Take a process that is asked for calls, and return its structure, which lives as long as this."""
@@ -146,6 +185,50 @@ class RemotePlants:
             raise
         for process, structure in self._all:
             process.number, process.arrived = structure.number, structure.state == _ARRIVED
+
+
+class PythonSteps:
+    """Steps of FMUs that Python takes at the request of C.
+
+    Attributes
+    ----------
+    error : BaseException or None
+        Why the last one has failed: an error of the FMU, or an interrupt.
+    """
+
+    def __init__(self) -> None:
+        self.error: BaseException | None = None
+        self._plants: dict[int, tuple[FmuInstance, tuple[ChildFace, RemoteStructure] | None]] = {}
+
+    def add(self, place: int, plant: FmuInstance, far: tuple[ChildFace, RemoteStructure] | None) -> None:
+        """Take an FMU, and the requests to its process that are C's in other steps."""
+        self._plants[place] = plant, far
+
+    def take(self, place: int, t: float, h: float) -> int:
+        """Take a step from t over h, both in s; return 1 if C can't go on from there."""
+        plant, far = self._plants[place]
+        try:
+            if far is not None:
+                far[0].number = far[1].number
+            try:
+                plant.step(t, h)
+            finally:
+                if far is not None:
+                    far[1].number = far[0].number
+        except BaseException as error:  # C has to return first
+            self.error = error
+            return 1
+        return int(plant.ends_run)
+
+    def check(self) -> None:
+        """Raise the error of a step that has failed."""
+        error, self.error = self.error, None
+        if error is not None:
+            raise error
+
+
+STEP = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, ctypes.c_double, ctypes.c_double)
+"""Kind of the function by which C asks for `PythonSteps.take`."""
 
 
 class LateReplies:

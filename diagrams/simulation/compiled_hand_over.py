@@ -9,10 +9,11 @@ from itertools import groupby
 
 import numpy as np
 
-from ...fmus.calls import FmuInstance, NativeStep, RemoteStep
+from ...fmus.calls import FmuInstance
 from ..compiled import (
     RECENT,
     REFUSED,
+    TOLD,
     UNDER_WAY,
     CompiledHybrid,
     CompiledLoop,
@@ -52,7 +53,7 @@ def bind_loop(
         code,
         [here.t, here.x, here.w, here.p],
         [workspace.x_next, workspace.z, workspace.log, workspace.ok],
-        steps_in_c(plants),
+        [*plants],
         columns=entries,
         width=workspace.log.size if entries is None else len(entries),
         every=recorder.every,
@@ -186,25 +187,8 @@ def restore_plans(continuous: Continuous, methods: Sequence[MethodOptions], step
 
 
 def plants_for_c(plants: Mapping[str, Plant]) -> dict[str, FmuInstance]:
-    """Return the plants that C can step, by path: in this process, or in others."""
-    return {
-        path: plant for path, plant in plants.items() if isinstance(plant, FmuInstance) and step_in_c(plant) is not None
-    }
-
-
-def step_in_c(plant: FmuInstance) -> NativeStep | RemoteStep | None:
-    """Return the step of a plant as C takes it."""
-    return plant.native or plant.remote
-
-
-def steps_in_c(plants: Iterable[FmuInstance]) -> list[NativeStep | RemoteStep]:
-    """Return the steps of plants, all of which C can step."""
-    found = list[NativeStep | RemoteStep]()
-    for plant in plants:
-        step = step_in_c(plant)
-        assert step is not None
-        found.append(step)
-    return found
+    """Return the plants that the loop in C can go over, by path: FMUs, whose steps are its own or Python's."""
+    return {path: plant for path, plant in plants.items() if isinstance(plant, FmuInstance)}
 
 
 def prepare(plants: Mapping[str, FmuInstance]) -> Callable[[], object]:
@@ -222,11 +206,15 @@ def step_plants(plants: Sequence[FmuInstance], t: float, h: float) -> None:
             plant.step(t, h)
 
 
-def end_steps(plants: Sequence[FmuInstance], first: int, stage: int, status: int, t: float, h: float) -> None:
+def end_steps(
+    loop: CompiledLoop, plants: Sequence[FmuInstance], first: int, stage: int, status: int, t: float, h: float
+) -> None:
     """Go on with steps from t over h, both in s, from the plant on that C could not go beyond.
 
     Parameters
     ----------
+    loop : CompiledLoop
+        The loop that has returned.
     plants : sequence of FmuInstance
         All plants; those before the first one have taken their steps.
     first : int
@@ -242,17 +230,18 @@ def end_steps(plants: Sequence[FmuInstance], first: int, stage: int, status: int
     if stage == REFUSED:
         step_plants(plants, t, h)
         return
-    apart = any(map(runs_apart, plants))
     rest = list[Callable[[], None]]()
-    for plant in plants[first:]:
-        if runs_apart(plant):
+    for plant, begun in zip(plants[first:], loop.begun()[first:], strict=True):
+        if begun:
             rest.append(partial(plant.finish_remote, t, h))
-        elif plant is plants[first]:
-            rest.append(partial(_judge, plant, stage, status, t, h))
-        else:
+        elif plant is not plants[first]:
             rest.append(partial(plant.step, t, h))
-    assert apart or stage != UNDER_WAY
-    if apart:
+        elif stage == TOLD:
+            rest.append(loop.check_steps)
+        else:
+            assert stage != UNDER_WAY
+            rest.append(partial(_judge, plant, stage, status, t, h))
+    if len(plants) > 1 and any(map(runs_apart, plants)):
         end_all(rest)
     else:
         for end in rest:

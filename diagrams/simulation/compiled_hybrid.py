@@ -289,7 +289,8 @@ class HybridTicks:
     def _judge(self, found: HybridOutcome, now: float, h: float) -> None:
         """Go on from the call of an FMU that the loop could not go beyond."""
         status = found.status if found.reason is HybridReason.FMU_FAILED else 0
-        end_steps([*self._plants.values()], found.plant, found.stage, status, now, h)
+        assert self._loop is not None
+        end_steps(self._loop.ticks, [*self._plants.values()], found.plant, found.stage, status, now, h)
 
     # --- between Python and C ----------------------------------------------------------------------------------------
 

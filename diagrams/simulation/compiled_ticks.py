@@ -215,7 +215,8 @@ class CompiledTicks:
                 forget_trials(self._flat)  # an interrupt of a block of Python is raised
             elif found.reason in (Reason.FMU_FAILED, Reason.FMU_FLAGS):
                 status = found.status if found.reason is Reason.FMU_FAILED else 0
-                end_steps(self._plants, found.plant, found.stage, status, now, h)
+                assert self._loop is not None
+                end_steps(self._loop, self._plants, found.plant, found.stage, status, now, h)
             else:
                 step_plants(self._plants, now, h)
         except SimulationError as error:
@@ -360,7 +361,7 @@ def find_obstacle_at_ticks(
         return (
             'an FMU takes longer steps than from one tick to the next, or a coupling other than "jacobi" is asked for'
         )
-    for path, plant in plants.items():
+    for path in plants:
         if path not in native:
-            return f"the FMU {path!r} has {plant.obstacle}" if isinstance(plant, FmuInstance) else f"{path!r} is no FMU"
+            return f"{path!r} is no FMU"
     return None

@@ -7,7 +7,7 @@ from .fmi_calls import ERROR, WARNING, FmiCalls, Log
 from .fmu_block import FmuBlock
 from .instance import FmuInstance
 from .loaded_library import CALLS, LoadedFmu, MakeCalls
-from .native_step import NativeAction, NativeLook, NativeStep, RemoteStep, SharedValues
+from .native_step import NativeAction, NativeLook, NativeStep, QuietStep, RemoteStep, SharedValues
 from .saved_state import FmuState
 from .step_failures import NEAR
 from .step_options import StepOptions, StepTime, check_offered
@@ -32,6 +32,7 @@ __all__ = [
     "NativeAction",
     "NativeLook",
     "NativeStep",
+    "QuietStep",
     "RemoteStep",
     "SharedValues",
     "StepOptions",

@@ -232,6 +232,17 @@ class FmiCalls(ABC):
         """Return the name that the library gives to a function."""
         return exported_name(name, self.prefix, self.fmu.modelIdentifier)
 
+    text_watch: Callable[..., int] | None = None
+    """Function for bound calls that notes whether texts have changed; None in this process, where they are read."""
+
+    def slope_line(self, references: Sequence[int], n: int) -> np.ndarray | None:
+        """Return where inputs' lines within a step stand in memory; None where `set_input_slopes` calls a function."""
+        return None
+
+    def function(self, name: str) -> Callable[..., int]:
+        """Return a C function by its name without prefix, for bound calls."""
+        return self._function(f"{self.prefix}{name}")
+
     def _function(self, name: str) -> Callable[..., int]:
         """Return a C function without declared arguments, which takes those that are made for it.
 

@@ -15,14 +15,14 @@ from ..archive import FmuVariable
 from .fmi_calls import StepCall
 from .fmu_block import FmuBlock
 from .loaded_library import MakeCalls
-from .native_step import BoundStart, NativeStep, native_step
+from .native_step import NativeStep, native_step
 from .saved_state import FmuState, StepMemory, pack_state, unpack_state
-from .shared_steps import SharedSteps
+from .shared_steps import QuietSteps, SharedSteps
 from .step_failures import NEAR, StepFailures
 from .step_options import needs_care
 from .stepping import CarefulSteps
-from .texts import Text, TextRecord
-from .transfer import Transfer, UnfitError
+from .texts import Text, TextRecord, watch_texts
+from .transfer import BoundStart, Transfer, UnfitError
 
 _Bound = tuple[Callable[[float, float], None], Callable[[], None], Callable[[float], None]]
 
@@ -39,7 +39,6 @@ class FmuInstance(StepFailures):
 
     step: Callable[[float, float], None]
     """Set the inputs, take a step from a time over a length, both in s, and get the outputs (after `bind`)."""
-    is_stepping = False
     start_step: Callable[[float, float], None]
     """Begin a step, as `step`; one in another process goes on by itself until `finish_step` (after `bind`)."""
     finish_step: Callable[[], None]
@@ -64,7 +63,6 @@ class FmuInstance(StepFailures):
         self._handles: dict[int, Any] = {}
         self.read = lambda t: None
         self._texts = TextRecord(self.fmi, block.text_variables)
-        self._careful: CarefulSteps | None = None
         self._native: tuple[StepCall, Transfer, Transfer] | None = None
         self._starts: dict[tuple[str, ...], BoundStart | None] = {}
 
@@ -115,6 +113,8 @@ class FmuInstance(StepFailures):
             super()._settle_start()
         else:
             self._careful.begin(self._began)
+            if self._quiet is not None:
+                self._quiet.hold()
 
     def bind(self, inputs: np.ndarray, outputs: np.ndarray) -> None:
         """Bind the vectors of the inputs to set and of the outputs to get, and get the outputs once."""
@@ -126,16 +126,19 @@ class FmuInstance(StepFailures):
         if self.fmi.in_process:
             self.step, self.exchange, self.read = (self._bind_plain if plain else self._bind_typed)(ins, outs, call)
         else:
-            shared = SharedSteps(self, ins, outs, call)
+            self._watch = watch = watch_texts(self.fmi, self._texts.variables.values())
+            shared = SharedSteps(self, ins, outs, call, None if careful else watch)
             self.step, self.exchange, self.read = shared.bind_step(), shared.exchange, shared.read
             self.start_step, self.finish_step = shared.start, shared.finish
-            self._shared = None if careful or self._texts.variables else shared
+            self._shared = shared if not careful and (watch is not None or not self._texts.variables) else None
         self._call = call
         plain = plain and self.fmi.in_process and not careful and not self._texts.variables
         self._native = (call, ins, outs) if plain else None
         if careful:
             self._careful = CarefulSteps(self, self._inputs, inputs, outs, call)
             self.step = partial(self._step_marked, self._careful.step)
+            if not self.fmi.in_process and (self._watch is not None or not self._texts.variables):
+                self._quiet = QuietSteps(self, self._careful, self._watch)
         if self._texts.variables:
             self.step = partial(self._step_and_note, self.step)
         if self.fmi.in_process and not self.is_built_here:
@@ -160,21 +163,18 @@ class FmuInstance(StepFailures):
 
     def _begin_texts(self) -> None:
         """Let the record of texts go on from the present time."""
+        if self._watch is not None:
+            self._watch.changed.value = 1
         for text in self.call("reading its texts", self._texts.go_back, self.t):
             self.add_note(text)
 
     def _step_and_note(self, step: Callable[[float, float], None], t: float, h: float) -> None:
         step(t, h)
-        self.call("reading its texts", self._texts.note, t + h)
+        self._note_texts(t + h)
 
     def _step_guarded(self, step: Callable[[float, float], None], t: float, h: float) -> None:
         with self.host:
             step(t, h)
-
-    def _step_marked(self, step: Callable[[float, float], None], t: float, h: float) -> None:
-        self.is_stepping = True
-        step(t, h)
-        self.is_stepping = False
 
     @property
     def texts(self) -> Mapping[str, list[tuple[float, Text]]]:
@@ -295,6 +295,10 @@ class FmuInstance(StepFailures):
         steps = None if self._careful is None else self._careful.memory()
         return self._keep(self.call("saving its state", self.fmi.save_state), self.t, self._running, steps)
 
+    def keep(self, handle: Any) -> FmuState:
+        """Return the saved state of a handle at the present time, for steps that are taken again."""
+        return self._keep(handle, self.t, self._running)
+
     def go_back(self, state: FmuState) -> None:
         """Set the FMU back to a state, without its outputs; for steps that are taken again."""
         self.ends_run = False
@@ -316,6 +320,8 @@ class FmuInstance(StepFailures):
         self._now.value, self._width.value = state.t, 0.0
         if self._careful is not None:
             self._careful.return_to(state.t, state.steps)
+        if self._quiet is not None:
+            self._quiet.hold()
         self.read(state.t)
         self._begin_texts()
 

@@ -20,10 +20,10 @@ from .fmi3 import Fmi3Calls
 from .fmi_calls import FATAL, FmiCalls
 from .fmu_block import FmuBlock
 from .message_log import MessageLog, clean_text, describe_end
-from .native_step import BoundStart
 from .shared_steps import SharedReading
 from .step_options import choose_modes
 from .texts import is_readable, list_limits, read_text, waits_for_initialization, write_text
+from .transfer import BoundStart
 
 CALLS: dict[str, type[FmiCalls]] = {"1": Fmi1Calls, "2": Fmi2Calls, "3": Fmi3Calls}
 """Functions by the major version of FMI."""

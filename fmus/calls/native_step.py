@@ -1,20 +1,18 @@
-"""An FMU as addresses, for loops in C: its step, its calls; and start values in two bound calls."""
+"""An FMU as addresses, for loops in C: its step, its calls."""
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..archive import FmuDescription
 from ..host_state import HostState
 from .bound_calls import AnswersAt, BoundCalls, Call, ChildRequest
-from .fmi_calls import FmiCalls, StepCall
-from .texts import waits_for_initialization
+from .fmi_calls import StepCall
 from .transfer import Transfer, TypeGroup
 
 
@@ -39,7 +37,7 @@ class NativeStep:
 
     Attributes
     ----------
-    version : {2, 3}
+    version : {1, 2, 3}
         Version of FMI.
     instance, step : int
         The instance, and its function doStep.
@@ -126,6 +124,44 @@ class SharedValues:
 
 
 @dataclass(frozen=True, eq=False)
+class QuietStep:
+    """When a step in another process has nothing but its calls to be done, and what is written before it.
+
+    Attributes
+    ----------
+    until : ndarray, shape (1,)
+        Time in s before whose neighbourhood C takes steps.
+    vector : ndarray
+        The run's vector of inputs.
+    watched : ndarray of int64
+        Places there of inputs at whose changes events are.
+    taken : ndarray
+        Their values as they were taken last.
+    sloped : ndarray of int64
+        Places of inputs whose slopes are told.
+    last : ndarray
+        Time in s and their values at the step before; NaN without one.
+    line, slopes : ndarray or None
+        Where their lines go (start, status, values, slopes), or the slopes alone.
+    event : int
+        Address of the flag of an event at the end of a step; 0 where it makes no difference.
+    changed : int
+        Address of the word that tells that texts have changed; 0 without texts.
+    """
+
+    until: np.ndarray
+    vector: np.ndarray
+    watched: np.ndarray
+    taken: np.ndarray
+    sloped: np.ndarray
+    last: np.ndarray
+    line: np.ndarray | None
+    slopes: np.ndarray | None
+    event: int
+    changed: int
+
+
+@dataclass(frozen=True, eq=False)
 class RemoteStep:
     """A step in another process as C asks for it; numbers are addresses.
 
@@ -139,6 +175,10 @@ class RemoteStep:
         As those of `NativeStep`.
     kept : tuple
         Whatever must live as long as the addresses.
+    quiet : QuietStep or None
+        Of steps that may be more than these calls.
+    is_careful : bool
+        Whether other steps are Python's.
     """
 
     request: ChildRequest
@@ -149,6 +189,8 @@ class RemoteStep:
     flags: int
     reached: int
     kept: tuple[Any, ...]
+    quiet: QuietStep | None = None
+    is_careful: bool = False
 
 
 def remote_step(
@@ -329,64 +371,3 @@ class NativeLook:
     discrete: np.ndarray
     low: np.ndarray
     high: np.ndarray
-
-
-class BoundStart:
-    """Start values of type Float64, set in one call, and read back in another.
-
-    Parameters
-    ----------
-    fmi : FmiCalls
-        Functions of the instance.
-    description : FmuDescription
-        The FMU's description.
-    names : sequence of str
-        Names of the values, for which `fits` holds.
-    """
-
-    def __init__(self, fmi: FmiCalls, description: FmuDescription, names: tuple[str, ...]):
-        variables = {name: description.find(name) for name in names}
-        size = sum(v.size for v in variables.values())
-        self._fmi, self._given, self._found = fmi, np.zeros(size), np.zeros(size)
-        inputs = [np.full(v.size, v.causality == "input") for v in variables.values()]
-        self._inputs = np.concatenate([np.zeros(0, dtype=bool), *inputs])
-        self._set, self._get = (
-            Transfer(fmi, verb, variables, vector) for verb, vector in (("Set", self._given), ("Get", self._found))
-        )
-
-    @staticmethod
-    def fits(description: FmuDescription, names: tuple[str, ...]) -> bool:
-        """Whether start values can be set so: numbers of that type alone, which can be set before initialization."""
-        if any(name in description.texts or description.find(name).type != "Float64" for name in names):
-            return False
-        late = any(waits_for_initialization(description, name) for name in names)
-        return not late and not description.structural.keys() & set(names)
-
-    def enter(self, values: Mapping[str, Any], tolerance: float | None) -> bool:
-        """Set the values, from which the run begins at t = 0, and enter Initialization Mode.
-
-        Returns
-        -------
-        bool
-            Whether the FMU has taken them to the last bit, without a word.
-        """
-        np.concatenate([np.zeros(0), *(np.ravel(value) for value in values.values())], out=self._given)
-        self._fmi.set_up(0.0, None, tolerance)
-        if not self._call(self._set):
-            return False
-        self._fmi.enter_initialization_mode(0.0, None, tolerance)
-        return self.are_kept(inputs=True)
-
-    def are_kept(self, *, inputs: bool = False) -> bool:
-        """Whether the FMU has the values still, to the last bit; those of inputs count where that is asked for."""
-        if not self._call(self._get):
-            return False
-        same = self._found == self._given
-        return bool(same.all() if inputs else (same | self._inputs).all())
-
-    @staticmethod
-    def _call(transfer: Transfer) -> bool:
-        if transfer.plain_call is None:
-            return True
-        function, arguments = transfer.plain_call
-        return not function(*arguments)

@@ -1,7 +1,8 @@
-"""A saved state of an instance."""
+"""A saved state of an instance, and what its steps remember beside it."""
 
 from __future__ import annotations
 
+import math
 import struct
 import weakref
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...blocks.core import FmuError
+from ..archive import OtherVariable
 from ..platform import native_platform
 
 _HEADER = struct.Struct("<8s32s24sd?")  # of a serialized state: magic, FMU's digest, platform, time, running
@@ -29,12 +31,36 @@ class Saver(Protocol):
         """Frees the state of a handle."""
 
 
+@dataclass
+class Clock:
+    """Input clock that ticks at times known ahead; infinite ones never come."""
+
+    variable: OtherVariable
+    interval: float = math.inf
+    next: float = math.inf
+    count: int = 0
+    origin: float = 0.0
+
+    def start(self, t: float, interval: float, shift: float) -> None:
+        """Let it tick at t + shift, and then every interval, in s."""
+        self.interval, self.origin, self.count = interval, t + shift, 0
+        self.next = self.origin
+
+    def tick(self) -> None:
+        """Go on to the next tick."""
+        if self.variable.is_periodic:
+            self.count += 1
+            self.next = self.origin + self.count * self.interval
+        else:
+            self.next = math.inf  # until the FMU says it anew
+
+
 @dataclass(frozen=True)
 class StepMemory:
     """Memory of the steps beside the FMU's own state: next events, the inputs of the step before, clocks."""
 
     next_event: float
-    last: tuple[float, np.ndarray] | None
+    last: np.ndarray
     added: float | None
     fresh: bool
     clocks: tuple[tuple[float, float, int, float], ...]

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from dataclasses import replace
+from typing import Any, Protocol
 
 import numpy as np
 
 from ..archive import FmuVariable
 from .bound_calls import WARNING, BoundCalls
 from .fmi_calls import FmiCalls, StepCall
-from .native_step import RemoteStep, remote_step
+from .native_step import QuietStep, RemoteStep, remote_step
+from .saved_state import FmuState
+from .step_options import StepTime
 from .stepped_instance import SteppedInstance as Judge
+from .stepping import CarefulSteps
+from .texts import TextWatch
 from .transfer import Transfer, UnfitError
 
 _NEAR = 1e-6  # distance from the end of a step, in steps, within which a time is that end
@@ -38,6 +44,9 @@ class SteppedInstance(Judge, Protocol):
     def width(self) -> ctypes.c_double:
         """Length of the step in s."""
 
+    def keep(self, handle: Any) -> FmuState:
+        """Return the saved state of a handle at the present time."""
+
 
 class SharedSteps:
     """Setting the inputs, a step, and getting the outputs, bound as one sequence of calls.
@@ -50,13 +59,18 @@ class SharedSteps:
         Inputs to set and outputs to get.
     call : StepCall
         The step.
+    watch : TextWatch, optional
+        Calls that note whether texts have changed.
     """
 
-    def __init__(self, instance: SteppedInstance, ins: Transfer, outs: Transfer, call: StepCall):
-        self.instance, self.ins, self.outs, self.call = instance, ins, outs, call
+    def __init__(
+        self, instance: SteppedInstance, ins: Transfer, outs: Transfer, call: StepCall, watch: TextWatch | None = None
+    ):
+        self.instance, self.ins, self.outs, self.call, self._watch = instance, ins, outs, call, watch
         bind, self._t, self._h = instance.fmi.bind, 0.0, 0.0
-        self._n_in = len(ins.calls)
-        self._step = bind([*ins.calls, (call.function, call.arguments), *outs.calls])
+        self._n_in, self._n_out = len(ins.calls), len(ins.calls) + len(outs.calls)
+        texts = [] if watch is None else watch.calls
+        self._step = bind([*ins.calls, (call.function, call.arguments), *outs.calls, *texts])
         self._exchange = bind([*ins.calls, *outs.calls])
         self._read = bind(outs.calls)
 
@@ -85,17 +99,19 @@ class SharedSteps:
         return step
 
     @property
-    def has_request(self) -> bool:
-        """Whether C can ask for the step."""
-        return self._step.request is not None
-
-    @property
     def remote(self) -> RemoteStep | None:
         """The step as addresses, for a loop in C; None where C can't ask for it."""
         request, instance = self._step.request, self.instance
         if request is None:
             return None
-        return remote_step(request, instance.now, instance.width, self.call, self.ins, self.outs)
+        step = remote_step(request, instance.now, instance.width, self.call, self.ins, self.outs)
+        if step is None or self._watch is None:
+            return step
+        none, changed = np.zeros(0, dtype=np.int64), ctypes.addressof(self._watch.changed)
+        texts = QuietStep(
+            np.full(1, math.inf), self.ins.vector, none, np.zeros(0), none, np.zeros(1), None, None, 0, changed
+        )
+        return replace(step, quiet=texts)
 
     def take_over(self, t: float, h: float) -> None:
         """Go on with a step from t over h, both in s, that C has begun: `finish` ends it."""
@@ -141,9 +157,14 @@ class SharedSteps:
         """Wait for a step that is pending and read the outputs; note a warning, or raise the error of a failure."""
         if status == WARNING:
             for place in self._step.warned_places():
+                if place > self._n_out:  # reading the texts tells of it
+                    continue
                 self.instance.judge(self._action(place, self._n_in, "a step"), status, t + h * (place > self._n_in))
             return
         place = self._step.failed
+        if place > self._n_out and self._watch is not None:
+            self._watch.changed.value = 1
+            return
         if place == self._n_in:
             self.instance.end_step(status, t, h)
             status = self._read.run()
@@ -173,6 +194,97 @@ class SharedSteps:
             self.outs.spread()
         except UnfitError as error:
             raise self.instance.refuse_output(error, t) from None
+
+
+class QuietSteps:
+    """Steps that may be more than their calls, as C takes those at which nothing else is to be done.
+
+    All others are Python's, the first one, too; after each of them C is told how far it may go.
+
+    Parameters
+    ----------
+    instance : SteppedInstance
+        The instance.
+    careful : CarefulSteps
+        Its steps.
+    watch : TextWatch or None
+        Texts that are recorded.
+    """
+
+    def __init__(self, instance: SteppedInstance, careful: CarefulSteps, watch: TextWatch | None):
+        self.instance, self.careful, self._watch, fmi = instance, careful, watch, instance.fmi
+        self._until = np.full(1, -math.inf)
+        parts = [careful.jumping, *(part for _, part in careful.clocked)]
+        self._watched = np.concatenate([np.zeros(0, dtype=np.int64), *(part.index for part in parts)])
+        self._parts, self._taken = parts, np.zeros(self._watched.size)
+        self._kept: FmuState | None = None
+        self._handle = fmi.variable(ctypes.c_void_p)
+        references, n = careful.sloped_references, careful.sloped.size
+        self._line = fmi.slope_line(references, n) if n else None
+        self._slopes = fmi.allocate(n, ctypes.c_double) if n and self._line is None else None
+        calls = [*careful.smooth.transfer.calls]
+        if self._slopes is not None:
+            kept, orders = (ctypes.c_uint * n)(*references), (ctypes.c_int * n)(*[1] * n)
+            slopes = kept, ctypes.c_size_t(n), orders, ctypes.c_void_p(self._slopes.ctypes.data)
+            calls.append((fmi.function("SetRealInputDerivatives"), (fmi.instance_argument, *slopes)))
+        if careful.options.rollback:
+            name = "GetFMUState" if fmi.prefix == "fmi3" else "GetFMUstate"
+            calls.append((fmi.function(name), (fmi.instance_argument, ctypes.byref(self._handle))))
+        self._n_step, call = len(calls), careful.call
+        texts = [] if watch is None else watch.calls
+        self._bound = fmi.bind([*calls, (call.function, call.arguments), *careful.outs.calls, *texts])
+
+    def hold(self) -> None:
+        """Leave the next step to Python."""
+        self._until[0] = -math.inf
+
+    def renew(self) -> None:
+        """Let C take steps up to the next event, after one by Python."""
+        careful, instance = self.careful, self.instance
+        if careful.options.rollback and self._kept is None:
+            self._handle.value = instance.call("saving its state", instance.fmi.save_state).value
+            self._kept = instance.keep(self._handle)
+        self._taken[:] = np.concatenate([np.zeros(0), *(part.values for part in self._parts)])
+        self._until[0] = -math.inf if instance.ends_run else careful.next_instant
+
+    @property
+    def remote(self) -> RemoteStep | None:
+        """A step as addresses, for a loop in C; None where C can't ask for it."""
+        request, careful = self._bound.request, self.careful
+        if request is None or careful.options.time is StepTime.ADDED:
+            return None
+        smooth, instance = careful.smooth, self.instance
+        step = remote_step(request, instance.now, instance.width, careful.call, smooth.transfer, careful.outs)
+        if step is None:
+            return None
+        inputs = [
+            replace(of, vector=smooth.source, index=smooth.index[... if of.index is None else of.index])
+            for of in step.inputs
+        ]
+        event = ctypes.addressof(careful.call.flags) if careful.has_events else 0
+        changed = 0 if self._watch is None else ctypes.addressof(self._watch.changed)
+        places = smooth.index[careful.sloped]
+        quiet = QuietStep(
+            self._until, smooth.source, self._watched, self._taken, places, careful.last, self._line, self._slopes,
+            event, changed,
+        )  # fmt: skip
+        return replace(step, inputs=inputs, quiet=quiet, is_careful=True)
+
+    def finish(self, t: float, h: float) -> None:
+        """End a step from t over h, both in s, that C has begun."""
+        careful, status = self.careful, self._bound.finish()
+        taken, place = 0, self._bound.failed
+        if status == WARNING:
+            for place in self._bound.warned_places():
+                if place < len(careful.smooth.transfer.calls):
+                    self.instance.judge("setting the inputs", status, t)
+                taken = WARNING if place == self._n_step else taken
+        elif status and place < self._n_step:  # nothing is lost by doing all of it once more
+            careful.step(t, h)
+            return
+        elif place == self._n_step:
+            taken = status
+        careful.go_on(t, h, taken, self._kept)
 
 
 class SharedReading:

@@ -13,9 +13,10 @@ from ..archive import FmuVariable
 from .fmi_calls import DISCARD, ERROR, FATAL, PENDING, WARNING, StepCall
 from .loaded_library import LoadedFmu
 from .native_step import RemoteStep
-from .shared_steps import SharedSteps
-from .step_options import needs_care
+from .shared_steps import QuietSteps, SharedSteps
 from .stepped_instance import SteppedInstance
+from .stepping import CarefulSteps
+from .texts import TextRecord, TextWatch
 from .transfer import OutOfRangeError, Transfer, UnfitError
 
 NEAR = 1e-6
@@ -36,6 +37,11 @@ class StepFailures(LoadedFmu):
     _width: ctypes.c_double
     _call: StepCall | None = None
     _shared: SharedSteps | None = None
+    _quiet: QuietSteps | None = None
+    _careful: CarefulSteps | None = None
+    _watch: TextWatch | None = None
+    _texts: TextRecord
+    is_stepping = False
     _has_retried = _has_been_off = False
     ends_run = False
     """Whether the FMU has asked to end the simulation."""
@@ -252,27 +258,33 @@ class StepFailures(LoadedFmu):
 
     @property
     def remote(self) -> RemoteStep | None:
-        """Its step in another process as C asks for it; None in this one, and where a step is more than its calls."""
-        return None if self._shared is None else self._shared.remote
-
-    @property
-    def obstacle(self) -> str:
-        """What keeps C from taking its steps, as "has …"; for one that is neither native nor remote."""
-        if needs_care(self.description, self.block.stepping):
-            return "steps with options (event mode, early return, input derivatives, rollback, times of its own)"
-        if self.block.text_variables:
-            return "texts that are recorded, which are read after each step; leave them out by ports="
-        if self.fmi.in_process:
-            return "ports with limits, or that are no Float64, in this process; isolate=True compiles them"
-        if self._shared is not None and self._shared.has_request:
-            return "an input of an enumeration whose numbers have gaps"
-        return "a process of its own, which C can't ask for steps on this platform"
+        """Its step in another process as C asks for it; None in this one, and where Python has to take each step."""
+        steps = self._quiet or self._shared
+        return None if steps is None else steps.remote
 
     def finish_remote(self, t: float, h: float) -> None:
         """End a step from t over h, both in s, that C has begun in another process, and get the outputs."""
-        assert self._shared is not None
-        self._shared.take_over(t, h)
-        self._shared.finish()
+        if self._quiet is not None:
+            self._step_marked(self._quiet.finish, t, h)
+        else:
+            assert self._shared is not None
+            self._shared.take_over(t, h)
+            self._shared.finish()
+        if self._texts.variables:
+            self._note_texts(t + h)
+
+    def _note_texts(self, t: float) -> None:
+        if self._careful is not None or self._watch is None or self._watch.take():
+            self.call("reading its texts", self._texts.note, t)
+            if self._watch is not None:
+                self._watch.take()
+
+    def _step_marked(self, step: Callable[[float, float], None], t: float, h: float) -> None:
+        self.is_stepping = True
+        step(t, h)
+        self.is_stepping = False
+        if self._quiet is not None:
+            self._quiet.renew()
 
     def note_retry(self, t: float, h: float, count: int) -> None:
         """Keep the message of the first step that was discarded."""

@@ -9,16 +9,15 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 
 from ...blocks.core import FmuRuntimeError
-from ..archive import FmuVariable, OtherVariable
+from ..archive import FmuVariable
 from .fmi_calls import DISCARD, MOST_ROUNDS, WARNING, StepCall
 from .fmu_block import check_next_time
-from .saved_state import FmuState, StepMemory
+from .saved_state import Clock, FmuState, StepMemory
 from .step_options import StepTime, allows_early_return, uses_event_mode
 from .stepped_instance import SavedInstance
 from .transfer import PartTransfer, Transfer, UnfitError
@@ -32,30 +31,6 @@ _MOST, _SLOW = 50_000, 1000
 """Parts of a step, at the rate of the last ones, that are an error, and those that are told."""
 _CHANGED = 2
 """Qualifier of an interval that the FMU has set anew (fmi3IntervalChanged)."""
-
-
-@dataclass
-class _Clock:
-    """Input clock that ticks at times known ahead; infinite ones never come."""
-
-    variable: OtherVariable
-    interval: float = math.inf
-    next: float = math.inf
-    count: int = 0
-    origin: float = 0.0
-
-    def start(self, t: float, interval: float, shift: float) -> None:
-        """Let it tick at t + shift, and then every interval, in s."""
-        self.interval, self.origin, self.count = interval, t + shift, 0
-        self.next = self.origin
-
-    def tick(self) -> None:
-        """Go on to the next tick."""
-        if self.variable.is_periodic:
-            self.count += 1
-            self.next = self.origin + self.count * self.interval
-        else:
-            self.next = math.inf  # until the FMU says it anew
 
 
 class CarefulSteps:
@@ -100,12 +75,19 @@ class CarefulSteps:
         ]
         self.triggered = {name: v for name, v in ours.items() if v.interval_variability == "triggered"}
         self.clocks = [
-            _Clock(v)
+            Clock(v)
             for v in self.about.other.values()
             if v.type_is_clock and v.causality == "input" and v.interval_variability != "triggered"
         ]
         self.next_event = math.inf
-        self._last: tuple[float, np.ndarray] | None = None  # time and values of the inputs of the step before
+        ports = {p: v for p, v in self.smooth.ports.items() if v.type == "Float64" and (v.intermediate or self.old)}
+        told = ports if self.options.input_derivatives else {}
+        self.sloped = np.concatenate([np.zeros(0, dtype=int), *(np.r_[self.smooth.places[port]] for port in told)])
+        """Places of the inputs whose slopes are told, among those of `smooth`."""
+        self.sloped_references = [r for v in told.values() for r in v.references]
+        self.last = np.full(1 + self.sloped.size, math.nan)
+        """Time in s and values of these inputs at the step before; NaN without one."""
+        self._taken: tuple[int, FmuState | None] | None = None  # status of a step that C has taken, state before it
         self._added: float | None = None
         self._has_told = False
         self._fresh = True  # discrete inputs have not been set since the start
@@ -117,7 +99,7 @@ class CarefulSteps:
 
         It is called only if Event Mode is used.
         """
-        self._last, self._added, self._fresh = None, None, True
+        self.last[:], self._added, self._fresh = math.nan, None, True
         self.next_event = math.inf
         for clock in self.clocks:
             if clock.variable.is_periodic and clock.variable.interval is not None:
@@ -126,17 +108,22 @@ class CarefulSteps:
         self._activate(t, [clock for clock in self.clocks if clock.next <= t], set())
         self._settle(t)
 
+    @property
+    def next_instant(self) -> float:
+        """Time in s of the next event that is known ahead; infinite without one."""
+        return min([self.next_event, *(clock.next for clock in self.clocks)])
+
     def memory(self) -> StepMemory:
         """Return what the steps keep beside the FMU's own state."""
         clocks = tuple((clock.interval, clock.next, clock.count, clock.origin) for clock in self.clocks)
         clocked = tuple(part.values.copy() for _, part in self.clocked)
         jumping = self.jumping.values.copy()
-        return StepMemory(self.next_event, self._last, self._added, self._fresh, clocks, clocked, jumping)
+        return StepMemory(self.next_event, self.last.copy(), self._added, self._fresh, clocks, clocked, jumping)
 
     def return_to(self, t: float, memory: StepMemory | None) -> None:
         """Go on from a restored state at a time in s; without a memory Event Mode tells the next events anew."""
         if memory is not None:
-            self.next_event, self._last = memory.next_event, memory.last
+            self.next_event, self.last[:] = memory.next_event, memory.last
             self._added, self._fresh = memory.added, memory.fresh
             self.jumping.values[:] = memory.jumping
             for (_, part), values in zip(self.clocked, memory.clocked, strict=True):
@@ -144,7 +131,7 @@ class CarefulSteps:
             for clock, kept in zip(self.clocks, memory.clocks, strict=True):
                 clock.interval, clock.next, clock.count, clock.origin = kept
             return
-        self._last, self._added, self._fresh, self.next_event = None, None, True, math.inf
+        self.last[:], self._added, self._fresh, self.next_event = math.nan, None, True, math.inf
         for clock in self.clocks:
             if clock.variable.is_periodic and math.isfinite(clock.interval):
                 ahead = (t - clock.origin) / clock.interval
@@ -172,6 +159,20 @@ class CarefulSteps:
         self._set(self.smooth, start)
         if self.options.input_derivatives:
             self._tell_slopes(start)
+        self._finish(start, h)
+
+    def go_on(self, t: float, h: float, status: int, state: FmuState | None) -> None:
+        """Go on with a step from t to t + h (both in s) that C has taken with its inputs, with a status.
+
+        ``state`` is that before it, of an FMU whose steps can be taken back.
+        """
+        self.smooth.take()
+        self._taken = status, state
+        self._finish(t, h)
+
+    def _finish(self, start: float, h: float) -> None:
+        """Step from start by h, both in s, once the inputs are set, and get the outputs."""
+        instance = self.instance
         self._go(start, h)
         instance.set_span(start, h)
         if (status := self.fmi.intermediate_status) > WARNING:
@@ -183,7 +184,7 @@ class CarefulSteps:
         """Step from t by h, in parts where events lie between or the FMU ends a step early."""
         end, now, still, instants = t + h, t, 0, deque[float](maxlen=_MANY)
         while end - now > _ROUNDED * h:
-            target = min([end, self.next_event, *(c.next for c in self.clocks)])
+            target = min(end, self.next_instant)
             if not self.about.variable_step:
                 target = self._check_even(now, end, target, h)
             target = end if end - target < _ROUNDED * h else target
@@ -254,9 +255,14 @@ class CarefulSteps:
     def _take(self, t: float, h: float) -> tuple[float, bool]:
         """Step once; return the time that was reached, and whether the FMU asks for Event Mode."""
         instance, call = self.instance, self.call
-        state = instance.save() if self.options.rollback else None
-        instance.set_span(t, h)
-        if (status := call.function(*call.arguments)) > 1:
+        taken, self._taken = self._taken, None
+        if taken is None:
+            state = instance.save() if self.options.rollback else None
+            instance.set_span(t, h)
+            status = call.function(*call.arguments)
+        else:
+            status, state = taken
+        if status > 1:
             if state is None or self.fmi.end_step(status)[0] != DISCARD or not self._redo(state, t, h):
                 instance.end_step(status, t, h)
             return t + h, False
@@ -321,21 +327,16 @@ class CarefulSteps:
 
     def _tell_slopes(self, t: float) -> None:
         """Tell the slopes of the real inputs by their differences from the step before (FMI 2.0, 4.2.1)."""
-        now = np.array(self.smooth.values)
-        slopes = np.zeros(now.size)
-        if self._last is not None and t > self._last[0]:
-            slopes = (now - self._last[1]) / (t - self._last[0])
-        ports = {p: v for p, v in self.smooth.ports.items() if v.type == "Float64" and (v.intermediate or self.old)}
-        if ports:
-            references = [r for v in ports.values() for r in v.references]
-            index = np.concatenate([np.r_[self.smooth.places[port]] for port in ports])
-            call = (self.fmi.set_input_slopes, t, references, now[index].tolist(), slopes[index].tolist())
+        now = self.smooth.values[self.sloped]
+        slopes = (now - self.last[1:]) / (t - self.last[0]) if t > self.last[0] else np.zeros(now.size)
+        if now.size:
+            call = (self.fmi.set_input_slopes, t, self.sloped_references, now.tolist(), slopes.tolist())
             self.instance.call("telling the slopes of its inputs", *call)
-        self._last = t, now
+        self.last[0], self.last[1:] = t, now
 
     # ---- events ----
 
-    def _handle_events(self, t: float, due: list[_Clock], triggered: set[str], *, set_inputs: bool) -> None:
+    def _handle_events(self, t: float, due: list[Clock], triggered: set[str], *, set_inputs: bool) -> None:
         """Enter Event Mode, let clocks tick, and settle (FMI 3.0, 2.3.5 and 4.2.1)."""
         instance = self.instance
         instance.call("entering Event Mode", self.fmi.enter_event_mode)
@@ -344,7 +345,7 @@ class CarefulSteps:
         self._activate(t, due, triggered)
         self._settle(t)
 
-    def _activate(self, t: float, due: list[_Clock], triggered: set[str]) -> None:
+    def _activate(self, t: float, due: list[Clock], triggered: set[str]) -> None:
         """Let clocks tick, and set the inputs that may be set at these ticks alone."""
         ticking = {clock.variable.name: clock.variable for clock in due}
         ticking |= {name: self.triggered[name] for name in sorted(triggered)}
@@ -379,7 +380,7 @@ class CarefulSteps:
         self._read_intervals(t, [c for c in self.clocks if not c.variable.is_periodic])
         instance.call("entering Step Mode", self.fmi.enter_step_mode)
 
-    def _read_intervals(self, t: float, clocks: list[_Clock]) -> None:
+    def _read_intervals(self, t: float, clocks: list[Clock]) -> None:
         """Ask the FMU for the intervals that its description does not state."""
         if not clocks:
             return

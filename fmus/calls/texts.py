@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import ctypes
+from collections.abc import Callable, Iterable, Mapping
 
 from ..archive import FmuDescription, OtherVariable
+from .bound_calls import Call
 from .fmi_calls import FmiCalls
 
 Text = str | bytes | tuple[str, ...] | tuple[bytes, ...]
@@ -69,6 +71,51 @@ def list_limits(label: str, about: FmuDescription, *, model_exchange: bool = Fal
         )
     found += [f"{label}: {finding.found.rstrip('.')}" for finding in about.findings]
     return found + [f"{label}: {text}" for text in about.unit_complaints]
+
+
+class TextWatch:
+    """Calls behind a step in another process that note whether texts have changed, so that they need not be read.
+
+    Parameters
+    ----------
+    fmi : FmiCalls
+        The instance's calls.
+    variables : iterable of OtherVariable
+        The texts; no binary data.
+
+    Attributes
+    ----------
+    calls : list of Call
+        The calls.
+    changed : ctypes.c_int64
+        Not 0 where they may have changed.
+    """
+
+    def __init__(self, fmi: FmiCalls, variables: Iterable[OtherVariable]):
+        self.changed = fmi.variable(ctypes.c_int64)
+        self.changed.value = 1
+        chosen = [*variables]
+        references = (ctypes.c_uint * len(chosen))(*(v.reference for v in chosen))
+        n = sum(v.size for v in chosen)
+        found = fmi.variable(ctypes.c_void_p * n)
+        at, word = ctypes.addressof(found), ctypes.c_void_p(ctypes.addressof(self.changed))
+        get = fmi.function("GetString"), fmi.value_arguments(references, len(chosen), at, n)
+        assert fmi.text_watch is not None
+        self.calls: list[Call] = [get, (fmi.text_watch, (ctypes.c_void_p(at), ctypes.c_size_t(n), word))]
+        self._kept = references, found
+
+    def take(self) -> bool:
+        """Return whether the texts may have changed since the last time."""
+        changed, self.changed.value = bool(self.changed.value), 0
+        return changed
+
+
+def watch_texts(fmi: FmiCalls, variables: Iterable[OtherVariable]) -> TextWatch | None:
+    """Return the watch of an instance's texts; None in this process, without texts, and where some are binary data."""
+    chosen = [v for v in variables if is_readable(fmi, v)]
+    if fmi.text_watch is None or not chosen or any(v.type != "String" for v in chosen):
+        return None
+    return TextWatch(fmi, chosen)
 
 
 class TextRecord:

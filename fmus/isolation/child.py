@@ -23,7 +23,7 @@ from contextlib import suppress
 from typing import Any
 
 from . import wire
-from .in_c import TYPES, Server
+from .in_c import TYPES, Server, make_watch
 from .surroundings import has_room, kill_group, limit, look_around, move, print_to, resident
 from .wire import (
     CAUSE,
@@ -236,7 +236,7 @@ class Child:
                     made.append((value[0], TYPES[value[0]].from_buffer(self.memory, value[1])))
                 else:
                     made.append((kind, TYPES[kind](value)))
-            function = self.library[name]
+            function = make_watch() if name == wire.WATCH_TEXTS else self.library[name]
             function.restype = ctypes.c_int
             bound.append((function, made))
         self.bound.append(bound)

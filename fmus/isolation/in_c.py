@@ -22,11 +22,31 @@ TYPES: dict[str, Any] = {
 _FORMS = {
     form: place
     for place, form in enumerate(
-        ("ppnp", "ppnpn", "pddi", "pddc", "pddcpppp", "pd", "ppn", "p", "pp", "ppppppp", "pipp", "pcpp")
+        ("ppnp", "ppnpn", "pddi", "pddc", "pddcpppp", "pd", "ppn", "p", "pp", "ppppppp", "pipp", "pcpp", "ppnpp", "pnp")
     )
 }
 """Forms of functions: pointers, numbers of elements, times, flags as int and as char; see `child.c`."""
 _LETTERS = {"P": "p", "L": "n", "Q": "n", "d": "d", "i": "i", "?": "c", "b": "c", "c": "c"}
+
+
+_WATCH = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p)
+
+
+def make_watch() -> Any:
+    """Return a function for bound calls that notes in a word whether texts are others than when it was called last.
+
+    Its arguments are where the texts stand, their number, and where the word stands, which it never sets back.
+    """
+    kept: list[Any] = []
+
+    def watch(texts: int, n: int, changed: int) -> int:
+        found = (ctypes.c_char_p * n).from_address(texts)[:]
+        if found != kept:
+            kept[:] = found
+            ctypes.c_int64.from_address(changed).value = 1
+        return 0
+
+    return _WATCH(watch)
 
 
 class _Call(ctypes.Structure):

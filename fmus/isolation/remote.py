@@ -30,6 +30,7 @@ from .limits import Isolation
 from .pool import give_back
 from .process import ChildProcess
 from .round_trip import bind_round_trip
+from .wire import WATCH_TEXTS
 
 
 class RemoteBoundCalls(BoundCalls):
@@ -82,10 +83,21 @@ class RemoteBoundCalls(BoundCalls):
         return status
 
 
+class RemoteWatch:
+    """The child's own function among bound calls that notes whether texts have changed; it is bound, never called."""
+
+    name = WATCH_TEXTS
+
+    def __call__(self, *arguments: object) -> int:
+        """Refuse."""
+        raise NotImplementedError("the child alone calls it, among bound calls")
+
+
 class RemoteCalls(FmiCalls):
     """Part of the calls that differs where the library is in a child; the other base is a version's calls."""
 
     in_process = False
+    text_watch = staticmethod(RemoteWatch())
     process: ChildProcess
     limits: Isolation
     _line: np.ndarray | None = None
@@ -173,17 +185,22 @@ class RemoteCalls(FmiCalls):
         self, t: float, references: Sequence[int], inputs: Sequence[float], slopes: Sequence[float]
     ) -> None:
         """Tell the slopes of inputs; in FMI 3.0 the child sets them when the FMU asks for that within a step."""
-        if self.prefix != "fmi3":
+        line = self.slope_line(references, len(inputs))
+        if line is None:
             super().set_input_slopes(t, references, inputs, slopes)
-            return
-        if self._line is None:
-            self._line = self.allocate(2 + 2 * len(inputs), ctypes.c_double)
+        else:
+            line[0], line[2:] = t, [*inputs, *slopes]
+
+    def slope_line(self, references: Sequence[int], n: int) -> np.ndarray | None:
+        """Return start, status, values and slopes of inputs within a step, as the child reads them in FMI 3.0."""
+        if self._line is None and self.prefix == "fmi3":
+            self._line = self.allocate(2 + 2 * n, ctypes.c_double)
             place = self.process.find(self._line.ctypes.data)
             self.process.request(
-                "follow", place, list(references), len(inputs), self.fmu.component, call="fmi3SetFloat64",
+                "follow", place, list(references), n, self.fmu.component, call="fmi3SetFloat64",
                 seconds=self.limits.step_time,
             )  # fmt: skip
-        self._line[0], self._line[2:] = t, [*inputs, *slopes]
+        return self._line
 
     @property
     def intermediate_status(self) -> int:

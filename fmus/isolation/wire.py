@@ -26,6 +26,8 @@ MAILBOX, DATA = 512, 1 << 16
 MEMORY, OUTPUT, NO_ROOM = 1, 2, 3
 """Reasons in the word `CAUSE`, for which the child has ended itself."""
 WAKE = b"w"
+WATCH_TEXTS = "loopwright_watch_texts"
+"""Name of a call of the child's own among those that are bound; see `Child._watch_texts`."""
 LOG_HEAD = struct.Struct("<iI")
 """Head of a log message in its file: status and length."""
 LONGEST_MESSAGE, MOST_MESSAGES, MOST_LOGGED = 8192, 20000, 64_000_000

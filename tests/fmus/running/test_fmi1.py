@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, FmuRuntimeError, ParameterError, Sine, UnknownNameError
-from loopwright.diagrams import Diagram
+from loopwright.blocks import Block, Constant, FmuRuntimeError, Input, Output, ParameterError, Sine, UnknownNameError
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, FmuFault, StepOptions, doctor
 from support.small_fmus import small_fmu, values
 
@@ -55,6 +55,15 @@ MODEL = """<ModelVariables>
  canInterpolateInputs="true" canHandleEvents="true"/></CoSimulation_StandAlone></Implementation>"""
 
 
+class Window(Block):
+    """1 while the count is 1 or 2, else 0."""
+
+    u, y = Input(), Output()
+
+    def output(self, t, x, u):
+        return np.where(np.abs(u.u - 1.5) < 1.0, 1.0, 0.0)
+
+
 @pytest.fixture(scope="module")
 def file(cache, tmp_path_factory):
     return small_fmu(tmp_path_factory.mktemp("fmi1"), "fmi1", SOURCE, MODEL)
@@ -69,6 +78,37 @@ def test_it_runs_with_its_parameters_types_and_texts(file, isolate):
     assert run["plant.count"].tolist() == [0, 1, 2, 3, 4, 5]
     assert run["plant.shown"][-1] == 1.0
     assert [m for m in run.messages if m.endswith("warning: 50% of all, 2.5")]
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_its_booleans_and_new_steps_are_those_of_both_tiers(file, isolate):
+    """``on`` is put out a step after it has changed; it refuses steps that are told to be a repetition."""
+    plant, window = Fmu(file, name="plant", isolate=isolate), Window(name="window")
+
+    @subsystem(sample_time=0.1)
+    def controller(count):
+        return window(count)
+
+    made = Diagram("d", plant(u=Constant(value=2.0), on=controller(plant["count"])))
+    one, two = (made.simulate(0.6, compile=c, progress=False) for c in (False, True))
+    assert (one.tier, two.tier) == ("interpreted", "compiled")
+    assert one.data.tobytes() == two.data.tobytes()
+    assert two["plant.shown"].tolist() == [0, 0, 1, 1, 0, 0, 0]
+    assert two["plant.x"] == pytest.approx(2.0 * two.t, abs=1e-14)
+
+
+def test_c_calls_it_by_its_own_prototypes(cache, tmp_path):
+    """References and numbers of elements alone, and newStep: the FMU refuses a step that is told to be a repetition."""
+    real = MODEL.replace('name="count" valueReference="4" causality="output"', 'name="count" valueReference="4"')
+    for name in ("on", "shown"):
+        real = "\n".join(line for line in real.splitlines() if f'name="{name}"' not in line)
+    file = small_fmu(tmp_path, "fmi1", SOURCE, real, name="real")
+    made = Diagram("d", Fmu(file, name="plant", isolate=False)(u=Sine(amplitude=1.0, frequency=1.0)))
+    one, two = (made.simulate(1.0, step=0.01, compile=c, progress=False) for c in (False, True))
+    assert (one.tier, two.tier) == ("interpreted", "compiled")
+    assert one.data.tobytes() == two.data.tobytes()
+    held = 0.01 * np.sin(2.0 * np.pi * 0.01 * np.arange(100))
+    assert two["plant.x"] == pytest.approx(np.concatenate([[0.0], np.cumsum(held)]), abs=1e-12)
 
 
 def test_it_has_the_linear_model_of_a_step(file):
