@@ -3,6 +3,7 @@
 from .compliance import AdmittanceFilter, ErrorDynamics
 from .environment import HandForce, PathSpring
 from .planar_model import PlanarModel
+from .planar_slopes import PlanarSlopes, planar_slopes
 from .transverse import (
     FeedbackLinearization,
     ForceProjection,
@@ -23,7 +24,9 @@ __all__ = [
     "PathSpring",
     "PathTracking",
     "PlanarModel",
+    "PlanarSlopes",
     "TransverseTransform",
     "expect_model",
     "expect_path",
+    "planar_slopes",
 ]

@@ -47,12 +47,11 @@ import numpy as np
 
 from ...blocks import AdmittanceFilter, ErrorDynamics, FeedbackLinearization, ForceSensor, Frame, Path, PlanarModel
 from ...blocks.core import Array, Finding, ParameterError, UnknownNameError, Value, parameter
-from ...blocks.path_following import expect_model, expect_path
+from ...blocks.path_following import expect_model, expect_path, planar_slopes
 from ...blocks.tracing import check_method
 from ..flat import WiredDiagram
 from ..results import OperatingPoint
 from .fig3_parts import check_wires, delay_of, find_kinks, plant_path
-from .planar import compute_slopes
 from .shown_plant import check_plant
 
 SIDES = ("par", "perp")
@@ -388,7 +387,7 @@ def _make_error(port: str, found: object, expected: str) -> ParameterError:
 def _reduce_to_motion(loop: AdmittanceLoop, model: PlanarModel) -> Motion:
     """Return M and C in the frame of the path; refuse a model that is not Cartesian."""
     E = loop.frame
-    made = compute_slopes(model, loop.path.to_plane(loop.eta, loop.xi), loop.velocity)
+    made = planar_slopes(model, loop.path.to_plane(loop.eta, loop.xi), loop.velocity)
     if type(model).h is not PlanarModel.h or np.any(made.by_position):
         raise ParameterError(
             f"found {type(model).__name__}, which is not Cartesian; expected a model whose output is its position and "

@@ -27,9 +27,9 @@ from .contact_limits import ContactLimit, ContactMap, CoupledLoop, check_propert
 from .contact_loop import close_loop, join_environment
 from .contact_parts import ContactParts, take_apart
 from .contact_ports import Ports
+from .growth_limits import PER_DECADE
 from .port_passivity import find_passivity
 from .rendered import CONTINUOUS, HIGHEST, LOWEST, OFF_PATH, PERIODIC, SAMPLED, Passivity, find_negative
-from .stability_limits import PER_DECADE
 
 if TYPE_CHECKING:
     from ..flat import WiredDiagram

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import OptionError, ParameterError, near
-from .stability_limits import UNITS
+from .growth_limits import UNITS
 
 
 def read_number(value: Any, port: str, unit: str) -> float:

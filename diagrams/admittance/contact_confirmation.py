@@ -16,7 +16,7 @@ from ...blocks.core import ConfirmationError, OptionError
 from .contact_arguments import read_positive
 from .contact_limits import ContactLimit
 from .contact_trials import STEP, TrialMethod, Trials, TriedContact
-from .stability_limits import GROWTH_AT
+from .growth_limits import GROWTH_AT
 
 FACTORS = (0.97, 1.03)
 """Shares of a limit at which the diagram is run."""

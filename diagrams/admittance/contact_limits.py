@@ -9,30 +9,29 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, OptionError, brief, on_one_thread
+from ...blocks.core import Finding, OptionError, on_one_thread
 from ..frequency import Number
 from .contact_arguments import check_property, read_density, read_number, read_positive
 from .contact_loop import ClosedLoop, Modes, close_loop, controller_rows, join_environment, split_modes
 from .contact_motion import find_direction, find_frequency
 from .contact_parts import ContactParts
-from .stability_limits import (
-    CONFIRMED_AT,
-    GROWTH_AT,
+from .growth_limits import (
     PER_DECADE,
-    SCANNED,
     UNITS,
-    find_brackets,
-    refine_change,
+    FoundLimit,
+    GrowthMap,
+    describe_limit,
+    find_first_limit,
+    scan_points,
 )
 
 FEWEST_PER_DECADE = 30
 """Fewest points of a scan in a decade: above k/M = (π/T)², stability changes several times in one."""
-_ROUNDING = 1e-12
-"""Relative rounding error of Brent's method."""
 _ESTIMATED = 10.0
 """Factor by which a stated error of differences may be too small."""
 
@@ -93,14 +92,7 @@ class ContactLimit:
     second_look: float = math.nan
 
     def __repr__(self) -> str:
-        held = ", ".join(f"{name} {value:g}" for name, value in self.environment.items())
-        limit = f"{self.vary} {self.value:.6g} {self.unit}"
-        facts = (
-            limit,
-            f"at {self.frequency:.4g} rad/s" if self.frequency == self.frequency else "",
-            held and f"with {held}",
-        )
-        return brief("limit of coupled stability", *facts, then=".value, .frequency, .confirmed_by")
+        return describe_limit(self.vary, self)
 
     @property
     def number(self) -> Number:
@@ -108,33 +100,19 @@ class ContactLimit:
         return Number(self.value, self.unit, self.tolerance, self.confirmed_by, findings=self.findings)
 
 
-@dataclass(frozen=True, eq=False)
-class ContactMap:
-    """Growth rates over two properties of the environment.
+@dataclass(frozen=True, eq=False, repr=False)
+class ContactMap(GrowthMap):
+    """Growth rates over two properties of the environment; see `GrowthMap` for ``x``, ``y`` and ``growth``.
+
+    The growth rates are those of the modes that the environment can move, and of those that grow whatever it is.
 
     Attributes
     ----------
-    x, y : str
-        Properties.
-    x_values, y_values : ndarray
-        Values of the properties.
-    growth : ndarray, shape (len(y_values), len(x_values))
-        σ in 1/s, negative where the loop is stable; of the modes that the environment can move, and of those that grow
-        whatever it is.
     limits : tuple of ContactLimit
         Limit of x at each value of y.
     """
 
-    x: str
-    y: str
-    x_values: np.ndarray
-    y_values: np.ndarray
-    growth: np.ndarray
     limits: tuple[ContactLimit, ...]
-
-    def __repr__(self) -> str:
-        facts = f"{len(self.y_values)} × {len(self.x_values)} growth rates over {self.y} and {self.x}"
-        return brief("map of coupled stability", facts, then=".growth, .limits")
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,49 +238,28 @@ def find_limit(
     ConfirmationError
         If python-control's interconnection of the same parts is not stable below the limit and unstable above it.
     """
-    first, last, per_decade = _check_scan(vary, low, high, per_decade)
+    grid = _read_scan(vary, low, high, per_decade)
     loop = CoupledLoop.of(parts, direction, vary, held)
-    grid = np.geomspace(first, last, max(8, math.ceil(per_decade * math.log10(last / first)) + 1))
-    common: dict[str, Any] = {"vary": vary, "unit": UNITS[vary], "scanned": (first, last), "environment": dict(held)}
-    common |= {"findings": parts.findings}
-    fixed = loop.find_fixed_growth()
-    if fixed is not None:
+    frequency, moved = math.nan, tuple[float, ...]()
+    if (fixed := loop.find_fixed_growth()) is not None:
         rate, frequency, moved = fixed
-        return ContactLimit(
-            value=0.0, frequency=frequency, direction=moved, restabilizes=(), growth_below=math.nan, growth_above=rate,
-            tolerance=0.0, confirmed_by=f"a mode that no such environment moves grows by {rate:.4g} 1/s", **common,
-        )  # fmt: skip
-    sigma = loop.growth(grid)
-    changes = [refine_change(loop.growth_at, a, b) for a, b in find_brackets(loop.growth_at, grid, sigma)]
-    if sigma[0] > 0.0:
-        frequency, moved = loop.fastest_mode(first)
-        return ContactLimit(
-            value=0.0, frequency=frequency, direction=moved, restabilizes=tuple(changes), growth_below=math.nan,
-            growth_above=float(sigma[0]), tolerance=0.0,
-            confirmed_by=f"unstable from the start of the scan, σ = {sigma[0]:.4g} 1/s", **common,
-        )  # fmt: skip
-    if not changes:
-        return ContactLimit(
-            value=math.inf, frequency=math.nan, direction=(), restabilizes=(), growth_below=math.nan,
-            growth_above=math.nan, tolerance=0.0, confirmed_by="no change of sign of the growth rate on the scan",
-            **common,
-        )  # fmt: skip
-    value, *later = changes
-    step = min(CONFIRMED_AT, 0.5 * (later[0] / value - 1.0)) if later else CONFIRMED_AT
-    confirmed = _confirm(loop, value, step)
-    slope = (loop.growth_at((1.0 + step) * value) - loop.growth_at((1.0 - step) * value)) / (2.0 * step)
-    error = 10.0 * abs(loop.growth_by_control(value) / slope) + abs(_model_error(loop, value) / slope) + _ROUNDING
-    frequency, moved = loop.fastest_mode(value)
+        grows = f"a mode that no such environment moves grows by {rate:.4g} 1/s"
+        found = FoundLimit(0.0, (), math.nan, rate, 0.0, grows)
+    else:
+        found = find_first_limit(
+            vary, grid, loop.growth(grid), loop.growth_at, loop.growth_by_control, partial(_model_error, loop)
+        )
+        if found.value < math.inf:
+            frequency, moved = loop.fastest_mode(found.value or float(grid[0]))
     return ContactLimit(
-        value=value,
+        vary=vary,
+        unit=UNITS[vary],
         frequency=frequency,
         direction=moved,
-        restabilizes=tuple(later),
-        growth_below=loop.growth_at((1.0 - GROWTH_AT) * value),
-        growth_above=loop.growth_at((1.0 + GROWTH_AT) * value),
-        tolerance=value * error,
-        confirmed_by=confirmed,
-        **common,
+        scanned=(float(grid[0]), float(grid[-1])),
+        environment=dict(held),
+        findings=parts.findings,
+        **found._asdict(),
     )
 
 
@@ -346,27 +303,12 @@ def check_properties(held: Mapping[str, Any], vary: str) -> dict[str, float]:
     return {name: read_number(value, name, UNITS[name]) for name, value in held.items()}
 
 
-def _check_scan(vary: str, low: Any, high: Any, per_decade: Any) -> tuple[float, float, int]:
-    first, last = SCANNED[vary]
-    first = first if low is None else read_positive(low, "low", f"value in {UNITS[vary]}")
-    last = last if high is None else read_positive(high, "high", f"value in {UNITS[vary]}")
-    if not first < last:
-        raise OptionError(
-            f"found a scan from {first!r} to {last!r}; expected 0 < low < high. Give other ends.", port=vary
-        )
-    return first, last, read_density(per_decade, FEWEST_PER_DECADE)
-
-
-def _confirm(loop: CoupledLoop, value: float, step: float) -> str:
-    """Confirm a limit by the poles of python-control's interconnection below and above it; return the computation."""
-    below, above = (loop.growth_by_control(x * value) for x in (1.0 - step, 1.0 + step))
-    if not below < 0.0 < above:
-        raise ConfirmationError(
-            f"{loop.vary} {value:.6g} {UNITS[loop.vary]} is no limit: python-control's interconnection has the growth "
-            f"rates {below:.4g} and {above:.4g} 1/s at {1.0 - step:.4g} and {1.0 + step:.4g} of it; expected the first "
-            "negative, the second positive. Scan more finely with per_decade=…."
-        )
-    return f"closed-loop eigenvalues of python-control's interconnection at {1.0 - step:.4g} and {1.0 + step:.4g}"
+def _read_scan(vary: str, low: Any, high: Any, per_decade: Any) -> np.ndarray:
+    unit = f"value in {UNITS[vary]}"
+    first, last = (
+        None if end is None else read_positive(end, name, unit) for name, end in (("low", low), ("high", high))
+    )
+    return scan_points(vary, (first, last), read_density(per_decade, FEWEST_PER_DECADE))
 
 
 def _model_error(loop: CoupledLoop, value: float) -> float:

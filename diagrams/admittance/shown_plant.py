@@ -19,9 +19,9 @@ import numpy as np
 
 from ...blocks import PlanarModel
 from ...blocks.core import Array, LoopwrightError, ParameterError
+from ...blocks.path_following import PlanarSlopes, planar_slopes
 from ...fmus.running import Derivation, DerivativeMethod, FmuLinearization
 from ..linearization import operating_point
-from .planar import Slopes, compute_slopes
 
 if TYPE_CHECKING:
     from ...fmus.running import Fmu
@@ -120,7 +120,7 @@ def check_plant(
             block=path,
         ) from error
     place, speed = (linear.y0[_entries(linear.outputs, port)] for port in ("position", "velocity"))
-    _compare(path, linear, compute_slopes(model, place, speed), rate, np.eye(2) if frame is None else frame)
+    _compare(path, linear, planar_slopes(model, place, speed), rate, np.eye(2) if frame is None else frame)
 
 
 def _refuse(path: str, port: str, found: str, expected: str, then: str) -> NoReturn:
@@ -252,7 +252,7 @@ def _linearize_at(
 # ---- the comparison ----
 
 
-def _compare(path: str, m: FmuLinearization, model: Slopes, rate: float, E: np.ndarray) -> None:
+def _compare(path: str, m: FmuLinearization, model: PlanarSlopes, rate: float, E: np.ndarray) -> None:
     """Refuse a linear model whose entries are not those of the reduced model."""
     parts = _pair_entries(m, model, rate)
     M = _inertia_of(E, model.G_v)
@@ -290,7 +290,7 @@ def _compare(path: str, m: FmuLinearization, model: Slopes, rate: float, E: np.n
         _refuse(path, "contact_force", "a force that changes with motion or forces", "a constant one", _LINEARIZE)
 
 
-def _pair_entries(m: FmuLinearization, model: Slopes, rate: float) -> dict[str, EntryPair]:
+def _pair_entries(m: FmuLinearization, model: PlanarSlopes, rate: float) -> dict[str, EntryPair]:
     """Return the entries to compare, by the port that they concern, in the coordinates (position, velocity)."""
     n = len(m.states)
     outputs = {port: _entries(m.outputs, port) for port in ("position", "velocity", "acceleration", "contact_force")}

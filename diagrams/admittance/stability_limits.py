@@ -1,38 +1,18 @@
-"""Limits of coupled stability: the environments that the compliance loop can touch.
-
-A limit is the first value, on a scan from below, at which the growth rate of the coupled loop changes its sign. The
-scan also finds regions beyond it that are stable again; bisection between two ends would miss them.
-"""
+"""Limits of coupled stability: the environments that the compliance loop can touch."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Array, ConfirmationError, Finding, OptionError, accepts, brief, kinds, near, on_one_thread
+from ...blocks.core import Array, Finding, OptionError, accepts, kinds, near, on_one_thread
 from ..frequency import Number
 from .compliance_loop import AdmittanceLoop
 from .coupled import ROBOT, crossing_frequency, growth_rate, growth_rate_by_control
-
-SCANNED = {"stiffness": (1e-2, 1e8), "damping": (1e-3, 1e6), "mass": (1e-4, 1e4), "tool_mass": (1e-4, 1e4)}
-"""Ends of the scan for each property, by default."""
-UNITS = {"stiffness": "N/m", "damping": "N.s/m", "mass": "kg", "tool_mass": "kg"}
-"""Unit of each property."""
-PER_DECADE = 40
-"""Points of a scan in a decade, by default."""
-CONFIRMED_AT = 0.01
-"""Relative distance from a limit at which it is confirmed: 0.99 and 1.01."""
-GROWTH_AT = 0.03
-"""Relative distance from a limit at which growth rates are given: 0.97 and 1.03."""
-_FLAT = 20.0
-"""Ratio of distance from zero and depth beyond which an extremum does not reach zero."""
-_ROUNDING = 1e-12
-"""Relative rounding error of Brent's method."""
-Growth = Callable[[float], float]
+from .growth_limits import PER_DECADE, UNITS, GrowthMap, describe_limit, find_first_limit, scan_points
 
 
 @dataclass(frozen=True)
@@ -82,14 +62,7 @@ class StabilityLimit:
     findings: tuple[Finding, ...] = ()
 
     def __repr__(self) -> str:
-        held = ", ".join(f"{name} {value:g}" for name, value in self.environment.items())
-        limit = f"{self.over} {self.value:.6g} {self.unit}"
-        facts = (
-            limit,
-            f"at {self.frequency:.4g} rad/s" if self.frequency == self.frequency else "",
-            held and f"with {held}",
-        )
-        return brief("limit of coupled stability", *facts, then=".value, .frequency, .confirmed_by")
+        return describe_limit(self.over, self)
 
     @property
     def number(self) -> Number:
@@ -97,32 +70,17 @@ class StabilityLimit:
         return Number(self.value, self.unit, self.tolerance, self.confirmed_by, findings=self.findings)
 
 
-@dataclass(frozen=True, eq=False)
-class StabilityMap:
-    """Growth rates over two properties of the environment.
+@dataclass(frozen=True, eq=False, repr=False)
+class StabilityMap(GrowthMap):
+    """Growth rates over two properties of the environment; see `GrowthMap` for ``x``, ``y`` and ``growth``.
 
     Attributes
     ----------
-    x, y : str
-        Properties.
-    x_values, y_values : ndarray
-        Values of the properties.
-    growth : ndarray, shape (len(y_values), len(x_values))
-        σ in 1/s, negative where the loop is stable.
     limits : tuple of StabilityLimit
         Limit of x at each value of y.
     """
 
-    x: str
-    y: str
-    x_values: np.ndarray
-    y_values: np.ndarray
-    growth: np.ndarray
     limits: tuple[StabilityLimit, ...]
-
-    def __repr__(self) -> str:
-        facts = f"{len(self.y_values)} × {len(self.x_values)} growth rates over {self.y} and {self.x}"
-        return brief("map of coupled stability", facts, then=".growth, .limits")
 
 
 @accepts(loop=ROBOT, damping=kinds.number)
@@ -179,48 +137,26 @@ def stability_limit(
         If python-control's interconnection of the same parts is not stable below the limit and unstable above it.
     """
     _check(over, environment)
-    first, last = SCANNED[over]
-    first, last = first if low is None else low, last if high is None else high
-    if not 0.0 < first < last < math.inf:
-        raise OptionError(
-            f"found a scan from {first!r} to {last!r}; expected 0 < low < high. Give other ends.", port=over
-        )
-    grid = np.geomspace(first, last, max(8, math.ceil(per_decade * math.log10(last / first)) + 1))
+    grid = scan_points(over, (low, high), per_decade)
     sigma: np.ndarray = growth_rate(loop, **{over: grid}, **environment)
-    rule = rule_of_thumb(loop, environment.get("damping", 0.0)) if over == "stiffness" else math.nan
-    common: dict[str, Any] = {"over": over, "unit": UNITS[over], "rule_of_thumb": rule, "scanned": (first, last)}
-    common |= {"environment": dict(environment), "findings": loop.findings}
 
     def growth_at(x: float) -> float:
         return float(growth_rate(loop, **{over: x}, **environment))
 
-    changes = [refine_change(growth_at, a, b) for a, b in find_brackets(growth_at, grid, sigma)]
-    if sigma[0] > 0.0:
-        changes.insert(0, 0.0)
-    if not changes:
-        confirmed = "no change of sign of the growth rate on the scan"
-        rates: dict[str, Any] = {"growth_below": math.nan, "growth_above": math.nan, "frequency": math.nan}
-        return StabilityLimit(value=math.inf, restabilizes=(), tolerance=0.0, confirmed_by=confirmed, **rates, **common)
-    value, *later = changes
-    if value == 0.0:
-        confirmed = f"unstable from the start of the scan, σ = {sigma[0]:.4g} 1/s"
-        rates = {"growth_below": math.nan, "growth_above": float(sigma[0]), "frequency": math.nan}
-        return StabilityLimit(
-            value=0.0, restabilizes=tuple(later), tolerance=0.0, confirmed_by=confirmed, **rates, **common
-        )
-    step = min(CONFIRMED_AT, 0.5 * (later[0] / value - 1.0)) if later else CONFIRMED_AT
-    confirmed = _confirm(loop, over, value, step, environment)
-    slope = (growth_at((1.0 + step) * value) - growth_at((1.0 - step) * value)) / (2.0 * step)  # of σ over ln value
-    error = abs(growth_rate_by_control(loop, **{over: value}, **environment) / slope)
+    def growth_by_control(x: float) -> float:
+        return growth_rate_by_control(loop, **{over: x}, **environment)
+
+    found = find_first_limit(over, grid, sigma, growth_at, growth_by_control)
+    is_found = 0.0 < found.value < math.inf
     return StabilityLimit(
-        value=value,
-        frequency=crossing_frequency(loop, **{over: value}, **environment),
-        restabilizes=tuple(later),
-        growth_below=growth_at((1.0 - GROWTH_AT) * value),
-        growth_above=growth_at((1.0 + GROWTH_AT) * value),
-        tolerance=value * (10.0 * error + _ROUNDING),
-        confirmed_by=confirmed,
-        **common,
+        over=over,
+        unit=UNITS[over],
+        frequency=crossing_frequency(loop, **{over: found.value}, **environment) if is_found else math.nan,
+        rule_of_thumb=rule_of_thumb(loop, environment.get("damping", 0.0)) if over == "stiffness" else math.nan,
+        scanned=(float(grid[0]), float(grid[-1])),
+        environment=dict(environment),
+        findings=loop.findings,
+        **found._asdict(),
     )
 
 
@@ -312,50 +248,3 @@ def _check(name: str, environment: dict[str, float]) -> None:
     for other in environment:
         if other not in UNITS:
             raise OptionError(f"an environment has no {other!r}. {near(other, UNITS)}", port=other)
-
-
-def find_brackets(growth_at: Growth, grid: np.ndarray, sigma: np.ndarray) -> Iterator[tuple[float, float]]:
-    """Yield intervals in which the growth rate changes its sign: between points, and around extrema between them."""
-    from scipy.optimize import minimize_scalar
-
-    positive = sigma > 0.0
-    for i in range(len(grid) - 1):
-        if positive[i] != positive[i + 1]:
-            yield float(grid[i]), float(grid[i + 1])
-        elif 0 < i + 1 < len(grid) - 1 and positive[i + 1] == positive[i + 2] and np.isfinite(sigma[i : i + 3]).all():
-            towards = 1.0 if positive[i] else -1.0  # sign of σ that the extremum points away from
-            here = towards * sigma[i : i + 3]
-            if here[1] > min(here[0], here[2]) or here[1] > _FLAT * float(np.ptp(here)):
-                continue
-            found = minimize_scalar(
-                lambda y, towards=towards: towards * growth_at(math.exp(y)),
-                bounds=(math.log(grid[i]), math.log(grid[i + 2])),
-                method="bounded",
-                options={"xatol": 1e-10},
-            )
-            if float(found.fun) < 0.0:
-                top = math.exp(float(found.x))
-                yield float(grid[i]), top
-                yield top, float(grid[i + 2])
-
-
-def refine_change(growth_at: Growth, low: float, high: float) -> float:
-    """Return the value at which the growth rate changes its sign, by Brent's method."""
-    from scipy.optimize import brentq
-
-    def bound_growth(y: float) -> float:
-        return min(max(growth_at(math.exp(y)), -1e6), 1e6)  # infinite where the equations have no solution
-
-    return math.exp(float(brentq(bound_growth, math.log(low), math.log(high), xtol=1e-13, rtol=1e-13, maxiter=200)))
-
-
-def _confirm(loop: AdmittanceLoop, over: str, value: float, step: float, environment: dict[str, float]) -> str:
-    """Confirm a limit by the poles of python-control's interconnection below and above it; return the computation."""
-    below, above = (growth_rate_by_control(loop, **{over: x * value}, **environment) for x in (1.0 - step, 1.0 + step))
-    if not below < 0.0 < above:
-        raise ConfirmationError(
-            f"{over} {value:.6g} {UNITS[over]} is no limit: python-control's interconnection has the growth rates "
-            f"{below:.4g} and {above:.4g} 1/s at {1.0 - step:.4g} and {1.0 + step:.4g} of it; expected the first "
-            "negative, the second positive. Scan more finely with per_decade=…."
-        )
-    return f"closed-loop eigenvalues of python-control's interconnection at {1.0 - step:.4g} and {1.0 + step:.4g}"

@@ -14,8 +14,8 @@ from loopwright.diagrams import experiments
 from loopwright.diagrams.admittance import stability_limits as _stability_limits
 from loopwright.diagrams.admittance.compliance_loop import AdmittanceLoop
 from loopwright.diagrams.admittance.coupled import close_loop, growth_rate, growth_rate_by_control, poles
+from loopwright.diagrams.admittance.growth_limits import find_brackets
 from loopwright.diagrams.admittance.stability_limits import (
-    find_brackets,
     rule_of_thumb,
     stability_limit,
     stability_map,

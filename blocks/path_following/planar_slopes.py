@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...blocks import PlanarModel
-from ...blocks.core import Array, identity
-from ...blocks.tracing import flat_column, wrap
+from ..core import Array, identity
+from ..tracing import flat_column, wrap
+from .planar_model import PlanarModel
 
 
-class Slopes(NamedTuple):
+class PlanarSlopes(NamedTuple):
     """Input matrix and derivatives of a planar model at a position and a velocity."""
 
     G_v: np.ndarray
@@ -22,12 +22,12 @@ class Slopes(NamedTuple):
     """Derivatives of f_v and G_v by the position, one after the other."""
 
 
-_KNOWN: dict[Any, Slopes] = {}
+_KNOWN: dict[Any, PlanarSlopes] = {}
 MOST = 64
 """Slopes that are kept: every variant of a loop asks for those of its models anew."""
 
 
-def compute_slopes(model: PlanarModel, position: Array, velocity: Array) -> Slopes:
+def planar_slopes(model: PlanarModel, position: Array, velocity: Array) -> PlanarSlopes:
     """Return G_v, ∂f_v/∂x_v and the derivatives by the position, by algorithmic differentiation.
 
     Those of models of this package are kept: the equations of others may have changed since.
@@ -46,7 +46,7 @@ def compute_slopes(model: PlanarModel, position: Array, velocity: Array) -> Slop
     return found
 
 
-def _differentiate(model: PlanarModel, position: Array, velocity: Array) -> Slopes:
+def _differentiate(model: PlanarModel, position: Array, velocity: Array) -> PlanarSlopes:
     import casadi as ca
 
     x_c, x_v = ca.MX.sym("x_c", 2), ca.MX.sym("x_v", 2)
@@ -55,4 +55,4 @@ def _differentiate(model: PlanarModel, position: Array, velocity: Array) -> Slop
     moved = ca.vertcat(ca.vec(ca.jacobian(f, x_c)), ca.vec(ca.jacobian(G, x_c)))
     made = ca.Function("slopes", [x_c, x_v], [G, ca.jacobian(f, x_v), moved])(position, velocity)
     values = [np.array(v.full()) for v in made]
-    return Slopes(values[0].reshape(2, 2), values[1], values[2])
+    return PlanarSlopes(values[0].reshape(2, 2), values[1], values[2])
