@@ -4,7 +4,8 @@
 
 /* A function of an FMU by its form, with its arguments: p is a pointer, n a number of elements, d a time, b a flag. */
 enum { TRANSFER_4, TRANSFER_5, STEP_INT, STEP_CHAR, STEP_3, TIME_1, VECTOR_3, MODE_1, UPDATE_2, UPDATE_7, DONE_INT, DONE_CHAR,
-       SLOPES_5, WATCH_3 };
+       SLOPES_5, WATCH_3,
+       UPDATE_CHAR };
 typedef int (*transfer_4)(void *, void *, size_t, void *);
 typedef int (*transfer_5)(void *, void *, size_t, void *, size_t);
 typedef int (*step_int)(void *, double, double, int);
@@ -18,6 +19,7 @@ typedef int (*update_7)(void *, void *, void *, void *, void *, void *, void *);
 typedef int (*done_int)(void *, int, void *, void *);
 typedef int (*done_char)(void *, bool, void *, void *);
 typedef int (*slopes_5)(void *, void *, size_t, void *, void *);
+typedef int (*update_char)(void *, char, void *);
 typedef int (*watch_3)(void *, size_t, void *);
 
 typedef struct {
@@ -57,6 +59,7 @@ static inline int make_call(const bound_call *c) {
     case DONE_INT: return ((done_int)c->function)(p[0], *(const int *)c->flag, p[1], p[2]);
     case DONE_CHAR: return ((done_char)c->function)(p[0], *(const bool *)c->flag, p[1], p[2]);
     case SLOPES_5: return ((slopes_5)c->function)(p[0], p[1], c->n[0], p[2], p[3]);
+    case UPDATE_CHAR: return ((update_char)c->function)(p[0], *(const char *)c->flag, p[1]);
     case WATCH_3: return ((watch_3)c->function)(p[0], c->n[0], p[1]);
     default:
         return ((step_3)c->function)(p[0], *c->now, *c->width, *(const bool *)c->flag, p[1], p[2], p[3], p[4]);

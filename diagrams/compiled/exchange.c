@@ -36,7 +36,7 @@ typedef struct {
     sequence complete, enter, update, leave;
     const uint8_t *again, *terminate, *nominals, *defined, *wants, *ends; /* its answers: flags of some bytes */
     const double *time;
-    int64_t width;              /* of a flag */
+    int64_t width, again_where; /* of a flag; whether it asks for another round where it is set, or where it isn't */
     double *u;                  /* inputs at the last instant that was reached */
     const double *least, *relative, *low, *high;
     const uint8_t *discrete;    /* inputs that an event alone takes over */
@@ -259,7 +259,7 @@ static void let_act(exchanged *e, double t, const double *u, double *into) {
     for (;; rounds++) {
         nominals |= is_set(e, e->nominals);
         if (is_set(e, e->terminate)) note_end_of(e, t, true);
-        if (!is_set(e, e->again)) break;
+        if (is_set(e, e->again) != e->again_where) break;
         if (rounds == EVENT_ROUNDS) break;
         if (!go_through_all(e, &e->update, t)) return;
     }

@@ -41,7 +41,7 @@ class _Sequence(ctypes.Structure):
 class _Exchanged(ctypes.Structure):
     _fields_ = [
         ("of", _AT), *_fields(_INT, "place states inputs first"), *_fields(_Sequence, "complete enter update leave"),
-        *_fields(_AT, "again terminate nominals defined wants ends time"), ("width", _INT),
+        *_fields(_AT, "again terminate nominals defined wants ends time"), *_fields(_INT, "width again_where"),
         *_fields(_AT, "u least relative low high discrete"), ("next_time", _REAL),
         *_fields(_INT, "asks ended in_event"), ("end", _REAL), *_fields(_INT, "other_nominals acted"),
         *_fields(_AT, "changed far"),
@@ -232,7 +232,7 @@ class NativeExchange:
         self._finals[path] = look.final
         answers = look.answers
         fmu.width, fmu.again, fmu.terminate, fmu.nominals = answers[:4]
-        fmu.defined, fmu.time, fmu.wants, fmu.ends = answers[4:]
+        fmu.defined, fmu.time, fmu.wants, fmu.ends, fmu.again_where = answers[4:]
         self._inputs[path] = np.zeros(fmu.inputs)
         fmu.u = self._own(self._inputs[path])
         fmu.least, fmu.relative, fmu.low, fmu.high = (

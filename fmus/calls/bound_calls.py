@@ -150,7 +150,10 @@ class EventUpdate(NamedTuple):
 
 
 class AnswersAt(NamedTuple):
-    """Addresses of the answers of ``update`` and ``complete``: flags of some bytes each, and a time in s."""
+    """Addresses of the answers of ``update`` and ``complete``: flags of some bytes each, and a time in s.
+
+    Another round is wanted where ``again`` is ``again_where``.
+    """
 
     width: int
     again: int
@@ -160,6 +163,7 @@ class AnswersAt(NamedTuple):
     next_time: int
     wants: int
     ends: int
+    again_where: bool = True
 
 
 @dataclass(frozen=True)

@@ -284,7 +284,7 @@ class ExchangeInstance(EvaluatedExchange):
             return "runs in a process of its own, for which C can't wait on this system"
         if self._texts.variables:
             return "has outputs of texts, which are recorded at each step"
-        return None if self._events.answers is not None and self._events.leave is not None else "is one of FMI 1.0"
+        return None
 
     def native_evaluation(self, wanted: Wanted, vectors: EvaluationVectors, *, again: bool) -> list[NativeAction]:
         """Return `bound_evaluation` as actions of C."""
@@ -299,9 +299,8 @@ class ExchangeInstance(EvaluatedExchange):
         enter += self._event_evaluation(inputs).native(without_result, self._order)
         complete = self._step_evaluation().native(without_result, self._order) if self.about.completes_steps else []
         calls = self._events
-        assert calls.leave is not None
         assert calls.answers is not None
-        states = self._bind_reading("get_states", calls.leave)
+        states = self._bind_reading("get_states", *([] if calls.leave is None else [calls.leave]))
         leave = call_actions(states, [_READING["get_states"]] * len(states.calls))
         low, high, discrete = np.full(u.size, -math.inf), np.full(u.size, math.inf), np.zeros(u.size, dtype=bool)
         low[index], high[index] = inputs.bounds
@@ -313,7 +312,7 @@ class ExchangeInstance(EvaluatedExchange):
             call_actions(self._bind_update(), [_UPDATING]),
             [*leave, *copy_action(ActionKind.GIVE, vectors.into, self._order, self._kept)],
             calls.answers,
-            None if self.fmi.in_process else calls.final,
+            None if self.fmi.in_process and calls.leave is not None else calls.final,
             self._least,
             self._relative,
             discrete,

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from .bound_calls import EventCalls, EventUpdate
+from .bound_calls import AnswersAt, EventCalls, EventUpdate
 from .fmi_calls import DISCARD, PENDING, FmiCalls, Log, StepCall, TypeCalls
 from .printf import Logger, format_message
 
@@ -201,7 +201,11 @@ class Fmi1Calls(FmiCalls):
         from fmpy.fmi1 import fmi1EventInfo
 
         info, wanted, final = self.variable(fmi1EventInfo), self.variable(ctypes.c_uint8), self.variable(ctypes.c_int)
-        instance = self.instance_argument
+        instance, never = self.instance_argument, self.variable(ctypes.c_uint8)
+        at, kind = ctypes.addressof, type(info)
+        names = ("iterationConverged", "terminateSimulation", "stateValueReferencesChanged", "upcomingTimeEvent")
+        settled, ends, others, defined = (at(info) + getattr(kind, name).offset for name in names)
+        time_at = at(info) + kind.nextEventTime.offset
 
         def updated() -> EventUpdate:
             def flag(name: str) -> bool:
@@ -218,8 +222,9 @@ class Fmi1Calls(FmiCalls):
             (self._function("fmi1CompletedIntegratorStep"), (instance, ctypes.byref(wanted))),
             final,
             updated,
-            lambda: (bool(wanted.value), False),
+            lambda: (bool(wanted.value), bool(never.value)),
             lambda: self._initialized,
+            AnswersAt(1, settled, ends, others, defined, time_at, at(wanted), at(never), again_where=False),
         )
 
     def update_events(self) -> EventUpdate:

@@ -351,7 +351,8 @@ class NativeLook:
     answers : AnswersAt
         Where the answers stand.
     final : object
-        C value that `complete` reads in another process: whether no earlier state will be restored.
+        C value that `complete` reads in another process: whether no earlier state will be restored; in this process
+        None, where it is its second argument, and a value that nobody reads in FMI 1.0.
     least, relative : ndarray
         Least change of each input that is a jump, by itself and relative to the input.
     discrete : ndarray of bool

@@ -22,7 +22,23 @@ TYPES: dict[str, Any] = {
 _FORMS = {
     form: place
     for place, form in enumerate(
-        ("ppnp", "ppnpn", "pddi", "pddc", "pddcpppp", "pd", "ppn", "p", "pp", "ppppppp", "pipp", "pcpp", "ppnpp", "pnp")
+        (
+            "ppnp",
+            "ppnpn",
+            "pddi",
+            "pddc",
+            "pddcpppp",
+            "pd",
+            "ppn",
+            "p",
+            "pp",
+            "ppppppp",
+            "pipp",
+            "pcpp",
+            "ppnpp",
+            "pnp",
+            "pcp",
+        )
     )
 }
 """Forms of functions: pointers, numbers of elements, times, flags as int and as char; see `child.c`."""

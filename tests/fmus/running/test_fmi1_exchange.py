@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import AlgebraicLoopError, Constant, FmuFileError, Gain
-from loopwright.diagrams import Diagram
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, FmuVerdict, doctor
 from loopwright.fmus.checks.validation import validate
 from support.small_fmus import small_fmu, values
@@ -69,11 +69,14 @@ def file(cache, tmp_path_factory):
     return small_fmu(tmp_path_factory.mktemp("fmi1"), "fmi1", BALL, MODEL, name="ball", states=2, indicators=1)
 
 
+@pytest.mark.parametrize("in_c", [False, True], ids=["interpreted", "compiled"])
 @pytest.mark.parametrize("isolate", [False, True])
-def test_a_ball_bounces_and_counts_as_in_closed_form(file, isolate):
+def test_a_ball_bounces_and_counts_as_in_closed_form(file, isolate, in_c):
     plant = Fmu(file, name="plant", isolate=isolate)
     assert plant.used_interface == "model_exchange"
-    run = Diagram("d", plant(u=Constant(value=0.0))).simulate(1.05, step=0.05, rtol=1e-9, atol=1e-12, progress=False)
+    made = Diagram("d", plant(u=Constant(value=0.0)))
+    run = made.simulate(1.05, step=0.05, rtol=1e-9, atol=1e-12, compile=in_c, progress=False)
+    assert run.tier == ("compiled" if in_c else "interpreted")
     np.testing.assert_allclose(run["plant.h"], bounced(run.t), atol=1e-8)
     np.testing.assert_array_equal(run["plant.k"], np.floor(4.0 * run.t + 1e-12))
     assert [e.t for e in run.events if e.event == "time_event"] == pytest.approx([0.25, 0.5, 0.75, 1.0], abs=1e-12)
@@ -81,6 +84,28 @@ def test_a_ball_bounces_and_counts_as_in_closed_form(file, isolate):
     assert sorted(impacts) == pytest.approx([IMPACT] * len(impacts), abs=1e-9)
     assert impacts
     assert run["plant.steps"][-1] > 10
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_it_is_evaluated_in_c(file, isolate):
+    """Under a sampled controller: its input jumps at each tick, and Event Mode has no calls of its own in FMI 1.0."""
+    plant = Fmu(file, name="plant", isolate=isolate)
+
+    @subsystem(sample_time=0.05)
+    def controller(h):
+        return 0.5 * h
+
+    made = Diagram("d", plant(u=controller(plant.h)))
+    one, two = (made.simulate(0.4, rtol=1e-9, atol=1e-12, compile=c, progress=False) for c in (False, True))
+    assert (one.tier, two.tier) == ("interpreted", "compiled"), two.messages
+    for name in ("plant.h", "plant.y"):
+        np.testing.assert_allclose(one[name], two[name], atol=1e-9)
+    np.testing.assert_array_equal(two["plant.k"], np.floor(4.0 * two.t + 1e-12))
+    h, v = 1.0, 0.0
+    for k in range(8):  # the force is held over each tick
+        assert two["plant.h"][k] == pytest.approx(h, abs=1e-9)
+        a = 0.5 * h - G
+        h, v = h + 0.05 * v + 0.5 * a * 0.05**2, v + 0.05 * a
 
 
 def test_it_agrees_with_fmpy(file):
