@@ -37,6 +37,7 @@ from .errors import (
     close_names,
     near,
 )
+from .explained_calls import UnknownArgumentError, explain_calls
 from .files import check_file, replace_file, write_text
 from .findings import Finding
 from .frozen import FrozenMapping
@@ -113,6 +114,7 @@ __all__ = [
     "TraceError",
     "Unit",
     "UnitError",
+    "UnknownArgumentError",
     "UnknownAttributeError",
     "UnknownNameError",
     "UnwiredInputError",
@@ -134,6 +136,7 @@ __all__ = [
     "describe_mismatch",
     "elements",
     "enumerate_some",
+    "explain_calls",
     "identity",
     "is_before",
     "kinds",

@@ -11,6 +11,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from .errors import OptionError
+from .explained_calls import BY_PLACE, EXPLAINED, UnknownArgumentError, misuse, name_of, own_names
 from .values import shorten
 
 P = ParamSpec("P")
@@ -18,7 +19,6 @@ R = TypeVar("R")
 Kind = Callable[[Any], str]
 """Returns in words which values are expected; "" for a value of the kind."""
 _LONGEST = 80
-_BY_PLACE = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 
 
 def accepts(called: str = "", /, **kinds: Kind) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -40,16 +40,20 @@ def accepts(called: str = "", /, **kinds: Kind) -> Callable[[Callable[P, R]], Ca
     def wrap(function: Callable[P, R]) -> Callable[P, R]:
         signature, who = inspect.signature(function), called or function.__name__
         parameters = {**signature.parameters}
-        names = [name for name, p in parameters.items() if p.kind in _BY_PLACE]
+        names = [name for name, p in parameters.items() if p.kind in BY_PLACE]
+        needed = {name for name, p in parameters.items() if p.default is p.empty}
         is_plain = not any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters.values())
 
         @wraps(function)
         def checked(*args: P.args, **kwargs: P.kwargs) -> R:
-            given: Mapping[str, Any]
+            given: Mapping[str, Any] = {}
             if is_plain and len(args) <= len(names) and kwargs.keys() <= parameters.keys():
                 given = {**dict(zip(names, args, strict=False)), **kwargs}  # without the many calls of `bind`
-            else:
-                given = signature.bind(*args, **kwargs).arguments
+            if len(given) != len(args) + len(kwargs) or not needed <= given.keys():
+                try:
+                    given = signature.bind(*args, **kwargs).arguments
+                except TypeError as error:
+                    raise (misuse(function, args, kwargs, called) or error) from None
             for name, value in given.items():
                 kind, parameter = kinds.get(name), parameters[name]
                 if kind is None or value is parameter.default:
@@ -62,8 +66,14 @@ def accepts(called: str = "", /, **kinds: Kind) -> Callable[[Callable[P, R]], Ca
                         check_argument(each, kind, name, who)
                 else:
                     check_argument(value, kind, name, who)
-            return function(*args, **kwargs)
+            try:
+                return function(*args, **kwargs)
+            except UnknownArgumentError as error:
+                if error.argument in kwargs:
+                    error.offer(called or name_of(function, args), own_names(function))
+                raise
 
+        setattr(checked, EXPLAINED, True)
         return checked
 
     return wrap

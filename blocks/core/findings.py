@@ -5,7 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
+from .explained_calls import explain_calls
 
+
+@explain_calls
 @dataclass(frozen=True)
 class Finding:
     """A fact that limits a result; subclasses are its kinds, with the facts as fields and the text as ``str(…)``.

@@ -10,6 +10,7 @@ from itertools import accumulate, pairwise
 import numpy as np
 
 from .brief import brief, enumerate_some
+from .explained_calls import explain_calls
 from .ports import Shape
 
 
@@ -38,6 +39,7 @@ def lay_out(sizes: Iterable[int], offset: int = 0) -> list[slice]:
     return [slice(start, end) for start, end in pairwise(ends)]
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Layout:
     """Layout of a flat vector: slice and shape of each array by name, in C order, one after the other.

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias
 
+from .explained_calls import explain_calls
 from .units import parse_unit
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ class ParameterSpec:
         return self.default is MISSING
 
 
+@explain_calls
 def parameter(
     *,
     default: Any = MISSING,

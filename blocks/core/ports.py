@@ -9,6 +9,7 @@ from typing import Any, overload
 import numpy as np
 
 from .errors import DefinitionError, near
+from .explained_calls import explain_calls
 from .signals import Signal, Wireable
 from .units import parse_unit
 
@@ -123,6 +124,7 @@ def check_port_names(cls: type) -> None:
         raise DefinitionError(f"a port can't be called {name!r}: {why}. Take {step}.", block=cls.__name__, port=name)
 
 
+@explain_calls
 class Input(Port):
     """An input. With ``default`` it may stay unwired. It takes ``nominal``, ``minimum`` and ``maximum`` of `Port`.
 
@@ -167,6 +169,7 @@ def number_inputs(count: int) -> dict[str, Input]:
     return dict(_numbered(count))
 
 
+@explain_calls
 class Output(Port):
     """An output; read on a block it is a `Signal`.
 
@@ -205,6 +208,7 @@ class Output(Port):
         return Signal(instance, self.name)
 
 
+@explain_calls
 class State(Port):
     """A state: continuous with a `derivative`, sampled with an `update`.
 
@@ -266,6 +270,7 @@ class State(Port):
         raise AttributeError(f"{self.name!r} is a state of {instance!r}: it lives in the run, not on the block.")
 
 
+@explain_calls
 class Event(Port):
     """An event of a continuous block: one of its ``indicators`` crosses zero in a direction.
 

@@ -6,7 +6,6 @@ one. Both can be wired on, indexed, unpacked, named, and used in ``+``, ``-`` an
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from contextvars import ContextVar
@@ -23,6 +22,8 @@ from .errors import (
     WiringError,
     near,
 )
+from .explained_calls import explain_calls
+from .index import as_index
 from .numpy_guard import NoNumber
 
 B = TypeVar("B")
@@ -154,6 +155,7 @@ class Wired(Wireable):
     __le__ = __gt__ = __ge__ = __lt__
 
 
+@explain_calls
 class Signal(Wired):
     """One output port of a block, or a part of it.
 
@@ -184,7 +186,7 @@ class Signal(Wired):
     def __getitem__(self, index: int | slice) -> Signal:
         if self.index is not None:
             raise WiringError("it is a part of a signal already; index the whole port, once.", port=self.port)
-        return Signal(self.source, self.port, _index(index, self.port), None, self.call)
+        return Signal(self.source, self.port, as_index(index, self.port), None, self.call)
 
     def __iter__(self) -> Iterator[Signal]:
         who = getattr(self.source, "label", None)
@@ -202,24 +204,6 @@ class Signal(Wired):
         return f"<signal {getattr(self.source, 'label', self.source)}.{self.port}{part}>"
 
 
-def _index(index: Any, port: str) -> int | slice:
-    """Return an index of Python's integers, so that NumPy's integers wire and compare alike."""
-
-    def integer(value: Any) -> int:
-        if isinstance(value, bool | np.bool_):
-            raise TypeError
-        return operator.index(value)
-
-    try:
-        if not isinstance(index, slice):
-            return integer(index)
-        return slice(*(None if i is None else integer(i) for i in (index.start, index.stop, index.step)))
-    except TypeError:
-        raise WiringError(
-            f"found the index {index!r}; expected an integer or a slice of integers, as in y[0] or y[:2].", port=port
-        ) from None
-
-
 def _outputs(source: Wireable) -> list[str]:
     """Return the output names that a notebook completes; none where they can't be found: completion must not fail."""
     with suppress(LoopwrightError):
@@ -228,6 +212,7 @@ def _outputs(source: Wireable) -> list[str]:
     return []
 
 
+@explain_calls
 class Call(Wired):
     """A block with its inputs: one node of a diagram."""
 

@@ -13,11 +13,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from .errors import UnitError, near
+from .explained_calls import explain_calls
 
 #: The base units of an FMI ``<BaseUnit>`` element, in the order of `Unit.exponents`.
 BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Unit:
     """A unit: ``value in base units = factor * value + offset`` (FMI 3.0, 2.4.3).
@@ -146,6 +148,7 @@ def _factors(part: str, text: str) -> list[tuple[Unit, int]]:
     return found
 
 
+@explain_calls
 def parse_unit(text: str) -> Unit:
     """Read a unit string.
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core import Array, DefinitionError, ParameterError, PathDomainError, Value
+from ..core import Array, DefinitionError, ParameterError, PathDomainError, Value, explain_calls
 from ..library import piecewise, wrap
 from . import tables
 from .tables import UNLIMITED
@@ -19,6 +19,7 @@ from .tables import UNLIMITED
 __all__ = ["UNLIMITED", "Frame", "Path"]
 
 
+@explain_calls
 class Frame(NamedTuple):
     """Moving frame of a path at one parameter θ.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from ...blocks import AdmittanceFilter, ForceProjection, PathProjection
-from ...blocks.core import Array, Finding, OptionError, UnknownNameError, brief
+from ...blocks.core import Array, Finding, OptionError, UnknownNameError, brief, explain_calls
 from ...fmus.running import Derivation
 from ..linearization import check_options, operating_point
 from .compliance_loop import SIDES
@@ -43,6 +43,7 @@ SOON = 1e-9
 _FREQUENCY = "frequency in rad/s"
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class Contact:
     """A point of a diagram's plant that an environment touches, linear at an operating point; `Diagram.contact`.

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...blocks.core import Array, Finding, OptionError, brief, count_of
+from ...blocks.core import Array, Finding, OptionError, brief, count_of, explain_calls
 from .contact_loop import Joined, close_loop, join_environment
 from .contact_parts import ContactParts
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class ContactAdmittance:
     """Admittance at a contact over frequencies.

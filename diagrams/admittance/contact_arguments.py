@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, ParameterError, near
+from ...blocks.core import OptionError, ParameterError, UnknownArgumentError
 from .growth_limits import UNITS
 
 
@@ -113,7 +113,7 @@ def check_property(name: Any, port: str) -> str:
         If an environment has none of this name.
     """
     if not isinstance(name, str) or name not in UNITS:
-        raise OptionError(f"an environment has no {name!r}. {near(str(name), UNITS)}", port=port)
+        raise UnknownArgumentError(str(name), UNITS, block=None, found="an environment has no").at(port=port)
     return name
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, OptionError
+from ...blocks.core import ConfirmationError, OptionError, explain_calls
 from .contact_arguments import read_positive
 from .contact_limits import ContactLimit
 from .contact_trials import STEP, TrialMethod, Trials, TriedContact
@@ -44,6 +44,7 @@ LONGEST = 8.0
 """Longest time in s that is waited for other modes."""
 
 
+@explain_calls
 @dataclass(frozen=True)
 class ContactTrial:
     """A run beside a limit.
@@ -65,6 +66,7 @@ class ContactTrial:
     fastest: float
 
 
+@explain_calls
 @dataclass(frozen=True)
 class ContactConfirmation:
     """Runs below and above a limit, with the environment at the plant.

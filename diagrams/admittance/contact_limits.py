@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Finding, OptionError, on_one_thread
+from ...blocks.core import Finding, OptionError, explain_calls, on_one_thread
 from ..frequency import Number
 from .contact_arguments import check_property, read_density, read_number, read_positive
 from .contact_loop import ClosedLoop, Modes, close_loop, controller_rows, join_environment, split_modes
@@ -36,6 +36,7 @@ _ESTIMATED = 10.0
 """Factor by which a stated error of differences may be too small."""
 
 
+@explain_calls
 @dataclass(frozen=True)
 class ContactLimit:
     """First value of one property of the environment at which a diagram loses its stability.
@@ -100,6 +101,7 @@ class ContactLimit:
         return Number(self.value, self.unit, self.tolerance, self.confirmed_by, findings=self.findings)
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False, repr=False)
 class ContactMap(GrowthMap):
     """Growth rates over two properties of the environment; see `GrowthMap` for ``x``, ``y`` and ``growth``.

@@ -32,7 +32,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from ...blocks.core import on_one_thread
+from ...blocks.core import explain_calls, on_one_thread
 from .compliance_loop import StateMatrices
 from .contact_loop import close_loop, controller_rows, hold_inputs, join_environment
 from .contact_parts import ContactParts
@@ -67,6 +67,7 @@ class PassivityReason(StrEnum):
     ACTIVE_PLANT = "not decided for a plant that is not passive alone"
 
 
+@explain_calls
 @dataclass(frozen=True)
 class PortPassivity:
     """Passivity of a contact against all passive environments, linear and about an operating point.

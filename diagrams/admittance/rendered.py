@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import Array, Finding, OptionError, accepts, brief, kinds
+from ...blocks.core import Array, Finding, OptionError, accepts, brief, explain_calls, kinds
 from ..frequency import read_matrices
 from .compliance_loop import AdmittanceLoop, hold_force
 from .coupled import ROBOT, close_loop
@@ -49,6 +49,7 @@ _ROUNDED = 1e-10
 """Real part relative to |Y| below which it is rounding."""
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class Passivity:
     """Sign of the real part of a rendered admittance.

@@ -8,13 +8,24 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...blocks.core import Array, Finding, OptionError, accepts, kinds, near, on_one_thread
+from ...blocks.core import (
+    Array,
+    Finding,
+    OptionError,
+    UnknownArgumentError,
+    accepts,
+    explain_calls,
+    kinds,
+    near,
+    on_one_thread,
+)
 from ..frequency import Number
 from .compliance_loop import AdmittanceLoop
 from .coupled import ROBOT, crossing_frequency, growth_rate, growth_rate_by_control
 from .growth_limits import PER_DECADE, UNITS, GrowthMap, describe_limit, find_first_limit, scan_points
 
 
+@explain_calls
 @dataclass(frozen=True)
 class StabilityLimit:
     """First value of one property of the environment at which the coupled loop loses its stability.
@@ -70,6 +81,7 @@ class StabilityLimit:
         return Number(self.value, self.unit, self.tolerance, self.confirmed_by, findings=self.findings)
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False, repr=False)
 class StabilityMap(GrowthMap):
     """Growth rates over two properties of the environment; see `GrowthMap` for ``x``, ``y`` and ``growth``.
@@ -247,4 +259,4 @@ def _check(name: str, environment: dict[str, float]) -> None:
         )
     for other in environment:
         if other not in UNITS:
-            raise OptionError(f"an environment has no {other!r}. {near(other, UNITS)}", port=other)
+            raise UnknownArgumentError(other, UNITS, block=None, found="an environment has no")

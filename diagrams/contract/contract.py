@@ -17,6 +17,7 @@ from ...blocks.core import (
     ShapeError,
     accepts,
     brief,
+    explain_calls,
     kinds,
     near,
 )
@@ -28,6 +29,7 @@ from .traces import check_derivatives, check_feedthrough, check_guards, check_sh
 from .values import check_ports, check_purity, check_values
 
 
+@explain_calls
 @dataclass(frozen=True)
 class BlockReport:
     """Findings of `check_block` about a block that keeps its contract.

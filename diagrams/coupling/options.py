@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from ...blocks.core import OptionError, near
+from ...blocks.core import OptionError, explain_calls, near
 
 
 class Scheme(StrEnum):
@@ -22,6 +22,7 @@ class Scheme(StrEnum):
     """The step is repeated until outputs and inputs agree at its end; inputs are the mean of beginning and end."""
 
 
+@explain_calls
 @dataclass(frozen=True, kw_only=True)
 class Coupling:
     """Exchange of values between FMUs in a run: ``simulate(…, coupling=Coupling(scheme="iterated"))``.

@@ -8,7 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from ...blocks.core import brief
+from ...blocks.core import brief, explain_calls
 from ..flat import FlatDiagram
 from ..wiring import join
 from .links import Links
@@ -72,6 +72,7 @@ class CoupledConnection:
     delay: float
 
 
+@explain_calls
 @dataclass(frozen=True)
 class CouplingReport:
     """Coupling of the FMUs of a diagram: ``print(diagram.report_coupling(…))``.

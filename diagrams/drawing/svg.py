@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from html import escape
 from pathlib import Path
 
-from ...blocks.core import OptionError, Sum, accepts, check_file, kinds, near, write_text
+from ...blocks.core import OptionError, Sum, accepts, check_file, explain_calls, kinds, near, write_text
 from ..wiring import CheckedDiagram, Structure, stepped_blocks
 from .layout import Net, arrange
 from .nets import Border, Nets, Place
@@ -22,6 +22,7 @@ TINTS = ("#eaf2fb", "#e6f5ec", "#f3ecfa", "#fdebec", "#e8f4f6", "#f6f2e2")
 """Colours of sampled subsystems, one for each sample time."""
 
 
+@explain_calls
 class Drawing:
     """A diagram's drawing; a notebook shows it.
 

@@ -16,7 +16,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from ...blocks.core import Block, brief, count_of
+from ...blocks.core import Block, brief, count_of, explain_calls
 from ..wiring import Checked, Structure
 from . import functions
 from .block_functions import BlockFunctions
@@ -47,6 +47,7 @@ class _shared(cached_property[T]):  # noqa: N801 (a decorator)
         return super().__get__(instance.origin if isinstance(instance, FlatDiagram) else instance, owner)
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FlatDiagram(FlatLayout):
     """A diagram flattened into functions of an instant.

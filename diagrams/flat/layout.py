@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...blocks.core import Layout, Shape
+from ...blocks.core import Layout, Shape, explain_calls
 from ..wiring import Order, Structure, join, stepped_blocks
 from .clocks import EVERY, TickPattern, in_order
 from .plant_ticks import find_plant_ticks, takes_any_step
@@ -70,6 +70,7 @@ class FlatEvent:
     subsystem: bool
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FlatLayout:
     """Where everything of a flattened diagram stands, and when it acts.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, brief, kinds
+from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, brief, explain_calls, kinds
 from .carried import carries_findings
 from .confirm import confirm_limit, confirm_peak, refuse_singular
 from .features import Features, scan
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .state_space import LinearSystem
 
 
+@explain_calls
 @dataclass(frozen=True)
 class DiskMargin:
     """Size α of the disk of factors that leave a loop stable.

@@ -9,7 +9,7 @@ import numpy as np
 from control import StateSpace, feedback
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError, accepts, brief, count_of, kinds
+from ...blocks.core import OptionError, accepts, brief, count_of, explain_calls, kinds
 from . import loop_plots
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ class Model(Protocol):
         """Return T = 1 − S at wires."""
 
 
+@explain_calls
 class LoopTransfer(StateSpace):  # type: ignore[misc]
     """The loop transfer function L at a wire, a `control.StateSpace`; `Linearization.loop` returns it.
 

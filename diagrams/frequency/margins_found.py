@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Finding, brief
+from ...blocks.core import Finding, brief, explain_calls
 from .number import MARK, Number
 
 NEAR = 1e-12
 """Distance from the limit of stability, relative to the largest pole, within which an unstable loop's pole is named."""
 
 
+@explain_calls
 @dataclass(frozen=True)
 class GainCrossover:
     """A frequency at which |L| = 1, and the rotation that takes L to −1 there (−180° to 180°)."""
@@ -22,6 +23,7 @@ class GainCrossover:
     phase_margin_deg: Number
 
 
+@explain_calls
 @dataclass(frozen=True)
 class PhaseCrossover:
     """A frequency at which L is real and negative, and the factor that takes it to −1 there."""
@@ -30,6 +32,7 @@ class PhaseCrossover:
     gain_margin: Number
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Margins:
     """Margins of a loop L with S = 1/(1 + L) and T = L/(1 + L).

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError, accepts, brief, kinds
+from ...blocks.core import OptionError, accepts, brief, explain_calls, kinds
 
 if TYPE_CHECKING:
     from control import FrequencyResponseData
@@ -56,6 +56,7 @@ class Interval:
 NOTHING = (math.nan, math.nan, math.nan)
 
 
+@explain_calls
 @dataclass(frozen=True)
 class MeasuredMargins:
     """Margins of a measured loop; the quantities are those of `Margins`.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from ...blocks.core import Finding
+from ...blocks.core import Finding, explain_calls
 
 MARK = "†"
 """Mark of a number with findings."""
@@ -54,6 +54,7 @@ def method_of(text: str) -> str:
     return text.method if isinstance(text, Confirmation) else str(text)
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Number:
     """A number with unit, tolerance, and the computation that confirmed it.

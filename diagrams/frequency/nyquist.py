@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, kinds
+from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, explain_calls, kinds
 from .carried import carries_findings
 from .features import Features, scan
 from .realization import Realization
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .state_space import LinearSystem
 
 
+@explain_calls
 @dataclass(frozen=True)
 class NyquistCount:
     """Numbers of the Nyquist criterion Z = N + P.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, ParameterError, brief, on_one_thread
+from ...blocks.core import ConfirmationError, Finding, ParameterError, brief, explain_calls, on_one_thread
 from .carried import carries_findings
 from .confirm import confirm_limit, confirm_no_limit, refuse_singular
 from .disk import disk_gains, sensitivity_at
@@ -38,6 +38,7 @@ ON_RIM = 180
 """Factors on the upper half of the disk's rim at which they are looked at."""
 
 
+@explain_calls
 @dataclass(frozen=True)
 class PeriodicMargins:
     """Margins of a periodic loop, of one static factor on the wire; those of an unstable closed loop are NaN.
@@ -110,6 +111,7 @@ class PeriodicMargins:
         return "\n".join([*lines, *(f"{MARK} {finding}" for finding in self.findings)])
 
 
+@explain_calls
 @carries_findings
 @on_one_thread
 def periodic_margins(loop: LinearSystem) -> PeriodicMargins:

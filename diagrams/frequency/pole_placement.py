@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import ConfirmationError, ParameterError, accepts, kinds
+from ...blocks.core import ConfirmationError, ParameterError, accepts, explain_calls, kinds
 from .polynomials import divide, eulerian_polynomial, real_polynomial, relative_difference, remainder
 
 Integral = Literal["forward", "backward", "trapezoidal"]
@@ -249,6 +249,7 @@ def _confirm_polynomial(found: np.ndarray, wanted: np.ndarray, caller: str, size
         )
 
 
+@explain_calls
 @dataclass(frozen=True)
 class SampledDesign:
     """Gains and true poles of a sampled PID loop around a chain of integrators.
@@ -381,8 +382,7 @@ def _affine_polynomial(gains: int, T: float, delay: int, integral: Integral) -> 
     A chain of k integrators behind a hold has the transfer function T^k E_k(z)/(k! (z − 1)^k), with the Eulerian
     polynomial E_k.
     """
-    chain = gains - 1
-    if chain < 1 or not (np.isfinite(T) and T > 0) or delay < 0 or int(delay) != delay:
+    if (chain := gains - 1) < 1 or not (np.isfinite(T) and T > 0) or delay < 0 or int(delay) != delay:
         raise ParameterError(
             f"found {gains} gains, a sample time of {T} s and a delay of {delay} samples; expected two gains or more, "
             "a positive sample time, and a whole number of samples that is not negative. Correct it.",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, ParameterError, accepts, kinds, on_one_thread
+from ...blocks.core import ConfirmationError, ParameterError, accepts, explain_calls, kinds, on_one_thread
 from .confirm import confirm_limit, pick_test_values
 from .crossings import Scan
 from .loop_margins import margins
@@ -26,6 +26,7 @@ SAME = 1e-4
 T = TypeVar("T")
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Comparison:
     """One number of a loop, by Loopwright and by python-control.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, ParameterError, accepts, brief, kinds
+from ...blocks.core import ConfirmationError, ParameterError, accepts, brief, explain_calls, kinds
 from .carried import carries_findings
 from .number import Number
 from .state_space import Matrices, make_state_space, read_matrices
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .state_space import LinearSystem
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class GangOfFour:
     """The four transfer functions of a closed loop of plant P and controller C, u = −C y.
@@ -44,12 +45,14 @@ class GangOfFour:
         return brief("gang of four", *facts, then=".S, .PS, .CS, .T")
 
 
+@explain_calls
 @carries_findings
 def sensitivity(loop: LinearSystem) -> StateSpace:
     """Return S = (I + L)⁻¹ of a square loop, with L's states."""
     return _close_loop(loop, complementary=False)
 
 
+@explain_calls
 @carries_findings
 def complementary(loop: LinearSystem) -> StateSpace:
     """Return T = (I + L)⁻¹ L of a square loop, with L's states."""

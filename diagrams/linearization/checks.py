@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
-from ...blocks.core import OptionError, WiringError
+from ...blocks.core import OptionError, WiringError, check_argument, kinds
 from ..coupling import Links, Scheme, tells_slopes
 from ..flat import NONE, FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from .coupled_chain import CoupledChain
 from .derivatives import LocalDerivatives, Tap
 from .mean_stairs import NO_STAIRS, Stairs
+
+
+def as_list(given: str | Iterable[str]) -> list[str]:
+    """Return a name, or several, as a list."""
+    check_argument(given, kinds.names, "inputs, outputs and openings", "linearize")
+    return [given] if isinstance(given, str) else list(given)
 
 
 def replace_stairs(diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, stairs: str | None) -> Stairs:

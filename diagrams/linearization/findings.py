@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ...blocks.core import Finding
+from ...blocks.core import Finding, explain_calls
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,7 @@ class BlockFinding(Finding):
     source: str
 
 
+@explain_calls
 @dataclass(frozen=True)
 class StepsOnly(BlockFinding):
     """An output or a state that depends on an input only in steps, such as a quantizer's: its slope is zero."""
@@ -39,6 +40,7 @@ class StepsOnly(BlockFinding):
         return f"{self.block}.{self.port} follows {self.source!r} in steps only: it linearizes to zero"
 
 
+@explain_calls
 @dataclass(frozen=True)
 class MeanSlope(BlockFinding):
     """An output or a state that depends on an input in stairs, which the model replaces by their mean slope.
@@ -55,6 +57,7 @@ class MeanSlope(BlockFinding):
         return f"{self.block}.{self.port} follows {self.source!r} in stairs: taken as their mean slope {self.slope:.6g}"
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Kink(BlockFinding):
     """A point at which the slopes to both sides differ, or the value jumps; the model has one of the slopes.
@@ -78,6 +81,7 @@ class Kink(BlockFinding):
         return f"{where}: slope {self.below:.6g} below the point and {self.above:.6g} above; the model has one of them"
 
 
+@explain_calls
 @dataclass(frozen=True)
 class ZeroSlope(BlockFinding):
     """A slope that is zero at the point, although the value changes over the nominal range of the source.
@@ -209,6 +213,7 @@ class UnusualStart(Finding):
         return "the start is unlike every later tick, as a block has a first tick of its own; linearize at a later time"
 
 
+@explain_calls
 @dataclass(frozen=True)
 class InexactDerivatives(Finding):
     """Directional derivatives of an FMU that differ from differences of its own values.
@@ -236,6 +241,7 @@ class InexactDerivatives(Finding):
         )
 
 
+@explain_calls
 @dataclass(frozen=True)
 class RefutedDerivatives(Finding):
     """Directional derivatives of an FMU that are plainly wrong: differences of its own values stand in for them.

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ...blocks.core import Finding, LoopwrightError, OptionError, accepts, brief, check_argument, count_of, kinds
+from ...blocks.core import Finding, LoopwrightError, OptionError, accepts, brief, count_of, explain_calls, kinds
 from ...fmus.running import Derivation, DerivativeMethod
 from ..flat import NONE, TickPattern, WiredDiagram
 from ..frequency import loop_class
 from ..results import OperatingPoint
 from ..wiring import exact_time
-from .checks import check_loop, check_opening, refuse_transport_delays, replace_stairs
+from .checks import as_list, check_loop, check_opening, refuse_transport_delays, replace_stairs
 from .derivatives import LocalDerivatives, find_signal
 from .exchanged import derivations_at, evaluators_at, findings_on
 from .findings import EntryTaken
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from ..frequency import LoopTransfer
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class Linearization:
     """A linear model of a diagram at an operating point.
@@ -223,7 +224,7 @@ class Linearization:
         if slow not in ("closed", "open"):
             raise OptionError(f"found slow={slow!r}; expected 'closed' or 'open'. Choose one of them.", port="slow")
         if to:
-            diagram, point, port = split_consumers(self.diagram, self.point, wires, _as_list(to))
+            diagram, point, port = split_consumers(self.diagram, self.point, wires, as_list(to))
             return replace(self, diagram=diagram, point=point).loop(port, lifted=lifted, slow=slow)
         cut = self._make_at(wires, openings=wires, loop="lifted" if lifted else "one", slow=slow)
         made: LoopTransfer = cut._state_space(-cut.C, -cut.D, f"L({', '.join(wires)})", loop_class())
@@ -289,7 +290,7 @@ def linearize(
     check_options(diagram, options, "linearize")
     at = operating_point(diagram, point, options)
     diagram = diagram.replace(at.parameters) if at.parameters else diagram  # parameters that a trim has found
-    given = [_as_list(names) for names in (inputs, outputs, openings)]
+    given = [as_list(names) for names in (inputs, outputs, openings)]
     diagram, at, ports = split_inputs(diagram, at, itertools.chain(*given))
     places = [[ports.get(name, name) for name in names] for names in given]
     made = _linearize(diagram, at, *places, plants=plants, stairs=stairs, step=options.get("step"))
@@ -319,7 +320,7 @@ def _linearize(
         )
     if step is not None and not at.asked:
         at = replace(at, asked=True)
-    names = [_as_list(n) for n in (inputs, outputs, openings)]
+    names = [as_list(n) for n in (inputs, outputs, openings)]
     flat = diagram.flatten_like(at)
     at.check_fits(flat, diagram.name)
     refuse_transport_delays(flat)
@@ -372,11 +373,6 @@ def _linearize(
         step=step,
         stairs=stairs,
     )
-
-
-def _as_list(given: str | Iterable[str]) -> list[str]:
-    check_argument(given, kinds.names, "inputs, outputs and openings", "linearize")
-    return [given] if isinstance(given, str) else list(given)
 
 
 @accepts(points=kinds.several, variants=kinds.several)

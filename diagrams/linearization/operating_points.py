@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from ...blocks.core import Layout, OptionError, UnknownNameError, accepts, kinds, near
+from ...blocks.core import Layout, OptionError, UnknownArgumentError, accepts, kinds
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, PointOrigin, Snapshot, layout_of
 
@@ -101,9 +101,7 @@ def check_options(diagram: WiredDiagram, options: Mapping[str, Any], caller: str
     """
     for name in options:
         if name not in OPTIONS:
-            raise UnknownNameError(
-                f"{caller} takes no {name!r}. {near(name, (*OPTIONS, *MORE.get(caller, ())))}", block=diagram.name
-            )
+            raise UnknownArgumentError(name, (*OPTIONS, *MORE.get(caller, ())), block=caller)
 
 
 def operating_point(diagram: WiredDiagram, point: PointLike, options: Mapping[str, Any]) -> OperatingPoint:

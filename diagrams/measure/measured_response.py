@@ -38,7 +38,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError, brief
+from ...blocks.core import OptionError, brief, explain_calls
 from ..flat import FlatDiagram, WiredDiagram
 from ..linearization import PointLike, find_signal, operating_point, ticks_to_renewal
 from ..results import OperatingPoint, PointOrigin, Snapshot
@@ -57,6 +57,7 @@ GROWN = 1e9
 """Growth of a signal, relative to the test signal and to the states before it, that no stable loop makes."""
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class FrequencyResponse:
     """A measured frequency response at a wire; this module describes the measurement.

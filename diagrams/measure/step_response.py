@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, OptionError, SimulationError, brief
+from ...blocks.core import LoopwrightError, OptionError, SimulationError, brief, explain_calls
 from ..flat import FlatDiagram, WiredDiagram
 from ..linearization import (
     Linearization,
@@ -43,6 +43,7 @@ LONG = 2000
 """Ticks of a run from which on C is worth its start where a solver goes from one to the next; no chunk is so long."""
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class StepResponse:
     """Response to a step.

@@ -27,7 +27,7 @@ from ...blocks import (
     SmoothStep,
     Step,
 )
-from ...blocks.core import brief
+from ...blocks.core import brief, explain_calls
 from ...fmus import Fmu
 from ...fmus.models import gantry
 from ..diagram import Diagram
@@ -52,6 +52,7 @@ __all__ = [
 ]
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Experiment:
     """An experiment, ready to run; it can be pickled.

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from ...blocks import Path, PlanarModel
+from ...blocks.core import explain_calls
 from ...fmus import Fmu
 from ...fmus.models import gantry
 from ..diagram import Diagram
@@ -32,6 +33,7 @@ class Fig3Diagram(Diagram):
         return FIG3 if has_parts(self) else ANY_DIAGRAM
 
 
+@explain_calls
 def fig3(
     plant: Fmu,
     path: Path,

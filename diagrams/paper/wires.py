@@ -24,7 +24,7 @@ from ...blocks import (
     TransverseTransform,
     UnitDelay,
 )
-from ...blocks.core import ShapeError, UnknownNameError
+from ...blocks.core import ShapeError, UnknownNameError, explain_calls
 from ...fmus import Fmu
 from ...fmus.models import gantry
 from ..wiring import subsystem
@@ -43,6 +43,7 @@ OPTIONAL: Mapping[str, str] = MappingProxyType({"contact_force": "N"})
 """Outputs that a plant may have."""
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Rig:
     """Effects of a real rig that the ideal loop lacks; all are off by default.
@@ -75,6 +76,7 @@ IDEAL = Rig()
 """The ideal loop."""
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Channel:
     """Reference and admittance of one direction of the controller.

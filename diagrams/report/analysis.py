@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-from ...blocks.core import OptionError, on_one_thread
+from ...blocks.core import OptionError, explain_calls, on_one_thread
 from ...fmus.running import Fmu
 from ..flat import WiredDiagram
 from ..linearization import find_signal
@@ -67,6 +67,7 @@ def check_workers(given: int | None, written: bool) -> int:
     return given
 
 
+@explain_calls
 @on_one_thread
 def analyse(
     diagram: WiredDiagram | ReportedExperiment,

@@ -6,11 +6,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ...blocks.core import brief
+from ...blocks.core import brief, explain_calls
 from ..frequency import Number
 from ..requirements import Review, Verdict
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Table:
     """A table: a title, column headings, and rows of texts or numbers.
@@ -45,6 +46,7 @@ class Judged(str):
         return made
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class Plot:
     """A figure: a key for its file, a caption, the matplotlib figure or SVG text; ``ahead`` of the tables or not.
@@ -62,6 +64,7 @@ class Plot:
         return brief(f"figure {self.key!r}", self.caption[:80], then=".figure")
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class Section:
     """A section: what it is about in words, then tables and figures; ``key`` starts the paths of its numbers."""
@@ -85,6 +88,7 @@ class Section:
         return brief(f"section {self.title!r}", *facts, then=".text, .tables, .plots, .sections")
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class Document:
     """Sections with their numbers, and what they are about.

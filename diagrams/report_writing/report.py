@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from html import escape
 
+from ...blocks.core import explain_calls
 from .html import to_html
 from .model import Document
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False, repr=False)
 class Report(Document):
     """A design report of a diagram.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
 
-from ...blocks.core import LoopwrightError, OptionError, UnknownNameError, brief, near
+from ...blocks.core import LoopwrightError, OptionError, UnknownNameError, brief, explain_calls, near
 from .contact_limits import ContactLimits, read_contacts
 from .limits import SENSES, STEP_SENSES, Limit, make_limit
 
@@ -136,6 +136,7 @@ class LoopLimits:
         return not self.limits and self.step is None and all(v.is_empty for v in self.variants.values())
 
 
+@explain_calls
 class Requirements(LoopLimits):
     """Requirements on a design: limits of its loops' margins, its step responses, and any other number of its report.
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from ...blocks.core import brief
+from ...blocks.core import brief, explain_calls
 from ..frequency import Number
 from .limits import Limit, Reason, Verdict
 
@@ -73,6 +73,7 @@ class RequirementResult:
         }
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Review:
     """All requirements of a design with their verdicts.

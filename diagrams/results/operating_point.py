@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ...blocks.core import Finding, OptionError, brief, count_of, enumerate_some, shorten
+from ...blocks.core import Finding, OptionError, brief, count_of, enumerate_some, explain_calls, shorten
 from ..flat import FlatDiagram
 from .saved_state import StateLayout, layout_of
 
@@ -46,6 +46,7 @@ class FreeDirection(Finding):
         )
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class OperatingPoint:
     """An instant of a diagram: everything that its linear model depends on.

@@ -10,7 +10,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import Layout, OptionError, PortUnit, UnknownNameError, kinds
+from ...blocks.core import Layout, OptionError, PortUnit, UnknownNameError, explain_calls, kinds
 from ..wiring import CheckedDiagram, Wire, split_entry
 from .short_text import describe_run
 from .signal_names import Place, Places, entries, place_of, resolve
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from .saved_state import RunState
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class Run:
     """A run: the outputs of the blocks, and the states, at the instants that were recorded.
@@ -231,8 +232,7 @@ class Run:
         if isinstance(name, str) and name in self._places:
             return self._places[name]
         full = resolve(name, self.wires, self.layout.slices)
-        where = self._find_columns(full)
-        if where is None:
+        if (where := self._find_columns(full)) is None:
             raise UnknownNameError(
                 f"the signal {full!r} was not recorded in this run, as the selection left it out. Run again with "
                 f"record=[…, {full!r}], or without record for all signals."

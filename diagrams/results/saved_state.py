@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, brief, shorten
+from ...blocks.core import OptionError, brief, explain_calls, shorten
 from ..flat import FlatDiagram
 from .stored import Stopped, own_version
 
@@ -20,6 +20,7 @@ StateLayout = tuple[tuple[tuple[str, object], ...], ...]
 """Names and shapes of a state's entries, kind by kind."""
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class RunState:
     """The complete state of a run at a tick: of all blocks and FMUs, of outputs that are held, and of the solver.

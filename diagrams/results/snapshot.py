@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ...blocks.core import brief, count_of
+from ...blocks.core import brief, count_of, explain_calls
 from ..wiring import Wire, index_of, split_entry
 from .signal_names import resolve
 
@@ -25,6 +25,7 @@ class RecordedRun(Protocol):
         """Options of the run."""
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Snapshot:
     """All signals and states at one recorded instant."""

@@ -28,7 +28,7 @@ from typing import Any, TextIO, TypedDict, overload
 
 import numpy as np
 
-from ...blocks.core import Layout, OptionError, PortUnit, check_argument, kinds
+from ...blocks.core import Layout, OptionError, PortUnit, check_argument, explain_calls, kinds
 from ..wiring import Wire
 
 FORMAT, VERSION = "loopwright run", 1
@@ -38,6 +38,7 @@ _BLOCK = 2**24  # bytes written at once
 PathLike = str | os.PathLike[str]
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Occurrence:
     """An event that fired: its time in s, the block's path, the event's name, and the states around the jump."""
@@ -49,6 +50,7 @@ class Occurrence:
     after: Mapping[str, Any] = field(default_factory=dict)
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Stopped:
     """The end of a run before its duration was over, by a stop condition, or by an FMU that has asked for it.
@@ -374,12 +376,10 @@ def _read_rows(path: Path, width: int) -> np.ndarray:
 
 
 def _to_json(value: object) -> object:
-    if isinstance(value, Mapping):
-        return dict(value)
+    if isinstance(value, Mapping | Stopped):
+        return dict(value) if isinstance(value, Mapping) else asdict(value)
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
-    if isinstance(value, Stopped):
-        return asdict(value)
     raise TypeError(f"{type(value).__name__} can't be stored")
 
 

@@ -8,11 +8,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, explain_calls
 
 Text = str | bytes | tuple[str, ...] | tuple[bytes, ...]
 
 
+@explain_calls
 @dataclass(frozen=True)
 class TextSignal:
     """A text or binary data over time: each value holds from its time until the next one.

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from typing import Any, Self, TypedDict
 
-from ...blocks.core import OptionError, check_argument, kinds, near
+from ...blocks.core import OptionError, UnknownArgumentError, check_argument, explain_calls, kinds
 from ..coupling import Coupling
 from ..flat import FlatDiagram, WiredDiagram, takes_any_step
 from ..results import OperatingPoint, RunState
@@ -86,6 +86,7 @@ _KINDS = {
 """Kinds of options that nothing else checks before it reads them."""
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class RunOptions:
     """Options of a run, as `Diagram.simulate`, `Diagram.simulation` and `Experiment.simulate` take them.
@@ -181,7 +182,7 @@ class RunOptions:
         known = [f.name for f in fields(cls)]
         for name in options:
             if name not in known:
-                raise OptionError(f"it is no option of a run. {near(name, known)}", block=block, port=name)
+                raise UnknownArgumentError(name, known, block=block)
         if "start" in options and options["start"] is None:
             raise OptionError(
                 "found None; expected a state or an operating point. A run has no final_state if it was interrupted or "

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Block, OptionError, SimulationError
+from ...blocks.core import Block, OptionError, SimulationError, explain_calls
 from ..coupling import note_fine_steps, note_loops
 from ..flat import EVERY, FlatDiagram, WiredDiagram
 from ..results import (
@@ -33,9 +33,10 @@ from .progress import Interrupted, compiler_notes, progress_bar
 from .run_options import RunOptions, default_step, refuse_rest, ticks_in
 from .save import can_save, restore_state, save_state
 from .start_at_point import apply_point
-from .view import SimulationView
+from .view import SimulationView, describe_simulation
 
 
+@explain_calls
 class Simulation:
     """A run in the making: made by `Diagram.simulation`, used in a ``with`` statement.
 
@@ -57,13 +58,7 @@ class Simulation:
     array([0.5 , 0.75, 1.  ])
     """
 
-    def __init__(
-        self,
-        diagram: WiredDiagram,
-        options: RunOptions | None = None,
-        *,
-        duration: float | None = None,
-    ):
+    def __init__(self, diagram: WiredDiagram, options: RunOptions | None = None, *, duration: float | None = None):
         options = options or RunOptions()
         start, step = options.start, options.step
         self._point = start if isinstance(start, OperatingPoint) else None
@@ -100,7 +95,8 @@ class Simulation:
         self._open: bool | None = None  # until it begins; False once it has ended
         self._recorder = self._new_recorder()
 
-    # --- its parts ---------------------------------------------------------------------------------------------------
+    def __repr__(self) -> str:
+        return describe_simulation(self.diagram.name, self.view, is_open=self._open)
 
     def _new_recorder(self) -> Recorder:
         every_tick = self._engine.every_tick

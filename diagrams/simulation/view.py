@@ -8,7 +8,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from ...blocks.core import brief
+from ...blocks.core import brief, explain_calls
 from ..coupling import Plant
 from ..exchange import ExchangedBlock
 from ..results import Occurrence, Stopped
@@ -52,6 +52,7 @@ class Position:
         self.fired.clear()
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class SimulationView:
     """The instant that a simulation has reached, to be read: ``simulation.view``.
@@ -121,9 +122,24 @@ class SimulationView:
         return self._position.tick
 
     @property
+    def stopped(self) -> Stopped | None:
+        """The stop condition or FMU that has ended the run."""
+        return self._position.stopped
+
+    @property
     def events(self) -> tuple[Occurrence, ...]:
         """The events that have fired at this instant."""
         return tuple(event for event in self._position.fired if event.t == self.t)
+
+
+def describe_simulation(name: str, view: SimulationView, *, is_open: bool | None) -> str:
+    """Return the state of a simulation, its time, and next steps."""
+    kind = f"simulation of {name!r}"
+    if is_open is None:
+        return brief(kind, "not begun", then="with … as simulation: simulation.advance(duration)")
+    stopped = "" if view.stopped is None else f"stopped by {view.stopped.block}"
+    then = ".advance(duration), .view, .save(), .run()" if is_open else ".run()"
+    return brief(kind, f"at t = {view.t:.9g} s" + ("" if is_open else ", ended"), stopped, then=then)
 
 
 def _read_only(vector: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, LoopwrightError, OptionError, SimulationError
+from ...blocks.core import ConfirmationError, LoopwrightError, OptionError, SimulationError, explain_calls
 from ..admittance import hold_sources
 from ..flat import WiredDiagram
 from ..frequency import Confirmation, Margins, Number, Realization, disk_margin, margins, mimo_disk_margin, mu_bound
@@ -53,6 +53,7 @@ class ConfirmationKind(StrEnum):
     """The environment is at the plant, at 0.97 and 1.03 of the limit, and the motion decays and grows as predicted."""
 
 
+@explain_calls
 @dataclass(frozen=True)
 class RunConfirmation:
     """Confirmation of a worst case by a run of the diagram.
@@ -251,6 +252,7 @@ def _read_growth(v: np.ndarray, t: np.ndarray) -> float:
     return float(math.log(last / first) / (t[len(v) - half] - t[0])) if first > 0 and last > 0 else -math.inf
 
 
+@explain_calls
 def confirm_sensitivity(found: Sensitivities, row: Sensitivity, *, delay: int = 0, skew: float = 0.0) -> Sensitivity:
     """Return a sensitivity that a second computation has confirmed: differences of the margin itself.
 

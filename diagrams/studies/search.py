@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, OptionError
+from ...blocks.core import LoopwrightError, OptionError, UnknownArgumentError
 from ..flat import WiredDiagram
 from ..frequency import Number, Realization, find_hidden_unstable, margin_slopes
 from ..linearization import Linearization, differentiate_loop, linearize, loop_of_variant, operating_point
@@ -92,6 +92,8 @@ class Study:
             at = base.point if not parameters else operating_point(diagram, asked, run)
             self._asked[start.index] = (diagram, at)
             return self._judge(start, base, diagram, at, self._loops[place] if not parameters else {})
+        except UnknownArgumentError:
+            raise  # no case has it
         except LoopwrightError as error:
             return replace(start, reason=str(error))
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, UnknownNameError, accepts, brief, enumerate_some, kinds, near
+from ...blocks.core import LoopwrightError, UnknownNameError, accepts, brief, enumerate_some, explain_calls, kinds, near
 from ..flat import WiredDiagram
 from ..frequency import MarginSlope, Number, margin_slopes
 from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize
@@ -30,6 +30,7 @@ BY_DIFFERENCES = "differences of linear models with changed start values"
 Four = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Sensitivity:
     """The derivative of one number of a loop by one number of a parameter.
@@ -96,6 +97,7 @@ class Sensitivity:
         }
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Sensitivities(Sequence[Sensitivity]):
     """Sensitivities of a loop's numbers to parameters, in the order of the parameters.

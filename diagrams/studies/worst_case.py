@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, accepts, brief, enumerate_some, kinds
+from ...blocks.core import OptionError, accepts, brief, enumerate_some, explain_calls, kinds
 from ..flat import WiredDiagram
 from ..requirements import Requirements
 from ..sweeps import Box, Samples, read_samples
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@explain_calls
 @dataclass(frozen=True)
 class WorstCase:
     """Worst case of a loop's numbers over ranges of parameters.

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, SimulationError
+from ...blocks.core import LoopwrightError, SimulationError, explain_calls
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Failure:
     """A run that failed, as data.

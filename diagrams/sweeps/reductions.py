@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, accepts, kinds
+from ...blocks.core import OptionError, accepts, explain_calls, kinds
 from ..results import Run
 
 KINDS = ("final", "maximum", "minimum", "mean", "settling_time")
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Reduction:
     """A number of each entry of a signal over a run; `final`, `maximum` and their like make them.
@@ -60,6 +61,7 @@ class Reduction:
         return "s" if self.kind == "settling_time" else None
 
 
+@explain_calls
 def final(signal: str) -> Reduction:
     """Return the reduction to a signal's last sample."""
     return _made("final", signal)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, UnknownNameError, accepts, kinds, near
+from ...blocks.core import OptionError, UnknownNameError, accepts, explain_calls, kinds, near
 from .outcome import Failure, Outcome
 from .samples import Samples
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class Sweep:
     """The results of a sweep.

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, brief, enumerate_some, near
+from ...blocks.core import OptionError, brief, enumerate_some, explain_calls, near
 from ..wiring import CheckedDiagram, find_parameter
 
 KINDS = ("grid", "latin")
 _SCALES = ("linear", "log")
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Box:
     """Range of one parameter, in its unit: a number, or an array of numbers with a range each.
@@ -96,6 +97,7 @@ class Box:
         return np.where(part == 0.0, low, np.where(part == 1.0, high, np.clip(found, low, high)))
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Sample:
     """One point of a sweep.
@@ -115,6 +117,7 @@ class Sample:
     seed: int
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Samples(Sequence[Sample]):
     """Samples of parameters, in their order.

@@ -15,7 +15,7 @@ import numpy as np
 from ...blocks.core import OptionError, accepts, kinds, one_thread
 from ..flat import FlatDiagram
 from ..results import Run, entries, machine_memory, resolve, select
-from ..simulation import SimulatedDiagram, Simulation, progress_bar
+from ..simulation import RunOptions, SimulatedDiagram, Simulation, progress_bar
 from ..wiring import find_parameter
 from .outcome import Outcome
 from .plan import Plan
@@ -76,6 +76,7 @@ def sweep(
 ) -> Sweep:
     """Run a diagram with many values of its parameters; see `Diagram.sweep`."""
     started, name = perf_counter(), diagram.name
+    RunOptions.of({option: value for option, value in options.items() if option not in _REFUSED}, block=name)
     found = read_samples(diagram, parameters, samples, count=count, seed=seed)
     plan = make_plan(diagram, duration, signals, reduce, seeds, options, count=len(found), lanes=lanes)
     _check_names(plan, found.names)

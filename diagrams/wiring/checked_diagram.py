@@ -7,7 +7,16 @@ from dataclasses import replace as replace_fields
 from fractions import Fraction
 from typing import Self
 
-from ...blocks.core import Block, OptionError, WiringError, check_argument, check_name, kinds, without_collection
+from ...blocks.core import (
+    Block,
+    OptionError,
+    WiringError,
+    check_argument,
+    check_name,
+    explain_calls,
+    kinds,
+    without_collection,
+)
 from ...blocks.tracing import check_method
 from .check import Checked, check
 from .delay_blocks import add_delay_blocks
@@ -21,6 +30,7 @@ from .variants import apply_changes
 LOOPS = ("error", "solve")
 
 
+@explain_calls
 class CheckedDiagram:
     """Blocks and wires as one value; `loopwright.diagrams.Diagram` adds its uses.
 
@@ -54,6 +64,10 @@ class CheckedDiagram:
                 f"found loops={loops!r}; expected {' or '.join(map(repr, LOOPS))}.", block=name, port="loops"
             )
         self._set(check_name(name), Collector(roots).structure(), loops)
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        explain_calls(cls)
 
     name: str
     loops: str

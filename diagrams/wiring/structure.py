@@ -20,10 +20,12 @@ from ...blocks.core import (
     UnwiredInputError,
     Wireable,
     WiringError,
+    explain_calls,
 )
 from .subsystems import SubsystemCall, SubsystemInput
 
 
+@explain_calls
 @dataclass(frozen=True)
 class SubsystemSettings:
     """Settings of a subsystem, or of the diagram itself (path "").
@@ -56,6 +58,7 @@ class SubsystemSettings:
     when: str = ""
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Wire:
     """The source end of a wire: an output port, or a part of it."""
@@ -70,12 +73,10 @@ class Wire:
     @property
     def part(self) -> str:
         """The part of the port as text, "" for the whole: entries are counted from 1, up to and including the last."""
-        if self.index is None:
-            return ""
         if isinstance(self.index, slice):
             start, stop = self.index.start or 0, self.index.stop
             return f"[{start + (start >= 0)}:{'' if stop is None else stop if stop >= 0 else stop - 1}]"
-        return f"[{self.index + (self.index >= 0)}]"
+        return "" if self.index is None else f"[{self.index + (self.index >= 0)}]"
 
 
 @dataclass
@@ -393,8 +394,7 @@ def _resolve(signal: Signal, paths: dict[int, str], crossed: list[tuple[Subsyste
         else:
             return Wire(paths[id(signal.source)], signal.port, index)
         if index is not None and inner.index is not None:
-            raise WiringError(
-                "a part of a part of a signal is taken across a subsystem's border; index it once.", port=signal.port
-            )
+            message = "a part of a part of a signal is taken across a subsystem's border; index it once."
+            raise WiringError(message, port=signal.port)
         index = inner.index if index is None else index
         signal = inner

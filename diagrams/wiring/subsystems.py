@@ -19,6 +19,7 @@ from ...blocks.core import (
     WiringError,
     as_signal,
     check_name,
+    explain_calls,
     near,
     read_time,
     recorder,
@@ -111,6 +112,7 @@ class SubsystemKeywords(TypedDict, total=False):
     triggered: str | None
 
 
+@explain_calls
 class Subsystem:
     """A function of signals that stands in a diagram like a block; made by `subsystem`, called like a block."""
 
@@ -291,6 +293,7 @@ def subsystem(
     enabled: str | None = None,
     triggered: str | None = None,
 ) -> Callable[[Callable[..., object]], Subsystem]: ...
+@explain_calls
 def subsystem(
     function: Callable[..., object] | None = None,
     /,

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuFileError, Layout, accepts, brief, kinds
+from ...blocks.core import FmuFileError, Layout, accepts, brief, explain_calls, kinds
 from ..host_state import FOLDER
 from .aliases import find_aliases
 from .binaries import find_binary, judge_name
@@ -36,6 +36,7 @@ _DROPPED = ("UInt", "Clock")
 """Beginnings of the types of FMI 3.0 of which FMPy drops attributes."""
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class FmuDescription:
     """Content of ``modelDescription.xml``, as far as a diagram needs it."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+from ...blocks.core import explain_calls
+
 
 class FmuFault(StrEnum):
     """Kind of a fault of an FMU file: the field `fault` of errors (`FmuFileError`) and of findings."""
@@ -62,6 +64,7 @@ class FmuSeverity(StrEnum):
     NOTE = "note"
 
 
+@explain_calls
 @dataclass(frozen=True)
 class FmuFinding:
     """Fault of an FMU file, or a note on its use.

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, explain_calls
 
 
+@explain_calls
 @dataclass(frozen=True)
 class ArchiveLimits:
     """Limits up to which an FMU is read and unpacked; beyond them it is refused before anything is written.

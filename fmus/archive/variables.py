@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ...blocks.core import explain_calls
 from .units import FmuUnits
 
 _FMI2_TYPES = {"Real": "Float64", "Integer": "Int32"}
@@ -25,6 +26,7 @@ TEXT_TYPES = ("String", "Binary")
 """Types that no wire carries, but that are set at the start and recorded."""
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class FmuVariable:
     """Variable of an FMU with numbers as values: a scalar, an array, or scalars that were gathered into an array."""

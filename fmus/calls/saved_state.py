@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ...blocks.core import FmuError
+from ...blocks.core import FmuError, explain_calls
 from ..archive import OtherVariable
 from ..platform import native_platform
 
@@ -68,6 +68,7 @@ class StepMemory:
     jumping: np.ndarray
 
 
+@explain_calls
 class FmuState:
     """Saved state of an `FmuInstance`: all of its memory at one time, and that time.
 

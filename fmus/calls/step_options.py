@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 from fractions import Fraction
 
-from ...blocks.core import ParameterError
+from ...blocks.core import ParameterError, explain_calls
 from ..archive import FmuDescription
 from .fmi_calls import FmiCalls
 
@@ -21,6 +21,7 @@ class StepTime(Enum):
     """t += h after each step, as some tools do: their records are then met bit for bit."""
 
 
+@explain_calls
 @dataclass(frozen=True)
 class StepOptions:
     """Options of the co-simulation of one FMU: ``Fmu(file, stepping=StepOptions(event_mode=True))``.

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from ...blocks.core import brief
+from ...blocks.core import brief, explain_calls
 from ..archive import FmuFault, FmuFinding, FmuSeverity
 from .summary import INTERFACES
 from .trial import RUNS
@@ -34,6 +34,7 @@ class FmuVerdict(StrEnum):
     REFUSED = "is refused"
 
 
+@explain_calls
 @dataclass(frozen=True)
 class FmuTrial:
     """Trial run of an interface, in a process of its own.
@@ -59,6 +60,7 @@ class FmuTrial:
     step: float | None = None
 
 
+@explain_calls
 @dataclass(frozen=True)
 class FmuDiagnosis:
     """Result of `doctor`; its text is that of ``loopwright doctor``.

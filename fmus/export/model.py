@@ -15,7 +15,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import DefinitionError, ParameterError, brief, kinds, parse_unit
+from ...blocks.core import DefinitionError, ParameterError, brief, explain_calls, kinds, parse_unit
 
 Causality = Literal["input", "output", "parameter", "local"]
 Variability = Literal["continuous", "discrete", "fixed", "tunable"]
@@ -35,6 +35,7 @@ _ALLOWED: dict[str, tuple[str, ...]] = {
 }
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class Variable:
     """Variable of a model (FMI 3.0, 2.4.7): Float64, scalar or array.
@@ -193,6 +194,7 @@ def check_file_name(name: str) -> None:
         )
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class ModelSpec:
     """Model to export: x' = derivative(t, x, u, p), y = output(t, x, u, p); at events x = jump(t, x, u, p, fired).

@@ -23,7 +23,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import FmuError
+from ...blocks.core import FmuError, explain_calls
 from ..platform import cache_folder, native_platform, record_build
 from .c_code import generate, runtime
 from .compiler import SUFFIXES, TARGETS, Compiler, check_platform, compile_shared, find_compiler, flags
@@ -172,6 +172,7 @@ def write_atomically(path: Path, data: bytes) -> None:
         raise
 
 
+@explain_calls
 def build_fmu(
     spec: ModelSpec,
     out: Path | str | None = None,
@@ -238,6 +239,7 @@ def build_fmu(
     return target
 
 
+@explain_calls
 def clear_cache() -> None:
     """Delete all cached FMUs and the compiler's own cache."""
     for name in ("fmus", "zig"):

@@ -25,7 +25,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from ...blocks.core import Block, DefinitionError, FmuError, Port
+from ...blocks.core import Block, DefinitionError, FmuError, Port, explain_calls
 from ...blocks.tracing import bundle, traced_parameters
 from ..platform import record_build
 from .html_page import block_text
@@ -45,6 +45,7 @@ _MAKE = (
 )
 
 
+@explain_calls
 def build_python(
     block: Block,
     out: Path | str | None = None,

@@ -6,9 +6,10 @@ import math
 import os
 from dataclasses import dataclass, fields
 
-from ...blocks.core import ParameterError
+from ...blocks.core import ParameterError, explain_calls
 
 
+@explain_calls
 @dataclass(frozen=True)
 class Isolation:
     """Limits of a process that an FMU runs in; a call beyond one ends the process, and the run with an error."""

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ...blocks.core import FmuError, Layout, ParameterError, UnknownNameError, brief, elements, near
+from ...blocks.core import FmuError, Layout, ParameterError, UnknownNameError, brief, elements, explain_calls, near
 from ..archive import FmuDescription
 from ..calls import FmuBlock, LoadedFmu
 from ..isolation import open_fmu
@@ -17,6 +17,7 @@ from .derivation import Derivation
 from .start_values import check_state
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class FmuLinearization:
     """Linear model of an FMU about an operating point (x0, u0) at the time t.

@@ -219,7 +219,7 @@ def test_the_wire_of_the_force_on_the_plant_is_a_measured_force():
         ({"direction": "across"}, OptionError, "found 'across'; expected 'par', 'perp' or a vector"),
         ({"direction": (0.0, 0.0)}, OptionError, "expected a vector of 2 finite entries that is not zero"),
         ({"at": 1.2}, ParameterError, "found a point at which states change"),
-        ({"when": 1.2}, UnknownNameError, "contact takes no 'when'"),
+        ({"when": 1.2}, UnknownNameError, "contact: it has no argument 'when'"),
     ],
 )
 def test_ports_that_make_no_contact_are_refused(arguments, error, words):

@@ -516,7 +516,7 @@ def test_a_batch_goes_through_points_and_parameters():
             r"'y' has no entry \[0\]; expected one within its shape \(2,\), counted from 1",
             {"inputs": "y[0]"},
         ),
-        (UnknownNameError, r"linearize takes no 'ouputs'\. Did you mean 'outputs'", {"ouputs": "y"}),
+        (UnknownNameError, r"Diagram.linearize: it has no argument 'ouputs'\. Did you mean 'outputs'", {"ouputs": "y"}),
         (OptionError, r"found plants='magic'; expected one of 'equations', 'step'", {"plants": "magic"}),
         (
             OptionError,

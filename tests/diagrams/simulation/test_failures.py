@@ -298,7 +298,7 @@ def test_options_of_the_run_and_of_the_experiment_are_kept_apart():
     experiment = experiments.path_following()
     with pytest.raises(OptionError, match=r"A\.delay: it is no option of a run\. Give it to the experiment"):
         experiment.simulate(delay=1)
-    with pytest.raises(OptionError, match="no option of a run"):
+    with pytest.raises(OptionError, match="it has no argument"):
         experiment.simulate(progres=False)
 
 

@@ -419,7 +419,7 @@ def test_a_seed_of_noise_is_a_number_of_the_run_and_one_code_serves_all():
         ({"reduce": {"step.values": final("y")}}, r"lag.reduce: found a reduction called 'step.values'"),
         ({"signals": "y", "seeds": "step.values"}, r"lag.seeds: found 'step.values' among the parameters and in seeds"),
         ({"signals": "y", "workers": 0}, r"found workers=0; expected a positive integer"),
-        ({"signals": "y", "evry": 2}, r"lag.evry: it is no option of a run"),
+        ({"signals": "y", "evry": 2}, r"Diagram.sweep: it has no argument 'evry'. Did you mean 'every'"),
         ({"signals": "y", "client": "tcp://there"}, r"lag.client: found client='tcp://there'; expected a distributed"),
         ({"signals": "y", "seeds": "noise.seed"}, r"nothing is called 'noise.seed'"),
         ({"signals": "y", "record": ["step"]}, r"lag.record: found a choice without 'y', which signals= or reduce="),
