@@ -139,6 +139,14 @@ def uncompiled(tmp_path_factory, monkeypatch):
 
 
 @pytest.fixture
+def meeting(tmp_path, monkeypatch):
+    """A `support.waiting.Meeting` that FMUs find whose processes start in this test."""
+    from support.waiting import Meeting
+
+    return Meeting(tmp_path, monkeypatch)
+
+
+@pytest.fixture
 def undrawn(monkeypatch):
     """Figures are empty files: for runs of which the files are counted and no figure is looked at."""
 

@@ -12,7 +12,6 @@ import resource
 import signal
 import sys
 import threading
-import time
 import traceback
 from pathlib import Path
 
@@ -76,13 +75,12 @@ def serve(request):
     options = dict(request["options"])
     if isinstance(options.get("isolate"), dict):
         options["isolate"] = Isolation(**options["isolate"])
-    before, started, error, run = look(), time.perf_counter(), None, None
+    before, error, run = look(), None, None
     try:
         block = Fmu(request["file"], name="zoo", start={"u": 1.0, **request.get("start", {})}, **options)
         run = Diagram("d", block()).simulate(request["duration"], step=request["step"], progress=False)
     except Exception as found:
         error, run = found, getattr(found, "run", None)
-    seconds = time.perf_counter() - started
     after, family = look(), children()
     return {
         "kinds": [kind.__name__ for kind in type(error).__mro__] if error else [],
@@ -94,7 +92,6 @@ def serve(request):
         "t": [] if run is None else list(run.t),
         "y": [] if run is None else [float(v) for v in run["zoo.y"]],
         "messages": [] if run is None else list(run.messages),
-        "seconds": seconds,
         "changed": {name: [value, after[name]] for name, value in before.items() if after[name] != value},
         "children": family,
         "threads": threading.active_count(),

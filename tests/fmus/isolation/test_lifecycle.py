@@ -6,7 +6,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from loopwright.blocks import FmuError, FmuRuntimeError
 from loopwright.fmus import Fmu, Isolation
 from loopwright.fmus.calls import LoadedFmu
 from loopwright.fmus.isolation import count_processes, end_idle, open_fmu
+from support.waiting import FAR, is_there, wait_for
 from support.zoo import zoo_fmu
 
 ON_LINUX = pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
@@ -55,20 +55,22 @@ def count_resources(temporary):
     return memory, [len(os.listdir("/proc/self/fd")), threading.active_count(), len(children), files]
 
 
+def settle():
+    """End the idle processes; the thread of their timer, which is cancelled, ends when it gets its next turn."""
+    end_idle()
+    assert wait_for(lambda: any(isinstance(t, threading.Timer) for t in threading.enumerate()), False) is False
+
+
 def check_flat(cycle, temporary, count, warm=3, growth=8.0):
     """Run a cycle many times; all counts stay, and memory grows by some MB at most."""
     for k in range(warm):
         cycle(k)
-    end_idle()
+    settle()
     before, counts = count_resources(temporary)
     for k in range(count):
         cycle(k)
-    end_idle()
-    deadline = time.monotonic() + 12.0  # the timer of idle processes ends by itself
+    settle()
     after, later = count_resources(temporary)
-    while later[1] > counts[1] and time.monotonic() < deadline:
-        time.sleep(0.2)
-        after, later = count_resources(temporary)
     assert later == counts
     assert after - before < growth, f"{after - before:.1f} MB in {count} cycles"
     assert count_processes() == (0, 0)
@@ -172,51 +174,41 @@ print(one.fmi.process.pid, one.fmi.process.folder, flush=True)
 if sys.argv[2] == "hang":
     one.step(0.01, 0.01)
 if sys.argv[2] == "wait":
-    time.sleep(60.0)
+    time.sleep(1e4)
 """
-
-
-def is_there(pid):
-    try:
-        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
 
 
 @ON_LINUX
 @pytest.mark.parametrize(("how", "kill"), [("end", False), ("wait", True), ("hang", True)])
 @pytest.mark.drawn(2)
-def test_the_child_ends_with_its_parent_and_removes_its_folder(folder, tmp_path, how, kill):
+def test_the_child_ends_with_its_parent_and_removes_its_folder(folder, tmp_path_factory, meeting, how, kill):
     """At the end of a script that closes nothing; and where the parent is killed, idle or in a call that hangs."""
+    temporary = tmp_path_factory.mktemp("temporary")
     file = zoo_fmu(folder, 3, "step deaf_hang 0.01" if how == "hang" else "")
-    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    environment = {**os.environ, "TMPDIR": str(temporary)}
     parent = subprocess.Popen(
         [sys.executable, "-c", SCRIPT, str(file), how], stdout=subprocess.PIPE, text=True, env=environment
     )
     pid, place = parent.stdout.readline().split()
     assert how == "end" or is_there(pid)
     if kill:
-        time.sleep(0.3)
+        assert how != "hang" or wait_for(lambda: meeting.count, 1) == 1  # the call hangs
         parent.kill()
-    parent.wait(20.0)
+    parent.wait(FAR)
     parent.stdout.close()
-    deadline = time.monotonic() + 5.0
-    while (is_there(pid) or Path(place).exists()) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert not is_there(pid)
-    assert not Path(place).exists()
-    assert [*tmp_path.iterdir()] == []
+    assert wait_for(lambda: is_there(pid) or Path(place).exists(), False) is False
+    assert [*temporary.iterdir()] == []
 
 
 def test_an_idle_process_ends_after_a_while(folder, monkeypatch):
-    monkeypatch.setattr("loopwright.fmus.isolation.pool._IDLE", 0.2)
+    from loopwright.fmus.isolation import pool
+
+    monkeypatch.setattr(pool, "_IDLE", 0.2)
     end_idle()
-    run_once(Fmu(zoo_fmu(folder, 3), name="plant", isolate=Isolation()))
-    assert count_processes() == (1, 1)
-    deadline = time.monotonic() + 5.0
-    while count_processes() != (0, 0) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert count_processes() == (0, 0)
+    with pool._LOCKS[0]:  # its timer waits
+        run_once(Fmu(zoo_fmu(folder, 3), name="plant", isolate=Isolation()))
+        assert count_processes() == (1, 1)
+    assert wait_for(count_processes, (0, 0)) == (0, 0)
 
 
 def test_a_process_that_died_while_idle_is_replaced(folder):
@@ -227,7 +219,7 @@ def test_a_process_that_died_while_idle_is_replaced(folder):
     run_once(plant)
     ((_, process, _),) = pool._IDLE_ONES
     process._process.kill()
-    time.sleep(0.1)
+    assert wait_for(process.has_ended)
     assert run_once(plant) == pytest.approx(0.03)
     end_idle()
     assert count_processes() == (0, 0)

@@ -1,12 +1,10 @@
 """FMUs in processes of their own: equal numbers, and faults that end the run alone. The FMU of the zoo is y' = u."""
 
 import os
-import resource
 import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 import warnings
 from contextlib import suppress
@@ -21,9 +19,11 @@ from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu, Isolation
 from loopwright.fmus.isolation import count_processes, end_idle, find_limits
 from support.exported import mass_spring_damper
+from support.waiting import Interruption, wait_for
 from support.zoo import zoo_fmu
 
-SHORT = Isolation(step_time=0.5, start_time=0.5)
+SHORT = Isolation(step_time=1.0)
+"""For calls that never end; no other test has a limit that a busy machine reaches."""
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def nothing_left():
     assert count_processes() == (0, 0)
 
 
-def simulate(file, isolate=SHORT, duration=0.1, **options):
+def simulate(file, isolate=True, duration=0.1, **options):
     return Diagram("d", Fmu(file, name="plant", isolate=isolate)(u=1.0)).simulate(
         duration, step=0.01, progress=False, **options
     )
@@ -82,7 +82,7 @@ FAULTS = [
     ("step segfault 0.05", FmuEnd.CRASH, "DoStep", "SIGSEGV"),
     ("step divide_trapped 0.05", FmuEnd.CRASH, "DoStep", "SIGFPE"),
     ("step exit0 0.05", FmuEnd.EXIT, "DoStep", "exit status 0"),
-    ("step deaf_hang 0.05", FmuEnd.TIMEOUT, "DoStep", "has not ended after 0.5 s"),
+    ("step deaf_hang 0.05", FmuEnd.TIMEOUT, "DoStep", "has not ended after 1 s"),
     ("get segfault 0.05", FmuEnd.CRASH, "Get", "SIGSEGV"),
 ]
 
@@ -92,7 +92,7 @@ FAULTS = [
 @pytest.mark.drawn
 def test_a_fault_ends_the_run_and_says_where_when_and_why(folder, fmi, fault, cause, call, text):
     with pytest.raises(FmuProcessError) as caught:
-        simulate(zoo_fmu(folder, fmi, fault))
+        simulate(zoo_fmu(folder, fmi, fault), SHORT if cause is FmuEnd.TIMEOUT else True)
     error = caught.value
     assert error.cause is cause
     assert call in error.call
@@ -144,7 +144,7 @@ def test_a_flood_of_output_ends_the_run(folder):
 
 def test_the_log_before_the_end_is_quoted(folder):
     with pytest.raises(FmuProcessError, match="The FMU says: plant: warning: from a thread") as caught:
-        simulate(zoo_fmu(folder, 3, "step log_hang 0.05"))
+        simulate(zoo_fmu(folder, 3, "step log_hang 0.05"), SHORT)
     assert caught.value.cause is FmuEnd.TIMEOUT
 
 
@@ -186,7 +186,7 @@ def test_what_an_fmu_forks_ends_with_its_process(folder, tmp_path, monkeypatch):
         one.step(0.0, 0.01)
         assert len(processes_of(tmp_path)) == 2
     end_idle()
-    assert processes_of(tmp_path) == []
+    assert wait_for(lambda: processes_of(tmp_path), []) == []  # killed, it ends when it gets its next turn
     assert [*tmp_path.iterdir()] == []
 
 
@@ -220,21 +220,20 @@ def test_an_fmu_that_a_process_can_have_once_may_be_there_twice(folder, tmp_path
     assert np.allclose(run["b.y"], 2.0 * run.t, atol=1e-12)
 
 
-def test_two_fmus_step_at_the_same_time(folder):
-    """Each step takes 20 ms of sleep: two one after the other take 40 ms, side by side little more than 20 ms."""
-    file = zoo_fmu(folder, 3, "step slow")
+def test_two_fmus_step_at_the_same_time(folder, meeting):
+    """Each step waits until the other FMU is in its own."""
+    file = zoo_fmu(folder, 3, "step meet")
     blocks = [Fmu(file, name=name, isolate=True) for name in "ab"]
     with blocks[0].instantiate(["u"], None) as a, blocks[1].instantiate(["u"], None) as b:
         for one in (a, b):
             one.bind(np.ones(1), np.zeros(1))
             one.begin()
-        began = time.perf_counter()
         for k in range(5):
             a.start_step(0.01 * k, 0.01)
             b.start_step(0.01 * k, 0.01)
             a.finish_step()
             b.finish_step()
-        assert time.perf_counter() - began < 0.17  # of 0.2 one after the other
+    assert meeting.count == 10
 
 
 def test_saved_states_go_across_the_process(folder):
@@ -341,13 +340,10 @@ def test_the_child_imports_the_standard_library_only():
 
     begin = process._START.replace("; main()", "; import loopwright_child.printf; print(*sys.modules)")
     here = [str(Path(module.__file__).parent) for module in (process, printf)]
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run([sys.executable, "-c", begin, *here], capture_output=True, text=True, check=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert "loopwright_child.child" in done.stdout.split()
     assert not {"numpy", "casadi", "fmpy", "loopwright", "scipy"} & set(done.stdout.split())
-    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    assert used < 0.3  # 0.06 s where the machine is quiet
+    assert len(done.stdout.split()) < 250
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
@@ -369,29 +365,15 @@ def test_a_fork_of_this_process_leaves_its_fmus_alone(folder):
         assert y[0] == pytest.approx(0.01)
 
 
-@pytest.fixture
-def interruptible():
-    """SIGINT raises KeyboardInterrupt, which it doesn't in a process that was started in the background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-def test_an_interrupt_ends_the_process_of_a_step(folder, interruptible):
-    """Ctrl-C while the FMU works: the run ends at once, and the process with it."""
-    plant = Fmu(zoo_fmu(folder, 3, "step deaf_hang 0.02"), name="plant", isolate=True)
-    timer = threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT))
+def test_an_interrupt_ends_the_process_of_a_step(folder, meeting):
+    """Ctrl-C while the FMU works: the run ends at once, long before the limit of a step, and the process with it."""
+    limits = Isolation(step_time=1e4)
+    plant = Fmu(zoo_fmu(folder, 3, "step deaf_hang 0.02"), name="plant", isolate=limits)
     with plant.instantiate(["u"], None) as one:
         one.bind(np.ones(1), np.zeros(1))
         one.begin()
-
-        def go():
-            for k in range(5):
-                one.step(0.01 * k, 0.01)
-
-        timer.start()
-        began = time.perf_counter()
-        with pytest.raises(KeyboardInterrupt):
-            go()
-        assert time.perf_counter() - began < 5.0
+        for k in range(2):
+            one.step(0.01 * k, 0.01)
+        with Interruption(lambda: meeting.count == 1), pytest.raises(KeyboardInterrupt):
+            one.step(0.02, 0.01)
     assert count_processes() == (0, 0)

@@ -9,7 +9,6 @@ import os
 import select
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +17,16 @@ import pytest
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu
 from support import zoo_host
+from support.waiting import FAR, wait_for
 from support.zoo import zoo_fmu
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its C source knows Linux")
 
 T, H, N = 0.05, 0.01, 11  # time of the fault, step, samples of a whole run to 0.1 s
 KEPT = 6  # samples up to the fault
-SHORT = {"step_time": 0.5, "start_time": 1.0}
+SOON = 180.0  # s, of a run that takes some tenths; the limits of its calls are further
+SHORT = {"step_time": 1.0, "start_time": 4.0}
+"""For calls that never end; no other test has a limit that a busy machine reaches."""
 
 
 class Host:
@@ -50,12 +52,12 @@ class Host:
         request = {"file": str(file), "options": options, "duration": 0.1, "step": H}
         self.process.stdin.write(json.dumps(request) + "\n")
         self.process.stdin.flush()
-        if not select.select([self.process.stdout], [], [], 30.0)[0]:
+        if not select.select([self.process.stdout], [], [], SOON)[0]:
             self.process.kill()
             self.process.wait()
-            raise AssertionError(f"the run of {file.name} has not ended after 30 s")
+            raise AssertionError(f"the run of {file.name} has not ended after {SOON:g} s")
         line = self.process.stdout.readline()
-        assert line, f"the process that ran {file.name} ended with {self.process.wait(5)}"
+        assert line, f"the process that ran {file.name} ended with {self.process.wait(FAR)}"
         answer = json.loads(line)
         assert "broken" not in answer, answer["broken"]
         return answer
@@ -65,7 +67,7 @@ class Host:
         if self.process is None:
             return [], []
         self.process.stdin.close()
-        self.process.wait(20)
+        self.process.wait(FAR)
         self.process.stdout.close()
         return wait_for(lambda: users_of(self.folder), []), sorted(p.name for p in self.temporary.rglob("*"))
 
@@ -80,14 +82,6 @@ def users_of(folder):
         except OSError:
             continue
     return [pid for pid in found if pid != os.getpid()]
-
-
-def wait_for(look, wanted, seconds=3.0):
-    """Return what is found, as soon as it is the wanted, or in the end."""
-    end = time.monotonic() + seconds
-    while (found := look()) != wanted and time.monotonic() < end:
-        time.sleep(0.02)
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -122,6 +116,11 @@ def slow(*values):
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
+def limits(fault):
+    """Return the limits of calls: those of a fault without end are reached, others never."""
+    return SHORT if fault in ("hang", "spin", "deaf_hang", "stop") else {"step_time": 1e4, "start_time": 1e4}
+
+
 def fail(answer, kind, kept, *words):
     """Check an error: its class, the samples until then, and words of its text, which names the block."""
     check_host(answer)
@@ -147,20 +146,19 @@ CRASHES = [
     quick("exit", "exit", "status 3"),
     slow("exit0", "exit", "status 0"),
     slow("quick_exit", "exit", "status 0"),
-    quick("hang", "timeout", "0.5 s"),
-    slow("spin", "timeout", "0.5 s"),
-    slow("deaf_hang", "timeout", "0.5 s"),
-    slow("stop", "timeout", "0.5 s"),
+    quick("hang", "timeout", "1 s"),
+    slow("spin", "timeout", "1 s"),
+    slow("deaf_hang", "timeout", "1 s"),
+    slow("stop", "timeout", "1 s"),
 ]
 
 
 @pytest.mark.parametrize("fmi", [3, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("fault", "cause", "word"), CRASHES)
 def test_a_fault_in_a_step_ends_the_run_and_nothing_else(host, place, fmi, fault, cause, word):
-    answer = host.run(zoo_fmu(place, fmi, f"step {fault} {T}"), isolate=SHORT)
+    answer = host.run(zoo_fmu(place, fmi, f"step {fault} {T}"), isolate=limits(fault))
     fail(answer, "FmuProcessError", KEPT, f"fmi{fmi}DoStep", word, f"t = {T} s")
     assert (answer["cause"], answer["call"]) == (cause, f"fmi{fmi}DoStep")
-    assert answer["seconds"] < 5.0
 
 
 BEFORE = {
@@ -176,23 +174,21 @@ AFTER = {"terminate": "Terminate", "free": "FreeInstance", "unload": "unloading"
     ("fault", "cause"), [quick("segfault", "crash"), slow("exit", "exit"), slow("hang", "timeout")]
 )
 def test_a_fault_before_the_first_step_names_the_call(host, place, fmi, where, fault, cause):
-    answer = host.run(zoo_fmu(place, fmi, f"{where} {fault}"), isolate=SHORT)
+    answer = host.run(zoo_fmu(place, fmi, f"{where} {fault}"), isolate=limits(fault))
     fail(answer, "FmuProcessError", 0)
     assert answer["cause"] == cause
     assert BEFORE[where].replace("Float64", "Real" if fmi == 2 else "Float64") in answer["call"]
-    assert answer["seconds"] < 5.0
 
 
 @pytest.mark.parametrize("fmi", [3, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("where", [quick("free"), slow("terminate"), slow("unload")])
 @pytest.mark.parametrize("fault", [quick("segfault"), slow("exit"), slow("hang")])
 def test_a_fault_after_the_last_step_leaves_the_run_whole_and_is_told(host, place, fmi, where, fault):
-    answer = host.run(zoo_fmu(place, fmi, f"{where} {fault}"), isolate=SHORT)
+    answer = host.run(zoo_fmu(place, fmi, f"{where} {fault}"), isolate=limits(fault))
     check_host(answer)
     assert answer["kinds"] == []
     assert len(answer["t"]) == N
     assert any(AFTER[where] in text for text in answer["messages"]), answer["messages"]
-    assert answer["seconds"] < 5.0
 
 
 # --- limits ----------------------------------------------------------------------------------------------------------
@@ -271,12 +267,11 @@ def test_a_step_that_fails_is_told_with_the_fmu_s_words(host, place, fmi, fault,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("fmi", "word"), [(2, "pending after 0.5 s"), (3, "status 5")])
+@pytest.mark.parametrize(("fmi", "word"), [(2, "pending after 1 s"), (3, "status 5")])
 def test_a_step_that_is_pending_for_ever_ends(host, place, fmi, word):
     """In FMI 2.0 it is asked for its status as long as a step may take; FMI 3.0 has no such status."""
     answer = host.run(zoo_fmu(place, fmi, f"step pending {T}"), isolate=SHORT)
     fail(answer, "FmuRuntimeError", KEPT, word)
-    assert answer["seconds"] < 5.0
 
 
 @pytest.mark.slow
@@ -372,10 +367,9 @@ def test_a_library_that_is_cut_off_is_refused(host, place, fmi, keep):
 @pytest.mark.parametrize("where", ["derivative", "states", "time", "indicators"])
 @pytest.mark.parametrize(("fault", "kind"), [("segfault", "FmuProcessError"), ("hang", "FmuProcessError"), ("error", "FmuRuntimeError")])  # fmt: skip
 def test_a_fault_in_an_evaluation_ends_the_run_and_nothing_else(host, place, fmi, where, fault, kind):
-    answer = host.run(zoo_fmu(place, fmi, f"{where} {fault} {T}"), isolate=SHORT, interface="model_exchange")
+    answer = host.run(zoo_fmu(place, fmi, f"{where} {fault} {T}"), isolate=limits(fault), interface="model_exchange")
     fail(answer, kind, len(answer["t"]))
     assert 1 <= len(answer["t"]) <= KEPT
-    assert answer["seconds"] < 5.0
 
 
 @pytest.mark.slow
@@ -411,4 +405,3 @@ def test_values_that_are_computed_with_the_derivatives_alone_are_not_stale(place
 def test_an_event_iteration_without_end_is_ended(host, place, fmi):
     answer = host.run(zoo_fmu(place, fmi, "update endless"), interface="model_exchange")
     fail(answer, "SimulationError", 0, "event iteration")
-    assert answer["seconds"] < 5.0
