@@ -92,25 +92,35 @@ class _StateSpace(Block):
         return self.A @ x.x + _apply(self.B, u.u)
 
     @classmethod
-    def _from_control(cls, system: Any, *, discrete: bool, name: str | None, **more: Any) -> Self:
-        dt = check_system(cls, system, "StateSpace", discrete=discrete)
+    def from_control(cls, system: Any, *, initial_state: Any = 0.0, name: str | None = None) -> Self:
+        """Return the block of a `control.StateSpace`; one input or output becomes a scalar.
+
+        The block has the names of the system's signals. Without ``name`` its name is the system's, if that is an
+        identifier.
+
+        Raises
+        ------
+        ParameterError
+            For anything but a state space in the block's time, continuous or discrete, and for one without states.
+        """
+        more = check_system(cls, system, "StateSpace")
         if system.nstates == 0:
             text = "found a system without states; expected one state or more. Use Gain(gain=system.D)."
             raise ParameterError(text, block=cls.__name__, port="system")
         B, C, D = (np.asarray(m, dtype=float) for m in (system.B, system.C, system.D))
         B, D = (B[:, 0], D[:, 0]) if system.ninputs == 1 else (B, D)
         C, D = (C[0], D[0]) if system.noutputs == 1 else (C, D)
-        if discrete:
-            more["dt"] = dt
-        return cls(A=system.A, B=B, C=C, D=D, name=block_name(system, name), **names_of(system), **more)
+        more |= {"initial_state": initial_state, **names_of(system)}
+        return cls(A=system.A, B=B, C=C, D=D, name=block_name(system, name), **more)
 
-    def _to_control(self, dt: float | bool) -> Any:
+    def to_control(self) -> Any:
+        """Return the `control.StateSpace`, with the names of its signals."""
         import control
 
         n = len(self.A)
         B, C = np.reshape(self.B, (n, -1)), np.reshape(self.C, (-1, n))
         D = np.broadcast_to(0.0, (len(C), B.shape[1])) if np.ndim(self.D) == 0 and self.D == 0 else self.D
-        return control.ss(self.A, B, C, np.reshape(D, (len(C), B.shape[1])), dt, **labels(self))
+        return control.ss(self.A, B, C, np.reshape(D, (len(C), B.shape[1])), sample_time_of(self), **labels(self))
 
 
 class StateSpace(_StateSpace):
@@ -133,24 +143,6 @@ class StateSpace(_StateSpace):
         """Return ẋ."""
         return self.advance(x, u)
 
-    @classmethod
-    def from_control(cls, system: Any, *, initial_state: Any = 0.0, name: str | None = None) -> Self:
-        """Return the block of a `control.StateSpace` in continuous time; one input or output becomes a scalar.
-
-        The block has the names of the system's signals. Without ``name`` its name is the system's, if that is an
-        identifier.
-
-        Raises
-        ------
-        ParameterError
-            For anything but a state space in continuous time, and for one without states.
-        """
-        return cls._from_control(system, discrete=False, name=name, initial_state=initial_state)
-
-    def to_control(self) -> Any:
-        """Return the `control.StateSpace`, with the names of its signals."""
-        return self._to_control(0)
-
 
 class DiscreteStateSpace(FixedSampleTime, _StateSpace):
     """Linear system in discrete time: x[k + 1] = A x[k] + B u[k], y[k] = C x[k] + D u[k].
@@ -170,24 +162,6 @@ class DiscreteStateSpace(FixedSampleTime, _StateSpace):
     def update(self, t: Array, x: Any, u: Any) -> Array:
         """Return the next state."""
         return self.advance(x, u)
-
-    @classmethod
-    def from_control(cls, system: Any, *, initial_state: Any = 0.0, name: str | None = None) -> Self:
-        """Return the block of a `control.StateSpace` in discrete time; one input or output becomes a scalar.
-
-        The block has the names of the system's signals. Without ``name`` its name is the system's, if that is an
-        identifier.
-
-        Raises
-        ------
-        ParameterError
-            For anything but a state space in discrete time, and for one without states.
-        """
-        return cls._from_control(system, discrete=True, name=name, initial_state=initial_state)
-
-    def to_control(self) -> Any:
-        """Return the `control.StateSpace`, with the names of its signals."""
-        return self._to_control(sample_time_of(self))
 
 
 class _TransferFunction(Block):
@@ -243,17 +217,29 @@ class _TransferFunction(Block):
         return np.concatenate([np.zeros(a.shape[0] - b.shape[0]), b]), a
 
     @classmethod
-    def _from_control(cls, system: Any, *, discrete: bool, name: str | None) -> Self:
-        dt = check_system(cls, system, "TransferFunction", discrete=discrete)
+    def from_control(cls, system: Any, *, name: str | None = None) -> Self:
+        """Return the block of a `control.TransferFunction` of one input and one output.
+
+        The block has the names of the system's signals. Without ``name`` its name is the system's, if that is an
+        identifier.
+
+        Raises
+        ------
+        ParameterError
+            For anything but a transfer function in the block's time, continuous or discrete, of one input and one
+            output.
+        """
+        more = check_system(cls, system, "TransferFunction")
         check_single(cls, system)
         a, b = (np.asarray(c[0][0], dtype=float) for c in (system.den, system.num))
-        more: dict[str, Any] = {"dt": dt} if discrete else {}
         return cls(numerator=b, denominator=a, name=block_name(system, name), **names_of(system), **more)
 
-    def _to_control(self, dt: float | bool) -> Any:
+    def to_control(self) -> Any:
+        """Return the `control.TransferFunction`, with the names of its signals."""
         import control
 
-        return control.tf(np.atleast_1d(self.numerator), np.atleast_1d(self.denominator), dt, **labels(self))
+        b, a = np.atleast_1d(self.numerator), np.atleast_1d(self.denominator)
+        return control.tf(b, a, sample_time_of(self), **labels(self))
 
 
 class TransferFunction(_TransferFunction):
@@ -301,24 +287,6 @@ class TransferFunction(_TransferFunction):
         w, _, a = self.scale_coefficients()
         return w * np.concatenate([x.x[1:], np.stack([u.u - a[1:][::-1] @ x.x])])
 
-    @classmethod
-    def from_control(cls, system: Any, *, name: str | None = None) -> Self:
-        """Return the block of a `control.TransferFunction` in continuous time, of one input and one output.
-
-        The block has the names of the system's signals. Without ``name`` its name is the system's, if that is an
-        identifier.
-
-        Raises
-        ------
-        ParameterError
-            For anything but a transfer function in continuous time, of one input and one output.
-        """
-        return cls._from_control(system, discrete=False, name=name)
-
-    def to_control(self) -> Any:
-        """Return the `control.TransferFunction`, with the names of its signals."""
-        return self._to_control(0)
-
 
 class DiscreteTransferFunction(FixedSampleTime, _TransferFunction):
     """Transfer function: Y(z) = (b₀ zᵐ + … + b_m) / (a₀ zⁿ + … + a_n) U(z), m ≤ n; it starts at rest.
@@ -346,24 +314,6 @@ class DiscreteTransferFunction(FixedSampleTime, _TransferFunction):
         """Return the next state."""
         b, a = self.coefficients()
         return section(b, a, x.x, u.u)[1]
-
-    @classmethod
-    def from_control(cls, system: Any, *, name: str | None = None) -> Self:
-        """Return the block of a `control.TransferFunction` in discrete time, of one input and one output.
-
-        The block has the names of the system's signals. Without ``name`` its name is the system's, if that is an
-        identifier.
-
-        Raises
-        ------
-        ParameterError
-            For anything but a transfer function in discrete time, of one input and one output.
-        """
-        return cls._from_control(system, discrete=True, name=name)
-
-    def to_control(self) -> Any:
-        """Return the `control.TransferFunction`, with the names of its signals."""
-        return self._to_control(sample_time_of(self))
 
 
 def section(b: Array, a: Array, x: Array, u: Array) -> tuple[Array, Array]:

@@ -10,19 +10,18 @@ import numpy as np
 from ..core import Block, ParameterError, SampleTimeError, kinds, shorten
 
 
-def check_system(cls: type[Block], system: Any, kind: str, *, discrete: bool) -> float | None:
-    """Refuse anything but a system of this kind and time; return the sample time of a discrete one.
+def check_system(cls: type[Block], system: Any, kind: str) -> dict[str, Any]:
+    """Refuse anything but a system of this kind and of the block's time; return the keyword ``dt`` of a discrete one.
 
     Parameters
     ----------
     cls : type
-        Class of the block to be made.
+        Class of the block to be made; in discrete time if it is a `FixedSampleTime`. A system with an unspecified time,
+        ``dt=None``, may be either.
     system : object
         The object to check.
     kind : {"StateSpace", "TransferFunction"}
         Class of python-control that is expected.
-    discrete : bool
-        Whether it must be in discrete time. A system with an unspecified time, ``dt=None``, may be either.
 
     Raises
     ------
@@ -40,7 +39,7 @@ def check_system(cls: type[Block], system: Any, kind: str, *, discrete: bool) ->
         raise ParameterError(
             f"found a {type(system).__name__}; expected a control.{kind}. {step}", block=cls.__name__, port="system"
         )
-    dt = system.dt
+    dt, discrete = system.dt, issubclass(cls, FixedSampleTime)
     if dt is not None and (dt == 0) == discrete:
         found, expected = ("continuous", "discrete") if discrete else ("discrete", "continuous")
         other_class = cls.__name__.removeprefix("Discrete") if discrete else f"Discrete{cls.__name__}"
@@ -50,7 +49,9 @@ def check_system(cls: type[Block], system: Any, kind: str, *, discrete: bool) ->
             block=cls.__name__,
             port="system",
         )
-    return None if dt is None or dt is True or dt == 0 else float(dt)
+    if not discrete:
+        return {}
+    return {"dt": None if dt is None or dt is True else float(dt)}
 
 
 def names_of(system: Any) -> dict[str, tuple[str, ...]]:
@@ -94,9 +95,11 @@ def labels(block: Any) -> dict[str, Any]:
     return {k: v if isinstance(v, str) else list(v) for k, v in found.items() if v is not None}
 
 
-def sample_time_of(block: Any) -> float | bool:
-    """Return ``dt`` of a discrete block as python-control spells it: True if it is not given."""
-    return True if block.dt is None else block.dt
+def sample_time_of(block: Block) -> float | bool:
+    """Return ``dt`` of a block as python-control spells it: 0 in continuous time, True where it is not given."""
+    if not isinstance(block, FixedSampleTime):
+        return 0
+    return True if block.dt is None else float(block.dt)
 
 
 def check_names(block: Any, **numbers: int) -> None:

@@ -137,16 +137,30 @@ class _ZeroPoleGain(Block):
             gain *= factor
         return self.gain * gain * signal, np.concatenate(parts)
 
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the output."""
+        return self.cascade(x, u)[0]
+
     def advance_section(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
         """Return output and rate or next state of one section, and the factor by which its output is too small."""
         raise NotImplementedError
 
     @classmethod
-    def _from_control(cls, system: Any, *, discrete: bool, name: str | None) -> Self:
-        dt = check_system(cls, system, "TransferFunction", discrete=discrete)
+    def from_control(cls, system: Any, *, name: str | None = None) -> Self:
+        """Return the block of a `control.TransferFunction` of one input and one output.
+
+        python-control keeps polynomials: zeros and poles are their roots, so multiple ones come apart. The block has
+        the names of the system's signals. Without ``name`` its name is the system's, if that is an identifier.
+
+        Raises
+        ------
+        ParameterError
+            For anything but a transfer function in the block's time, continuous or discrete, of one input and one
+            output, with poles.
+        """
+        more = check_system(cls, system, "TransferFunction")
         check_single(cls, system)
         b, a = (np.trim_zeros(np.asarray(c[0][0], dtype=float), "f") for c in (system.num, system.den))
-        more: dict[str, Any] = {"dt": dt} if discrete else {}
         return cls(
             zeros=tuple(complex(z) for z in np.roots(b)),
             poles=tuple(complex(p) for p in np.roots(a)),
@@ -156,10 +170,11 @@ class _ZeroPoleGain(Block):
             **more,
         )
 
-    def _to_control(self, dt: float | bool) -> Any:
+    def to_control(self) -> Any:
+        """Return the `control.TransferFunction`, its polynomials multiplied out, with the names of its signals."""
         import control
 
-        return control.zpk(list(self.zeros), list(self.poles), self.gain, dt, **labels(self))
+        return control.zpk(list(self.zeros), list(self.poles), self.gain, sample_time_of(self), **labels(self))
 
 
 class ZeroPoleGain(_ZeroPoleGain):
@@ -192,31 +207,9 @@ class ZeroPoleGain(_ZeroPoleGain):
         rate = w * np.concatenate([x[1:], np.stack([u - a[1:][::-1] @ x])])
         return b[0] * u + (b[1:] - b[0] * a[1:])[::-1] @ x, rate, factor
 
-    def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the output."""
-        return self.cascade(x, u)[0]
-
     def derivative(self, t: Array, x: Any, u: Any) -> Array:
         """Return ẋ."""
         return self.cascade(x, u)[1]
-
-    @classmethod
-    def from_control(cls, system: Any, *, name: str | None = None) -> Self:
-        """Return the block of a `control.TransferFunction` in continuous time, of one input and one output.
-
-        python-control keeps polynomials: zeros and poles are their roots, so multiple ones come apart. The block has
-        the names of the system's signals. Without ``name`` its name is the system's, if that is an identifier.
-
-        Raises
-        ------
-        ParameterError
-            For anything but a transfer function in continuous time, of one input and one output, with poles.
-        """
-        return cls._from_control(system, discrete=False, name=name)
-
-    def to_control(self) -> Any:
-        """Return the `control.TransferFunction`, its polynomials multiplied out, with the names of its signals."""
-        return self._to_control(0)
 
 
 class DiscreteZeroPoleGain(FixedSampleTime, _ZeroPoleGain):
@@ -241,28 +234,6 @@ class DiscreteZeroPoleGain(FixedSampleTime, _ZeroPoleGain):
         """Return output and next state of a section."""
         return (*section(b, a, x, u), 1.0)
 
-    def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the output."""
-        return self.cascade(x, u)[0]
-
     def update(self, t: Array, x: Any, u: Any) -> Array:
         """Return the next state."""
         return self.cascade(x, u)[1]
-
-    @classmethod
-    def from_control(cls, system: Any, *, name: str | None = None) -> Self:
-        """Return the block of a `control.TransferFunction` in discrete time, of one input and one output.
-
-        python-control keeps polynomials: zeros and poles are their roots, so multiple ones come apart. The block has
-        the names of the system's signals. Without ``name`` its name is the system's, if that is an identifier.
-
-        Raises
-        ------
-        ParameterError
-            For anything but a transfer function in discrete time, of one input and one output, with poles.
-        """
-        return cls._from_control(system, discrete=True, name=name)
-
-    def to_control(self) -> Any:
-        """Return the `control.TransferFunction`, its polynomials multiplied out, with the names of its signals."""
-        return self._to_control(sample_time_of(self))

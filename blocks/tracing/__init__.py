@@ -7,7 +7,7 @@ from .opaque_equations import raise_failure
 from .outside import describe_outside
 from .structure import has_structure, is_traced_by, structure, traced_parameters
 from .switching_times import Line, switching_times
-from .symbols import bundle, flat_column, has_large_product, size, with_values, wrap
+from .symbols import bundle, count_uses, flat_column, has_large_product, size, with_values, wrap
 from .traced import Traced, constants_of, trace
 from .traced_array import as_traced
 
@@ -20,6 +20,7 @@ __all__ = [
     "bundle",
     "check_method",
     "constants_of",
+    "count_uses",
     "describe_outside",
     "evaluate",
     "flat_column",

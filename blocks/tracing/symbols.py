@@ -102,3 +102,17 @@ def flat_column(value: Any) -> Any:
         inner = value.to_casadi()
         return ca.vec(inner.T) if value.ndim == 2 else ca.vec(inner)
     return ca.MX(ca.DM(np.ravel(np.asarray(value, dtype=float))))
+
+
+def count_uses(f: ca.Function) -> dict[int, int]:
+    """Return the number of reads of each operation's result, of a scalar function; places of work are reused."""
+    made: dict[int, int] = {}
+    uses = dict.fromkeys(range(f.n_instructions()), 0)
+    for k in range(f.n_instructions()):
+        op = f.instruction_id(k)
+        if op not in (ca.OP_CONST, ca.OP_INPUT):
+            for i in f.instruction_input(k):
+                uses[made[i]] += 1
+        if op != ca.OP_OUTPUT:
+            made[f.instruction_output(k)[0]] = k
+    return uses

@@ -9,6 +9,7 @@ from typing import Any
 
 import casadi as ca
 
+from ...blocks.tracing import count_uses
 from .no_lanes import NoLanesError
 
 _INFIX = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
@@ -98,7 +99,7 @@ class _Writer:
 
     def write(self) -> None:
         f = self._f
-        uses = _count_uses(f)
+        uses = count_uses(f)
         work: dict[int, _Value] = {}
         filled: set[tuple[int, int]] = set()
         for k in range(f.n_instructions()):
@@ -202,17 +203,3 @@ def _number(value: float) -> str:
     if math.isinf(value):
         return "INFINITY" if value > 0 else "-INFINITY"
     return value.hex()
-
-
-def _count_uses(f: Any) -> dict[int, int]:
-    """Return the number of reads of each operation's result; places of work are reused."""
-    made: dict[int, int] = {}
-    uses = dict.fromkeys(range(f.n_instructions()), 0)
-    for k in range(f.n_instructions()):
-        op = f.instruction_id(k)
-        if op not in (ca.OP_CONST, ca.OP_INPUT):
-            for i in f.instruction_input(k):
-                uses[made[i]] += 1
-        if op != ca.OP_OUTPUT:
-            made[f.instruction_output(k)[0]] = k
-    return uses

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import casadi as ca
 
+from ...blocks.tracing import count_uses
+
 _SUM, _PRODUCT, _POWER, _ATOM = 1, 2, 3, 4
 _FUNCTIONS = {
     ca.OP_EXP: "exp", ca.OP_LOG: "log", ca.OP_SQRT: "sqrt", ca.OP_SIN: "sin", ca.OP_COS: "cos", ca.OP_TAN: "tan",
@@ -95,7 +97,7 @@ def equations(f: ca.Function, knowns: Sequence[Sequence[str]], unknowns: Sequenc
     if f.n_instructions() > limit + f.numel_in() + f.numel_out():
         return []
     taken = {name for group in knowns for name in group}
-    uses = _count_uses(f)
+    uses = count_uses(f)
     work: dict[int, Term] = {}
     shared: list[str] = []
     choices: dict[str, tuple[str, str]] = {}
@@ -125,17 +127,3 @@ def equations(f: ca.Function, knowns: Sequence[Sequence[str]], unknowns: Sequenc
             term = (name, _ATOM)
         work[out[0]] = term
     return [*shared, *(f"{name} = {results[i]}" for i, name in enumerate(unknowns))]
-
-
-def _count_uses(f: ca.Function) -> dict[int, int]:
-    """Return the number of reads of each operation's result (places of work are reused)."""
-    made: dict[int, int] = {}
-    uses = dict.fromkeys(range(f.n_instructions()), 0)
-    for k in range(f.n_instructions()):
-        op = f.instruction_id(k)
-        if op not in (ca.OP_CONST, ca.OP_INPUT):
-            for i in f.instruction_input(k):
-                uses[made[i]] += 1
-        if op != ca.OP_OUTPUT:
-            made[f.instruction_output(k)[0]] = k
-    return uses
