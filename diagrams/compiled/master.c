@@ -116,7 +116,7 @@ static inline int64_t step_plant(const plant *p, double now, double width, outco
     *p->width = width;
     out->stage = STEP;
     if ((status = (unsigned)step(p)) > 0) return out->status = (int)status, FMU_FAILED;
-    return p->flags[1] | p->flags[2] ? FMU_FLAGS : DONE; /* a flag for an event is for event mode alone */
+    return (p->flags[1] | p->flags[2]) ? FMU_FLAGS : DONE; /* a flag for an event is for event mode alone */
 }
 
 static inline int64_t read_plant(const plant *p, double now, double width, double near, outcome *out) {
