@@ -60,7 +60,16 @@ from .frequency import (
     sampled_poles,
     sensitivity,
 )
-from .linearization import InexactDerivatives, Kink, Linearization, MeanSlope, RefutedDerivatives, StepsOnly, ZeroSlope
+from .linearization import (
+    CoarseValues,
+    InexactDerivatives,
+    Kink,
+    Linearization,
+    MeanSlope,
+    RefutedDerivatives,
+    StepsOnly,
+    ZeroSlope,
+)
 from .measure import FrequencyResponse, StepResponse
 from .paper import Channel, Fig3Diagram, Rig, experiments, fig3
 from .report import analyse
@@ -90,6 +99,7 @@ __all__ = [
     "BlockReport",
     "Box",
     "Channel",
+    "CoarseValues",
     "Comparison",
     "Contact",
     "ContactAdmittance",

@@ -220,7 +220,7 @@ PUBLIC = {
         mass_spring_damper model_spec read_description scara tune
     """,
     "diagrams": """
-        AdmittanceLoop BlockReport Box Channel Comparison Contact ContactAdmittance ContactConfirmation ContactLimit ContactMap
+        AdmittanceLoop BlockReport Box Channel CoarseValues Comparison Contact ContactAdmittance ContactConfirmation ContactLimit ContactMap
         ContactTrial Coupling CouplingReport Diagram DiskMargin Drawing Failure Fig3Diagram FlatDiagram FrequencyResponse
         GainCrossover GangOfFour InexactDerivatives Interrupted InterruptedSweep Kink Layout Linearization Margins MeanSlope MeasuredMargins Number
         NyquistCount Occurrence OperatingPoint Passivity PassivityReason PeriodicMargins PhaseCrossover Plot PortPassivity Reduction RefutedDerivatives Report Requirements Review

@@ -38,7 +38,7 @@ LONG = {
 }
 """Arguments that are right, and take long."""
 RESULTS = {
-    "Array", "BlockReport", "Call", "Channel", "Comparison", "Contact", "ContactAdmittance", "ContactConfirmation",
+    "Array", "BlockReport", "Call", "Channel", "CoarseValues", "Comparison", "Contact", "ContactAdmittance", "ContactConfirmation",
     "ContactLimit", "ContactMap", "ContactTrial", "CouplingReport", "DiskMargin", "Drawing", "Event", "Failure",
     "Fig3Diagram", "FlatDiagram", "Frame", "FrequencyResponse", "GainCrossover", "GangOfFour", "InexactDerivatives",
     "Input", "Kink", "Layout", "Linearization", "Margins", "MeanSlope", "MeasuredMargins", "Number", "NyquistCount",

@@ -3,6 +3,7 @@
 from .derivatives import Tap, find_signal
 from .findings import (
     BlockFinding,
+    CoarseValues,
     CutFromTracking,
     EntryTaken,
     EventWithinPeriod,
@@ -25,6 +26,7 @@ from .trim_search import point_from_states, trim
 
 __all__ = [
     "BlockFinding",
+    "CoarseValues",
     "CutFromTracking",
     "EntryTaken",
     "EventWithinPeriod",

@@ -17,7 +17,7 @@ from ..exchange import ExchangeEvaluator
 from ..flat import Evaluators, FlatDiagram
 from ..results import OperatingPoint
 from ..wiring import join
-from .findings import InexactDerivatives, RefutedDerivatives
+from .findings import CoarseValues, InexactDerivatives, RefutedDerivatives
 
 if TYPE_CHECKING:
     from ...fmus.running import Fmu
@@ -81,13 +81,14 @@ class PointEvaluator(ExchangeEvaluator):
         if x.size and not self._fmu.description.states:  # its states have no names by which they could be moved
             found = super().differences(names, t, x, u)
             error = float(np.abs(found - super().differences(names, t, x, u, 2.0)).max(initial=0.0))
+            coarseness = 0.0
         else:
-            found, error = find_exchange_slopes(
-                self._fmu, self._wired, lambda x, u: self.evaluate(names, t, x, u).copy(), x, u
-            )
+            made = find_exchange_slopes(self._fmu, self._wired, lambda x, u: self.evaluate(names, t, x, u).copy(), x, u)
+            found, error, coarseness = made.J, float(np.max(made.error, initial=0.0)), made.find_coarseness()
         self._note(error, found)
         self._differenced.add(names)
-        self.derivation = replace(self.derivation, method=DerivativeMethod.DIFFERENCES)
+        worst = max(coarseness, self.derivation.coarseness)
+        self.derivation = replace(self.derivation, method=DerivativeMethod.DIFFERENCES, coarseness=worst)
         return found
 
 
@@ -137,12 +138,14 @@ def derivations_at(
 
 
 def findings_on(derivations: Mapping[str, Derivation]) -> list[Finding]:
-    """Return findings on the FMUs whose directional derivatives are not exact."""
-    return [
-        RefutedDerivatives(path, d.gap) if d.refuted else InexactDerivatives(path, d.gap)
-        for path, d in sorted(derivations.items())
-        if d.gap != 0.0
-    ]
+    """Return findings on the FMUs whose derivatives are not exact, or whose values are too coarse for differences."""
+    found: list[Finding] = []
+    for path, d in sorted(derivations.items()):
+        if d.gap != 0.0:
+            found.append(RefutedDerivatives(path, d.gap) if d.refuted else InexactDerivatives(path, d.gap))
+        if d.coarseness:
+            found.append(CoarseValues(path, d.coarseness))
+    return found
 
 
 def noise_of(evaluators: Evaluators | None) -> tuple[float, float]:

@@ -266,6 +266,31 @@ class RefutedDerivatives(Finding):
 
 
 @dataclass(frozen=True)
+class CoarseValues(Finding):
+    """Values of an FMU without directional derivatives that are too coarse to tell all their slopes by differences.
+
+    They move in steps (a converter, single precision beside a large offset), or have a kink at the point.
+
+    Attributes
+    ----------
+    block : str
+        Path of the FMU.
+    error : float
+        Largest error of a derivative, relative to the largest change of the value that it belongs to.
+    """
+
+    block: str
+    error: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.block}: its values move in steps, or have a kink at this point: differences tell their slopes to "
+            f"{self.error:.2g} of the largest change alone. Take an FMU with directional derivatives, or in double "
+            "precision"
+        )
+
+
+@dataclass(frozen=True)
 class EntryTaken(Finding):
     """An entry of a signal that was asked for by its name, ``"motor_force[1]"``.
 

@@ -11,6 +11,7 @@ from .native_step import NativeAction, NativeLook, NativeStep, QuietStep, Remote
 from .saved_state import FmuState
 from .step_failures import NEAR
 from .step_options import StepOptions, StepTime, check_offered
+from .transfer import is_kept
 
 __all__ = [
     "CALLS",
@@ -40,6 +41,7 @@ __all__ = [
     "bind_functions",
     "check_offered",
     "exported_name",
+    "is_kept",
     "is_smooth",
     "list_prototypes",
 ]

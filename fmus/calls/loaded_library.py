@@ -23,7 +23,7 @@ from .message_log import MessageLog, clean_text, describe_end
 from .shared_steps import SharedReading
 from .step_options import choose_modes
 from .texts import is_readable, list_limits, read_text, waits_for_initialization, write_text
-from .transfer import BoundStart
+from .transfer import BoundStart, is_kept
 
 CALLS: dict[str, type[FmiCalls]] = {"1": Fmi1Calls, "2": Fmi2Calls, "3": Fmi3Calls}
 """Functions by the major version of FMI."""
@@ -203,9 +203,8 @@ class LoadedFmu:
         numbers = dict(sorted(numbers.items(), key=lambda item: item[1].type))  # those of a type are read in one call
         found = self.read_variables(numbers.values())
         for name, v in numbers.items():
-            tolerance = 1e-6 if v.type == "Float32" else 1e-12
             put, at = np.ravel(given[name]).astype(float), at + v.size
-            if not np.all(np.abs(found[at - v.size : at] - put) <= tolerance * np.abs(put)):  # a NaN is lost, too
+            if not is_kept(found[at - v.size : at], put, single=v.type == "Float32"):
                 lost[name] = given[name]
         return lost
 

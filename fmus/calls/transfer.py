@@ -17,6 +17,22 @@ from .texts import waits_for_initialization
 _ROUNDED = 1e-12
 
 
+EXACT, SINGLE = 1e-12, 1e-6
+"""Relative distances up to which a value is kept, of double precision and of variables in single precision."""
+
+
+def is_kept(found: np.ndarray, put: np.ndarray, *, single: bool = False, tolerance: float = EXACT) -> bool:
+    """Return whether an FMU has the values that were set; a NaN is lost.
+
+    An FMU may compute in single precision behind variables in double precision: their nearest numbers are the values.
+    """
+    if single:
+        tolerance = SINGLE
+    with np.errstate(over="ignore"):
+        rounded = put.astype(np.float32).astype(float)
+    return bool(np.all((np.abs(found - put) <= tolerance * np.abs(put)) | (found == rounded)))
+
+
 class Transfer:
     """Calls that get or set the values of ports, all of one type in one call.
 

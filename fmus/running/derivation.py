@@ -45,6 +45,9 @@ class Derivation:
         size; 0 where they agree, NaN where they could not be compared.
     refuted : bool
         Whether that gap is so large that differences stand in for the derivatives that are wrong.
+    coarseness : float
+        Largest error of a derivative by differences, relative to the largest change of its row, where the FMU's values
+        move in steps, are coarsely rounded, or have a kink; 0 where they tell their slopes well.
 
     Examples
     --------
@@ -59,6 +62,7 @@ class Derivation:
     restarted: bool = False
     gap: float = 0.0
     refuted: bool = False
+    coarseness: float = 0.0
 
     @property
     def is_exact(self) -> bool:
@@ -79,6 +83,8 @@ class Derivation:
             text += ", which could not be compared with differences"
         elif self.gap:
             text += f", off by {self.gap:.2g} of their size"
+        if self.coarseness:
+            text += f", right to {self.coarseness:.2g} of the largest change alone, as the values are coarse"
         if self.restarted:
             text += ", each from a new start, as the FMU does not restore its state though it says so"
         return text

@@ -13,7 +13,7 @@ from ...blocks.tracing import NEXT
 from ..archive import FmuDescription, FmuVariable
 from ..calls import ExchangeInstance, is_smooth
 from ..isolation import open_fmu
-from .differences import Column, differentiate
+from .differences import Column, Differences, differentiate
 from .slope_check import SlopeCheck, check_slopes
 
 INTERFACES = ("co_simulation", "model_exchange")
@@ -184,8 +184,8 @@ def find_exchange_slopes(
     values: Callable[[np.ndarray, np.ndarray], np.ndarray],
     x: np.ndarray,
     u: np.ndarray,
-) -> tuple[np.ndarray, float]:
-    """Return the derivative of values by (x, u) of model exchange, by differences, and its largest estimated error.
+) -> Differences:
+    """Return the derivative of values by (x, u) of model exchange, by differences.
 
     Parameters
     ----------
@@ -199,7 +199,8 @@ def find_exchange_slopes(
     parts = [(v, x, where) for v, where in _states_in(block)]
     parts += [(v, u, places[port]) for port, v in moved.items()]
     base = values(x, u)
-    J, worst = np.zeros((base.size, x.size + u.size)), 0.0
+    many = x.size + u.size
+    made = Differences(np.zeros((base.size, 0)), np.zeros((base.size, 0)), np.zeros(0), base).place([], many)
     for variable, vector, where in parts:
         column = Column(about, [variable.name], vector[where], EQUATIONS)
 
@@ -208,11 +209,9 @@ def find_exchange_slopes(
             changed[where] = moved
             return values(changed, u) if vector is x else values(x, changed)
 
-        found, error = differentiate(column, base, evaluate)
         first = where.start if vector is x else x.size + where.start
-        J[:, first : first + variable.size] = found
-        worst = max(worst, float(np.max(error, initial=0.0)))
-    return J, worst
+        made += differentiate(column, base, evaluate).place([*range(first, first + variable.size)], many)
+    return made
 
 
 def _states_in(block: ExchangeMembers) -> Iterator[tuple[FmuVariable, slice]]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...blocks.core import FmuError, Layout, ParameterError, UnknownNameError, brief, elements, explain_calls, near
 from ..archive import FmuDescription
-from ..calls import FmuBlock, LoadedFmu
+from ..calls import FmuBlock, LoadedFmu, is_kept
 from ..isolation import open_fmu
 from .derivation import Derivation
 from .start_values import check_state
@@ -118,7 +118,7 @@ class FmuPoint:
     def check(self, found: np.ndarray) -> None:
         """Refuse an operating point that the FMU does not accept."""
         for name, part in self.about.layout(self.states).split(found).items():
-            if name in self.given and not np.allclose(part, self.given[name], rtol=1e-9, atol=0.0):
+            if name in self.given and not is_kept(part, np.ravel(self.given[name]).astype(float), tolerance=1e-9):
                 raise FmuError(
                     f"its state was set to {self.given[name].tolist()}, but is {np.ravel(part).tolist()} when the FMU "
                     f"has initialized at t = {self.t:.9g} s: an event there changes it, or its start value is only a "

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from ...blocks.core import FmuError, ParameterError
 from ..calls import LoadedFmu
 from .derivation import Derivation, DerivativeMethod
-from .differences import Column, differentiate
+from .differences import Column, Differences, differentiate
 from .fmu_point import FmuLinearization, FmuPoint, LinearizableFmu, initialize_at
 from .slope_check import SlopeCheck, check_slopes
 
@@ -141,8 +142,9 @@ def _linearize_by_directions(point: FmuPoint, instance: LoadedFmu) -> FmuLineari
     if others.any():  # local variables
         if not instance.model_exchange:
             _initialize_anew(point, instance)
-        J, error = _differences(point, instance, values)
-        part[others], uncertainty[others] = J[others], error[others]
+        found_too = _differences(point, instance, values)
+        part[others], uncertainty[others] = found_too.J[others], found_too.error[others]
+        derivation = replace(derivation, coarseness=found_too.find_coarseness(others))
     J = point.widen(part)
     return point.model(J, x, u, values, h=None, derivation=derivation, uncertainty=point.widen(uncertainty))
 
@@ -177,7 +179,10 @@ def _check(point: FmuPoint, instance: LoadedFmu, J: np.ndarray, rows: np.ndarray
         return SlopeCheck(J, np.zeros(J.shape), np.nan, is_wrong=False)
     limits = [np.concatenate([np.ravel(v.limits[side]) for v in variables]) for side in (0, 1)]
     nominals = np.concatenate([np.ravel(v.nominals) for v in variables])
-    return check_slopes(J, values, at, nominals, (limits[0], limits[1]), np.concatenate(moved))
+    found = check_slopes(J, values, at, nominals, (limits[0], limits[1]), np.concatenate(moved))
+    with suppress(FmuError):
+        values(at)  # further derivatives are those of the point, not of where the check has ended
+    return found
 
 
 def _initialize_anew(point: FmuPoint, instance: LoadedFmu) -> None:
@@ -209,28 +214,32 @@ def _linearize_by_differences(point: FmuPoint, instance: LoadedFmu) -> FmuLinear
     x, u = instance.values(point.states), instance.values(point.inputs)
     point.check(x)
     values = _values(point, instance)
-    J, uncertainty = map(point.widen, _differences(point, instance, values))
-    derivation = Derivation(DerivativeMethod.DIFFERENCES, _interface_name(instance.model_exchange))
+    made = _differences(point, instance, values)
+    J, uncertainty = point.widen(made.J), point.widen(made.error)
+    interface = _interface_name(instance.model_exchange)
+    coarseness = made.find_coarseness(point.smooth([*point.states, *point.outputs]))
+    derivation = Derivation(DerivativeMethod.DIFFERENCES, interface, coarseness=coarseness)
     return point.model(J, x, u, values, h=None, derivation=derivation, uncertainty=uncertainty)
 
 
-def _differences(point: FmuPoint, instance: LoadedFmu, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of `_values` by states and inputs, and their errors, by differences."""
+def _differences(point: FmuPoint, instance: LoadedFmu, values: np.ndarray) -> Differences:
+    """Return the derivatives of `_values` by states and inputs, by differences."""
     x = instance.values(point.states)
     at = np.concatenate([x, instance.values(point.moved)])
     column = Column(point.about, [*point.states, *point.moved], at, EQUATIONS)
 
+    def move(name: str, to: np.ndarray) -> None:
+        if instance.model_exchange and name in point.states:
+            instance.set_continuous_states(to[: x.size])
+        else:
+            instance.set_values({name: column.part(name, to)})
+
     def evaluate(name: str, moved: np.ndarray) -> np.ndarray:
         with _mode_of(point, instance, name):
-            if instance.model_exchange and name in point.states:
-                instance.set_continuous_states(moved[: x.size])
-            else:
-                instance.set_values({name: column.part(name, moved)})
-            found = _values(point, instance)
-            if instance.model_exchange and name in point.states:
-                instance.set_continuous_states(x)
-            else:
-                instance.set_values({name: column.part(name, column.at)})
-        return found
+            try:
+                move(name, moved)
+                return _values(point, instance)
+            finally:
+                move(name, column.at)
 
     return differentiate(column, values, evaluate)

@@ -82,10 +82,15 @@ def _linearize_step(point: FmuPoint, instance: LoadedFmu, h: float, relative_ste
             change = {name: column.part(name, moved)}
             return step_from_point(change, {}) if name in point.states else step_from_point({}, change)
 
-        J, uncertainty = map(point.widen, differentiate(column, values, evaluate))
+        found = differentiate(column, values, evaluate)
     finally:
         back.free()
-    derivation = Derivation(DerivativeMethod.STEP_DIFFERENCES, restarted=back.lied)
+    way = DerivativeMethod.STEP_DIFFERENCES
+    coarseness = found.find_coarseness(point.smooth([*point.states, *point.outputs]))
+    derivation = Derivation(way, restarted=back.lied, coarseness=coarseness)
+    # a solver's error is relative to the largest values, whichever row it is in
+    shared = np.finfo(float).eps * np.max(np.abs(values), initial=0.0) / (relative_step * found.sizes)
+    J, uncertainty = point.widen(found.J), point.widen(found.error + shared)
     return point.model(J, x, u, values, h=h, derivation=derivation, uncertainty=uncertainty)
 
 
