@@ -265,6 +265,7 @@ class RefutedDerivatives(Finding):
         )
 
 
+@explain_calls
 @dataclass(frozen=True)
 class CoarseValues(Finding):
     """Values of an FMU without directional derivatives that are too coarse to tell all their slopes by differences.
