@@ -16,7 +16,7 @@ from .grouping import Tables, make_tables
 from .kernels import write_kernels
 from .libraries import CompiledFunction, address_of, is_kept, load_compiled, read_sources
 from .reordered import put_in_order
-from .staged_functions import Staged
+from .staged_functions import Staged, StagedEquations
 
 LARGEST = 6_000
 """Operations of a function up to which it is compiled as a whole: the compiler's time grows faster than they do."""
@@ -71,7 +71,7 @@ class TickCode:
     ticks: Mapping[frozenset[TickPattern], CompiledTick]
     exact: bool
     library: ctypes.CDLL
-    loops: Mapping[frozenset[TickPattern], CompiledFunction] = field(default_factory=dict)
+    loops: Mapping[frozenset[TickPattern], CompiledFunction | StagedEquations] = field(default_factory=dict)
     master: Any = None
     notes: tuple[str, ...] = ()
 
@@ -170,9 +170,13 @@ def write_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> 
 
 
 def loop_functions(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> dict[frozenset[TickPattern], Any]:
-    """Return the equations of the algebraic loops at ticks: their mismatch, and its derivative."""
+    """Return the equations of the algebraic loops at ticks, mismatch and derivative, but for those in stages."""
     found = {clocks: flat.loop_equations(clocks) for clocks in acting} if flat.loops.slices else {}
-    return {c: share_terms(made.fast, f"loops{i}") for i, (c, made) in enumerate(found.items()) if made is not None}
+    return {
+        c: share_terms(made.fast, f"loops{i}")
+        for i, (c, made) in enumerate(found.items())
+        if made is not None and not made.schedule.opaque
+    }
 
 
 def write_loops(loops: Mapping[frozenset[TickPattern], Any]) -> str:

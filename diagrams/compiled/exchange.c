@@ -347,13 +347,22 @@ static inline bool has_news(const outside *o) {
 /* The derivative of the rates by differences: columns without a common row are moved together. */
 typedef struct {
     const tick *rates;
-    double *x, *dx, *before, *step;
+    newton *loops;                  /* algebraic loops, which are solved wherever the states are moved to; NULL: none */
+    double *x, *dx, *before, *step, *values; /* values: of the loops, where the states have not been moved */
     const double *typical;          /* sizes of the states, below which steps don't become smaller */
     int64_t n, colors;
     const int64_t *where;           /* of each column: its entry of x */
     const int32_t *first, *columns; /* of each color: where its columns begin */
     const int32_t *rows_first, *rows; /* of each column: where its rows begin */
 } slopes_of;
+
+static inline void keep_loops(const newton *s, const double *x, double *values) {
+    for (int64_t i = 0; i < s->n; i++) values[i] = x[s->where[i]];
+}
+
+static inline void put_loops(const newton *s, const double *values, double *x) {
+    for (int64_t i = 0; i < s->n; i++) x[s->where[i]] = values[i];
+}
 
 VISIBLE int loopwright_slopes(const double **arguments, double **results, long long *iw, double *w, int memory) {
     const slopes_of *g = (const slopes_of *)iw;
@@ -362,6 +371,7 @@ VISIBLE int loopwright_slopes(const double **arguments, double **results, long l
     (void)arguments, (void)w;
     if (f->evaluate(f->arguments, into, f->iw, f->w, memory)) return 1;
     memcpy(g->before, g->dx, (size_t)g->n * sizeof(double));
+    if (g->loops) keep_loops(g->loops, g->x, g->values);
     for (int64_t c = 0; c < g->colors; c++) {
         for (int32_t k = g->first[c]; k < g->first[c + 1]; k++) {
             double *x = g->x + g->where[g->columns[k]];
@@ -369,7 +379,7 @@ VISIBLE int loopwright_slopes(const double **arguments, double **results, long l
             g->step[k] = *x;
             *x = moved;
         }
-        const int failed = f->evaluate(f->arguments, into, f->iw, f->w, memory);
+        const int failed = (g->loops && !solve_loops(g->loops, g->x)) || f->evaluate(f->arguments, into, f->iw, f->w, memory);
         for (int32_t k = g->first[c]; k < g->first[c + 1]; k++) {
             const int32_t j = g->columns[k];
             double *x = g->x + g->where[j];
@@ -378,7 +388,17 @@ VISIBLE int loopwright_slopes(const double **arguments, double **results, long l
             for (int32_t i = g->rows_first[j]; i < g->rows_first[j + 1]; i++)
                 out[i] = (g->dx[g->rows[i]] - g->before[g->rows[i]]) / h;
         }
+        if (g->loops) put_loops(g->loops, g->values, g->x);
         if (failed) return 1;
     }
+    return 0;
+}
+
+/* The mismatch of algebraic loops, and its derivative by their values. */
+VISIBLE int loopwright_equations(const double **arguments, double **results, long long *iw, double *w, int memory) {
+    const slopes_of *g = (const slopes_of *)iw;
+    double *into[] = {results[1]};
+    if (loopwright_slopes(arguments, into, iw, w, memory)) return 1;
+    memcpy(results[0], g->before, (size_t)g->n * sizeof(double));
     return 0;
 }

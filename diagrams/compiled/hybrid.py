@@ -14,7 +14,7 @@ from ..flat import NONE, FlatDiagram, TickPattern
 from .bound import BoundFunction, address
 from .hybrid_code import Between, HybridCode, hybrid_master
 from .hybrid_structures import HybridStructure, MethodStructure, ProblemStructure, SpanStructure
-from .loop import CompiledLoop, NewtonOptions, OutcomeStructure
+from .loop import CompiledLoop, NewtonOptions, NewtonStructure, OutcomeStructure
 from .radau import radau_numbers
 from .staged import NativeExchange
 from .staged_functions import Staged, StagedSlopes
@@ -152,16 +152,15 @@ class CompiledHybrid:
     ):
         self.ticks, self._kept = loop, list[Any]([code, arguments, x_next])
         self.kinds: Mapping[frozenset[TickPattern], int] = loop.kinds
-        n, width = flat.continuous.size, flat.width
-        _, x, w, p = arguments
+        n, width, (_, x, w, p) = flat.continuous.size, flat.width, arguments
         trial = [np.zeros(1), x.copy(), w, p]
         where = self._own(flat.continuous.astype(np.int64))
         slope = code.between.get("slope")
         slopes = np.zeros(0 if slope is None else n * n if loops else len(slope.pattern[0]))
         self._hybrid = hybrid = HybridStructure(l=loop.structure, automatic=len(methods) > 1, accepts=accepts)
         self._exchange, hybrid.looked = exchange, np.nan
-        self._tolerances: list[np.ndarray] = []
-        z, inputs = held
+        self._solver: NewtonStructure | None = None
+        self._tolerances, (z, inputs) = list[np.ndarray](), held
         if inputs is not z:
             hybrid.z, hybrid.held, hybrid.inputs = self._own(z), self._own(inputs), z.size
         hybrid.budget = self._largest_budget = _budget(code.between["flow"].operations, methods, n)
@@ -180,16 +179,17 @@ class CompiledHybrid:
         results = [slopes]
         if loops is not None:
             m = len(loops.where)
-            solver = loop.bind_loops(code.ticks, NONE, trial, loops)
-            through = np.zeros(2 * n * m)
-            self._kept.append(solver)
-            hybrid.p.loops, hybrid.p.here, hybrid.p.by_loops = ctypes.addressof(solver), address(x), self._own(through)
+            self._solver = loop.bind_loops(code.ticks, NONE, trial, loops)
+            hybrid.p.loops, hybrid.p.here = ctypes.addressof(self._solver), address(x)
             hybrid.solved = self._own(np.zeros(m))
-            results += [through[: n * m], through[n * m :], np.zeros(m * m)]
+            if not isinstance(slope, StagedSlopes):
+                through = np.zeros(2 * n * m)
+                hybrid.p.by_loops = self._own(through)
+                results += [through[: n * m], through[n * m :], np.zeros(m * m)]
         if slope is not None:
             typical = np.maximum(np.abs(methods[-1].atol) / methods[-1].rtol, 1e-300)
             hybrid.p.slope = self._bind(slope, trial, results, typical)
-            if loops is None:
+            if loops is None or isinstance(slope, StagedSlopes):
                 rows, columns = slope.pattern
                 hybrid.p.entries = len(rows)
                 hybrid.p.row, hybrid.p.column = (self._own(np.array([*v, 0], dtype=np.int64)) for v in (rows, columns))
@@ -247,7 +247,7 @@ class CompiledHybrid:
             return self._exchange.bind(function, arguments, results)
         if self._exchange is not None and isinstance(function, StagedSlopes):
             assert typical is not None
-            return self._exchange.bind_slopes(function, arguments, results, typical)
+            return self._exchange.bind_slopes(function, arguments, results, typical, self._solver)
         bound = BoundFunction(function, arguments, results, typical)
         self._kept.append(bound)
         return bound.structure

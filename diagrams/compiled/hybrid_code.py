@@ -28,7 +28,7 @@ from .grouping import make_part_tables, make_tables
 from .kernels import write_kernels
 from .libraries import CompiledFunction, address_of, load_compiled, read_sources
 from .small_steps import STEPS, write_steps
-from .staged_functions import Staged, StagedSlopes
+from .staged_functions import Staged, StagedEquations, StagedSlopes
 from .step_outputs import may_fail_at_steps
 
 _SOURCES = (
@@ -124,8 +124,6 @@ def find_hybrid_obstacle(flat: FlatDiagram, solver: str) -> str | None:
     delayed = sorted({path for name in flat.plant_inputs.slices if blocks[path := flat.ports[name][0]].transport})
     if delayed:
         return f"the transport delay {delayed[0]!r} keeps its past in Python"
-    if flat.outside and flat.loops.slices:
-        return f"it has an algebraic loop beside the FMU {flat.outside[0]!r} in model exchange"
     opaque = sorted(path for path in flat.checked.traced if blocks[path].opaque and path not in flat.outside)
     if opaque and flat.outside:
         return f"Python evaluates the block {opaque[0]!r} beside the FMU {flat.outside[0]!r} in model exchange"
@@ -182,7 +180,8 @@ def write_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *,
 
     def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
         code = replace(written.make(libraries), judged=judged)
-        return replace(code, ticks=replace(code.ticks, loops=find_loops(loops, libraries[-1]))) if loops else code
+        found = {**code.ticks.loops, **find_loops(loops, libraries[-1])} if loops else code.ticks.loops
+        return replace(code, ticks=replace(code.ticks, loops=found))
 
     return HybridSources([*written.texts, *([write_loops(loops)] if loops else [])], make)
 
@@ -217,6 +216,9 @@ def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *,
     schedules |= {"flow": flat.flow, "jump": flat.jump}
     if flat.events:
         schedules["indicators"] = flat.indicators
+    equations = {f"loops_at{i}": (c, flat.loop_equations(c)) for i, c in enumerate(kinds if flat.loops.slices else ())}
+    looped = {name: (c, made.schedule) for name, (c, made) in equations.items() if made and made.schedule.opaque}
+    schedules |= {name: schedule for name, (_, schedule) in looped.items()}
     functions: dict[str, list[Any]] = {}
     for name, schedule in schedules.items():
         traced = [stage.fast for stage in schedule.stages if not isinstance(stage, OpaqueStage)]
@@ -231,10 +233,11 @@ def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *,
             for name, schedule in schedules.items()
         }
         ticks = {clocks: staged.pop(f"tick{i}") for i, clocks in enumerate(kinds)}
+        loops = {c: StagedEquations(staged.pop(name), flat.active_loops(c)) for name, (c, _) in looped.items()}
         between: dict[str, Between] = {**staged}
         if stiff:
-            between["slope"] = StagedSlopes.of(staged["flow"], flat.continuous)
-        return HybridCode(TickCode(ticks, exact=False, library=library), between)
+            between["slope"] = StagedSlopes.of(staged["flow"], flat.continuous, looped=bool(flat.active_loops(NONE)))
+        return HybridCode(TickCode(ticks, exact=False, library=library, loops=loops), between)
 
     return HybridSources([write_functions("hybrid", chain(*functions.values()))], make)
 

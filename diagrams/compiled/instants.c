@@ -192,7 +192,9 @@ static bool see(hybrid *h, int64_t look) {
     outside *o = h->o;
     o->look = look;
     for (int64_t i = 0; i < h->w.m; i++) h->w.fired[i] = 0.0;
-    if (o->lost || o->failed || call(&o->jump)) return false;
+    if (o->lost || o->failed) return false;
+    if (h->p.loops && !solve_loops(h->l.loops + h->between, h->l.x)) return false; /* states may have jumped */
+    if (call(&o->jump)) return false;
     memcpy(h->l.x, h->l.x_next, (size_t)h->l.states * sizeof(double));
     memcpy(h->p.x, h->l.x, (size_t)h->l.states * sizeof(double));
     return true;

@@ -17,7 +17,9 @@ from ..flat import TRUE, TickPattern
 from .code import CompiledTick, TickCode, master
 from .native_tick import at, bind_native
 from .remote import RemotePlants
-from .staged_functions import Staged
+from .staged_functions import Staged, StagedEquations
+
+_SEEN = 1e-6  # least singular value, relative to 1 + the loop's gain, that differences surely tell from 0
 
 
 class Reason(IntEnum):
@@ -151,6 +153,11 @@ class StagedBinding(Protocol):
     def bind(self, staged: Staged, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> ctypes.Structure:
         """Return a function bound to vectors, as C knows it."""
 
+    def bind_equations(
+        self, equations: StagedEquations, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
+    ) -> ctypes.Structure:
+        """Return the equations of algebraic loops bound to vectors, as C knows them."""
+
 
 class CompiledLoop:
     """The loop over ticks, bound to the numbers of a run.
@@ -237,13 +244,15 @@ class CompiledLoop:
 
     def _tick(
         self,
-        tick: CompiledTick,
+        tick: CompiledTick | StagedEquations,
         arguments: Sequence[np.ndarray],
         results: Sequence[np.ndarray],
     ) -> ctypes.Structure:
-        if isinstance(tick, Staged):
+        if isinstance(tick, Staged | StagedEquations):
             assert self._exchange is not None
-            return self._exchange.bind(tick, arguments, results)
+            if isinstance(tick, Staged):
+                return self._exchange.bind(tick, arguments, results)
+            return self._exchange.bind_equations(tick, arguments, results)
         bound = bind_native(tick, arguments, results)
         self._kept.append(bound)
         return TickStructure(bound.address, bound.arguments, bound.results, bound.iw, bound.w)
@@ -254,7 +263,7 @@ class CompiledLoop:
         clocks: frozenset[TickPattern],
         arguments: Sequence[np.ndarray],
         options: NewtonOptions | None,
-    ) -> ctypes.Structure:
+    ) -> NewtonStructure:
         """Return the algebraic loops at a tick, bound to the vectors (t, x, w, p); valid as long as this lives."""
         if clocks not in code.loops or options is None:
             return NewtonStructure()
@@ -271,7 +280,7 @@ class CompiledLoop:
             rows=self._array(np.zeros(n, dtype=np.int64)),
             tolerance=options.tolerance,
             rounding=options.rounding,
-            singular=options.singular,
+            singular=max(options.singular, _SEEN if isinstance(code.loops[clocks], StagedEquations) else 0.0),
             iterations=options.iterations,
             halvings=options.halvings,
         )

@@ -108,7 +108,7 @@ static bool differentiate(method *m, double t, const double *x) {
     m->slope_is_new = 1;
     if (!look(p, t < p->stop ? t : p->stop, x)) return m->has_slope;
     if (call(&p->slope)) return m->has_slope;
-    if (p->loops && !lead_through_loops(p)) return m->has_slope;
+    if (p->loops && p->by_loops && !lead_through_loops(p)) return m->has_slope;
     if (!all_finite(p->slopes, p->row ? p->entries : n * n)) return m->has_slope;
     if (p->row) {
         memset(m->J, 0, n * n * sizeof(double));

@@ -14,10 +14,10 @@ from ...fmus.host_state import HostState
 from ..flat import JUMP, OpaqueStage
 from .grouped_parts import color_columns
 from .libraries import address_of
-from .loop import TickStructure
+from .loop import NewtonStructure, TickStructure
 from .native_tick import at, list_vectors
 from .remote import WAIT, LateReplies, RemotePlants
-from .staged_functions import Staged, StagedSlopes
+from .staged_functions import Staged, StagedEquations, StagedSlopes
 
 _LOGGED = 2**20  # bytes of events of inputs in a call
 _INT, _REAL, _AT = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
@@ -68,7 +68,7 @@ class _Schedule(ctypes.Structure):
 
 class _Slopes(ctypes.Structure):
     _fields_ = [
-        *_fields(_AT, "rates x dx before step typical"), *_fields(_INT, "n colors"),
+        *_fields(_AT, "rates loops x dx before step values typical"), *_fields(_INT, "n colors"),
         *_fields(_AT, "where first columns rows_first rows"),
     ]  # fmt: skip
 
@@ -122,7 +122,8 @@ class NativeExchange:
 
     def __init__(self, blocks: Mapping[str, NativeBlock], first: Mapping[str, int], width: int, library: ctypes.CDLL):
         self._blocks, self._width, self._kept = blocks, width, list[Any]()
-        self._stages, self._slopes = (address_of(library, f"loopwright_{name}") for name in ("stages", "slopes"))
+        names = ("stages", "slopes", "equations")
+        self._stages, self._slopes, self._equations = (address_of(library, f"loopwright_{name}") for name in names)
         self.paths = [*blocks]
         self._each = (_Exchanged * len(blocks))()
         self._names = dict[int, tuple[str, ...]]()
@@ -180,10 +181,25 @@ class NativeExchange:
         self._kept += [made, found]
         return TickStructure(self._stages, None, ctypes.addressof(last), ctypes.addressof(found), None)
 
-    def bind_slopes(
-        self, slopes: StagedSlopes, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], typical: np.ndarray
+    def bind_equations(
+        self, equations: StagedEquations, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
     ) -> TickStructure:
-        """Return the derivative of rates bound to vectors."""
+        """Return the equations of algebraic loops bound to vectors."""
+        where, n = np.array(equations.where), len(equations.where)
+        slopes = StagedSlopes(equations.mismatch, where, [np.arange(n, dtype=np.int32)] * n)
+        made = self.bind_slopes(slopes, arguments, results, np.ones(n))
+        made.evaluate = self._equations
+        return made
+
+    def bind_slopes(
+        self,
+        slopes: StagedSlopes,
+        arguments: Sequence[np.ndarray],
+        results: Sequence[np.ndarray],
+        typical: np.ndarray,
+        loops: NewtonStructure | None = None,
+    ) -> TickStructure:
+        """Return the derivative of rates bound to vectors; ``loops`` are solved wherever the states are moved to."""
         n = slopes.where.size
         dx = np.zeros(n)
         rates = self.bind(slopes.rates, arguments, [dx])
@@ -191,6 +207,8 @@ class NativeExchange:
         ends = np.cumsum([0, *map(len, slopes.rows)])
         found = _Slopes(
             rates=ctypes.addressof(rates),
+            loops=None if loops is None else ctypes.addressof(loops),
+            values=self._own(np.zeros(0 if loops is None else loops.n)),
             x=at(arguments[1]),
             dx=at(dx),
             **{name: self._own(np.zeros(n)) for name in ("before", "step")},
@@ -203,8 +221,8 @@ class NativeExchange:
             rows_first=self._own(ends.astype(np.int32)),
             rows=self._own(slopes.pattern[0].astype(np.int32)),
         )
-        into = list_vectors(results, 1)
-        self._kept += [rates, found, into, dx, arguments, results]
+        into = list_vectors(results, len(results))
+        self._kept += [rates, loops, found, into, dx, arguments, results]
         return TickStructure(self._slopes, None, ctypes.addressof(into), ctypes.addressof(found), None)
 
     def bind_jump(self, staged: Staged, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:

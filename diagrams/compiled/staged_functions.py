@@ -59,9 +59,9 @@ class StagedSlopes:
     rows: Sequence[np.ndarray]
 
     @staticmethod
-    def of(rates: Staged, where: np.ndarray) -> StagedSlopes:
-        """Return them for rates and the entries of x that are integrated."""
-        depends = rates.schedule.depends("dx", "x")[:, where]
+    def of(rates: Staged, where: np.ndarray, *, looped: bool = False) -> StagedSlopes:
+        """Return them for rates and the entries of x that are integrated; loops may lead from each to each."""
+        depends = np.ones((where.size, where.size), bool) if looped else rates.schedule.depends("dx", "x")[:, where]
         return StagedSlopes(rates, where, [np.flatnonzero(column).astype(np.int32) for column in depends.T])
 
     @property
@@ -74,3 +74,19 @@ class StagedSlopes:
         """Row and column of each entry."""
         columns = np.repeat(np.arange(len(self.where)), [len(own) for own in self.rows])
         return np.concatenate([np.zeros(0, dtype=np.int32), *self.rows]), columns
+
+
+@dataclass(frozen=True, eq=False)
+class StagedEquations:
+    """The mismatch of algebraic loops in stages, and its derivative by their values, by differences.
+
+    Attributes
+    ----------
+    mismatch : Staged
+        The mismatch.
+    where : sequence of int
+        Entries of x that hold the values.
+    """
+
+    mismatch: Staged
+    where: Sequence[int]
