@@ -100,18 +100,18 @@ def _has_any(function: Any) -> bool:
 def _any_call_may_fail(flat: FlatDiagram) -> bool:
     """Whether any call of a block's function between ticks may fail, whatever the rates do."""
     program = flat.program_at(NONE).program
-    moving = np.zeros(program.count, dtype=bool)
+    moving = bytearray(program.count)
     states = np.array(program.x.ids, dtype=np.int64)
-    moving[list(program.t.ids)] = True
-    moving[states[flat.continuous]] = True
+    for value in (*program.t.ids, *states[flat.continuous].tolist()):
+        moving[value] = 1
     of_python = {id(flat.blocks.of(path, names)) for path, names in flat.order.steps if flat.table.blocks[path].opaque}
     judged = dict[tuple[int | str, tuple[bool, ...]], bool]()
     for op in program.operations:
-        columns = tuple(bool(moving[column.start : column.stop].any()) for column in op.arguments)
-        if not any(columns):
+        columns = tuple([1 in moving[column.start : column.stop] for column in op.arguments])
+        if True not in columns:
             continue
         for made in op.results:
-            moving[made.start : made.stop] = True
+            moving[made.start : made.stop] = b"\1" * len(made)
         key = op.kernel, columns
         if op.kernel in program.functions and key not in judged:
             function = program.functions[op.kernel]

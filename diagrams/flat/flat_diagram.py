@@ -20,9 +20,9 @@ from ...blocks.core import Block, brief, count_of, explain_calls
 from ..wiring import Checked, Structure
 from . import functions
 from .block_functions import BlockFunctions
-from .clocks import TickPattern
+from .clocks import NONE, TickPattern
 from .layout import FlatLayout, sample_time_of
-from .program import PartProgram, TickProgram
+from .program import Cells, PartProgram, TickProgram
 from .stages import Schedule
 from .total_derivative import Derivative
 
@@ -132,6 +132,10 @@ class FlatDiagram(FlatLayout):
 
     def part_program(self, name: str) -> PartProgram:
         """Return "flow", "indicators" or "jump" as calls of block functions, for grouped code."""
+        if name == "flow":  # the blocks are gone through once for the tick at which no clock acts, and for this
+            tick = self.program_at(NONE)
+            assert tick.rates is not None
+            return PartProgram.of(tick.program, Cells(tick.program, tick.rates))
         return functions.trace_part_program(self, self.blocks, name)
 
     @_shared

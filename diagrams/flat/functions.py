@@ -76,6 +76,7 @@ def trace_tick_program(layout: FlatLayout, functions: BlockFunctions, acting: fr
     program = Program((layout.width, layout.plant_outputs.total, layout.parameters.total))
     instant = evaluate(layout, functions, acting, program.t, program.x, program.w, program.p)
     made, taken = zip(*instant.mismatch, strict=True) if instant.mismatch else ((), ())
+    flow = program.join([rates(instant)]).ids if acting == NONE else None
     return TickProgram(
         program,
         x_next=program.join([next_x(instant)]).ids,
@@ -83,6 +84,7 @@ def trace_tick_program(layout: FlatLayout, functions: BlockFunctions, acting: fr
         log=program.join([instant.w, *outputs_of(instant), kept_states(instant)]).ids,
         guards=program.join(instant.guards).ids,
         mismatch=(program.join(made).ids, program.join(taken).ids) if layout.loops.slices else None,
+        rates=flow,
     )
 
 
@@ -203,20 +205,14 @@ def _let_fire(instant: Instant) -> None:
                         instant.new[path] = choose(opens, rows(x, where), old)
 
 
-PARTS = ("flow", "indicators", "jump")
-"""Functions between ticks that grouped code is made from."""
-
-
 @without_collection
 def trace_part_program(layout: FlatLayout, functions: BlockFunctions, name: str) -> PartProgram:
-    """Return one of `PARTS` as a program; that of a jump takes which events fire as a further argument."""
+    """Return "indicators" or "jump" as a program; a jump takes which events fire as a further argument."""
     fires = name == "jump"
     sizes = (layout.width, layout.plant_outputs.total, layout.parameters.total)
     program = Program(sizes, len(layout.events) if fires else 0)
     fired = program.more if fires else None
     instant = evaluate(layout, functions, NONE, program.t, program.x, program.w, program.p, fired=fired)
-    if name == "flow":
-        return PartProgram.of(program, program.join([rates(instant)]))
     if name == "indicators":
         return PartProgram.of(program, *map(program.join, indicators_of(instant)))
     _let_fire(instant)

@@ -224,7 +224,7 @@ class FlatLayout:
     def active_loops(self, acting: frozenset[TickPattern]) -> list[int]:
         """Return the entries of x that hold the torn ports that act, in the order in which they come round."""
         found: list[int] = []
-        for path, names in self.order.steps:
+        for path, names in self.order.steps if self.loops.slices else ():
             clock = self.clocks.get(self.table.subsystem_of[path])
             if clock is None or clock in acting:
                 found += self.loops.entries(full for name in names if (full := join(path, name)) in self.loops.slices)

@@ -96,11 +96,11 @@ class Program:
 
     def constant(self, values: Any) -> range:
         """Return the values that hold some numbers."""
-        numbers = np.ravel(np.asarray(values, dtype=float))
+        numbers = np.asarray(values, dtype=float)
         key = numbers.tobytes()
         if key not in self._constants:
             made = self._constants[key] = self._make(numbers.size)
-            self.constants.update(zip(made, numbers.tolist(), strict=True))
+            self.constants.update(zip(made, numbers.ravel().tolist(), strict=True))
         return self._constants[key]
 
     def ids(self, column: Any) -> Ids:
@@ -113,8 +113,8 @@ class Program:
         if key not in self._sizes:
             self.functions[key] = function
             self._sizes[key] = [function.numel_out(i) for i in range(function.n_out())]
-        given = tuple(self._together(self.ids(column)) for column in arguments)
-        results = tuple(self._make(size) for size in self._sizes[key])
+        given = tuple([self._together(self.ids(column)) for column in arguments])
+        results = tuple([self._make(size) for size in self._sizes[key]])
         self.operations.append(Operation(key, given, results))
         return [Cells(self, made) for made in results]
 
@@ -164,6 +164,8 @@ class TickProgram:
         The values that become the results of a tick; ``log`` is without the residual.
     mismatch : tuple of Ids, or None
         Of algebraic loops: what came round, and what was taken; None where the log has no residual.
+    rates : Ids, or None
+        The rates of the integrated states at an instant at which no clock acts; None at others.
     """
 
     program: Program
@@ -172,6 +174,7 @@ class TickProgram:
     log: Ids
     guards: Ids
     mismatch: tuple[Ids, Ids] | None
+    rates: Ids | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -162,13 +162,13 @@ def test_the_rates_of_a_grouped_run_are_not_traced_as_a_whole(grouped):
 
 def test_all_blocks_are_gone_through_once_for_the_instants_between_ticks(grouped, monkeypatch):
     made = []
-    trace = flat_diagram.functions.trace_tick_program
+    evaluate = flat_diagram.functions.evaluate
     monkeypatch.setattr(
-        flat_diagram.functions, "trace_tick_program", lambda *given: (made.append(given[-1]), trace(*given))[1]
+        flat_diagram.functions, "evaluate", lambda *given, **more: (made.append(given[2]), evaluate(*given, **more))[1]
     )
     flat = ring(12)[0].flatten(0.1)
     sources = write_hybrid(flat, [NONE], stiff=False)
-    assert made == [NONE]  # once more, where it is asked whether outputs may fail at steps
+    assert made == [NONE]  # for rates, outputs, and where it is asked whether these may fail at steps
     del sources
     write_hybrid(flat, [NONE], stiff=False)
     assert made == [NONE, NONE]  # it is large, and isn't kept
