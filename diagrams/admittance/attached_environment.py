@@ -33,7 +33,7 @@ SUBSTEPS = 10
 """Communication points of an FMU in a tick, where the environment's force is held between them."""
 EARLY = Fraction(1, 1000)
 """Part of a tick by which outputs with feedthrough are sampled before it."""
-BLOCK, SAMPLING = "environment", "environment_sampling"
+BLOCK = "environment"
 _ROUNDED = 1e-9
 """Relative size of an entry that should be zero."""
 

@@ -17,7 +17,7 @@ from .shapes import BORDER, GREY, INK, NAME, PLANT, WIRE, line, rect, seconds, t
 MANY = 40
 """Blocks above which subsystems are drawn closed by default."""
 
-HEADER, MARGIN, PIN, STUB = 24.0, 14.0, 18.0, 14.0
+HEADER, MARGIN, PIN = 24.0, 14.0, 18.0
 TINTS = ("#eaf2fb", "#e6f5ec", "#f3ecfa", "#fdebec", "#e8f4f6", "#f6f2e2")
 """Colours of sampled subsystems, one for each sample time."""
 

@@ -34,13 +34,8 @@ DIGEST = "#"
 _LONGEST = 40
 
 
-def revision_of(plan: Plan) -> str:
-    """Return the digest of a sweep without its samples: that of its parts."""
-    return digest_of(parts_of(plan))
-
-
 def digest_of(parts: Parts) -> str:
-    """Return the digest of a sweep's parts."""
+    """Return the digest of a sweep's parts: of a sweep without its samples."""
     texts = (f"{kind}\0{name}\0{text}" for kind in sorted(parts) for name, text in sorted(parts[kind].items()))
     return hashlib.sha256("\0".join(texts).encode()).hexdigest()
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import Array, Block, Event, FmuError, FmuFileError, Layout, ParameterError, State
+from ...blocks.core import Array, Event, FmuError, FmuFileError, Layout, ParameterError, State
 from ...blocks.tracing import NEXT
 from ..archive import FmuDescription, FmuVariable
-from ..calls import ExchangeInstance, is_smooth
+from ..calls import ExchangeInstance, StepOptions, is_smooth
 from ..isolation import open_fmu
 from .differences import Column, Differences, differentiate
+from .port_members import PortMembers
 from .slope_check import SlopeCheck, check_slopes
 
 INTERFACES = ("co_simulation", "model_exchange")
@@ -55,19 +56,15 @@ def choose_interface(description: FmuDescription, asked: str | None, label: str)
     return asked
 
 
-class ExchangeMembers(Block):
+class ExchangeMembers(PortMembers):
     """Members of an FMU's block that make it one of model exchange."""
 
     if TYPE_CHECKING:
         interface: str | None
-        start: Mapping[str, Any]
+        stepping: StepOptions
 
         @property
-        def description(self) -> FmuDescription: ...  # noqa: D102
-        @property
-        def input_variables(self) -> Mapping[str, FmuVariable]: ...  # noqa: D102
-        @property
-        def output_variables(self) -> Mapping[str, FmuVariable]: ...  # noqa: D102
+        def variable_step(self) -> bool: ...  # noqa: D102
 
     @property
     def used_interface(self) -> str:

@@ -10,34 +10,26 @@ from typing import Any
 
 from ...blocks.core import (
     Block,
-    Call,
     FmuError,
     FmuFileError,
     FrozenMapping,
-    Input,
-    Output,
     ParameterError,
-    Signal,
-    UnknownAttributeError,
-    UnknownNameError,
     kinds,
-    near,
     parameter,
 )
-from ..archive import ArchiveLimits, FmuDescription, FmuVariable, OtherVariable, read_description
+from ..archive import ArchiveLimits, FmuDescription, read_description
 from ..calls import FmuInstance, StepOptions, check_offered
 from ..isolation import Isolation, check_isolation, open_fmu
 from .exchange import ExchangeMembers, choose_interface
 from .fmu_point import FmuLinearization
 from .linearization import linear_model
-from .ports import FmuPorts, choose_ports, find_element, other_name
 from .replacement import check_replacement
 from .start_values import check_start, check_value, read_sized
 from .step_model import STEP, step_difference
 
 
 class Fmu(ExchangeMembers):
-    """FMU of FMI 2.0 or 3.0 as a block, by co-simulation or model exchange; its ports are the FMU's inputs and outputs.
+    """FMU of FMI 1.0, 2.0 or 3.0 as a block, by co-simulation or model exchange; its inputs and outputs are ports.
 
     Outputs are attributes (``plant.position``). A port whose name is no identifier is read by index
     (``plant["axis.phi"]``), or gets another name by ``rename``. In co-simulation inputs are held between communication
@@ -107,10 +99,6 @@ class Fmu(ExchangeMembers):
             )
         object.__setattr__(self, "start", FrozenMapping(check_start(description, self.start, who)))
 
-    def _choose_ports(self, description: FmuDescription) -> FmuPorts:
-        chosen = None if self.ports is None else tuple(self.ports)
-        return choose_ports(description, tuple(self.rename.items()), chosen, self.label)
-
     def check_place(self, old: Block, wired: Collection[str], read: Collection[str]) -> None:
         """Check that it fits the wires of the block that it replaces.
 
@@ -140,26 +128,6 @@ class Fmu(ExchangeMembers):
     def converts_units(self) -> bool | None:  # type: ignore[override]
         """Whether wires in other units of its ports' dimensions are converted."""
         return self.convert_units
-
-    @property
-    def input_variables(self) -> Mapping[str, FmuVariable]:
-        """The FMU's variables that are input ports, by the ports' names."""
-        return self._choose_ports(self.description).inputs
-
-    @property
-    def output_variables(self) -> Mapping[str, FmuVariable]:
-        """The FMU's variables that are output ports, by the ports' names."""
-        return self._choose_ports(self.description).outputs
-
-    @property
-    def text_variables(self) -> Mapping[str, OtherVariable]:
-        """The FMU's texts and binary data that are recorded in a run (``run.texts``), by their ports."""
-        return self._choose_ports(self.description).texts
-
-    @property
-    def left_out(self) -> Mapping[str, str]:
-        """Types of the variables that no wire carries, by name: texts, binaries, clocks, negated aliases."""
-        return {name: v.type for name, v in self.description.other.items()}
 
     def __repr__(self) -> str:
         text = super().__repr__()
@@ -229,69 +197,6 @@ class Fmu(ExchangeMembers):
     def drawn_as(self) -> str:
         """Kind of the block as a drawing names it: its file."""
         return f"FMU {Path(self.file).name}"
-
-    @property
-    def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
-        """The FMU's inputs, and the parameters among ``ports``."""
-        return {
-            port: Input(v.shape, v.unit, v.description, default=self._default(v), name=port)
-            for port, v in self.input_variables.items()
-        }
-
-    def _default(self, v: FmuVariable) -> Any:
-        """Return the value of an input that is not wired; None where one must be."""
-        if v.name in self.start:
-            return self.start[v.name]
-        array, index = self.description.elements.get(v.name, ("", ()))
-        if array in self.start:
-            return self.start[array][index]
-        return v.start if v.causality == "parameter" else None
-
-    @property
-    def outputs(self) -> Mapping[str, Output]:  # type: ignore[override]
-        """The FMU's outputs, and the local variables among ``ports``."""
-        return {port: Output(v.shape, v.unit, v.description, name=port) for port, v in self.output_variables.items()}
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Call:
-        """Wire the FMU: signals by position in the order of the inputs, or by keyword.
-
-        Raises
-        ------
-        UnknownNameError
-            For a name that is no input, and for an input that no wire carries.
-        """
-        left_out = self.description.other, self.description.aliases
-        for name in kwargs:
-            if any(name in names for names in left_out) and name not in self.inputs:
-                raise UnknownNameError(self._no_port(name), block=self.label)
-        return super().__call__(*args, **kwargs)
-
-    def __getattr__(self, name: str) -> Signal:
-        if name.startswith("_") or "file" not in self.__dict__:
-            raise AttributeError(name)
-        outputs = self.outputs
-        if name in outputs:
-            return Signal(self, name)
-        raise UnknownAttributeError(self._no_port(name), block=self.label)
-
-    def _no_port(self, name: str) -> str:
-        """Return the text of an error: it has no such output, or a port that no wire carries."""
-        if name in self.description.aliases:
-            return other_name(self.description, name)
-        other = self.description.other.get(name)
-        if other is None:
-            return f"it has no output {name!r}. {near(name, self.outputs)}"
-        return f"its {other.causality} {name!r} is {other.refusal}"
-
-    def __getitem__(self, name: Any) -> Signal:
-        if isinstance(name, str):
-            if name in self.outputs:
-                return Signal(self, name)
-            element = find_element(self.description, self.output_variables, name, self.label)
-            if element is None:
-                raise UnknownNameError(self._no_port(name), block=self.label)
-            return Signal(self, element[0])[element[1]]
-        return super().__getitem__(name)
 
     def linear_model(
         self,

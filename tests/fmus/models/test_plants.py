@@ -14,7 +14,7 @@ from scipy.linalg import expm
 
 import loopwright.fmus
 from loopwright.blocks import FmuRuntimeError, ParameterError
-from loopwright.fmus import Fmu, gantry_stiction, scara
+from loopwright.fmus import Fmu, gantry_elastic, gantry_stiction, scara
 from support.plants import (
     C_V,
     F_C,
@@ -102,6 +102,15 @@ def test_the_elastic_gantry_is_two_masses_on_each_axis(build):
     assert np.abs(x[:, 4:6] - x[:, :2]).max() > 5e-5  # the screws do deflect
     at_ticks = np.array([elastic(row, u, f, 0.3)[2:4] for row, u, f in zip(x[1:], motor, external, strict=True)])
     assert np.abs(got["acceleration"][1:] - at_ticks).max() < 1e-5  # m/s2, of 8
+
+
+def test_the_resonance_of_a_screw_is_that_of_its_eigenvalues():
+    frequency, damping = gantry_elastic.nominal.resonance
+    for i in range(2):
+        inverse = 1.0 / M_T[i] + 1.0 / M_J[i]
+        pole = np.linalg.eigvals([[0.0, 1.0], [-K[i] * inverse, -D[i] * inverse]])[0]
+        assert 2.0 * np.pi * frequency[i] == pytest.approx(abs(pole), rel=1e-12)
+        assert damping[i] == pytest.approx(-pole.real / abs(pole), rel=1e-12)
 
 
 @pytest.mark.slow
