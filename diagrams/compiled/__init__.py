@@ -3,9 +3,11 @@
 from .background import BackgroundCode
 from .code import LARGEST, TickCode, compile_ticks, find_obstacle, write_ticks
 from .fused import FusedPlant, compile_fused, fuse
+from .grouping import make_tables
 from .handed_over import HandedOver, find_exchange_obstacle
 from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOptions, Span
 from .hybrid_code import HybridCode, compile_hybrid, find_hybrid_obstacle, write_hybrid
+from .kernels import Kernel
 from .libraries import load_compiled
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
 from .native_tick import bind_call
@@ -29,6 +31,7 @@ __all__ = [
     "HybridCode",
     "HybridOutcome",
     "HybridReason",
+    "Kernel",
     "MethodOptions",
     "NativeExchange",
     "NewtonOptions",
@@ -47,6 +50,7 @@ __all__ = [
     "find_obstacle",
     "fuse",
     "load_compiled",
+    "make_tables",
     "write_hybrid",
     "write_ticks",
 ]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from string import Template
 from typing import Any
 
-from .vector_code import write_vectors
+from .scalar_calls import ScalarFunctions
 
 METHODS: Mapping[str, str] = {
     "euler": "EACH_RATE next[where[i]] = x[where[i]] + h * k1[i];",
@@ -49,7 +49,7 @@ class FlowSource:
     Attributes
     ----------
     rates : casadi.Function
-        ``(t, x, w, p) -> dx``, of scalar operations.
+        ``(t, x, w, p) -> dx``.
     where : sequence of int
         Entries of x that they belong to.
     method : str
@@ -61,7 +61,7 @@ class FlowSource:
     method: str
 
 
-def write_flow(source: FlowSource) -> tuple[str, int]:
+def write_flow(source: FlowSource, scalars: ScalarFunctions) -> tuple[str, int]:
     """Write the C code of a step; return it with the number of vectors that are kept.
 
     Raises
@@ -69,6 +69,6 @@ def write_flow(source: FlowSource) -> tuple[str, int]:
     NoLanesError
         For an operation that has no form over vectors.
     """
-    code = write_vectors("flow", source.rates, ("t", "x", "w", "p"), {3})
+    code = scalars.write_calls("flow", source.rates, ("t", "x", "w", "p"), {3})
     where = ", ".join(map(str, source.where))
     return code.text + _TEXT.substitute(where=where, n=len(source.where), method=METHODS[source.method]), code.kept

@@ -5,23 +5,22 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from threading import Lock
 from typing import Any
 from weakref import WeakKeyDictionary
 
-import casadi as ca
-
 from ...blocks.core import CompilerError, FmuError
 from ...fmus import Fmu
 from ...fmus.export import describe_processor, processor_flags
-from ..compiled import LARGEST, load_compiled
-from ..flat import TRUE, FlatDiagram, TickPattern
+from ..compiled import LARGEST, NewtonOptions, load_compiled
+from ..flat import NONE, TRUE, FlatDiagram, TickPattern
 from .flow_code import METHODS, FlowSource, write_flow
 from .lane_plants import LanePlant, read_plant
+from .loop_code import LoopSource, write_loops
 from .no_lanes import NoLanesError
+from .scalar_calls import ScalarFunctions
 from .start_code import StartSource, write_start
-from .vector_code import write_vectors
+from .tick_code import TickSources, read_source, share
 
 # A product and a sum of one expression are fused, whatever the optimizer does; more of it gains nothing.
 FLAGS = ("-O2", "-ffp-contract=on")
@@ -40,40 +39,68 @@ class LaneSizes:
 
 
 def write_lanes(
-    ticks: Sequence[Any],
+    ticks: TickSources,
+    kinds: Sequence[frozenset[TickPattern]],
     plants: Sequence[LanePlant],
     sizes: LaneSizes,
     count: int,
+    scalars: ScalarFunctions,
     start: StartSource | None = None,
     flow: FlowSource | None = None,
-) -> str:
-    """Write the C code that goes over ticks with a vector of runs.
+    loops: Mapping[int, LoopSource] | None = None,
+) -> tuple[str, Room]:
+    """Write the C code that goes over ticks with a vector of runs; return it with the memory that it needs.
 
     Parameters
     ----------
-    ticks : sequence of casadi.Function
-        ``(t, x, w, p) -> (x_next, z, log, ok)``, of scalar operations, one for each set of clocks that act together.
+    ticks : TickSources
+        The ticks.
+    kinds : sequence of frozenset of TickPattern
+        The sets of clocks that act together.
     plants : sequence of LanePlant
         The FMUs in their order.
     sizes : LaneSizes
         Entries of the vectors.
     count : int
         Runs in a vector.
+    scalars : ScalarFunctions
+        Functions that are called lane by lane; those of the ticks are in it.
     start : StartSource, optional
         Functions from which runs start.
     flow : FlowSource, optional
         Rates of the continuous states.
+    loops : mapping of int to LoopSource, optional
+        The algebraic loops of some kinds of ticks.
     """
-    parts = [f"#define LANES {count}\n", f"#define TRUTH {TRUE!r}\n"]
-    parts += [f"#define N_{name.upper()} {size}\n" for name, size in vars(sizes).items()]
-    parts.append(read_source("vectors.h"))
+    head = [f"#define LANES {count}\n", f"#define TRUTH {TRUE!r}\n"]
+    head += [f"#define N_{name.upper()} {size}\n" for name, size in vars(sizes).items()]
+    parts = [ticks.text]
+    if loops:
+        parts.append(read_source("lane_newton.c"))
     prepare, steps, go_on, keep = [], [], [], []
-    cases = []
-    for i, tick in enumerate(ticks):
-        code = write_vectors(f"tick{i}", tick, _TICK, {3})
+    cases, room = [], 0
+
+    def take(name: str, size: int) -> str:
+        """Return the declaration of vectors that a function keeps."""
+        nonlocal room
+        if not ticks.is_grouped:
+            return f"vec {name}[AT_LEAST_1({size})];"
+        room += size
+        return f"vec *{name} = (vec *)l->room + {room - size};"
+
+    names = "x", "w", "z", "p", "x_next", "log"
+    own = [take(name, getattr(sizes, name.partition("_")[0])) for name in names]
+    for i, clocks in enumerate(kinds):
+        code = ticks.write(f"tick{i}", clocks)
         parts.append(code.text)
-        prepare.append(f"vec kept_tick{i}[AT_LEAST_1({code.kept})]; tick{i}_prepare(p, kept_tick{i});")
-        cases.append(f"case {i}: tick{i}(t, x, w, p, kept_tick{i}, x_next, z, log, ok); break;")
+        prepare.append(f"{take(f'kept_tick{i}', code.kept)} tick{i}_prepare(p, kept_tick{i});")
+        solve = ""
+        if loops and i in loops:
+            text, kept = write_loops(f"loops{i}", loops[i], _TICK, scalars)
+            parts.append(text)
+            prepare.append(f"vec kept_loops{i}[AT_LEAST_1({kept})]; loops{i}_equations_prepare(p, kept_loops{i});")
+            solve = f"unsolved = loops{i}(t, x, w, p, kept_loops{i}, alive); "
+        cases.append(f"case {i}: {solve}tick{i}(t, x, w, p, kept_tick{i}, x_next, z, log, ok); break;")
     at = 0
     for i, plant in enumerate(plants):
         parts.append(plant.write(f"plant{i}"))
@@ -84,12 +111,13 @@ def write_lanes(
         keep.append(f"plant{i}_end(&of{i}, (vec *)l->plant + {first});")
     states = ""
     if flow is not None:
-        text, kept = write_flow(flow)
+        text, kept = write_flow(flow, scalars)
         parts.append(text)
         prepare.append(f"vec kept_flow[AT_LEAST_1({kept})]; flow_prepare(p, kept_flow);")
         states = "step_states(t0, t1, to, x, w, p, kept_flow);"
     evaluate = f"switch (kind) {{ {' '.join(cases)} }}"
     parts += [
+        f"#define TAKE_ROOM {' '.join(own)}\n",
         f"#define PREPARE {' '.join(prepare)}\n",
         f"#define STEP_STATES(t0, t1, to) {states}\n",
         f"#define STEP_PLANTS(t0, h) {' '.join(steps)}\n",
@@ -98,14 +126,25 @@ def write_lanes(
         f"#define KEEP_PLANTS {' '.join(keep)}\n",
         read_source("lanes.c"),
     ]
+    at_start = 0
     if start is not None:
-        parts.append(write_start(start, plants))
-    return "".join(parts)
+        text, at_start = write_start(start, plants, ticks, scalars)
+        parts.append(text)
+    return "".join([scalars.write(), *head, read_source("vectors.h"), *parts]), Room(room, at_start)
 
 
-def read_source(name: str) -> str:
-    """Return a C source of this package."""
-    return files(__package__).joinpath(name).read_text(encoding="utf-8")
+@dataclass(frozen=True)
+class Room:
+    """Vectors of memory that the code needs.
+
+    Attributes
+    ----------
+    run, start : int
+        To go over ticks, and for the first one.
+    """
+
+    run: int
+    start: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +169,8 @@ class LaneCode:
         Functions of the start of runs; None if it can't be computed over vectors.
     has_states : bool
         Whether there are continuous states between ticks.
+    room : Room
+        Vectors of memory that it needs.
     """
 
     run: Any
@@ -140,6 +181,7 @@ class LaneCode:
     library: ctypes.CDLL
     starts: LaneStarts | None = None
     has_states: bool = False
+    room: Room = Room(0, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +191,7 @@ class LaneStarts:
     Attributes
     ----------
     tick : callable
-        ``(x, w, p, x_next, z, log, ok)``: the tick with which they begin.
+        ``(x, w, p, x_next, z, log, ok, kept)``: the tick with which they begin, and its memory.
     outputs : callable
         ``(plants, z, w)``: outputs of the FMUs at their inputs in z, which they keep; z may be None.
     values : list of callable
@@ -174,6 +216,7 @@ def compile_lanes(
     count: int,
     start: StartSource | None = None,
     method: str = "",
+    loops: Mapping[frozenset[TickPattern], NewtonOptions] | None = None,
 ) -> LaneCode:
     """Compile the code that goes over ticks with a vector of runs, unless the cache has it.
 
@@ -189,6 +232,8 @@ def compile_lanes(
         Functions from which runs start.
     method : str
         The method of fixed step that integrates continuous states; empty where there is none.
+    loops : mapping, optional
+        How the algebraic loops of each tick are solved, where there are some.
 
     Raises
     ------
@@ -199,50 +244,66 @@ def compile_lanes(
         known = _COMPILED.setdefault(flat.origin, {})
         key = count, tuple(acting), method, None if start is None else start.key
         if key not in known:
-            known[key] = _compile(flat.origin, acting, count, start, method)
+            known[key] = _compile(flat.origin, acting, count, start, method, loops or {})
         return known[key]
 
 
 def _compile(
-    flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], count: int, start: StartSource | None, method: str
+    flat: FlatDiagram,
+    acting: Sequence[frozenset[TickPattern]],
+    count: int,
+    start: StartSource | None,
+    method: str,
+    newton: Mapping[frozenset[TickPattern], NewtonOptions],
 ) -> LaneCode:
     if between := _between_ticks(flat, method):
         raise NoLanesError(between)
-    if flat.loops.slices:
-        raise NoLanesError(f"it has algebraic loops, such as through {next(iter(flat.loops.slices))}")
     if flat.apart:
         raise NoLanesError(f"{min(flat.apart)} is evaluated from outside")
-    if flat.by_block:
-        raise NoLanesError("its ticks have too many operations to be compiled as a whole")
-    ticks = [flat.at_tick(clocks).last.fast for clocks in acting]
-    if not all(tick.is_a("SXFunction") for tick in ticks):
-        raise NoLanesError(_no_scalars(flat))
-    if (operations := sum(tick.n_instructions() for tick in ticks)) > LARGEST:
-        raise NoLanesError(f"its ticks have {operations} operations, and at most {LARGEST} are compiled as a whole")
-    ticks = [_share(tick) for tick in ticks]
+    scalars = ScalarFunctions()
+    ticks = TickSources(flat, [*acting, *(() if start is None else (start.clocks,))], scalars)
+    loops = dict[int, LoopSource]()
+    for i, clocks in enumerate(acting):
+        equations = flat.loop_equations(clocks) if clocks in newton else None
+        if equations is not None:
+            loops[i] = LoopSource(_check_size(equations.fast), newton[clocks])
     plants = {path: _plant(flat, path) for path in flat.plant_ticks}
-    first = ticks[0]
     sizes = LaneSizes(
-        *(first.numel_in(1), first.numel_in(2), first.numel_out(1), first.numel_in(3), first.numel_out(2))
-    )
+        flat.width, flat.plant_outputs.total, flat.plant_inputs.total, flat.parameters.total,
+        flat.log.total + flat.width + bool(flat.loops.slices),
+    )  # fmt: skip
     flow = None
     if flat.continuous.size:
-        rates = flat.flow.last.fast
-        if not rates.is_a("SXFunction"):
-            raise NoLanesError(_no_scalars(flat))
-        flow = FlowSource(_share(rates), flat.continuous.tolist(), method)
-    begin = None if start is None else StartSource(_share(start.tick), start.values, start.key)
-    source = write_lanes(ticks, [*plants.values()], sizes, count, begin, flow)
+        rates = _check_size(flat.flow.last.fast)
+        flow = FlowSource(rates, flat.continuous.tolist(), method)
+    source, room = write_lanes(ticks, acting, [*plants.values()], sizes, count, scalars, start, flow, loops)
     try:
         library = load_compiled(source, (*processor_flags(), *FLAGS), describe_processor())
     except (CompilerError, FmuError) as error:
         raise NoLanesError(str(error).rstrip(".")) from error
     run = library["loopwright_lanes"]
     run.restype = None
-    starts = None if begin is None else _bind_starts(library, begin)
-    return LaneCode(
-        run, {clocks: i for i, clocks in enumerate(acting)}, plants, sizes, count, library, starts, flow is not None
-    )
+    starts = None if start is None else _bind_starts(library, start)
+    kinds = {clocks: i for i, clocks in enumerate(acting)}
+    return LaneCode(run, kinds, plants, sizes, count, library, starts, flow is not None, room)
+
+
+def _check_size(function: Any) -> Any:
+    """Return a function of the whole diagram, in which each operation on scalars is done once.
+
+    Raises
+    ------
+    NoLanesError
+        If it is too large to be compiled as a whole.
+    """
+    if not function.is_a("SXFunction"):
+        return function
+    if (operations := function.n_instructions()) > LARGEST:
+        raise NoLanesError(
+            f"its rates, or the equations of its algebraic loops, have {operations} operations, and at most {LARGEST} "
+            "are compiled as a whole"
+        )
+    return share(function)
 
 
 def _bind_starts(library: ctypes.CDLL, source: StartSource) -> LaneStarts:
@@ -253,7 +314,7 @@ def _bind_starts(library: ctypes.CDLL, source: StartSource) -> LaneStarts:
 
     sizes = [sum(function.numel_out(i) for i in range(function.n_out())) for function in source.values]
     values = [bind(f"start{i}", 5) for i in range(len(sizes))]
-    return LaneStarts(bind("first_tick", 7), bind("first_outputs", 3), values, sizes)
+    return LaneStarts(bind("first_tick", 8), bind("first_outputs", 3), values, sizes)
 
 
 def _between_ticks(flat: FlatDiagram, method: str) -> str:
@@ -264,6 +325,8 @@ def _between_ticks(flat: FlatDiagram, method: str) -> str:
             f"it has continuous states, those of {path}, and each run would choose its steps; give a solver of fixed "
             "step, such as solver='rk4' with step="
         )
+    if flat.continuous.size and flat.active_loops(NONE):
+        return f"it has algebraic loops between ticks, such as through {min(flat.loops.slices)}"
     if flat.outside:
         return f"{flat.outside[0]} is evaluated from outside"
     if flat.events:
@@ -276,21 +339,6 @@ def _between_ticks(flat: FlatDiagram, method: str) -> str:
     delays = {flat.ports[name][0] for name in flat.plant_inputs.slices}
     delays = {path for path in delays if flat.table.blocks[path].transport}
     return f"{min(delays)} is a transport delay in continuous time" if delays else ""
-
-
-def _no_scalars(flat: FlatDiagram) -> str:
-    """Return which blocks are no scalar operations, as a clause."""
-    traced = flat.checked.traced
-    found = [path for path in traced if not traced[path].function.is_a("SXFunction")]
-    few = f"{', '.join(found[:3])}{' and others' if len(found) > 3 else ''}" if found else "it"
-    return (
-        f"{few} {'have' if len(found) > 1 else 'has'} a table or a large matrix product, which is no scalar operation"
-    )
-
-
-def _share(tick: Any) -> Any:
-    symbols = tick.sx_in()
-    return ca.Function(tick.name(), symbols, ca.cse(tick.call(symbols)))
 
 
 def _plant(flat: FlatDiagram, path: str) -> LanePlant:

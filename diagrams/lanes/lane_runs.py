@@ -149,12 +149,13 @@ class LaneRuns:
         self._steps = np.array(vectors.steps, dtype=float)
         width, count = code.count, vectors.count
         self._vectors, self._last, self._count = vectors, _aligned(vectors.row), count
+        self._room = make_room(code.room.run, width)
         numbers = vectors.p, vectors.x, vectors.w, vectors.z, vectors.plants, self._last
         p, x, w, z, plant, last = (vector.ctypes.data for vector in numbers)
         self._structure = _structure(width)(
             every=every, skip=every - 1, columns=self._columns.size, stops=self._stops.size,
             column=self._columns.ctypes.data, stop=self._stops.ctypes.data, p=p, x=x, w=w, z=z, plant=plant,
-            steps=self._steps.ctypes.data, last=last,
+            steps=self._steps.ctypes.data, last=last, room=self._room.ctypes.data,
         )  # fmt: skip
         self._structure.alive[:] = [-1] * count + [0] * (width - count)
 
@@ -227,6 +228,7 @@ def _structure(count: int) -> type[ctypes.Structure]:
             *((name, pointer) for name in ("column", "stop", "p", "x", "w", "z", "plant", "steps", "last")),
             *((name, lanes) for name in ("alive", "failed", "stopped", "by")),
             *((name, integer) for name in ("ticks", "rows")),
+            ("room", pointer),
         ]
         _STRUCTURES[count] = type("LanesStructure", (ctypes.Structure,), {"_fields_": fields})
     return _STRUCTURES[count]

@@ -19,6 +19,7 @@ typedef struct {
     int64_t stopped[LANES];        /* the tick at which it was stopped, counted from 1; 0: none */
     int64_t by[LANES];             /* the stop that ended it, by its place */
     int64_t ticks, rows;           /* that were gone through, and kept, so far */
+    double *room;                  /* vectors: memory of large diagrams */
 } lanes;
 
 /* Substeps of at most `step` in h, as in runtime/integrators.c. */
@@ -36,9 +37,9 @@ static void keep_last(const lanes *l, mask which, const vec *log) {
 VISIBLE void loopwright_lanes(lanes *l, int64_t count, const double *times, const double *widths, const int32_t *kinds,
                               const double *ends, double *rows) {
     (void)ends; /* vectors: times at the ends of ticks, where continuous states see sources from the left */
-    vec x[AT_LEAST_1(N_X)], w[AT_LEAST_1(N_W)], z[AT_LEAST_1(N_Z)], p[AT_LEAST_1(N_P)];
-    vec x_next[AT_LEAST_1(N_X)], log[AT_LEAST_1(N_LOG)], ok[1], t[1];
-    mask alive;
+    TAKE_ROOM
+    vec ok[1], t[1];
+    mask alive, unsolved = {0};
     memcpy(&alive, l->alive, sizeof alive);
     memcpy(x, l->x, sizeof(vec) * N_X);
     memcpy(w, l->w, sizeof(vec) * N_W);
@@ -51,7 +52,7 @@ VISIBLE void loopwright_lanes(lanes *l, int64_t count, const double *times, cons
         t[0] = splat(times[i + 1]);
         EVALUATE(kinds[i])
         l->ticks++;
-        mask bad = alive & ~(ok[0] != 0.0);
+        mask bad = alive & (~(ok[0] != 0.0) | unsolved);
         if (__builtin_expect(any(bad), 0)) {
             alive &= ~bad;
             int from = -1;

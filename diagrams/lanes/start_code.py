@@ -8,14 +8,17 @@ from typing import Any
 
 import casadi as ca
 
+from ..flat import TickPattern
 from .lane_plants import LanePlant
-from .vector_code import write_vectors
+from .scalar_calls import ScalarFunctions
+from .tick_code import TickSources
 
-_TICK, _START = ("t", "x", "w", "p"), ("x", "w", "p", "left")
+_START = ("x", "w", "p", "left")
 _FIRST_TICK = """
 /* The tick with which a run begins. */
-VISIBLE void loopwright_first_tick(const vec *x, const vec *w, const vec *p, vec *x_next, vec *z, vec *log, vec *ok) {{
-    vec t[1] = {{splat(0.0)}}, kept[AT_LEAST_1({kept})];
+VISIBLE void loopwright_first_tick(const vec *x, const vec *w, const vec *p, vec *x_next, vec *z, vec *log, vec *ok,
+                                   vec *kept) {{
+    vec t[1] = {{splat(0.0)}};
     first_tick_prepare(p, kept);
     first_tick(t, x, w, p, kept, x_next, z, log, ok);
 }}
@@ -40,28 +43,37 @@ class StartSource:
 
     Attributes
     ----------
-    tick : casadi.Function
-        ``(t, x, w, p) -> (x_next, z, log, ok)`` of the tick with which they begin, of scalar operations.
+    clocks : frozenset of TickPattern
+        The clocks that act at the tick with which they begin.
     values : sequence of casadi.Function
-        Each ``(x, w, p, left) -> columns``, of scalar operations.
+        Each ``(x, w, p, left) -> columns``.
     key : object
         Equal keys, equal functions of one diagram.
     """
 
-    tick: Any
+    clocks: frozenset[TickPattern]
     values: Sequence[Any]
     key: Any
 
 
-def write_start(source: StartSource, plants: Sequence[LanePlant]) -> str:
+def write_start(
+    source: StartSource, plants: Sequence[LanePlant], ticks: TickSources, scalars: ScalarFunctions
+) -> tuple[str, int]:
     """Write the C code; it stands behind that of the FMUs, ``plant0`` and so on.
+
+    Returns
+    -------
+    text : str
+        The C code.
+    kept : int
+        Vectors of memory that the first tick needs.
 
     Raises
     ------
     NoLanesError
         For an operation that has no form over vectors.
     """
-    tick = write_vectors("first_tick", source.tick, _TICK, {3})
+    tick = ticks.write("first_tick", source.clocks)
     looks, at = list[str](), 0
     for i, plant in enumerate(plants):
         place = f"plant + {at}"
@@ -69,11 +81,13 @@ def write_start(source: StartSource, plants: Sequence[LanePlant]) -> str:
             f"{{ plant{i} of; plant{i}_begin(&of, {place}); plant{i}_look(&of, z, w); plant{i}_end(&of, {place}); }}"
         )
         at += plant.width
-    parts = [tick.text, _FIRST_TICK.format(kept=tick.kept, plants=" ".join(looks))]
+    parts = [tick.text, _FIRST_TICK.format(plants=" ".join(looks))]
     for i, function in enumerate(source.values):
-        symbols = function.sx_in()
-        columns = [ca.densify(column) for column in function.call(symbols)]
-        joined = ca.Function("start", symbols, [ca.cse(ca.vertcat(ca.SX(0, 1), *columns))])
-        code = write_vectors(f"start{i}", joined, _START, ())
+        is_scalar = function.is_a("SXFunction")
+        symbols = function.sx_in() if is_scalar else function.mx_in()
+        kind: Any = ca.SX if is_scalar else ca.MX
+        joined = ca.vertcat(kind(0, 1), *(ca.densify(column) for column in function.call(symbols)))
+        joined = ca.cse(joined) if is_scalar else joined
+        code = scalars.write_calls(f"start{i}", ca.Function("start", symbols, [joined]), _START, ())
         parts += [code.text, _VALUES.format(i=i, kept=code.kept)]
-    return "".join(parts)
+    return "".join(parts), tick.kept

@@ -1,5 +1,6 @@
 """The loop over ticks, and between them."""
 
+from .algebraic_loops import newton_options
 from .diagnosis import START_SETTLED
 from .engine import Engine
 from .initialize import find_initial_state, find_start_values, values_from_left
@@ -31,6 +32,7 @@ __all__ = [
     "find_initial_state",
     "find_start_values",
     "late_progress",
+    "newton_options",
     "progress_bar",
     "refuse_rest",
     "simulate",

@@ -7,11 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...blocks.core import SimulationError
-from ..flat import EXACT_LOOP
+from ..flat import EXACT_LOOP, FlatDiagram, TickPattern
+
+if TYPE_CHECKING:
+    from ..compiled import NewtonOptions
 
 TOLERANCE = 1e-9
 """Largest residual of an algebraic loop that counts as solved, relative to 1 + the size of its values."""
@@ -238,3 +242,10 @@ def _differ(a: np.ndarray, b: np.ndarray) -> bool:
 
 def _text(values: np.ndarray) -> str:
     return f"{float(values[0]):.6g}" if len(values) == 1 else f"({', '.join(f'{float(v):.6g}' for v in values)})"
+
+
+def newton_options(flat: FlatDiagram, clocks: frozenset[TickPattern]) -> NewtonOptions:
+    """Return Newton's method in C for the algebraic loops at a tick at which some clocks act."""
+    from ..compiled import NewtonOptions
+
+    return NewtonOptions(flat.active_loops(clocks), TOLERANCE, ROUNDING, SINGULAR, ITERATIONS, HALVINGS)

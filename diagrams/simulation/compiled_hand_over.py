@@ -22,7 +22,6 @@ from ..compiled import (
     HybridCode,
     MethodOptions,
     NativeExchange,
-    NewtonOptions,
     TickCode,
     Watch,
     compile_other_side,
@@ -30,10 +29,10 @@ from ..compiled import (
 from ..coupling import Plant, PlantSteps, end_all, runs_apart, step_all
 from ..events import Domains
 from ..exchange import INPUT_EVENT
-from ..flat import NONE, FlatDiagram, TickPattern
+from ..flat import NONE, TickPattern
 from ..results import Occurrence, Recorder
 from ..solvers import AutoSolver
-from .algebraic_loops import HALVINGS, ITERATIONS, ROUNDING, SINGULAR, TOLERANCE
+from .algebraic_loops import newton_options
 from .continuous import Continuous
 from .solver_setup import has_guards, next_instant, remembers
 from .workspace import Workspace
@@ -61,11 +60,6 @@ def bind_loop(
         loops={clocks: newton_options(workspace.flat, clocks) for clocks in code.loops},
         exchange=exchange,
     )
-
-
-def newton_options(flat: FlatDiagram, clocks: frozenset[TickPattern]) -> NewtonOptions:
-    """Return Newton's method for the algebraic loops at a tick at which some clocks act."""
-    return NewtonOptions(flat.active_loops(clocks), TOLERANCE, ROUNDING, SINGULAR, ITERATIONS, HALVINGS)
 
 
 def bind_hybrid(

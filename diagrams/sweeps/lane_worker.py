@@ -16,7 +16,7 @@ from ...fmus.calls import FmuInstance
 from ..flat import EVERY, Announcer, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of, ticks_after
 from ..lanes import LaneCode, LaneEnd, LaneRuns, LaneStart, LaneVectors, NoLanesError, compile_lanes, make_room
 from ..results import Run, Stopped, machine_memory
-from ..simulation import START_EXCHANGES, StopConditions
+from ..simulation import START_EXCHANGES, StopConditions, newton_options
 from .bound_run import BoundRun, Tell
 from .outcome import Outcome
 from .plan import Plan, Worker
@@ -26,6 +26,10 @@ from .vector_start import StartSearch, VectorStart
 
 DIFFER = (
     "Side by side in vector lanes: values differ from those of single runs by rounding, which some motions magnify."
+)
+LEFT = (
+    "Not side by side in vector lanes: the run could not go on in its lane, as where an algebraic loop has no "
+    "determined solution, and was made again by itself."
 )
 _MOST_SUBSTEPS = 10_000
 _MOST_KINDS = 32
@@ -108,12 +112,13 @@ class LaneWorker(Worker):
         for samples, vectors in together:
             for sample, run in zip(samples, found.run(vectors, tell, started), strict=True):
                 if run is None:
-                    alone.append((sample, None))
+                    alone.append((sample, LEFT))
                 else:
                     yield self._judge(sample, partial(_itself, run))
         for sample, note in alone:
             outcome = self.run(sample, tell)
-            yield outcome if note is None else _note(outcome, note)
+            is_told = note is None or (note is LEFT and outcome.failure is not None)  # the failure says it all
+            yield outcome if is_told else _note(outcome, str(note))
 
     def _lanes(self, numbers: Numbers[Any], bound: BoundRun) -> _Lanes | str:
         """Return the lanes of bound runs, or why there are none."""
@@ -160,7 +165,8 @@ class _Lanes:
             raise NoLanesError(f"the samples of {count} runs at a time would take {needed / 2**30:.0f} GiB")
         search = StartSearch(bound) if agrees else None
         source = None if search is None else search.source
-        self._code: LaneCode = compile_lanes(flat, acting, count, source, method if flat.continuous.size else "")
+        loops = {clocks: newton_options(flat, clocks) for clocks in acting if flat.active_loops(clocks)}
+        self._code: LaneCode = compile_lanes(flat, acting, count, source, method if flat.continuous.size else "", loops)
         width, every = max(1, len(self._columns)), bound.recorder.every
         self._chunk = max(1, min(len(self._ticks), every * _BYTES // (8 * width * count)))
         self._span = min(_FIRST, self._chunk)

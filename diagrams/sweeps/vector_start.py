@@ -48,9 +48,7 @@ class StartSearch:
             workspace.begin_anew(flat)
             self.left = {port: np.asarray(tap(None)) for port, tap in values_from_left(workspace).items()}
             self.functions = trace_start(flat, self.left)
-        tick = flat.origin.at_tick(flat.acting(0)).last.fast
-        if all(function.is_a("SXFunction") for function in (tick, *self.values)):
-            self.source = StartSource(tick, self.values, tuple(self.left))
+        self.source = StartSource(flat.acting(0), self.values, tuple(self.left))
 
     @property
     def values(self) -> list[Any]:
@@ -127,6 +125,7 @@ class VectorStart:
         self._left = make_room(sum(v.size for v in left), n)
         self._left[:] = np.concatenate([np.zeros(0), *left])[:, None]
         self._next, self._log, self._ok = make_room(sizes.x, n), make_room(sizes.log, n), make_room(1, n)
+        self._room = make_room(code.room.start, n)
         self._values = [make_room(size, n) for size in code.starts.sizes] if code.starts is not None else []
         self._initial: dict[str, dict[bytes, np.ndarray]] = {path: {} for path in self._functions.inputs}
 
@@ -177,7 +176,7 @@ class VectorStart:
         assert calls is not None
         x, w, z, plants = vectors.x, vectors.w, vectors.z, vectors.plants
         log, ok, after = self._log, self._ok, self._next
-        every = [array.ctypes.data for array in (x, w, vectors.p, after, z, log, ok)]
+        every = [array.ctypes.data for array in (x, w, vectors.p, after, z, log, ok, self._room)]
         own, given, into = plants.ctypes.data, z.ctypes.data, w.ctypes.data
         left, good = np.ones(count, dtype=bool), np.ones(count, dtype=bool)
         ends = [np.empty_like(values) for values in (after, w, z, plants)]

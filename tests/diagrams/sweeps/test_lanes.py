@@ -11,7 +11,6 @@ from loopwright.blocks import (
     Gain,
     Input,
     Integrator,
-    Lookup1D,
     OptionError,
     Output,
     Sine,
@@ -152,14 +151,6 @@ def test_runs_of_other_structure_or_other_steps_go_side_by_side_with_their_like(
     assert_near_single_runs(diagram, found, 0.2, ["x"])
 
 
-def around(u):
-    """y = u − y / 2."""
-    half = Gain(gain=0.5, name="half")
-    y = u - half.y
-    half(y)
-    return y
-
-
 class Odd(Block):
     """Twice its input, evaluated by Python."""
 
@@ -197,10 +188,6 @@ def test_runs_that_cannot_go_side_by_side_go_by_themselves_and_say_why():
         "rates", Gain(gain=1.0, name="kp")(Integrator(name="held")(Constant(value=1.0, name="one"))).named("x")
     )
     assert "it has continuous states, those of held, and each run would choose its steps" in notes(rates, table, step=T)
-    assert "it has algebraic loops, such as through box." in notes(loop(more=around, loops="solve"), table)
-    assert "box.lookup_1d has a table or a large matrix product, which is no scalar operation" in notes(
-        loop(more=Lookup1D(breakpoints=(-9.0, 0.0, 9.0), values=(-9.0, 0.0, 4.0))), table
-    )
 
 
 def test_why_each_run_needs_a_set_up_of_its_own_is_told():

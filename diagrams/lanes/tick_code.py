@@ -1,0 +1,83 @@
+"""C code over vectors of ticks: small ones as one function of scalar operations, others as groups of blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from typing import Any
+
+import casadi as ca
+
+from ..compiled import LARGEST
+from ..flat import FlatDiagram, TickPattern
+from .grouped_code import GroupedCode
+from .scalar_calls import ScalarFunctions
+from .vector_code import VectorCode, write_vectors
+
+_TICK = ("t", "x", "w", "p")
+
+
+class TickSources:
+    """The ticks of a diagram, to be written as C over vectors: ``NAME(t, x, w, p, kept, x_next, z, log, ok)``.
+
+    Parameters
+    ----------
+    flat : FlatDiagram
+        The diagram.
+    acting : sequence of frozenset of TickPattern
+        The sets of clocks that act together at some tick.
+    scalars : ScalarFunctions
+        Functions that are called lane by lane.
+
+    Attributes
+    ----------
+    text : str
+        The C code that stands before the ticks.
+    is_grouped : bool
+        Whether they are groups of equal blocks, whose values need memory.
+    """
+
+    def __init__(self, flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], scalars: ScalarFunctions):
+        kinds = [*dict.fromkeys(acting)]
+        straight = None if flat.by_block else _find_straight(flat, kinds)
+        self.is_grouped, self.text = straight is None, ""
+        self._straight: Mapping[frozenset[TickPattern], Any] = straight or {}
+        if straight is None:
+            self._programs = {clocks: flat.program_at(clocks) for clocks in kinds}
+            self._code = GroupedCode([*self._programs.values()], scalars, read_source("grouped_lanes.c"))
+            self.text = self._code.text
+
+    def write(self, name: str, clocks: frozenset[TickPattern]) -> VectorCode:
+        """Write the tick at which some clocks act, under a name.
+
+        Raises
+        ------
+        NoLanesError
+            For an operation that has no form over vectors.
+        """
+        if self.is_grouped:
+            return self._code.write(name, self._programs[clocks])
+        return write_vectors(name, self._straight[clocks], _TICK, {3})
+
+
+def read_source(name: str) -> str:
+    """Return a C source of this package."""
+    return files(__package__).joinpath(name).read_text(encoding="utf-8")
+
+
+def share(function: Any) -> Any:
+    """Return a function of scalar operations in which each of them is done once."""
+    symbols = function.sx_in()
+    return ca.Function(function.name(), symbols, ca.cse(function.call(symbols)))
+
+
+def _find_straight(
+    flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]]
+) -> dict[frozenset[TickPattern], Any] | None:
+    """Return ticks as functions of scalar operations; None if they are none, or too many to be compiled as a whole."""
+    ticks = {clocks: flat.at_tick(clocks).last.fast for clocks in kinds}
+    if not all(tick.is_a("SXFunction") for tick in ticks.values()):
+        return None
+    if sum(tick.n_instructions() for tick in ticks.values()) > LARGEST:
+        return None
+    return {clocks: share(tick) for clocks, tick in ticks.items()}
