@@ -22,8 +22,8 @@ _SINGLE = {
     NOT: "one_where(a[0] == 0.0)",
     CHOOSE: "where(a[0] != 0.0, b[0]) + where(a[0] == 0.0, c[0])",  # as of a single run: no zero is negative
 }
-_INLINE, _INLINED = 100, "static inline __attribute__((always_inline))"
-"""Lines of a block's function up to which it is inlined: a compiler takes long for large ones."""
+_INLINED = 100
+"""Operations of a block's function up to which it is inlined: a compiler takes long for large ones."""
 _KERNEL = """
 static void lane_kernel{place}(int32_t n, const int32_t *o, vec *v, const vec *p) {{
     vec kept[AT_LEAST_1({kept})];
@@ -104,7 +104,8 @@ class GroupedCode:
     def _add(self, key: int, function: Any, scalars: ScalarFunctions) -> None:
         place, last = len(self._known), function.n_in() - 1
         names = [f"i{k}" for k in range(function.n_in())]
-        code = scalars.write_calls("BLOCK", function, names, ())
+        inlined = function.n_instructions() <= _INLINED
+        code = scalars.write_calls("BLOCK", function, names, (), inlined=inlined)
         if code.text in self._known:
             self._of[key] = self._known[code.text]
             return
@@ -121,7 +122,7 @@ class GroupedCode:
         to = [f"v + o[{at[True, k]}]" if (True, k) in at else "v" for k in range(function.n_out())]
         self._known[code.text] = self._of[key] = Kernel(place, tuple(columns))
         text = re.sub(r"\bBLOCK(?=_prepare\b|\()", f"block{place}", code.text)
-        self._texts.append(text if text.count("\n") < _INLINE else text.replace(_INLINED, "static"))
+        self._texts.append(text)
         self._texts.append(
             _KERNEL.format(
                 place=place, kept=code.kept, width=len(columns), arguments=", ".join(of), results=", ".join(to)

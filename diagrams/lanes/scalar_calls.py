@@ -32,14 +32,16 @@ class ScalarFunctions:
             generator.add(function)
         return f"{_AS_ALONE}{generator.dump()}{_FUSED}"
 
-    def write_calls(self, name: str, function: Any, arguments: Sequence[str], fixed: Collection[int]) -> VectorCode:
+    def write_calls(
+        self, name: str, function: Any, arguments: Sequence[str], fixed: Collection[int], *, inlined: bool = True
+    ) -> VectorCode:
         """Write a function over vectors: in vector operations where it has them, else as a call for each lane.
 
         Each lane has the bits that the function has when it is compiled for one run.
 
         Parameters
         ----------
-        name, function, arguments, fixed
+        name, function, arguments, fixed, inlined
             See `write_vectors`; the function may be an ``MXFunction``, too.
 
         Raises
@@ -48,7 +50,7 @@ class ScalarFunctions:
             For a function that needs too much memory.
         """
         if function.is_a("SXFunction"):
-            return write_vectors(name, function, arguments, fixed)
+            return write_vectors(name, function, arguments, fixed, inlined=inlined)
         if max(function.sz_w(), function.sz_iw()) > _LARGEST:
             raise NoLanesError(f"a function of it needs more than {_LARGEST} numbers of memory")
         symbols, scalar = function.mx_in(), f"scalar{len(self._functions)}"

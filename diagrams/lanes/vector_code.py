@@ -54,7 +54,9 @@ class _Value:
     constant: float | None = None
 
 
-def write_vectors(name: str, function: Any, arguments: Sequence[str], fixed: Collection[int]) -> VectorCode:
+def write_vectors(
+    name: str, function: Any, arguments: Sequence[str], fixed: Collection[int], *, inlined: bool = True
+) -> VectorCode:
     """Write a function of scalar operations as C code over vectors.
 
     Its operations are those of the function, one for one, but for two: a product that is used in one sum alone is
@@ -71,6 +73,8 @@ def write_vectors(name: str, function: Any, arguments: Sequence[str], fixed: Col
         Names of its arguments in C; each is an array of vectors.
     fixed : collection of int
         Arguments that don't change in a run: what they determine is computed once.
+    inlined : bool
+        Whether the compiler has to write it where it is called, for which it takes long if it is large.
 
     Raises
     ------
@@ -83,7 +87,8 @@ def write_vectors(name: str, function: Any, arguments: Sequence[str], fixed: Col
     all_given = "".join(f"const vec *restrict {argument}, " for argument in arguments)
     made = ", ".join(f"vec *restrict out{i}" for i in range(function.n_out()))
     head = f"static void {name}_prepare({given}vec *restrict kept) {{\n"
-    body = f"static inline __attribute__((always_inline)) void {name}({all_given}const vec *restrict kept, {made}) {{\n"
+    kind = "static inline __attribute__((always_inline))" if inlined else "static"
+    body = f"{kind} void {name}({all_given}const vec *restrict kept, {made}) {{\n"
     text = f"{head}{''.join(writer.early)}}}\n\n{body}{''.join(writer.late)}}}\n"
     return VectorCode(text, writer.kept)
 

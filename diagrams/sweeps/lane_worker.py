@@ -90,7 +90,7 @@ class LaneWorker(Worker):
                 yield _note(self.run(sample, tell), f"Not side by side in vector lanes: {found}.")
             return
         started = perf_counter()
-        alone: list[tuple[Sample, str | None]] = []
+        alone, left = list[tuple[Sample, str | None]](), list[Sample]()
         vectors, places = found.start_together([own for _, own in group])
         together = [([group[place][0] for place in places], vectors)] if vectors is not None else []
         ready: dict[tuple[float, ...], list[tuple[Sample, LaneStart]]] = {}
@@ -112,13 +112,15 @@ class LaneWorker(Worker):
         for samples, vectors in together:
             for sample, run in zip(samples, found.run(vectors, tell, started), strict=True):
                 if run is None:
-                    alone.append((sample, LEFT))
+                    left.append(sample)
                 else:
                     yield self._judge(sample, partial(_itself, run))
         for sample, note in alone:
             outcome = self.run(sample, tell)
-            is_told = note is None or (note is LEFT and outcome.failure is not None)  # the failure says it all
-            yield outcome if is_told else _note(outcome, str(note))
+            yield outcome if note is None else _note(outcome, note)
+        for sample in left:
+            outcome = self.run(sample, tell)
+            yield outcome if outcome.failure is not None else _note(outcome, LEFT)
 
     def _lanes(self, numbers: Numbers[Any], bound: BoundRun) -> _Lanes | str:
         """Return the lanes of bound runs, or why there are none."""
