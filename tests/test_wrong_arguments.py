@@ -34,6 +34,7 @@ WRONG = {
 LONG = {
     ("Diagram.worst_case", "count", "None"),  # a hundred samples
     ("Diagram.sweep", "workers", "None"),  # every core
+    ("analyse", "only", "None"),  # every section
     ("Diagram.frequency_response", "frequencies", "true"),  # 1 rad/s
 }
 """Arguments that are right, and take long."""
@@ -52,11 +53,7 @@ RESULTS = {
 }  # fmt: skip
 """Classes whose objects functions return, or that are declarations; their makers are tested."""
 ELSEWHERE = {
-    "analyse": "Diagram.report; its options are tested with the report",
-    "build_fmu": "takes a ModelSpec, as build makes it",
-    "build_python": "takes the arguments of build",
     "clear_cache": "takes none",
-    "confirm_sensitivity": "takes results of Diagram.sensitivity",
     "fig3": "the paper's diagram, made by the experiments",
     "parameter": "a declaration of a block's class",
 }

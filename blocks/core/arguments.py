@@ -121,6 +121,11 @@ def finite(value: Any) -> str:
     return "" if is_real(value) and np.isfinite(float(value)) else "a finite number"
 
 
+def positive(value: Any) -> str:
+    """Kind of a finite number above zero."""
+    return "" if not finite(value) and float(value) > 0 else "a positive number"
+
+
 def whole(value: Any) -> str:
     """Kind of a whole number."""
     return "" if is_real(value) and np.isfinite(float(value)) and float(value) == int(value) else "a whole number"
@@ -198,6 +203,12 @@ def path(value: Any) -> str:
     """Kind of a path of a file or folder."""
     good = isinstance(value, str | os.PathLike) and str(value) and "\0" not in str(value)
     return "" if good else "a path"
+
+
+def paths(value: Any) -> str:
+    """Kind of a list of paths; one that is made as it is read is taken as it is."""
+    good = not several(value) and not isinstance(value, np.ndarray)
+    return "" if good and not (isinstance(value, list | tuple) and any(map(path, value))) else "a list of paths"
 
 
 def function(value: Any) -> str:

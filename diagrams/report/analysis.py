@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-from ...blocks.core import OptionError, explain_calls, on_one_thread
+from ...blocks.core import OptionError, accepts, kinds, on_one_thread
 from ...fmus.running import Fmu
 from ..flat import WiredDiagram
 from ..linearization import find_signal
@@ -67,7 +67,24 @@ def check_workers(given: int | None, written: bool) -> int:
     return given
 
 
-@explain_calls
+def _reported(value: Any) -> str:
+    """Kind of all that is reported: diagrams, and experiments."""
+    good = isinstance(value, WiredDiagram) or isinstance(getattr(value, "diagram", None), WiredDiagram)
+    return "" if good else "a Diagram, or an experiment"
+
+
+@accepts(
+    diagram=_reported,
+    loops=kinds.names,
+    only=kinds.names,
+    requirements=kinds.either(kinds.one_of_class(Requirements, "Requirements(…)"), kinds.path),
+    about=kinds.mapping,
+    decibels=kinds.flag,
+    hertz=kinds.flag,
+    progress=kinds.function,
+    measured=kinds.mapping,
+    contacts=kinds.either(kinds.mapping, kinds.one_of_class(ContactTask, "a ContactTask"), kinds.path),
+)
 @on_one_thread
 def analyse(
     diagram: WiredDiagram | ReportedExperiment,

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Block, OptionError, SimulationError, explain_calls
+from ...blocks.core import Block, OptionError, SimulationError, accepts, explain_calls, kinds
 from ..coupling import note_fine_steps, note_loops
 from ..flat import EVERY, FlatDiagram, WiredDiagram
 from ..results import (
@@ -146,6 +146,7 @@ class Simulation:
             culprit = engine.blame(error).at(t=self.t)
             raise self._with_run(culprit) from culprit.__cause__
 
+    @accepts(k=kinds.whole)
     def time_of(self, k: int) -> float:
         """Return the time of tick ``k`` in s."""
         return self._engine.position.time_of(k)
@@ -184,6 +185,7 @@ class Simulation:
 
     # --- going on ----------------------------------------------------------------------------------------------------
 
+    @accepts(progress=kinds.function)
     def advance(self, duration: float, *, progress: Any = None) -> None:
         """Go on for a duration in s; one that is no multiple of the step between ticks ends the run.
 
@@ -234,6 +236,7 @@ class Simulation:
     def _on_event(self, event: Occurrence) -> None:
         self._recorder.event(event)
 
+    @accepts(path=kinds.text, block=kinds.one_of_class(Block, "a block"))
     def set_parameters(self, path: str, block: Block) -> None:
         """Let a block go on with the parameters of a variant of it, from this instant.
 
@@ -284,6 +287,7 @@ class Simulation:
     def _with_run(self, error: SimulationError) -> SimulationError:
         return error if error.run is not None else error.keep(self.run(final=False))
 
+    @accepts(final=kinds.flag, last=kinds.flag)
     def run(self, *, final: bool = True, last: bool = False) -> Run:
         """Return what was recorded since the start, or since `restore`; afterwards recording begins anew.
 

@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, LoopwrightError, OptionError, SimulationError, explain_calls
+from ...blocks.core import (
+    ConfirmationError,
+    LoopwrightError,
+    OptionError,
+    SimulationError,
+    accepts,
+    explain_calls,
+    kinds,
+)
 from ..admittance import hold_sources
 from ..flat import WiredDiagram
 from ..frequency import Confirmation, Margins, Number, Realization, disk_margin, margins, mimo_disk_margin, mu_bound
@@ -252,7 +260,18 @@ def _read_growth(v: np.ndarray, t: np.ndarray) -> float:
     return float(math.log(last / first) / (t[len(v) - half] - t[0])) if first > 0 and last > 0 else -math.inf
 
 
-@explain_calls
+def _sensitivities(value: Any) -> str:
+    """Kind of the result of a study of sensitivities, whose class is defined above this file."""
+    return "" if hasattr(value, "model") and hasattr(value, "of") else "the result of Diagram.sensitivity"
+
+
+def _sensitivity(value: Any) -> str:
+    """Kind of one of its rows."""
+    good = hasattr(value, "parameter") and hasattr(value, "quantity")
+    return "" if good else "one of the sensitivities found, such as found[name, 'ms']"
+
+
+@accepts(found=_sensitivities, row=_sensitivity, delay=kinds.whole, skew=kinds.number)
 def confirm_sensitivity(found: Sensitivities, row: Sensitivity, *, delay: int = 0, skew: float = 0.0) -> Sensitivity:
     """Return a sensitivity that a second computation has confirmed: differences of the margin itself.
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, brief, enumerate_some, explain_calls, near
+from ...blocks.core import Block, OptionError, brief, enumerate_some, explain_calls, near
 from ..wiring import CheckedDiagram, find_parameter
 
 KINDS = ("grid", "latin")
@@ -349,7 +349,11 @@ def read_samples(
             found = samples if isinstance(samples, Samples) else table(samples, seed=seed)
     except OptionError as error:
         raise error.at(block=diagram.name) from None
-    return found.resolve(diagram)
+    resolved = found.resolve(diagram)
+    for name in resolved.names:
+        if name in diagram.structure.blocks and not any(isinstance(s.parameters[name], Block) for s in resolved):
+            diagram.replace({name: resolved[0].parameters[name]})  # ends in an error that names its parameters
+    return resolved
 
 
 def check_seed(seed: object) -> int:

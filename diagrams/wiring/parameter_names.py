@@ -5,11 +5,11 @@ All that takes parameters by name finds them here: variants, sweeps, sensitiviti
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from ...blocks.core import Block, OptionError, UnknownNameError, Value, elements, near, shorten
+from ...blocks.core import Block, OptionError, UnknownNameError, Value, elements, enumerate_some, near, shorten
 from .entry_names import index_of, split_entry
 from .structure import Structure
 
@@ -92,8 +92,37 @@ def split_path(table: Structure, path: str, diagram: str) -> tuple[str, list[str
         raise UnknownNameError(
             f"{path!r} is a parameter of {', '.join(owners)}; write the path, such as '{owners[0]}.{path}'."
         )
+    if other := _describe_other(table, path):
+        raise UnknownNameError(f"{path!r} is {other}", block=diagram)
     known = {f"{p}.{q}" for p, block in table.blocks.items() for q in type(block).parameter_specs} | set(table.blocks)
     raise UnknownNameError(f"nothing is called {path!r} in diagram {diagram!r}. {near(path, known)}")
+
+
+def name_parameters(block: Block, path: str) -> str:
+    """Return the paths of a block's parameters in a row, for messages."""
+    names = enumerate_some([f"{path}.{name}" for name in type(block).parameter_specs], 8)
+    return names or "it has none"
+
+
+def _describe_other(table: Structure, path: str) -> str:
+    """Return what a name that is no parameter's stands for, and the parameters there; "" if nothing is called that."""
+
+    def ends(known: Iterable[str]) -> list[str]:
+        return [p for p in known if p and (p == path or p.endswith("." + path))]
+
+    expected = "expected a parameter"
+    for full in ends(table.blocks):
+        block = table.blocks[full]
+        return f"a block, {type(block).__name__}; {expected} of it: {name_parameters(block, full)}."
+    for full in ends(table.subsystems):
+        inside = enumerate_some([p for p, at in table.subsystem_of.items() if at == full], 8)
+        settings = enumerate_some([f"{full}.{name}" for name in OF_A_SUBSYSTEM])
+        return f"a subsystem; {expected} of a block in it ({inside}), or one of its settings: {settings}."
+    for full in ends(table.names):
+        wire = table.names[full]
+        own = name_parameters(table.blocks[wire.block], wire.block)
+        return f"a wire, from {wire}; {expected} of a block, such as its own: {own}."
+    return ""
 
 
 def find_path(path: str, known: Mapping[str, object], kind: str, diagram: str) -> str:

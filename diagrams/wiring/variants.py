@@ -6,10 +6,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace as replace_fields
 from typing import Any, TypeVar
 
-from ...blocks.core import Block, LoopwrightError, OptionError, UnknownNameError, Value, WiringError, near
+from ...blocks.core import Block, LoopwrightError, OptionError, UnknownNameError, Value, WiringError, near, shorten
 from ...blocks.tracing import check_method
 from .entry_names import split_entry, with_entry
-from .parameter_names import OF_A_SUBSYSTEM, check_name, find_path, find_place
+from .parameter_names import OF_A_SUBSYSTEM, check_name, find_path, find_place, name_parameters
 from .structure import Structure, SubsystemSettings
 from .subsystems import check_delay, exact_offset, exact_time
 
@@ -82,8 +82,8 @@ def _change(table: Structure, path: str, keys: list[str], value: object) -> None
     """Change a parameter of the block, or a setting of the subsystem, at a path."""
     if not keys:
         raise WiringError(
-            f"found {value!r}; expected a block in its place, such as Fmu('other.fmu'), or the name of a parameter "
-            f"({path}.…).",
+            f"found {shorten(value)}; expected a block in its place, such as Fmu('other.fmu'), or the name of a "
+            f"parameter of it: {name_parameters(table.blocks[path], path)}.",
             block=path,
         )
     if path in table.subsystems:

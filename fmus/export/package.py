@@ -23,7 +23,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import FmuError, explain_calls
+from ...blocks.core import FmuError, accepts, explain_calls, kinds
 from ..platform import cache_folder, native_platform, record_build
 from .c_code import generate, runtime
 from .compiler import SUFFIXES, TARGETS, Compiler, check_platform, compile_shared, find_compiler, flags
@@ -172,7 +172,15 @@ def write_atomically(path: Path, data: bytes) -> None:
         raise
 
 
-@explain_calls
+@accepts(
+    spec=kinds.one_of_class(ModelSpec, "a ModelSpec, such as model_spec(block)"),
+    out=kinds.path,
+    fmi=kinds.whole,
+    arrays=kinds.flag,
+    platform=kinds.names,
+    documentation=kinds.text,
+    notify=kinds.function,
+)
 def build_fmu(
     spec: ModelSpec,
     out: Path | str | None = None,

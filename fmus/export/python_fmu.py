@@ -25,7 +25,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from ...blocks.core import Block, DefinitionError, FmuError, Port, explain_calls
+from ...blocks.core import Block, DefinitionError, FmuError, Port, accepts, kinds
 from ...blocks.tracing import bundle, traced_parameters
 from ..platform import record_build
 from .html_page import block_text
@@ -45,7 +45,16 @@ _MAKE = (
 )
 
 
-@explain_calls
+@accepts(
+    block=kinds.one_of_class(Block, "a block"),
+    out=kinds.path,
+    name=kinds.text,
+    internal_step=kinds.positive,
+    stop_time=kinds.positive,
+    step_size=kinds.positive,
+    files=kinds.paths,
+    notify=kinds.function,
+)
 def build_python(
     block: Block,
     out: Path | str | None = None,

@@ -11,6 +11,8 @@ import loopwright.fmus as fmus
 from loopwright.blocks import Gain, Integrator, StateSpace, Step
 from loopwright.diagrams import Diagram, Requirements, experiments, subsystem
 
+from .carts import cart_contact
+
 QUIET = {"progress": False}
 
 
@@ -72,6 +74,33 @@ def sensitivities():
 @cache
 def worst():
     return drive().worst_case({"kp.gain": (0.1, 0.3)}, "u", count=2, starts=0)
+
+
+@cache
+def limit():
+    return cart_contact().stability_limit("stiffness", per_decade=30)
+
+
+@cache
+def simulation():
+    """Return a simulation that is open until the process ends."""
+    opened = drive().simulation(step=0.02).__enter__()
+    opened.advance(0.1)
+    return opened
+
+
+@cache
+def spec():
+    return fmus.model_spec(fmus.mass_spring_damper.nominal, name="i")
+
+
+@cache
+def fig3_parts():
+    """Return the arguments of an experiment's diagram."""
+    structure = experiments.path_following().diagram.structure
+    plant = next(block for block in structure.blocks.values() if isinstance(block, fmus.Fmu))
+    line = blocks.Line(start=(-1.0, 0.0), end=(1.0, 0.0))
+    return {"plant": plant, "path": line, "par": diagrams.Channel((-1.0, -2.0)), "perp": diagrams.Channel((-1.0, -2.0))}
 
 
 def calls():
@@ -187,6 +216,30 @@ def calls():
         "stability_map": lambda: (diagrams.stability_map, {
             "loop": admittance(), "x_values": [1e3, 1e4], "y_values": [0.0, 1.0], "x": "stiffness", "y": "damping"}),
         "stiffness_limits": lambda: (diagrams.stiffness_limits, {"loop": admittance(), "dampings": [0.0]}),
+        "confirm_sensitivity": lambda: (diagrams.confirm_sensitivity, {
+            "found": sensitivities(), "row": next(iter(sensitivities())), "delay": 0, "skew": 0.0}),
+        "analyse": lambda: (diagrams.analyse, {
+            "diagram": d(), "at": 0.0, "loops": ["u"], "only": ("subject",), "stairs": None, "requirements": None, "about": {"a": "b"},
+            "decibels": False, "hertz": False, "measured": None, "worst_case": None, "contacts": None, "workers": 1}),
+        "Contact.admittance": lambda: (cart_contact().admittance, {"omega": [1.0]}),
+        "Contact.passivity": lambda: (cart_contact().passivity, {"low": 1.0, "high": 10.0, "per_decade": 30}),
+        "Contact.loop": lambda: (cart_contact().loop, {"vary": "stiffness", "damping": 1.0}),
+        "Contact.stability_limit": lambda: (cart_contact().stability_limit, {
+            "vary": "stiffness", "low": 1e2, "high": 1e4, "per_decade": 30, "damping": 0.0}),
+        "Contact.stability_map": lambda: (cart_contact().stability_map, {
+            "x_values": [1e2, 1e3], "y_values": [0.0, 1.0], "x": "stiffness", "y": "damping"}),
+        "Contact.confirm": lambda: (cart_contact().confirm, {"limit": limit(), "push": 1e-6, "method": "solver"}),
+        "Simulation.time_of": lambda: (simulation().time_of, {"k": 1}),
+        "Simulation.advance": lambda: (simulation().advance, {"duration": 0.02, "progress": None}),
+        "Simulation.save": lambda: (simulation().save, {}),
+        "Simulation.restore": lambda: (simulation().restore, {"state": run().final_state}),
+        "Simulation.run": lambda: (simulation().run, {"final": True}),
+        "Simulation.set_parameters": lambda: (simulation().set_parameters, {"path": "control.kp", "block": drive()["kp"].replace(gain=0.3)}),
+        "fmus.build_fmu": lambda: (fmus.build_fmu, {
+            "spec": spec(), "out": "/nowhere/x.fmu", "fmi": 3, "arrays": True, "platform": None, "documentation": ""}),
+        "fmus.build_python": lambda: (fmus.build_python, {
+            "block": fmus.mass_spring_damper.nominal, "out": "/nowhere/x.fmu", "name": "i", "internal_step": 1e-3, "stop_time": 1.0,
+            "step_size": 1e-3, "files": ()}),
         "fmus.doctor": lambda: (fmus.doctor, {"file": "/nowhere.fmu", "run": False, "limits": None}),
         "fmus.read_description": lambda: (fmus.read_description, {"file": "/nowhere.fmu", "sizes": None, "limits": None}),
         "fmus.tune": lambda: (fmus.tune, {"path": "/nowhere.fmu"}),

@@ -28,6 +28,7 @@ from loopwright.blocks import (
     Sum,
     TransportDelay,
     UnitDelay,
+    UnknownNameError,
     WiringError,
 )
 from loopwright.diagrams import Diagram, experiments, subsystem
@@ -181,7 +182,9 @@ def test_a_name_in_other_letters_has_the_name_that_was_meant_first(change, meant
 
 
 def test_what_is_no_block_in_a_blocks_place_names_the_block():
-    with pytest.raises(WiringError, match=r"^control.kp: found 'x'; expected a block in its place"):
+    with pytest.raises(
+        WiringError, match=r"^control.kp: found 'x'; expected a block in its place.* of it: control\.kp\.gain"
+    ):
         drive().replace({"kp": "x"})
 
 
@@ -265,3 +268,36 @@ def test_a_projection_in_continuous_time_follows_however_smooth_the_rest_is():
     theta = PathProjection(Circle(radius=0.5))(position).named("theta")
     run = Diagram("d", Integrator()(theta)).simulate(10.0, progress=False)
     assert np.abs(run["theta"] - 3.0 * run.t).max() < 1e-12 * 30.0  # nearly five laps, counted
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("kp", r"'kp' is a block, Gain; expected a parameter of it: control\.kp\.gain\."),
+        (
+            "control",
+            r"'control' is a subsystem; expected a parameter of a block in it \(.*control\.kp.*control\.sample_time",
+        ),
+        (
+            "u",
+            r"'u' is a wire, from control\.kp_plus_ki\.y; expected a parameter of a block, such as its own: control\.kp_plus_ki\.signs",
+        ),
+    ],
+)
+def test_a_name_of_something_else_than_a_parameter_says_so_and_names_parameters(name, said):
+    from support.public_calls import drive
+
+    with pytest.raises(UnknownNameError, match=said):
+        drive().trim(free=[name])
+    if name != "kp":  # a block may be replaced as a whole
+        with pytest.raises(UnknownNameError, match=said):
+            drive().replace({name: 1.0})
+
+
+def test_a_sweep_over_the_numbers_of_a_whole_block_is_refused_before_it_runs():
+    from support.public_calls import drive
+
+    with pytest.raises(WiringError, match=r"control\.kp: found 0\.1; expected a block in its place.*control\.kp\.gain"):
+        drive().sweep({"kp": (0.1, 0.2)}, 0.1, signals="y")
+    with pytest.raises(WiringError, match=r"control\.kp: .*control\.kp\.gain"):
+        drive().worst_case({"kp": (0.1, 0.2)}, "u", count=2, starts=0)
