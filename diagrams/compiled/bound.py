@@ -12,7 +12,7 @@ from .grouped_parts import Differences, DifferencesStructure, GroupedPart, PartS
 from .hybrid_code import Between
 from .libraries import CompiledFunction
 from .loop import TickStructure
-from .native_tick import at, bind_python, list_vectors
+from .native_tick import at, bind_python, call_for_c, list_vectors
 
 
 class BoundFunction:
@@ -73,7 +73,7 @@ class BoundFunction:
         calls = [bind_python(call, part.functions, v, arguments[3]) for call in tables.python]
 
         def call(i: int) -> int:
-            calls[i]()
+            call_for_c(calls[i])
             return 0
 
         group = PartStructure(

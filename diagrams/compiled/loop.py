@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Protocol
@@ -15,7 +15,7 @@ from ...fmus.calls import NEAR, FmuInstance, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
 from ..flat import TRUE, TickPattern
 from .code import CompiledTick, TickCode, master
-from .native_tick import at, bind_native
+from .native_tick import INTERRUPTS, at, bind_native
 from .remote import RemotePlants
 from .staged_functions import Staged, StagedEquations
 
@@ -330,7 +330,7 @@ class CompiledLoop:
 
         C sets rounding mode and traps back after each step; the working folder is set back at the end.
         """
-        return self._guard() if self._watched or any(r.address for r in self._remotes) else nullcontext()
+        return self._guard() if self._watched or any(r.address for r in self._remotes) else INTERRUPTS.kept()
 
     @contextmanager
     def _guard(self) -> Iterator[None]:
@@ -339,6 +339,7 @@ class CompiledLoop:
                 stack.enter_context(host)
             for remote in self._remotes:
                 stack.enter_context(remote.guard())
+            stack.enter_context(INTERRUPTS.kept())
             yield
         for host, changed in self._watched:
             if changed:

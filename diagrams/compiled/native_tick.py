@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -27,6 +31,65 @@ class _Group(ctypes.Structure):
         *((name, ctypes.c_int64) for name in ("n_inputs", "n_guards", "n_loops", "residual")),
         ("python", _Python),
     ]
+
+
+class Interrupts(threading.local):
+    """Keeps an interrupt (Ctrl-C) that comes while C runs, until Python is where it can be raised.
+
+    Python raises it at its next instruction: the first one of a function that C calls, where ctypes would drop it.
+
+    Attributes
+    ----------
+    heard : bool
+        Whether an interrupt is raised at once: Python has been called by C, and catches it.
+    came : bool
+        Whether one waits to be raised.
+    """
+
+    def __init__(self) -> None:
+        self.heard = self.came = False
+
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """Keep an interrupt of this block for its end, but where it is heard."""
+        main = threading.current_thread() is threading.main_thread()
+        if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+            yield
+            self.check()
+            return
+        self.heard = self.came = False
+        signal.signal(signal.SIGINT, self._note)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        self.check()
+
+    def check(self) -> None:
+        """Raise the interrupt that waits."""
+        if self.came:
+            self.came = False
+            raise KeyboardInterrupt
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.heard:
+            signal.default_int_handler(number, frame)
+        self.came = True
+
+
+INTERRUPTS = Interrupts()
+"""Those of this process; only its main thread has any."""
+
+
+def call_for_c(call: Callable[[], None]) -> None:
+    """Call Python for C; an interrupt waits until C has returned."""
+    try:
+        INTERRUPTS.heard = True
+        call()
+    except KeyboardInterrupt:
+        INTERRUPTS.came = True
+    finally:
+        INTERRUPTS.heard = False
 
 
 @dataclass(frozen=True)
@@ -71,7 +134,7 @@ def bind_native(tick: CompiledTick, arguments: Sequence[np.ndarray], results: Se
     calls = [bind_python(call, tick.functions, v, arguments[3]) for call in tables.python]
 
     def call(i: int) -> int:
-        calls[i]()
+        call_for_c(calls[i])
         return 0
 
     group = _group(tables, arguments, _Python(call))
@@ -88,6 +151,7 @@ def bind_call(tick: CompiledTick, arguments: Sequence[np.ndarray], results: Sequ
 
     def call() -> None:
         function(bound.arguments, bound.results, bound.iw, bound.w, 0)
+        INTERRUPTS.check()
 
     return call
 

@@ -13,7 +13,7 @@ import numpy as np
 from ...blocks.core import LoopwrightError
 from ...fmus.calls import ERROR, BoundCalls, ChildFace, ChildRequest, FmuInstance, QuietStep, RemoteStep, SharedValues
 from .libraries import load_compiled, read_sources
-from .native_tick import at
+from .native_tick import INTERRUPTS, at
 
 UNDER_WAY, REFUSED, TOLD = 3, 4, 5
 """Stages at which such an FMU is left to Python: its step has begun; no step has, as an input doesn't fit; Python has
@@ -206,8 +206,10 @@ class PythonSteps:
 
     def take(self, place: int, t: float, h: float) -> int:
         """Take a step from t over h, both in s; return 1 if C can't go on from there."""
-        plant, far = self._plants[place]
         try:
+            plant, far = self._plants[place]
+            INTERRUPTS.heard = True
+            INTERRUPTS.check()
             if far is not None:
                 far[0].number = far[1].number
             try:
@@ -218,6 +220,8 @@ class PythonSteps:
         except BaseException as error:  # C has to return first
             self.error = error
             return 1
+        finally:
+            INTERRUPTS.heard = False
         return int(plant.ends_run)
 
     def check(self) -> None:
@@ -256,15 +260,22 @@ class LateReplies:
 
     def wait(self, place: int) -> int:
         """Wait for the reply of an FMU; return 0 if it never comes."""
-        structure, asked = self._asked[place]
-        calls = asked[structure.sequence]
-        assert calls.request is not None
-        calls.request.process.number = structure.number
         try:
+            structure, asked = self._asked[place]
+            calls = asked[structure.sequence]
+            assert calls.request is not None
+            process = calls.request.process
+            process.number = structure.number
+            INTERRUPTS.heard = True
+            if INTERRUPTS.came:  # before the wait, which gives the process up at an interrupt
+                process.give_up()
+            INTERRUPTS.check()
             calls.finish()
         except BaseException as error:  # C has to return first
             self.error = error
             return 0
+        finally:
+            INTERRUPTS.heard = False
         return 1
 
 

@@ -1,5 +1,7 @@
 """Grouped code: one C function for each kind of block, with the bits of the blocks evaluated one by one."""
 
+import os
+import signal
 from time import sleep
 
 import numpy as np
@@ -19,8 +21,8 @@ from loopwright.blocks import (
     TransferFunction,
     UnitDelay,
 )
-from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.compiled import libraries
+from loopwright.diagrams import Diagram, Interrupted, subsystem
+from loopwright.diagrams.compiled import libraries, native_tick
 from loopwright.diagrams.flat import flat_diagram
 from support.both_forms import assert_same_bits, both
 from support.hybrid_blocks import counting
@@ -238,3 +240,24 @@ def test_an_interrupt_in_a_block_of_python_ends_the_run():
     with with_python(interrupted).simulation(compile=True) as simulation, pytest.raises(KeyboardInterrupt) as caught:
         simulation.advance(1.0)
     assert 0.4 < caught.value.run.t[-1] < 0.6
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends itself a signal")
+def test_an_interrupt_that_comes_as_c_calls_python_ends_the_run(monkeypatch):
+    """Python would raise it at the first instruction of the function that C calls, where ctypes drops it."""
+    calls, entries = [], [0]
+
+    def enter(call, before=native_tick.call_for_c):
+        entries[0] += 1
+        if entries[0] == 60:
+            signal.raise_signal(signal.SIGINT)
+        before(call)
+
+    monkeypatch.setattr(native_tick, "call_for_c", enter)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(Interrupted), with_python(lambda x, u: calls.append(1) or u).simulation(compile=True) as s:
+            s.advance(1e4)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert 59 <= len(calls) < 10_000
