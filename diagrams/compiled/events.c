@@ -13,7 +13,7 @@ typedef struct {
     int64_t m;                    /* events */
     tick indicators, jump;        /* at the trial, and at the instant that is reached */
     double *z, *open, *fired;     /* results of the indicators, argument of the jump */
-    const uint8_t *rising, *falling, *hysteretic, *asks; /* asks: Python lets it fire */
+    const uint8_t *rising, *falling, *hysteretic, *asks; /* asks: who lets it fire */
     const double *hysteresis;
     const int64_t *own, *own_first; /* integrated states of the event's block: own[own_first[i]] and so on */
     double spacing, finest, step; /* step: of a method of fixed step, else NaN */
@@ -29,7 +29,10 @@ typedef struct {
     double *times, *seen, *gates, *domains; /* of a block of instants */
     double *x, *x_before, *now, *strict, *values, *motion, *later;
     uint8_t *fires, *following, *located; /* located: what fires at the instant that was found in a step */
+    double *landed; /* the side from which an indicator has come to rest in contact; 0: it has not */
 } watch;
+
+enum { BY_C, BY_PYTHON, BY_FMU };
 
 static void keep(watch *w) {
     memcpy(w->kept, w->state, (size_t)w->state_size * sizeof(double));

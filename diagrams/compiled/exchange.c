@@ -1,13 +1,13 @@
 /* FMUs in model exchange: functions of a diagram in stages, with calls of FMUs between them.
 
    An evaluation leaves all that an FMU keeps as it is. A look at an instant that is reached tells the FMU that a step is
-   complete, or lets an event act whose inputs have jumped; events of time, of steps and of indicators are left to Python.
+   complete, or lets an event act: of its indicators, or of inputs that have jumped; those of time and of steps are Python's.
    An FMU in a process of its own is asked for all calls between two copies at once: its buffers are in the memory that
    both share. It stands behind `remote.c` and `master.c`. */
 
 enum { TAKE, GIVE, SET_TIME, CALL, ASK };
 enum { OK, WARNING, DISCARD, LOST_PROCESS };
-enum { TO_STEP, TO_EVENTS, TO_OTHERS };
+enum { TO_STEP, TO_EVENTS, TO_OTHERS, TO_ACT };
 enum { EVENT_ROUNDS = 100 };
 
 typedef struct {
@@ -32,7 +32,7 @@ struct outside;
 /* An FMU in model exchange. */
 typedef struct {
     struct outside *of;
-    int64_t place, states, inputs, first; /* first: where its states stand in the vector of all */
+    int64_t place, states, inputs, events, first; /* first: where its states stand in the vector of all */
     sequence complete, enter, update, leave;
     const uint8_t *again, *terminate, *nominals, *defined, *wants, *ends; /* its answers: flags of some bytes */
     const double *time;
@@ -54,7 +54,7 @@ typedef struct outside {
     int64_t count;
     exchanged *each;
     tick jump;                  /* a look at the instant that is reached */
-    int64_t look;               /* purpose of the look: a step is complete, events act, or those of other blocks alone */
+    int64_t look;               /* a step is complete; events act; no FMU acts by itself, and then those that fire act */
     int64_t lost;               /* whether Python has to look */
     int64_t failed, plant;      /* whether a call has failed: `action` of `plant`, with a status, at `at` */
     const action *action;
@@ -277,8 +277,16 @@ static void look_at(const stage_of *g) {
     exchanged *e = g->fmu;
     outside *o = e->of;
     for (int64_t i = 0; i < e->states; i++) g->into[i] = g->x[i];
+    bool fires = false;
+    for (int64_t i = 0; i < e->events; i++) fires |= g->u[e->inputs + i] != 0.0;
     if (o->look == TO_STEP) {
         complete_step(e, *g->t, g->u);
+    } else if (o->look == TO_ACT) {
+        if (!fires) return;
+        let_act(e, *g->t, g->u, g->into);
+        e->asks = 0;
+    } else if (fires) {
+        if (!is_within(e, g->u)) o->lost = 1;
     } else if (*g->t >= e->next_time || e->asks) {
         o->lost = 1;
     } else if (has_jumped(e, g->u)) {

@@ -98,6 +98,7 @@ static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
             for (int64_t i = 0; i < p->loops->n; i++) h->l.x[p->loops->where[i]] = h->solved[i];
         if (h->found && fire(h, t, t) == LOST) return ask(h, h->o ? h->acted ? ASK_SETTLE : ASK_FIRE : ASK_BETWEEN);
         h->t = t;
+        if (h->found && h->o && has_news(h->o)) return ask_here(h, t, ASK_SETTLE);
         if (t == edge && edge < end) { /* a discontinuity of a source */
             keep_instant(h);
             enter(h, g, t);

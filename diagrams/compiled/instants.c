@@ -159,6 +159,15 @@ static bool is_contact(const watch *w, const problem *p, const double *x, const 
     return moved && new[m + i] != old[m + i];
 }
 
+/* Put an indicator on the border that a jump has left it at; Python goes on with what is in contact. */
+static void land_on(watch *w, int64_t i) {
+    const double z = w->motion[3 * w->m + i];
+    w->landed[i] = w->domain[i];
+    w->domain[i] = 0.0;
+    w->low[i] = fmin(z, -w->hysteresis[i]);
+    w->high[i] = fmax(z, w->hysteresis[i]);
+}
+
 /* Note that an event fires; false if they pile up: chattering, Zeno behaviour, or a sliding mode of a fixed step. */
 static bool count_event(watch *w, int64_t i, double t) {
     double *latest = w->latest + LATEST * i;
@@ -239,12 +248,13 @@ static int fire(hybrid *h, double t, double at) {
     problem *p = &h->p;
     const int64_t width = h->l.states, row = 2 + 2 * width;
     for (int round = 0; round < ROUNDS; round++) {
-        bool moves = false;
+        bool moves = false, acts = false, rests = false;
         int64_t count = 0;
         for (int64_t i = 0; i < w->m; i++) {
             w->fired[i] = w->fires[i];
             if (!w->fires[i]) continue;
-            if (w->asks[i]) return LOST;
+            if (w->asks[i] == BY_PYTHON) return LOST;
+            acts |= w->asks[i] == BY_FMU;
             moves |= w->own_first[i] < w->own_first[i + 1];
             count++;
         }
@@ -261,9 +271,14 @@ static int fire(hybrid *h, double t, double at) {
             log += row;
         }
         if (p->loops && !solve_loops(h->l.loops + h->between, h->l.x)) return LOST;
+        for (int64_t i = 0; i < w->m; i++)
+            if (w->fires[i] && !count_event(w, i, t)) return LOST;
+        if (!count_instant(w, t)) return LOST;
         if (h->o) {
             h->o->look = TO_OTHERS;
             if (call(&h->o->jump)) return LOST;
+            h->o->look = TO_ACT; /* an FMU that has acted can't go back */
+            if (acts && call(&h->o->jump)) return LOST;
         } else {
             call(&w->jump);
         }
@@ -273,14 +288,21 @@ static int fire(hybrid *h, double t, double at) {
         for (int64_t i = 0; i < w->m; i++) {
             if (!w->fires[i]) continue;
             memcpy(w->log + w->logged++ * row + 2 + width, h->l.x, (size_t)width * sizeof(double));
-            if (!count_event(w, i, t)) return LOST;
         }
-        if (!count_instant(w, t)) return LOST;
+        if (acts) {
+            h->acted = 1;
+            keep_instant(h); /* Python goes on from behind what has acted */
+        }
         if (moves) {
             if (!move_on(h, at, w->motion + 3 * w->m)) return LOST;
             here_states(h, w->x);
             for (int64_t i = 0; i < w->m; i++)
-                if (w->fires[i] && is_contact(w, p, w->x, w->x_before, i)) return LOST;
+                if (w->fires[i] && is_contact(w, p, w->x, w->x_before, i)) {
+                    if (!acts) return LOST;
+                    land_on(w, i);
+                    rests = true;
+                }
+            if (rests) return keep_instant(h), LOST;
         }
         if (!indicate(w, p, at, here_states(h, w->x))) return LOST;
         bool again = take_domains(w, w->domain, w->now, w->fires);

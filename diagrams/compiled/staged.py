@@ -40,7 +40,8 @@ class _Sequence(ctypes.Structure):
 
 class _Exchanged(ctypes.Structure):
     _fields_ = [
-        ("of", _AT), *_fields(_INT, "place states inputs first"), *_fields(_Sequence, "complete enter update leave"),
+        ("of", _AT), *_fields(_INT, "place states inputs events first"),
+        *_fields(_Sequence, "complete enter update leave"),
         *_fields(_AT, "again terminate nominals defined wants ends time"), *_fields(_INT, "width again_where"),
         *_fields(_AT, "u least relative low high discrete"), ("next_time", _REAL),
         *_fields(_INT, "asks ended in_event"), ("end", _REAL), *_fields(_INT, "other_nominals acted"),
@@ -238,6 +239,7 @@ class NativeExchange:
         structure.made = vectors.into.size
         if stage.names == (JUMP,):
             self._bind_look(fmu, stage.path, block.native_look(vectors), vectors.x.size)
+            fmu.events = vectors.u.size - fmu.inputs
             return
         structure.calls = self._sequence(stage.path, block.native_evaluation(stage.wanted, vectors, again=again))
 

@@ -25,6 +25,9 @@ def _fields(kind: Any, names: str) -> list[tuple[str, Any]]:
     return [(name, kind) for name in names.split()]
 
 
+_BY_C, _BY_PYTHON, _BY_FMU = range(3)  # who lets an event fire
+
+
 class WatchStructure(ctypes.Structure):
     """The events as C knows them."""
 
@@ -35,6 +38,7 @@ class WatchStructure(ctypes.Structure):
         *_fields(_AT, "domain low high slack size rounding largest counts latest fresh recent"), ("fired_times", _INT),
         ("kept", _AT), *_fields(_INT, "kept_times kept_log"), ("log", _AT), *_fields(_INT, "logged capacity"),
         *_fields(_AT, "times seen gates domains x x_before now strict values motion later fires following located"),
+        ("landed", _AT),
     ]  # fmt: skip
 
 
@@ -113,7 +117,14 @@ class Watch:
             "rising": [e.direction != "falling" for e in events],
             "falling": [e.direction != "rising" for e in events],
             "hysteretic": [e.hysteresis > 0.0 for e in events],
-            "asks": [e.path in flat.outside or (e.subsystem and subsystems[e.path].when == "reset") for e in events],
+            "asks": [
+                _BY_FMU
+                if e.path in flat.outside
+                else _BY_PYTHON
+                if e.subsystem and subsystems[e.path].when == "reset"
+                else _BY_C
+                for e in events
+            ],
         }
         for name, values in flags.items():
             self._put(name, np.array(values, dtype=np.uint8))
@@ -139,6 +150,8 @@ class Watch:
         self.located = np.zeros(m, dtype=np.uint8)
         """Which events fire at an instant that was found in a step, where C has left that to Python."""
         self._put("located", self.located)
+        self._landed = np.zeros(m)
+        self._put("landed", self._landed)
 
     def _put(self, name: str, vector: np.ndarray) -> None:
         self._kept.append(vector)
@@ -190,6 +203,12 @@ class Watch:
         for i, own in enumerate(times):
             rows[i, : len(own)] = own
             self._parts["counts"][i] = len(own)
+
+    def take_landed(self) -> list[tuple[int, int]]:
+        """Return the indicators that jumps have left in contact since the last call, and the sides they come from."""
+        found = [(int(i), int(self._landed[i])) for i in np.flatnonzero(self._landed)]
+        self._landed[:] = 0.0
+        return found
 
     def set_recent(self, times: Sequence[float]) -> None:
         """Take over the times in s at which any event has fired last."""

@@ -120,6 +120,8 @@ def take_back_domains(domains: Domains, watch: Watch, fired: Sequence[Fired]) ->
     states = watch.domain.astype(int), first, watch.low, watch.high, watch.slack
     limits = watch.latest, np.array(watch.largest), recent, side, stuck
     domains.restore((states, (watch.size, watch.rounding), watch.fresh, limits))
+    for event, side in watch.take_landed():
+        domains.limits.note_contact(event, side)
 
 
 def methods_of(continuous: Continuous) -> list[MethodOptions]:
@@ -300,6 +302,7 @@ def let_act(
         workspace.messages += continuous.sliding.look(continuous.domains, t)
     continuous.enter(t)
     continuous.settle(t)
+    continuous.accept()
     workspace.evaluate()
     return continuous.is_stopped()
 
