@@ -2,12 +2,13 @@
 
 from .check import Checked
 from .checked_diagram import CheckedDiagram, find_parameter
+from .collector import Collector
 from .cycles import find_cyclic_parts
 from .entry_names import index_of, split_entry
 from .entry_order import OrderStep
 from .order import Order, find_orders
 from .parameter_names import find_place, split_path
-from .structure import Collector, Structure, SubsystemSettings, Wire, join, stepped_blocks
+from .structure import Structure, SubsystemSettings, Wire, join, stepped_blocks
 from .subsystems import Subsystem, exact_time, subsystem
 from .variants import change_parameter
 

@@ -19,10 +19,11 @@ from ...blocks.core import (
 )
 from ...blocks.tracing import check_method
 from .check import Checked, check
+from .collector import Collector
 from .delay_blocks import add_delay_blocks
 from .order import Order, find_orders
 from .parameter_names import find_name, find_path
-from .structure import Collector, Structure, SubsystemSettings, Wire, stepped_blocks
+from .structure import Structure, SubsystemSettings, Wire, stepped_blocks
 from .subsystems import exact_time
 from .units import add_unit_conversions
 from .variants import apply_changes
