@@ -22,6 +22,11 @@ class Finding:
 
     limits_numbers: ClassVar[bool] = True
 
+    @property
+    def leaves_error_unknown(self) -> bool:
+        """Whether the error of numbers that are made from the result is not known: their tolerance is NaN."""
+        return False
+
     def as_dict(self) -> dict[str, Any]:
         """Return the kind, the fields and the text by name, as in a report's JSON."""
         return {"kind": type(self).__name__, **asdict(self), "text": str(self)}

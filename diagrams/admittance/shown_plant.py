@@ -296,7 +296,7 @@ def _pair_entries(m: FmuLinearization, model: PlanarSlopes, rate: float) -> dict
     outputs = {port: _entries(m.outputs, port) for port in ("position", "velocity", "acceleration", "contact_force")}
     u, F = (_entries(m.inputs, port) for port in ("motor_force", "external_force"))
     both, rows = u + F, outputs["position"] + outputs["velocity"]
-    U = m.uncertainty
+    U = np.nan_to_num(m.uncertainty)
     T, U_T = m.C[rows], U[n:, :n][rows]
     Ti = np.linalg.inv(T)
     A, B = T @ m.A @ Ti, T @ m.B[:, both]

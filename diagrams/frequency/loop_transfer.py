@@ -42,7 +42,8 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
     wires : tuple of str
         The wires that are cut.
     inexactness : float
-        Estimated error of its matrices, relative to their largest entry: that of the linear models of FMUs.
+        Estimated error of its matrices, relative to their largest entry: that of the linear models of FMUs; NaN
+        if it is not known.
     findings, notes : tuple
         Effects that limit it; see `Linearization.loop`.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,7 +67,8 @@ class Number:
     unit : str
         Unit, "1" of a pure number.
     tolerance : float
-        Absolute bound of the numerical error of the value, in its unit.
+        Absolute bound of the numerical error of the value, in its unit; NaN where it is not known, as one of the
+        findings says.
     confirmed_by : str
         The independent computation that agreed. A `Confirmation` gives its method, too, without the single case's
         values.
@@ -92,6 +94,8 @@ class Number:
     def __post_init__(self) -> None:
         for name in ("value", "tolerance"):
             object.__setattr__(self, name, float(getattr(self, name)))
+        if not self.given and any(finding.leaves_error_unknown for finding in self.findings):
+            object.__setattr__(self, "tolerance", math.nan)
 
     def __float__(self) -> float:
         return self.value

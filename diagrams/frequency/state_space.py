@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -80,8 +81,9 @@ def make_state_space(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray,
 
 
 def inexactness_of(system: LinearSystem) -> float:
-    """Return the error of a system's matrices, relative to their largest entry: of a loop with FMUs; else 0."""
-    return float(getattr(system, "inexactness", 0.0))
+    """Return the known error of a system's matrices, relative to their largest entry: of a loop with FMUs; else 0."""
+    known = float(getattr(system, "inexactness", 0.0))
+    return 0.0 if math.isnan(known) else known
 
 
 def findings_of(system: LinearSystem) -> tuple[Finding, ...]:

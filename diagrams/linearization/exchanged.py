@@ -32,7 +32,7 @@ class PointEvaluator(ExchangeEvaluator):
         self._inputs = Layout.of(dict(flat.checked.traced[path].inputs))
         self._wired = [port for port in self._inputs.slices if (path, port) in flat.table.wires]
         self.error = 0.0
-        """Largest estimated error of a derivative so far; 0 where the FMU computes them."""
+        """Largest known error of a derivative so far; 0 where the FMU computes them."""
         self.noise = 0.0
         """The same error, relative to the largest derivative beside it."""
         exchange = self._fmu.description.exchange
@@ -62,7 +62,7 @@ class PointEvaluator(ExchangeEvaluator):
             return super().differentiate(names, t, x, u)
         if not self.derivation.gap >= found.gap:
             self.derivation = found.describe(self.derivation)
-        self._note(float(np.max(found.error, initial=0.0)), made[:, 1:])
+        self._note(float(np.max(found.error, initial=0.0, where=np.isfinite(found.error))), made[:, 1:])
         return made
 
     def slopes(self, ports: Sequence[str], *, rates: bool, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:

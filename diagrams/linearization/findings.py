@@ -229,6 +229,11 @@ class InexactDerivatives(Finding):
     block: str
     gap: float
 
+    @property
+    def leaves_error_unknown(self) -> bool:
+        """Whether the gap is not known."""
+        return math.isnan(self.gap)
+
     def __str__(self) -> str:
         if math.isnan(self.gap):
             return (

@@ -8,6 +8,7 @@ least common period. Hold and delay are exact (`over_a_period`).
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -68,7 +69,8 @@ class Linearization:
     derivations : mapping
         Method by which each FMU and each opaque block was differentiated, by path, as a `Derivation`.
     uncertainty : float
-        Largest estimated error of an entry of an FMU's linear model; 0 if all are exact.
+        Largest estimated error of an entry of an FMU's linear model; 0 if all are exact, NaN if one is not known
+        (`InexactDerivatives` with a ``gap`` of NaN).
     memory : tuple of str
         States that only start a search, such as a projection's last foot point: their poles at z = 0 are no design
         poles.
@@ -270,7 +272,8 @@ class Linearization:
         if loop:
             own = not shift and not self.openings and not frozen
             closed = self if own else _linearize(self.diagram, at, (), (), (), **how)
-            cut = Model((made.A, made.B, made.C, made.D), made.dt, [], made.affine, uncertainty=made.uncertainty)
+            known = 0.0 if math.isnan(made.uncertainty) else made.uncertainty
+            cut = Model((made.A, made.B, made.C, made.D), made.dt, [], made.affine, uncertainty=known)
             confirm_loop(cut, closed.A, wires, self.diagram.name)
         return made
 
@@ -350,6 +353,7 @@ def _linearize(
     ways = SignalPaths(flat, [s.port for s in found[2]])
     carried = ways.between(every, *([s.port for s in group] for group in found[:2]))
     carried += find_cut_findings(flat, at, [s.port for s in found[2]], carried) if loop else ()
+    is_unknown = any(math.isnan(derivation.gap) for derivation in methods.values())
     opaque = {p: Derivation(DerivativeMethod.BLOCK_DIFFERENCES) for p, b in flat.table.blocks.items() if b.opaque}
     return Linearization(
         diagram,
@@ -364,7 +368,7 @@ def _linearize(
         point=at,
         affine=model.affine,
         derivations={**opaque, **methods},
-        uncertainty=max(model.uncertainty, error),
+        uncertainty=math.nan if is_unknown else max(model.uncertainty, error),
         memory=model.memory,
         openings=tuple(names[2]),
         findings=tuple(dict.fromkeys((*every, *carried))),

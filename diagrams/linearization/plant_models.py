@@ -47,6 +47,7 @@ class PlantModel:
     outputs: list[int]
     derivation: Derivation
     uncertainty: float
+    """Largest error of an entry, of those that are known."""
     y_next: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """Outputs after the step."""
     next: Mapping[str, Any] = field(default_factory=dict)
@@ -387,4 +388,5 @@ def _prefix_names(path: str, states: Sequence[str]) -> tuple[str, ...]:
 
 
 def _largest_error(m: FmuLinearization | _HeldStep) -> float:
-    return float(np.max(m.uncertainty, initial=0.0))
+    """Return the largest error that is known; entries with a NaN have none."""
+    return float(np.max(m.uncertainty, initial=0.0, where=np.isfinite(m.uncertainty)))

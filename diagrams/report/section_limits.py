@@ -30,5 +30,5 @@ def not_modelled(case: Case) -> Section:
         text.append(TEXTS.line("delay"))
     for v in case.usable():
         if v.model.uncertainty:
-            text.append(TEXTS.line("differenced", variant=v.title, uncertainty=f"{v.model.uncertainty:.1g}"))
+            text.append(TEXTS.line("differenced", variant=v.title, uncertainty=v.model.uncertainty))
     return Section("limits", LIMITS_TITLE, tuple(dict.fromkeys(text)))

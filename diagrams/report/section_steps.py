@@ -257,10 +257,13 @@ def _numbers(got: StepResponse, test: StepTest, v: Variant) -> dict[str, Number]
         factor = abs(got.size) if name == "peak" else 1.0
         found[name] = Number(factor * value, units.get(name, "1"), factor * tolerance, how)
     if got.prediction is not None:
+        unknown = tuple(finding for finding in v.model.findings if finding.leaves_error_unknown)
         for name, (value, tolerance) in known.items():
             factor = abs(got.size) if name == "peak" else 1.0
             said = "the linear model's matrix, sample by sample"
-            found[f"linear.{name}"] = Number(factor * value, units.get(name, "1"), factor * tolerance, said)
+            found[f"linear.{name}"] = Number(
+                factor * value, units.get(name, "1"), factor * tolerance, said, findings=unknown
+            )
         found["difference"] = Number(_deviation(got), "1", 1e-9, "co-simulation and linear model, sample by sample")
     return found
 

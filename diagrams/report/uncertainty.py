@@ -132,7 +132,7 @@ def _relative_error(v: Variant, wire: str, cut: Cut, w: np.ndarray) -> tuple[flo
 
     rng = np.random.default_rng(0)
     largest = max([1e-300, *(float(np.max(np.abs(M), initial=0.0)) for M in (L.A, L.B, L.C, L.D))])
-    relative = v.model.uncertainty / largest
+    relative = 0.0 if math.isnan(v.model.uncertainty) else v.model.uncertainty / largest  # tolerances are NaN already
     error = 0.0
     for _ in range(4):
         error = max(error, off(_Moved(*(M * (1 + relative * rng.choice([-1, 1], M.shape)) for M in _matrices(L)))))

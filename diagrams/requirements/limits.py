@@ -174,9 +174,11 @@ def judge(number: Number, limit: Limit) -> tuple[Verdict, Reason, float]:
     """Return the verdict on a number, its reason, and the distance to the nearest limit, negative beyond it.
 
     A number is passed only if it is confirmed, or a given, and within the limits by its tolerance. One whose linear
-    model leaves something out (†) is not passed either; beyond a limit it fails.
+    model leaves something out (†) is not passed either; beyond a limit it fails, where its error is known.
     """
     distance = limit.distance(number.value)
+    if math.isfinite(number.value) and math.isnan(number.tolerance) and number.findings:
+        return Verdict.UNDECIDED, Reason.FINDINGS, distance
     if math.isnan(number.value) or not number.tolerance < math.inf:
         return Verdict.UNDECIDED, Reason.NO_VALUE, math.nan
     if not number.confirmed_by.strip():

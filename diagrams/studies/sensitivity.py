@@ -192,9 +192,11 @@ class Sensitivities(Sequence[Sensitivity]):
                 lines.append(f"{quantity} = {mine[0].number}")
             for row in mine:
                 marks = "".join((" (kink)" if row.kink else "", " (states held)" if row.rest_lost else ""))
+                error = row.slope.tolerance
+                known = ", of unknown error" if math.isnan(error) else f" ± {error:.1g}"
                 lines.append(
-                    f"  {row.parameter:44s} {row.per_percent.value:+12.4g}   ({row.slope.value:+.6g} ± "
-                    f"{row.slope.tolerance:.1g}, at {row.value:g} {row.unit}){marks}"
+                    f"  {row.parameter:44s} {row.per_percent.value:+12.4g}   ({row.slope.value:+.6g}{known}, at "
+                    f"{row.value:g} {row.unit}){marks}"
                 )
         if self.without_effect:
             lines.append(f"without effect: {', '.join(self.without_effect)}")

@@ -49,7 +49,8 @@ class FmuLinearization:
     derivation: Derivation
     """Method by which the derivatives were computed."""
     uncertainty: np.ndarray
-    """Estimated error of each entry of [[A, B], [C, D]]; zero if the FMU computed it, and differences agree."""
+    """Estimated error of each entry of [[A, B], [C, D]]; zero if the FMU computed it, and differences agree;
+    NaN if these are no evidence."""
 
     def __repr__(self) -> str:
         facts = f"{len(self.states)} states", f"{len(self.inputs)} inputs", f"{len(self.outputs)} outputs", self.how

@@ -176,7 +176,7 @@ def _check(point: FmuPoint, instance: LoadedFmu, J: np.ndarray, rows: np.ndarray
         if not instance.model_exchange:
             _initialize_anew(point, instance)
     except FmuError:
-        return SlopeCheck(J, np.zeros(J.shape), np.nan, is_wrong=False)
+        return SlopeCheck(J, np.full(J.shape, np.nan), np.nan, is_wrong=False)
     limits = [np.concatenate([np.ravel(v.limits[side]) for v in variables]) for side in (0, 1)]
     nominals = np.concatenate([np.ravel(v.nominals) for v in variables])
     found = check_slopes(J, values, at, nominals, (limits[0], limits[1]), np.concatenate(moved))

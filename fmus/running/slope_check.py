@@ -36,7 +36,7 @@ class SlopeCheck:
     J : ndarray
         The derivatives, with differences in place of those that are plainly wrong.
     error : ndarray
-        Estimated error of each entry; 0 where the derivative agrees with its difference.
+        Estimated error of each entry; 0 where the derivative agrees with its difference, NaN where that is no evidence.
     gap : float
         Largest distance of a derivative from its difference, relative to the size of the values' change; 0 if all
         agree, NaN if the values could not be computed, or their differences are no evidence.
@@ -92,7 +92,7 @@ def check_slopes(
             return agreed
         return checker.check_columns(J)
     except LoopwrightError:  # the FMU can't be evaluated beside this point: nothing is known
-        return SlopeCheck(J, agreed.error, np.nan, False)
+        return SlopeCheck(J, np.where(checker.moved, np.nan, agreed.error), np.nan, False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +235,7 @@ class _Checker:
 
     def check_columns(self, J: np.ndarray) -> SlopeCheck:
         """Compare each column by itself; put differences in place of entries that are plainly wrong."""
-        made, error, gap, wrong, unknown = J.copy(), np.zeros(J.shape), 0.0, False, False
+        made, error, gap, wrong, unknown = J.copy(), np.zeros(J.shape), 0.0, False, np.zeros(J.shape, bool)
         for k in np.flatnonzero(self.moved):
             v = np.zeros(self.at.size)
             v[k] = self.sizes[k] if self.up[k] else -self.sizes[k]
@@ -244,7 +244,7 @@ class _Checker:
             wrong_rows = known & found.is_wrong
             if wrong_rows.any():
                 known = known & ~(wrong_rows & self._rises(J[:, k], found.slope / v[k], int(k)))
-            unknown |= not known.all()
+            unknown[:, k] = ~known
             off, bad = known & ~found.agrees, known & found.is_wrong
             if not off.any():
                 continue
@@ -253,4 +253,6 @@ class _Checker:
             gap = max(gap, float(np.max(found.gap[off] / size)))
             made[bad, k], error[bad, k] = found.slope[bad] / v[k], found.error[bad] / self.sizes[k]
             wrong |= bool(bad.any())
-        return SlopeCheck(made, error, np.nan if unknown and not gap else gap, wrong)
+        if unknown.any() and not gap:
+            error[unknown], gap = np.nan, np.nan
+        return SlopeCheck(made, error, gap, wrong)

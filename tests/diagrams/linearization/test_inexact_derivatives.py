@@ -7,6 +7,7 @@ from scipy.linalg import expm
 from loopwright.blocks import PID, Constant, FmuError
 from loopwright.diagrams import Diagram, InexactDerivatives, RefutedDerivatives, margins, subsystem
 from loopwright.diagrams.linearization.exchanged import PointEvaluator
+from loopwright.diagrams.requirements import Limit, Reason, Verdict, judge
 from loopwright.fmus import Fmu
 from tests.support.misstated import A, B, misstated_fmu
 
@@ -162,3 +163,33 @@ def test_a_coarse_solver_of_an_fmu_is_part_of_the_model_of_its_steps(tmp_path):
         np.testing.assert_allclose(linear.B[own], step[:, 2:], atol=1e-9)
         assert np.abs(linear.B[own] - step[:, 2:]).max() <= linear.uncertainty + 1e-12
         assert linear.derivations["plant"].held == (not changes)
+
+
+ROUGH = (("return -100.0 * x - v + c->u; }", "return single(single(101325.0 - 100.0 * x) - 101325.0) - v + c->u; }"),)
+"""Its force is rounded to steps of 0.008: differences are no evidence."""
+
+
+@pytest.mark.parametrize("interface", WAYS)
+def test_numbers_that_rest_on_derivatives_of_unknown_error_have_an_unknown_tolerance(tmp_path, interface):
+    single = "static double single(double v) { volatile float s = (float)v; return s; }\nstatic double rate("
+    file = misstated_fmu(tmp_path, 3, (*ROUGH, ("static double rate(", single)))
+    model = Fmu(file).linear_model(state={"x": 1e-5, "v": 0.2}, interface=interface)
+    np.testing.assert_array_equal(model.A, A)
+    assert np.isnan(model.derivation.gap)
+    assert np.isnan(model.uncertainty[1, 0])
+    assert not model.uncertainty[0].any()
+    linear = sampled(file, interface).linearize()
+    assert np.isnan(linear.uncertainty)
+    (finding,) = linear.findings
+    assert isinstance(finding, InexactDerivatives)
+    assert finding.leaves_error_unknown
+    loop = linear.loop("u")
+    assert np.isnan(loop.inexactness)
+    found, exact = margins(loop), margins(sampled(misstated_fmu(tmp_path, 3), interface).linearize().loop("u"))
+    for name in ("phase_margin_deg", "ms", "gain_margin_high"):
+        number = getattr(found, name)
+        assert np.isnan(number.tolerance)
+        assert number.value == pytest.approx(getattr(exact, name).value, rel=1e-6)
+        assert number.as_dict()["findings"][0]["kind"] == "InexactDerivatives"
+        verdict, reason, _ = judge(number, Limit(0.0, np.inf))
+        assert (verdict, reason) == (Verdict.UNDECIDED, Reason.FINDINGS)

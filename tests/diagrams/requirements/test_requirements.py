@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from loopwright.blocks import OptionError
-from loopwright.diagrams import Number, Requirements, Verdict
+from loopwright.diagrams import Kink, Number, Requirements, Verdict
 from loopwright.diagrams.requirements import (
     Limit,
     Reason,
@@ -19,6 +19,7 @@ from loopwright.diagrams.requirements import (
 )
 
 OPEN = math.inf
+KINK = Kink("valve", "y", "u", 0.0, 1.0)
 
 
 def number(value, tolerance=1e-9, confirmed_by="closed-loop eigenvalues", **more):
@@ -55,7 +56,7 @@ def test_a_number_passes_or_fails_with_its_tolerance(value, tolerance, limit, ve
         (number(50.0, math.nan), Reason.NO_VALUE),
         (number(50.0, math.inf), Reason.NO_VALUE),
         (number(50.0, 0.0, ""), Reason.NOT_CONFIRMED),
-        (number(50.0, findings=("a kink",)), Reason.FINDINGS),
+        (number(50.0, findings=(KINK,)), Reason.FINDINGS),
     ],
 )
 def test_a_number_that_is_not_known_is_never_passed(bad, reason):
@@ -65,7 +66,7 @@ def test_a_number_that_is_not_known_is_never_passed(bad, reason):
 
 
 def test_a_number_that_leaves_something_out_can_still_fail():
-    assert judge(number(40.0, findings=("a kink",)), Limit(45.0, OPEN))[0] is Verdict.FAILED
+    assert judge(number(40.0, findings=(KINK,)), Limit(45.0, OPEN))[0] is Verdict.FAILED
 
 
 @given(
