@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from contextlib import chdir
+from contextlib import chdir, nullcontext
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -168,11 +168,65 @@ def test_the_code_of_a_notebook_runs(monkeypatch):
     plt.close("all")
 
 
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+TINY = 1e-6
+"""Size below which a printed number may be rounding: another machine's has the same size, within a factor of a thousand."""
+
+
+def printed(cell):
+    """Return the text that a cell has printed, without empty lines."""
+    texts = [o["text"] if "text" in o else o.get("data", {}).get("text/plain", "") for o in cell.get("outputs", [])]
+    return "\n".join(line for line in "".join(texts).splitlines() if line.strip())
+
+
+def agree(one, other):
+    """Whether two printed numbers are the same one, on two machines."""
+    a, b = abs(float(one)), abs(float(other))
+    if float(one) * float(other) >= 0 and 0 < max(a, b) < TINY and min(a, b) > 0:
+        return max(a, b) < 1000 * min(a, b)
+    return abs(float(one) - float(other)) <= 0.01 * max(a, b) + 1e-12
+
+
+def check_printed(stored, made):
+    """Compare the texts that a notebook holds with those of today; its cells with the tag "machine" print times."""
+    for number, (old, new) in enumerate(zip(stored.cells, made.cells, strict=True)):
+        if old.cell_type != "code" or "machine" in old.metadata.get("tags", ()):
+            continue
+        texts = printed(old), printed(new)
+        numbers = [NUMBER.findall(text) for text in texts]
+        words = [NUMBER.sub("…", text) for text in texts]
+        same = len(numbers[0]) == len(numbers[1]) and all(map(agree, *numbers))
+        assert (words[0], same) == (words[1], True), (
+            f"cell {number} holds what it printed once; execute the notebook anew"
+        )
+
+
+@pytest.mark.parametrize(
+    ("stored", "made", "fresh"),
+    [
+        ("within 8e-08 s", "within 1e-12 s", False),
+        ("within 3e-12 s", "within 1e-12 s", True),
+        ("11 switchings", "12 switchings", False),
+        ("energy 0.218347 kWh", "energy 0.218348 kWh", True),
+        ("energy 0.218 kWh", "power 0.218 kWh", False),
+    ],
+)
+def test_a_notebook_with_old_numbers_is_noticed(stored, made, fresh):
+    def notebook(text):
+        return nbformat.v4.new_notebook(
+            cells=[nbformat.v4.new_code_cell("", outputs=[nbformat.v4.new_output("stream", text=text)])]
+        )
+
+    with nullcontext() if fresh else pytest.raises(AssertionError, match="cell 0"):
+        check_printed(notebook(stored), notebook(made))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_the_notebooks_run(path):
-    notebook = nbformat.read(path, as_version=4)
+    stored, notebook = nbformat.read(path, as_version=4), nbformat.read(path, as_version=4)
     NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(path.parent)}}).execute()
+    check_printed(stored, notebook)
     shown = [o for cell in notebook.cells for o in cell.get("outputs", [])]
     assert any("image/png" in o.get("data", {}) for o in shown)
 
