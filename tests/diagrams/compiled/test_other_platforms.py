@@ -5,7 +5,7 @@ import pytest
 
 from loopwright.blocks import Constant, Gain, Integrator, Product, PythonFunction, Relay, Sine, Sum, TransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.diagrams.compiled import code, fused_code, hybrid_code, write_hybrid, write_ticks
+from loopwright.diagrams.compiled import code, fused, hybrid_code, write_hybrid, write_ticks
 from loopwright.diagrams.lanes import lane_code
 from loopwright.diagrams.simulation.compiled_ticks import kinds_of
 from loopwright.fmus.export.compiler import TARGETS
@@ -76,7 +76,7 @@ def written_for_this_processor(monkeypatch):
         return code.load_compiled(source, flags, processor)
 
     diagram = experiments.EXPERIMENTS["C"]().diagram
-    monkeypatch.setattr(fused_code, "load_compiled", lambda *given: note(*given, of="fused"))
+    monkeypatch.setattr(fused, "load_compiled", lambda *given: note(*given, of="fused"))
     monkeypatch.setattr(lane_code, "load_compiled", lambda *given: note(*given, of="lanes"))
     diagram.simulate(0.01, fuse=True, **QUIET)
     stiff = {"controller.admittance_par.stiffness": [300.0, 301.0, 302.0, 303.0]}
