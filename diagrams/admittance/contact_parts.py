@@ -131,20 +131,8 @@ def take_apart(
     """
     path, block = ports.plant, diagram.blocks[ports.plant]
     flat = diagram.flatten_like(point)
-    all_wires = flat.table.wires  # with the delays of subsystems
-    wires = {
-        port: Source(wire.block, wire.port, wire.index)
-        for port in block.inputs
-        if (wire := all_wires.get((path, port))) is not None
-    }
-    looped = next((port for port, wire in wires.items() if wire.block == path), None)
-    if looped is not None:
-        raise OptionError(
-            f"found it wired to an output of {path!r} itself; expected a block between them. Put a Gain(gain=1) there.",
-            block=path,
-            port=looped,
-        )
-    used = {wire.port for wire in all_wires.values() if wire.block == path}
+    wires = _find_sources(flat, path)
+    used = {wire.port for wire in flat.table.wires.values() if wire.block == path}
     seen = [name for name in block.outputs if name in used]
     outputs = [f"{path}.{name}" for name in seen]
     sources = list(dict.fromkeys(f"{wire.block}.{wire.port}" for wire in wires.values()))
@@ -158,18 +146,8 @@ def take_apart(
     _check_held(diagram, point, path, model, outputs, sources)
     m = _linearize_plant(diagram, point, path)
     _check_rest(path, m, model)
-    pushed, position, velocity = (
-        m.inputs.entries([ports.force]),
-        *(m.outputs.entries([name]) for name in (ports.position, ports.velocity)),
-    )
     felt = [] if signal is None else list(signal.entries)
-    if not len(position) == len(velocity) == len(pushed) or len(felt) not in (0, len(pushed)):
-        raise ShapeError(
-            f"found {len(pushed)} entries of the force, {len(position)} of the position, {len(velocity)} of the "
-            f"velocity and {len(felt)} of the measured force {measured!r}; expected equal numbers. Name other ports.",
-            block=path,
-            port=ports.force,
-        )
+    pushed, position, velocity = _find_entries(m, ports, measured, len(felt))
     wired, rows = m.inputs.entries(wires), m.outputs.entries(seen)
     own = [] if not inside or signal is None else [
         rows.index(m.outputs.slices[signal.port[1]].start + i) for i in felt
@@ -223,6 +201,45 @@ def take_apart(
         ticks=ticks,
     )
     return parts, any(isinstance(f, UnusualStart) for f in model.findings)
+
+
+def _find_sources(flat: FlatDiagram, path: str) -> dict[str, Source]:
+    """Return the sources of a plant's inputs, by input; wires go through the delays of subsystems."""
+    found = {
+        port: Source(wire.block, wire.port, wire.index)
+        for port in flat.table.blocks[path].inputs
+        if (wire := flat.table.wires.get((path, port))) is not None
+    }
+    looped = next((port for port, wire in found.items() if wire.block == path), None)
+    if looped is not None:
+        raise OptionError(
+            f"found it wired to an output of {path!r} itself; expected a block between them. Put a Gain(gain=1) there.",
+            block=path,
+            port=looped,
+        )
+    return found
+
+
+def _find_entries(
+    m: PlantEquations, ports: Ports, measured: str | None, felt: int
+) -> tuple[list[int], list[int], list[int]]:
+    """Return the entries of the force among the model's inputs, of position and velocity among its outputs.
+
+    Parameters
+    ----------
+    felt : int
+        Number of entries of the measured force, 0 without one.
+    """
+    pushed = m.inputs.entries([ports.force])
+    position, velocity = (m.outputs.entries([name]) for name in (ports.position, ports.velocity))
+    if not len(position) == len(velocity) == len(pushed) or felt not in (0, len(pushed)):
+        raise ShapeError(
+            f"found {len(pushed)} entries of the force, {len(position)} of the position, {len(velocity)} of the "
+            f"velocity and {felt} of the measured force {measured!r}; expected equal numbers. Name other ports.",
+            block=ports.plant,
+            port=ports.force,
+        )
+    return pushed, position, velocity
 
 
 def _widen(M: np.ndarray, by: int) -> np.ndarray:
