@@ -19,6 +19,7 @@ from loopwright.diagrams.cli.command_line import main
 from loopwright.diagrams.paper.experiment_numbers import DEFINITIONS, key_numbers
 from loopwright.diagrams.paper.figures import plot_experiment, plot_path
 from loopwright.diagrams.results.plots import STYLE, save
+from support.waiting import FAR
 
 HEADER = (
     "t,eta[1],eta[2],xi[1],xi[2],position[1],position[2],velocity[1],velocity[2],force[1],force[2],"
@@ -377,7 +378,7 @@ def test_an_interrupt_while_the_command_is_loaded_ends_without_a_traceback():
         "from loopwright.diagrams.__main__ import main\n"
         "raise SystemExit(main())\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=FAR, check=False)
     assert (done.returncode, done.stderr) == (130, "loopwright: interrupted.\n")
 
 

@@ -1,7 +1,6 @@
 """Parts of a result from two processes are those of one, in their order, whatever happens to the second one."""
 
 import os
-import time
 from dataclasses import dataclass, field
 
 import pytest
@@ -9,6 +8,7 @@ import pytest
 from loopwright.blocks import LoopwrightError, OptionError
 from loopwright.diagrams.report.analysis import check_workers
 from loopwright.diagrams.second_process import SecondProcess
+from support.waiting import wait_for
 
 KEYS = ("a", "b", "c", "d")
 
@@ -40,8 +40,8 @@ def parts(tmp_path, monkeypatch):
 
 def share(task, told):
     def make(key):
-        if key == "a":
-            time.sleep(0.1)  # the second process gets its turn
+        if key == "a" and second._process is not None:  # the second process gets its turn
+            assert wait_for(lambda: bool(second._made) or not second._thread.is_alive())
         return task.make(key, told.append)
 
     with SecondProcess(task, "letters") as second:

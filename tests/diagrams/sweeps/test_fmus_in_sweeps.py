@@ -11,6 +11,7 @@ import pytest
 from loopwright.blocks import Block, FmuRuntimeError, Gain, Input, Output, State, parameter
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, build
+from support.waiting import FAR
 
 T = 0.01
 
@@ -70,7 +71,7 @@ def test_the_path_of_an_fmu_holds_while_another_thread_loads_one(tmp_path, monke
 
     with ThreadPoolExecutor(1) as pool:
         loading = pool.submit(load)
-        assert elsewhere.wait(10.0)
+        assert elsewhere.wait(FAR)
         assert block.description.file == tmp_path / "root.fmu"
         goes_on.set()
         loading.result()

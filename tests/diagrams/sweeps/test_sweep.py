@@ -29,6 +29,7 @@ from loopwright.diagrams.sweeps.plan import Worker
 from loopwright.diagrams.sweeps.samples import Samples
 from loopwright.diagrams.sweeps.sweep import make_plan
 from loopwright.diagrams.sweeps.workers import make_worker
+from support.waiting import FAR
 
 QUIET = {"progress": False}
 INTERPRETED = {"progress": False, "compile": False, "workers": 1}
@@ -451,8 +452,8 @@ def test_an_error_of_a_thread_ends_the_sweep_and_all_threads(monkeypatch):
             failed.set()
             raise ZeroDivisionError("a mistake in the sweep itself")
         if sample.index > 3:  # the other thread's, which was handed out before the failure
-            assert failed.wait(60)
-            failing[0].join(60)
+            assert failed.wait(FAR)
+            failing[0].join(FAR)
         return run(self, sample, tell)
 
     monkeypatch.setattr(Worker, "run", fail)

@@ -20,6 +20,7 @@ from loopwright.diagrams.sweeps.plan import Plan, Worker
 from loopwright.fmus import Fmu, gantry
 from support.lanes import noisy
 from support.swept import double_end, fragile
+from support.waiting import FAR, wait_for
 
 QUIET = {"progress": False}
 GAINS = {"fragile.gain": (1.0, 2.0, 3.0, 4.0, 5.0)}
@@ -75,7 +76,7 @@ found = diagram.sweep({"twice.gain": (1.0, 2.0, 3.0)}, 1.0, reduce={"end": lambd
 print(found["end"].tolist(), found.failures)
 """
     )
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False, timeout=200)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False, timeout=FAR)
     assert (done.stdout, done.stderr) == ("[1.0, 2.0, 3.0] ()\n", ""), done.stderr
 
 
@@ -173,7 +174,6 @@ def test_ctrl_c_ends_a_sweep_at_once_and_keeps_what_was_run(tmp_path, compiled):
     script = tmp_path / "script.py"
     script.write_text(
         f"""
-import sys, time
 from loopwright.diagrams import InterruptedSweep, experiments, final
 diagram = experiments.hand_guiding().diagram
 try:
@@ -181,19 +181,15 @@ try:
                   workers=2, compile={compiled}, to={str(tmp_path / "s")!r}, progress=False)
 except InterruptedSweep as error:
     done = sum(outcome is not None for outcome in error.sweep.outcomes)
-    print(time.time(), done, len(error.sweep["end"]) if done else 0, flush=True)
+    print(done, len(error.sweep["end"]) if done else 0, flush=True)
 """
     )
     process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    deadline = time.time() + 100.0
-    while not list((tmp_path / "s").glob("part-*")) and time.time() < deadline:
-        time.sleep(0.1)
-    interrupted = time.time()
+    assert wait_for(lambda: any((tmp_path / "s").glob("part-*")))
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
-    ended, done, rows = out.split()
+    out, err = process.communicate(timeout=FAR)  # all runs take 450 s in C, 2000 s interpreted
+    done, rows = out.split()
     assert (process.returncode, err) == (0, "")
-    assert float(ended) - interrupted < 3.0  # s; a run of this sweep takes 0.3 s in C, 1.5 s interpreted
     assert 0 < int(done) < 3000 == int(rows)
 
 
