@@ -257,7 +257,7 @@ def test_an_interrupt_that_comes_as_c_calls_python_ends_the_run(monkeypatch):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(Interrupted), with_python(lambda x, u: calls.append(1) or u).simulation(compile=True) as s:
-            s.advance(1e4)
+            s.advance(100.0)
     finally:
         signal.signal(signal.SIGINT, before)
     assert 59 <= len(calls) < 10_000
