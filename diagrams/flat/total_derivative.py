@@ -11,7 +11,7 @@ import numpy as np
 
 from ...blocks.core import Layout, ParameterError
 from .fast_functions import speed_up
-from .stages import Bound, Evaluator, Evaluators, OpaqueStage, Schedule, TracedStage, bind_function
+from .stages import Bound, Evaluator, Evaluators, OpaqueStage, Schedule, TracedStage, bind_function, call_function
 
 By = tuple[str, Sequence[int] | None]
 """An argument of a schedule, and the entries by which it is differentiated; None for all."""
@@ -68,7 +68,7 @@ class Derivative:
         variables = [*((symbols[name], entries) for name, entries in self.by), *whole]
         slopes = [_slope(e, symbol, entries) for e in stage.results for symbol, entries in variables]
         names = [*self.schedule.arguments, *(["carried"] if staged else [])]
-        shown = stage.results if staged or self.values else ()
+        shown = [ca.densify(e) for e in stage.results if staged or self.values]
         outputs = [f"o{i}" for i in range(len(shown) + len(slopes))]
         return ca.Function(f"{stage.name}_derivative", [*stage.arguments], [*shown, *slopes], names, outputs)
 
@@ -108,7 +108,7 @@ class Derivative:
         schedule = self.schedule
         count = len(schedule.results)
         if not schedule.opaque:
-            made = [np.array(v).reshape(v.shape) for v in self._functions[id(schedule.last)].call([*arguments])]
+            made = call_function(self._functions[id(schedule.last)], arguments)
             shown = count if self.values else 0
             return [*map(np.ravel, made[:shown]), *made[shown:]]
         c, D = np.zeros(schedule.width), np.zeros((schedule.width, self._columns.total))
@@ -117,7 +117,7 @@ class Derivative:
             if isinstance(stage, OpaqueStage):
                 self._pass_through(stage, stage.evaluator(evaluators or {}), float(np.ravel(arguments[0])[0]), c, D)
                 continue
-            made = [np.array(v).reshape(v.shape) for v in self._functions[id(stage)].call([*arguments, c])]
+            made = call_function(self._functions[id(stage)], [*arguments, c])
             if stage is not schedule.last:
                 c[stage.makes] = np.ravel(made[0])
                 D[stage.makes] = np.hstack(made[1:-1]) + made[-1] @ D

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from ...fmus.running import Fmu
 
 
+KEPT = 2**20
+"""Bytes of derivatives of an FMU that are kept at an operating point."""
+
+
 class PointEvaluator(ExchangeEvaluator):
     """Evaluator of one FMU at an operating point; it notes how its derivatives are computed."""
 
@@ -42,12 +46,24 @@ class PointEvaluator(ExchangeEvaluator):
         )
         """Method by which the derivatives are computed."""
         self._checked, self._differenced = set[tuple[str, ...]](), set[tuple[str, ...]]()
+        self._derivatives: dict[tuple[object, ...], np.ndarray] = {}
 
     def differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
         """Return the derivative of `evaluate`; the FMU's own is held against differences where it is asked for first.
 
-        Where it is plainly wrong, differences stand in for it from then on.
+        Where it is plainly wrong, differences stand in for it from then on. The last ones are kept: the loops at all
+        wires, and the slopes along all parameters, ask for them at the same instants.
         """
+        key = names, t, x.tobytes(), u.tobytes(), self.derivation.refuted
+        known = self._derivatives.pop(key, None)
+        made = self._differentiate(names, t, x, u) if known is None else known
+        if made is not None:
+            self._derivatives[key] = made
+            if len(self._derivatives) * made.nbytes > KEPT:
+                del self._derivatives[next(iter(self._derivatives))]
+        return made
+
+    def _differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
         made = super().differentiate(names, t, x, u)
         if made is None or names in self._checked:
             return made

@@ -19,6 +19,8 @@ from .plant_models import join_matrices, states_of
 
 EQUILIBRIUM = 1e-9
 """Largest residual of an equilibrium."""
+STAGES = (1.0, 0.6, 0.2816, 0.857, 0.0526, 0.3333, 0.6513, 0.1184, 0.25, 0.3077, 0.0789)
+"""Instants within a step at which DOP853 asks for rates, as parts of the step; the end comes first."""
 Four: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -44,6 +46,9 @@ def differentiate_flow(
     Only continuous states change. At an equilibrium, and everywhere where the flow is linear, the derivative is a
     matrix exponential. Elsewhere the variational equation is integrated along the motion, from one discontinuity of a
     source to the next: by DOP853 at 1e-12, or at the error of the derivatives of FMUs where that is larger.
+
+    An FMU in model exchange may depend on time without saying so. At an equilibrium it is asked at the instants at
+    which DOP853 would ask it; where rates and derivatives are the same bits at all of them, they stay.
     """
     from scipy.linalg import expm
 
@@ -62,7 +67,16 @@ def differentiate_flow(
     start, end = x1[xc], t + h
     F, f0 = differentiate(t, start)
     final = x1.copy()
-    if not local.varies and all(size_of_change(*part) <= EQUILIBRIUM for part in local.parts(f0, start)):
+    rests = all(size_of_change(*part) <= EQUILIBRIUM for part in local.parts(f0, start))
+
+    def stays() -> bool:
+        """Return whether rates and derivatives at rest are the same over the whole time."""
+        if not flat.outside or len([*_split_at_discontinuities(flat, t, end)]) > 1:
+            return False
+        asked = (differentiate(min(t + part * h, left_of(end)), start) for part in STAGES)
+        return all(np.array_equal(J, F) and np.array_equal(f, f0) for J, f in asked)
+
+    if rests and (not local.varies or stays()):
         big = np.zeros((nc + many, nc + many), dtype=F.dtype)
         big[:nc] = F
         whole = np.asarray(expm(big * h))[:nc]

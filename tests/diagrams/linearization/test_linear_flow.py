@@ -5,8 +5,10 @@ import pytest
 import scipy.integrate
 from scipy.linalg import expm
 
-from loopwright.blocks import Block, Constant, Gain, Input, Output, State, TransferFunction
+from loopwright.blocks import Block, Constant, Gain, Input, Output, State, TransferFunction, parameter
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams.exchange import ExchangeEvaluator
+from loopwright.fmus import Fmu, build, mass_spring_damper
 
 T = 0.05
 
@@ -67,3 +69,61 @@ def test_a_plant_that_is_not_linear_is_integrated(monkeypatch):
     model = loop(Tank(name="plant")).linearize()
     assert calls
     assert np.max(np.abs(model.affine)) == pytest.approx(np.sqrt(3.0) * np.tanh(np.sqrt(3.0) * T), rel=1e-9)
+
+
+def exchanged(path, gain=-3.0, **start):
+    plant = Fmu(path, interface="model_exchange", name="plant", start=start)
+    read, push = ("y", "u") if "y" in plant.output_variables else ("position", "force")
+
+    @subsystem(sample_time=T, name="controller")
+    def controller(y):
+        return Gain(gain=gain, name="k")(y).named("f")
+
+    return Diagram("loop", plant(**{push: controller(getattr(plant, read))}))
+
+
+def test_an_fmu_in_model_exchange_at_rest_is_no_integration(cache, monkeypatch):
+    """Its derivatives are asked for once at each instant, whatever wires and parameters they are for."""
+    monkeypatch.setattr(scipy.integrate, "solve_ivp", lambda *_, **__: pytest.fail("integrated"))
+    asked = []
+    plain = ExchangeEvaluator.differentiate
+    monkeypatch.setattr(ExchangeEvaluator, "differentiate", lambda s, *a: asked.append(a[1]) or plain(s, *a))
+    diagram = exchanged(mass_spring_damper.build(), position=0.0)
+    model = diagram.linearize()
+    A, B = np.array([[0.0, 1.0], [-100.0, -1.0]]), np.array([[0.0], [1.0]])
+    held = expm(np.block([[A, B], [np.zeros((1, 3))]]) * T)
+    closed = held[:2, :2] - 3.0 * held[:2, 2:] @ [[1.0, 0.0]]
+    found = np.sort_complex(model.poles[np.abs(model.poles) > 1e-12])
+    assert found == pytest.approx(np.sort_complex(np.linalg.eigvals(closed)), rel=1e-12)
+    diagram.sensitivity("f", ["k.gain"])
+    assert len(asked) <= 60  # 400 and more where it is integrated, along the gain four times as many again
+
+
+class Dated(Block):
+    """A first-order lag that becomes faster, with a disturbance that grows: ẋ = u − (1 + a t) x + b t²."""
+
+    u = Input(shape=())
+    y = Output(shape=())
+    x = State(start=0.0)
+    a: float = parameter(default=0.0)
+    b: float = parameter(default=0.0)
+
+    def derivative(self, t, x, u):
+        return u.u - (1.0 + self.a * t) * x.x + self.b * t**2
+
+    def output(self, t, x, u):
+        return x.x
+
+
+@pytest.mark.parametrize(
+    ("start", "transition", "end"),
+    [
+        ({"b": 1.0}, np.exp(-T), T**2 - 2.0 * T + 2.0 - 2.0 * np.exp(-T)),
+        ({"a": 40.0}, np.exp(-T - 20.0 * T**2), 0.0),
+    ],
+    ids=["its motion", "its derivatives"],
+)
+def test_an_fmu_at_rest_that_follows_time_is_integrated(start, transition, end, cache):
+    model = exchanged(build(Dated()), gain=0.0, **start).linearize()
+    assert model.A[0, 0] == pytest.approx(transition, rel=1e-9)
+    assert model.affine[0] == pytest.approx(end, abs=1e-12)
