@@ -113,7 +113,9 @@ class FlatDiagram(FlatLayout):
         all outputs there.
         """
         if acting not in self._ticks:
-            self._ticks[acting] = functions.trace_tick(self, self.blocks, acting, by_block=self.by_block)
+            large = acting == NONE and self.by_block and not self.apart and self.continuous.size
+            keep = self._rates.append if large and "flow" not in vars(self.origin) else None
+            self._ticks[acting] = functions.trace_tick(self, self.blocks, acting, by_block=self.by_block, keep=keep)
         return self._ticks[acting]
 
     def program_at(self, acting: frozenset[TickPattern]) -> TickProgram:
@@ -160,9 +162,14 @@ class FlatDiagram(FlatLayout):
         return {}
 
     @_shared
+    def _rates(self) -> list[functions.TracedRates]:
+        """Rates of a large diagram that a tick has made by the way, until `flow` takes them."""
+        return []
+
+    @_shared
     def flow(self) -> Schedule:
         """Return the rates of the continuous states between ticks, ``(t, x, w, p) -> dx``."""
-        return functions.trace_flow(self, self.blocks)
+        return functions.trace_flow(self, self.blocks, self._rates.pop() if self._rates else None)
 
     @_shared
     def jacobian(self) -> Derivative:

@@ -10,7 +10,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import reduce
 from typing import Any
 
@@ -49,17 +49,29 @@ def make_symbols(layout: FlatLayout) -> dict[str, Any]:
     return {name: ca.MX.sym(name, size) for name, size in sizes.items()}
 
 
+TracedRates = tuple[Mapping[str, Any], Any]
+"""Symbols, and the rates of the integrated states as an expression of them."""
+
+
 def trace_tick(
-    layout: FlatLayout, functions: BlockFunctions, acting: frozenset[TickPattern], *, by_block: bool = False
+    layout: FlatLayout,
+    functions: BlockFunctions,
+    acting: frozenset[TickPattern],
+    *,
+    by_block: bool = False,
+    keep: Callable[[TracedRates], None] | None = None,
 ) -> Schedule:
     """Return ``(t, x, w, p) -> (x_next, z, log, ok)``: a tick at which the given clocks act.
 
     With ``by_block`` the operations of each block are done as they are, and not simplified with those of others.
+    ``keep`` is given the rates, which are made by the way.
     """
     symbols = make_symbols(layout)
 
     def results(apart: Apart) -> Mapping[str, Any]:
         instant = evaluate(layout, functions, acting, **symbols, apart=apart)
+        if keep is not None:
+            keep((symbols, rates(instant)))
         found = {"x_next": next_x(instant), "z": plant_inputs(instant), "log": log(instant)}
         sizes = (ca.norm_1(found[name]) for name in ("log", "x_next", "z") if found[name].numel())
         ok = sum(sizes, ca.MX(0.0)) <= LARGEST  # false for any NaN or infinity
@@ -119,8 +131,16 @@ def trace_output(layout: FlatLayout, functions: BlockFunctions, port: tuple[str,
     return trace_schedule("output", symbols, results)
 
 
-def trace_flow(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
-    """Return ``(t, x, w, p) -> dx``: the rates of the entries of x that are integrated."""
+def trace_flow(layout: FlatLayout, functions: BlockFunctions, made: TracedRates | None = None) -> Schedule:
+    """Return ``(t, x, w, p) -> dx``: the rates of the entries of x that are integrated.
+
+    Parameters
+    ----------
+    made : TracedRates, optional
+        The rates, where a tick at which no clock acts has been traced, and nothing is evaluated from outside.
+    """
+    if made is not None:
+        return trace_schedule("flow", made[0], lambda apart: {"dx": made[1]})
     symbols = make_symbols(layout)
     return trace_schedule(
         "flow", symbols, lambda apart: {"dx": rates(evaluate(layout, functions, NONE, **symbols, apart=apart))}

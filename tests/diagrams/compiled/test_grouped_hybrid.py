@@ -172,3 +172,17 @@ def test_all_blocks_are_gone_through_once_for_the_instants_between_ticks(grouped
     del sources
     write_hybrid(flat, [NONE], stiff=False)
     assert made == [NONE, NONE]  # it is large, and isn't kept
+
+
+def test_all_blocks_are_gone_through_once_for_an_interpreted_run(grouped, monkeypatch):
+    """Instants between ticks and rates are traced together; a run is the matrix exponential, to the error of rk4."""
+    made = []
+    evaluate = flat_diagram.functions.evaluate
+    monkeypatch.setattr(
+        flat_diagram.functions, "evaluate", lambda *given, **more: (made.append(given[2]), evaluate(*given, **more))[1]
+    )
+    diagram, names = ring(12)
+    run = diagram.simulate(1.0, step=0.01, solver="rk4", compile=False, **QUIET)
+    assert made == [NONE]
+    exact = expm(matrix_of(12)) @ [run[f"{name}.y"][0] for name in names]
+    assert [run[f"{name}.y"][-1] for name in names] == pytest.approx(exact, abs=1e-8)
