@@ -11,6 +11,7 @@ import hashlib
 import mmap
 import os
 import struct
+import sys
 from functools import lru_cache
 from itertools import groupby
 from pathlib import Path
@@ -20,8 +21,7 @@ import unicorn
 from unicorn import arm64_const as arm
 from unicorn import x86_const as x86
 
-from loopwright.diagrams.compiled import code, fused_code, handed_over, hybrid, hybrid_code, loop, native_tick
-from loopwright.diagrams.lanes import lane_code
+from loopwright.diagrams.compiled import code, hybrid_code, libraries, native_tick, remote
 from loopwright.fmus.export import compile_shared
 
 lief.logging.disable()
@@ -271,8 +271,15 @@ class Library:
 
 def compile_for(platform, source, out, *more):
     """Compile a source of compiled runs for a platform, without the instructions of this machine's processor."""
-    flags = [flag for flag in (*code._FLAGS, *more) if "native" not in flag]
+    flags = [flag for flag in (*libraries._FLAGS, *more) if "native" not in flag]
     compile_shared({"code.c": source}, out, platform=platform, more_flags=flags)
+
+
+def _replace(patch, original, made):
+    """Replace a function under all names that modules have for it."""
+    for module in [module for name, module in sorted(sys.modules.items()) if name.startswith("loopwright.diagrams")]:
+        for name in [name for name, value in vars(module).items() if value is original]:
+            patch.setattr(module, name, made)
 
 
 def emulate(patch, platform, folder):
@@ -280,7 +287,7 @@ def emulate(patch, platform, folder):
 
     Its steps of FMUs are not for Windows, whose calls place numbers and integers in one order.
     """
-    processor, known = Processor(platform), {}
+    processor, known, original_load = Processor(platform), {}, libraries.load_compiled
 
     def load(source, flags=(), processor_of=""):
         if (source, flags) not in known:
@@ -295,12 +302,9 @@ def emulate(patch, platform, folder):
         made.processor = processor
         return made
 
-    for module in (code, hybrid_code, fused_code, lane_code):
-        patch.setattr(module, "load_compiled", load)
-    patch.setattr(code, "master", lru_cache(code.master.__wrapped__))
-    patch.setattr(loop, "master", code.master)
-    patch.setattr(hybrid_code, "hybrid_master", lru_cache(hybrid_code.hybrid_master.__wrapped__))
-    for module in (hybrid, handed_over):
-        patch.setattr(module, "hybrid_master", hybrid_code.hybrid_master)
+    for original in (code.master, hybrid_code.hybrid_master):
+        _replace(patch, original, lru_cache(original.__wrapped__))
+    _replace(patch, libraries.load_compiled, load)
+    patch.setattr(remote, "load_compiled", original_load)  # code of other processes
     patch.setattr(native_tick, "_Tick", function)
     return processor

@@ -5,7 +5,7 @@ import pytest
 
 from loopwright.blocks import Constant, Gain, Integrator, Product, PythonFunction, Relay, Sine, Sum, TransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.diagrams.compiled import code, fused, hybrid_code, write_hybrid, write_ticks
+from loopwright.diagrams.compiled import code, fused, hybrid_code, libraries, write_hybrid, write_ticks
 from loopwright.diagrams.lanes import lane_code
 from loopwright.diagrams.simulation.compiled_ticks import kinds_of
 from loopwright.fmus.export.compiler import TARGETS
@@ -52,8 +52,8 @@ def sources():
     """All C code that runs compile, by name."""
     found = {
         "loop": code.master_source(),
-        "hybrid loop": code.read_sources(*hybrid_code._SOURCES),
-        "other process": code.read_sources("newton.c", "remote.c", "child.c"),
+        "hybrid loop": libraries.read_sources(*hybrid_code._SOURCES),
+        "other process": libraries.read_sources("newton.c", "remote.c", "child.c"),
     }
     with pytest.MonkeyPatch.context() as patch:
         for grouped in (False, True):
@@ -73,7 +73,7 @@ def written_for_this_processor(monkeypatch):
 
     def note(source, flags=(), processor="", *, of):
         found[of] = source, flags
-        return code.load_compiled(source, flags, processor)
+        return libraries.load_compiled(source, flags, processor)
 
     diagram = experiments.EXPERIMENTS["C"]().diagram
     monkeypatch.setattr(fused, "load_compiled", lambda *given: note(*given, of="fused"))
