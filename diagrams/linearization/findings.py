@@ -40,6 +40,18 @@ class StepsOnly(BlockFinding):
         return f"{self.block}.{self.port} follows {self.source!r} in steps only: it linearizes to zero"
 
 
+@dataclass(frozen=True)
+class EventsOnly(StepsOnly):
+    """An output of an FMU in model exchange beside a discrete input, which acts at events: that slope is left out."""
+
+    def __str__(self) -> str:
+        return (
+            f"{self.block}.{self.port} may follow {self.source!r}, a discrete input in model exchange, which acts at "
+            "events: the model leaves that way out. Take interface='co_simulation' for this FMU, or have the input "
+            "exported as continuous"
+        )
+
+
 @explain_calls
 @dataclass(frozen=True)
 class MeanSlope(BlockFinding):

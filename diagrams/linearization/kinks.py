@@ -25,13 +25,14 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core import Block, Finding, Output, State
+from ...fmus.calls import is_smooth
 from ...fmus.running import Fmu
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
 from .block_slopes import BlockSlopes, slopes_of
 from .exchanged import evaluators_at
-from .findings import Kink, StepsOnly, ZeroSlope
+from .findings import EventsOnly, Kink, StepsOnly, ZeroSlope
 from .operating_points import operating_point
 from .plant_models import plant_paths
 from .signal_paths import SignalPaths
@@ -69,15 +70,18 @@ def find_kinks(flat: FlatDiagram, at: OperatingPoint) -> tuple[Finding, ...]:
 
 
 def _find_steps_of_plants(flat: FlatDiagram) -> Iterator[StepsOnly]:
-    """Yield the ways through FMUs from or to a port of integers, which has no derivatives."""
+    """Yield the ways through FMUs from or to a port of integers, which has no derivatives, and from discrete inputs."""
     for path in (*plant_paths(flat), *flat.outside):
         block = flat.table.blocks[path]
         if not isinstance(block, Fmu):
             continue
         for port, source in product(block.output_variables, block.input_variables):
-            whole = block.output_variables[port].is_integer or block.input_variables[source].is_integer
-            if whole and (path, source) in flat.table.wires:
+            if (path, source) not in flat.table.wires:
+                continue
+            if block.output_variables[port].is_integer or block.input_variables[source].is_integer:
                 yield StepsOnly(path, port, source)
+            elif path in flat.outside and not is_smooth(block.input_variables[source]):
+                yield EventsOnly(path, port, source)
 
 
 def find_kinks_between(
