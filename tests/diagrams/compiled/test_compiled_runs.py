@@ -278,6 +278,8 @@ def test_a_library_that_was_cut_off_is_compiled_again(tmp_path, monkeypatch, fre
     part = library.read_bytes()[: library.stat().st_size // 2]
     library.unlink()  # it is loaded, and must not change under this process
     library.write_bytes(part)
+    assert not libraries.is_kept(source)
     libraries.load_compiled.cache_clear()
     assert code.MASTER in str(libraries.load_compiled(source)[code.MASTER].__name__)
     assert library.stat().st_size > len(part)
+    assert libraries.is_kept(source)
