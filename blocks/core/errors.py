@@ -301,7 +301,9 @@ def close_names(name: str, known: Iterable[str]) -> list[str]:
     plain: dict[str, list[str]] = {}
     for one in sorted({str(k) for k in known}):
         plain.setdefault(one.casefold(), []).append(one)
-    close = difflib.get_close_matches(str(name).casefold(), plain, n=3, cutoff=0.5)
+    asked = str(name).casefold()
+    alike = [one for one in plain if len(asked) > 2 or one[:1] == asked[:1]]  # one letter of two, elsewhere, is chance
+    close = difflib.get_close_matches(asked, alike, n=3, cutoff=0.5)
     return [one for folded in close for one in plain[folded]][:3]
 
 

@@ -72,6 +72,15 @@ class NoNumber:
     def __abs__(self) -> NoReturn:
         raise self._number_error("abs", "Function(np.abs)(u)")
 
+    def __float__(self) -> NoReturn:
+        raise self._number_error("a function of numbers", "Function(np.sin)(u), say, with NumPy's functions")
+
+    def __rshift__(self, other: Any) -> NoReturn:
+        raise WiringError(
+            "blocks are wired by calls, not by >>. Call the second block with the first: second(first).",
+            block=self._source_name(),
+        )
+
     def __mod__(self, other: Any) -> NoReturn:
         raise self._number_error("%", "Function(lambda u: np.mod(u, …))(u)")
 

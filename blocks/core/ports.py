@@ -155,7 +155,8 @@ class Input(Port):
         if instance is None:
             return self
         raise AttributeError(
-            f"{self.name!r} is an input of {instance!r} and can't be read; wire it by calling the block."
+            f"{self.name!r} is an input of {instance!r} and can't be read; wire it by calling the block, and read it "
+            f"in an equation as u.{self.name}"
         )
 
 

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from casadi import ArrayInterface
 
-from ..core import Block, DefinitionError, LoopwrightError, Port, Shape, ShapeError, State, TraceError
+from ..core import Block, DefinitionError, LoopwrightError, Port, Shape, ShapeError, State, TraceError, near
 from .symbols import flat_column, size
 from .traced_functions import NotTracedError
 
@@ -90,7 +90,9 @@ def trace_error(error: Exception, block: Block, equation: str) -> TraceError:
     if isinstance(error, NotTracedError):  # says what to write
         other = f", or take {instead}, which is not traced" if instead else ""
         return TraceError(f"its {equation} can't be traced{line}: {error}{other}.")
-    text = f"its {equation} can't be traced{line}: {type(error).__name__}: {error}."
+    text = f"its {equation} can't be traced{line}: {type(error).__name__}: {str(error).rstrip('.')}."
+    if isinstance(error, AttributeError) and (known := getattr(error.obj, "_fields", ())):
+        text += f" {near(str(error.name), known)}"
     if isinstance(error, NameError | ZeroDivisionError | AttributeError | KeyError | ImportError):
         mistake = TraceError(f"{text} Correct the equation there.")
         mistake.is_mistake = True

@@ -66,6 +66,12 @@ def read_matrices(system: LinearSystem) -> Matrices:
                 f"found a {type(system).__name__}, measured data without poles; expected a control.StateSpace. The "
                 "margins of data are measured_margins(data), with their uncertainty."
             ) from error
+        if hasattr(system, "linearize") or hasattr(system, "loop"):
+            made_of = "diagram.linearize()" if hasattr(system, "linearize") else "model"
+            raise ParameterError(
+                f"found a {type(system).__name__}; expected the loop at a wire. Give {made_of}.loop('wire'), with "
+                "a wire's name."
+            ) from error
         raise ParameterError(
             f"found {type(system).__name__}, which python-control can't turn into a state space ({error}); expected "
             "a control.StateSpace. Make one with control.ss(A, B, C, D, dt)."

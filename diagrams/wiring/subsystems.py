@@ -253,7 +253,12 @@ class SubsystemCall(Wireable):
             named[name] = signal
         return named
 
+    def __repr__(self) -> str:
+        return f"<call of {self.label}>"
+
     def _signal(self) -> Signal:
+        if not self.results:
+            raise WiringError("its function returns no signal. End it with return, and the outputs.", block=self.label)
         if len(self.results) != 1:
             raise WiringError(
                 f"it has {len(self.results)} outputs ({', '.join(self.results) or 'none'}); unpack the call, or name "

@@ -1,0 +1,52 @@
+"""Mistakes that come naturally to whoever knows another tool: the error says what to write."""
+
+import math
+
+import pytest
+
+from loopwright.blocks import Block, Gain, Input, LoopwrightError, State, Step
+from loopwright.diagrams import Diagram, margins, subsystem
+from support.public_calls import drive
+
+STEP = Step(times=0.0, values=1.0, name="r")
+
+
+class Tank(Block):
+    flow = Input()
+    h = State(start=0.1, output=True)
+
+    def derivative(self, t, x, u):
+        return u.flw
+
+
+class Vessel(Tank):
+    def derivative(self, t, x, u):
+        return self.flow
+
+
+@subsystem(sample_time=0.01)
+def nothing(e):
+    Gain(gain=1.0)(e)
+
+
+@pytest.mark.parametrize(
+    ("ask", "said"),
+    [
+        (lambda: float(STEP()), r"r: a function of numbers can't be applied to a signal.*Function\(np\.sin\)"),
+        (lambda: math.sin(STEP().named("r1")), r"Function\(np\.sin\)"),
+        (lambda: STEP >> Gain(gain=1.0), r"wired by calls, not by >>"),
+        (lambda: margins(drive()), r"found a Diagram; expected the loop at a wire. Give diagram\.linearize\(\)\.loop"),
+        (lambda: margins(drive().linearize()), r"found a Linearization; .*Give model\.loop"),
+        (lambda: Diagram("t", Tank()(STEP)), r"has no attribute 'flw'\. Did you mean 'flow'\? Correct"),
+        (lambda: Diagram("t", Vessel()(STEP)), r"read it in an equation as u\.flow\. Correct"),
+        (lambda: Diagram("t", Gain(gain=1.0)(nothing(STEP))), r"nothing: its function returns no signal. End it with return"),
+        (lambda: drive().simulate(0.1, dt=0.01), r"no argument 'dt'\. Known: atol, .*step"),
+    ],
+)  # fmt: skip
+def test_a_natural_mistake_is_told_with_what_to_write(ask, said):
+    with pytest.raises(LoopwrightError, match=said):
+        ask()
+
+
+def test_a_call_of_a_subsystem_prints_as_that():
+    assert repr(nothing(STEP)) == "<call of nothing>"
