@@ -229,14 +229,13 @@ class InjectionRun:
         simulation.record_instant()
         self.go(count, every)
         run = simulation.run(final=False)
-        times = np.array([simulation.time_of(first + i * every) for i in range(count + 1)])
+        times = times_of(range(first, first + count * every + 1, every), self.flat.base)
         rows = np.searchsorted(run.t, times * (1.0 + 1e-15), side="right") - 1
 
         if every > 1:
             v = np.asarray(run[".".join(self.signal.port)])
-            between = (
-                np.searchsorted(run.t, [simulation.time_of(first + i) for i in range(count * every)], side="right") - 1
-            )
+            all_times = times_of(range(first, first + count * every), self.flat.base)
+            between = np.searchsorted(run.t, all_times, side="right") - 1
             all_ticks = v[between].reshape(count, every, -1)
             self.held &= bool(np.all(all_ticks == all_ticks[:, :1]))
 
@@ -247,6 +246,14 @@ class InjectionRun:
         v, u = (read(port, self.signal.entries) for port in (self.signal.port, (self.made.sum, "y")))
         y = [read(o.port, o.entries) for o in self.outputs]
         return v, u, np.hstack([np.zeros((count + 1, 0)), *y])
+
+
+def times_of(ticks: range, base: Fraction) -> np.ndarray:
+    """Return the times of ticks in s, each of them rounded once, as those of a run are."""
+    times, whole = base.numerator, base.denominator
+    if max(ticks[-1] * times, whole) < 2**53:  # whole numbers that floats hold: their quotient is rounded once
+        return np.asarray(np.arange(ticks.start, ticks.stop, ticks.step) * times / whole)
+    return np.array([k * times / whole for k in ticks])
 
 
 def _translate_point(point: OperatingPoint, old: FlatDiagram, made: InjectedDiagram, signal: Tap) -> OperatingPoint:

@@ -3,6 +3,8 @@
 Every response is one of sampled signals: v, what the wire's port puts out, and u = v + d, what its consumers get.
 """
 
+from fractions import Fraction
+
 import control
 import numpy as np
 import pytest
@@ -21,8 +23,9 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Channel, Diagram, Rig, fig3, subsystem
 from loopwright.diagrams.linearization.derivatives import find_signal
-from loopwright.diagrams.measure.injection import inject_signal
+from loopwright.diagrams.measure.injection import inject_signal, times_of
 from loopwright.diagrams.measure.waveforms import compute_phasors, plan_signal
+from loopwright.diagrams.simulation import Simulation
 from loopwright.fmus import Fmu, gantry, mass_spring_damper
 
 PATH = Ellipse(semi_axes=(0.3, 0.15), center=(0.5, 0.5))
@@ -317,3 +320,18 @@ def test_what_does_not_fit_is_refused(changes, error, text):
         diagram = Diagram("d", Integrator(name="place")(Constant(value=0.0)))
     with pytest.raises(error, match=text):
         diagram.frequency_response(**given)
+
+
+@pytest.mark.parametrize(
+    "base", [Fraction(1, 1000), Fraction(7, 3000), Fraction(1, 3 * 10**9), Fraction(2**40 + 1, 2**60)]
+)
+def test_times_of_ticks_are_rounded_once(base):
+    for ticks in (range(400), range(12_345, 20_000, 7), range(10**9, 10**9 + 5)):
+        expected = [float(k * base) for k in ticks]  # a fraction becomes a float by one rounding
+        assert times_of(ticks, base).tolist() == expected
+
+
+def test_records_check_no_argument_at_each_sample(monkeypatch):
+    monkeypatch.setattr(Simulation, "time_of", lambda *_: pytest.fail("asked at each sample"))
+    found = continuous_loop().frequency_response("u", [20.0], amplitude=1e-3, windows=2, confirm=False)
+    assert found.S.frdata.item() == pytest.approx(1.0 / (1.0 + (60j + 40.0) / -400.0), rel=1e-3)
