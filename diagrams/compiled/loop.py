@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Protocol
@@ -14,7 +14,7 @@ import numpy as np
 from ...fmus.calls import NEAR, FmuInstance, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
 from ..flat import TRUE, TickPattern
-from .code import CompiledTick, TickCode, master
+from .code import CompiledTick, GroupedTick, TickCode, master
 from .native_tick import INTERRUPTS, at, bind_native
 from .remote import RemotePlants
 from .staged_functions import Staged, StagedEquations
@@ -202,6 +202,7 @@ class CompiledLoop:
         self._remotes = [self._remote, *([] if exchange is None else [exchange.remote])]
         self._kept: list[Any] = [code, arguments, results, plants, columns, exchange]
         self._exchange = exchange
+        self._calls_python = any(isinstance(t, GroupedTick) and len(t.tables.python) > 0 for t in code.ticks.values())
         self._watched: list[tuple[HostState, ctypes.c_bool]] = [] if exchange is None else [*exchange.watched]
         t, x, _, _ = arguments
         x_next, _, log, ok = results
@@ -330,7 +331,9 @@ class CompiledLoop:
 
         C sets rounding mode and traps back after each step; the working folder is set back at the end.
         """
-        return self._guard() if self._watched or any(r.address for r in self._remotes) else INTERRUPTS.kept()
+        if self._watched or any(r.address for r in self._remotes):
+            return self._guard()
+        return INTERRUPTS.kept() if self._calls_python else nullcontext()
 
     @contextmanager
     def _guard(self) -> Iterator[None]:
@@ -339,7 +342,8 @@ class CompiledLoop:
                 stack.enter_context(host)
             for remote in self._remotes:
                 stack.enter_context(remote.guard())
-            stack.enter_context(INTERRUPTS.kept())
+            if self._calls_python or any(r.address for r in self._remotes):
+                stack.enter_context(INTERRUPTS.kept())
             yield
         for host, changed in self._watched:
             if changed:

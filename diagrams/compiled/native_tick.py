@@ -151,7 +151,8 @@ def bind_call(tick: CompiledTick, arguments: Sequence[np.ndarray], results: Sequ
 
     def call() -> None:
         function(bound.arguments, bound.results, bound.iw, bound.w, 0)
-        INTERRUPTS.check()
+        if INTERRUPTS.came:
+            INTERRUPTS.check()
 
     return call
 
