@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from ..core import Array, Block, Event, Input, Output, ParameterError, State, parameter
-from ..tracing import hold
+from ..tracing import find_hold
 from .integrators import check_limits, clip
 
 _WAYS = ("back_calculation", "clamping", "none")
@@ -199,11 +199,11 @@ class PID(Block):
         """Return the numbers of the filter and of back-calculation for one sample."""
         made = {}
         if self.filter_time is not None:
-            decay, gain = hold(np.array([[-1.0 / self.filter_time]]), T, method)
+            decay, gain = find_hold(np.array([[-1.0 / self.filter_time]]), T, method)
             made = {"filter_decay": float(decay[0, 0]), "filter_gain": float(gain[0, 0])}
         if self.tracks:
             rate = self.tracking_rate() if self.ki or self.tracking_time is not None else 0.0
-            made["tracking_share"] = 1.0 - float(hold(np.array([[-rate]]), T, method)[0][0, 0])
+            made["tracking_share"] = 1.0 - float(find_hold(np.array([[-rate]]), T, method)[0][0, 0])
         return made
 
     def unlimited_output(self, x: Any, u: Any) -> Array:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from ..core import Array, Block, Event, Input, Output, ParameterError, State, parameter
-from ..tracing import hold
+from ..tracing import find_hold
 
 
 class ErrorDynamics(Block):
@@ -171,7 +171,7 @@ class AdmittanceFilter(Block):
     def constants(self, T: float, method: str) -> dict[str, np.ndarray]:
         """Return transition and forcing of the free filter over one sample."""
         A = np.array([[0.0, 1.0], [-self.stiffness / self.mass, -self.effective_damping / self.mass]])
-        transition, forcing = hold(A, T, method)
+        transition, forcing = find_hold(A, T, method)
         return {"transition": transition, "forcing": forcing}
 
     def driving_acceleration(self, u: Any) -> Array:

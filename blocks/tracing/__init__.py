@@ -1,6 +1,6 @@
 """Equations of blocks as CasADi functions, and their discretization."""
 
-from .discretization import check_method, hold
+from .discretization import check_method, find_hold, hold
 from .equations import initial_state, start_shapes, start_values
 from .numpy_check import GUARDS, NEXT, evaluate
 from .opaque_equations import raise_failure
@@ -23,6 +23,7 @@ __all__ = [
     "count_uses",
     "describe_outside",
     "evaluate",
+    "find_hold",
     "flat_column",
     "has_large_product",
     "has_structure",

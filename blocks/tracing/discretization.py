@@ -40,6 +40,11 @@ def hold(A: np.ndarray, T: float, method: str) -> tuple[np.ndarray, np.ndarray]:
     SampleTimeError
         For another method, and for a trapezoidal step whose I − A T/2 is singular.
     """
+    return find_hold(A, T, method)
+
+
+def find_hold(A: np.ndarray, T: float, method: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `hold` does, from arguments of known kinds: a sweep does so for each of its runs."""
     check_method(method)
     A = np.atleast_2d(np.asarray(A, dtype=float))
     n = len(A)

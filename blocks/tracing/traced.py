@@ -24,7 +24,7 @@ import casadi as ca
 import numpy as np
 
 from ..core import SOLVED, Block, Layout, LoopwrightError, SampleTimeError, Shape, TraceError, Value
-from .discretization import hold
+from .discretization import find_hold
 from .equations import check_definition, guards_of, match_ports, start_values, takes_update, trace_error
 from .numpy_check import GUARDS, NEXT, compare
 from .opaque_equations import Foreign
@@ -64,13 +64,13 @@ class Traced:
         given = [value for _, value in traced_parameters(block)]
         numbers: list[float] = []
         for value in (*given, T, *constants_of(block, T, self.method).values()):
-            numbers += [value] if isinstance(value, float) else np.ravel(value).tolist()
+            numbers += [value] if isinstance(value, float) else np.asarray(value).ravel().tolist()
         p = np.array(numbers, dtype=float)
         if self.system_matrix is None:
             return p
         n = sum(size(s) for s in self.states.values())
         A = np.array(self.system_matrix(p)).reshape(n, n)
-        return np.concatenate([p, *(m.ravel() for m in hold(A, T, self.method))])
+        return np.concatenate([p, *(m.ravel() for m in find_hold(A, T, self.method))])
 
 
 def constants_of(block: Block, T: float, method: str) -> dict[str, Any]:

@@ -146,7 +146,7 @@ def write_numbers(flat: FlatDiagram, blocks: Mapping[str, Block], p: np.ndarray,
             continue
         p[flat.parameters.slices[path]] = flat.pack(path, block)
         inputs = flat.checked.traced[path].inputs
-        if values := [np.ravel(port.start_value(block, inputs)) for port in block.states.values()]:
+        if values := [np.asarray(port.start_value(block, inputs)).ravel() for port in block.states.values()]:
             x0[flat.states.slices[path]] = np.concatenate(values)
 
 

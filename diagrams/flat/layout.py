@@ -195,7 +195,7 @@ class FlatLayout:
 
     def acting(self, k: int) -> frozenset[TickPattern]:
         """Return the clocks that tick at tick ``k``."""
-        return frozenset(c for c in self.distinct if c.acts(k))
+        return frozenset([c for c in self.distinct if c.acts(k)])
 
     def ticks(self, k: int, last: int, *, every: bool) -> Iterator[int]:
         """Yield the ticks to visit after tick ``k``: all, or those at which something acts, and the last one."""

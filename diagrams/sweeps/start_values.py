@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from operator import is_
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -73,7 +74,7 @@ class StartValues:
     def _initial(self, flat: FlatDiagram, path: str, columns: dict[str, Any]) -> np.ndarray:
         """Return a block's initial state; the last one, where neither the block nor its inputs have changed."""
         block = flat.table.blocks[path]
-        key = b"".join(b"-" if column is None else column.tobytes() for column in columns.values())
+        key = b"".join([b"-" if column is None else column.tobytes() for column in columns.values()])
         known = self._found.get(path)
         if known is None or known[0] is not block or known[1] != key:
             known = self._found[path] = (block, key, find_initial_state(flat, path, columns))
@@ -83,7 +84,7 @@ class StartValues:
         """Return the values just before t = 0 of the sources that jump there."""
         blocks = self._workspace.flat.table.blocks
         sources = [blocks[path] for path in self._sources]
-        if self._left is None or any(new is not old for new, old in zip(sources, self._left[0], strict=True)):
+        if self._left is None or not all(map(is_, sources, self._left[0])):
             found = {port: np.asarray(tap(None)) for port, tap in values_from_left(self._workspace).items()}
             self._left = (sources, found)
         return self._left[1]

@@ -87,20 +87,20 @@ def sweep(
             raise OptionError(f"found {to!r}; expected the path of a folder. Give one.", block=name, port="to")
         store = Store(Path(to), parts_of(plan), {"diagram": name, "duration": plan.duration}, overwrite=overwrite)
         known = store.read()
-    keys = [key_of(sample, seeded=bool(plan.seeds)) for sample in found] if store is not None else []
     outcomes: list[Outcome | None] = [None] * len(found)
-    for place, key in enumerate(keys):
-        if key in known:
-            outcomes[place] = replace(known[key], index=place)
-    reused = sum(outcome is not None for outcome in outcomes)
-    left = [sample for sample in found if outcomes[sample.index] is None]
-    done = reused
+    reused = 0
 
     def result() -> Sweep:
         messages = tuple(dict.fromkeys(m for o in outcomes if o is not None for m in o.messages))
         return Sweep(found, tuple(outcomes), name, perf_counter() - started, reused, messages, tuple(plan.reductions))
 
     try:
+        keys = [key_of(sample, seeded=bool(plan.seeds)) for sample in found] if store is not None else []
+        for place, key in enumerate(keys):
+            if key in known:
+                outcomes[place] = replace(known[key], index=place)
+        done = reused = sum(outcome is not None for outcome in outcomes)
+        left = [sample for sample in found if outcomes[sample.index] is None]
         run = _run(plan, left, count_workers, client)
         with one_thread(), _bar(name, len(found), progress) as show, closing(run) as stream:
             show(done)

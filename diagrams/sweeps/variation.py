@@ -12,7 +12,7 @@ from ...blocks.tracing import has_structure
 from ...fmus import Fmu
 from ...fmus.archive import FmuDescription
 from ..simulation import SimulatedDiagram
-from ..wiring import change_parameter, split_entry, split_path
+from ..wiring import change_parameters, split_entry, split_path
 
 D = TypeVar("D", bound=SimulatedDiagram)
 _KEPT = 8
@@ -79,6 +79,7 @@ class Variation(Generic[D]):
         blocks: dict[str, Block] = {}
         starts: dict[str, dict[str, Any]] = {}
         names: dict[str, list[str]] = {}
+        changes: dict[str, list[tuple[list[str], Any]]] = {}
         scheduled = self._diagram.scheduled.blocks
         for name, value in parameters.items():
             place = self.place(name)
@@ -90,8 +91,10 @@ class Variation(Generic[D]):
             if isinstance(block, Fmu):
                 starts.setdefault(path, {})[keys[1]] = block.start_value(self._about(path, block), keys[1], value)
             else:
-                blocks[path] = change_parameter(blocks.get(path, block), keys, value)
+                changes.setdefault(path, []).append((keys, value))
             names.setdefault(path, []).append(name)
+        for path, of_it in changes.items():
+            blocks[path] = change_parameters(scheduled[path], of_it)
         changed = {path for path, block in blocks.items() if not self._is_numbers(path, block)}
         for path in changed | ({self._owner(name) for name in other} & names.keys() if other else set()):
             other.update(names[path])
@@ -156,7 +159,7 @@ class Variation(Generic[D]):
         if path not in self._free:
             self._free[path] = [port for port in old.inputs if (path, port) not in wires]
         free = self._free[path]
-        return all(identity(block.inputs[q].default) == identity(old.inputs[q].default) for q in free)
+        return not free or all(identity(block.inputs[q].default) == identity(old.inputs[q].default) for q in free)
 
 
 def _has_elements(block: Fmu, name: str) -> bool:

@@ -10,7 +10,7 @@ from .order import Order, find_orders
 from .parameter_names import find_place, split_path
 from .structure import Structure, SubsystemSettings, Wire, join, stepped_blocks
 from .subsystems import Subsystem, exact_time, subsystem
-from .variants import change_parameter
+from .variants import change_parameter, change_parameters
 
 __all__ = [
     "Checked",
@@ -23,6 +23,7 @@ __all__ = [
     "SubsystemSettings",
     "Wire",
     "change_parameter",
+    "change_parameters",
     "exact_time",
     "find_cyclic_parts",
     "find_orders",

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace as replace_fields
 from typing import Any, TypeVar
 
+import numpy as np
+
 from ...blocks.core import Block, LoopwrightError, OptionError, UnknownNameError, Value, WiringError, near, shorten
 from ...blocks.tracing import check_method
 from .entry_names import split_entry, with_entry
@@ -33,9 +35,18 @@ def apply_changes(table: Structure, changes: Iterable[tuple[object, object]], di
             table.blocks[full] = value.replace(name=full.rpartition(".")[2])
     others = [one for one, is_block in zip(named, blocks, strict=True) if not is_block]
     found = [(*_find_target(table, path, diagram), path, value) for path, value in others]
-    for full, keys, path, value in sorted(found, key=lambda one: (len(one[1]), "[" in "".join(one[1]))):
+    of_block: dict[str, list[tuple[list[str], object]]] = {}
+    for full, keys, path, value in sorted(found, key=lambda one: place_of_change((one[1], None))):
         _check_once(given, ".".join([full, *keys]), path, diagram)
-        _change(table, full, keys, value)
+        if keys and full not in table.subsystems:
+            of_block.setdefault(full, []).append((keys, value))
+        else:
+            _change(table, full, keys, value)
+    for full, of_it in of_block.items():
+        try:
+            table.blocks[full] = change_parameters(table.blocks[full], of_it)
+        except LoopwrightError as error:
+            raise error.at(block=full) from None
     return table
 
 
@@ -79,20 +90,14 @@ def _find_target(table: Structure, path: str, diagram: str) -> tuple[str, list[s
 
 
 def _change(table: Structure, path: str, keys: list[str], value: object) -> None:
-    """Change a parameter of the block, or a setting of the subsystem, at a path."""
+    """Change a setting of the subsystem at a path; a block has to be named with a parameter."""
     if not keys:
         raise WiringError(
             f"found {shorten(value)}; expected a block in its place, such as Fmu('other.fmu'), or the name of a "
             f"parameter of it: {name_parameters(table.blocks[path], path)}.",
             block=path,
         )
-    if path in table.subsystems:
-        table.subsystems[path] = _change_subsystem(table.subsystems[path], keys[0], value)
-        return
-    try:
-        table.blocks[path] = change_parameter(table.blocks[path], keys, value)
-    except LoopwrightError as error:
-        raise error.at(block=path) from None
+    table.subsystems[path] = _change_subsystem(table.subsystems[path], keys[0], value)
 
 
 def _used_ports(table: Structure, path: str) -> tuple[set[str], set[str]]:
@@ -137,15 +142,37 @@ def change_parameter(block: V, keys: list[str], value: object) -> V:
 
     The last name may be an entry of an array: ``"denominator[1]"``.
     """
-    name = keys[0]
-    if len(keys) == 1:
-        whole, entry = split_entry(name, type(block).parameter_specs)
-        if entry and whole in type(block).parameter_specs:
-            name, value = whole, with_entry(block.__dict__[whole], entry, value, whole)
-        return block.replace(**{name: value})
-    inner = block.__dict__.get(name)
-    if isinstance(inner, Value):
-        return block.replace(**{name: change_parameter(inner, keys[1:], value)})
-    if isinstance(inner, Mapping):
-        return block.replace(**{name: {**inner, ".".join(keys[1:]): value}})
-    raise UnknownNameError(f"it has no parameter {'.'.join(keys)!r}. {near(name, type(block).parameter_specs)}")
+    return change_parameters(block, [(keys, value)])
+
+
+def change_parameters(block: V, changes: Iterable[tuple[list[str], object]]) -> V:
+    """Return ``block`` with several of its parameters changed at once: it is checked with all of them, and built once.
+
+    Whole parameters come first, then their entries and parts; see `change_parameter`.
+    """
+    found: dict[str, Any] = {}
+    specs = type(block).parameter_specs
+    for keys, value in sorted(changes, key=place_of_change):
+        name = keys[0]
+        whole, entry = split_entry(name, specs) if len(keys) == 1 else (name, "")
+        if whole in found and whole in specs and (entry or len(keys) > 1) and not isinstance(found[whole], np.ndarray):
+            block, found = block.replace(**found), {}  # it has the whole in the form that parts belong to
+        if len(keys) == 1:
+            is_entry = bool(entry) and whole in specs
+            now = found.get(whole, block.__dict__.get(whole))
+            found[whole if is_entry else name] = with_entry(now, entry, value, whole) if is_entry else value
+            continue
+        inner = found.get(name, block.__dict__.get(name))
+        if isinstance(inner, Value):
+            found[name] = change_parameter(inner, keys[1:], value)
+        elif isinstance(inner, Mapping):
+            found[name] = {**inner, ".".join(keys[1:]): value}
+        else:
+            raise UnknownNameError(f"it has no parameter {'.'.join(keys)!r}. {near(name, specs)}")
+    return block.replace(**found)
+
+
+def place_of_change(change: tuple[list[str], object]) -> tuple[int, bool]:
+    """Return the place in the order of changes of one block: whole parameters, then entries, then parts of parts."""
+    keys, _ = change
+    return len(keys), "[" in "".join(keys)

@@ -5,7 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from loopwright.diagrams import experiments
+from loopwright.blocks import Constant, DiscreteTransferFunction
+from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.sweeps import final, maximum
 from loopwright.diagrams.sweeps.bound_run import BoundRun
 from loopwright.diagrams.sweeps.plan import Worker
@@ -85,3 +86,24 @@ def test_the_first_tick_of_a_compiled_run_is_evaluated_in_c(diagram):
         assert simulation._engine.workspace.native
     with diagram.simulation(compile=False) as simulation:
         assert not simulation._engine.workspace.native
+
+
+def test_a_block_is_built_once_for_all_of_its_parameters(monkeypatch):
+    @subsystem(sample_time=0.1, name="box")
+    def box(u):
+        return DiscreteTransferFunction(numerator=(0.3, 0.2), denominator=(1.0, -0.4), name="filter")(u)
+
+    diagram = Diagram("filtered", box(Constant(value=1.0, name="one")).named("y"))
+    names = [f"box.filter.{name}" for name in ("numerator[1]", "numerator[2]", "denominator[2]")]
+    built = []
+    plain = DiscreteTransferFunction.replace
+
+    def replace(block, **changes):
+        built.append(changes)
+        return plain(block, **changes)
+
+    with Worker(make_plan(diagram, 3.0, (), {"end": final("y")}, (), {})) as worker:
+        monkeypatch.setattr(DiscreteTransferFunction, "replace", replace)
+        found = worker.run(Sample(0, dict(zip(names, (0.1, 0.4, -0.5), strict=True)), 0))
+    assert len(built) == 1
+    assert abs(found.numbers["end"] - (0.1 + 0.4) / (1.0 - 0.5)) < 1e-6  # the gain at rest

@@ -104,6 +104,16 @@ def test_an_interrupted_sweep_keeps_its_results_and_goes_on(tmp_path, runs, monk
     np.testing.assert_allclose(rest["end"], [0.1, 0.2, 0.3, 0.4])
 
 
+def test_an_interrupt_before_the_first_run_is_one_of_the_sweep(tmp_path, runs, monkeypatch):
+    def interrupt(sample, *, seeded):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys.modules["loopwright.diagrams.sweeps.sweep"], "key_of", interrupt)
+    with pytest.raises(InterruptedSweep, match="interrupted after 0 of 4 samples"):
+        guarded().sweep({"guard.gain": GAINS}, 0.1, **KEPT, to=tmp_path / "s", **QUIET)
+    assert not runs
+
+
 def _power(run):
     return run["y"] @ run["y"]
 

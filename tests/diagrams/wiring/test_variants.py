@@ -20,6 +20,7 @@ from loopwright.blocks import (
     ParameterError,
     PathProjection,
     SampleTimeError,
+    Saturation,
     SimulationError,
     Sine,
     State,
@@ -301,3 +302,18 @@ def test_a_sweep_over_the_numbers_of_a_whole_block_is_refused_before_it_runs():
         drive().sweep({"kp": (0.1, 0.2)}, 0.1, signals="y")
     with pytest.raises(WiringError, match=r"control\.kp: .*control\.kp\.gain"):
         drive().worst_case({"kp": (0.1, 0.2)}, "u", count=2, starts=0)
+
+
+@pytest.mark.parametrize("names", [("s.lower", "s.upper"), ("s.upper", "s.lower")])
+def test_parameters_of_one_block_fit_together_and_need_not_one_by_one(names):
+    """Limits of -1 and 1 become 2 and 3; with the lower one alone they would be refused."""
+    diagram = Diagram("limited", Saturation(lower=-1.0, upper=1.0, name="s")(Constant(value=9.0, name="c")).named("y"))
+    new = {"s.lower": 2.0, "s.upper": 3.0}
+    changed = diagram.replace({name: new[name] for name in names})["s"]
+    assert (changed.lower, changed.upper) == (2.0, 3.0)
+    with pytest.raises(ParameterError, match="found lower=4 and upper=3"):
+        diagram.replace({"s.lower": 4.0, "s.upper": 3.0})
+    rows = [{name: new[name] for name in names}]
+    found = diagram.sweep(None, 0.1, samples=rows, signals="y", workers=1, progress=False)
+    assert not found.failures
+    assert np.all(found["y"] == 3.0)
