@@ -154,7 +154,7 @@ def change_parameters(block: V, changes: Iterable[tuple[list[str], object]]) -> 
     specs = type(block).parameter_specs
     for keys, value in sorted(changes, key=place_of_change):
         name = keys[0]
-        whole, entry = split_entry(name, specs) if len(keys) == 1 else (name, "")
+        whole, entry = split_entry(name, specs) if len(keys) == 1 else (name, ())
         if whole in found and whole in specs and (entry or len(keys) > 1) and not isinstance(found[whole], np.ndarray):
             block, found = block.replace(**found), {}  # it has the whole in the form that parts belong to
         if len(keys) == 1:
