@@ -32,7 +32,8 @@ def record_build(digest: str) -> None:
     """Note in the cache that Loopwright has built a file with this SHA-256 digest, for `is_built_here`."""
     folder = cache_folder() / "built"
     with suppress(OSError):  # a cache that can't be written: the FMU counts as foreign
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        folder.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        folder.mkdir(exist_ok=True, mode=0o700)
         (folder / digest).touch(mode=0o600)
 
 
@@ -58,7 +59,7 @@ def check_cache() -> Path:
     """
     folder = cache_folder()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)  # the compiler's own cache stands there, too
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
-import shutil
+import re
+import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,6 +22,9 @@ from ...fmus.platform import cache_folder, native_platform
 
 _FLAGS = ("-fno-math-errno", "-fno-trapping-math", "-fno-builtin-pow")
 # Nobody reads errno, so that sine and cosine of one angle are one call; a power of two stays a power in every bit.
+
+_OURS = re.compile(r"[0-9a-f]{40}\.(size|so|dll|dylib)")
+"""Names of what stands in the folder of compiled diagrams; other files there are the user's."""
 
 
 @dataclass(frozen=True)
@@ -91,13 +95,16 @@ def load_compiled(source: str, flags: tuple[str, ...] = (), known: str = "") -> 
         If the cache can't be written.
     """
     library = _library_of(source, flags, known)
-    if not _is_whole(library):
-        compile_shared({"code.c": source}, library, more_flags=(*_FLAGS, *flags))
-        size = _size_file(library)
-        made = size.with_suffix(f".{os.getpid()}")
-        made.write_text(str(library.stat().st_size))
-        os.replace(made, size)
-    return ctypes.CDLL(str(library))
+    try:
+        if not _is_whole(library):
+            compile_shared({"code.c": source}, library, more_flags=(*_FLAGS, *flags))
+            _note_size(library)
+        return ctypes.CDLL(str(library))
+    except OSError as error:  # a full disk, or one from which nothing may be run
+        raise CompilerError(
+            f"compiled code can't be kept in {str(library.parent)!r}, or not be loaded from there: {error}. Make room "
+            "there, or set LOOPWRIGHT_CACHE to another folder."
+        ) from error
 
 
 def is_kept(source: str) -> bool:
@@ -109,6 +116,14 @@ def is_kept(source: str) -> bool:
         If there is no compiler.
     """
     return _is_whole(_library_of(source))
+
+
+def _note_size(library: Path) -> None:
+    """Note a library's length beside it; several threads and processes may do so at once."""
+    with tempfile.TemporaryDirectory(prefix=".building-", dir=library.parent) as folder:
+        made = Path(folder) / "size"
+        made.write_text(str(library.stat().st_size))
+        os.replace(made, _size_file(library))
 
 
 def _size_file(library: Path) -> Path:
@@ -131,19 +146,25 @@ def _library_of(source: str, flags: tuple[str, ...] = (), known: str = "") -> Pa
     ).hexdigest()
     folder = cache_folder().absolute() / "compiled"
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        _check_owner(folder)
     except OSError as error:
         raise CompilerError(
             f"the folder of compiled diagrams can't be made: {error}. Set LOOPWRIGHT_CACHE to a folder of your own."
         ) from error
-    _check_owner(folder)
     return folder / f"{key[:40]}{SUFFIXES[platform.rpartition('-')[2]]}"
 
 
 def _check_owner(folder: Path) -> None:
-    """Refuse a folder that others than the user can write to: what stands there is run."""
+    """Refuse a folder that others than the user can write to, and a link to one: what stands there is run."""
     if os.name != "posix":
         return
+    if folder.is_symlink():
+        raise CompilerError(
+            f"the folder of compiled diagrams {str(folder)!r} is a link to another one; expected a folder, since what "
+            "stands there is run. Remove the link, or set LOOPWRIGHT_CACHE to where it leads."
+        )
     was_open = folder.stat().st_mode & 0o022
     with suppress(OSError):
         folder.chmod(0o700)
@@ -154,6 +175,6 @@ def _check_owner(folder: Path) -> None:
             f"{found.st_mode & 0o777:o}; expected user {os.getuid()} and 700, since what stands there is run. Remove "
             "it, or set LOOPWRIGHT_CACHE to a folder of your own."
         )
-    if was_open:  # what others may have left there would be run, too
-        shutil.rmtree(folder)
-        folder.mkdir(mode=0o700)
+    for file in folder.iterdir() if was_open else ():  # what others may have left there would be run, too
+        if _OURS.fullmatch(file.name):
+            file.unlink(missing_ok=True)
