@@ -316,7 +316,7 @@ class ChildProcess:
         self, call: str, cause: FmuEnd | None = None, *, seconds: float = 0.0, error: Exception | None = None
     ) -> NoReturn:
         """End the process, and raise the error that says why."""
-        for _ in range(100):  # the pipe closes before the process has ended
+        for _ in range(500):  # the pipe closes before the process has ended, on a busy machine long before
             if cause is not None or self.has_ended():
                 break
             time.sleep(0.01)
