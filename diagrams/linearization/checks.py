@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ...blocks.core import OptionError, WiringError, check_argument, kinds
+from ...blocks.core import NonFiniteError, OptionError, WiringError, check_argument, kinds
 from ..coupling import Links, Scheme, tells_slopes
 from ..flat import NONE, FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
@@ -19,6 +19,22 @@ def as_list(given: str | Iterable[str]) -> list[str]:
     """Return a name, or several, as a list."""
     check_argument(given, kinds.names, "inputs, outputs and openings", "linearize")
     return [given] if isinstance(given, str) else list(given)
+
+
+def check_slopes(slopes: np.ndarray) -> np.ndarray:
+    """Return the derivatives of a trim's equations; refuse those that are not finite.
+
+    Raises
+    ------
+    NonFiniteError
+        Such a derivative, as that of a root at 0.
+    """
+    if not np.isfinite(slopes).all():
+        raise NonFiniteError(
+            "trim: found a derivative of the diagram's equations that is not finite; expected finite numbers, and a "
+            "root has none at 0. Begin elsewhere: at= another time, or with other initial states."
+        )
+    return slopes
 
 
 def replace_stairs(diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, stairs: str | None) -> Stairs:

@@ -31,6 +31,7 @@ from ..flat import (
     trace_schedule,
 )
 from ..results import FreeDirection, OperatingPoint, PointOrigin
+from .checks import check_slopes
 from .exchanged import evaluators_at
 from .operating_points import PointLike, operating_point, with_residual
 from .trim_plants import ExchangedPlants, Plants, check_drift
@@ -234,7 +235,7 @@ def solve(equations: _Equations) -> np.ndarray:
     found = least_squares(
         lambda v: equations.residual_at(fill_in(v))[0],
         begin,
-        jac=lambda v: equations.residual_at(fill_in(v))[1][:, moves],
+        jac=lambda v: check_slopes(equations.residual_at(fill_in(v))[1][:, moves]),
         bounds=(low[moves], high[moves]),
         x_scale="jac",
         ftol=1e-15,

@@ -38,11 +38,12 @@ def describe_run(run: ToldRun) -> str:
     """Return what a run is, its samples and signals, its messages, and next steps."""
     t = run.t
     span = f" from {t[0]:.9g} to {t[-1]:.9g} s" if len(t) else ""
-    wires = list(run.wires)
-    first = (wires or run.names or ["name"])[0]
+    names = run.names
+    wires = [name for name in run.wires if name in names]
+    first = (wires or names or ["name"])[0]
     facts = (
         count_of(len(t), "sample") + span,
-        count_of(len(run.names), "signal") + (f" (named: {enumerate_some(wires)})" if wires else ""),
+        count_of(len(names), "signal") + (f" (named: {enumerate_some(wires)})" if wires else ""),
         run.tier,
         f"stopped at {run.stopped.t:.9g} s by {run.stopped.block}" if run.stopped is not None else "",
         count_of(len(run.events), "event") if run.events else "",

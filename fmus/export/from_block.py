@@ -217,7 +217,9 @@ def build(
 def _check_exportable(block: Block, name: str) -> None:
     """Refuse a block with parts that an FMU would leave out silently."""
     if isinstance(block, type) or not isinstance(block, Block):
-        raise DefinitionError(f"found {block!r}; expected a block, such as Gantry().", block=name)
+        called = f"the class {block.__name__}" if isinstance(block, type) else repr(block)
+        made = f"{block.__name__}(…)" if isinstance(block, type) else "Gantry()"
+        raise DefinitionError(f"found {called}; expected a block, such as {made}.")
     if not (hasattr(block, "derivative") or block.events):
         raise DefinitionError(
             "found no derivative(t, x, u); expected a continuous model. Write one, or export another block.", block=name

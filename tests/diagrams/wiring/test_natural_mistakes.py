@@ -2,10 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from loopwright.blocks import Block, Gain, Input, LoopwrightError, State, Step
 from loopwright.diagrams import Diagram, margins, subsystem
+from loopwright.fmus import build
 from support.public_calls import drive
 
 STEP = Step(times=0.0, values=1.0, name="r")
@@ -24,6 +26,14 @@ class Vessel(Tank):
         return self.flow
 
 
+class Leak(Block):
+    flow = Input()
+    level = State(start=0.0, output=True)
+
+    def derivative(self, t, x, u):
+        return u.flow - np.sqrt(x.level)
+
+
 @subsystem(sample_time=0.01)
 def nothing(e):
     Gain(gain=1.0)(e)
@@ -40,6 +50,8 @@ def nothing(e):
         (lambda: Diagram("t", Tank()(STEP)), r"has no attribute 'flw'\. Did you mean 'flow'\? Correct"),
         (lambda: Diagram("t", Vessel()(STEP)), r"read it in an equation as u\.flow\. Correct"),
         (lambda: Diagram("t", Gain(gain=1.0)(nothing(STEP))), r"nothing: its function returns no signal. End it with return"),
+        (lambda: Diagram("t", Leak()(STEP)).trim(), r"derivative of the diagram's equations that is not finite"),
+        (lambda: build(Leak, "leak.fmu"), r"found the class Leak; expected a block, such as Leak\(…\)"),
         (lambda: drive().simulate(0.1, dt=0.01), r"no argument 'dt'\. Known: atol, .*step"),
     ],
 )  # fmt: skip
@@ -50,3 +62,9 @@ def test_a_natural_mistake_is_told_with_what_to_write(ask, said):
 
 def test_a_call_of_a_subsystem_prints_as_that():
     assert repr(nothing(STEP)) == "<call of nothing>"
+
+
+def test_a_run_of_some_signals_names_those_that_it_has():
+    run = drive().simulate(0.1, record=["plant.y"], progress=False)
+    assert "(named: y)" in repr(run)
+    assert "run['y']" in repr(run)
