@@ -6,7 +6,7 @@ from .links import Links
 from .loops import note_loops
 from .options import Coupling, Scheme, refuse_exchanged, to_coupling
 from .plant_steps import PlantSteps, end_all, runs_apart, step_all
-from .plants import Plant, load_plants, note_fine_steps
+from .plants import Plant, load_plants, note_steps
 from .report import CoupledConnection, CouplingReport, HeldFrom, LinkKind, report_coupling
 from .rollback import accept_steps, try_steps
 from .search import Search
@@ -28,8 +28,8 @@ __all__ = [
     "end_all",
     "find_fixed_point",
     "load_plants",
-    "note_fine_steps",
     "note_loops",
+    "note_steps",
     "refuse_exchanged",
     "report_coupling",
     "runs_apart",

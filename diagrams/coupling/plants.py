@@ -12,6 +12,9 @@ from ...blocks.core import Layout, LoopwrightError, SimulationError
 from ..flat import FlatDiagram, own_step
 from ..wiring import stepped_blocks
 
+NEAR = 1e-9
+"""Relative distance up to which a communication step is a multiple of a plant's own."""
+
 
 class Plant(Protocol):
     """A stepped block in a run, as its ``instantiate`` yields it: `bind`, `exchange`, `begin`, then each `step`."""
@@ -64,7 +67,12 @@ class Stepped(Protocol):
         """Load the plant for a run; see `loopwright.blocks.Block`."""
 
 
-def note_fine_steps(flat: FlatDiagram) -> tuple[str, ...]:
+def note_steps(flat: FlatDiagram, *, step: object) -> tuple[str, ...]:
+    """Return messages on the communication steps of plants; ``step`` is that which the run was asked for, or None."""
+    return (*(_note_fine_steps(flat) if step is None else ()), *_note_parts_of_steps(flat))
+
+
+def _note_fine_steps(flat: FlatDiagram) -> tuple[str, ...]:
     """Return a message for each plant that steps more finely than any subsystem acts, as it can't do otherwise."""
     shortest = min((clock.every for clock in flat.distinct), default=0)
     found = []
@@ -78,6 +86,23 @@ def note_fine_steps(flat: FlatDiagram) -> tuple[str, ...]:
             "Take sample times of which the shortest divides the others, or an FMU with "
             "canHandleVariableCommunicationStepSize."
         )
+    return tuple(found)
+
+
+def _note_parts_of_steps(flat: FlatDiagram) -> tuple[str, ...]:
+    """Return a message for each plant whose communication steps are no multiples of the fixed step that it states."""
+    found = []
+    for path, block in stepped_blocks(flat.table).items():
+        own = getattr(block, "fixed_internal_step", None)
+        if not own:
+            continue
+        h = float(min(clock.every for clock in flat.plant_ticks[path]) * flat.base)
+        if h < own * (1.0 - NEAR) or abs(h / own - round(h / own)) > NEAR * h / own:
+            found.append(
+                f"{path}: its solver has steps of {own:.6g} s (fixedInternalStepSize), of which its communication "
+                f"steps of {h:.6g} s are no multiples: its outputs may belong to another time. Take sample times, or a "
+                "step, that are multiples."
+            )
     return tuple(found)
 
 

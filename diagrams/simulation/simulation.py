@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Block, OptionError, SimulationError, accepts, explain_calls, kinds
-from ..coupling import note_fine_steps, note_loops
+from ..coupling import note_loops, note_steps
 from ..flat import EVERY, FlatDiagram, WiredDiagram
 from ..results import (
     Occurrence,
@@ -89,7 +89,7 @@ class Simulation:
             self._last = count + (0 if start is None else start.tick)
             self._recording.check_memory(count, every_tick=every_tick)
         self._engine = Engine(self.flat, diagram.name, options, every_tick=every_tick, on_event=self._on_event)
-        fine = note_fine_steps(self.flat) if base is None else ()
+        fine = note_steps(self.flat, step=base)
         self._notes = (*fused, *fine, *note_loops(self.flat, self._engine.coupling))
         self._elapsed, self._begun = 0.0, False
         self._open: bool | None = None  # until it begins; False once it has ended

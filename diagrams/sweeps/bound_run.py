@@ -12,7 +12,7 @@ import numpy as np
 
 from ...blocks.core import SimulationError
 from ...fmus.calls import FmuInstance
-from ..coupling import note_fine_steps, note_loops
+from ..coupling import note_loops, note_steps
 from ..flat import EVERY, FlatDiagram, renumber
 from ..results import Occurrence, Places, Recorder, Recording, Run, Stopped
 from ..simulation import Engine, RunOptions, SimulatedDiagram, default_step, refuse_rest, ticks_in
@@ -56,7 +56,7 @@ class BoundRun:
         self.engine = Engine(self.flat, diagram.name, options, every_tick=every_tick, on_event=self._note)
         rows = self.count + 2 if self.engine.every_tick else None
         self.recorder: Recorder = self._recording.begin(rows)
-        fine = note_fine_steps(self.flat) if base is None else ()
+        fine = note_steps(self.flat, step=base)
         self._notes: tuple[str, ...] = (*fused, *fine, *note_loops(self.flat, self.engine.coupling))
         self._has_begun = False
         self._told: dict[str, int] = {}

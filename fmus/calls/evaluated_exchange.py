@@ -24,8 +24,10 @@ from .transfer import OutOfRangeError, Transfer, UnfitError
 _NOTHING = nullcontext()
 _MOVED, _SAME, _MOST_PATTERNS = 1e-4, 1e-8, 50
 """Relative distance by which a check of the model structure moves states and inputs; change that is none; patterns."""
-_CHECKED: set[str] = set()
-"""Digests of the FMUs whose model structure has been checked in this process."""
+_CHECKED: set[tuple[str, float, bytes, bytes]] = set()
+_MOST_CHECKED = 10_000
+"""Points at which the model structure of an FMU has been checked in this process: its digest, t, x and u; and how many
+are kept."""
 
 
 class EvaluatedExchange(SavedExchange):
@@ -237,12 +239,14 @@ class EvaluatedExchange(SavedExchange):
         return J
 
     def _check_structure(self, t: float, x: np.ndarray, u: np.ndarray) -> None:
-        """Refuse a model structure that leaves out what outputs or derivatives follow; once for each FMU of others.
+        """Refuse a model structure that leaves out what outputs or derivatives follow; once for each point of an FMU.
 
-        The order of evaluation and linear models rest on it. Everything that some values should not follow is moved.
+        FMUs that Loopwright has built are right. An input may act in some mode only, so every start is looked at. The
+        order of evaluation and linear models rest on it. Everything that some values should not follow is moved.
         """
         about = self.description
-        if is_built_here(about.digest) or about.digest in _CHECKED or (x.size and not about.states):
+        key = about.digest, t, x.tobytes(), u.tobytes()
+        if is_built_here(about.digest) or key in _CHECKED or (x.size and not about.states):
             return
         ports = [p for p, v in self.block.output_variables.items() if v.type == "Float64" and is_smooth(v)]
         rows = [self.block.output_variables[p] for p in ports]
@@ -291,7 +295,9 @@ class EvaluatedExchange(SavedExchange):
                 t=t,
             )
         values(start)
-        _CHECKED.add(about.digest)
+        if len(_CHECKED) >= _MOST_CHECKED:
+            _CHECKED.clear()
+        _CHECKED.add(key)
 
     def _error(self, action: str, status: int, t: float) -> FmuRuntimeError:
         self.failed, self.fatal = status >= ERROR, status >= FATAL

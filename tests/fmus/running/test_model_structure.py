@@ -7,6 +7,7 @@ from scipy.linalg import expm
 from loopwright.blocks import Constant, FmuRuntimeError
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu
+from tests.support.closed_form import closed_form_fmu
 from tests.support.misstated import misstated_fmu
 
 RATE = {
@@ -33,6 +34,20 @@ def test_a_dependency_that_is_left_out_is_named(tmp_path, fmi, kept, left_out):
             assert error.value.block == "plant"
         with pytest.raises(FmuRuntimeError, match=message):
             damped(file).linearize(0.0)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_dependency_that_shows_in_a_mode_alone_is_named_by_a_linear_model_there(tmp_path, fmi):
+    equations = "dx[0] = 1.0; y[0] = 4*x[0] + (x[0] > 1.0 ? 5*u[0] : 0.0);"
+    file = closed_form_fmu(tmp_path, fmi, equations, dependencies={"y1": "x1", "dx1": ""})
+    plant = Fmu(file, interface="model_exchange", name="plant")
+    diagram = Diagram("modes", plant(u1=Constant(value=2.0, name="push")()))
+    early = diagram.linearize(0.5, inputs="push.y", outputs="plant.y1")
+    assert early.C[0, 0] == pytest.approx(4.0, rel=1e-9)
+    assert early.D[0, 0] == 0.0
+    with pytest.raises(FmuRuntimeError, match="says that 'y1' does not depend on 'u1'") as error:
+        diagram.linearize(1.5, inputs="push.y", outputs="plant.y1")
+    assert error.value.block == "plant"
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
