@@ -6,7 +6,7 @@ from .carried import with_findings
 from .disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin, mu_bound
 from .features import find_hidden_unstable
 from .loop_class import loop_class
-from .loop_margins import margins
+from .loop_margins import find_disk_frequency, margins
 from .margin_slopes import MarginSlope, margin_slopes
 from .margins_found import GainCrossover, Margins, PhaseCrossover
 from .measured_margins import Interval, MeasuredMargins, measured_margins, read_frequency_data
@@ -46,6 +46,7 @@ __all__ = [
     "delayed_hold",
     "delayed_hold_margin",
     "disk_margin",
+    "find_disk_frequency",
     "find_hidden_unstable",
     "gang_of_four",
     "loop_at",

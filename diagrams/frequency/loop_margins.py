@@ -292,6 +292,11 @@ class _MarginFinder:
         return Number(omega, "rad/s", 1e-10 * omega, how)
 
 
+def find_disk_frequency(r: Realization) -> float:
+    """Return the frequency in rad/s at which |S − T| is largest: that of the disk margin."""
+    return float(Scan(r).find_peak(0.5, -0.5).omega)
+
+
 def _missing_phase(c: Crossing) -> float:
     """Return the phase by which L is ahead of −1, in degrees above −180 and up to 180."""
     degrees = float(np.degrees(np.angle(-c.L)))

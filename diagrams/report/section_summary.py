@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ...blocks.core import LoopwrightError, print_unit
-from ..frequency import Number
+from ..frequency import Number, Realization, find_disk_frequency
 from ..linearization import Linearization, find_signal
 from ..report_writing import Judged, Section, Table, Texts
 from ..requirements import Limit, RequirementResult, Review, Verdict
@@ -21,7 +21,7 @@ from .section_steps import NAMES
 from .section_worst_case import KEY as WORST_CASE
 from .section_worst_case import MissingWorstCase, ReportedWorstCase
 from .stability import unstable_first
-from .variant import Implementation, Variant
+from .variant import Cut, Implementation, Variant
 
 TEXTS = Texts(__package__, "summary")
 TITLE = "Summary"
@@ -144,8 +144,10 @@ def _weakest(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
         yield TEXTS.line("weakest_modulus", **facts)
         return
     facts |= {"low": (2 - alpha) / (2 + alpha), "high": (2 + alpha) / (2 - alpha) if alpha < 2 else math.inf}
-    where = next((n for n in _frequencies(path, numbers) if math.isfinite(n.value)), None)
-    facts |= {"phase": 2 * math.degrees(math.atan(alpha / 2)), "frequency": None if where is None else where.value}
+    facts |= {
+        "phase": 2 * math.degrees(math.atan(alpha / 2)),
+        "frequency": _frequency(actual, facts["wire"], path, numbers),
+    }
     yield TEXTS.line("weakest", **facts)
     others = [(v, numbers[p].value) for v, p in _elsewhere(case, path) if p in numbers]
     raised = [(v.title, value) for v, value in others if value > alpha * (1 + ALIKE)]
@@ -186,11 +188,21 @@ def _not_confirmed(reported: ReportedWorstCase | MissingWorstCase | None) -> Ite
             yield TEXTS.line("worst_case_not_confirmed", trial=trial, problem=reported.problem)
 
 
-def _frequencies(path: str, numbers: Mapping[str, Number]) -> Iterator[Number]:
+def _frequency(v: Variant, wire: str, path: str, numbers: Mapping[str, Number]) -> float | None:
+    """Return the frequency in rad/s of a disk margin; None where it is not known. It need not be that of M_s."""
     start = path.rpartition(".")[0]
-    for name in ("disk_frequency", "frequency", "ms_frequency"):
-        if f"{start}.{name}" in numbers:
-            yield numbers[f"{start}.{name}"]
+    for name in ("disk_frequency", "frequency"):
+        if f"{start}.{name}" in numbers and math.isfinite(numbers[f"{start}.{name}"].value):
+            return numbers[f"{start}.{name}"].value
+    if f"{start}.ms_frequency" not in numbers:
+        return None
+    try:
+        cut, _, L = v.fullest_loop(wire)
+    except LoopwrightError:
+        return None
+    is_this = path.split(".")[3:-1] == ([] if cut is Cut.PLAIN else [cut.value])
+    found = find_disk_frequency(Realization.of(L)) if is_this else math.inf
+    return found if math.isfinite(found) else None
 
 
 def _elsewhere(case: Case, path: str) -> Iterator[tuple[Variant, str]]:
