@@ -177,10 +177,17 @@ class BoundRun:
 
     def _take_record(self, started: float) -> Run:
         t, data = self.recorder.finish()
-        return self.make_run(t, data, self.engine.position.stopped, started, self.take_messages())
+        stopped, residual = self.engine.position.stopped, self.recorder.residual
+        return self.make_run(t, data, stopped, started, self.take_messages(), residual)
 
     def make_run(
-        self, t: np.ndarray, data: np.ndarray, stopped: Stopped | None, started: float, messages: Sequence[str]
+        self,
+        t: np.ndarray,
+        data: np.ndarray,
+        stopped: Stopped | None,
+        started: float,
+        messages: Sequence[str],
+        residual: np.ndarray | None,
     ) -> Run:
         """Return a run from its samples.
 
@@ -194,6 +201,8 @@ class BoundRun:
             Reading of the clock at its start.
         messages : sequence of str
             What was told in it.
+        residual : ndarray or None
+            Largest residual of the algebraic loops, by sample.
         """
         run = Run(
             t=t,
@@ -205,7 +214,7 @@ class BoundRun:
             elapsed=perf_counter() - started,
             tier=self.engine.take_tier(),
             events=self.recorder.events,
-            residual=self.recorder.residual,
+            residual=residual,
             messages=(*self._notes, *self.engine.messages, *messages),
             stopped=stopped,
             columns=self.recorder.columns,

@@ -277,7 +277,10 @@ class _Lanes:
         if last % every:  # the last sample is kept in any case
             data, t = np.concatenate([data, end.last[None]]), np.append(t, self._times[last])
         stopped = Stopped(float(self._times[last]), self._stops.paths[end.by]) if end.stopped else None
-        return self.bound.make_run(t.copy(), data, stopped, started, messages)
+        residual = None
+        if self.bound.recorder.has_residual:  # it is the last entry that is kept
+            data, residual = data[:, :-1], data[:, -1].copy()
+        return self.bound.make_run(t.copy(), data, stopped, started, messages, residual)
 
 
 def _number(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], ticks: np.ndarray) -> np.ndarray:

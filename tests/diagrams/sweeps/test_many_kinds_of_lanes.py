@@ -143,6 +143,20 @@ def test_a_loop_that_is_not_determined_fails_as_a_single_run_and_harms_no_other(
         np.testing.assert_allclose(found["y"][i], found["u"][i] / (1.0 + gains[i]), rtol=0, atol=1e-12)
 
 
+def look(run):
+    """The largest residual, and the numbers of samples and of columns that a run has."""
+    return np.array([run.residual.max(), len(run.residual), len(run.t), run.data.shape[1]])
+
+
+def test_a_run_in_a_lane_has_the_residual_of_its_own_loops():
+    diagram, table = sampled(implicit, loops="solve"), [{"scale.gain": s} for s in (1.0, 3.0, 0.0)]
+    options = {"samples": table, "reduce": {"look": look}, "workers": 1, **QUIET}
+    found, alone = (diagram.sweep(None, 0.2, lanes=lanes, **options)["look"] for lanes in (LANES, False))
+    np.testing.assert_array_equal(found[:, 1:], alone[:, 1:])
+    assert np.all(found[:, 0] <= 1e-9)  # as of a loop that counts as solved
+    assert found[2, 0] == alone[2, 0]
+
+
 def test_loops_around_a_plant_are_near_single_runs():
     def around(u):
         half = Gain(gain=0.5, name="half")
