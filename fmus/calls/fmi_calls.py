@@ -385,6 +385,12 @@ class FmiCalls(ABC):
         """Set all continuous states, in the FMU's order."""
         self.fmu.setContinuousStates((ctypes.c_double * x.size)(*x), x.size)
 
+    def state_derivatives(self, n: int) -> np.ndarray:
+        """Return the derivatives of the n continuous states, in the FMU's order."""
+        made, name = (ctypes.c_double * n)(), self.exchange_names["derivatives"]
+        getattr(self.fmu, name[0].lower() + name[1:])(made, n)
+        return np.array(made)
+
     # ---- messages ----
 
     def status_name(self, code: int) -> str:

@@ -81,7 +81,7 @@ int fmi2DoStep(void *p, double t, double h, int final) {
 
 def closed_form_fmu(
     folder, fmi, equations, states=1, inputs=1, outputs=1, *, number="double", attributes="", of_input="continuous",
-    dependencies=None, check="", name="small",
+    dependencies=None, check="", name="small", changes=(),
 ):  # fmt: skip
     """Build it into a folder, for a version of FMI, and return its path.
 
@@ -100,12 +100,17 @@ def closed_form_fmu(
         Dependencies of ``"dx1"``, …, ``"y1"``, … as names, ``"x1 u1"``; of the others none are stated.
     check : str
         C code at the beginning of a step.
+    changes : sequence of (str, str)
+        Texts of the source, and what stands in for them.
     """
     prefix = f"fmi{fmi}"
     several = [equations] if isinstance(equations, str) else equations
     equations = " ".join(f"case {k}: {{ {text} break; }}" for k, text in enumerate(several))
     source = f"#define FMI {fmi}\n#define STATES {states}\n#define PASTE(a, b) a##b\n#define NAME(end) PASTE({prefix}, end)\n"
     source += _SOURCE.replace("NUMBER", number).replace("EQUATIONS", equations).replace("CHECK", check)
+    for before, after in changes:
+        assert before in source, before
+        source = source.replace(before, after)
     names = {
         "RATES": "GetDerivatives" if fmi == 2 else "GetContinuousStateDerivatives",
         **{v.upper(): f"{v}{'Real' if fmi == 2 else 'Float64'}" for v in ("Get", "Set")},

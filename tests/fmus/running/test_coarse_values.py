@@ -162,3 +162,18 @@ def test_slopes_are_right_within_their_errors_wherever_the_point_is_on_the_stair
         )
         assert abs(found.slope[0] - slope(x)) <= found.error[0]
         assert found.error[0] <= {"smooth": 1e-7, "kink": 1e-7}.get(name, 5.0)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_derivatives_that_are_computed_in_their_own_function_alone_are_not_stale(tmp_path, fmi):
+    rates = (
+        "instance *c = p; number d[9] = {0}, y[9] = {0}; find(c, c->x, d, y);\n    for (size_t i = 0; i < n; i++) dx"
+    )
+    changes = (("r[i] < 20 ? d[k]", "r[i] < 20 ? c->kept[k]"), (rates, rates.replace(" dx", " c->kept[i] = dx")))
+    equations = "dx[0] = -10*x[0] + u[0]; y[0] = 10*x[0];"
+    file = closed_form_fmu(
+        tmp_path, fmi, equations, changes=(("int step, which;", "number kept[9]; int step, which;"), *changes)
+    )
+    model = Fmu(file).linear_model(state={"x1": 1.0}, interface="model_exchange")
+    assert model.f == pytest.approx([-10.0])
+    np.testing.assert_allclose(joined(model), [[-10.0, 1.0], [10.0, 0.0]], atol=1e-8)
