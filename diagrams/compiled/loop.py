@@ -11,11 +11,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ...blocks.interrupts import INTERRUPTS
 from ...fmus.calls import NEAR, FmuInstance, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
 from ..flat import TRUE, TickPattern
 from .code import CompiledTick, GroupedTick, TickCode, master
-from .native_tick import INTERRUPTS, at, bind_native
+from .native_tick import at, bind_native
 from .remote import RemotePlants
 from .staged_functions import Staged, StagedEquations
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import ctypes
-import signal
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from types import FrameType
 from typing import Any
 
 import numpy as np
 
+from ...blocks.interrupts import INTERRUPTS
 from ..flat import bind_function
 from .code import CompiledTick
 from .grouping import PythonCall, Tables
@@ -31,54 +28,6 @@ class _Group(ctypes.Structure):
         *((name, ctypes.c_int64) for name in ("n_inputs", "n_guards", "n_loops", "residual")),
         ("python", _Python),
     ]
-
-
-class Interrupts(threading.local):
-    """Keeps an interrupt (Ctrl-C) that comes while C runs, until Python is where it can be raised.
-
-    Python raises it at its next instruction: the first one of a function that C calls, where ctypes would drop it.
-
-    Attributes
-    ----------
-    heard : bool
-        Whether an interrupt is raised at once: Python has been called by C, and catches it.
-    came : bool
-        Whether one waits to be raised.
-    """
-
-    def __init__(self) -> None:
-        self.heard = self.came = False
-
-    @contextmanager
-    def kept(self) -> Iterator[None]:
-        """Keep an interrupt of this block for its end, but where it is heard."""
-        main = threading.current_thread() is threading.main_thread()
-        if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-            yield
-            self.check()
-            return
-        self.heard = self.came = False
-        signal.signal(signal.SIGINT, self._note)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-        self.check()
-
-    def check(self) -> None:
-        """Raise the interrupt that waits."""
-        if self.came:
-            self.came = False
-            raise KeyboardInterrupt
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.heard:
-            signal.default_int_handler(number, frame)
-        self.came = True
-
-
-INTERRUPTS = Interrupts()
-"""Those of this process; only its main thread has any."""
 
 
 def call_for_c(call: Callable[[], None]) -> None:

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import NonFiniteError, OptionError
+from ...blocks.interrupts import INTERRUPTS
 from .base import AcceptedStep, Dense, Problem, Statistics, VariableStep
 from .dense_output import from_derivatives
 
@@ -135,6 +136,8 @@ class _Calls:
 
     def _rate(self, t: float, x: int, f: int, _: object) -> int:
         try:
+            INTERRUPTS.heard = True
+            INTERRUPTS.check()
             self.statistics.rate_evaluations += 1
             rates = self.vector(f)
             rates[:] = self.problem.rate(min(t, self.stop), self.vector(x))
@@ -142,9 +145,13 @@ class _Calls:
         except BaseException as error:
             self.error = error
             return -1
+        finally:
+            INTERRUPTS.heard = False
 
     def _jacobian(self, t: float, x: int, f: int, matrix: int, *_: object) -> int:
         try:
+            INTERRUPTS.heard = True
+            INTERRUPTS.check()
             self.statistics.jacobian_evaluations += 1
             n = self.problem.size
             columns = self.view(self.library.SUNDenseMatrix_Data(matrix), n * n).reshape(n, n)
@@ -153,6 +160,8 @@ class _Calls:
         except BaseException as error:
             self.error = error
             return -1
+        finally:
+            INTERRUPTS.heard = False
 
     def _say(self, line: int, function: bytes, file: bytes, message: bytes, code: int, *_: object) -> None:
         self.message = message.decode("utf-8", "replace")
@@ -202,14 +211,16 @@ class Cvode(VariableStep):
 
     def _start(self, t: float, x: np.ndarray) -> None:
         self._fails += self._count_failed_tests()
-        self._calls.stop, self._t, self._x_old = self.stop, t, x
+        self._calls.stop, self._calls.error, self._t, self._x_old = self.stop, None, t, x
         self._calls.vector(self._x)[:] = x
         self._check(self._library.CVodeReInit(self._memory, t, self._x))
         self._check(self._library.CVodeSetStopTime(self._memory, self.stop))
 
     def _advance(self) -> AcceptedStep:
         t, x_old = self._t, self._x_old
-        self._check(self._library.CVode(self._memory, self.stop, self._x, byref(self._t_new), _ONE_STEP))
+        with INTERRUPTS.kept():  # one that comes as CVODE calls Python
+            code = self._library.CVode(self._memory, self.stop, self._x, byref(self._t_new), _ONE_STEP)
+        self._check(code)
         self._t, self._x_old = self._t_new.value, self._calls.vector(self._x).copy()
         self.check_finite(self._t, self._x_old, "state")
         self.statistics.steps += 1
