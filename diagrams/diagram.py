@@ -288,7 +288,7 @@ class Diagram(VariedDiagram):
         from .report_writing import check_files, write_report
 
         check_files(path, pdf=pdf, json=json, paper=paper)
-        made = with_drawing(analyse(self, written=path is not None, **options), self)
+        made = with_drawing(analyse(self, _written=path is not None, **options), self)
         write_report(made, path, pdf=pdf, json=json, paper=paper)
         return made
 

@@ -146,3 +146,13 @@ def test_a_misspelt_option_is_named_with_its_neighbours_wherever_it_is_handed_on
         good.pop(right, None)
         with pytest.raises(LoopwrightError, match=f"'?{right}x'?.*'{right}'"):
             function(**good, **{right + "x": 1.0})
+
+
+@pytest.mark.parametrize("call", ["analyse", "report"])
+@pytest.mark.parametrize(("wrong", "line"), [("titel", "title"), ("title", "title"), ("autor", "author")])
+def test_a_line_of_a_reports_heading_is_offered_where_it_is_written(call, wrong, line):
+    function = getattr(drive(), call, None) or (lambda **options: loopwright.diagrams.analyse(drive(), **options))
+    with pytest.raises(OptionError) as caught:
+        function(**{wrong: "The tank"})
+    assert f"has no argument '{wrong}'. Did you mean about={{'{line}': …}}" in str(caught.value)
+    assert "written" not in str(caught.value)

@@ -37,7 +37,7 @@ from .errors import (
     close_names,
     near,
 )
-from .explained_calls import UnknownArgumentError, explain_calls
+from .explained_calls import UnknownArgumentError, explain_calls, offer_elsewhere
 from .files import check_file, replace_file, write_text
 from .findings import Finding
 from .frozen import FrozenMapping
@@ -146,6 +146,7 @@ __all__ = [
     "near",
     "next_edge",
     "number_inputs",
+    "offer_elsewhere",
     "on_one_thread",
     "one_thread",
     "parameter",

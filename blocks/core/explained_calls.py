@@ -17,22 +17,51 @@ _MADE_BY = ("__init__", "__new__")
 _CALLED = (*_MADE_BY, "__call__")
 EXPLAINED = "explains_calls"
 """Attribute of functions that explain calls already."""
+_ELSEWHERE = "names_elsewhere"
 
 
 class UnknownArgumentError(OptionError, UnknownNameError):
     """A keyword that a function, or one that it hands its options on to, doesn't know."""
 
-    def __init__(self, argument: str, known: Iterable[str], *, block: str | None, found: str = "it has no argument"):
-        self.argument, self.known, self.found = argument, frozenset(known), found
+    def __init__(
+        self,
+        argument: str,
+        known: Iterable[str],
+        *,
+        block: str | None,
+        found: str = "it has no argument",
+        elsewhere: Mapping[str, str] | None = None,
+    ):
+        self.argument, self.known, self.found, self.elsewhere = argument, frozenset(known), found, elsewhere or {}
         super().__init__(self._tell(), block=block)
 
     def _tell(self) -> str:
-        return f"{self.found} {self.argument!r}. {near(self.argument, self.known)}"
+        close = close_names(self.argument, self.known | self.elsewhere.keys())
+        offered = " or ".join(self.elsewhere.get(name, repr(name)) for name in close)
+        return f"{self.found} {self.argument!r}. " + (
+            f"Did you mean {offered}?" if close else near(self.argument, self.known)
+        )
 
     def offer(self, block: str, more: Iterable[str]) -> None:
         """Tell of the function that was called, which has arguments of its own besides those that it hands on."""
         self.known |= frozenset(more)
         self.block, self.message = block, self._tell()
+
+
+def offer_elsewhere(**ways: str) -> Callable[[F], F]:
+    """Make the errors of a function's calls offer what to write for names that are no arguments of it.
+
+    Parameters
+    ----------
+    **ways
+        For each name the text, such as ``title="about={'title': …}"``.
+    """
+
+    def mark(function: F) -> F:
+        setattr(function, _ELSEWHERE, ways)
+        return function
+
+    return mark
 
 
 def explain_calls(subject: F) -> F:
@@ -95,7 +124,7 @@ def misuse(
     if inspect.Parameter.VAR_KEYWORD not in has_more:
         for name in kwargs:
             if name not in named:
-                return UnknownArgumentError(name, shown, block=who)
+                return UnknownArgumentError(name, shown, block=who, elsewhere=getattr(function, _ELSEWHERE, {}))
     if len(args) > len(placed) and inspect.Parameter.VAR_POSITIONAL not in has_more:
         allowed = ", ".join(p.name for p in placed[owner:])
         others = ", ".join(f"{name}=…" for name, p in named.items() if p.kind is p.KEYWORD_ONLY and name in shown)

@@ -263,7 +263,7 @@ def _analyse(
         measured=measured,
         worst_case=searched,
         contacts=touched,
-        written=True,
+        _written=True,
     )
     return with_drawing(made, diagram)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-from ...blocks.core import OptionError, accepts, kinds, on_one_thread
+from ...blocks.core import OptionError, accepts, kinds, offer_elsewhere, on_one_thread
 from ...fmus.running import Fmu
 from ..flat import WiredDiagram
 from ..linearization import find_signal
@@ -33,6 +33,7 @@ from .section_subject import operating_points, remarks, subject, versions
 from .section_summary import summary
 from .section_worst_case import find_reported, read_task, worst_case_of
 
+_HEADING = ("title", "author", "project", "date", "revision")  # lines of ``about``
 SUBJECT = ReportPart("subject", subject)
 REMARKS = ReportPart("subject", remarks)
 OPERATING_POINTS = ReportPart("operating_points", operating_points)
@@ -86,6 +87,7 @@ def _reported(value: Any) -> str:
     contacts=kinds.either(kinds.mapping, kinds.one_of_class(ContactTask, "a ContactTask"), kinds.path),
 )
 @on_one_thread
+@offer_elsewhere(**{name: f"about={{'{name}': …}}" for name in _HEADING})
 def analyse(
     diagram: WiredDiagram | ReportedExperiment,
     *,
@@ -104,7 +106,7 @@ def analyse(
     worst_case: WorstCase | WorstCaseTask | str | os.PathLike[str] | None = None,
     contacts: Mapping[str, Any] | ContactTask | str | os.PathLike[str] | None = None,
     workers: int | None = None,
-    written: bool = False,
+    _written: bool = False,  # the report is written next: its figures are drawn
 ) -> Report:
     """Analyse a diagram, and return the content of its report.
 
@@ -156,8 +158,6 @@ def analyse(
     workers : int, optional
         1 makes all sections in this process; with 2, a second process makes some of a diagram with FMUs. The report is
         the same. Without it there are two where the report is written, and two processors.
-    written : bool
-        Whether the report is written next, so that its figures are drawn.
 
     Returns
     -------
@@ -193,7 +193,7 @@ def analyse(
         asked = Requirements(stable=False)  # a robot that yields to a force may drift, and has a pole on the limit
     task = read_task(diagram, worst_case, file, asked)
     axes, names = AxisUnits(decibels, hertz), tuple(measured or ())
-    how: dict[str, Any] = {"workers": check_workers(workers, written), "drawn": written}
+    how: dict[str, Any] = {"workers": check_workers(workers, _written), "drawn": _written}
     case, sections = kind.sections(diagram, point, experiment, wires, only, tell, stairs, asked, axes, names, **how)
     loops_measured = read_measured(case, measured) if measured else ()
     if loops_measured:
