@@ -24,7 +24,7 @@ from typing import Any
 
 from . import wire
 from .in_c import TYPES, Server, make_watch
-from .surroundings import has_room, kill_group, limit, look_around, move, print_to, resident
+from .surroundings import forget, has_room, kill_group, limit, look_around, move, print_to, resident
 from .wire import (
     CAUSE,
     CHILD_SLEEPS,
@@ -159,6 +159,7 @@ class Child:
 
     def do_load(self, path: str, names: list[str], blobs: list[bytes]) -> tuple[Any, list[bytes]]:
         """Load the library, and return which of some functions it exports."""
+        forget()
         if not self.before:
             self.before = look_around(self.about["files"])
         here = os.getcwd()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _ctypes
 import ctypes
 import mmap
 import os
@@ -44,8 +45,41 @@ def look_around(folder: str) -> list[tuple[str, Any]]:
         found += [("threads", len(tasks)), ("children", children), ("files", len(os.listdir("/proc/self/fd")))]
         with open("/proc/self/status") as file:
             found += [("signals", line) for line in file if line.startswith(("SigIgn", "SigCgt"))]
+    found.append(("libraries", _list_loaded(folder)))
     found.append(("its files", _list_files(folder)))
     return found
+
+
+def forget() -> None:
+    """Set back the C library's random numbers, which `look_around` can't see, as in a process that has just begun."""
+    names = ["ucrtbase", "msvcrt"] if sys.platform == "win32" else [None]
+    for name in names:
+        with suppress(OSError):
+            library = ctypes.CDLL(name)
+            for seed in ("srand", "srandom"):
+                if hasattr(library, seed):
+                    library[seed](1)  # by the standard the seed of those that give none
+            if sys.platform == "linux":
+                library.seed48((ctypes.c_ushort * 3)())
+
+
+def _list_loaded(folder: str) -> list[str]:
+    """Return the libraries in a folder that this process has loaded: some stay, with their memory, when unloaded.
+
+    Those of C++ do, if they share a unique symbol with others.
+    """
+    folder = os.path.realpath(folder)
+    with suppress(OSError), open("/proc/self/maps") as file:
+        paths = (line.split(maxsplit=5)[5:] for line in file)
+        return sorted({path[0].strip() for path in paths if path and path[0].startswith(folder + os.sep)})
+    found = []
+    for where, _, names in os.walk(folder):
+        for name in names:
+            if hasattr(os, "RTLD_NOLOAD") and name.endswith((".so", ".dylib")):
+                with suppress(OSError):
+                    _ctypes.dlclose(_ctypes.dlopen(os.path.join(where, name), os.RTLD_NOLOAD | os.RTLD_NOW))
+                    found.append(name)
+    return sorted(found)
 
 
 def _list_files(folder: str) -> list[Any]:

@@ -1,6 +1,7 @@
 /* A hostile FMU of FMI 2.0 or 3.0 for co-simulation and model exchange: y is the integral of u. One fault, at one place, from one
    time on, stands in a text of the library that the test writes over: "place fault time". */
 #define _GNU_SOURCE
+#include <dlfcn.h>
 #include <fcntl.h>
 #include <fenv.h>
 #include <math.h>
@@ -121,6 +122,8 @@ static int act(const char *here, instance *c, double t) {
     if (IS("limits")) { struct rlimit r = {3, 3}; setrlimit(RLIMIT_NOFILE, &r); }
     if (IS("alarm")) { ualarm(20000, 0); nap(0.2); nap(0.2); }
     if (IS("file")) { FILE *o = fopen("droppings.txt", "w"); if (o) { fputs("zoo", o); fclose(o); } }
+    if (IS("chance")) c->y += rand() + random() + drand48();
+    if (IS("stays")) { static double left; Dl_info me; c->y += left++; if (dladdr(&left, &me)) dlopen(me.dli_fname, RTLD_NOW | RTLD_NODELETE); }
     if (IS("warning")) { LOG(c, 1, "this is a warning"); return 1; }
     if (IS("discard")) { LOG(c, 2, "no solution here"); return 2; }
     if (IS("error")) { LOG(c, 3, "this is an error"); return 3; }

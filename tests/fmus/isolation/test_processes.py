@@ -204,6 +204,16 @@ def test_the_process_is_kept_for_the_next_run_with_a_fresh_instance(folder):
     assert np.array_equal(first["plant.y"], second["plant.y"])
 
 
+@pytest.mark.parametrize(("fault", "kept"), [("chance", (1, 1)), ("stays", (0, 0))])
+def test_a_run_does_not_follow_from_the_one_before(folder, fault, kept):
+    """Random numbers of the C library begin again; a library that stays when it is unloaded has its memory still."""
+    file = zoo_fmu(folder, 3, f"step {fault}")
+    first, second = simulate(file), simulate(file)
+    assert first["plant.y"][-1] > 1.0
+    assert first["plant.y"].tobytes() == second["plant.y"].tobytes()
+    assert count_processes() == kept
+
+
 def test_an_fmu_that_a_process_can_have_once_may_be_there_twice(folder, tmp_path):
     import zipfile
 
