@@ -229,6 +229,8 @@ class FmuEnd(Enum):
 
     CRASH = "crash"
     """A signal, such as that of a segmentation fault."""
+    KILLED = "killed"
+    """SIGKILL, which the system sends where its memory is short, or another program: no fault of a library."""
     EXIT = "exit"
     """The FMU has ended its process itself."""
     TIMEOUT = "timeout"

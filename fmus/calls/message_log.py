@@ -17,6 +17,8 @@ _QUOTED = 5
 _RERUN = "Samples until then are in error.run. The FMU can be run again; other FMUs and this process go on."
 _ADVICE = {
     FmuEnd.CRASH: f"{_RERUN} Report it to its makers.",
+    FmuEnd.KILLED: "The system does so where memory is short, and its log tells it (dmesg); another program may, too. "
+    f"Free some memory, or run fewer FMUs at once. {_RERUN}",
     FmuEnd.EXIT: f"{_RERUN} Report it to its makers: a library must not end its process.",
     FmuEnd.TIMEOUT: "It may wait for a licence or another program, or hang. Give it more time by "
     f"isolate=Isolation(step_time=…, start_time=…), or take a smaller step. {_RERUN}",

@@ -27,6 +27,7 @@ _CHOICES = {"CoSimulation": "co_simulation", "ModelExchange": "model_exchange"}
 _LOOK = "Check its start values and inputs: see them with loopwright inspect."
 BY_END = {
     FmuEnd.CRASH: "Don't load it into a program whose work you need (isolate=False). Report it to its makers.",
+    FmuEnd.KILLED: "The system may have done so, as its memory was short. Free some, and try again.",
     FmuEnd.EXIT: "It may miss a licence or a file; ask its makers. Don't load it with isolate=False.",
     FmuEnd.TIMEOUT: "Run it in the tool that exported it; it may wait for a licence or another program.",
 }

@@ -37,6 +37,8 @@ def read_end(
         if peak > _NEARLY * memory:  # the system gave it no more, which few libraries bear
             used = f"{peak / 1e6:.6g} of {memory / 1e6:.6g} MB"
             return FmuEnd.MEMORY, f"its process crashed ({name}{more}) when its memory was used up ({used})"
+        if status == _BY_US:
+            return FmuEnd.KILLED, f"its process was killed ({name}{more})"
         return FmuEnd.CRASH, f"its process crashed ({name}{more})"
     if os.name == "nt" and status >= 0xC0000000:
         return FmuEnd.CRASH, f"its process crashed (0x{status:08X})"

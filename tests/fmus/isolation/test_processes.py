@@ -81,6 +81,7 @@ FAULTS = [
     ("enter exit", FmuEnd.EXIT, "EnterInitializationMode", "exit status 3"),
     ("step segfault 0.05", FmuEnd.CRASH, "DoStep", "SIGSEGV"),
     ("step divide_trapped 0.05", FmuEnd.CRASH, "DoStep", "SIGFPE"),
+    ("step kill 0.05", FmuEnd.KILLED, "DoStep", "was killed (SIGKILL"),
     ("step exit0 0.05", FmuEnd.EXIT, "DoStep", "exit status 0"),
     ("step deaf_hang 0.05", FmuEnd.TIMEOUT, "DoStep", "has not ended after 1 s"),
     ("get segfault 0.05", FmuEnd.CRASH, "Get", "SIGSEGV"),
@@ -300,6 +301,7 @@ def test_a_crash_in_model_exchange_names_the_time(msd, wait):
             evaluate(0.5, np.zeros(2), np.ones(1))
     assert caught.value.block == "plant"
     assert caught.value.t == 0.5
+    assert caught.value.cause is FmuEnd.KILLED
 
 
 def test_foreign_fmus_are_isolated_and_own_builds_are_not(folder, msd, tmp_path):
