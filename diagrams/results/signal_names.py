@@ -38,7 +38,8 @@ def resolve(name: str, wires: Mapping[str, Wire], ports: Collection[str]) -> str
     """
     if not isinstance(name, str):
         raise UnknownNameError(
-            f"found {name!r}; expected the name of a signal, a text such as {next(iter((*wires, *ports)), 'y')!r}."
+            f"found {name!r}; expected the name of a signal, a text such as {next(iter((*wires, *ports)), 'y')!r}. "
+            "run.names has all of them, for loops, too."
         )
     if name in wires or name in ports:
         return name

@@ -62,6 +62,13 @@ def test_a_part_of_a_vector_has_its_unit_and_its_row():
     assert np.array_equal(run.at(1.0)["rates"], [0.0, 0.0])
 
 
+def test_a_loop_over_a_run_is_told_where_its_names_are(run):
+    """Python asks for run[0], as a run has names in place of numbers."""
+    with pytest.raises(UnknownNameError, match=r"found 0; expected the name of a signal.*'left'.*run\.names has all"):
+        list(run)
+    assert [name for name in run.names if name in run] == run.names
+
+
 def test_names_complete_in_a_notebook(run):
     assert {"a.w", "b.w", "constant.y"} <= set(run._ipython_key_completions_())
 
