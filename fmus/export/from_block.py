@@ -169,7 +169,8 @@ def build(
     block : Block
         A block with a ``derivative``; its parameters become the FMU's start values.
     out : path, optional
-        File, or folder for it; without it, the file in the cache is returned.
+        File, or folder for it; without it, the file in the cache is returned. A file gets the ending ``.fmu`` if it
+        lacks it.
     name : str, optional
         Name of the model; without it, the class name in lower case.
     internal_step : float

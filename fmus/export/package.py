@@ -154,6 +154,17 @@ def _archive(spec: ModelSpec, options: Options, compiler: Compiler, notify: Call
     return zip_files(files)
 
 
+def file_for(out: Path | str, name: str) -> Path:
+    """Return the file of an FMU: ``<name>.fmu`` in a folder; a path without the ending ``.fmu`` gets it.
+
+    Other tools find FMUs by their ending, so none is written without it. Other endings stay: ``pend.v2.fmu``.
+    """
+    out = Path(out)
+    if out.is_dir():
+        return out / f"{name}.fmu"
+    return out if out.suffix.lower() == ".fmu" else out.with_name(f"{out.name}.fmu")
+
+
 def write_atomically(path: Path, data: bytes) -> None:
     """Write a file so that it is complete or does not exist, never half written."""
     temporary = None
@@ -200,7 +211,8 @@ def build_fmu(
     spec : ModelSpec
         The model.
     out : path, optional
-        File to copy it to; a folder gets ``<name>.fmu``. Without it, the file in the cache is returned.
+        File to copy it to, which gets the ending ``.fmu`` if it lacks it; a folder gets
+        ``<name>.fmu``. Without it, the file in the cache is returned.
     fmi : {3, 2}
         FMI 3.0 or FMI 2.0.
     arrays : bool
@@ -241,8 +253,7 @@ def build_fmu(
     record_build(hashlib.sha256(data).hexdigest())
     if out is None:
         return cached
-    out = Path(out)
-    target = out / cached.name if out.is_dir() else out
+    target = file_for(out, spec.name)
     write_atomically(target, data)
     return target
 

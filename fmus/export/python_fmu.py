@@ -30,7 +30,7 @@ from ...blocks.tracing import bundle, traced_parameters
 from ..platform import record_build
 from .html_page import block_text
 from .model import check_file_name
-from .package import write_atomically, zip_files
+from .package import file_for, write_atomically, zip_files
 from .xml_fmi3 import _unit, package_version
 
 NEEDS = "Needs Python where it runs, with NumPy and Loopwright {version}: its equations are Python code."
@@ -78,7 +78,7 @@ def build_python(
     block : Block
         The model.
     out : path, optional
-        File or folder for the FMU; without it, the current folder.
+        File or folder for the FMU; without it, the current folder. A file gets the ending ``.fmu`` if it lacks it.
     name : str, optional
         Name of the model; without it, the class name in lower case.
     internal_step : float
@@ -138,8 +138,7 @@ def build_python(
         own = [folder / "in" / "loopwright.json", folder / "in" / "loopwright.pickle"]
         archive = _make(script, folder / "out", [*own, *taken], name, kind)
         data = _complete(archive, about, values, block)
-    target = Path.cwd() if out is None else Path(out)
-    target = target / f"{name}.fmu" if target.is_dir() else target
+    target = file_for(Path.cwd() if out is None else out, name)
     write_atomically(target, data)
     record_build(hashlib.sha256(data).hexdigest())
     return target

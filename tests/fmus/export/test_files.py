@@ -325,3 +325,13 @@ def test_the_gantry_runs_alike_in_both_versions():
     whole = fmpy.simulate_fmu(str(three), start_values={"motor_force": [150.0, 0.0]}, output=["position"], **options)
     assert np.array_equal(scalar["position[1]"], whole["position"][:, 0])
     assert abs(scalar["position[1]"][-1] - scalar["position[1]"][0]) > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("given", "written"), [("pend", "pend.fmu"), ("pend.v2", "pend.v2.fmu"), ("pend.FMU", "pend.FMU")]
+)
+def test_a_file_without_the_ending_of_fmus_gets_it(tmp_path, given, written):
+    assert _build.file_for(tmp_path / given, "gantry") == tmp_path / written
+    assert gantry.build(out=tmp_path / given) == tmp_path / written
+    assert [file.name for file in tmp_path.iterdir()] == [written]
+    assert _build.file_for(tmp_path, "gantry") == tmp_path / "gantry.fmu"
