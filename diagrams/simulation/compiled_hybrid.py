@@ -128,7 +128,7 @@ class HybridTicks:
         last: int,
         recorder: Recorder,
         *,
-        arrived: Callable[[int], bool],
+        arrived: Callable[..., bool],
         progress: Callable[[float], Any],
     ) -> float | None:
         """Run the ticks after tick ``k`` up to ``last`` and record them; see `CompiledTicks.run`.
@@ -158,7 +158,7 @@ class HybridTicks:
         t: float,
         last: int,
         recorder: Recorder,
-        arrived: Callable[[int], bool],
+        arrived: Callable[..., bool],
         progress: Callable[[float], Any],
     ) -> float | None:
         visited, rest = (EVERY,) if self._sampled else self._clocks, np.zeros(0, dtype=np.int64)
@@ -191,7 +191,8 @@ class HybridTicks:
             if found.ticks:
                 k = int(done[-1])
                 landed = np.flatnonzero(lands[: found.ticks])
-                over = landed.size and arrived(int(done[landed[-1]]))
+                in_step = found.reason is HybridReason.FMU_FAILED
+                over = landed.size and arrived(int(done[landed[-1]]), in_step)
                 if over and found.reason is not HybridReason.ENDED:
                     return None
             if found.reason is HybridReason.ENDED:

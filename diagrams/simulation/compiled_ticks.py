@@ -132,7 +132,7 @@ class CompiledTicks:
         last: int,
         recorder: Recorder,
         *,
-        arrived: Callable[[int], bool],
+        arrived: Callable[..., bool],
         progress: Callable[[float], Any],
     ) -> None:
         """Run the ticks after tick ``k`` up to ``last`` and record them.
@@ -140,7 +140,8 @@ class CompiledTicks:
         Parameters
         ----------
         arrived : callable
-            Told the ticks at which the loop has returned; returns whether the run ends there.
+            Told the ticks at which the loop has returned, and whether plants are in the next step already, in which one
+            may ask for the end; returns whether the run ends there.
         progress : callable
             Told the time after each chunk.
         """
@@ -149,7 +150,7 @@ class CompiledTicks:
                 return
 
     def _run_window(
-        self, window: _Window, recorder: Recorder, arrived: Callable[[int], bool], progress: Callable[[float], Any]
+        self, window: _Window, recorder: Recorder, arrived: Callable[..., bool], progress: Callable[[float], Any]
     ) -> bool:
         """Run some ticks; return whether the run ends there."""
         loop, at, k = self._bind(recorder), 0, window.before
@@ -163,7 +164,7 @@ class CompiledTicks:
             at += found.ticks
             if found.ticks:
                 k = int(window.ticks[at - 1])
-                if arrived(k):
+                if arrived(k, found.reason is Reason.FMU_FAILED):
                     return True
             if found.reason is Reason.HALTED and found.ticks:
                 self._chunk = max(1, self._chunk // 2)

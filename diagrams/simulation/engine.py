@@ -311,10 +311,10 @@ class Engine:
         """Let interpreted ticks end at the next one: C takes over."""
         self._due = self._can_stop = True
 
-    def _arrive(self, k: int) -> bool:
-        """Take note of a tick that has been recorded; return whether it ends the run."""
+    def _arrive(self, k: int, steps_on: bool = False) -> bool:
+        """Take note of a tick that was recorded; return whether it ends the run, in whose next step plants may be."""
         self.position.tick = k
-        return self._can_stop and self._is_over()
+        return self._can_stop and not steps_on and self._is_over()
 
     def _is_over(self) -> bool:
         position = self.position

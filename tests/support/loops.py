@@ -66,6 +66,6 @@ def stabilized_loops(draw, sampled):
     solve = control.dlqr if sampled else control.lqr
     try:
         K, _, _ = solve(loop.A, loop.B, np.eye(n) * weight, np.eye(1))
-    except np.linalg.LinAlgError:  # a mode that can't be moved, or hardly
+    except (np.linalg.LinAlgError, ValueError):  # a mode that can't be moved, or hardly, as SciPy says in two ways
         reject()
     return control.ss(loop.A, loop.B, K, 0, loop.dt)

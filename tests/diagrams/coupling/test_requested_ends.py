@@ -256,19 +256,36 @@ int fmi3DoStep(void *p, double t, double h, bool f, bool *e, bool *stop, bool *e
 """
 
 
+@pytest.mark.parametrize("in_c", [False, True], ids=["interpreted", "compiled"])
 @pytest.mark.parametrize("isolate", [False, True])
 @pytest.mark.parametrize(("last", "samples"), [(0.0, 1), (0.5, 6), (0.53, 7)])
-def test_an_end_in_event_mode_ends_the_run_there(cache, tmp_path, last, samples, isolate):
+def test_an_end_in_event_mode_ends_the_run_there(cache, tmp_path, last, samples, isolate, in_c):
     gets = values("fmi3", "Get", "Float64", "double", {1: "c->y", 2: "c->u", 3: "c->last"})
     sets = values("fmi3", "Set", "Float64", "double", {2: "c->u", 3: "c->last"})
     about = _describe("fmi3").replace("<CoSimulation ", '<CoSimulation hasEventMode="true" ')
     about = about.replace('canGetAndSetFMUState="true" canSerializeFMUState="true"', "")
     file = small_fmu(tmp_path, "fmi3", _EVENTS + gets + sets, about)
     run = driven(file, last, isolate=isolate, stepping=StepOptions(event_mode=True)).simulate(
-        1.0, step=0.1, progress=False
+        1.0, step=0.1, compile=in_c, progress=False
     )
     check_end(run, last)
     assert len(run.t) == samples
+
+
+@pytest.mark.parametrize("in_c", [False, True], ids=["interpreted", "compiled"])
+def test_an_end_in_event_mode_beside_continuous_states(cache, tmp_path, in_c):
+    gets = values("fmi3", "Get", "Float64", "double", {1: "c->y", 2: "c->u", 3: "c->last"})
+    sets = values("fmi3", "Set", "Float64", "double", {2: "c->u", 3: "c->last"})
+    about = _describe("fmi3").replace("<CoSimulation ", '<CoSimulation hasEventMode="true" ')
+    about = about.replace('canGetAndSetFMUState="true" canSerializeFMUState="true"', "")
+    file = small_fmu(tmp_path, "fmi3", _EVENTS + gets + sets, about)
+    plant = Fmu(file, name="plant", start={"last": 0.5}, stepping=StepOptions(event_mode=True))
+    made = Diagram("d", plant(u=Constant(value=1.0)), Integrator(name="sum")(plant.y))
+    run = made.simulate(1.0, step=0.1, compile=in_c, progress=False)
+    assert run.tier == ("compiled" if in_c else "interpreted")
+    check_end(run, 0.5)
+    np.testing.assert_allclose(run.t, np.arange(6) * 0.1, atol=1e-14)
+    np.testing.assert_allclose(run["sum.y"][-1], 0.1 * np.sum(run["plant.y"][:-1]), rtol=1e-9)  # y is held over steps
 
 
 def test_a_linear_model_at_an_end_in_model_exchange_is_refused(cache, tmp_path):

@@ -174,6 +174,8 @@ def test_ctrl_c_ends_a_sweep_at_once_and_keeps_what_was_run(tmp_path, compiled):
     script = tmp_path / "script.py"
     script.write_text(
         f"""
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job begins with it ignored
 from loopwright.diagrams import InterruptedSweep, experiments, final
 diagram = experiments.hand_guiding().diagram
 try:

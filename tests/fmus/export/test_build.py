@@ -212,7 +212,7 @@ def test_the_system_compiler_builds_for_its_own_platform_only():
 @pytest.mark.slow
 def test_all_platforms(tmp_path, cache):
     notes = []
-    path = build_fmu(mass_spring_damper(), tmp_path / "all.fmu", platform=TARGETS, notify=notes.append)
+    path = build_fmu(mass_spring_damper(), tmp_path / "all.fmu", platform=[*TARGETS], notify=notes.append)
     assert len(notes) == len(TARGETS)
     magic = {"linux": b"\x7fELF", "windows": b"MZ", "darwin": b"\xcf\xfa\xed\xfe"}
     with zipfile.ZipFile(path) as archive:
