@@ -8,7 +8,17 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ...blocks.core import Block, LoopwrightError, OptionError, UnknownNameError, Value, WiringError, near, shorten
+from ...blocks.core import (
+    Block,
+    LoopwrightError,
+    OptionError,
+    UnknownNameError,
+    Value,
+    WiringError,
+    enumerate_some,
+    near,
+    shorten,
+)
 from ...blocks.tracing import check_method
 from .entry_names import split_entry, with_entry
 from .parameter_names import OF_A_SUBSYSTEM, check_name, find_path, find_place, name_parameters
@@ -29,6 +39,7 @@ def apply_changes(table: Structure, changes: Iterable[tuple[object, object]], di
     given: dict[str, str] = {}
     for (path, value), is_block in zip(named, blocks, strict=True):
         if is_block and isinstance(value, Block):
+            _refuse_subsystem(table, path, diagram)
             full = find_path(path, table.blocks, "block", diagram)
             _check_once(given, full, path, diagram)
             value.check_place(table.blocks[full], *_used_ports(table, full))
@@ -57,6 +68,19 @@ def _check_once(given: dict[str, str], full: str, path: str, diagram: str) -> No
             f"found two names of one parameter, {given[full]!r} and {path!r}; give it once.", block=diagram, port=full
         )
     given[full] = path
+
+
+def _refuse_subsystem(table: Structure, path: str, diagram: str) -> None:
+    """Refuse a block in the place of a subsystem: its wires lead to blocks inside, and none to the subsystem."""
+    if _find_owner(table, path):
+        return
+    for full in (p for p in table.subsystems if p and (p == path or p.endswith("." + path))):
+        inside = enumerate_some([p for p, at in table.subsystem_of.items() if at == full], 8)
+        raise UnknownNameError(
+            f"{path!r} is a subsystem, and a block takes the place of a block only. Replace a block in it ({inside}), "
+            "or build the diagram with the block in place of the subsystem.",
+            block=diagram,
+        )
 
 
 def _find_owner(table: Structure, path: str) -> str:

@@ -513,6 +513,11 @@ def test_replace_with_an_unknown_name_offers_near_ones(lagged):
         lagged.replace({"box.lag.time_konst": 1.0})
 
 
+def test_a_block_in_place_of_a_subsystem_is_told_that_it_is_one(lagged):
+    with pytest.raises(UnknownNameError, match=r"'box' is a subsystem, .*Replace a block in it \(box\.lag\)"):
+        lagged.replace(box=Lag(time_constant=1.0))
+
+
 def test_replacing_a_block_by_one_that_does_not_fit_the_wires(lagged):
     with pytest.raises(WiringError, match="box.lag|one"):
         lagged.replace(one=Constant(value=(1.0, 2.0)))
