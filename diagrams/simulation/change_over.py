@@ -86,8 +86,7 @@ class ChangeOver:
         if self._later is None:
             from .compiled_ticks import make_later
 
-            regular = self._steps.regular
-            self._later = make_later(self._workspace, self._plants, self._stops, every=self._every, regular=regular)
+            self._later = make_later(self._workspace, self._plants, self._stops, steps=self._steps, every=self._every)
         if self._later is None:
             self._possible = False
         else:

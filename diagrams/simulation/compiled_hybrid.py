@@ -356,7 +356,7 @@ def make_hybrid(
     stops: Sequence[int],
     *,
     every: bool,
-    regular: bool,
+    coupled: bool,
     asked: bool = True,
     fuse: bool = False,
 ) -> tuple[HybridTicks | None, tuple[str, ...]]:
@@ -364,8 +364,8 @@ def make_hybrid(
 
     Parameters
     ----------
-    regular : bool
-        Whether every plant steps once from each tick to the next.
+    coupled : bool
+        Whether another coupling than "jacobi" is asked for.
     asked : bool
         Whether the user asks for C, by ``compile=True``; else a compiler that fails is told once, and nothing else.
     fuse : bool, default False
@@ -375,7 +375,7 @@ def make_hybrid(
     reason = find_hybrid_obstacle(workspace.flat, continuous.solver.name)
     if reason is None and continuous.exchanged is not None:
         reason = find_exchange_obstacle(continuous.exchanged.blocks)
-    reason = reason or find_obstacle_at_ticks(workspace.flat, plants, native, regular=regular)
+    reason = reason or find_obstacle_at_ticks(workspace.flat, plants, native, steps, coupled=coupled)
     if reason is None:
         try:
             found = HybridTicks(workspace, continuous, native, steps, stops, every=every, fuse=fuse)

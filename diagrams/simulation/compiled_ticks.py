@@ -23,7 +23,7 @@ from ..compiled import (
     compile_ticks,
     find_obstacle,
 )
-from ..coupling import Plant
+from ..coupling import Plant, PlantSteps
 from ..flat import EVERY, EXACT_LOOP, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of, ticks_after
 from ..results import Recorder
 from .compiled_hand_over import bind_loop, end_steps, plants_for_c, prepare, step_plants
@@ -251,21 +251,26 @@ def make_compiled(
     plants: Mapping[str, Plant],
     stops: Sequence[int],
     *,
+    steps: PlantSteps,
     every: bool,
-    regular: bool,
+    coupled: bool,
     fuse: bool = False,
 ) -> tuple[CompiledTicks | None, tuple[str, ...]]:
     """Return the ticks of a run in C, None where they can't be had, and messages about them.
 
     Parameters
     ----------
-    regular : bool
-        Whether every plant steps once from each tick to the next.
+    steps : PlantSteps
+        Steps of the plants.
+    coupled : bool
+        Whether another coupling than "jacobi" is asked for.
     fuse : bool, default False
         Compile ticks and plants of our own together, for the processor of this machine.
     """
     native = plants_for_c(plants)
-    reason = find_obstacle(workspace.flat) or find_obstacle_at_ticks(workspace.flat, plants, native, regular=regular)
+    reason = find_obstacle(workspace.flat) or find_obstacle_at_ticks(
+        workspace.flat, plants, native, steps, coupled=coupled
+    )
     if reason is None:
         try:
             code = _fuse(workspace.flat, native, every=every) if fuse else None
@@ -343,24 +348,33 @@ def tell_failure_once(failure: Exception) -> tuple[str, ...]:
 
 
 def make_later(
-    workspace: Workspace, plants: Mapping[str, Plant], stops: Sequence[int], *, every: bool, regular: bool
+    workspace: Workspace, plants: Mapping[str, Plant], stops: Sequence[int], *, steps: PlantSteps, every: bool
 ) -> LaterTicks | None:
     """Return ticks that C takes over from where a run is long enough; None where it can't. See `make_compiled`."""
     flat = workspace.flat
-    if find_obstacle(flat) or find_obstacle_at_ticks(flat, plants, plants_for_c(plants), regular=regular):
+    if find_obstacle(flat) or find_obstacle_at_ticks(flat, plants, plants_for_c(plants), steps, coupled=False):
         return None
     return LaterTicks(workspace, plants, stops, every=every)
 
 
 def find_obstacle_at_ticks(
-    flat: FlatDiagram, plants: Mapping[str, Plant], native: Mapping[str, FmuInstance], *, regular: bool
+    flat: FlatDiagram,
+    plants: Mapping[str, Plant],
+    native: Mapping[str, FmuInstance],
+    steps: PlantSteps,
+    *,
+    coupled: bool,
 ) -> str | None:
     """Return why the clocks and the plants of a run can't be gone over in C; None if they can."""
     if len(flat.distinct) > CLOCKS:
         return f"it has {len(flat.distinct)} different clocks, and at most {CLOCKS} are compiled"
-    if not regular:
+    if coupled:
+        return "coupling= asks for another one than 'jacobi', whose steps Python takes"
+    if not steps.regular:
+        path = next(path for path in flat.plant_ticks if not steps.is_regular(path))
         return (
-            'an FMU takes longer steps than from one tick to the next, or a coupling other than "jacobi" is asked for'
+            f"{path!r} takes longer steps than from one tick to the next. With step={float(flat.base):.9g} all plants "
+            "step at each tick"
         )
     for path in plants:
         if path not in native:

@@ -191,8 +191,8 @@ class Engine:
         if self.continuous is not None:
             return self._make_hybrid()
         found, message = make_compiled(
-            self.workspace, self.plants, self._stops.entries, every=self.every_tick,
-            regular=self.steps.regular and self.coupled is None, fuse=self._fuse,
+            self.workspace, self.plants, self._stops.entries, steps=self.steps, every=self.every_tick,
+            coupled=self.coupled is not None, fuse=self._fuse,
         )  # fmt: skip
         self.messages += message
         return found
@@ -203,7 +203,7 @@ class Engine:
         assert self.continuous is not None
         ticks, message = make_hybrid(
             self.workspace, self.continuous, self.plants, self.steps, self._stops.entries, every=self.every_tick,
-            regular=self.steps.regular and self.coupled is None, asked=self._compile is True, fuse=self._fuse,
+            coupled=self.coupled is not None, asked=self._compile is True, fuse=self._fuse,
         )  # fmt: skip
         self.messages += message
         return ticks
