@@ -106,7 +106,9 @@ def test_a_loop_that_becomes_undetermined_says_the_same():
     def equation(v, u):
         return v + np.where(u > 0.9, 0.0, 1.0) * (v - 1.0)
 
-    failing(loop_of(equation))
+    text, _, t = failing(loop_of(equation))
+    assert "f.y: it is singular" in text
+    assert t == pytest.approx(np.ceil(np.arcsin(0.9) / (4.0 * np.pi) / 0.01) * 0.01)  # the first tick with u above 0.9
 
 
 def test_a_loop_through_states_goes_on_from_saved_states():
