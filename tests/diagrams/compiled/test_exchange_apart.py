@@ -5,19 +5,15 @@ import signal
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
-from loopwright.blocks import Constant, FmuProcessError, FmuRuntimeError, UnitDelay
-from loopwright.diagrams import Diagram, Interrupted, subsystem
+from loopwright.blocks import Constant, FmuProcessError, FmuRuntimeError
+from loopwright.diagrams import Diagram, Interrupted
 from loopwright.fmus import Fmu, Isolation, mass_spring_damper
 from loopwright.fmus.isolation import count_processes, end_idle
+from support.controlled_mass import exact_loop, pi_loop
 from support.eventful import eventful_fmu
 from support.waiting import Interruption
 
-T = 1e-3
-M = mass_spring_damper.nominal
-A = np.array([[0.0, 1.0], [-M.stiffness / M.mass, -M.damping / M.mass]])
-B = np.array([[0.0], [1.0 / M.mass]])
 SHORT = Isolation(step_time=1.0)
 """For calls that never end; no other test has a limit that a busy machine reaches."""
 EXACT = {"rtol": 1e-9, "atol": 1e-12, "progress": False}
@@ -36,29 +32,8 @@ def mass(cache, tmp_path_factory):
     return mass_spring_damper.build(out=tmp_path_factory.mktemp("apart") / "mass.fmu")
 
 
-def pi_loop(mass, isolate):
-    """A PI controller at 1 kHz around a mass on a spring."""
-    plant = Fmu(mass, interface="model_exchange", name="plant", isolate=isolate)
-
-    @subsystem(sample_time=T, name="controller")
-    def controller(y):
-        error = 1.0 - y
-        memory = UnitDelay(initial_value=0.0, name="integral")
-        return 20.0 * error + 50.0 * memory(memory.y + T * error)
-
-    return Diagram("loop", plant(force=controller(plant.position)))
-
-
-def exact_loop(n):
-    """Positions in that loop at n ticks, by the exponential of a matrix."""
-    step = expm(T * np.block([[A, B], [np.zeros((1, 3))]]))[:2]
-    x, integral, found = np.array([0.1, 0.0]), 0.0, []
-    for _ in range(n):
-        found.append(x[0])
-        error = 1.0 - x[0]
-        force, integral = 20.0 * error + 50.0 * integral, integral + T * error
-        x = step @ [*x, force]
-    return np.array(found)
+def mass_loop(mass, isolate):
+    return pi_loop(Fmu(mass, interface="model_exchange", name="plant", isolate=isolate))
 
 
 def eventful(file, start=None, isolate=True):
@@ -67,7 +42,7 @@ def eventful(file, start=None, isolate=True):
 
 
 def test_a_controlled_plant_is_that_of_the_matrix_exponential_with_the_bits_of_this_process(mass):
-    runs = [pi_loop(mass, isolate).simulate(0.1, compile=True, **EXACT) for isolate in (True, False)]
+    runs = [mass_loop(mass, isolate).simulate(0.1, compile=True, **EXACT) for isolate in (True, False)]
     assert [run.tier for run in runs] == ["compiled", "compiled"]
     assert runs[0].data.tobytes() == runs[1].data.tobytes()
     np.testing.assert_allclose(runs[0]["plant.position"], exact_loop(101), rtol=0.0, atol=1e-9)
@@ -91,7 +66,7 @@ def test_events_of_every_kind_are_those_of_this_process(cache, tmp_path, fmi):
 def test_it_works_where_memory_is_not_written_in_order(mass, monkeypatch):
     end_idle()
     monkeypatch.setattr("loopwright.fmus.isolation.wire.ORDERED", False)
-    run = pi_loop(mass, True).simulate(0.1, compile=True, **EXACT)
+    run = mass_loop(mass, True).simulate(0.1, compile=True, **EXACT)
     np.testing.assert_allclose(run["plant.position"], exact_loop(101), rtol=0.0, atol=1e-9)
 
 
@@ -189,7 +164,7 @@ def test_ctrl_c_ends_a_run_soon(cache, tmp_path, hangs):
 
 
 def test_a_saved_state_tells_the_fmu_that_steps_may_be_taken_back_and_a_crash_between_two_advances_is_told(mass):
-    with pi_loop(mass, True).simulation(compile=True) as simulation:
+    with mass_loop(mass, True).simulation(compile=True) as simulation:
         plant = simulation._engine.exchanged.blocks["plant"]
         for saved in (False, True):
             if saved:
@@ -206,14 +181,14 @@ def test_a_saved_state_tells_the_fmu_that_steps_may_be_taken_back_and_a_crash_be
 
 @pytest.mark.one_tier
 def test_runs_that_are_long_for_a_process_of_their_own_are_compiled_by_themselves(mass):
-    run = pi_loop(mass, True).simulate(4.0, record=["plant.position"], every=100, progress=False)
+    run = mass_loop(mass, True).simulate(4.0, record=["plant.position"], every=100, progress=False)
     assert run.tier == "compiled"
     np.testing.assert_allclose(run["plant.position"], exact_loop(4001)[::100], rtol=0.0, atol=1e-6)
-    assert pi_loop(mass, True).simulate(0.1, progress=False).tier == "interpreted"
+    assert mass_loop(mass, True).simulate(0.1, progress=False).tier == "interpreted"
 
 
 def test_it_is_interpreted_where_c_can_not_wait_for_a_process(mass, monkeypatch):
     monkeypatch.setattr("loopwright.fmus.isolation.process.ChildProcess.request_of", lambda self, sequence: None)
-    run = pi_loop(mass, True).simulate(0.01, compile=True, progress=False)
+    run = mass_loop(mass, True).simulate(0.01, compile=True, progress=False)
     assert run.tier == "interpreted"
     assert any("'plant' in model exchange runs in a process of its own" in message for message in run.messages)

@@ -19,17 +19,11 @@ from loopwright.blocks import (
     Step,
     StopCondition,
     TransferFunction,
-    UnitDelay,
 )
 from loopwright.diagrams import Diagram, Interrupted, subsystem
 from loopwright.fmus import Fmu, bouncing_ball, build, mass_spring_damper
+from support.controlled_mass import START, A, B, T, exact_loop, pi_loop
 from support.eventful import eventful_fmu
-
-T = 1e-3
-M = mass_spring_damper.nominal
-A = np.array([[0.0, 1.0], [-M.stiffness / M.mass, -M.damping / M.mass]])
-B = np.array([[0.0], [1.0 / M.mass]])
-START = 0.1
 
 
 class Car(Block):
@@ -92,30 +86,6 @@ def same(interpreted, compiled, rtol=1e-8, atol=1e-10):
     np.testing.assert_allclose([e.t for e in interpreted.events], [e.t for e in compiled.events], rtol=1e-7, atol=1e-9)
 
 
-def pi_loop(plant):
-    """A PI controller at 1 kHz around an FMU."""
-
-    @subsystem(sample_time=T, name="controller")
-    def controller(y):
-        error = 1.0 - y
-        memory = UnitDelay(initial_value=0.0, name="integral")
-        return 20.0 * error + 50.0 * memory(memory.y + T * error)
-
-    return Diagram("loop", plant(force=controller(plant.position)))
-
-
-def exact_loop(n):
-    """Positions in that loop at n ticks, by the exponential of a matrix."""
-    step = expm(T * np.block([[A, B], [np.zeros((1, 3))]]))[:2]
-    x, integral, found = np.array([START, 0.0]), 0.0, []
-    for _ in range(n):
-        found.append(x[0])
-        error = 1.0 - x[0]
-        force, integral = 20.0 * error + 50.0 * integral, integral + T * error
-        x = step @ [*x, force]
-    return np.array(found)
-
-
 @pytest.mark.parametrize("fmi", [2, 3])
 @pytest.mark.parametrize("solver", ["auto", "RK23", "DOP853", "Radau", "rk4"])
 def test_a_plant_under_a_sampled_controller_is_that_of_the_matrix_exponential(files, fmi, solver):
@@ -150,7 +120,7 @@ def test_feedback_in_continuous_time_through_the_fmu(files):
         return Diagram("loop", plant(force=Gain(gain=-5.0, name="feedback")(plant.position)))
 
     interpreted, compiled = both(make, 1.0, step=0.1)
-    closed = np.array([[0.0, 1.0], [-(M.stiffness + 5.0) / M.mass, -M.damping / M.mass]])
+    closed = A - 5.0 * B @ [[1.0, 0.0]]
     exact = [(expm(closed * t) @ [START, 0.0])[0] for t in compiled.t]
     np.testing.assert_allclose(compiled["plant.position"], exact, atol=1e-7)
     same(interpreted, compiled)
