@@ -5,9 +5,14 @@ python benchmarks/exchange.py
 
 import tempfile
 import time
+import timeit
+import zipfile
 from pathlib import Path
 
+import numpy as np
+
 from loopwright.blocks import Gain
+from loopwright.blocks.core import Wanted
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, bouncing_ball, mass_spring_damper
 
@@ -47,6 +52,27 @@ def measure_tick(mass, *, isolate, form):
     return (long - short) / count, run.tier
 
 
+def measure_evaluation(mass):
+    """Return the wall-clock seconds of an evaluation in another process: of our own FMU, and of a copy from anywhere.
+
+    The copy is asked in the longer order, as an FMU of another tool is.
+    """
+    copy = mass.with_name("foreign.fmu")
+    with zipfile.ZipFile(mass) as old, zipfile.ZipFile(copy, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name))
+    found = []
+    for file in (mass, copy):
+        plant = Fmu(file, interface="model_exchange", name="plant", isolate=True)
+        with plant.exchange(["force"]) as instance:
+            u = np.zeros(1)
+            x = instance.exchange(u)
+            instance.begin_exchange()
+            call = instance.evaluation(Wanted(("position", "velocity", "acceleration"), rates=True))
+            found.append(min(timeit.repeat(lambda: call(0.0, x, u), number=20, repeat=500)) / 20)  # noqa: B023
+    return found
+
+
 def main():
     """Measure, and print a table: interpreted, compiled, and how many times as fast that is."""
     folder = Path(tempfile.mkdtemp())
@@ -59,6 +85,8 @@ def main():
         for name, (before, after) in {"impact": impacts, "tick": ticks}.items():
             shown = f"{1e6 * before:9.1f} µs  {1e6 * after:9.1f} µs  {before / after:5.1f}"
             print(f"{name + ' ' + place:>34}  {shown if tiers[1] == 'compiled' else shown[:12] + '   not compiled'}")
+    own, foreign = measure_evaluation(mass)
+    print(f"evaluation in a process of its own: {1e6 * own:.1f} µs, of an FMU of another tool {1e6 * foreign:.1f} µs")
 
 
 if __name__ == "__main__":

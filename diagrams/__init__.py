@@ -2,6 +2,6 @@
 
 from lazy_loader import attach_stub as _load_on_use
 
-from ..blocks import moved as _moved  # noqa: F401  an old pickle names modules of this room: it gets an error that says so
+from ..blocks import moved as _moved  # noqa: F401  gives old pickles, which name modules of this room, an error
 
 __getattr__, __dir__, __all__ = _load_on_use(__name__, __file__)  # the names stand in __init__.pyi

@@ -372,7 +372,8 @@ class Diagram(VariedDiagram):
         windows : int
             Most windows that are waited for.
         agreement : float
-            Relative difference of two windows at which a frequency is done.
+            Relative difference of two windows at which a frequency is done. One at which noise keeps the windows from
+            agreeing is done, too, with the uncertainty of their mean.
         confirm : bool
             Whether to measure a second time, with half the amplitude and smaller tolerances, for the uncertainty.
         **options

@@ -31,12 +31,17 @@ class _FloatingPoint:
         self.get: Callable[[Any], int] = getattr(library, "fegetenv", lambda at: 0)
         self.set: Callable[[Any], int] = getattr(library, "fesetenv", lambda at: 0)
 
-    def modes(self, environment: Any) -> tuple[bytes, ...]:
-        """Return the modes in a ``fenv_t``."""
-        found = [environment.raw[start:stop] for start, stop in self.places]
-        if len(found) > 1:
-            found[-1] = bytes([found[-1][0] & ~_FLAGS]) + found[-1][1:]
-        return tuple(found)
+    def views(self, environment: Any) -> list[Any]:
+        """Return views of the modes in a ``fenv_t``, as C integers."""
+        kinds = {2: ctypes.c_uint16, 4: ctypes.c_uint32}
+        return [kinds[stop - start].from_buffer(environment, start) for start, stop in self.places]
+
+    @staticmethod
+    def modes(views: list[Any]) -> tuple[int, ...]:
+        """Return the modes that views show."""
+        if len(views) == 2:
+            return views[0].value, views[1].value & ~_FLAGS
+        return tuple(view.value for view in views)
 
 
 _floating_point: _FloatingPoint | None = None
@@ -52,7 +57,9 @@ def _modes() -> _FloatingPoint:
 class HostState:
     """The state as it is at the start of a ``with`` statement; its end sets it back, and tells what has been changed.
 
-    Rounding modes and traps are kept on Linux alone.
+    One within another keeps the state of the outer one. Rounding modes and traps are kept on Linux alone. There
+    `settle` sets them back after each call, to what they were at the last such start, so that nothing is computed in
+    those of a library.
 
     Parameters
     ----------
@@ -62,23 +69,42 @@ class HostState:
 
     def __init__(self, tell: Callable[[str], None]):
         self._tell = tell
-        self._numbers, self._now = ctypes.create_string_buffer(64), ctypes.create_string_buffer(64)
         self._floating_point = _modes()
+        self._numbers, self._now = ctypes.create_string_buffer(64), ctypes.create_string_buffer(64)
+        self._views, self._views_now = (self._floating_point.views(found) for found in (self._numbers, self._now))
+        self._keep_modes()
         self._told: set[str] = set()
-        self._folder = ""
+        self._folder, self._depth = "", 0
 
     def __enter__(self) -> HostState:
+        self._depth += 1
+        if self._depth > 1:
+            return self
+        self._folder = ""
         with suppress(OSError):  # a folder that has been removed
             self._folder = os.getcwd()
-        self._floating_point.get(self._numbers)
+        self._keep_modes()
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def _keep_modes(self) -> None:
+        self._floating_point.get(self._numbers)
+        self._kept = self._floating_point.modes(self._views)
+
+    def settle(self, status: Any, *_: object) -> Any:
+        """Set rounding mode and traps back after a call, and return its result: what ctypes calls ``errcheck``."""
         numbers = self._floating_point
         numbers.get(self._now)
-        if numbers.modes(self._now) != numbers.modes(self._numbers):
+        if numbers.modes(self._views_now) != self._kept:
             numbers.set(self._numbers)
             self.note_modes()
+        return status
+
+    def __exit__(self, *error: object) -> None:
+        if self._depth == 1:
+            self.settle(None)
+        self._depth -= 1
+        if self._depth:
+            return
         folder = ""
         with suppress(OSError):
             folder = os.getcwd()

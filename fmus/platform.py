@@ -6,12 +6,16 @@ import os
 import platform
 import sys
 import tempfile
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
+from typing import Any
 
 import platformdirs
 
-from ..blocks.core import FmuError
+from ..blocks.core import FmuError, LoopwrightError, explain_disk_errors
+
+OWN_CACHE = "Set LOOPWRIGHT_CACHE to a folder of your own."
+"""Step where the cache folder can't be used."""
 
 
 def native_platform() -> str:
@@ -23,15 +27,45 @@ def native_platform() -> str:
 
 
 def cache_folder() -> Path:
-    """Return the folder of files that can be built again: LOOPWRIGHT_CACHE, else the user's cache folder."""
+    """Return the folder of files that can be built again: LOOPWRIGHT_CACHE, else the user's cache folder.
+
+    Its path is absolute, since the working folder changes for moments.
+
+    Raises
+    ------
+    FmuError
+        If there is no home folder, or if LOOPWRIGHT_CACHE is a relative path and the working folder was removed.
+    """
     given = os.environ.get("LOOPWRIGHT_CACHE")
-    return Path(given).expanduser() if given else Path(platformdirs.user_cache_dir("loopwright", appauthor=False))
+    try:
+        folder = Path(given).expanduser() if given else Path(platformdirs.user_cache_dir("loopwright", appauthor=False))
+    except RuntimeError:  # "~", for a user whom the system doesn't know
+        folder = Path("~")
+    if folder.parts[:1] == ("~",):
+        raise FmuError(
+            "found no home folder for the cache, neither by HOME nor by the system's list of users; expected one. "
+            f"{OWN_CACHE}"
+        )
+    with explain_disk_errors(f"the cache folder {str(folder)!r} can't be found", folder, OWN_CACHE, FmuError):
+        return folder.absolute()
+
+
+def explain_cache_errors(
+    failed: str = "", raised: type[LoopwrightError] = FmuError, **where: Any
+) -> AbstractContextManager[None]:
+    """Return a context in which an error of the system is explained as one of the cache folder.
+
+    Parameters are those of `explain_disk_errors`; without ``failed`` the message says that the cache can't be used.
+    """
+    folder = cache_folder()
+    failed = failed or f"the cache folder {str(folder)!r} can't be used"
+    return explain_disk_errors(failed, folder, OWN_CACHE, raised, **where)
 
 
 def record_build(digest: str) -> None:
     """Note in the cache that Loopwright has built a file with this SHA-256 digest, for `is_built_here`."""
-    folder = cache_folder() / "built"
-    with suppress(OSError):  # a cache that can't be written: the FMU counts as foreign
+    with suppress(OSError, FmuError):  # a cache that can't be written: the FMU counts as foreign
+        folder = cache_folder() / "built"
         folder.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         folder.mkdir(exist_ok=True, mode=0o700)
         (folder / digest).touch(mode=0o600)
@@ -39,10 +73,10 @@ def record_build(digest: str) -> None:
 
 def is_built_here(digest: str) -> bool:
     """Return whether Loopwright has built a file with this digest, by a note that only this user can have written."""
-    folder = cache_folder() / "built"
     try:
+        folder = cache_folder() / "built"
         stats = [(folder / digest).stat(), folder.stat(), folder.parent.stat()]
-    except OSError:
+    except (OSError, FmuError):
         return False
     if os.name != "posix":
         return True
@@ -58,13 +92,8 @@ def check_cache() -> Path:
         If it can't be written.
     """
     folder = cache_folder()
-    try:
+    with explain_cache_errors():
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)  # the compiler's own cache stands there, too
         with tempfile.TemporaryFile(dir=folder):
             pass
-    except OSError as error:
-        raise FmuError(
-            f"can't write the cache folder {str(folder)!r}: {error}. Set LOOPWRIGHT_CACHE to a folder that can be "
-            "written."
-        ) from error
     return folder

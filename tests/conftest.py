@@ -22,6 +22,8 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 def pytest_addoption(parser):
     parser.addoption("--both-tiers", action="store_true", help="compile every run as well, and compare the bits")
+    text = "disturb linear algebra in all tests (0: in none); else in the tests of numbers, with seed 1"
+    parser.addoption("--disturbed", type=int, metavar="SEED", help=text)
     parser.addoption("--grouped", action="store_true", help="compile every diagram block by block")
 
 
@@ -42,6 +44,32 @@ def both_tiers(request):
 
     with pytest.MonkeyPatch.context() as patch:
         tiers.install(patch)
+        yield
+
+
+@pytest.fixture(scope="session")
+def disturbance():
+    """Linear algebra that can be disturbed, see `support.disturbed`."""
+    from support.disturbed import Disturbance
+
+    with pytest.MonkeyPatch.context() as patch:
+        found = Disturbance()
+        found.install(patch)
+        yield found
+
+
+@pytest.fixture(autouse=True)
+def disturbed(request):
+    """Disturb linear algebra in the tests of numbers, with seed 1 or that of ``--disturbed``; that in all tests."""
+    from support.disturbed import NUMBERS
+
+    seed = request.config.getoption("--disturbed")
+    if seed is None:
+        seed = int(request.node.nodeid.startswith(NUMBERS))
+    if not seed or request.node.get_closest_marker("equal_bits") is not None:
+        yield
+        return
+    with request.getfixturevalue("disturbance").on(seed):
         yield
 
 
@@ -88,7 +116,9 @@ def pytest_xdist_make_scheduler(config, log):
     class Scheduling(LoadFileScheduling):
         def _split_scope(self, nodeid):
             exported = nodeid.startswith("tests/fmus/") and self.numnodes <= 3
-            return "tests/fmus" if exported else super()._split_scope(nodeid)
+            if exported:
+                return "tests/fmus"
+            return nodeid if nodeid.startswith("tests/test_other_machines.py") else super()._split_scope(nodeid)
 
     config.option.loadscopereorder = False
     return Scheduling(config, log)

@@ -1,6 +1,7 @@
 """The house's own rules, read from the sources: nothing depends on words of English texts."""
 
 import ast
+import importlib
 import re
 from functools import cache
 from pathlib import Path
@@ -141,3 +142,35 @@ def test_the_rule_sees_what_it_is_about(line, monkeypatch):
 )
 def test_the_rule_leaves_names_alone(line):
     assert not list(prose_read(ast.parse(line)))
+
+
+# --- names in texts ----------------------------------------------------------------------------------------------------
+
+_NAMED = re.compile(r"\bloopwright((?:\.[A-Za-z_]\w*)+)")
+_FILES = {"json", "pickle", "toml", "html", "fmu", "svg", "md", "py", "pdf", "git"}
+
+
+def exists(dotted):
+    """Whether a name below the package is there: a module, or a name of one and its attributes."""
+    parts, found = dotted.split("."), importlib.import_module("loopwright")
+    for i, part in enumerate(parts):
+        if not hasattr(found, part):
+            try:
+                importlib.import_module(".".join(["loopwright", *parts[: i + 1]]))
+            except ImportError:
+                return False
+        found = getattr(found, part)
+    return True
+
+
+def test_every_name_of_ours_in_a_text_exists():
+    """Error texts, hints, docstrings and pages name functions that a reader can call."""
+    named = {}
+    for path in [*SOURCES, *(ROOT / "docs").rglob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]:
+        text = path.read_text(encoding="utf-8")
+        for found in _NAMED.finditer(text):
+            name = found.group(1)[1:]
+            if name.split(".")[0] not in _FILES:
+                named.setdefault(name, f"{path.relative_to(ROOT)}:{text[: found.start()].count(chr(10)) + 1}")
+    assert len(named) > 20
+    assert {where: name for name, where in named.items() if not exists(name)} == {}

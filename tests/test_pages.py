@@ -67,6 +67,16 @@ def run_commands(text, folder):
         assert done.returncode == 0, f"{program} {arguments}: {done.stdout}{done.stderr}"
 
 
+def test_a_script_of_the_readmes_code_shows_no_warnings(tmp_path):
+    (tmp_path / "script.py").write_text("\n".join(blocks_of_code((ROOT / "README.md").read_text(encoding="utf-8"))))
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONWARNINGS"} | {"MPLBACKEND": "agg"}
+    done = subprocess.run(
+        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr
+
+
 def test_the_readme_opens_with_a_closed_loop_in_ten_lines_that_runs(tmp_path):
     first, *more = blocks_of_code((ROOT / "README.md").read_text(encoding="utf-8"))
     lines = [line for line in first.splitlines() if line.strip()]

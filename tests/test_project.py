@@ -8,6 +8,8 @@ import os
 import subprocess
 import sys
 import tomllib
+import warnings
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -49,6 +51,27 @@ def test_ruff(arguments):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.parametrize(
+    ("module", "error"),
+    [
+        ("control.statesp", nullcontext()),
+        ("numpy.lib", nullcontext()),
+        ("distributed.utils", nullcontext()),
+        ("loopwright.diagrams.frequency.loop_margins", pytest.raises(DeprecationWarning)),
+        ("support.linear", pytest.raises(DeprecationWarning)),
+        ("tests.blocks.test_a", pytest.raises(DeprecationWarning)),
+        ("__main__", pytest.raises(DeprecationWarning)),
+        ("<string>", pytest.raises(DeprecationWarning)),  # the code of pages, which tests run with exec
+    ],
+)
+def test_deprecations_are_errors_where_our_code_or_a_users_causes_them(module, error):
+    for kind in (DeprecationWarning, type("DeprecatedSince", (DeprecationWarning,), {})):
+        with error:
+            warnings.warn_explicit("goes in version 3", kind, "file.py", 1, module=module)
+    with pytest.raises(FutureWarning):  # which Python shows wherever it comes from
+        warnings.warn_explicit("changes in version 3", FutureWarning, "file.py", 1, module=module)
+
+
 def test_types(pytestconfig):
     """Mypy's cache stays from run to run, as it does for people: an entry counts only for the file's very content."""
     folder = pytestconfig.cache.mkdir("types")
@@ -58,7 +81,9 @@ def test_types(pytestconfig):
             (folder / "loopwright" / room).symlink_to(ROOT / room)
     packages = [argument for room in ROOMS for argument in ("-p", f"loopwright.{room}")]
     environment = {**os.environ, "MYPYPATH": str(folder)}
-    done = call(sys.executable, "-m", "mypy", *packages, "--cache-dir", str(folder / "cache"), env=environment)
+    here = ".".join(map(str, sys.version_info[:2]))  # NumPy's stubs may need it, where it is newer than the lowest
+    options = ("--python-version", here, "--cache-dir", str(folder / "cache"))
+    done = call(sys.executable, "-m", "mypy", *packages, *options, env=environment)
     assert done.returncode == 0, done.stdout + done.stderr
 
 

@@ -256,6 +256,10 @@ class Block(Value, Wireable):
             return iter(self._signal())  # one signal, or none: the error says what to do
         return iter([Signal(self, name) for name in names])
 
+    def advise_unwired(self, ports: Collection[str]) -> str:
+        """Return what else gives values to inputs without a wire, as the end of an error's text; "" if nothing."""
+        return ""
+
     def entries_of(self, parameter: str) -> Collection[str]:
         """Return the names that entries of a mapping among its parameters may have, besides those that it holds."""
         return ()

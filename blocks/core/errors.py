@@ -25,6 +25,7 @@
     ├── FmuError (RuntimeError)           an FMU that can't be read, built or loaded
     │   ├── FmuFileError
     │   └── CompilerError
+    ├── DiskError (OSError)               a file or folder that can't be used: permission, space, limits
     └── ConfirmationError (RuntimeError)  two independent computations of one number disagree
 
 Each error names the block (its path), the port and the time, then says what was found, what was expected, and one next
@@ -292,6 +293,13 @@ class FmuFileError(FmuError):
 
 class CompilerError(FmuError):
     """No C compiler was found, or it failed; the message quotes it."""
+
+
+class DiskError(LoopwrightError, OSError):
+    """A file or folder can't be used: no permission, no space, a limit, no such folder; the message says which.
+
+    Its ``__cause__`` is the system's own error.
+    """
 
 
 class ConfirmationError(LoopwrightError, RuntimeError):

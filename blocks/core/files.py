@@ -8,8 +8,13 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 
+from .disk import explain_disk_errors
 from .errors import OptionError
+
+OTHER_FILE = "Name a file in another folder."
+"""Step where a file that a user has named can't be written."""
 
 
 def check_file(path: str | os.PathLike[str]) -> Path:
@@ -18,16 +23,18 @@ def check_file(path: str | os.PathLike[str]) -> Path:
     Raises
     ------
     OptionError
-        A folder, or a file in a folder that isn't there or can't be written to.
+        A folder, or a file in a folder that isn't there or can't be written to; the message says why.
     """
     file = Path(path).expanduser()
-    if file.is_dir():
-        raise OptionError(f"{str(path)!r} is a folder. Name a file in it.", port="path")
-    if not file.parent.is_dir():
-        raise OptionError(f"there is no folder {str(file.parent)!r}. Make it, or name another one.", port="path")
-    folder = Path(os.path.realpath(file)).parent
-    if (file.is_file() or not file.exists()) and not os.access(folder, os.W_OK):
-        raise OptionError(f"nothing can be written to {str(folder)!r}. Name another folder.", port="path")
+    with explain_disk_errors(f"{str(path)!r} can't be written", file, OTHER_FILE, OptionError, port="path"):
+        if file.is_dir():
+            raise OptionError(f"{str(path)!r} is a folder. Name a file in it.", port="path")
+        if not file.parent.is_dir():
+            raise OptionError(f"there is no folder {str(file.parent)!r}. Make it, or name another one.", port="path")
+        folder = Path(os.path.realpath(file)).parent
+        if file.is_file() or not file.exists():
+            with TemporaryFile(dir=folder):
+                pass
     return file
 
 
@@ -40,25 +47,30 @@ def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     Raises
     ------
-    OSError
+    DiskError
         If the file can't be written.
     """
     given = Path(path).expanduser()
-    if given.exists() and not given.is_file():
-        yield given
-        return
-    target = Path(os.path.realpath(given))
-    fresh = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.part{target.suffix}")
-    try:
-        yield fresh
-        with open(fresh, "rb+") as file:
-            os.fsync(file.fileno())  # some systems tell of a full disk here only
-        if target.exists():
-            shutil.copymode(target, fresh)
-        fresh.replace(target)
-    finally:
-        with suppress(OSError):
-            fresh.unlink()
+    with explain_disk_errors(f"{str(path)!r} can't be written", given, OTHER_FILE):
+        if given.exists() and not given.is_file():
+            yield given
+            return
+        target = Path(os.path.realpath(given))
+        fresh = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.part{target.suffix}")
+        try:
+            yield fresh
+            with open(fresh, "rb+") as file:
+                os.fsync(file.fileno())  # some systems report a full disk here only
+            if target.exists():
+                shutil.copymode(target, fresh)
+            fresh.replace(target)
+        except OSError as error:
+            if error.filename == str(fresh):  # a name that its user has not given
+                error.filename, error.filename2 = str(target), None
+            raise
+        finally:
+            with suppress(OSError):
+                fresh.unlink()
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
@@ -66,7 +78,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
     Raises
     ------
-    OSError
+    DiskError
         If the file can't be written.
     """
     with replace_file(path) as fresh:

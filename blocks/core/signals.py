@@ -6,7 +6,7 @@ one. Both can be wired on, indexed, unpacked, named, and used in ``+``, ``-`` an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from contextvars import ContextVar
 from typing import Any, Protocol, TypeVar
@@ -69,6 +69,9 @@ class WirableBlock(Protocol):
     @property
     def outputs(self) -> Mapping[str, Any]:
         """Output ports by name."""
+
+    def advise_unwired(self, ports: Collection[str]) -> str:
+        """Return what else gives values to inputs without a wire."""
 
 
 recorder: ContextVar[list[Any] | None] = ContextVar("loopwright_calls", default=None)
@@ -344,7 +347,8 @@ def bind(block: WirableBlock, args: tuple[Any, ...], kwargs: dict[str, Any]) -> 
     if missing:
         raise UnwiredInputError(
             f"nothing is wired to {', '.join(repr(m) for m in missing)}; expected {block.label}"
-            f"({', '.join(f'{name}=…' for name, port in inputs.items() if port.default is None or name in given)}).",
+            f"({', '.join(f'{name}=…' for name, port in inputs.items() if port.default is None or name in given)})."
+            f"{block.advise_unwired(missing)}",
             block=who,
             port=missing[0],
         )

@@ -44,7 +44,8 @@ def push(line: Array, value: Array) -> Array:
 class Delay(Block):
     """Delay by whole samples: y[k] = u[k − n].
 
-    The first n outputs are ``initial_value``; without it, the first input.
+    The first n outputs are ``initial_value``; without it, the input just before t = 0: of a source that jumps there,
+    the value before the jump.
 
     Raises
     ------
@@ -56,7 +57,7 @@ class Delay(Block):
     """
 
     steps: int = parameter(minimum=1, description="number of samples, n")
-    initial_value: Array | None = parameter(default=None, description="first outputs; None takes the first input")
+    initial_value: Array | None = parameter(default=None, description="first outputs; None: u just before t = 0")
     u = Input(shape=None, description="signal to delay, a scalar or a vector")
     y = Output(like="u", description="the input n ticks ago")
     line = History("steps", "initial_value", description="the last n inputs, the oldest first, one row for each")
@@ -67,7 +68,7 @@ class Delay(Block):
         return self.initial_value is None
 
     def initial(self, u: Any) -> Array:
-        """Return the state at the start, all rows the first input."""
+        """Return the state at the start, all rows the input just before t = 0."""
         return np.stack([u.u] * self.steps)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
@@ -81,6 +82,9 @@ class Delay(Block):
 
 class TransportDelay(Block):
     """Transport delay: y(t) = u(t − τ), of any shape, and ``initial_value`` while t < τ.
+
+    With ``initial_value=None`` that is the input at t = 0, after a jump there; in a sampled subsystem the input just
+    before t = 0, as of `Delay`.
 
     In a continuous subsystem the solver keeps past inputs. In a sampled subsystem the delay must be a whole number of
     samples; `discretize` returns the block that then replaces this one.
@@ -96,7 +100,7 @@ class TransportDelay(Block):
     transport: ClassVar[bool] = True
     """True: a solver gives the input of the time ``delay`` ago."""
     delay: float = parameter(unit="s", above=0.0, description="delay τ")
-    initial_value: Array | None = parameter(default=0.0, description="output while t < τ; None takes the first input")
+    initial_value: Array | None = parameter(default=0.0, description="output while t < τ; None: the input at t = 0")
     u = Input(shape=None, description="signal to delay, of any shape")
     y = Output(like="u", description="the input τ ago")
 

@@ -86,7 +86,8 @@ class DiscreteIntegrator(Block):
 class FIR(Block):
     """FIR filter: y[k] = c₀ u[k] + c₁ u[k − 1] + … + c_n u[k − n], of a scalar or, element by element, of a vector.
 
-    The inputs before the first are ``initial_value``; without it, the first input.
+    The inputs before the first tick are ``initial_value``; without it, the input just before t = 0: of a source that
+    jumps there, the value before the jump.
 
     Raises
     ------
@@ -97,7 +98,7 @@ class FIR(Block):
     """
 
     coefficients: Array = parameter(description="c₀, c₁, …, at least two")
-    initial_value: Array | None = parameter(default=None, description="inputs before the first; None: the first input")
+    initial_value: Array | None = parameter(default=None, description="earlier inputs; None: u just before t = 0")
     u = Input(shape=None, description="signal to filter, a scalar or a vector")
     y = Output(shape=None, description="the filtered input")
     line = History("taps", "initial_value", description="the last inputs, the oldest first, one row for each")
@@ -122,7 +123,7 @@ class FIR(Block):
         return self.initial_value is None
 
     def initial(self, u: Any) -> Array:
-        """Return the state at the start, all rows the first input."""
+        """Return the state at the start, all rows the input just before t = 0."""
         return np.stack([u.u] * self.taps)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
@@ -137,8 +138,8 @@ class FIR(Block):
 class MovingAverage(Block):
     """Moving average: y[k] = (u[k] + u[k − 1] + … + u[k − n + 1]) / n, of a scalar or a vector.
 
-    The sum is computed anew in each tick, so no rounding error builds up. The inputs before the first are
-    ``initial_value``; without it, the first input.
+    The sum is computed in full at each tick, so no rounding error builds up. The inputs before the first tick are
+    ``initial_value``; without it, the input just before t = 0: of a source that jumps there, the value before the jump.
 
     Raises
     ------
@@ -147,7 +148,7 @@ class MovingAverage(Block):
     """
 
     samples: int = parameter(minimum=2, description="number of samples in the average, n")
-    initial_value: Array | None = parameter(default=None, description="inputs before the first; None: the first input")
+    initial_value: Array | None = parameter(default=None, description="earlier inputs; None: u just before t = 0")
     u = Input(shape=None, description="signal to average, a scalar or a vector")
     y = Output(like="u", description="the average of the last n inputs")
     line = History("taps", "initial_value", description="the last inputs, the oldest first, one row for each")
@@ -163,7 +164,7 @@ class MovingAverage(Block):
         return self.initial_value is None
 
     def initial(self, u: Any) -> Array:
-        """Return the state at the start, all rows the first input."""
+        """Return the state at the start, all rows the input just before t = 0."""
         return np.stack([u.u] * self.taps)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:

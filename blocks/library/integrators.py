@@ -271,7 +271,7 @@ class FilteredDerivative(Block):
     """
 
     time_constant: float = parameter(unit="s", above=0.0, description="time constant of the filter, T_f")
-    initial_value: Array | None = parameter(default=None, description="x at the start; None takes the first input")
+    initial_value: Array | None = parameter(default=None, description="x at the start; None: u just before t = 0")
     u = Input(shape=None, description="signal to differentiate, of any shape")
     y = Output(shape=None, description="the filtered derivative")
     filtered = State(start="initial_value", like="u", description="the filtered input, x")

@@ -213,7 +213,7 @@ class EdgeDetector(Block):
     """
 
     edge: str = parameter(default="rising", description="'rising', 'falling' or 'both'")
-    initial_value: Array | None = parameter(default=None, description="u before the start; None takes the first input")
+    initial_value: Array | None = parameter(default=None, description="u before the start; None: u just before t = 0")
     u = Input(shape=None, description="logic signal, of any shape")
     y = Output(shape=None, description="1 at an edge, else 0")
     last = State(start="initial_value", like="u", description="u at the last tick")
@@ -311,7 +311,7 @@ class Counter(Block):
     clear = Event("rising", "the reset becomes true")
 
     def initial(self, u: Any) -> tuple[Array, Array]:
-        """Return zero, and the first input as the last one."""
+        """Return zero, and the input just before t = 0 as the last one."""
         return np.zeros(np.shape(u.u)), u.u
 
     def output(self, t: Array, x: Any, u: Any, T: Array = None) -> Array:

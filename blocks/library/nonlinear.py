@@ -147,7 +147,8 @@ class Backlash(Block):
     """Backlash (play): y rests within a dead band, and the ends of the band carry it along: y − b/2 ≤ u ≤ y + b/2.
 
     y moves with u once the band is used up, y = u ∓ b/2, and rests as soon as u turns. At a tick, exactly:
-    y[k] = y[k − 1] limited to [u[k] − b/2, u[k] + b/2].
+    y[k] = y[k − 1] limited to [u[k] − b/2, u[k] + b/2]. Before the first tick y is ``initial_value``; without it, the
+    input just before t = 0: of a source that jumps there, the value before the jump.
 
     In a continuous subsystem y starts and stops by events. There u must not jump, and its rate is a second input, whose
     sign shows where u turns: ``Backlash(width=…, with_rate=True)(angle, speed)``.
@@ -163,7 +164,7 @@ class Backlash(Block):
 
     width: Array = parameter(above=0.0, description="width b of the dead band, a number or one for each element")
     initial_value: Array | None = parameter(
-        default=None, description="y at the start, limited to the band; None starts in its middle, y = u"
+        default=None, description="y at the start, limited to the band; None: y = u just before t = 0"
     )
     with_rate: bool = parameter(default=False, description="True adds the input rate, which events need")
     y = Output(like="u", description="position that is carried along")
@@ -227,8 +228,9 @@ class Backlash(Block):
 class RateLimiter(Block):
     """Rate limiter: y follows u, and rises and falls no faster than the limits.
 
-    At a tick, exactly: y[k] = y[k − 1] + (u[k] − y[k − 1] limited to [−falling·T, rising·T]). The first output is the
-    first input, or ``initial_value`` moved by one tick.
+    At a tick, exactly: y[k] = y[k − 1] + (u[k] − y[k − 1] limited to [−falling·T, rising·T]). Before the first tick y
+    is ``initial_value``; without it, the input just before t = 0. So the first output is the first input, unless a
+    source jumps at t = 0: then y leaves the value before the jump at the limited rate.
 
     In a continuous subsystem the rate of u is not known, and ẏ = ((u − y) / τ limited to [−falling, rising]). Within
     the limits y has the lag τ: it is τ r behind a ramp of rate r. It needs no events.
@@ -246,7 +248,7 @@ class RateLimiter(Block):
     time_constant: float | None = parameter(
         default=None, unit="s", above=0.0, description="lag τ within the limits, in a continuous subsystem"
     )
-    initial_value: Array | None = parameter(default=None, description="y before the start; None takes the first input")
+    initial_value: Array | None = parameter(default=None, description="y before the start; None: u just before t = 0")
     u = Input(shape=None, description="signal to follow, of any shape")
     y = Output(like="u", description="the limited signal")
     last = State(start="initial_value", like="u", description="y at the last tick; in a continuous subsystem y itself")

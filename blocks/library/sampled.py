@@ -12,8 +12,8 @@ from ..core import Array, Block, Input, Output, State, parameter
 class UnitDelay(Block):
     """Delay by one sample: y[k] = u[k − 1].
 
-    The first output is ``initial_value``; without it, the first input, so that u[0] acts in both of the first two
-    ticks.
+    The first output is ``initial_value``; without it, the input just before t = 0. That is u[0], which then acts in
+    both of the first two ticks, unless a source jumps at t = 0: then it is the value before the jump.
 
     Raises
     ------
@@ -21,7 +21,7 @@ class UnitDelay(Block):
         For an ``initial_value`` of another shape than the input's, when the diagram is built; a number fits any.
     """
 
-    initial_value: Array | None = parameter(default=None, description="first output; None takes the first input")
+    initial_value: Array | None = parameter(default=None, description="first output; None: u just before t = 0")
     u = Input(shape=None, description="signal to delay, of any shape")
     y = Output(like="u", description="the input one tick ago")
     last = State(start="initial_value", like="u", description="the last input")

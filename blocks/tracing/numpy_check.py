@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -14,6 +13,7 @@ from ..core import Block, LoopwrightError, Shape, TraceError
 from .equations import parts_of, takes_update
 from .rounding import record_rounding, watch
 from .symbols import bundle, with_values
+from .traced_functions import NotTracedError
 
 NEXT, GUARDS = "next", "guards"
 _POINTS = 2
@@ -184,6 +184,8 @@ def evaluate(
                 return getattr(shadow, equation)(t, bx, bu, *more, **({"T": T} if wants else {}))
         except (LoopwrightError, *_SINGULAR):
             raise
+        except NotTracedError as error:
+            raise TraceError(f"its {equation} can be traced, but not be run with numbers: {error}.") from error
         except Exception as error:
             failure = f"{type(error).__name__}: {error}".rstrip(".")
             raise TraceError(
@@ -219,11 +221,18 @@ def evaluate(
 
 
 def _refuse_rounding(block: Block, point: _Point, T: Any, numbers: Mapping[str, Any], names: Sequence[str]) -> None:
-    """Refuse `np.round` and `np.rint`: they differ from a trace at halves only, which random points don't hit."""
+    """Refuse `np.round` and `np.rint`: they differ from a trace at halves only, which random points don't hit.
+
+    Errors of the equations at this point are passed over, as elsewhere, except an operation that nobody handles.
+    """
     t, x, u, fired = point.arguments()
     x, u, fired, seen = ({n: watch(v) for n, v in d.items()} for d in (x, u, fired, numbers))
-    with record_rounding() as rounded, contextlib.suppress(Exception):
-        evaluate(block, (watch(t), x, u, fired), watch(T), seen, names)
+    with record_rounding() as rounded:
+        try:
+            evaluate(block, (watch(t), x, u, fired), watch(T), seen, names)
+        except Exception as error:
+            if isinstance(error.__cause__, NotTracedError):
+                raise
     if rounded:
         raise TraceError(
             "it uses np.round or np.rint, which round halves to the even neighbour in NumPy and away from zero in a "

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from .traced_functions import NotTracedError
+
 _noticed: ContextVar[list[str] | None] = ContextVar("loopwright_rounding", default=None)
 
 
@@ -26,13 +28,18 @@ def record_rounding() -> Iterator[list[str]]:
 class Watched(np.ndarray):
     """An array that is watched; so is everything that is computed from it."""
 
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
+    def __array_ufunc__(self, ufunc: Any, method: Any, *inputs: Any, **kwargs: Any) -> Any:
         found = _noticed.get()
         if found is not None and ufunc is np.rint:  # np.round and np.around call it
             found.append(ufunc.__name__)
-        if kwargs.get("out") is not None:
-            kwargs["out"] = tuple(_unwatch(v) for v in kwargs["out"])
-        return watch(getattr(ufunc, method)(*map(_unwatch, inputs), **kwargs))
+        # All are plain arrays now, also in where=, and the method of a plain array asks no operand: nothing comes back.
+        plain, options = _unwatch(inputs), _unwatch(kwargs)
+        made = super().__array_ufunc__(ufunc, method, *plain, **options)
+        if made is NotImplemented and not any(_is_foreign(v) for v in plain):  # else the operand of that class is asked
+            raise NotTracedError(
+                f"NumPy {np.__version__} hands np.{ufunc.__name__} back. Write it in sums, products and np.where"
+            )
+        return watch(made)
 
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
         return watch(super().__array_function__(func, types, args, kwargs))
@@ -45,7 +52,17 @@ class Watched(np.ndarray):
 
 
 def _unwatch(value: Any) -> Any:
-    return np.asarray(value) if isinstance(value, Watched) else value
+    """Return NumPy's own arrays for watched ones, also in tuples, lists and dictionaries."""
+    if isinstance(value, Watched):
+        return value.view(np.ndarray)
+    if type(value) in (tuple, list):
+        return type(value)(map(_unwatch, value))
+    return {k: _unwatch(v) for k, v in value.items()} if type(value) is dict else value
+
+
+def _is_foreign(value: Any) -> bool:
+    """Whether a value's class computes NumPy's functions itself."""
+    return not isinstance(value, np.ndarray | np.generic) and hasattr(value, "__array_ufunc__")
 
 
 def watch(value: Any) -> Any:

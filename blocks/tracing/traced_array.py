@@ -14,6 +14,7 @@ An operation that can't be traced raises a `NotTracedError`, which says what to 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextvars import ContextVar
 from functools import lru_cache
 from typing import Any
 
@@ -31,6 +32,7 @@ from .traced_functions import (
     TRUTH,
     NotTracedError,
     advise,
+    advise_on_arguments,
     argmax,
     argmin,
 )
@@ -43,6 +45,9 @@ _ARITHMETIC = (
     *(f"__{r}{name}__" for name in ("sub", "mul", "truediv", "pow", "matmul") for r in ("", "r")),
     *("__neg__", "__pos__", "__abs__", "sum", "mean", "prod", "max", "min", "ptp", "var", "std"),
 )
+_CHOICES = {"out", "where", "initial"}
+_DEEPEST = 20  # calls of NumPy within one another that CasADi's interface makes; it has reason for three
+_depth: ContextVar[int] = ContextVar("loopwright_trace_depth", default=0)
 _JOINS = (np.where, np.stack, np.concatenate, np.hstack, np.vstack, np.reshape, np.transpose, np.squeeze, np.ravel)
 
 
@@ -181,6 +186,21 @@ def _logic(operation: Callable[[Any, Any], Any], a: Any, b: Any) -> Any:
     return made
 
 
+def _hand_on(name: str, compute: Callable[[], Any]) -> Any:
+    """Return what CasADi's interface computes.
+
+    Arguments that it does not know it hands back to NumPy, which asks it again, without end: that is an error.
+    """
+    depth = _depth.get()
+    if depth >= _DEEPEST:
+        raise NotTracedError(advise_on_arguments(name))
+    token = _depth.set(depth + 1)
+    try:
+        return compute()
+    finally:
+        _depth.reset(token)
+
+
 class TracedArray(_Array):  # type: ignore[misc]
     """Array of symbols; see the module. ``is_truth`` says whether its entries are truth values."""
 
@@ -198,11 +218,12 @@ class TracedArray(_Array):  # type: ignore[misc]
                 return made
         if method == "accumulate" and ufunc in (np.minimum, np.maximum):
             return _accumulate(ufunc, *inputs, **options)
-        made = super().__array_ufunc__(ufunc, method, *inputs, **options)
+        name = ufunc.__name__ + (f".{method}" if method != "__call__" else "")
+        made = _hand_on(name, lambda: super(TracedArray, self).__array_ufunc__(ufunc, method, *inputs, **options))
         if made is NotImplemented and all(
             isinstance(i, _Array | np.ndarray | np.generic | int | float) for i in inputs
         ):
-            raise NotTracedError(advise(ufunc.__name__ + (f".{method}" if method != "__call__" else "")))
+            raise NotTracedError((advise_on_arguments if _CHOICES & options.keys() else advise)(name))
         return _own(made, ufunc in _TRUTH)
 
     def __array_function__(self, function: Any, types: Any, args: Any, kwargs: Any) -> Any:
@@ -214,7 +235,9 @@ class TracedArray(_Array):  # type: ignore[misc]
         if function in _JOINS and args:
             joined = args[1:] if function is np.where else args[0] if isinstance(args[0], tuple | list) else args[:1]
             truth = _are_truth(*joined)
-        made = super().__array_function__(function, types, args, kwargs)
+        made = _hand_on(
+            function.__name__, lambda: super(TracedArray, self).__array_function__(function, types, args, kwargs)
+        )
         if made is NotImplemented:
             raise NotTracedError(advise(function.__name__))
         return _own(made, truth)

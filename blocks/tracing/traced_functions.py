@@ -170,6 +170,14 @@ def advise(name: str) -> str:
     return f"np.{name} can't be traced. {_INSTEAD.get(name, 'Write it in sums, products, comparisons and np.where')}"
 
 
+def advise_on_arguments(name: str) -> str:
+    """Return what to write for a function of NumPy that traces, but not with symbols in these arguments."""
+    return (
+        f"np.{name} can't be traced with symbols in these arguments. Give symbols by position, leave out=, where= and "
+        "initial= out, and write np.where(condition, a, b) for what depends on a condition"
+    )
+
+
 TRUTH = (
     "a symbol has no truth value while it is traced, so that if, and, or, not, min(), max(), sorted() and chains such "
     "as 0 < u < 1 don't work. Write np.where(condition, a, b) for if, (u > 0) & (u < 1) for and, | for or, ~ for not, "

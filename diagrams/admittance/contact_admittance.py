@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...blocks.core import Array, Finding, OptionError, brief, count_of, explain_calls
+from ..frequency import refine_sign_change
 from .contact_loop import Joined, close_loop, join_environment
 from .contact_parts import ContactParts
 
@@ -55,8 +56,6 @@ BESIDE = 0.05
 
 def look_again(parts: ContactParts, direction: np.ndarray, omega: float) -> float:
     """Return the stiffness ω/|Y| at which Re Y(jω) = 0 beside a frequency in rad/s; NaN without one."""
-    from scipy.optimize import brentq
-
     low, high = (1.0 - BESIDE) * omega, (1.0 + BESIDE) * omega
     if not 0.0 < low < high < (math.pi / parts.shortest if parts.shortest else math.inf):
         return math.nan
@@ -66,7 +65,7 @@ def look_again(parts: ContactParts, direction: np.ndarray, omega: float) -> floa
 
     if not real(low) * real(high) < 0.0:
         return math.nan
-    w = float(brentq(real, low, high, rtol=1e-12))
+    w = refine_sign_change(real, low, high, xtol=2e-12 * omega, rtol=1e-12)
     return w / float(np.abs(compute_admittance(parts, direction, np.array([w]))[0]))
 
 

@@ -27,6 +27,7 @@ from .growth_limits import (
     GrowthMap,
     describe_limit,
     find_first_limit,
+    growth_rounding,
     scan_points,
 )
 
@@ -142,7 +143,9 @@ class CoupledLoop:
 
     def growth(self, value: Any) -> np.ndarray:
         """Return σ in 1/s of the fastest mode that the environment can move; infinite without a solution."""
-        A = self.close(value).A
+        return self._find_rates(self.close(value).A)
+
+    def _find_rates(self, A: np.ndarray) -> np.ndarray:
         solvable = np.isfinite(A).all(axis=(-1, -2))
         poles = np.linalg.eigvals(self.modes.reduce(np.where(solvable[..., None, None], A, 0.0)))
         return np.where(solvable, np.max(to_rates(self.parts, poles).real, axis=-1), np.inf)
@@ -150,6 +153,10 @@ class CoupledLoop:
     def growth_at(self, value: float) -> float:
         """Return σ in 1/s at one value."""
         return float(self.growth(np.float64(value)))
+
+    def rounding_at(self, value: float) -> float:
+        """Return a bound of the rounding error of σ at one value, in 1/s."""
+        return growth_rounding(self._find_rates, self.close(np.float64(value)).A)
 
     def fastest_mode(self, value: float) -> tuple[float, tuple[float, ...]]:
         """Return the frequency of the mode that grows fastest, in rad/s, and the direction in which it moves."""
@@ -249,7 +256,13 @@ def find_limit(
         found = FoundLimit(0.0, (), math.nan, rate, 0.0, grows)
     else:
         found = find_first_limit(
-            vary, grid, loop.growth(grid), loop.growth_at, loop.growth_by_control, partial(_model_error, loop)
+            vary,
+            grid,
+            loop.growth(grid),
+            loop.growth_at,
+            loop.growth_by_control,
+            loop.rounding_at,
+            partial(_model_error, loop),
         )
         if found.value < math.inf:
             frequency, moved = loop.fastest_mode(found.value or float(grid[0]))

@@ -25,11 +25,13 @@ def find_direction(parts: ContactParts, direction: np.ndarray, state: np.ndarray
     """Return the unit vector of the largest motion of the contact in a mode, towards the environment's direction."""
     n = len(parts.plant.A)
     moved = parts.position @ state[:n]
-    if not np.linalg.norm(moved):
+    if np.linalg.norm(moved) <= _ROUNDED * np.linalg.norm(np.abs(parts.position) @ np.abs(state[:n])):
         moved = parts.velocity @ state[:n]
     axis = np.linalg.svd(np.stack([moved.real, moved.imag], axis=-1))[0][:, 0]
     towards = axis @ direction
-    axis = axis * (-1.0 if towards < 0.0 or (towards == 0.0 and axis[np.argmax(np.abs(axis))] < 0.0) else 1.0)
+    if abs(towards) <= _ROUNDED:  # across the environment: towards the first axis that it has a part in
+        towards = axis[int(np.argmax(np.abs(axis) > _ROUNDED))]
+    axis = axis if towards >= 0.0 else -axis
     return tuple(float(v) if abs(v) > _ROUNDED else 0.0 for v in axis)
 
 

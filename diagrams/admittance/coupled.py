@@ -87,7 +87,11 @@ def poles(
         Poles along the last axis, without the pure drift of a coupled direction that has neither environment nor
         stiffness.
     """
-    A = close_loop(loop, stiffness=stiffness, damping=damping, mass=mass, tool_mass=tool_mass)
+    return find_poles(loop, close_loop(loop, stiffness=stiffness, damping=damping, mass=mass, tool_mass=tool_mass))
+
+
+def find_poles(loop: AdmittanceLoop, A: np.ndarray) -> np.ndarray:
+    """Return the poles of matrices of `close_loop`; see `poles`."""
     solvable = np.isfinite(A).all(axis=(-1, -2))
     eigenvalues = np.linalg.eigvals(np.where(solvable[..., None, None], A, 0.0))
     values: np.ndarray = np.where(solvable[..., None], eigenvalues, np.nan)
@@ -115,9 +119,18 @@ def growth_rate(loop: AdmittanceLoop, **environment: Array) -> Array:
     float or ndarray
         σ; infinite where the continuous equations have no solution.
     """
-    values = to_rates(loop, poles(loop, **environment))
-    sigma = np.where(np.isnan(values).any(axis=-1), np.inf, np.max(values.real, axis=-1))
+    sigma = _find_fastest(loop, poles(loop, **environment))
     return float(sigma) if np.ndim(sigma) == 0 else sigma
+
+
+def find_rates(loop: AdmittanceLoop, A: np.ndarray) -> np.ndarray:
+    """Return the growth rates of matrices of `close_loop` in 1/s; see `growth_rate`."""
+    return _find_fastest(loop, find_poles(loop, A))
+
+
+def _find_fastest(loop: AdmittanceLoop, values: np.ndarray) -> np.ndarray:
+    values = to_rates(loop, values)
+    return np.asarray(np.where(np.isnan(values).any(axis=-1), np.inf, np.max(values.real, axis=-1)))
 
 
 def to_rates(loop: AdmittanceLoop, values: np.ndarray) -> np.ndarray:

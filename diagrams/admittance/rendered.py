@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core import Array, Finding, OptionError, accepts, brief, explain_calls, kinds
-from ..frequency import read_matrices
+from ..frequency import read_matrices, refine_sign_change
 from .compliance_loop import AdmittanceLoop, hold_force
 from .coupled import ROBOT, close_loop
 from .port_passivity import PortPassivity
@@ -223,8 +223,6 @@ def find_negative(
     admittance: Callable[[np.ndarray], Array], low: float, high: float, per_decade: int
 ) -> tuple[tuple[float, float], ...]:
     """Return the intervals of frequencies in which the real part of an admittance is negative, on a scan in rad/s."""
-    from scipy.optimize import brentq
-
     grid = np.geomspace(low, high, max(8, math.ceil(per_decade * math.log10(high / low)) + 1))
 
     def sine(w: np.ndarray | float) -> np.ndarray:
@@ -234,7 +232,9 @@ def find_negative(
     positive = sine(grid) >= 0.0
 
     def find_edge(i: int) -> float:
-        return math.exp(brentq(lambda y: float(sine(math.exp(y))), *np.log(grid[i : i + 2]), xtol=1e-13))
+        return math.exp(
+            refine_sign_change(lambda y: float(sine(math.exp(y))), *np.log(grid[i : i + 2]).tolist(), xtol=1e-13)
+        )
 
     edges = ([] if positive[0] else [low]) + [find_edge(int(i)) for i in np.flatnonzero(positive[1:] != positive[:-1])]
     if len(edges) % 2:

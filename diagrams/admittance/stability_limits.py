@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -21,8 +22,8 @@ from ...blocks.core import (
 )
 from ..frequency import Number
 from .compliance_loop import AdmittanceLoop
-from .coupled import ROBOT, crossing_frequency, growth_rate, growth_rate_by_control
-from .growth_limits import PER_DECADE, UNITS, GrowthMap, describe_limit, find_first_limit, scan_points
+from .coupled import ROBOT, close_loop, crossing_frequency, find_rates, growth_rate, growth_rate_by_control
+from .growth_limits import PER_DECADE, UNITS, GrowthMap, describe_limit, find_first_limit, growth_rounding, scan_points
 
 
 @explain_calls
@@ -158,7 +159,10 @@ def stability_limit(
     def growth_by_control(x: float) -> float:
         return growth_rate_by_control(loop, **{over: x}, **environment)
 
-    found = find_first_limit(over, grid, sigma, growth_at, growth_by_control)
+    def rounding_at(x: float) -> float:
+        return growth_rounding(partial(find_rates, loop), close_loop(loop, **{over: x}, **environment))
+
+    found = find_first_limit(over, grid, sigma, growth_at, growth_by_control, rounding_at)
     is_found = 0.0 < found.value < math.inf
     return StabilityLimit(
         over=over,

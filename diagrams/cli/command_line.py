@@ -17,13 +17,23 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
 from typing import Any
 
-from ...blocks.core import FmuError, FmuFileError, LoopwrightError, OptionError, write_text
+from ...blocks.core import (
+    DiskError,
+    FmuError,
+    FmuFileError,
+    LoopwrightError,
+    OptionError,
+    describe_disk_error,
+    explain_disk_errors,
+    write_text,
+)
+from ...fmus import Fmu
 from ...fmus.models import gantry
 from ..paper import DEFINITIONS, EXPERIMENTS, Experiment, key_numbers
 from ..results import Run
 from ..simulation import Interrupted
 from .fmu import COMMANDS, add_commands
-from .options import option_lines, parse_letters, parse_options, share
+from .options import option_lines, parse_letters, parse_options, parse_renames, share
 from .report import add_report, report_command
 from .text import fit as _fit
 from .text import say as _say
@@ -67,6 +77,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OptionError as error:
         _say(f"loopwright: error: {error}", sys.stderr)
         return 2
+    except DiskError as error:
+        _say(f"loopwright: error: {error}", sys.stderr)
+        return 1
     except KeyboardInterrupt:
         _say("loopwright: interrupted.", sys.stderr)
         return 130
@@ -103,6 +116,15 @@ def _make_parser() -> argparse.ArgumentParser:
     run.add_argument("--out", metavar="DIR", default="out", help="folder for the files (default: out)")
     run.add_argument("--plant", metavar="FILE.fmu", help="another plant in place of the gantry")
     run.add_argument(
+        "--rename",
+        metavar="NAME=PORT",
+        action="append",
+        default=[],
+        dest="renames",
+        help="the plant's name of a port, and the name that Fig. 3 has for it, such as 's_y=position[1]'; repeat it "
+        "for several",
+    )
+    run.add_argument(
         "--option",
         metavar="NAME=VALUE",
         action="append",
@@ -128,17 +150,11 @@ def _version() -> str:
 def _make_folder(name: str) -> Path:
     """Make the folder, and check that files can be written there."""
     folder = Path(name).expanduser()
-    try:
+    failed = f"nothing can be written to the folder {name!r}"
+    with explain_disk_errors(failed, folder, "Name another folder.", OptionError, port="--out"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OptionError(f"the folder {name!r} can't be made: {error}. Name another one.", port="--out") from error
-    try:
         with TemporaryFile(dir=folder):
             pass
-    except OSError as error:
-        raise OptionError(
-            f"nothing can be written to the folder {name!r}: {error}. Name another one.", port="--out"
-        ) from error
     return folder
 
 
@@ -148,8 +164,10 @@ def _make_folder(name: str) -> Path:
 def _run(arguments: argparse.Namespace) -> int:
     """Build all experiments first, so that wrong usage is found before anything runs; then run them."""
     letters = parse_letters(arguments.letters)
-    chosen = share(letters, parse_options(arguments))
+    chosen, renames = share(letters, parse_options(arguments)), parse_renames(arguments)
     try:
+        for options in chosen.values() if renames else ():
+            options["plant"] = Fmu(options["plant"], name="plant", rename=renames)
         if any(options.get("plant") is None for options in chosen.values()):
             gantry.build(notify=lambda line: _say(line, sys.stderr))
         experiments = [EXPERIMENTS[letter](**options) for letter, options in chosen.items()]
@@ -180,7 +198,8 @@ def _run(arguments: argparse.Namespace) -> int:
                 table[letter], names = _write(experiment, run, problem, folder)
                 written.append(names)
             except OSError as error:
-                failed[letter] = f"its files can't be written: {error}{stay}"
+                found = describe_disk_error(error, folder, "Name another folder: --out.")
+                failed[letter] = f"its files can't be written{stay}: {found}"
                 _say(f"loopwright: experiment {letter}: {failed[letter]}", sys.stderr)
             except KeyboardInterrupt:
                 interrupted = True
@@ -241,7 +260,8 @@ def _files(letter: str, folder: Path) -> list[Path]:
 
 def _earlier_files_text(letter: str, folder: Path) -> str:
     """Return a remark that an earlier run's files stay, if there are any."""
-    return f"; the files of an earlier run stay in {folder}" if any(f.exists() for f in _files(letter, folder)) else ""
+    is_there = any(os.path.exists(file) for file in _files(letter, folder))
+    return f"; the files of an earlier run stay in {folder}" if is_there else ""
 
 
 # --- printing -------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -38,7 +39,7 @@ def add_doctor(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def run_doctor(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright doctor``."""
     path = Path(arguments.file).expanduser()
-    usable = path.is_file()
+    usable = os.path.isfile(path)
     if not arguments.json:
         check_file(arguments.file)
     limits = None

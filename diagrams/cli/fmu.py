@@ -14,7 +14,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from ...blocks.core import Block, FmuFileError, LoopwrightError, OptionError, TraceError, close_names, near
+from ...blocks.core import (
+    Block,
+    FmuFileError,
+    LoopwrightError,
+    OptionError,
+    TraceError,
+    close_names,
+    explain_disk_errors,
+    near,
+)
 from ...fmus.checks import INTERFACES, summarize, validate
 from ...fmus.export import TARGETS, build_python
 from ...fmus.export import build as build_model
@@ -114,9 +123,12 @@ def plants() -> list[str]:
 def run_build(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright build``."""
     options = _build_options(arguments)
-    out = Path.cwd() if arguments.out is None else Path(arguments.out).expanduser()
-    out_is_file = out.suffix.lower() == ".fmu" and not out.is_dir()
-    if out.is_file() and not out_is_file:
+    step = "Name another folder: --out."
+    with explain_disk_errors("the FMU can't be written", arguments.out or ".", step, OptionError, port="--out"):
+        out = Path.cwd() if arguments.out is None else Path(arguments.out).expanduser()
+        out_is_file = out.suffix.lower() == ".fmu" and not out.is_dir()
+        is_other_file = out.is_file() and not out_is_file
+    if is_other_file:
         raise OptionError(f"found the file {str(out)!r}; expected a folder, or a file that ends in .fmu.", port="--out")
     try:
         with _find_model(arguments) as make:

@@ -68,6 +68,21 @@ def parse_options(arguments: argparse.Namespace) -> dict[str, Any]:
     return options
 
 
+def parse_renames(arguments: argparse.Namespace) -> dict[str, str]:
+    """Return the ports' names that were given to the plant, by the FMU's names."""
+    found: dict[str, str] = {}
+    for text in arguments.renames:
+        name, equals, port = text.rpartition("=")  # names of variables may contain "="; ports of Fig. 3 don't
+        if not equals or not name.strip() or not port.strip():
+            raise OptionError(f"found --rename {text!r}; expected NAME=PORT, such as --rename 's_y=position[1]'.")
+        if name.strip() in found:
+            raise OptionError("it is given twice; give it once.", port=f"--rename {name.strip()}")
+        found[name.strip()] = port.strip()
+    if found and arguments.plant is None:
+        raise OptionError("it names ports of another plant; give that plant, too.", port="--rename")
+    return found
+
+
 def parse_value(text: str) -> Any:
     """Read a word of `_WORDS`, or a Python or JSON literal; anything else is text."""
     if text.lower() in _WORDS:

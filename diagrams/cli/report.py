@@ -17,6 +17,7 @@ from ...blocks.core import (
     LoopwrightError,
     OptionError,
     UnknownNameError,
+    describe_disk_error,
     near,
     print_unit,
 )
@@ -157,7 +158,8 @@ def report_command(arguments: argparse.Namespace) -> int:
         try:
             files = write_report(report, out, pdf=arguments.pdf, json=arguments.json, paper=arguments.paper)
         except OSError as error:
-            say(f"loopwright: error: the report can't be written: {error}. Name another file.", sys.stderr)
+            found = describe_disk_error(error, out, "Name another file: --out.")
+            say(f"loopwright: error: the report can't be written: {found}", sys.stderr)
             return 1
         except KeyboardInterrupt:
             say("loopwright: interrupted; the report is not written.", sys.stderr)

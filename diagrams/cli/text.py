@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import IO
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, explain_disk_errors
 
 _PLAIN = str.maketrans(
     {"η": "eta", "ξ": "xi", "θ": "theta", "σ": "sigma", "κ": "kappa", "ζ": "zeta", "∥": "_par", "⊥": "_perp", "²": "2"}
@@ -55,7 +55,9 @@ def check_file(name: str) -> Path:
         If there is no such file.
     """
     path = Path(name).expanduser()
-    if not path.is_file():
+    with explain_disk_errors("it can't be read", path, "Give another file.", OptionError, block=str(path)):
+        is_file = path.is_file()
+    if not is_file:
         found = "is a folder" if path.is_dir() else "there is no such file"
         raise OptionError(f"{found}; expected an FMU. Check the path.", block=str(path))
     return path

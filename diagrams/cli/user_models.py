@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
-from ...blocks.core import Block, DefinitionError, LoopwrightError, OptionError, near
+from ...blocks.core import Block, DefinitionError, LoopwrightError, OptionError, explain_disk_errors, near
 
 _MODULE = "loopwright_user_model"
 
@@ -78,9 +78,11 @@ def _split_name(text: str, port: str = "MODEL", example: str = "model.py:Motor")
     path = Path(head).expanduser()
     if path.suffix != ".py":
         raise OptionError(f"found {text!r}; expected FILE.py:Name, such as {example}.", port=port)
-    if not path.is_file():
-        raise OptionError(f"there is no file {str(path)!r}. Check the path.", port=port)
-    return path.resolve(), name
+    step = "Copy it to a folder that you can read."
+    with explain_disk_errors(f"{str(path)!r} can't be read", path, step, OptionError, port=port):
+        if not path.is_file():
+            raise OptionError(f"there is no file {str(path)!r}. Check the path.", port=port)
+        return path.resolve(), name
 
 
 @contextlib.contextmanager

@@ -5,9 +5,9 @@
    to where it is closest. A contact, Zeno behaviour, chattering and an indicator that is not finite are left to Python. */
 
 enum { QUIET, EVENT, LOST };
-enum { HALVINGS = 40, BLOCK = 63, MOST = 1024, LATEST = 9, RECENT = 500, SLIDES = 10, ROUNDS = 100 };
+enum { HALVINGS = 40, BLOCK = 63, MOST = 1024, LATEST = 9, RECENT = 500, SLIDES = 10, ROUNDS = 100, AROUND = 5 };
 
-static const double CLOSE_TO_END = 1e-3, ROUNDING = 1e-13, SCATTER = 8.0, CLOSE = 1e-11, CONTINUOUS = 1e-9;
+static const double CLOSE_TO_END = 1e-3, ROUNDING = 1e-13, SCATTER = 8.0, LEAST = 1e-15, CLOSE = 1e-11, CONTINUOUS = 1e-9;
 
 typedef struct {
     int64_t m;                    /* events */
@@ -108,6 +108,7 @@ static double value_at(watch *w, problem *p, method *m, int64_t i, double t, boo
 /* Return an instant at or just behind a root, on the side of b; Chandrupatla (1997). See events/bracket.py. */
 static double find_root(watch *w, problem *p, method *m, int64_t i, double level, double a, double fa, double b, double fb,
                         double resolution, bool *lost) {
+    if (fabs(b - a) <= resolution) return b; /* a step within it could lead out of the interval */
     const bool up = fa < 0.0;
     double part = fa / (fa - fb), x1 = a, f1 = fa, x2 = b, f2 = fb, x3, f3, least = 0.5 * resolution / fabs(b - a);
     for (int rounds = 0; rounds < 1000 && !*lost; rounds++) {
@@ -130,6 +131,28 @@ static double find_root(watch *w, problem *p, method *m, int64_t i, double level
     }
     *lost = true;
     return b;
+}
+
+/* Return how far values of an indicator around its root are from a straight line: its rounding errors. */
+static double scatter_around(watch *w, problem *p, method *m, int64_t i, double t, bool *lost) {
+    const double apart = fmax(4 * ulp(t), w->finest);
+    double at[2 * AROUND + 1], z[2 * AROUND + 1], found = 0.0;
+    int count = 0;
+    for (int k = -AROUND; k <= AROUND; k++) {
+        const double time = fmin(fmax(t + apart * k, m->t_old), m->t);
+        if (count && !(time > at[count - 1])) continue;
+        at[count] = time;
+        z[count++] = value_at(w, p, m, i, time, lost);
+    }
+    if (count < 3) return 0.0;
+    const double span = at[count - 1] - at[0], rise = z[count - 1] - z[0];
+    for (int k = 1; k < count - 1; k++) found = fmax(found, fabs(z[k] - z[0] - (at[k] - at[0]) / span * rise));
+    return isfinite(found) ? found : 0.0;
+}
+
+/* Return the slack of an indicator that has just crossed zero, from its values and rounding errors there. */
+static inline double slack_after(const watch *w, int64_t i, double value) {
+    return fmin(fmax(SCATTER * value, LEAST * w->size[i]), CONTINUOUS * w->size[i]);
 }
 
 /* Return when an indicator has just left its domain, between a and b, where it has; write how far it is on both sides. */
@@ -163,6 +186,7 @@ static double find_change(watch *w, problem *p, method *m, int64_t i, double a, 
     const double below = fmax(a, t - fmax(4 * ulp(t), w->finest));
     const double here = fabs(value_at(w, p, m, i, t, lost) - level);
     *distance = fmax(here, fabs(value_at(w, p, m, i, below, lost) - level));
+    *distance = fmax(*distance, scatter_around(w, p, m, i, t, lost));
     return t;
 }
 
@@ -280,7 +304,7 @@ static int first_among(watch *w, problem *p, method *method, int64_t k, int64_t 
         if (!take_domains(w, w->domain, w->now, w->fires)) return LOST;
         memcpy(w->domain, w->now, (size_t)m * sizeof(double));
         for (int64_t i = 0; i < m; i++)
-            if (w->fires[i]) w->slack[i] = fmin(SCATTER * w->values[i], CONTINUOUS * w->size[i]);
+            if (w->fires[i]) w->slack[i] = slack_after(w, i, w->values[i]);
         *found = first;
         return EVENT;
     }
@@ -288,38 +312,18 @@ static int first_among(watch *w, problem *p, method *method, int64_t k, int64_t 
     return QUIET;
 }
 
-/* Take notes of the largest values in a block, and of rounding errors where a step begins behind an event. */
+/* Take notes of the largest values in a block, and of rounding errors where a step begins behind an event. Slack counts
+   up to where an indicator is far from zero, in `first_among`: until there a dip back across zero may be one of rounding. */
 static void note_sizes(watch *w, int64_t n, bool begins) {
     const int64_t m = w->m, third = HALVINGS / 3;
-    bool clear = begins && n > 1;
     for (int64_t i = 0; i < m; i++) {
         double largest = 0.0;
         for (int64_t j = 0; j < n; j++) largest = fmax(largest, fabs(w->seen[j * m + i]));
         w->size[i] = largest;
         w->rounding[i] = ROUNDING * largest;
-        clear = clear && w->domain[i] != 0.0;
     }
-    if (!begins) return;
-    if (clear) { /* whether all slack is gone before anything is outside: then it makes no difference */
-        int64_t first = n;
-        for (int64_t j = 1; j < n && first == n; j++)
-            for (int64_t i = 0; i < m; i++)
-                if (w->seen[j * m + i] > highest(w, i, w->domain[i], 0.0) ||
-                    w->seen[j * m + i] < lowest(w, i, w->domain[i], 0.0))
-                    first = j;
-        clear = first > 1;
-        for (int64_t i = 0; i < m && clear; i++) {
-            double distance = 0.0;
-            for (int64_t j = 1; j < first; j++) distance = fmax(distance, fabs(w->seen[j * m + i]));
-            clear = distance > fmax(w->slack[i], CONTINUOUS * w->size[i]);
-        }
-    }
+    if (!begins || n <= third + 1) return;
     for (int64_t i = 0; i < m; i++) {
-        if (clear) {
-            w->slack[i] = 0.0;
-            continue;
-        }
-        if (n <= third + 1) continue;
         double scatter = 0.0;
         const double z0 = w->seen[i], rise = w->seen[third * m + i] - z0, span = w->times[third] - w->times[0];
         for (int64_t j = 1; j < third; j++)

@@ -13,6 +13,8 @@ typedef struct {
     int64_t n_inputs, n_guards, n_loops;
     int64_t residual;               /* 1 where the log ends with the residual of algebraic loops */
     int (*python)(int64_t call);    /* lets Python evaluate a block; not 0: it has failed */
+    const int32_t *unread;          /* entries of the log that may be no finite numbers, ascending */
+    int64_t n_unread;
 } group;
 
 static double size_of(const double *values, int64_t n) {
@@ -26,6 +28,16 @@ static double size_of(const double *values, int64_t n) {
     }
     for (; i < n; i++) a += fabs(values[i]);
     return (a + b) + (c + d);
+}
+
+static double size_but(const double *values, int64_t n, const int32_t *left_out, int64_t count) {
+    double size = 0;
+    int64_t from = 0;
+    for (int64_t k = 0; k < count; k++) {
+        size += size_of(values + from, left_out[k] - from);
+        from = left_out[k] + 1;
+    }
+    return size + size_of(values + from, n - from);
 }
 
 VISIBLE int grouped(const double **arguments, double **results, long long *iw, double *v, int memory) {
@@ -46,7 +58,7 @@ VISIBLE int grouped(const double **arguments, double **results, long long *iw, d
         }
     }
     for (int64_t i = 0; i < g->n_inputs; i++) size += fabs(z[i] = v[g->inputs[i]]);
-    size += size_of(v + 1, g->log) + size_of(v + g->next, g->states);
+    size += size_but(v + 1, g->log, g->unread, g->n_unread) + size_of(v + g->next, g->states);
     if (g->log) memcpy(log, v + 1, (size_t)g->log * sizeof(double));
     if (g->states) memcpy(x_next, v + g->next, (size_t)g->states * sizeof(double));
     if (g->residual) {

@@ -53,6 +53,8 @@ class Tables:
         Entries of the log without the residual.
     residual : bool
         Whether the log ends with the residual of algebraic loops.
+    unread : ndarray of int32
+        Entries of the log that may be no finite numbers, ascending.
     python : sequence of PythonCall
         The blocks that Python evaluates.
     """
@@ -67,6 +69,7 @@ class Tables:
     taken: np.ndarray
     log: int
     residual: bool
+    unread: np.ndarray
     python: Sequence[PythonCall]
 
 
@@ -102,6 +105,7 @@ def make_tables(tick: TickProgram, kernels: Mapping[int | str, Kernel]) -> Table
         taken=where(taken),
         log=len(tick.log),
         residual=tick.mismatch is not None,
+        unread=np.ascontiguousarray(tick.unread, dtype=np.int32),
         python=python,
     )
 

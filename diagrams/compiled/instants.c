@@ -342,7 +342,7 @@ static int fire_ahead(hybrid *h, double t) {
     for (int64_t i = 0; i < w->m; i++) {
         if (!w->fires[i]) continue;
         w->domain[i] = w->now[i];
-        w->slack[i] = fmin(SCATTER * fmax(fabs(w->z[i]), fabs(w->later[i])), CONTINUOUS * w->size[i]);
+        w->slack[i] = slack_after(w, i, fmax(fabs(w->z[i]), fabs(w->later[i])));
     }
     *h->l.t = later;
     put_states(h, x);

@@ -18,7 +18,7 @@ import numpy as np
 
 from ...blocks.core import CompilerError
 from ...fmus.export import SUFFIXES, compile_shared, describe_compiler
-from ...fmus.platform import cache_folder, native_platform
+from ...fmus.platform import OWN_CACHE, cache_folder, explain_cache_errors, native_platform
 
 _FLAGS = ("-fno-math-errno", "-fno-trapping-math", "-fno-builtin-pow")
 # Nobody reads errno, so that sine and cosine of one angle are one call; a power of two stays a power in every bit.
@@ -95,15 +95,16 @@ def load_compiled(source: str, flags: tuple[str, ...] = (), known: str = "") -> 
         If the cache can't be written.
     """
     library = _library_of(source, flags, known)
-    try:
+    with explain_cache_errors("compiled code can't be kept in the cache", CompilerError):
         if not _is_whole(library):
             compile_shared({"code.c": source}, library, more_flags=(*_FLAGS, *flags))
             _note_size(library)
+    try:
         return ctypes.CDLL(str(library))
-    except OSError as error:  # a full disk, or one from which nothing may be run
+    except OSError as error:  # such as a disk from which nothing may be run: the loader gives a text alone
         raise CompilerError(
-            f"compiled code can't be kept in {str(library.parent)!r}, or not be loaded from there: {error}. Make room "
-            "there, or set LOOPWRIGHT_CACHE to another folder."
+            f"compiled code can't be loaded from {str(library.parent)!r}: {error}; expected a folder from which "
+            f"libraries can be run. {OWN_CACHE}"
         ) from error
 
 
@@ -144,15 +145,11 @@ def _library_of(source: str, flags: tuple[str, ...] = (), known: str = "") -> Pa
     key = hashlib.sha256(
         "\0".join((platform, *describe_compiler(platform), *_FLAGS, *flags, known, source)).encode()
     ).hexdigest()
-    folder = cache_folder().absolute() / "compiled"
-    try:
+    folder = cache_folder() / "compiled"
+    with explain_cache_errors("the folder of compiled diagrams can't be made", CompilerError):
         folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.mkdir(mode=0o700, exist_ok=True)
         _check_owner(folder)
-    except OSError as error:
-        raise CompilerError(
-            f"the folder of compiled diagrams can't be made: {error}. Set LOOPWRIGHT_CACHE to a folder of your own."
-        ) from error
     return folder / f"{key[:40]}{SUFFIXES[platform.rpartition('-')[2]]}"
 
 

@@ -143,7 +143,7 @@ static inline int64_t begin_apart(const loop *l, double now, double width, outco
     for (int64_t j = 0; j < l->plants; j++) {
         const plant *p = l->fmus + j;
         if (!is_for_c(p, now, width)) continue;
-        *p->now = now;
+        *p->now = begin_step(p->quiet, now, width);
         *p->width = p->by_python ? now + width - now : width; /* parts of a step end where others begin */
         if (p->quiet) tell_slopes(p->quiet, now);
         post(p->far);
@@ -152,9 +152,9 @@ static inline int64_t begin_apart(const loop *l, double now, double width, outco
 }
 
 /* Wait for the end of such a step; where it is out of the ordinary, Python ends it. */
-static inline int64_t end_apart(const loop *l, const plant *p, double now, double width, outcome *out) {
+static inline int64_t end_apart(const loop *l, const plant *p, double width, outcome *out) {
     if (take_reply(p->far, l->apart) && !(p->flags[1] | p->flags[2]) &&
-        !(fabs(*p->reached - now - width) > width * l->near) && !(p->quiet && has_ended_loud(p->quiet)) &&
+        !(fabs(*p->reached - *p->now - width) > width * l->near) && !(p->quiet && has_ended_loud(p->quiet)) &&
         spread_all(p->far))
         return look_at_clock(l->apart), DONE;
     out->stage = UNDER_WAY;
@@ -184,7 +184,7 @@ static inline int64_t step_plants(const loop *l, double now, double width, outco
         out->plant = j;
         if (STEP_FUSED(j, p, now, width)) continue;
         if (p->far && p->far->state != IDLE) {
-            if ((reason = end_apart(l, p, now, width, out)) != DONE) return reason;
+            if ((reason = end_apart(l, p, width, out)) != DONE) return reason;
             continue;
         }
         if (p->by_python) {

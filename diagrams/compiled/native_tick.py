@@ -27,6 +27,8 @@ class _Group(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("inputs", "guards", "made", "taken")),
         *((name, ctypes.c_int64) for name in ("n_inputs", "n_guards", "n_loops", "residual")),
         ("python", _Python),
+        ("unread", ctypes.c_void_p),
+        ("n_unread", ctypes.c_int64),
     ]
 
 
@@ -124,6 +126,8 @@ def _group(tables: Tables, arguments: Sequence[np.ndarray], python: Any) -> _Gro
         n_loops=tables.made.size,
         residual=tables.residual,
         python=python,
+        unread=at(tables.unread),
+        n_unread=tables.unread.size,
     )
 
 

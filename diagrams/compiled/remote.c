@@ -58,6 +58,7 @@ typedef struct {
     double *slopes;
     const bool *event;      /* the step has ended with an event; NULL: it makes no difference */
     const int64_t *changed; /* texts have changed; NULL: none are recorded */
+    double *added;          /* time that steps have added up to, NaN before the first one; NULL: they begin at the run's */
 } quiet;
 
 /* Of all such FMUs of a run: the time at which Python has its turn, in ns; 0 before the first step. */
@@ -239,6 +240,14 @@ static inline bool is_quiet(const quiet *q, double now, double width) {
     for (int64_t i = 0; i < q->watched; i++)
         if (q->vector[q->watched_index[i]] != q->taken[i]) return false;
     return true;
+}
+
+/* Return where a step begins; where times are added up, add it. */
+static inline double begin_step(const quiet *q, double now, double width) {
+    if (!q || !q->added) return now;
+    const double start = isnan(*q->added) ? now : *q->added;
+    *q->added = start + width;
+    return start;
 }
 
 /* Tell the slopes of inputs, from the differences to the step before. */

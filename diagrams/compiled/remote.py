@@ -60,7 +60,7 @@ class _Quiet(ctypes.Structure):
         ("until", ctypes.c_void_p),
         *((name, ctypes.c_int64) for name in ("watched", "sloped")),
         *((name, ctypes.c_void_p) for name in ("vector", "watched_index", "sloped_index", "taken", "last", "line")),
-        *((name, ctypes.c_void_p) for name in ("slopes", "event", "changed")),
+        *((name, ctypes.c_void_p) for name in ("slopes", "event", "changed", "added")),
     ]
 
 
@@ -106,6 +106,7 @@ class RemotePlants:
         made = _Quiet(
             at(quiet.until), watched.size, sloped.size, at(quiet.vector), at(watched), at(sloped), at(quiet.taken),
             at(quiet.last), line, slopes, quiet.event or None, quiet.changed or None,
+            None if quiet.added is None else at(quiet.added),
         )  # fmt: skip
         self._kept += [quiet, watched, sloped, made]
         return ctypes.addressof(made)

@@ -23,6 +23,8 @@ def find_root(f: Callable[[float], float], a: float, fa: float, b: float, fb: fl
     resolution : float
         Length of the interval in which the root is known in the end, of a few ulps at least.
     """
+    if abs(b - a) <= resolution:
+        return b  # a step within it could lead out of the interval
     up = fa < 0.0  # whether f is positive behind the root
     part = fa / (fa - fb)  # of the way from end 1 to end 2
     x1, f1, x2, f2 = a, fa, b, fb  # the last value, and the other end of the interval around the root

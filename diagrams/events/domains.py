@@ -26,7 +26,7 @@ import numpy as np
 from ...blocks.core import SimulationError
 from ..flat import FlatDiagram, FlatEvent
 from ..solvers import AcceptedStep
-from .limits import EventLimits
+from .limits import BRIEF, EventLimits
 from .search import EventSearch, Many
 
 _SAME_INSTANT = 100  # events that fire each other at one instant
@@ -35,6 +35,8 @@ _ROUNDING = 1e-13  # of an indicator near the border, relative to its values in 
 _SCATTER = (
     8.0  # rounding errors of an indicator that has just crossed zero, relative to those seen, or its values there
 )
+_LESS = 1.0 - 1e-6  # of its speed is left after an impact that has taken energy, by more than rounding does
+_LEAST = 1e-15  # of its values in a step: rounding errors of what is computed from such values
 _CLOSE = 1e-11  # of an indicator that may cross zero within ulps of the time, relative to its values in the last step
 _CONTINUOUS = 1e-9  # they are at most this part of its values in the step: else it jumps there
 
@@ -179,7 +181,7 @@ class Domains:
         on_border = (z == 0.0) & ~self._gates
         self.domain = self._first = np.where(z > 0.0, 1, np.where(on_border, 0, -1))
         self._low, self._high = -self._hysteresis, self._hysteresis.copy()
-        self._slack[:] = 0.0
+        self._slack = np.zeros_like(self._slack)
         self._set_bounds()
 
     def reset(self, subsystem: str) -> None:
@@ -207,8 +209,7 @@ class Domains:
         fired = self.fires(self.domain, now)
         if fired.any():
             self.take_fired(fired, np.where(fired, now, self.domain))
-            far = _SCATTER * np.maximum(np.abs(z), np.abs(self._z))
-            self._slack = np.where(fired, np.minimum(far, _CONTINUOUS * self._size), self._slack)
+            self._slack = np.where(fired, self._slack_after(np.maximum(np.abs(z), np.abs(self._z))), self._slack)
             self._set_bounds()
         return fired
 
@@ -226,15 +227,28 @@ class Domains:
         self.limits.note(found.before)
         self.domain = found.before
         self.take_fired(fired, found.now)
-        self._slack = np.where(fired, np.minimum(_SCATTER * found.values, _CONTINUOUS * self._size), self._slack)
+        self._slack = np.where(fired, self._slack_after(found.values), self._slack)
         self._set_bounds()
         return found.t, fired
+
+    def _slack_after(self, values: np.ndarray) -> np.ndarray:
+        """Return the slack of indicators that have just crossed zero, from their values and rounding errors there."""
+        return np.asarray(np.minimum(np.maximum(_SCATTER * values, _LEAST * self._size), _CONTINUOUS * self._size))
+
+    @property
+    def slack(self) -> np.ndarray:
+        """Distance beyond zero to which an indicator that has just crossed it counts as beyond."""
+        return self._slack
+
+    def slack_of(self, scatter: np.ndarray, size: np.ndarray) -> np.ndarray:
+        """Return the slack of indicators that scatter so far about straight lines, with values up to the size."""
+        return np.asarray(np.minimum(_SCATTER * scatter, _CONTINUOUS * size))
 
     def look_at(self, size: np.ndarray, scatter: np.ndarray | None) -> None:
         """Note the largest values of the indicators in a step that is searched, and how they scatter at its start."""
         self._size, self._rounding = size, _ROUNDING * size
         if scatter is not None:
-            self._slack = np.maximum(self._slack, np.minimum(_SCATTER * scatter, _CONTINUOUS * size))
+            self._slack = np.maximum(self._slack, self.slack_of(scatter, size))
             self._set_bounds()
         elif not self.domain.all():  # of rounding there is a matter on the border only
             self._set_bounds()
@@ -342,6 +356,8 @@ class Domains:
                 self._high[i] = max(after.z[i], self._hysteresis[i])
                 self._set_bounds()
                 self.limits.note_contact(i, int(side))
+                if _is_brief(before, after, i, int(side)):
+                    self.limits.count_brief(i, t, self.spacing)
 
     # --- never a hang ------------------------------------------------------------------------------------------------
 
@@ -378,6 +394,16 @@ class Domains:
         self.domain, self._first, self._low, self._high, self._slack = (part.copy() for part in domains)
         self._set_bounds()
         self.limits.restore(limits)
+
+
+def _is_brief(before: Motion, after: Motion, i: int, side: int) -> bool:
+    """Return whether an impact has taken energy, and the flight after it is too brief to be told from a rest.
+
+    It leaves with v h in one step of Euler and 2 v h − a h² in two; its flight takes 2 v/a = 2 v h/(a h²) steps.
+    """
+    leaving = -side * after.once[i]
+    fall = 2.0 * leaving + side * after.twice[i]
+    return bool(2.0 * leaving <= BRIEF * fall and abs(after.once[i]) <= _LESS * abs(before.once[i]))
 
 
 def _continuous_states(flat: FlatDiagram, event: FlatEvent) -> np.ndarray:

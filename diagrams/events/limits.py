@@ -16,6 +16,9 @@ _ZENO, _SHRUNK = 8, 1e-6  # intervals that shrink from one to the next, down to 
 _RESOLVED = 1e3  # ulps of the time, above which intervals are no matter of rounding
 _SLIDES = 10  # events in a row, by which a fixed step knows a sliding mode
 _RESTS = 20  # events in a row that lead back into contact; colliding bodies pass an impact on a few times
+BRIEF = 1e-4  # of the time between two ticks: rounding alone keeps shorter flights up where each impact takes energy
+_BRIEFS = 100  # impacts in a row with shorter flights
+_APART = 1e-3  # of the time between two ticks: impacts further apart are not in a row
 
 
 class EventLimits:
@@ -30,6 +33,8 @@ class EventLimits:
         """The side from which each indicator on the border is held: 1, −1; 0 for none."""
         self._stuck = np.zeros(len(events), dtype=int)
         """Events in a row that led back into contact."""
+        self._briefs, self._brief_at = np.zeros(len(events), dtype=int), np.full(len(events), -np.inf)
+        """Impacts in a row with brief flights after them, and the time in s of the last one."""
         self.holds = False
         """Whether an indicator on the border is held from a side."""
 
@@ -57,6 +62,19 @@ class EventLimits:
         """Return whether event ``i`` has led back into a contact that its jump made."""
         return bool(self._stuck[i])
 
+    def count_brief(self, i: int, t: float, spacing: float) -> None:
+        """Note that an impact at t, both in s, is followed by a flight of less than `BRIEF` of the spacing of ticks.
+
+        Raises
+        ------
+        SimulationError
+            If there have been many in a row: the motion has come to rest, but for rounding errors.
+        """
+        in_a_row = self._brief_at[i] <= t <= self._brief_at[i] + _APART * spacing
+        self._briefs[i], self._brief_at[i] = (self._briefs[i] + 1 if in_a_row else 1), t
+        if self._briefs[i] >= _BRIEFS:
+            raise self._rests(t, i, int(self._briefs[i]))
+
     # --- counts ------------------------------------------------------------------------------------------------------
 
     def count(self, t: float, fired: np.ndarray, change: Callable[[], tuple[float, np.ndarray]]) -> None:
@@ -74,7 +92,7 @@ class EventLimits:
         """
         for i in np.flatnonzero(fired):
             if self._stuck[i] >= _RESTS:
-                raise self._rests(t, int(i))
+                raise self._rests(t, int(i), _RESTS)
             times = self._times[i]
             if times:
                 self._largest[i] = max(self._largest[i], t - times[-1])
@@ -84,11 +102,11 @@ class EventLimits:
         if len(self._recent) == _CHATTER and t - self._recent[0][0] < _SPAN * (1.0 + abs(t)):
             raise self._chatters(t, *change())
 
-    def _rests(self, t: float, i: int) -> SimulationError:
+    def _rests(self, t: float, i: int, times: int) -> SimulationError:
         event = self.events[i]
         return SimulationError(
             f"the event {event.name!r} rests in contact: its jump leaves its indicator at zero, and the motion leads "
-            f"it back beyond at once, {_RESTS} times in a row. Nothing in the equations holds it there; going on would "
+            f"it back beyond at once, {times} times in a row. Nothing in the equations holds it there; going on would "
             "let it pass through. Give the block a state of rest: a discrete state that the jump sets and that holds "
             "the rates, and an event that ends it.",
             block=event.path,
@@ -154,12 +172,14 @@ class EventLimits:
     def save(self) -> Any:
         """Return what is needed to go on from here."""
         times = [list(d) for d in self._times]
-        return times, self._largest.copy(), list(self._recent), self._side.copy(), self._stuck.copy()
+        rest = self._side.copy(), self._stuck.copy(), self._briefs.copy(), self._brief_at.copy()
+        return times, self._largest.copy(), list(self._recent), rest
 
     def restore(self, saved: Any) -> None:
         """Go back to what `save` returned."""
-        times, largest, recent, side, stuck = saved
-        self._largest, self._side, self._stuck = largest.copy(), side.copy(), stuck.copy()
-        self.holds = bool(side.any())
+        times, largest, recent, rest = saved
+        self._largest = largest.copy()
+        self._side, self._stuck, self._briefs, self._brief_at = (part.copy() for part in rest)
+        self.holds = bool(self._side.any())
         self._times = [deque(d, maxlen=_ZENO + 1) for d in times]
         self._recent = deque(recent, maxlen=_CHATTER)

@@ -24,6 +24,7 @@ _HALVINGS = 40
 _CLOSE = 1e-3
 _FEW, _MOST = 48, 1024  # instants that are evaluated in one pass: the first one, and at most
 _PARTS = 0.5 ** np.arange(_HALVINGS, 0, -1)
+_AROUND = np.arange(-5.0, 6.0)  # instants around a root
 _KEPT = 64  # divisions of a step that are remembered
 _APART = 1e-15  # of the time, relative: instants that are further from each other are distinct
 
@@ -70,6 +71,13 @@ class Rule(Protocol):
 
     def take(self, now: np.ndarray) -> None:
         """Take over domains that fire nothing."""
+
+    @property
+    def slack(self) -> np.ndarray:
+        """Return the distance beyond zero to which each indicator that has just crossed it counts as beyond."""
+
+    def slack_of(self, scatter: np.ndarray, size: np.ndarray) -> np.ndarray:
+        """Return the slack of indicators that scatter so far about straight lines, with values up to the size."""
 
     def strict_bounds(self, domain: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Return `bounds` without slack for rounding errors; None if an indicator is on the border."""
@@ -162,10 +170,14 @@ class EventSearch:
             if bad.size:
                 end = int(bad[0])
                 largest = size[:end].max(axis=0)
+        slack = rule.slack
         out = rule.clear(z[k:end], size[k:end], largest) if self.fresh and k == 1 and k < end else None
         if out is None:
             rule.look_at(largest, _scatter(times, z) if self.fresh and k == 1 else None)
         dips = self._find_dips(times[:end], z[:end], size[:end])
+        if dips and self.fresh and k == 1:
+            slack = np.maximum(slack, rule.slack_of(_scatter(times, z), largest))
+        leaving = _leading_run(size[:end] <= slack) if dips and slack.any() else np.zeros(len(slack), dtype=int)
         known = [(0, rule.domain)]  # the instants from which on the domains were others, and these
         while k < end:
             now = known[-1][1]
@@ -176,7 +188,8 @@ class EventSearch:
             stop = k + first // out.shape[1] if out.flat[first] else end
             out = None
             for dip in dips:
-                ends = self._follow_dips(step, times, z, dip, dips[dip], known) if k <= dip < stop else []
+                close = np.where(dip - 1 < leaving, slack, 0.0)
+                ends = self._follow_dips(step, times, dip, dips[dip], known, close) if k <= dip < stop else []
                 if ends:
                     return self._earliest(step, times, z, dip, ends, known)
             if stop == end:
@@ -187,7 +200,8 @@ class EventSearch:
             known.append((stop, changed))
             ends = [(int(i), float(times[stop - 1]), b) for i in np.flatnonzero(rule.fires(now, changed))]
             if stop in dips:
-                ends += self._follow_dips(step, times, z, stop, dips[stop], known)
+                close = np.where(stop - 1 < leaving, slack, 0.0)
+                ends += self._follow_dips(step, times, stop, dips[stop], known, close)
             if ends:
                 return self._earliest(step, times, z, stop, ends, known)
             k = stop + 1
@@ -252,9 +266,13 @@ class EventSearch:
         return {int(row) + 2: np.flatnonzero(of) for row, of in zip(k, which, strict=True) if of.any()}
 
     def _follow_dips(
-        self, step: AcceptedStep, times: np.ndarray, z: np.ndarray, k: int, which: np.ndarray, known: list[Known]
+        self, step: AcceptedStep, times: np.ndarray, k: int, which: np.ndarray, known: list[Known], slack: np.ndarray
     ) -> list[tuple[int, float, float]]:
-        """Return those that were in the other domain between instants k − 2 and k, and between which times to look."""
+        """Return those that were in the other domain between instants k − 2 and k, and between which times to look.
+
+        One that is just leaving zero has been there if it was further than its slack, for rounding errors carry it back
+        as well: the instants tell nothing of them, as the closest of many values between these is taken.
+        """
         first, last = float(times[k - 2]), float(times[k])
         before, middle, after = (_domains_at(known, j) for j in (k - 2, k - 1, k))
         found = []
@@ -262,7 +280,9 @@ class EventSearch:
             if not before[i] == middle[i] == after[i] != 0:
                 continue
             t = self._find_closest(int(i), int(middle[i]), first, last, step)
-            now = self._rule.domains_of(self._rule.g(t, step.interpolate(t)), middle)
+            z = np.array(self._rule.g(t, step.interpolate(t)))
+            z[i] += middle[i] * slack[i]
+            now = self._rule.domains_of(z, middle)
             if now[i] != middle[i] and first < t < last and self._rule.fires(middle, now)[i]:
                 found.append((int(i), first, t))
         return found
@@ -291,7 +311,8 @@ class EventSearch:
     ) -> tuple[float, float]:
         """Return the time at which indicator ``i`` has just left its domain, between a and b, where it has.
 
-        Also the larger one of its distances from there on both sides. ``values`` are those that are known.
+        Also the largest one of its distances from there on both sides and its rounding errors around it. ``values`` are
+        those that are known.
         """
         g, interpolate = self._rule.g, step.interpolate
         low, high = (float(bound[i]) for bound in self._rule.bounds(before))
@@ -324,8 +345,23 @@ class EventSearch:
             ahead = max(math.ulp(t), self._finest)
             while t < b and not is_changed(t):
                 t, ahead = min(b, t + ahead), 2 * ahead
-        below = max(a, t - max(4 * math.ulp(t), self._finest))
-        return t, max(abs(value(t) - level), abs(value(below) - level))
+        apart = max(4 * math.ulp(t), self._finest)
+        below = max(a, t - apart)
+        scatter = self._scatter_around(i, t, apart, step)
+        return t, max(abs(value(t) - level), abs(value(below) - level), scatter)
+
+    def _scatter_around(self, i: int, t: float, apart: float, step: AcceptedStep) -> float:
+        """Return how far values of an indicator around its root are from a straight line: its rounding errors.
+
+        Two values there may be close to zero by chance.
+        """
+        times = np.unique(np.clip(t + apart * _AROUND, step.t_old, step.t))
+        if len(times) < 3:
+            return 0.0
+        z = self._many(times, step.interpolate_many(times))[0][:, i]
+        part = (times - times[0]) / (times[-1] - times[0])
+        found = float(np.abs(z - z[0] - part * (z[-1] - z[0])).max())
+        return found if math.isfinite(found) else 0.0
 
 
 def _scatter(times: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -335,6 +371,11 @@ def _scatter(times: np.ndarray, z: np.ndarray) -> np.ndarray:
         return np.zeros(z.shape[1])
     part = (times[1:m] - times[0]) / (times[m] - times[0])
     return np.asarray(np.abs(z[1:m] - z[0] - part[:, None] * (z[m] - z[0])).max(axis=0))
+
+
+def _leading_run(within: np.ndarray) -> np.ndarray:
+    """Return how many rows are true from the first one on, for each column."""
+    return np.where(within.all(axis=0), len(within), (~within).argmax(axis=0))
 
 
 def _domains_at(known: list[Known], k: int) -> np.ndarray:

@@ -30,6 +30,8 @@ T = TypeVar("T")
 
 LARGEST = 2_000
 """Operations of a tick up to which it is simplified as a whole: a C compiler's time grows faster than they do."""
+_EACH = 3
+"""Operations of a tick for each output value of an FMU: its size, the sum of sizes, the entry of the log."""
 MOST_KEPT = 24
 """Functions of others that are kept with a diagram's own."""
 EXACT_LOOP = 4
@@ -144,12 +146,15 @@ class FlatDiagram(FlatLayout):
     def by_block(self) -> bool:
         """Whether a tick is evaluated block by block: it is large, or has blocks that Python evaluates.
 
+        It is large by the operations of its blocks, and by the outputs of its FMUs: code for the whole has a statement
+        for each value, code by block goes over tables.
+
         This holds for interpreted and compiled runs. In another one, operations of several blocks are simplified
         together.
         """
         if any(self.table.blocks[path].opaque for path in self.checked.traced):
             return True
-        return self.operations > LARGEST
+        return self.operations + _EACH * self.plant_outputs.total > LARGEST
 
     @cached_property
     def operations(self) -> int:

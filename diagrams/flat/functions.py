@@ -5,7 +5,8 @@
     (g, open) = h(t, x, w, p)               between ticks: the indicators of all events
     x_next = J(t, x, w, p, fired)           at events
 
-``ok`` is 1 while everything is finite and every guard positive. The vectors are those of `FlatLayout`.
+``ok`` is 1 while everything is finite, but outputs of FMUs that nothing reads (`FlatLayout.unread`), and every guard
+positive. The vectors are those of `FlatLayout`.
 """
 
 from __future__ import annotations
@@ -73,13 +74,21 @@ def trace_tick(
         if keep is not None:
             keep((symbols, rates(instant)))
         found = {"x_next": next_x(instant), "z": plant_inputs(instant), "log": log(instant)}
-        sizes = (ca.norm_1(found[name]) for name in ("log", "x_next", "z") if found[name].numel())
+        counted = {**found, "log": _without(found["log"], layout.unread_entries)}
+        sizes = (ca.norm_1(counted[name]) for name in ("log", "x_next", "z") if counted[name].numel())
         ok = sum(sizes, ca.MX(0.0)) <= LARGEST  # false for any NaN or infinity
         if instant.guards:
             ok = ca.logic_and(ok, ca.mmin(ca.vertcat(*instant.guards) > 0))
         return {**found, "ok": ok}
 
     return trace_schedule("tick", symbols, results, by_block=by_block)
+
+
+def _without(column: Any, entries: np.ndarray) -> Any:
+    """Return a column without some of its entries."""
+    if not entries.size:
+        return column
+    return column[np.setdiff1d(np.arange(column.numel()), entries).tolist()]
 
 
 @without_collection
@@ -97,6 +106,7 @@ def trace_tick_program(layout: FlatLayout, functions: BlockFunctions, acting: fr
         guards=program.join(instant.guards).ids,
         mismatch=(program.join(made).ids, program.join(taken).ids) if layout.loops.slices else None,
         rates=flow,
+        unread=layout.unread_entries,
     )
 
 

@@ -132,6 +132,30 @@ class FlatLayout:
         for values in (self.continuous, self.x0, self.p):
             values.setflags(write=False)  # a run has its own
 
+    @cached_property
+    def unread(self) -> dict[str, slice]:
+        """Where outputs of FMUs that nothing reads stand in the log, by dotted path: these alone may be no numbers.
+
+        Readers are wires and what enables or triggers subsystems; a name of a wire, and the record, are none.
+        """
+        wires = [*self.table.wires.values(), *self.table.controls.values()]
+        read = {(wire.block, wire.port) for wire in wires}
+        foreign = {
+            path
+            for path, block in self.table.blocks.items()
+            if (block.stepped and not block.transport) or block.evaluated_outside
+        }
+        return {
+            name: where
+            for name, where in self.log.slices.items()
+            if self.ports[name][0] in foreign and self.ports[name] not in read
+        }
+
+    @cached_property
+    def unread_entries(self) -> np.ndarray:
+        """Entries of the log of `unread`, ascending."""
+        return np.array([i for where in self.unread.values() for i in range(where.start, where.stop)], dtype=np.int32)
+
     @property
     def width(self) -> int:
         """Number of entries of x."""

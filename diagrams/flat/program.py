@@ -166,6 +166,8 @@ class TickProgram:
         Of algebraic loops: what came round, and what was taken; None where the log has no residual.
     rates : Ids, or None
         The rates of the integrated states at an instant at which no clock acts; None at others.
+    unread : ndarray of int32
+        Entries of the log that may be no finite numbers: outputs of FMUs that nothing reads.
     """
 
     program: Program
@@ -175,6 +177,7 @@ class TickProgram:
     guards: Ids
     mismatch: tuple[Ids, Ids] | None
     rates: Ids | None = None
+    unread: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int32))
 
 
 @dataclass(frozen=True, eq=False)

@@ -358,7 +358,8 @@ def call_function(function: Any, arguments: Sequence[Any]) -> list[np.ndarray]:
 
 
 def _view(vector: np.ndarray) -> Any:
-    return memoryview(vector)  # type: ignore[arg-type]
+    buffer: Any = vector  # stubs of NumPy don't agree on whether an array is a buffer
+    return memoryview(buffer)
 
 
 def _range(part: slice) -> range:

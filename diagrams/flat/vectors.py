@@ -48,14 +48,18 @@ def next_x(instant: Instant) -> Any:
     ]
     for part, new in made:
         parts += [new.get(name, rows(instant.x, where)) for name, where in part.slices.items()]
-    return join_columns(parts)
+    return join_columns(parts) if parts else _no_rows(instant)
+
+
+def _no_rows(instant: Instant) -> Any:
+    return instant.t.program.join([]) if isinstance(instant.t, Cells) else ca.MX(0, 1)
 
 
 def rates(instant: Instant) -> Any:
     """Return the rates of the entries of x that are integrated."""
     layout = instant.layout
     if not layout.continuous.size:
-        return instant.t.program.join([]) if isinstance(instant.t, Cells) else ca.MX(0, 1)
+        return _no_rows(instant)
     states = layout.states.slices.items()
     none = np.zeros if isinstance(instant.t, Cells) else ca.MX.zeros
     columns = [instant.rates[path] if path in instant.rates else none(s.stop - s.start) for path, s in states]

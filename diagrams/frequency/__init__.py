@@ -18,7 +18,9 @@ from .polynomials import relative_difference
 from .python_control import Comparison, compare_margins, compare_with_control
 from .realization import Realization
 from .sensitivities import GangOfFour, complementary, delayed_hold, delayed_hold_margin, gang_of_four, sensitivity
+from .sign_changes import refine_sign_change
 from .state_space import read_matrices
+from .ties import first_largest, order_key
 
 if TYPE_CHECKING:
     from .loop_transfer import LoopTransfer as LoopTransfer
@@ -48,6 +50,7 @@ __all__ = [
     "disk_margin",
     "find_disk_frequency",
     "find_hidden_unstable",
+    "first_largest",
     "gang_of_four",
     "loop_at",
     "loop_class",
@@ -58,10 +61,12 @@ __all__ = [
     "mimo_disk_margin",
     "mu_bound",
     "nyquist_count",
+    "order_key",
     "periodic_margins",
     "place",
     "read_frequency_data",
     "read_matrices",
+    "refine_sign_change",
     "relative_difference",
     "sampled_gains",
     "sampled_poles",

@@ -5,8 +5,7 @@ Each ``confirm_…`` raises ConfirmationError if its computation disagrees, and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -21,25 +20,6 @@ STEP = 0.01
 LEVEL = 1e-3
 FEW = 6
 """Values up to which a confirmation names each."""
-
-
-@contextmanager
-def refuse_singular(name: str) -> Iterator[None]:
-    """Raise a ConfirmationError for an equation that rounding leaves without a solution.
-
-    Parameters
-    ----------
-    name : str
-        Function that the error names.
-    """
-    try:
-        yield
-    except np.linalg.LinAlgError as error:
-        raise ConfirmationError(
-            f"found an equation of the loop without a solution ({error}); expected one at every frequency off the "
-            "poles. The realization is ill-conditioned: give the loop as a state space with balanced states.",
-            block=name,
-        ) from error
 
 
 def pick_test_values(value: float, others: Sequence[float], nominal: float) -> tuple[float, float]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from .features import Features, scan
 from .realization import Realization
+from .sign_changes import refine_sign_change
 
 Function = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """From L and dL/d(log ω) to a value and its slope over log ω."""
@@ -159,7 +160,7 @@ class Scan:
                 if left == 0.0:
                     found.append(span[0])
                 elif left * right < 0:
-                    if max(abs(left), abs(right)) > 1e-11:  # smaller ones are the rounding of a constant
+                    if max(abs(left), abs(right)) > self._find_rounding(omega[k : k + 2], L[k : k + 2]):
                         found.append(self._polish(lambda w: self._evaluate(function, w, 0), span))
                 elif left * slope[k] < 0 and right * slope[k + 1] > 0:
                     turn = self._polish(lambda w: self._evaluate(function, w, 1), span)
@@ -168,16 +169,18 @@ class Scan:
                         found.append(self._polish(lambda w: self._evaluate(function, w, 0), (turn, span[1])))
         return found
 
+    def _find_rounding(self, omega: np.ndarray, L: np.ndarray) -> float:
+        """Return a bound of the relative rounding error of L at frequencies, at least that of a constant.
+
+        Beside a pole on the axis it turns the phase, and a crossing that is less than it isn't there.
+        """
+        return max(1e-11, float(np.max(self.r.rounding(1j * omega) / np.abs(L))))
+
     def _evaluate(self, function: Function, omega: float, which: int) -> float:
         """Return the value (0) or the slope (1) of a function."""
         return float(function(*self._response(omega))[which][0])
 
     @staticmethod
     def _polish(function: Callable[[float], float], span: tuple[float, float]) -> float:
-        from scipy.optimize import brentq
-
-        low, high = np.log(span[0]), np.log(span[1])
-        ends = function(np.exp(low)), function(np.exp(high))
-        if ends[0] * ends[1] > 0:  # rounding has moved the ends: the root is at one of them
-            return span[0] if abs(ends[0]) < abs(ends[1]) else span[1]
-        return float(np.exp(brentq(lambda x: function(np.exp(x)), low, high, xtol=1e-14, rtol=1e-14)))
+        low, high = (float(np.log(omega)) for omega in span)
+        return float(np.exp(refine_sign_change(lambda x: function(np.exp(x)), low, high, xtol=1e-14)))

@@ -10,12 +10,13 @@ import numpy as np
 
 from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, brief, explain_calls, kinds
 from .carried import carries_findings
-from .confirm import confirm_limit, confirm_peak, refuse_singular
+from .confirm import confirm_limit, confirm_peak
 from .features import Features, scan
 from .loop_margins import EIGENVALUES
 from .number import Confirmation, Number
-from .realization import Realization
+from .realization import Realization, refuse_singular
 from .state_space import make_state_space, read_matrices
+from .ties import first_largest
 
 if TYPE_CHECKING:
     from control import StateSpace
@@ -318,7 +319,7 @@ def _find_largest(r: Realization, function: Callable[[float], float]) -> tuple[f
 
     omega = np.unique(np.concatenate([[0.0], *_make_grid(r), [r.nyquist]]))
     values = np.array([function(w) for w in omega])
-    best, where = float(values.max()), float(omega[np.argmax(values)])
+    best, where = float(values.max()), float(omega[first_largest(values)])
     inside = [k for k in range(1, len(omega) - 1) if values[k - 1] <= values[k] >= values[k + 1] and omega[k - 1] > 0]
     for k in sorted(inside, key=lambda k: -values[k])[:5]:
         high = omega[k + 1] if np.isfinite(omega[k + 1]) else 10 * omega[k]

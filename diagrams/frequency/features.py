@@ -89,11 +89,11 @@ def split_axis_poles(r: Realization, p: np.ndarray, scale: float) -> tuple[tuple
             for middle in left:
                 near = sorted(range(len(left)), key=lambda k: abs(left[k] - middle))[:m]
                 group = np.array([left[k] for k in near])
-                mean = group.mean()
+                mean = complex(group.mean())
                 spread = float(np.max(np.abs(group - mean)))
-                if spread <= radius and abs(r.growth(mean)) <= 1e-11 * scale:
+                if spread <= radius and abs(float(r.growth(np.array(mean)))) <= 1e-11 * scale:
                     left = [value for k, value in enumerate(left) if k not in near]
-                    found.append((complex(mean), m, spread))
+                    found.append((mean, m, spread))
                     again = True
                     break
     axis = []
@@ -112,18 +112,39 @@ def split_axis_poles(r: Realization, p: np.ndarray, scale: float) -> tuple[tuple
 
 
 def transmission_zeros(r: Realization) -> np.ndarray:
-    """Return the zeros of a loop with one channel, in the plane of p."""
+    """Return the zeros of a loop with one channel, in the plane of p.
+
+    Zeros at infinity scatter by rounding to some 1e15^(1/k) times the poles, k of them together. How many of them there
+    are is read from the Markov parameters, not from where they were found.
+    """
     from scipy.linalg import eig
 
     n = r.order
-    if not n or len(r.D) != 1:
+    if not n or len(r.D) != 1 or not (finite := n - count_zeros_at_infinity(r)):
         return np.zeros(0)
     b, c = np.linalg.norm(r.B) or 1.0, np.linalg.norm(r.C) or 1.0
     pencil = np.block([[r.A, r.B / b], [r.C / c, r.D / (b * c)]])
     alpha, beta = eig(pencil, np.diag([1.0] * n + [0.0]), right=False, homogeneous_eigvals=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         zeros = alpha / beta
-    return np.asarray(zeros[np.isfinite(zeros) & (np.abs(zeros) < 1e6 * max(r.scale, 1e-300))])
+    zeros = zeros[np.isfinite(zeros)]
+    zeros = zeros[np.argsort(np.abs(zeros), kind="stable")[:finite]]
+    return np.asarray(zeros[np.abs(zeros) < 1e6 * max(r.scale, 1e-300)])
+
+
+def count_zeros_at_infinity(r: Realization) -> int:
+    """Return the relative degree of a loop with one channel: the place of the first Markov parameter D, CB, CAB, … ≠ 0.
+
+    A sum of products is 0 where it is less than its rounding, which follows the sizes of the products.
+    """
+    C, x, size = r.C[0], r.B[:, 0], np.abs(r.B[:, 0])
+    if r.D[0, 0]:  # what rounding left in it was removed with the reduction
+        return 0
+    for k in range(1, r.order):
+        if abs(C @ x) > 1e-15 * (r.order + k) * (np.abs(C) @ size):
+            return k
+        x, size = r.A @ x, np.abs(r.A) @ size
+    return r.order
 
 
 def scan(r: Realization, features: Features, *, delay: float = 0.0) -> list[np.ndarray]:

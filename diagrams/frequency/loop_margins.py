@@ -17,14 +17,13 @@ from .confirm import (
     confirm_peak,
     count_unstable,
     find_level_frequencies,
-    refuse_singular,
 )
 from .crossings import Crossing, Peak, Scan
 from .features import find_hidden_unstable
 from .margins_found import GainCrossover, Margins, PhaseCrossover
 from .number import Confirmation, Number
 from .nyquist import count_encirclements
-from .realization import Realization
+from .realization import Realization, refuse_singular
 
 if TYPE_CHECKING:
     from .state_space import LinearSystem

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError, accepts, brief, explain_calls, kinds
+from ...blocks.core import OptionError, accepts, brief, describe_disk_error, explain_calls, kinds
 
 if TYPE_CHECKING:
     from control import FrequencyResponseData
@@ -334,7 +334,8 @@ def read_frequency_data(file: str | os.PathLike[str], *, dt: float = 0.0) -> Fre
             reader = csv.reader(opened)
             numbered = [(reader.line_num, row) for row in reader if row and any(cell.strip() for cell in row)]
     except OSError as error:
-        raise OptionError(f"it can't be read: {error.strerror}. Name another file.", block=str(file)) from error
+        found = describe_disk_error(error, file, "Name another file.")
+        raise OptionError(f"it can't be read: {found}", block=str(file)) from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise OptionError(f"it is no CSV file in UTF-8: {error}. Save it as one.", block=str(file)) from error
     rows = [row for _, row in numbered]

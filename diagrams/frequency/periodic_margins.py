@@ -16,11 +16,12 @@ import numpy as np
 
 from ...blocks.core import ConfirmationError, Finding, ParameterError, brief, explain_calls, on_one_thread
 from .carried import carries_findings
-from .confirm import confirm_limit, confirm_no_limit, refuse_singular
+from .confirm import confirm_limit, confirm_no_limit
 from .disk import disk_gains, sensitivity_at
 from .features import SIDES
 from .number import MARK, Confirmation, Number
-from .realization import Realization
+from .realization import Realization, refuse_singular
+from .sign_changes import refine_sign_change
 
 if TYPE_CHECKING:
     from .state_space import LinearSystem
@@ -233,7 +234,6 @@ class PeriodicMarginFinder:
         begin, end : float
             First and last number.
         """
-        from scipy.optimize import brentq
 
         def growth(x: float) -> float:
             return float(np.max(self.r.growth(self.r.eigenvalues(at(x)))))
@@ -244,7 +244,7 @@ class PeriodicMarginFinder:
             step = max(0.5 * self._distance(f) / abs(f), SMALLEST_STEP)
             following = x + sign * min(step, abs(end - x))
             if growth(following) >= 0:
-                return float(brentq(growth, x, following, xtol=1e-14 * abs(following), rtol=1e-14))
+                return refine_sign_change(growth, x, following, xtol=1e-14 * abs(following))
             x = following
         return None
 

@@ -112,7 +112,8 @@ def _place(A: np.ndarray, B: np.ndarray, wanted: np.ndarray) -> np.ndarray:
                 port=name,
             )
     polynomial = real_polynomial(wanted)
-    rank = int(np.linalg.matrix_rank(B))
+    lengths = np.linalg.norm(B, axis=0)  # units of the inputs don't matter
+    rank = int(np.linalg.matrix_rank(B / np.where(lengths > 0.0, lengths, 1.0), tol=1e-10))
     multiplicity = max(int(np.sum(np.abs(wanted - p) < 1e-9 * (1 + abs(p)))) for p in wanted)
     if rank > 1 and multiplicity <= rank:
         from scipy.signal import place_poles

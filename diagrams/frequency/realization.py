@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, ParameterError
+from ...blocks.core import ConfirmationError, LoopwrightError, ParameterError
 from .state_space import inexactness_of, read_coefficients, read_matrices
 from .transfer_functions import Coefficients
 
@@ -22,12 +24,34 @@ STRUCTURE = 1e-14
 """Size of an entry, relative to the largest after scaling, below which it is a zero that rounding has changed."""
 ROUNDING = (1e-8, 1e-10, 1e-12)
 """Sizes below which an entry may be such a zero; each is tried, and kept if the response stays the same."""
-MARGINAL = 1e-14
+MARGINAL = 1e-13
 """Distance from the limit of stability, relative to the largest pole, below which a pole counts as on it."""
+ROUNDOFF = 2e-15
+"""Relative size of the rounding in a solution of linear equations: nine times that of a number."""
 LIGHTLY_DAMPED = 0.3
 """Damping ratio of a pole below which a response is drawn at more frequencies around it."""
 LARGE = 1e4
 """|L| above which a difference does not show in the closed loop."""
+
+
+@contextmanager
+def refuse_singular(name: str) -> Iterator[None]:
+    """Raise a ConfirmationError for an equation that rounding leaves without a solution.
+
+    Parameters
+    ----------
+    name : str
+        Function that the error names.
+    """
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        raise ConfirmationError(
+            f"found an equation of the loop without a solution ({error}); expected one at every frequency off the "
+            "poles. The realization is ill-conditioned: give the loop as a state space with balanced states, or as its "
+            "transfer function.",
+            block=name,
+        ) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +89,8 @@ class Realization:
         ParameterError
             If it is no linear system, has no definite sample time or entries that are not finite, or the delay is not
             a number of samples.
+        ConfirmationError
+            If it is so ill-conditioned that its equations have no solution off the poles.
         """
         name = str(getattr(loop, "name", None) or "loop")
         try:
@@ -96,7 +122,8 @@ class Realization:
             D = np.where(np.abs(D) <= STRUCTURE * size, 0.0, D)
         for _ in range(int(delay)):
             A, B, C, D = _delay_inputs(A, B, C, D)
-        made = cls(*_balance(A, B, C), D, float(dt), np.zeros(0), None, inexactness_of(loop)).reduce()
+        with refuse_singular(name):
+            made = cls(*_balance(A, B, C), D, float(dt), np.zeros(0), None, inexactness_of(loop)).reduce()
         # scaled once more, with input and output: rounding in A alone may have set the first scales
         A, B, C = _scale(made.A, made.B, made.C)
         return replace(made, A=A, B=B, C=C, coefficients=read_coefficients(loop))
@@ -240,7 +267,19 @@ class Realization:
         one, two = self.matrix(1j * omega), other.matrix(1j * omega)
         size, apart = np.max(np.abs(two), axis=(1, 2)), np.max(np.abs(one - two), axis=(1, 2))
         counts = size < LARGE
-        return bool(counts.any() and np.all(apart[counts] <= 1e-9 * size[counts]))
+        tolerance = 1e-9 * size + other.rounding(1j * omega)
+        return bool(counts.any() and np.all(apart[counts] <= tolerance[counts]))
+
+    def rounding(self, s: np.ndarray) -> np.ndarray:
+        """Return a bound of the rounding error of the transfer matrix at points s, shape (...).
+
+        Solving (p I − A) x = B u is exact for a matrix that differs by some ε of its norm, which moves C x by the
+        solution, the adjoint one and that difference (Higham, Accuracy and Stability of Numerical Algorithms, 7.1).
+        """
+        states, costates = self._states(s), _transpose(self)._states(s)
+        size = self.order * (self.scale + np.abs(self.point(s)))
+        x, y = (np.linalg.norm(found, axis=(1, 2)) for found in (states, costates))
+        return np.asarray(ROUNDOFF * size * x * y)
 
     def _replace_by(self, part: Realization, hidden: np.ndarray) -> Realization:
         """Return a part of this system if its response is the same, with ``hidden`` added; else this system."""
@@ -255,8 +294,8 @@ class Realization:
         before, after = self.matrix(s), part.matrix(s)
         size = np.max(np.abs(before), axis=(1, 2)) + 1e-300
         # far above 1 an error does not show in the closed loop, and integrators amplify rounding
-        worst = np.max(np.abs(before - after), axis=(1, 2)) / (size * np.maximum(1.0, np.sqrt(size)))
-        return part if np.max(worst) < max(1e-9, 100 * self.inexactness) else self
+        allowed = max(1e-9, 100 * self.inexactness) * size * np.maximum(1.0, np.sqrt(size)) + self.rounding(s)
+        return part if np.all(np.max(np.abs(before - after), axis=(1, 2)) < allowed) else self
 
     def _solve(self, s: np.ndarray, right: np.ndarray) -> np.ndarray:
         return np.linalg.solve(self.point(s)[:, None, None] * np.eye(self.order) - self.A, right)

@@ -10,6 +10,7 @@ import numpy as np
 from ...blocks.core import ConfirmationError, ParameterError, accepts, brief, explain_calls, kinds
 from .carried import carries_findings
 from .number import Number
+from .sign_changes import refine_sign_change
 from .state_space import Matrices, make_state_space, read_matrices
 
 if TYPE_CHECKING:
@@ -194,7 +195,6 @@ def delayed_hold_margin(plant: LinearSystem, controller: LinearSystem, *, larges
         If the loop is not stable at 0.99 and unstable at 1.01 of the delay.
     """
     import control
-    from scipy.optimize import brentq
 
     C = control.ss(controller)
     T = float(C.dt)
@@ -214,7 +214,7 @@ def delayed_hold_margin(plant: LinearSystem, controller: LinearSystem, *, larges
     k = next((k for k in range(1, int(10 * largest) + 1) if radius(k * step) >= 0), None)
     if k is None:
         return Number(np.inf, "s", 0.0, f"eigenvalues with the delayed hold: stable up to {largest:g} samples")
-    found = float(brentq(radius, (k - 1) * step, k * step, xtol=1e-15 * T, rtol=1e-14))
+    found = refine_sign_change(radius, (k - 1) * step, k * step, xtol=1e-15 * T)
     low, high = radius(0.99 * found), radius(1.01 * found)
     if not low < 0 < high:
         raise ConfirmationError(

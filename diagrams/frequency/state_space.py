@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from fractions import Fraction
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
 from ...blocks.core import Finding, ParameterError
-from .transfer_functions import Coefficients, realize
+from .transfer_functions import Coefficients, read_companion, realize
 
 if TYPE_CHECKING:
     from control import StateSpace, TransferFunction
@@ -47,16 +49,18 @@ class Matrices(NamedTuple):
 def read_matrices(system: LinearSystem) -> Matrices:
     """Return the matrices of a system of python-control; a transfer function is realized first.
 
-    A transfer function with one channel is realized around z = 1 (`realize`), others by python-control.
+    A transfer function with one channel is realized around z = 1 (`realize`), others by python-control. So is a sampled
+    state space in companion form, which is a transfer function in z, as `control.ss` makes of one.
     """
-    import control
-
-    if isinstance(system, control.TransferFunction) and system.ninputs == system.noutputs == 1:
+    polynomials = _read_polynomials(system)
+    if polynomials is not None:
         sampled = system.dt is True or bool(system.dt)
-        form = realize(system.num[0][0], system.den[0][0], sampled=sampled)
+        form = realize(*polynomials, sampled=sampled)
         if form is not None:
             A = form.A + np.eye(len(form.A)) * sampled
             return Matrices(A, form.B, form.C, form.D, system.dt)
+    import control
+
     try:
         made = control.ss(system)
         A, B, C, D = (np.asarray(getattr(made, name), dtype=float) for name in "ABCD")
@@ -99,9 +103,26 @@ def findings_of(system: LinearSystem) -> tuple[Finding, ...]:
 
 
 def read_coefficients(system: LinearSystem) -> Coefficients | None:
-    """Return the coefficients of a sampled transfer function with one channel; None of any other system."""
+    """Return the coefficients of a sampled transfer function with one channel; None of any other system.
+
+    A state space in companion form is one, too.
+    """
+    polynomials = _read_polynomials(system) if getattr(system, "dt", None) else None
+    return None if polynomials is None else Coefficients(*(tuple(float(c) for c in row) for row in polynomials))
+
+
+def _read_polynomials(system: LinearSystem) -> tuple[Sequence[float | Fraction], Sequence[float | Fraction]] | None:
+    """Return numerator and denominator of a system with one channel that is given by them, the highest power first.
+
+    That is a transfer function, or a sampled state space in companion form; None of any other system.
+    """
     import control
 
-    if not isinstance(system, control.TransferFunction) or not system.dt or (system.ninputs, system.noutputs) != (1, 1):
+    if (getattr(system, "ninputs", 0), getattr(system, "noutputs", 0)) != (1, 1):
         return None
-    return Coefficients(*(tuple(float(c) for c in row[0][0]) for row in (system.num, system.den)))
+    if isinstance(system, control.TransferFunction):
+        return system.num[0][0], system.den[0][0]
+    if isinstance(system, control.StateSpace) and (system.dt is True or system.dt) and not inexactness_of(system):
+        A, B, C, D = (np.asarray(getattr(system, name), dtype=float) for name in "ABCD")
+        return read_companion(A, B, C, D)
+    return None

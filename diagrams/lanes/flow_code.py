@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from string import Template
 from typing import Any
 
+from ...blocks.core import left_of
 from .scalar_calls import ScalarFunctions
 
 METHODS: Mapping[str, str] = {
@@ -23,13 +24,14 @@ METHODS: Mapping[str, str] = {
 """Methods of fixed step, as in compiled/methods.c."""
 
 _TEXT = Template("""
-/* A step of the continuous states from tick to tick. A source that jumps at its end has its value from before there:
-   it is seen at the time `to`, which is of each lane. */
-static inline void step_states(double from, double end, vec to, vec *x, const vec *w, const vec *p, const vec *kept) {
+/* A step of the continuous states from tick to tick. Its end is seen from the left, as in problem.c: a source that
+   jumps there still has its value from before. */
+static inline void step_states(double from, double end, vec *x, const vec *w, const vec *p, const vec *kept) {
     static const int where[] = {$where};
     vec k1[$n], k2[$n], k3[$n], k4[$n], stage[N_X], next[N_X], t[1];
     const double h = end - from;
     const vec first = splat(from), middle = splat(from + 0.5 * h);
+    const vec to = splat(fmax(from, end - $left * fabs(end)));
 #define EACH_RATE for (int i = 0; i < $n; i++)
 #define RATES(at, set, into) set; t[0] = at; flow(t, stage, w, p, kept, into);
     (void)k2, (void)k3, (void)k4, (void)to, (void)middle;
@@ -71,4 +73,7 @@ def write_flow(source: FlowSource, scalars: ScalarFunctions) -> tuple[str, int]:
     """
     code = scalars.write_calls("flow", source.rates, ("t", "x", "w", "p"), {3})
     where = ", ".join(map(str, source.where))
-    return code.text + _TEXT.substitute(where=where, n=len(source.where), method=METHODS[source.method]), code.kept
+    step = _TEXT.substitute(
+        where=where, n=len(source.where), method=METHODS[source.method], left=(1.0 - left_of(1.0)).hex()
+    )
+    return code.text + step, code.kept

@@ -114,12 +114,12 @@ def write_lanes(
         text, kept = write_flow(flow, scalars)
         parts.append(text)
         prepare.append(f"vec kept_flow[AT_LEAST_1({kept})]; flow_prepare(p, kept_flow);")
-        states = "step_states(t0, t1, to, x, w, p, kept_flow);"
+        states = "step_states(t0, t1, x, w, p, kept_flow);"
     evaluate = f"switch (kind) {{ {' '.join(cases)} }}"
     parts += [
         f"#define TAKE_ROOM {' '.join(own)}\n",
         f"#define PREPARE {' '.join(prepare)}\n",
-        f"#define STEP_STATES(t0, t1, to) {states}\n",
+        f"#define STEP_STATES(t0, t1) {states}\n",
         f"#define STEP_PLANTS(t0, h) {' '.join(steps)}\n",
         f"#define EVALUATE(kind) {evaluate}\n",
         f"#define PLANTS_GO_ON(which, from) {' '.join(go_on)}\n",
@@ -167,8 +167,6 @@ class LaneCode:
         The library, which is loaded as long as this lives.
     starts : LaneStarts or None
         Functions of the start of runs; None if it can't be computed over vectors.
-    has_states : bool
-        Whether there are continuous states between ticks.
     room : Room
         Vectors of memory that it needs.
     """
@@ -180,7 +178,6 @@ class LaneCode:
     count: int
     library: ctypes.CDLL
     starts: LaneStarts | None = None
-    has_states: bool = False
     room: Room = Room(0, 0)
 
 
@@ -285,7 +282,7 @@ def _compile(
     run.restype = None
     starts = None if start is None else _bind_starts(library, start)
     kinds = {clocks: i for i, clocks in enumerate(acting)}
-    return LaneCode(run, kinds, plants, sizes, count, library, starts, flow is not None, room)
+    return LaneCode(run, kinds, plants, sizes, count, library, starts, room)
 
 
 def _check_size(function: Any) -> Any:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from ...blocks.core import left_of
 from .lane_code import LaneCode
 
 
@@ -29,8 +28,6 @@ class LaneStart:
         The entries of the log that are kept.
     messages : tuple of str
         What its start has told.
-    edges : ndarray of int
-        Ticks, by their places from 0 on, at which a source in continuous time is not smooth.
     """
 
     x: np.ndarray
@@ -41,7 +38,6 @@ class LaneStart:
     steps: tuple[float, ...]
     row: np.ndarray
     messages: tuple[str, ...] = ()
-    edges: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +84,6 @@ class LaneVectors:
         Longest step of each FMU's integrator in s.
     messages : list of tuple of str
         What the start of each run has told.
-    edges : list of ndarray
-        As `LaneStart` has them.
     """
 
     def __init__(self, code: LaneCode, columns: int):
@@ -99,7 +93,6 @@ class LaneVectors:
         self.row = make_room(columns, count)
         self.steps: tuple[float, ...] = ()
         self.messages: list[tuple[str, ...]] = []
-        self.edges: list[np.ndarray] = []
 
     @classmethod
     def of(cls, code: LaneCode, starts: Sequence[LaneStart]) -> LaneVectors:
@@ -110,7 +103,6 @@ class LaneVectors:
                 getattr(found, name)[:, lane] = getattr(start, name)
             found.plants[:, lane] = np.concatenate([np.zeros(0), *(start.plants[path] for path in code.plants)])
             found.messages.append(start.messages)
-            found.edges.append(start.edges)
         found.steps = starts[0].steps
         found.fill()
         return found
@@ -169,7 +161,7 @@ class LaneRuns:
         """Rows to be left out before the next one that is kept."""
         return int(self._structure.skip)
 
-    def run(self, times: np.ndarray, widths: np.ndarray, kinds: np.ndarray, rows: np.ndarray, first: int = 0) -> int:
+    def run(self, times: np.ndarray, widths: np.ndarray, kinds: np.ndarray, rows: np.ndarray) -> int:
         """Go through ticks, as `CompiledLoop.run` does; return the number of rows that were written.
 
         Parameters
@@ -182,20 +174,12 @@ class LaneRuns:
             Clocks that act at each of them, as numbers of the code.
         rows : ndarray, shape (m, columns, lanes)
             The memory for the rows, of `make_room`.
-        first : int
-            Place of the first of these ticks.
         """
-        ends = make_room(len(widths), self._code.count) if self._code.has_states else np.zeros(0)
-        if ends.size:
-            ends[:] = times[1:, None]
-            for lane, edges in enumerate(self._vectors.edges):
-                here = edges[(edges >= first) & (edges < first + len(widths))] - first
-                ends[here, lane] = [left_of(float(t)) for t in times[1 + here]]
         self._structure.rows = 0
         self._code.run(
             ctypes.byref(self._structure),
             ctypes.c_int64(len(widths)),
-            *(ctypes.c_void_p(vector.ctypes.data) for vector in (times, widths, kinds, ends, rows)),
+            *(ctypes.c_void_p(vector.ctypes.data) for vector in (times, widths, kinds, rows)),
         )
         return int(self._structure.rows)
 

@@ -4,6 +4,7 @@
    is told with the tick that it could not go beyond, and its lane goes on with the numbers of another one. */
 
 
+#include <float.h>
 
 typedef struct {
     int64_t every, skip;           /* one of so many rows is kept; rows to leave out before the next one */
@@ -35,8 +36,7 @@ static void keep_last(const lanes *l, mask which, const vec *log) {
 }
 
 VISIBLE void loopwright_lanes(lanes *l, int64_t count, const double *times, const double *widths, const int32_t *kinds,
-                              const double *ends, double *rows) {
-    (void)ends; /* vectors: times at the ends of ticks, where continuous states see sources from the left */
+                              double *rows) {
     TAKE_ROOM
     vec ok[1], t[1];
     mask alive, unsolved = {0};
@@ -47,12 +47,14 @@ VISIBLE void loopwright_lanes(lanes *l, int64_t count, const double *times, cons
     memcpy(p, l->p, sizeof(vec) * N_P);
     PREPARE
     for (int64_t i = 0; i < count; i++) {
-        STEP_STATES(times[i], times[i + 1], ((const vec *)ends)[i])
+        STEP_STATES(times[i], times[i + 1])
         STEP_PLANTS(times[i], widths[i])
         t[0] = splat(times[i + 1]);
         EVALUATE(kinds[i])
         l->ticks++;
-        mask bad = alive & (~(ok[0] != 0.0) | unsolved);
+        vec size = splat(0.0); /* an FMU that was built here is not done with a step if one of its outputs is no number */
+        for (int64_t j = 0; j < N_W; j++) size += vec_fabs(w[j]);
+        mask bad = alive & (~(ok[0] != 0.0) | ~(size <= DBL_MAX) | unsolved);
         if (__builtin_expect(any(bad), 0)) {
             alive &= ~bad;
             int from = -1;

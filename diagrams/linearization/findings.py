@@ -72,7 +72,7 @@ class MeanSlope(BlockFinding):
 @explain_calls
 @dataclass(frozen=True)
 class Kink(BlockFinding):
-    """A point at which the slopes to both sides differ, or the value jumps; the model has one of the slopes.
+    """A point at which the slopes to both sides differ, or the value jumps.
 
     Attributes
     ----------
@@ -80,17 +80,21 @@ class Kink(BlockFinding):
         Slopes to smaller and to larger values of the source, of the pair of entries that differs most.
     jump : float
         Change of the value at the point, 0 where it has none.
+    slope : float, optional
+        Slope of the model at the point: one of the two, or their mean, as of |u| at 0.
     """
 
     below: float
     above: float
     jump: float = 0.0
+    slope: float | None = None
 
     def __str__(self) -> str:
         where = f"{self.block}.{self.port} is at a kink of its dependence on {self.source!r}"
         if self.jump:
             return f"{where}: it jumps by {self.jump:.6g} there, and the model leaves the jump out"
-        return f"{where}: slope {self.below:.6g} below the point and {self.above:.6g} above; the model has one of them"
+        both = f"{where}: slope {self.below:.6g} below the point and {self.above:.6g} above"
+        return both if self.slope is None else f"{both}; the model has {self.slope + 0.0:.6g}"
 
 
 @explain_calls

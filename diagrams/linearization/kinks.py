@@ -17,7 +17,7 @@ that switch by events are looked at after the events that the change fires.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, TypeAlias
 
@@ -160,7 +160,8 @@ class _BlockAtPoint:
             source = self.slopes.columns.name_at(column)
             if source in self.slopes.columns.ports and source not in self.wired:
                 continue
-            for row, kink in self._find_kinks(column, f0, J0):
+            for row, kink in self._find_kinks(column, f0):
+                kink = replace(kink, slope=float(J0[row, column]))
                 key = self.slopes.rows.name_at(row), source
                 old = kinks.get(key)
                 if key not in steps and (old is None or _size_of(kink) > _size_of(old)):
@@ -207,7 +208,7 @@ class _BlockAtPoint:
 
     # --- kinks -------------------------------------------------------------------------------------------------------
 
-    def _find_kinks(self, column: int, f0: np.ndarray, J0: np.ndarray) -> Iterator[tuple[int, Kink]]:
+    def _find_kinks(self, column: int, f0: np.ndarray) -> Iterator[tuple[int, Kink]]:
         h = NEAR * self.span[column]
         by_values = self.slopes.is_opaque or self.slopes.is_large
         if by_values or any(self._moved(column, by)[1] for by in (h, -h)):

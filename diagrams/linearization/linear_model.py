@@ -17,7 +17,17 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ...blocks.core import Finding, LoopwrightError, OptionError, accepts, brief, count_of, explain_calls, kinds
+from ...blocks.core import (
+    Finding,
+    LoopwrightError,
+    NonFiniteError,
+    OptionError,
+    accepts,
+    brief,
+    count_of,
+    explain_calls,
+    kinds,
+)
 from ...fmus.running import Derivation, DerivativeMethod
 from ..flat import NONE, TickPattern, WiredDiagram
 from ..frequency import loop_class
@@ -292,12 +302,28 @@ def linearize(
     """Linearize a diagram; see `Diagram.linearize`."""
     check_options(diagram, options, "linearize")
     at = operating_point(diagram, point, options)
+    _refuse_lost(diagram, at)
     diagram = diagram.replace(at.parameters) if at.parameters else diagram  # parameters that a trim has found
     given = [as_list(names) for names in (inputs, outputs, openings)]
     diagram, at, ports = split_inputs(diagram, at, itertools.chain(*given))
     places = [[ports.get(name, name) for name in names] for names in given]
     made = _linearize(diagram, at, *places, plants=plants, stairs=stairs, step=options.get("step"))
     return replace(made, inputs=name_inputs(made.inputs, ports), outputs=name_inputs(made.outputs, ports))
+
+
+def _refuse_lost(diagram: WiredDiagram, at: OperatingPoint) -> None:
+    """Refuse a point at which an FMU's output is no number: a run may have one that nothing reads, a model may not."""
+    flat = diagram.flatten_like(at)
+    for name in flat.unread:
+        if name in at.values and not np.all(np.isfinite(at.values[name])):
+            path, port = flat.ports[name]
+            raise NonFiniteError(
+                f"found {np.ravel(at.values[name]).tolist()}; expected finite numbers, as a linear model has a row for "
+                "each output. Choose the FMU's ports without this one: ports=[…].",
+                block=path,
+                port=port,
+                t=at.t,
+            )
 
 
 def _linearize(

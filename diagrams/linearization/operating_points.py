@@ -11,7 +11,7 @@ import numpy as np
 
 from ...blocks.core import Layout, OptionError, UnknownArgumentError, accepts, kinds
 from ..flat import FlatDiagram, WiredDiagram
-from ..results import OperatingPoint, PointOrigin, Snapshot, layout_of
+from ..results import OperatingPoint, PointOrigin, Snapshot, layout_of, units_of
 
 if TYPE_CHECKING:
     from ..simulation import Simulation
@@ -63,6 +63,7 @@ def capture(simulation: Simulation, how: PointOrigin = PointOrigin.RUN) -> Opera
         coupling=simulation.coupling,
         coupling_order=simulation.coupling_order,
         exchanged={path: block.operating_point() for path, block in view.exchanged.items()},
+        units=units_of(simulation.diagram.blocks, (*view.plants, *view.exchanged)),
     )
     return with_residual(flat, point, view.x_next)
 
@@ -262,6 +263,7 @@ def copy_point(diagram: WiredDiagram, point: OperatingPoint, other: WiredDiagram
     """
     from ..simulation import copy_states
 
+    point.check_units(other.blocks, other.name)
     old = diagram.flatten_like(point)
     guess = operating_point(other, None, {} if other.has_base else {"step": point.base})
     flat = other.flatten_like(guess)

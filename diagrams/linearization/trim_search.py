@@ -30,6 +30,7 @@ from ..flat import (
     rates,
     trace_schedule,
 )
+from ..frequency import first_largest
 from ..results import FreeDirection, OperatingPoint, PointOrigin
 from .checks import check_slopes
 from .exchanged import evaluators_at
@@ -272,20 +273,36 @@ def find_free_directions(equations: _Equations, unknown: np.ndarray) -> tuple[Fr
     scaled = scaled / np.maximum(np.max(np.abs(scaled), axis=1, initial=0.0), 1e-300)[:, None]
     _, values, rows = np.linalg.svd(scaled)
     rank = int(np.sum(values > UNDETERMINED * max(1.0, float(values.max(initial=0.0)))))
-    basis = rows[rank:] * sizes
-    for k in range(len(basis)):
-        pivot = int(np.argmax(np.abs(basis[k] / sizes)))
-        basis[k] = basis[k] / basis[k, pivot]
-        others = [i for i in range(len(basis)) if i != k]
-        basis[others] -= np.outer(basis[others, pivot], basis[k])
+    basis = _make_basis(rows[rank:]) * sizes
     names = [equations.unknown_names[i] for i in moves]
     found = []
     for direction in basis:
-        share = direction / direction[np.argmax(np.abs(direction))]
+        share = direction / direction[first_largest(np.abs(direction))]
         entries = [(n, round(float(v), 12)) for n, v in zip(names, share, strict=True) if abs(v) > 1e-9 and n]
         if entries:
             found.append(FreeDirection(tuple(sorted(entries, key=lambda e: (-abs(e[1]), e[0])))))
     return tuple(sorted(found, key=lambda f: f.entries[0][0]))
+
+
+def _make_basis(rows: np.ndarray) -> np.ndarray:
+    """Return the basis of a space in which each row has a column of its own, 1 there and 0 in the others.
+
+    Singular vectors of one value may be turned against each other. The columns are chosen by their lengths in the
+    space, which a turn leaves as they are.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (m, n)
+        Orthonormal rows.
+    """
+    pivots: list[int] = []
+    rest = rows.copy()
+    for _ in range(len(rows)):
+        lengths = np.linalg.norm(rest, axis=0)
+        pivots.append(first_largest(lengths))
+        axis = rest[:, pivots[-1]] / lengths[pivots[-1]]
+        rest = rest - np.outer(axis, axis @ rest)
+    return np.asarray(np.linalg.solve(rows[:, pivots], rows))
 
 
 def trim(

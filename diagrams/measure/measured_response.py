@@ -16,16 +16,18 @@ a held signal then cuts no loop: there is no L.
 
 **Procedure.** The signal is ramped in over a window. Windows of whole periods follow, until the phasors of two of them
 agree, their distance is noise (it has stopped falling), or the largest number of windows is reached. Offset and drift
-are subtracted. The last window gives the result.
+are subtracted. The last window gives the result; where the distance is noise, the mean of the windows since then.
 The rest beside the lines is the distortion, a sign of an amplitude that leaves the linear range.
 
 **Uncertainty.** Three estimates are added up:
 
-- the distance of the last two windows: settling; where it is noise, the largest one of the last three;
-- twice the distance to a second measurement, with half the amplitude, the frequencies in reverse order, and a solver
-  tolerance ten times smaller: nonlinearity, drift, and the solver's error;
+- the distance of the last two windows: settling; where it is noise, what the scatter of the windows makes of their mean
+  in 95 % of all measurements;
+- twice the distance to a second measurement, beyond the noise of both, with half the amplitude, the frequencies in
+  reverse order, and a solver tolerance ten times smaller: nonlinearity, drift, and the solver's error;
 - the movement of the operating point from before the test signal to after it, less a uniform drift such as that of an
-  angle at constant speed. A movement of more than 1e-3 refutes the measurement: the uncertainty is infinite.
+  angle at constant speed, and less what noise that was seen explains. A movement of more than 1e-3 refutes the
+  measurement: the uncertainty is infinite.
 """
 
 from __future__ import annotations
@@ -87,7 +89,8 @@ class FrequencyResponse:
     windows : (K,) ndarray of int
         Number of windows.
     settled : (K,) ndarray of bool
-        Whether the phasors of the last two windows agreed, at an operating point that has not moved.
+        Whether the phasors of the last two windows agreed, or differ by noise that leaves an error of at most 10 %, at
+        an operating point that has not moved.
     moved : float
         Drift of the operating point: the largest change of a block's state or an FMU's output, from before the test
         signal to a window after its end, relative to 1 + its size.

@@ -14,6 +14,16 @@ from .waveforms import Part, compute_phasors
 
 MOVED = 1e-3
 """Movement of the operating point, relative to 1 + the size of a state, that refutes a measurement."""
+SHARE = 0.95
+"""Share of the measurements with noise whose error is at most what the noise adds to the uncertainty."""
+SWAMPED = 0.1
+"""Relative error by noise beyond which a line is not measured."""
+WANDERS = 10.0
+"""Movement of a state that noise explains, in standard deviations, of which few samples give an estimate only."""
+LIKE = 3.0
+"""Ratio of two distances of windows that both are noise."""
+PARTS = 8
+"""Parts of the last window, at whose ends the scatter of the states is looked at."""
 FINER = 0.1
 """Factor of the solver's tolerances in the second measurement."""
 
@@ -26,6 +36,8 @@ class Measurement:
         self.y = np.zeros((outputs, n, lines), complex)
         self.uncertainty, self.distortion = np.zeros(lines), np.zeros(lines)
         self.windows, self.settled = np.zeros(lines, int), np.ones(lines, bool)
+        self.noise = np.zeros((2, lines))
+        """Relative errors of v and u by noise; 0 where two windows agree."""
         self.moved, self.unexpected, self.held = 0.0, 0.0, True
         self.largest = np.inf
         """Size above which a signal shows that the diagram is not stable."""
@@ -33,22 +45,29 @@ class Measurement:
     def note_movement(self, run: InjectionRun, before: np.ndarray, began: float, samples: int, every: int) -> None:
         """Note the change of the states since the time ``began`` in s, and its part that is no uniform drift.
 
-        The drift is that of one more window, without a test signal.
+        The drift is that of one more window, without a test signal. Where noise was seen, a state that scatters in that
+        window has moved only as far as its scatter does not explain.
         """
         here, elapsed = run.read_states(), run.t - began
         size, t = 1.0 + np.abs(before), run.t
-        run.go(samples, every)
-        drift = (run.read_states() - here) * elapsed / (run.t - t)
+        ends = np.unique(np.linspace(0, samples, PARTS + 1).astype(int))
+        seen = [here]
+        for count in np.diff(ends):
+            run.go(int(count), every)
+            seen.append(run.read_states())
+        drift = (seen[-1] - here) * elapsed / (run.t - t)
         change = np.abs(here - before)
         beyond = np.minimum(change, np.abs(here - before - drift))
+        if self.noise.any():
+            beyond = np.maximum(0.0, beyond - WANDERS * _scatter(ends, np.array(seen)))
         self.moved = max(self.moved, float(np.max(change / size, initial=0.0)))
         self.unexpected = max(self.unexpected, float(np.max(beyond / size, initial=0.0)))
 
     def compare(self, other: Measurement) -> None:
-        """Add twice the relative distance to a second measurement to the uncertainty."""
-        for mine, theirs in ((self.v, other.v), (self.u, other.u)):
+        """Add twice the relative distance to a second measurement, beyond the noise of both, to the uncertainty."""
+        for mine, theirs, noise in zip((self.v, self.u), (other.v, other.u), self.noise + other.noise, strict=True):
             distance, size = (np.linalg.norm(m, axis=(0, 1)) for m in (mine - theirs, mine))
-            self.uncertainty += 2.0 * distance / np.where(size > 0.0, size, 1.0)
+            self.uncertainty += 2.0 * np.maximum(0.0, distance / np.where(size > 0.0, size, 1.0) - noise)
 
     def refute_moved(self) -> None:
         """Add the movement of the operating point to the uncertainty, which it makes infinite if it is large."""
@@ -95,18 +114,56 @@ def _is_noise(errors: Sequence[np.ndarray], agreement: float) -> bool:
     return bool(np.all((lately >= 0.9 * before) | (errors[-1] <= agreement)))
 
 
+def _begin_of_noise(errors: Sequence[np.ndarray], noisy: np.ndarray) -> int:
+    """Return the first window, of at least four, from which on distances are of the size of the last three.
+
+    The first two are left out in any case: the response may still be coming to rest in them.
+    """
+    level = LIKE * np.max(errors[-3:], axis=0)
+    falling = [k for k in range(1, len(errors) - 3) if np.any((errors[k] > level) & noisy)]
+    return max(2, falling[-1] if falling else 0)
+
+
+def _scatter(at: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of each column about its straight line."""
+    if len(at) < 4:
+        return np.zeros(values.shape[1])
+    line = np.column_stack([np.ones(len(at)), at / at[-1]])
+    rest = values - line @ np.linalg.lstsq(line, values)[0]
+    return np.asarray(np.sqrt(np.sum(rest**2, axis=0) / (len(at) - 2)))
+
+
+def _find_noise(phasors: np.ndarray) -> np.ndarray:
+    """Return the error of the mean of windows by noise, by line, that `SHARE` of all means keep.
+
+    Of m complex normal values, |mean − true|² over Σ|value − mean|²/(m (m − 1)) is F-distributed with 2 and 2 (m − 1)
+    degrees of freedom, whose quantile is (m − 1) ((1 − share)^(−1/(m − 1)) − 1).
+
+    Parameters
+    ----------
+    phasors : (m, lines, entries) ndarray
+        Phasors of the windows.
+    """
+    m = len(phasors)
+    quantile = (m - 1) * ((1.0 - SHARE) ** (-1.0 / (m - 1)) - 1.0)
+    squares = np.sum(np.abs(phasors - np.mean(phasors, axis=0)) ** 2, axis=(0, 2))
+    return np.asarray(np.sqrt(quantile * squares / (m * (m - 1))))
+
+
 def measure_part(
     run: InjectionRun, part: Part, entry: int, j: int, every: int, windows: int, agreement: float,
     found: Measurement, i: int,
 ) -> None:  # fmt: skip
     """Play part i of the test signal at one entry until two windows agree; write the last one's phasors to ``found``.
 
+    Where the distance of windows is noise, which falls no further, the mean of the windows since then is written.
+
     ``j`` is the entry's place among the injected ones.
     """
     n = part.samples
     run.play(part.waveform, entry, ramp=n * every * float(run.flat.base))
     run.go(n, every)
-    last, count, errors = None, 0, [np.full(len(part.lines), np.inf)]
+    last, count, errors, all_windows = None, 0, [np.full(len(part.lines), np.inf)], []
     while count < windows and not np.all(errors[-1] <= agreement) and not _is_noise(errors, agreement):
         v, u, y = run.record(n, every)
         _check_size(run, part, v, found.largest)
@@ -120,8 +177,18 @@ def measure_part(
                 error += change / np.where(size > 0.0, size, 1.0)
             errors.append(error)
         last = here
+        all_windows.append(here)
     assert last is not None
-    error = np.max(errors[-3:], axis=0) if _is_noise(errors, agreement) else errors[-1]
+    error, noise = errors[-1], np.zeros((2, len(part.lines)))
+    noisy = (errors[-1] > agreement) & _is_noise(errors, agreement)
+    if noisy.any():
+        some = np.array(all_windows[_begin_of_noise(errors, noisy) :])
+        mean = np.mean(some, axis=0)
+        for k, columns in enumerate((slice(0, m), slice(m, 2 * m))):
+            size = np.linalg.norm(mean[:, columns], axis=1)
+            noise[k] = np.where(noisy, _find_noise(some[:, :, columns]) / np.where(size > 0.0, size, 1.0), 0.0)
+        last = np.where(noisy[:, None], mean, last)
+        error = np.where(noisy, np.sum(noise, axis=0), error)
     found.held &= run.held
     where = slice(i, i + 1) if found.v.shape[2] > len(part.lines) else slice(None)
     d = last[:, m + j] - last[:, j]  # u − v at the entry where it was added
@@ -130,4 +197,5 @@ def measure_part(
     found.uncertainty[where] = np.maximum(found.uncertainty[where], error)
     found.distortion[where] = np.maximum(found.distortion[where], rest)
     found.windows[where] = np.maximum(found.windows[where], count)
-    found.settled[where] &= errors[-1] <= agreement
+    found.settled[where] &= (errors[-1] <= agreement) | (noisy & (error <= SWAMPED))
+    found.noise[:, where] = np.maximum(found.noise[:, where], noise)

@@ -28,6 +28,7 @@ from ..linearization import (
 )
 from ..results import PointOrigin
 from .injection import InjectionRun, inject_signal
+from .step_measures import ExpectedStep
 
 SAMPLES = 1000
 """Samples of the response of a diagram that is not sampled."""
@@ -37,6 +38,12 @@ SLOWEST = 1e-6
 """Poles slower than that, relative to the fastest, are taken as integrators that nothing feeds back."""
 CONSTANTS = 40.0
 """Time constants of the slowest other pole after which a linear model rests."""
+FINER = 6
+"""Halvings of a sample time within which the largest value between two samples is looked for."""
+FINEST = 40
+"""Halvings of it right behind a sample, where a fast mode has decayed before the next one."""
+DOUBLED = 200
+"""Samples after the record for which a linear model is looked at before their distance is doubled."""
 CHUNK = 500
 """Samples between two looks at a signal's growth."""
 LONG = 2000
@@ -79,6 +86,15 @@ class StepResponse:
         times in the period of all clocks.
     final : (1 + K,) ndarray, optional
         Values that the linear model's v and outputs come to, NaN where they don't rest; None without a prediction.
+    later : (2, 1 + K) ndarray, optional
+        Smallest and largest values of the linear model's v and outputs after the record; None without a prediction.
+    between : (1 + K,) ndarray, optional
+        Largest size of the linear model's v and outputs between the samples, less that at the samples; 0 where the
+        model is sampled. None without a prediction.
+    steady : (1 + K,) ndarray of bool, optional
+        Whether v and the outputs are held between the samples; without it as ``held`` says of v, and no output is.
+    solved : bool
+        Whether a solver of variable step has a part in it, whose error is more than rounding.
     """
 
     wire: str
@@ -95,6 +111,10 @@ class StepResponse:
     held: bool
     prediction: np.ndarray | None
     final: np.ndarray | None = None
+    later: np.ndarray | None = None
+    between: np.ndarray | None = None
+    steady: np.ndarray | None = None
+    solved: bool = False
 
     def __repr__(self) -> str:
         facts = (
@@ -131,6 +151,18 @@ class StepResponse:
         if self.final is None:
             return math.nan
         return float(self.final[1] if to_output else -self.final[0]) / self.size
+
+    def expected(self, column: int, unit: float = 1.0, since: int = 0) -> ExpectedStep | None:
+        """Return the linear model's v (column 0) or output (1, …) in a unit, from a sample on; None without one."""
+        if self.prediction is None or self.final is None or self.later is None or self.between is None:
+            return None
+        low, high = sorted(float(x) / unit for x in self.later[:, column])
+        final, between = float(self.final[column]) / unit, float(self.between[column]) / abs(unit)
+        return ExpectedStep(self.prediction[since:, column] / unit, final, low, high, between)
+
+    def is_steady(self, column: int) -> bool:
+        """Return whether v (0) or an output (1, …) is held between the samples, so that no peak lies between them."""
+        return bool(self.steady[column]) if self.steady is not None else self.held and column == 0
 
 
 def step_response(
@@ -236,38 +268,104 @@ def step_response(
     if not sampled:
         d = np.full(len(t), size)
     moved = float(np.max(np.abs(rest - rest[0]) / (1.0 + np.abs(rest[0])), initial=0.0))
+    prediction: np.ndarray | None = None
+    final: np.ndarray | None = None
+    later: np.ndarray | None = None
+    between: np.ndarray | None = None
     try:
         if wait:
             raise OptionError("the wire is renewed off the period. Measure another one.", port=wire)
         if slow > 1:
             raise OptionError("the wire is renewed within the model's period. Measure another one.", port=wire)
         model = linearize(variant, point, inputs=[wire], outputs=[wire, *names], stairs=stairs)
-        prediction, final = predict(model, d, t), size * find_final(model)
+        prediction, later, between = predict(model, d, t)
+        final = size * find_final(model)
     except LoopwrightError:
-        prediction, final = None, None
+        pass
     labels = tuple(label for tap in taps for label in tap.labels)
     is_held = bool(held) and steady and not _follows_states(flat, signal.port)
+    columns = [is_held]
+    for tap in taps:
+        renewed = ticks_between_renewals(flat, [tap.port]) if sampled and not _follows_states(flat, tap.port) else None
+        columns += [renewed is not None and renewed % every == 0 and not wait] * len(tap.labels)
     return StepResponse(
         wire, float(size), t, d, change[:, 0], labels, change[:, 1:], rest[0, 1:], float(rest[0, 0]),
         moved, float(period), is_held,
-        prediction, final,
+        prediction, final, later, between, np.array(columns), flat.hybrid,
     )  # fmt: skip
 
 
-def predict(model: Linearization, d: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return the outputs of a linear model with one input d: sampled as it is, or held from the first sample on."""
+def predict(model: Linearization, d: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the outputs of a linear model with one input d: sampled as it is, or held from the first sample on.
+
+    Returns
+    -------
+    rows : (N, K) ndarray
+        Outputs at the samples.
+    later : (2, K) ndarray
+        Smallest and largest outputs after the last sample, with d held at its last value.
+    between : (K,) ndarray
+        Largest size of the outputs between the samples, less that at the samples; 0 of a sampled model.
+    """
+    C, D, n = model.C, model.D[:, 0], len(model.A)
+    h = float(t[1] - t[0])
+    one = _advance_by(model, h)
+    z, states = np.zeros(n + 1), np.zeros((len(d), n + 1))
+    for k, value in enumerate(d):
+        z[n] = value
+        states[k] = z
+        z = one @ z
+    rows = states[:, :n] @ C.T + np.outer(d, D)
+    later = _find_extremes(model, one, z, h)
+    between = np.zeros(len(C))
+    if not model.dt:
+        size = np.max(np.abs(rows), axis=0)
+        moves = [_advance_by(model, h * 0.5**k) for k in range(FINER + 2, FINEST, 2)]  # powers of one lose digits
+        part = whole = _advance_by(model, h * 0.5**FINER)
+        for _ in range(2**FINER - 1):
+            moves.append(part)
+            part = whole @ part
+        for move in moves:
+            inside = states @ (C @ move[:n]).T + np.outer(d, D)
+            between = np.maximum(between, np.max(np.abs(inside), axis=0) - size)
+    return rows, later, between
+
+
+def _advance_by(model: Linearization, h: float) -> np.ndarray:
+    """Return the matrix that takes (x, d) of a linear model h seconds further with d held, or by its sample time."""
     from scipy.linalg import expm
 
-    A, B, C, D = model.A, model.B, model.C, model.D
-    if not model.dt:
-        n, h = len(A), float(t[1] - t[0])
-        both = expm(np.block([[A, B], [np.zeros((1, n + 1))]]) * h)
-        A, B = both[:n, :n], both[:n, n:]
-    x, rows = np.zeros(len(A)), []
-    for value in d:
-        rows.append(C @ x + D[:, 0] * value)
-        x = A @ x + B[:, 0] * value
-    return np.array(rows)
+    A, B, n = model.A, model.B[:, :1], len(model.A)
+    if model.dt:
+        return np.block([[A, B], [np.zeros((1, n)), np.ones((1, 1))]])
+    return np.asarray(expm(np.block([[A, B], [np.zeros((1, n + 1))]]) * h))
+
+
+def _find_extremes(model: Linearization, one: np.ndarray, z: np.ndarray, h: float) -> np.ndarray:
+    """Return the smallest and the largest outputs of a linear model from (x, d) = z on, until it rests.
+
+    After every `DOUBLED` samples, which are h seconds apart at first, their distance is doubled: what decays slowly is
+    looked at as long as it lasts.
+    """
+    n, low, high = len(model.A), np.full(len(model.C), np.inf), np.full(len(model.C), -np.inf)
+    slowest, elapsed = float(np.min(_find_rates(model), initial=np.inf)), 0.0
+    with np.errstate(all="ignore"):
+        while not elapsed * slowest > CONSTANTS:
+            for _ in range(DOUBLED):
+                y = model.C @ z[:n] + model.D[:, 0] * z[n]
+                low, high = np.minimum(low, y), np.maximum(high, y)
+                z = one @ z
+            elapsed, h, one = elapsed + DOUBLED * h, 2.0 * h, one @ one
+    return np.stack([low, high])
+
+
+def _find_rates(model: Linearization) -> np.ndarray:
+    """Return how fast the modes of a linear model decay or grow, in 1/s; those slower than `SLOWEST` are left out."""
+    poles = np.linalg.eigvals(model.A)
+    with np.errstate(divide="ignore"):
+        rates = np.abs(np.log(np.abs(poles)) / model.dt if model.dt else poles.real)
+    rates = np.minimum(rates, np.pi / model.dt) if model.dt else rates
+    return np.asarray(rates[rates > SLOWEST * np.max(rates, initial=0.0)])
 
 
 def find_final(model: Linearization) -> np.ndarray:
@@ -276,21 +374,11 @@ def find_final(model: Linearization) -> np.ndarray:
     They are those after many time constants of its slowest pole; poles slower than `SLOWEST` of the fastest stay where
     they are.
     """
-    from scipy.linalg import expm
-
-    A, B, C, D, n = model.A, model.B[:, :1], model.C, model.D[:, 0], len(model.A)
-    poles = np.linalg.eigvals(A)
-    with np.errstate(divide="ignore"):
-        rates = np.abs(np.log(np.abs(poles)) / model.dt if model.dt else poles.real)
-    rates = np.minimum(rates, np.pi / model.dt) if model.dt else rates
-    rates = rates[rates > SLOWEST * np.max(rates, initial=0.0)]
+    C, D, n, rates = model.C, model.D[:, 0], len(model.A), _find_rates(model)
     if not rates.size:
         return np.asarray(D, dtype=float)
-    h = model.dt or 0.1 / float(np.max(np.abs(poles)))
-    if model.dt:
-        M = np.block([[A, B], [np.zeros((1, n)), np.ones((1, 1))]])
-    else:
-        M = expm(np.block([[A, B], [np.zeros((1, n + 1))]]) * h)
+    h = model.dt or 0.1 / float(np.max(np.abs(np.linalg.eigvals(model.A))))
+    M = _advance_by(model, h)
     doublings = max(1, math.ceil(math.log2(CONSTANTS / float(np.min(rates)) / h)))
     for _ in range(doublings):
         M = M @ M

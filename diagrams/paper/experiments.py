@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path as File
@@ -163,7 +164,7 @@ def _plant(letter: str, options: Mapping[str, Any], given: Collection[str], posi
     place = plant.output_variables["position"].name
     start: dict[str, Any] = {}
     if variables[place].start is not None:
-        start[place] = position
+        start |= plant.start_of("position", position, "m")
     elif not plant.start:
         raise OptionError(
             f"its {place} is computed and can't be set to ({position[0]:g}, {position[1]:g}) m, where experiment "
@@ -172,7 +173,7 @@ def _plant(letter: str, options: Mapping[str, Any], given: Collection[str], posi
             block=f"experiment {letter}",
             port="plant",
         )
-    for name in ("coulomb_scale", "viscous_scale", "friction_width"):
+    for name, unit in (("coulomb_scale", "1"), ("viscous_scale", "1"), ("friction_width", "m/s")):
         if own and (name not in given or (name not in variables and options[name] == DEFAULTS[name])):
             continue
         if name not in variables:
@@ -182,13 +183,18 @@ def _plant(letter: str, options: Mapping[str, Any], given: Collection[str], posi
                 block=f"experiment {letter}",
                 port=name,
             )
-        if name in plant.start and float(plant.start[name]) != options[name]:
+        entry = plant.start_of(name, options[name], unit)
+        value = float(entry[name])
+        # a converted number may differ in its last bits from the same one that was written in the FMU's unit
+        if name in plant.start and not math.isclose(float(plant.start[name]), value, rel_tol=1e-12):
+            unit = f" {variables[name].unit}" if variables[name].unit not in (None, "1") else ""
             raise OptionError(
-                f"found {options[name]:g}, and {float(plant.start[name]):g} in the plant's start values; give it once.",
+                f"found {value:g}{unit}, and {float(plant.start[name]):g}{unit} in the plant's start values; give it "
+                "once.",
                 block=f"experiment {letter}",
                 port=name,
             )
-        start[name] = options[name]
+        start |= entry
     if not own:
         start["internal_step"] = _internal_step(options["friction_width"])
     return plant.replace(start={**start, **plant.start})

@@ -7,7 +7,6 @@ import os
 from collections.abc import Mapping
 from fractions import Fraction
 from numbers import Real
-from pathlib import Path as File
 from types import MappingProxyType
 from typing import Any
 
@@ -100,7 +99,7 @@ def merge(letter: str, duration: float, given: Mapping[str, Any], **own: Any) ->
         raise refuse("admittance_method", "'exact' or 'semi_implicit'")
     if not isinstance(options["path"], Path):
         raise refuse("path", "a path, such as Ellipse(…)")
-    if isinstance(options["plant"], str | os.PathLike) and File(options["plant"]).expanduser().is_dir():
+    if isinstance(options["plant"], str | os.PathLike) and os.path.isdir(os.path.expanduser(options["plant"])):
         raise OptionError(
             f"{str(options['plant'])!r} is a folder; expected an FMU, a file that ends in .fmu. Name the file.",
             block=f"experiment {letter}",

@@ -119,13 +119,19 @@ class Fig3Case(Case):
             return base
         try:
             first = [float(np.ravel(here.point.values[f"{name}.y"])[0]) for name in REFERENCES]
-            found = base.replace({f"{PLANT}.start.position": self.path.to_plane(*first)})
+            found = base.replace(self._placed(*first))
         except (LoopwrightError, KeyError):
             return base
         if not Variant("", "", found, None, Implementation.SAMPLED).rests:
             return base
         self.notes.append(TEXTS.line("starts_elsewhere", eta=first[0], xi=first[1]))
         return found
+
+    def _placed(self, eta: float, xi: float) -> dict[str, Any]:
+        """Return the change of the diagram that starts its plant at a point beside the path, η and ξ in m."""
+        position = self.path.to_plane(eta, xi)
+        start = {"position": position} if self.plant is None else self.plant.start_of("position", position, "m")
+        return {f"{PLANT}.start.{name}": value for name, value in start.items()}
 
     # --- the plant ----------------------------------------------------------------------------------------------------
 
@@ -247,7 +253,7 @@ class Fig3Case(Case):
         """Return a variant at rest at another point beside the path, made once; None where it is not at rest there."""
         known = self._elsewhere.setdefault(variant, {})
         if (eta, xi) not in known:
-            changes: dict[str, Any] = {f"{PLANT}.start.position": self.path.to_plane(eta, xi)}
+            changes = self._placed(eta, xi)
             for name, value in zip(REFERENCES, (eta, xi), strict=True):
                 changes[name] = Reference(value, unit="m", name=name)
             try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -24,9 +25,10 @@ from ...blocks import (
     TransverseTransform,
     UnitDelay,
 )
-from ...blocks.core import ShapeError, UnknownNameError, explain_calls
+from ...blocks.core import Input, Output, ShapeError, UnknownNameError, explain_calls
 from ...fmus import Fmu
 from ...fmus.models import gantry
+from ...fmus.running import suggest_names
 from ..wiring import subsystem
 
 POLES_PAR, POLES_PERP = (-20.0,) * 3, (-40.0,) * 3
@@ -182,12 +184,21 @@ def check_plant(plant: Fmu) -> None:
     def listed(names: Mapping[str, str]) -> str:
         return ", ".join(f"{name} [2] in {unit}" for name, unit in names.items())
 
+    suggested = suggest_names(
+        plant,
+        {n: Input(shape=(2,), unit=unit, name=n) for n, unit in INPUTS.items()},
+        {n: Output(shape=(2,), unit=unit, name=n) for n, unit in OUTPUTS.items()},
+    )
+    rename = {**plant.rename, **suggested} if suggested else {"name in the FMU": "position"}
+    one = "=".join(next(iter(rename.items())))
+    scalars = any("[" in new for new in suggested.values())
     found = f"it has no {', no '.join(missing)}" if missing else f"it has {', '.join(wrong)}"
     raise (UnknownNameError if missing else ShapeError)(
         f"{found}. Fig. 3 needs a plant with the inputs {listed(INPUTS)}, and the outputs {listed(OUTPUTS)}; "
         f"{listed(OPTIONAL)} is optional (axes y and z). This one has the inputs {', '.join(inputs) or '(none)'}, "
-        f"and the outputs {', '.join(outputs) or '(none)'}. Where only a name differs, give it "
-        "the expected one, in Python: Fmu(file, rename={'name in the FMU': 'position'}).",
+        f"and the outputs {', '.join(outputs) or '(none)'}. Where only a name differs"
+        f"{', or scalars are its elements' * scalars}, give it the expected one, in Python: "
+        f"Fmu(file, rename={rename!r}). On the command line: --rename {shlex.quote(one)}, once for each.",
         block=plant.label,
     )
 

@@ -15,7 +15,7 @@ from .. import report_figures as figures
 from ..flat import WiredDiagram
 from ..frequency import Confirmation, Number, Realization
 from ..linearization import find_signal
-from ..measure import NONE, StepResponse, is_at_rest, measure_step, step_response
+from ..measure import StepResponse, is_at_rest, measure_step, step_response
 from ..report_writing import Plot, Section, Table, Texts
 from ..requirements import StepLimits
 from .case import Case
@@ -33,14 +33,16 @@ SAMPLES = (100, 20000)
 """Fewest and most samples of a run."""
 ROUNDING = 1e-12
 """Size of rounding errors, relative to the largest signal."""
+SOLVER_ERROR = 1e-7
+"""Error of a response that a solver had a part in, relative to its largest change; 100 times its relative tolerance."""
+TICK_ERROR = 1e-9
+"""That of one that was computed at ticks alone."""
 AGREEMENT = 0.01
 """Difference of co-simulation and linear model, relative to the largest change, up to which they agree."""
 SIZE = 100.0
 """Size of a step, in amplitudes of the injection check, where none is given."""
 SLOWEST = 1e-6
 """Poles slower than that, relative to the fastest, are taken as integrators that nothing feeds back."""
-OF_SETTLED = ("final", "overshoot", "settling", "rise")
-"""Numbers of a response that has settled."""
 NAMES: Mapping[str, str] = {
     "overshoot": "overshoot",
     "settling": "settling time, 2 %",
@@ -89,24 +91,25 @@ def steps(case: Case) -> Section | None:
             continue
         for test in step_tests(case, v):
             try:
-                got = _run(case, v, test)
+                ran = _run(case, v, test)
             except LoopwrightError as error:
                 text.append(TEXTS.line("failed", variant=v.title, wire=test.wire, message=str(error)))
                 continue
-            if got is None:
+            if ran is None:
                 continue
+            got, slowest = ran
             where = f"{test.key}.{v.key}"
-            own = _numbers(got, test, v)
+            own = _numbers(got, test, v, slowest)
             numbers |= {f"{where}.{name}": number for name, number in own.items()}
             for name, said in NAMES.items():
                 linear = own.get(f"linear.{name}")
                 if name != "peak":
                     rows.append((_said(test), v.title, said, own[name], linear))
             saturated = _limits_reached(v.diagram, got)
-            for name, before, change in _effort(got, test):
+            for name, before, change, off in _effort(got, test, slowest):
                 key = f"effort.{name.replace('.', '_')}"
                 unit = _unit(v.diagram, name)
-                numbers[f"{where}.{key}"] = Number(change, unit, 1e-9 * abs(change), _how(got))
+                numbers[f"{where}.{key}"] = Number(change, unit, off, _how(got))
                 at_first = Number(before, unit, 1e-9 * abs(before), "the run before the step", given=True)
                 effort.append((_said(test), v.title, name, at_first, numbers[f"{where}.{key}"]))
             text += [TEXTS.line("saturated", variant=v.title, wire=test.wire, blocks=saturated)] if saturated else []
@@ -132,8 +135,11 @@ def _said(test: StepTest) -> str:
     return f"{test.wire} → {test.output}" if test.output else test.wire
 
 
-def _run(case: Case, v: Variant, test: StepTest) -> StepResponse | None:
-    """Return a response; None at a wire with several entries, which has no single step."""
+def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | None] | None:
+    """Return a response and the rate of its slowest mode in 1/s, None if it has none.
+
+    None at a wire with several entries, which has no single step.
+    """
     try:
         plan = case.excitation(v, test.wire)
         poles = _poles(v, test)
@@ -146,7 +152,8 @@ def _run(case: Case, v: Variant, test: StepTest) -> StepResponse | None:
     limits = test.limits
     dt = v.model.dt or 0.0
     s = poles[np.abs(poles.real) > SLOWEST * np.max(np.abs(poles), initial=0.0)]
-    length = TIME_CONSTANTS / float(np.min(np.abs(s.real))) if s.size else 1.0
+    slowest = float(np.min(np.abs(s.real))) if s.size else None
+    length = TIME_CONSTANTS / slowest if slowest else 1.0
     if limits is not None:
         ends = [limits.limits[name].high for name in ("settling", "rise") if name in limits.limits]
         length = max([length, *(BEYOND * end for end in ends if math.isfinite(end))])
@@ -156,10 +163,11 @@ def _run(case: Case, v: Variant, test: StepTest) -> StepResponse | None:
         length = limits.length
     size = SIZE * plan.amplitude if limits is None or limits.size is None else limits.size
     outputs = [*([test.output] if test.output else []), *_commands(v.diagram, test.wire), *_excesses(v.diagram)]
-    return step_response(
+    got = step_response(
         plan.variant.diagram, test.wire, size=size, length=length, at=plan.variant.point, outputs=outputs,
         stairs=v.stairs,
     )  # fmt: skip
+    return got, slowest
 
 
 def _poles(v: Variant, test: StepTest) -> np.ndarray | None:
@@ -207,15 +215,31 @@ def _limits_reached(diagram: WiredDiagram, got: StepResponse) -> list[str]:
     return reached
 
 
-def _effort(got: StepResponse, test: StepTest) -> Iterator[tuple[str, float, float]]:
+def _effort(got: StepResponse, test: StepTest, slowest: float | None) -> Iterator[tuple[str, float, float, float]]:
+    """Yield signals with their values before the step, their largest changes, and the errors of these."""
     if not test.output:
-        yield test.wire, _rounded(got.wire_before, 1.0), float(np.max(np.abs(got.v)))
+        change, error = _largest(got, 0, slowest)
+        yield test.wire, _rounded(got.wire_before, 1.0), change, error
     for i, name in enumerate(got.outputs):
         plain = name.partition("[")[0]
         if plain.rpartition(".")[2] != "excess":
             largest = float(np.max(np.abs(got.before)))
-            change = _rounded(float(np.max(np.abs(got.y[:, i]))), max(largest, float(np.max(np.abs(got.y)))))
-            yield name, _rounded(float(got.before[i]), largest), change
+            change, error = _largest(got, 1 + i, slowest)
+            change = _rounded(change, max(largest, float(np.max(np.abs(got.y)))))
+            yield name, _rounded(float(got.before[i]), largest), change, error
+
+
+def _largest(got: StepResponse, column: int, slowest: float | None) -> tuple[float, float]:
+    """Return the largest change of v (column 0) or of an output, and its error, with the rounding of two runs."""
+    r, before = (got.v, got.wire_before) if column == 0 else (got.y[:, column - 1], got.before[column - 1])
+    value, tolerance = measure_step(
+        got.t, r, held=got.is_steady(column), expected=got.expected(column), slowest=slowest, accuracy=_accuracy(got)
+    )["peak"]
+    return value, tolerance + ROUNDING * abs(float(before))
+
+
+def _accuracy(got: StepResponse) -> float:
+    return SOLVER_ERROR if got.solved else TICK_ERROR
 
 
 def _unit(diagram: WiredDiagram, name: str) -> str:
@@ -232,31 +256,27 @@ def _rounded(value: float, size: float) -> float:
     return 0.0 if abs(value) <= ROUNDING * max(size, 1e-300) else value
 
 
-def _numbers(got: StepResponse, test: StepTest, v: Variant) -> dict[str, Number]:
+def _numbers(got: StepResponse, test: StepTest, v: Variant, slowest: float | None) -> dict[str, Number]:
     """Return the numbers of a response by the ends of their paths."""
     output = bool(test.output)
     begins = int(np.argmax(got.d != 0.0))
     t = got.t[begins:] - got.t[begins]
-    held = got.held and not output
+    column = int(output)
+    expected = got.expected(column, got.size if output else -got.size, begins)
+    options: dict[str, Any] = {"held": got.is_steady(column), "expected": expected, "accuracy": _accuracy(got)}
     how = _how(got)
     units = {"settling": "s", "rise": "s", "peak": _unit(v.diagram, test.output or test.wire)}
     found = {}
-    known, target, settled = {}, None, is_at_rest(got.answer(output)[begins:])
-    if got.prediction is not None:
-        last = got.final_answer(output)
-        known = measure_step(t, got.answer(output, linear=True)[begins:], held=held, target=_or_none(last))
-        if math.isinf(known["settling"].value):  # the record is too short for the linear model
-            settled, known = False, known | dict.fromkeys(OF_SETTLED, NONE)
-        target = _or_none(known["final"].value)
-    measured = measure_step(t, got.answer(output)[begins:], held=held, target=target)
-    if known and math.isnan(known["final"].value) and not settled:
-        measured |= dict.fromkeys(OF_SETTLED, NONE)
+    answer = got.answer(output)[begins:]
+    settled = is_at_rest(t, answer, expected, slowest)
+    measured = measure_step(t, answer, slowest=slowest, **options)
     found["length"] = Number(float(t[-1]), "s", 0.0, "given: the last sample", given=True)
     found["settled"] = Number(float(settled), "1", 0.0, how)
     for name, (value, tolerance) in measured.items():
         factor = abs(got.size) if name == "peak" else 1.0
         found[name] = Number(factor * value, units.get(name, "1"), factor * tolerance, how)
-    if got.prediction is not None:
+    if expected is not None:
+        known = measure_step(t, expected.response, **options | {"accuracy": TICK_ERROR})
         unknown = tuple(finding for finding in v.model.findings if finding.leaves_error_unknown)
         for name, (value, tolerance) in known.items():
             factor = abs(got.size) if name == "peak" else 1.0
@@ -266,10 +286,6 @@ def _numbers(got: StepResponse, test: StepTest, v: Variant) -> dict[str, Number]
             )
         found["difference"] = Number(_deviation(got), "1", 1e-9, "co-simulation and linear model, sample by sample")
     return found
-
-
-def _or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _deviation(got: StepResponse) -> float:

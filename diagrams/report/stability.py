@@ -6,6 +6,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from ..frequency import order_key
 from ..report_writing import Section, Texts
 from .case import Case
 from .section_subject import SUBJECT_TITLE
@@ -46,7 +47,7 @@ def unstable_first(case: Case) -> Section | None:
 def show_poles(poles: np.ndarray, v: Variant) -> str:
     """Return poles in 1/s as text, the fastest growing first, a pair as one; those of a sampled model with |z|."""
     shown = []
-    for s in sorted(poles, key=lambda s: (-s.real, abs(s.imag))):
+    for s in sorted(poles, key=lambda s: (-order_key(s.real), order_key(abs(s.imag)))):
         if s.imag < -ON_THE_LIMIT * abs(s):
             continue  # the conjugate is named
         one = abs(s.imag) <= ON_THE_LIMIT * abs(s)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
-from ...blocks.core import LoopwrightError, OptionError, near
+from ...blocks.core import LoopwrightError, OptionError, describe_disk_error, near
 from .requirements import Requirements
 
 _HEADER = re.compile(r"""\s*\[\[?\s*(?P<key>(?:"[^"]*"|'[^']*'|[^\]#])+?)\s*\]""")
@@ -62,9 +62,8 @@ class TomlFile:
             text = file.read_text(encoding="utf-8-sig")  # some editors put a mark of the byte order first
             return cls(file, tomllib.loads(text), text)
         except OSError as error:
-            raise OptionError(
-                f"{str(path)!r} can't be read: {error.strerror}. Name another file.", port=port
-            ) from error
+            found = describe_disk_error(error, file, "Name another file.")
+            raise OptionError(f"{str(path)!r} can't be read: {found}", port=port) from error
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise OptionError(f"{str(path)!r} is not TOML: {error}. Mend that line.", port=port) from error
 

@@ -1,7 +1,7 @@
 """Results of runs: recording, storage, plots and exports."""
 
 from .memory import machine_memory
-from .operating_point import FreeDirection, OperatingPoint, PointOrigin
+from .operating_point import FreeDirection, OperatingPoint, PointOrigin, units_of
 from .plots import (
     BLUE,
     DARK,
@@ -63,4 +63,5 @@ __all__ = [
     "save",
     "select",
     "style",
+    "units_of",
 ]

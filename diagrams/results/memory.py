@@ -7,7 +7,7 @@ import shutil
 from fractions import Fraction
 from pathlib import Path
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, explain_disk_errors
 
 
 def machine_memory() -> int:
@@ -62,5 +62,6 @@ def check_memory(
 
 def free_on_disk(path: Path) -> int:
     """Return the bytes that are free where a path is to be created."""
-    path = path.absolute()
-    return shutil.disk_usage(next(p for p in (path, *path.parents) if p.exists())).free
+    with explain_disk_errors(f"the run can't be kept in {str(path)!r}", path, "Choose another path.", OptionError):
+        path = path.absolute()
+        return shutil.disk_usage(next(p for p in (path, *path.parents) if p.exists())).free

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from fractions import Fraction
@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ...blocks.core import Finding, OptionError, brief, count_of, enumerate_some, explain_calls, shorten
+from ...blocks.core import Finding, OptionError, brief, count_of, enumerate_some, explain_calls, same_unit, shorten
 from ..flat import FlatDiagram
 from .saved_state import StateLayout, layout_of
 
@@ -44,6 +44,21 @@ class FreeDirection(Finding):
         return (
             f"the trim is not unique: nothing determines the change of {shares}; it stays near where the search began"
         )
+
+
+def units_of(blocks: Mapping[str, Any], paths: Iterable[str]) -> dict[str, str]:
+    """Return the units of the states and ports of some FMUs, by their dotted paths, as far as they have any."""
+    found: dict[str, str] = {}
+    for path in paths:
+        block = blocks[path]
+        about = getattr(block, "description", None)
+        if about is None:
+            continue
+        variables = {name: about.find(name) for name in (*about.states, *about.discrete_states)}
+        for name, variable in {**variables, **block.output_variables, **block.input_variables}.items():
+            if variable.unit is not None:
+                found[f"{path}.{name}"] = variable.unit
+    return found
 
 
 @explain_calls
@@ -116,6 +131,36 @@ class OperatingPoint:
             block=name,
             port="operating point",
         )
+
+    units: Mapping[str, str] = field(default_factory=dict, repr=False)
+    """Units of the FMUs' states and ports at the point, by their dotted paths."""
+
+    def check_units(self, blocks: Mapping[str, Any], name: str) -> None:
+        """Refuse the operating point of a diagram whose FMUs have their states or ports in other units.
+
+        Its numbers are in the units of the FMUs that it was found with; in another unit they would be others.
+
+        Parameters
+        ----------
+        blocks : mapping
+            Blocks of the diagram by path.
+        name : str
+            The diagram's name.
+
+        Raises
+        ------
+        OptionError
+            If a unit is another one.
+        """
+        here = units_of(blocks, (*self.plants, *self.exchanged))
+        for path, unit in self.units.items():
+            if path in here and not same_unit(unit, here[path]):
+                raise OptionError(
+                    f"found an operating point with {path} in {unit}; expected {here[path]}, the unit of the FMU in "
+                    "this diagram. Make the point with this diagram: diagram.operating_point(t).",
+                    block=name,
+                    port="operating point",
+                )
 
     asked: bool = False
     """Whether ``base`` was asked for, as a ``step``: FMUs step at every tick then."""

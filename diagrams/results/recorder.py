@@ -7,15 +7,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from io import FileIO
 from pathlib import Path
 from time import monotonic
-from typing import TextIO
+from typing import Any, TextIO
 
 import numpy as np
 
-from ...blocks.core import Layout, OptionError, SimulationError, UnknownNameError
+from ...blocks.core import Layout, OptionError, SimulationError, UnknownNameError, describe_disk_error, enumerate_some
 from ..wiring import Wire
 from .memory import machine_memory
 from .signal_names import entries, resolve
-from .stored import END, Occurrence, PathLike, create, event_line, prepare, read, split, write_json
+from .stored import END, OTHER_PATH, Occurrence, PathLike, create, event_line, prepare, read, split, write_json
 
 _FIRST, _LARGEST = 1024, 2**26  # rows of the first chunk in memory, bytes of the largest
 _ROWS, _BYTES = 1024, 2**18  # of a chunk on its way to disk, whichever is less
@@ -98,8 +98,53 @@ class Recorder:
         self._tail: np.ndarray | None = None  # the newest row that was flushed
         self._keep = self._keep_in_memory if to is None else self._keep_on_disk
         self.row = self._keep if self.every == 1 else self._keep_nth
+        self._watched: Mapping[str, np.ndarray] = {}
+        self._lost: dict[str, float] = {}
         self.residual: np.ndarray | None = None
         """After `finish`: the residual of each sample kept."""
+
+    def watch(self, outputs: Mapping[str, slice]) -> None:
+        """Look for samples of some outputs that are no finite numbers, as far as they are kept; see `lost_outputs`.
+
+        Parameters
+        ----------
+        outputs : mapping
+            Their entries in the vector of a sample, by dotted path.
+        """
+        for name, where in outputs.items():
+            entries = np.arange(where.start, where.stop)
+            kept = entries if self._pick is None else np.flatnonzero(np.isin(self._pick, entries))
+            if kept.size:
+                self._watched = {**self._watched, name: 1 + kept}
+
+    def describe_lost(self) -> tuple[str, ...]:
+        """Return the message of a run on the outputs that were watched and are no finite numbers in its samples."""
+        found = [f"{name} from t = {t:.9g} s on" for name, t in self.lost_outputs().items()]
+        if not found:
+            return ()
+        text = (
+            f"no finite numbers stand in the record of {enumerate_some(found)}: an FMU puts them out, and the run goes "
+            "on, as nothing reads them. Choose the FMU's ports without them, by ports=, if they are of no use."
+        )
+        return (text,)
+
+    def lost_outputs(self) -> dict[str, float]:
+        """Return the outputs that were watched and are no finite numbers in a sample, with the first such time in s."""
+        if not self._watched:
+            return {}
+        if self.to is not None:
+            self.flush()
+        else:
+            for chunk in (*self._done, self._chunk[: self._k]):
+                self._look(chunk)
+        return dict(self._lost)
+
+    def _look(self, rows: np.ndarray) -> None:
+        for name, columns in self._watched.items():
+            if name not in self._lost and len(rows):
+                lost = ~np.isfinite(rows[:, columns]).all(axis=1)
+                if lost.any():
+                    self._lost[name] = float(rows[int(np.argmax(lost)), 0])
 
     # --- samples: called at every tick -------------------------------------------------------------------------------
 
@@ -174,11 +219,15 @@ class Recorder:
         if self.to is None:
             self._fired.append(occurrence)
         else:
-            self._start()[1].write(event_line(occurrence))
+            events = self._start()[1]
+            try:
+                events.write(event_line(occurrence))
+            except OSError as error:
+                raise self._write_error(error) from error
 
     def begin_anew(self) -> None:
         """Take the samples of another run into memory, after `finish`."""
-        self._skip, self._tail, self._fired = 0, None, []
+        self._skip, self._tail, self._fired, self._lost = 0, None, [], {}
         self.events = self._fired
 
     # --- chunks ------------------------------------------------------------------------------------------------------
@@ -226,6 +275,7 @@ class Recorder:
         if self._files is None:
             return
         rows, events = self._files
+        self._look(self._chunk[: self._k])
         if self._k:
             self._tail = self._chunk[self._k - 1].copy()
         left = self._chunk[: self._k].data.cast("B") if self._k else memoryview(b"")
@@ -242,9 +292,10 @@ class Recorder:
 
     def _write_error(self, error: OSError) -> SimulationError:
         self._broken = True
+        place = os.fspath(self.to or "")
         return SimulationError(
-            f"the run can't be written to {os.fspath(self.to or '')!r}: {error.strerror or error}. The samples written "
-            "before are kept; make room, or choose another path."
+            f"the run can't be written to {place!r}; the samples written before are kept: "
+            f"{describe_disk_error(error, place, OTHER_PATH)}"
         )
 
     def finish(self, **end: object) -> tuple[np.ndarray, np.ndarray]:
@@ -314,6 +365,7 @@ def select(
     width: int,
     *,
     states: bool = True,
+    blocks: Mapping[str, Any] | None = None,
 ) -> np.ndarray | None:
     """Return the entries of a sample's vector that a selection keeps, ascending; None for all.
 
@@ -328,6 +380,8 @@ def select(
         The named wires.
     states : bool
         Whether the states are kept.
+    blocks : mapping, optional
+        Blocks by path, for errors; see `resolve`.
 
     Raises
     ------
@@ -342,7 +396,7 @@ def select(
     for name in record:
         inside = [where for port, where in layout.slices.items() if port.startswith(f"{name}.")]
         try:
-            kept.update(entries(resolve(name, wires, layout.slices), layout, wires).ravel().tolist())
+            kept.update(entries(resolve(name, wires, layout.slices, blocks), layout, wires).ravel().tolist())
         except UnknownNameError:
             if not inside:
                 raise

@@ -54,7 +54,8 @@ class Recording:
     @cached_property
     def columns(self) -> np.ndarray | None:
         """The entries that are kept; None for all."""
-        return select(self.record, self.flat.log, self.flat.table.names, self.width, states=self.states)
+        flat = self.flat
+        return select(self.record, flat.log, flat.table.names, self.width, states=self.states, blocks=flat.table.blocks)
 
     @cached_property
     def units(self) -> dict[str, PortUnit]:
@@ -99,7 +100,7 @@ class Recording:
                 has_states=self.states,
                 residual=residual,
             )
-        return Recorder(
+        recorder = Recorder(
             self.width,
             self.columns,
             every=self.every,
@@ -109,3 +110,5 @@ class Recording:
             header=head,
             overwrite=self.overwrite,
         )
+        recorder.watch(flat.unread)
+        return recorder

@@ -154,6 +154,8 @@ class Run:
         ------
         OptionError
             If something is in the way.
+        DiskError
+            If the folder can't be written.
         """
         folder = Path(path)
         prepare(folder, overwrite)
@@ -231,7 +233,7 @@ class Run:
         """Return a signal's shape, and its columns in ``data``."""
         if isinstance(name, str) and name in self._places:
             return self._places[name]
-        full = resolve(name, self.wires, self.layout.slices)
+        full = self._resolve(name)
         if (where := self._find_columns(full)) is None:
             raise UnknownNameError(
                 f"the signal {full!r} was not recorded in this run, as the selection left it out. Run again with "
@@ -239,6 +241,9 @@ class Run:
             )
         self._places[name] = place_of(where)
         return self._places[name]
+
+    def _resolve(self, name: str) -> str:
+        return resolve(name, self.wires, self.layout.slices, getattr(self.diagram, "blocks", None))
 
     def find_in(self, places: Places) -> None:
         """Find signals where other runs of the same recording have found them."""
@@ -255,7 +260,7 @@ class Run:
 
     def unit(self, name: str) -> str | tuple[str, ...] | None:
         """Return the unit of a signal, None where it is not declared."""
-        full, entry = split_entry(resolve(name, self.wires, self.layout.slices), {*self.wires, *self.layout.slices})
+        full, entry = split_entry(self._resolve(name), {*self.wires, *self.layout.slices})
         wire = self.wires.get(full)
         unit = self.units.get(full if wire is None else f"{wire.block}.{wire.port}")
         if not isinstance(unit, tuple):

@@ -7,12 +7,14 @@ matrix a single number counts row by row, as the columns of exported tables do.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from typing import Any
 
 import numpy as np
 
 from ...blocks.core import Layout, UnknownNameError, near
 from ..wiring import Wire, index_of, split_entry
 
+_COMPUTED = ("local", "output", "calculatedParameter")
 Place = tuple[tuple[int, ...], slice | np.ndarray]
 """Shape of a signal, and its columns in a run's data."""
 Places = dict[str, Place]
@@ -26,10 +28,22 @@ def place_of(columns: np.ndarray) -> Place:
     return columns.shape, slice(int(flat[0]), int(flat[0]) + flat.size) if together else flat
 
 
-def resolve(name: str, wires: Mapping[str, Wire], ports: Collection[str]) -> str:
+def resolve(
+    name: str, wires: Mapping[str, Wire], ports: Collection[str], blocks: Mapping[str, Any] | None = None
+) -> str:
     """Return the full name that ``name`` stands for: a wire's or port's path, or a unique end of one; wires go first.
 
-    An entry, ``name[1]``, stays behind it.
+    An output ``w`` goes before ports of the same block with longer names, such as ``inertia.w``. An entry, ``name[1]``,
+    stays behind it.
+
+    Parameters
+    ----------
+    name : str
+        The name.
+    wires, ports : mapping, collection
+        Named wires, and the dotted paths of ports.
+    blocks : mapping, optional
+        Blocks by path: an error names their variables that are no ports.
 
     Raises
     ------
@@ -47,6 +61,8 @@ def resolve(name: str, wires: Mapping[str, Wire], ports: Collection[str]) -> str
         found = sorted(n for n in group if n.endswith("." + name))
         if found and (len(found) == 1 or (group is wires and len({wires[n] for n in found}) == 1)):
             return found[0]
+        if found and group is ports and (exact := _output_itself(name, found)):
+            return exact
         if found:
             error = UnknownNameError(
                 f"{name!r} stands for several signals: {', '.join(found)}. Write more of the path."
@@ -55,9 +71,36 @@ def resolve(name: str, wires: Mapping[str, Wire], ports: Collection[str]) -> str
             raise error
     whole, entry = split_entry(name, {*wires, *ports})
     if entry:
-        return resolve(whole, wires, ports) + name[len(whole) :]
+        return resolve(whole, wires, ports, blocks) + name[len(whole) :]
+    if hidden := _hidden_variable(name, blocks or {}):
+        path, variable = hidden
+        raise UnknownNameError(
+            f"no signal {name!r} was recorded: {variable!r} is a variable of the FMU {path!r}, and no port of its. "
+            f"Make it one, beside those that are needed: Fmu(…, ports=[…, {variable!r}])."
+        )
     short = {n.rpartition(".")[2] for n in (*wires, *ports)}
     raise UnknownNameError(f"no signal {name!r} was recorded. {near(name, short | set(wires) | set(ports))}")
+
+
+def _output_itself(name: str, found: Collection[str]) -> str:
+    """Return the port ``path.name`` if all other names are ports with longer names of the same block, else ""."""
+    shortest = min(found, key=len)
+    head = shortest[: -len(name)]
+    return shortest if all(other.startswith(head) for other in found) else ""
+
+
+def _hidden_variable(name: str, blocks: Mapping[str, Any]) -> tuple[str, str] | None:
+    """Return the block and the variable of an FMU that could be a port and be recorded, if one has that name."""
+    found = []
+    for path, block in blocks.items():
+        about: Any = getattr(block, "description", None)
+        for variable in getattr(about, "names", ()):
+            full = f"{path}.{variable}"
+            if (full == name or full.endswith(f".{name}")) and about.find(variable).causality in _COMPUTED:
+                found.append((path, variable))
+    exact = [pair for pair in found if ".".join(pair) == name]
+    one = exact or found
+    return one[0] if len(one) == 1 else None
 
 
 def entries(full: str, layout: Layout, wires: Mapping[str, Wire]) -> np.ndarray:

@@ -28,12 +28,24 @@ from typing import Any, TextIO, TypedDict, overload
 
 import numpy as np
 
-from ...blocks.core import Layout, OptionError, PortUnit, check_argument, explain_calls, kinds
+from ...blocks.core import (
+    Layout,
+    OptionError,
+    PortUnit,
+    check_argument,
+    describe_disk_error,
+    explain_calls,
+    explain_disk_errors,
+    kinds,
+)
 from ..wiring import Wire
 
 FORMAT, VERSION = "loopwright run", 1
 HEADER, ROWS, EVENTS, END = "header.json", "rows.f64", "events.jsonl", "end.json"
 _BLOCK = 2**24  # bytes written at once
+
+OTHER_PATH = "Choose another path."
+"""Step where a run's folder can't be used."""
 
 PathLike = str | os.PathLike[str]
 
@@ -191,18 +203,18 @@ def prepare(folder: Path, overwrite: bool) -> None:
     OptionError
         If something stands there that may not be replaced.
     """
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise OptionError(f"found a file at {os.fspath(folder)!r}; expected a folder, or nothing. Choose another path.")
-    if any(folder.iterdir()) and not (folder / HEADER).is_file():
-        raise OptionError(
-            f"found a folder at {os.fspath(folder)!r} that holds other things than a run. Choose another path."
-        )
-    if (folder / HEADER).is_file() and not overwrite:
-        raise OptionError(
-            f"found a run at {os.fspath(folder)!r} already. Choose another path, or give overwrite=True to replace it."
-        )
+    place = os.fspath(folder)
+    with explain_disk_errors(f"the run can't be kept in {place!r}", place, OTHER_PATH, OptionError):
+        if not folder.exists():
+            return
+        if not folder.is_dir():
+            raise OptionError(f"found a file at {place!r}; expected a folder, or nothing. Choose another path.")
+        if any(folder.iterdir()) and not (folder / HEADER).is_file():
+            raise OptionError(f"found a folder at {place!r} that holds other things than a run. Choose another path.")
+        if (folder / HEADER).is_file() and not overwrite:
+            raise OptionError(
+                f"found a run at {place!r} already. Choose another path, or give overwrite=True to replace it."
+            )
 
 
 def create(folder: Path, head: Mapping[str, object]) -> tuple[FileIO, TextIO]:
@@ -250,19 +262,25 @@ def write(folder: Path, head: Header, parts: Sequence[np.ndarray], events: Itera
         The events that fired.
     **end
         Facts about its end; see `End`.
+
+    Raises
+    ------
+    DiskError
+        If it can't be written.
     """
     events, n = list(events), _BLOCK // (8 * len(head["columns"])) + 1
-    rows, lines = create(folder, head)
-    with rows, lines:
-        for k in range(0, len(parts[0]), n):
-            left = np.ascontiguousarray(np.hstack([part[k : k + n] for part in parts]), "<f8").data.cast("B")
-            while left:
-                left = left[rows.write(left) :]
-        lines.writelines(map(event_line, events))
-        lines.flush()
-        for file in (rows, lines):
-            os.fsync(file.fileno())
-    write_json(folder / END, end)
+    with explain_disk_errors(f"the run can't be written to {os.fspath(folder)!r}", folder, OTHER_PATH):
+        rows, lines = create(folder, head)
+        with rows, lines:
+            for k in range(0, len(parts[0]), n):
+                left = np.ascontiguousarray(np.hstack([part[k : k + n] for part in parts]), "<f8").data.cast("B")
+                while left:
+                    left = left[rows.write(left) :]
+            lines.writelines(map(event_line, events))
+            lines.flush()
+            for file in (rows, lines):
+                os.fsync(file.fileno())
+        write_json(folder / END, end)
 
 
 class StoredEvents(Sequence[Occurrence]):
@@ -347,6 +365,9 @@ def read(path: PathLike) -> Stored:
         head: Header = json.loads((folder / HEADER).read_text(encoding="utf-8"))
         if head["format"] != FORMAT:
             raise KeyError("format")
+    except PermissionError as error:
+        step = "Copy it to a folder that you can read."
+        raise OptionError(f"the run at {place!r} can't be read: {describe_disk_error(error, place, step)}") from error
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise OptionError(
             f"found no stored run at {place!r}; expected a folder with a {HEADER}, as run.save(path) and "

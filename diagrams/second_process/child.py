@@ -29,6 +29,8 @@ def main() -> None:
     tells its error. What anybody prints goes to the standard error.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that has started it ends it
+    if hasattr(signal, "SIGTTOU"):  # it is no foreground process, and may write to any terminal all the same
+        signal.signal(signal.SIGTTOU, signal.SIG_IGN)
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     orders = sys.stdin.buffer

@@ -14,6 +14,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
 from ...blocks.core import OptionError
+from ...fmus.child_processes import ProcessGroup
 from ..sweeps import receive, send, to_bytes
 from .child import Task
 
@@ -52,9 +53,12 @@ class SecondProcess(Generic[T]):
         try:
             data = to_bytes(task, name)
             program = [sys.executable, "-c", _PROGRAM]
-            self._process = subprocess.Popen(
-                program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
-            )
+            self._group = ProcessGroup()
+            try:
+                self._process = self._group.start(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            except BaseException:
+                self._group.end()
+                raise
         except (OptionError, OSError):  # such as a class of the main script: everything is made here
             return
         self._send(sys.path)
@@ -70,6 +74,7 @@ class SecondProcess(Generic[T]):
             return
         process.kill()
         process.wait()
+        self._group.end()
         if self._thread is not None:
             self._thread.join()
         for pipe in (process.stdin, process.stdout):

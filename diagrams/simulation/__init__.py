@@ -3,6 +3,7 @@
 from .algebraic_loops import newton_options
 from .diagnosis import START_SETTLED
 from .engine import Engine
+from .held_inputs import note_held_inputs
 from .initialize import find_initial_state, find_start_values, values_from_left
 from .progress import Interrupted, late_progress, progress_bar
 from .run_options import START_EXCHANGES, KeptKeywords, RunKeywords, RunOptions, default_step, refuse_rest, ticks_in
@@ -33,6 +34,7 @@ __all__ = [
     "find_start_values",
     "late_progress",
     "newton_options",
+    "note_held_inputs",
     "progress_bar",
     "refuse_rest",
     "simulate",

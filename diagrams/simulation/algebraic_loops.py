@@ -63,20 +63,30 @@ class LoopSolver:
         self.J = J.reshape(n, n, order="F")
         self.loops = loops
 
-    def solve(self) -> None:
+    def solve(self, *, search: bool = False) -> None:
         """Solve them from the values in x on.
 
         Newton's method with the exact derivative; a step that makes the residual larger is halved, and on, as long as
-        that helps.
+        that helps. At the start, where no solution comes before, ``search`` begins from a few other values if that does
+        not lead to one; of the solutions that are found, the nearest to the values in x is taken.
 
         Raises
         ------
         SimulationError
             If there is no solution, or Newton's method does not find it.
         """
+        before = self.x[self.where].copy()
         found = self._seek()
         if not found <= TOLERANCE and math.isfinite(found):  # a NaN that comes in is told by who made it
-            raise self._unsolved(found)
+            if not search:
+                raise self._unsolved(found)
+            others = self._search(before, ())
+            if not others:
+                raise self._unsolved(found, "the last solution and from a few other values")
+            away = [float(np.max(np.abs(v - before))) for v in others]
+            nearest = min(away) + _APART * (1.0 + min(away))  # of two that are as near, the one that is found first
+            self.x[self.where] = next(v for v, distance in zip(others, away, strict=True) if distance <= nearest)
+            self.call()
 
     def _size(self, v: np.ndarray) -> float:
         return float(np.max(np.abs(self.r)) / (1.0 + np.max(np.abs(v))))
@@ -152,22 +162,29 @@ class LoopSolver:
     def others(self) -> list[np.ndarray]:
         """Return other solutions, as far as Newton's method finds them from a few other values; x stays as it is."""
         solution = self.x[self.where].copy()
-        found: list[np.ndarray] = []
-        alternating = np.where(np.arange(len(solution)) % 2, -1.0, 1.0)
-        patterns = [np.ones(len(solution))] + ([alternating] if len(solution) > 1 else [])
         try:
-            for start in (s * (1.0 + np.abs(solution)) * p for p in patterns for s in _STARTS):
-                self.x[self.where] = start
-                try:
-                    left = self._seek()
-                except SimulationError:  # of a block that has no value there
-                    continue
-                v = self.x[self.where].copy()
-                if left <= TOLERANCE and all(_differ(v, known) for known in (solution, *found)):
-                    found.append(v)
+            return self._search(solution, (solution,))
         finally:
             self.x[self.where] = solution
             self.call()
+
+    def _search(self, around: np.ndarray, known: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Return solutions that are found from a few values of the size of some values, without those that are known.
+
+        x is left at the last value that was tried.
+        """
+        found: list[np.ndarray] = []
+        alternating = np.where(np.arange(len(around)) % 2, -1.0, 1.0)
+        patterns = [np.ones(len(around))] + ([alternating] if len(around) > 1 else [])
+        for start in (s * (1.0 + np.abs(around)) * p for p in patterns for s in _STARTS):
+            self.x[self.where] = start
+            try:
+                left = self._seek()
+            except SimulationError:  # of a block that has no value there
+                continue
+            v = self.x[self.where].copy()
+            if left <= TOLERANCE and all(_differ(v, other) for other in (*known, *found)):
+                found.append(v)
         return found
 
     # --- words -------------------------------------------------------------------------------------------------------
@@ -177,10 +194,10 @@ class LoopSolver:
         path, _, port = self.names[0].rpartition(".")
         return SimulationError(f"{text}\n{loops}\n{_ADVICE}", block=path, port=port, t=float(self.t[0]))
 
-    def _unsolved(self, residual: float) -> SimulationError:
+    def _unsolved(self, residual: float, begun: str = "the last solution") -> SimulationError:
         return self._error(
             f"the algebraic loop was not solved: its residual is {residual:.3g}, expected at most {TOLERANCE:g}. "
-            "Newton's method, started from the last solution, got no closer; the loop may have none, or several."
+            f"Newton's method, started from {begun}, got no closer; the loop may have none, or several."
         )
 
     def _undetermined(self, direction: np.ndarray) -> SimulationError:

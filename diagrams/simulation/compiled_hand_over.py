@@ -106,7 +106,7 @@ def name_methods(methods: Sequence[MethodOptions]) -> str:
 def hand_over_domains(domains: Domains, watch: Watch) -> list[float]:
     """Let C go on with the domains; return the times in s at which events have fired last."""
     (domain, _, low, high, slack), (size, rounding), watch.fresh, limits = domains.save()
-    watch.latest, watch.largest[:], recent, _, _ = limits
+    watch.latest, watch.largest[:], recent, _ = limits
     watch.domain[:], watch.low[:], watch.high[:], watch.slack[:] = domain, low, high, slack
     watch.size[:], watch.rounding[:] = size, rounding
     return [t for t, _ in recent]
@@ -114,11 +114,11 @@ def hand_over_domains(domains: Domains, watch: Watch) -> list[float]:
 
 def take_back_domains(domains: Domains, watch: Watch, fired: Sequence[Fired]) -> None:
     """Let Python go on with the domains from C, where some events have fired since they were handed over."""
-    (_, first, *_), _, _, (_, _, recent, side, stuck) = domains.save()
+    (_, first, *_), _, _, (_, _, recent, rest) = domains.save()
     groups = groupby(fired, key=lambda one: one.t)
     recent = [*recent, *((t, tuple(one.event for one in group)) for t, group in groups)][-RECENT:]
     states = watch.domain.astype(int), first, watch.low, watch.high, watch.slack
-    limits = watch.latest, np.array(watch.largest), recent, side, stuck
+    limits = watch.latest, np.array(watch.largest), recent, rest
     domains.restore((states, (watch.size, watch.rounding), watch.fresh, limits))
     for event, side in watch.take_landed():
         domains.limits.note_contact(event, side)

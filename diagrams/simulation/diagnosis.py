@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import NonFiniteError, SimulationError
+from ...blocks.core import NonFiniteError, SimulationError, enumerate_some
 from ...blocks.tracing import GUARDS, NEXT, bundle, raise_failure
 from ..flat import Evaluators, FlatDiagram, Instant, TickPattern, Vectors, evaluate, evaluate_apart
+from ..wiring import join
 
 START_SETTLED = 1e-13
 """Relative change of a value at the start between two passes that is rounding: a few hundred ulps."""
@@ -41,14 +42,18 @@ def failure(
     """
     forget_trials(flat)
     for name, where in flat.plant_outputs.slices.items():
-        if not np.all(np.isfinite(here.w[where])):
+        if name not in flat.unread and not np.all(np.isfinite(here.w[where])):
             path, port = flat.ports[name]
-            return _non_finite(path, port, here.w[where], "It comes out of the FMU.")
+            return _non_finite(path, port, here.w[where], _out_of_an_fmu(flat, path, port))
     found: list[SimulationError] = []
 
     def visit(instant: Instant, path: str, inputs: dict[str, Any], made: dict[str, Any]) -> None:
         if not found and instant.gate_of(path) is not False:
-            known = {n: np.ravel(np.array(v)) for n, v in made.items() if n not in instant.provisional}
+            known = {
+                n: np.ravel(np.array(v))
+                for n, v in made.items()
+                if n not in instant.provisional and join(path, n) not in flat.unread
+            }
             error = _wrong(flat, here.x, path, inputs, known)
             if error is not None:
                 found.append(error)
@@ -95,7 +100,9 @@ def _wrong(
             what = {NEXT: "the rate of its states" if trace.advance == "derivative" else "the next state"}.get(
                 name, name
             )
-            return _non_finite(path, what, made[name], inputs_text(shaped))
+            outside = block.evaluated_outside and name in block.outputs
+            hint = f"{_out_of_an_fmu(flat, path, name)} " if outside else ""
+            return _non_finite(path, what, made[name], f"{hint}{inputs_text(shaped)}")
     return None
 
 
@@ -133,6 +140,17 @@ def inputs_text(inputs: dict[str, Any]) -> str:
     """Write the values of a block's inputs."""
     shown = ", ".join(f"{n} = {np.asarray(v).tolist()}" for n, v in inputs.items() if v is not None)
     return f"Its inputs then: {shown}." if shown else "It has no inputs."
+
+
+def _out_of_an_fmu(flat: FlatDiagram, path: str, port: str) -> str:
+    """Return where an FMU's output that is not finite goes, and what to do about it."""
+    ends = [join(*end) for end, wire in flat.table.wires.items() if (wire.block, wire.port) == (path, port)]
+    ends += [name for name, wire in flat.table.controls.items() if (wire.block, wire.port) == (path, port)]
+    readers = f" It is read by {enumerate_some(sorted(ends))}." if ends else ""
+    return (
+        f"It comes out of the FMU.{readers} Look up its inputs and start values, or wire another of its variables, "
+        "which ports= makes a port; an output that nothing reads may be NaN."
+    )
 
 
 def _non_finite(path: str, port: str, values: np.ndarray, hint: str) -> NonFiniteError:

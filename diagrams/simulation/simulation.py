@@ -29,6 +29,7 @@ from ..results import (
     not_open_error,
 )
 from .engine import Engine
+from .held_inputs import note_held_inputs
 from .progress import Interrupted, compiler_notes, progress_bar
 from .run_options import RunOptions, default_step, refuse_rest, ticks_in
 from .save import can_save, restore_state, save_state
@@ -90,7 +91,12 @@ class Simulation:
             self._recording.check_memory(count, every_tick=every_tick)
         self._engine = Engine(self.flat, diagram.name, options, every_tick=every_tick, on_event=self._on_event)
         fine = note_steps(self.flat, step=base)
-        self._notes = (*fused, *fine, *note_loops(self.flat, self._engine.coupling))
+        self._notes = (
+            *fused,
+            *fine,
+            *note_loops(self.flat, self._engine.coupling),
+            *note_held_inputs(self.flat),
+        )
         self._elapsed, self._begun = 0.0, False
         self._open: bool | None = None  # until it begins; False once it has ended
         self._recorder = self._new_recorder()
@@ -333,7 +339,7 @@ class Simulation:
         self._recorder.row(self.t, self._engine.workspace.log)
 
     def _take_facts(self, *more: str) -> dict[str, Any]:
-        tier, messages = self._engine.take_tier(), (*self._messages, *more)
+        tier, messages = self._engine.take_tier(), (*self._messages, *self._recorder.describe_lost(), *more)
         return {"elapsed": self._elapsed, "tier": tier, "messages": messages, "stopped": self.stopped}
 
     @property

@@ -25,7 +25,10 @@ def apply_point(diagram: WiredDiagram, point: OperatingPoint) -> WiredDiagram:
     ------
     FmuError
         An FMU whose states can't be set at the start, and that starts in others.
+    OptionError
+        An FMU whose states or ports are in other units there.
     """
+    point.check_units(diagram.blocks, diagram.name)
     changes: dict[str, Any] = dict(point.parameters)
     variant = diagram.replace(changes) if changes else diagram
     blocks: dict[str, Any] = {}

@@ -259,7 +259,7 @@ class Workspace:
             return None if loops is None else loops.solve
 
         def solve() -> None:
-            loops.solve()
+            loops.solve(search=not self.begun)
             if self.begun:
                 loops.check_determined()
 

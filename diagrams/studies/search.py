@@ -12,7 +12,7 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError, OptionError, UnknownArgumentError
 from ..flat import WiredDiagram
-from ..frequency import Number, Realization, find_hidden_unstable, margin_slopes
+from ..frequency import Number, Realization, find_hidden_unstable, margin_slopes, order_key
 from ..linearization import Linearization, differentiate_loop, linearize, loop_of_variant, operating_point
 from ..results import OperatingPoint
 from ..sweeps import Box
@@ -215,7 +215,7 @@ class Study:
     def search(self, starts: int, steps: int) -> None:
         """Go downhill from the worst cases that could be analysed; an unstable one is bad enough."""
         known = (c for c in self.cases if c.parameters and c.quantity and math.isfinite(c.goodness))
-        ranked = sorted(known, key=lambda c: (c.goodness, c.index))
+        ranked = sorted(known, key=lambda c: (order_key(c.goodness), c.index))
         begun: list[np.ndarray] = []
         for case in ranked:
             if len(begun) == starts or self._is_lost():
@@ -300,7 +300,7 @@ class Study:
         known = [c for c in self.cases if c.parameters and c.quantity]
         if not known:
             return
-        best = min(known, key=lambda c: (c.goodness, c.index))
+        best = min(known, key=lambda c: (order_key(c.goodness), c.index))
         for step in PATTERN:
             better = True
             while better and not self._is_lost():

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError, UnknownNameError, accepts, brief, enumerate_some, explain_calls, kinds, near
 from ..flat import WiredDiagram
-from ..frequency import MarginSlope, Number, margin_slopes
+from ..frequency import MarginSlope, Number, margin_slopes, order_key
 from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize
 from ..results import BLUE, DARK, VERMILION, OperatingPoint, new_figure, style
 from ..wiring import find_parameter
@@ -176,7 +176,7 @@ class Sensitivities(Sequence[Sensitivity]):
         if self.rows and quantity not in self.quantities:
             raise UnknownNameError(f"the loop has no {quantity!r}. {near(str(quantity), self.quantities)}")
         mine = [row for row in self.rows if row.quantity == quantity and math.isfinite(row.slope.value)]
-        return sorted(mine, key=lambda row: (-abs(row.per_percent.value), row.parameter))[:count]
+        return sorted(mine, key=lambda row: (-order_key(abs(row.per_percent.value)), row.parameter))[:count]
 
     def table(self) -> list[dict[str, Any]]:
         """Return all rows as mappings; ``pandas.DataFrame(found.table())`` shows them."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from ...blocks.core import OptionError, accepts, brief, enumerate_some, explain_calls, kinds
 from ..flat import WiredDiagram
+from ..frequency import order_key
 from ..requirements import Requirements
 from ..sweeps import Box, Samples, read_samples
 from .cases import Case, CaseOrigin, CaseState, Goal, describe, make_goal
@@ -107,7 +108,7 @@ class WorstCase:
 
     def table(self) -> list[dict[str, Any]]:
         """Return all cases as mappings, the worst first; ``pandas.DataFrame(found.table())`` shows them."""
-        return [case.as_dict() for case in sorted(self.cases, key=lambda case: (case.goodness, case.index))]
+        return [case.as_dict() for case in sorted(self.cases, key=lambda case: (order_key(case.goodness), case.index))]
 
     def confirm(self, amplitude: float | None = None) -> RunConfirmation:
         """Confirm the worst case by a run of the diagram with its parameters.
@@ -218,7 +219,7 @@ def find_worst_case(
     if boxes and starts > 0:
         study.try_corners()
         study.search(starts, steps)
-    worst = study.with_findings(min(study.cases, key=lambda case: (case.goodness, case.index)))
+    worst = study.with_findings(min(study.cases, key=lambda case: (order_key(case.goodness), case.index)))
     study.cases[worst.index] = worst
     cases = tuple(study.cases)
     return WorstCase(worst, tuple(nominal), cases, boxes, goal, diagram, places, {**options, "delay": delay}, measure)

@@ -15,7 +15,7 @@ from ...fmus.calls import FmuInstance
 from ..coupling import note_loops, note_steps
 from ..flat import EVERY, FlatDiagram, renumber
 from ..results import Occurrence, Places, Recorder, Recording, Run, Stopped
-from ..simulation import Engine, RunOptions, SimulatedDiagram, default_step, refuse_rest, ticks_in
+from ..simulation import Engine, RunOptions, SimulatedDiagram, default_step, note_held_inputs, refuse_rest, ticks_in
 from .start_values import StartValues
 from .variation import Numbers
 
@@ -57,7 +57,12 @@ class BoundRun:
         rows = self.count + 2 if self.engine.every_tick else None
         self.recorder: Recorder = self._recording.begin(rows)
         fine = note_steps(self.flat, step=base)
-        self._notes: tuple[str, ...] = (*fused, *fine, *note_loops(self.flat, self.engine.coupling))
+        self._notes: tuple[str, ...] = (
+            *fused,
+            *fine,
+            *note_loops(self.flat, self.engine.coupling),
+            *note_held_inputs(self.flat),
+        )
         self._has_begun = False
         self._told: dict[str, int] = {}
         self._places: Places = {}
@@ -176,9 +181,10 @@ class BoundRun:
             self._has_begun = True
 
     def _take_record(self, started: float) -> Run:
+        lost = self.recorder.describe_lost()
         t, data = self.recorder.finish()
         stopped, residual = self.engine.position.stopped, self.recorder.residual
-        return self.make_run(t, data, stopped, started, self.take_messages(), residual)
+        return self.make_run(t, data, stopped, started, (*self.take_messages(), *lost), residual)
 
     def make_run(
         self,

@@ -14,7 +14,7 @@ from typing import Any
 
 from ...blocks.core import OptionError, one_thread, replace_file
 from ...fmus import Fmu
-from ...fmus.platform import cache_folder, is_built_here, record_build
+from ...fmus.platform import cache_folder, explain_cache_errors, is_built_here, record_build
 from ..simulation import SimulatedDiagram
 from .outcome import WORKER_ENDED, Failure, Outcome
 from .plan import Plan, Worker
@@ -77,11 +77,12 @@ class Parcel:
 def _keep(digest: str, content: bytes, *, built: bool) -> Path:
     """Return the file of an FMU in the cache; it is written where it isn't there."""
     folder = cache_folder() / "travelled"
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     path = folder / f"{digest}.fmu"
-    if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != digest:
-        with replace_file(path) as fresh:
-            fresh.write_bytes(content)
+    with explain_cache_errors("an FMU of the sweep can't be kept in this worker's cache"):
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+            with replace_file(path) as fresh:
+                fresh.write_bytes(content)
     if built:
         record_build(digest)
     return path

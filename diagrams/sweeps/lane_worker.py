@@ -206,7 +206,8 @@ class _Lanes:
         engine.take_first_tick(None, lambda t, log: rows.append(log[self._columns]))
         if engine.position.stopped is not None or not len(self._ticks):
             return None
-        edges = np.zeros(0, dtype=int) if engine.continuous is None else self._edges(engine.continuous.sources)
+        if engine.continuous is not None:
+            self._refuse_between_ticks(engine.continuous.sources)
         plants, steps = dict[str, np.ndarray](), list[float]()
         for path, plant in self._code.plants.items():
             instance = engine.plants[path]
@@ -216,28 +217,20 @@ class _Lanes:
             steps.append(step)
         here = workspace.here
         vectors = here.x.copy(), here.w.copy(), workspace.z.copy(), here.p.copy()
-        return LaneStart(*vectors, plants, tuple(steps), rows[0], bound.take_messages(), edges)
+        return LaneStart(*vectors, plants, tuple(steps), rows[0], bound.take_messages())
 
-    def _edges(self, sources: Iterable[tuple[str, Announcer]]) -> np.ndarray:
-        """Return the places of the ticks at which sources are not smooth; between ticks a run's steps would be its own.
-
-        Raises
-        ------
-        NoLanesError
-            For a source that is not smooth between ticks.
-        """
-        base, end, found = self.bound.flat.base, self._times[-1], set[int]()
+    def _refuse_between_ticks(self, sources: Iterable[tuple[str, Announcer]]) -> None:
+        """Raise NoLanesError for a source that is not smooth between ticks, where a run's steps would be its own."""
+        base, end = self.bound.flat.base, self._times[-1]
         for path, source in sources:
             t, seen = source.next_instant(0.0), 0
             while t < end:
                 k = round(t * base.denominator / base.numerator)
                 if abs(t - k * base.numerator / base.denominator) > 4 * np.spacing(t) or getattr(source, "late", {}):
                     raise NoLanesError(f"{path} is not smooth at t = {t:g} s, between ticks")
-                found.add(k)
                 t, seen = source.next_instant(t), seen + 1
                 if seen > len(self._ticks):
                     raise NoLanesError(f"{path} is not smooth at instants between ticks")
-        return np.flatnonzero(np.isin(self._ticks, [*found]))
 
     def _refuse_fine(self, path: str, step: float) -> None:
         if self._widths.max() > _MOST_SUBSTEPS * step:
@@ -254,7 +247,7 @@ class _Lanes:
         k, total = 0, len(self._ticks)
         while k < total and runs.is_going:
             end, begun = min(k + self._span, total), perf_counter()
-            rows = runs.run(self._times[k : end + 1], self._widths[k:end], self._kinds[k:end], room, k)
+            rows = runs.run(self._times[k : end + 1], self._widths[k:end], self._kinds[k:end], room)
             for parts, lane in zip(kept, np.ascontiguousarray(room[:rows, :n].transpose(2, 0, 1)), strict=False):
                 parts.append(lane)
             took = perf_counter() - begun

@@ -12,6 +12,7 @@ from contextlib import suppress
 from typing import Any, BinaryIO
 
 from ...blocks.core import OptionError
+from ...fmus.child_processes import ProcessGroup
 from .child import receive, send
 from .desk import Desk
 from .outcome import WORKER_ENDED, Failure, Outcome
@@ -19,6 +20,7 @@ from .plan import Plan
 from .samples import Sample
 
 _PROGRAM = "from loopwright.diagrams.sweeps.child import main; main()"
+_LEAVING = 10.0  # s in which a process that has nothing more to do ends by itself
 
 
 def run_in_processes(plan: Plan, samples: Iterable[Sample], count: int) -> Generator[Outcome, None, None]:
@@ -38,16 +40,23 @@ def run_in_processes(plan: Plan, samples: Iterable[Sample], count: int) -> Gener
     Raises
     ------
     OptionError
-        If the diagram, or a function of the sweep, can't be sent to a process.
+        If the diagram, or a function of the sweep, can't be sent to a process, or no process can be started.
     """
     data = to_bytes(plan, plan.diagram.name)
-    processes = [_Process(data) for _ in range(count)]
+    try:
+        group = ProcessGroup()
+    except OSError as error:
+        raise OptionError(
+            f"worker processes can't be started: {error}. workers=1 runs all in this process.", block=plan.diagram.name
+        ) from error
+    with group:
+        processes = [_Process(data, group) for _ in range(count)]
 
-    def end() -> None:
-        for process in processes:
-            process.end()
+        def end() -> None:
+            for process in processes:
+                process.end()
 
-    yield from Desk(samples).serve([process.work for process in processes], end)
+        yield from Desk(samples).serve([process.work for process in processes], end)
 
 
 def to_bytes(plan: object, name: str) -> bytes:
@@ -86,15 +95,20 @@ def _not_sent(name: str, error: object) -> OptionError:
 class _Process:
     """A worker process; it is started when it is needed first, and anew after its end."""
 
-    def __init__(self, data: bytes):
-        self._data = data
+    def __init__(self, data: bytes, group: ProcessGroup):
+        self._data, self._group = data, group
         self._process: subprocess.Popen[bytes] | None = None
         self._lock, self._over = threading.Lock(), False
 
     def work(self, desk: Desk) -> None:
-        """Run the samples of a desk until there are none."""
+        """Run the samples of a desk until there are none; then the process ends by itself, and so its FMUs do."""
         while taken := desk.take():
             desk.put(self.run(taken[0]))
+        process = self._process
+        if process is not None:
+            with suppress(OSError, subprocess.TimeoutExpired):
+                _pipe(process.stdin).close()
+                process.wait(_LEAVING)
 
     def run(self, sample: Sample) -> Outcome:
         """Return the outcome of a sample; where the process ends, that is its failure."""
@@ -111,9 +125,8 @@ class _Process:
             if self._over:
                 raise EOFError
             if self._process is None:
-                self._process = subprocess.Popen(
-                    [sys.executable, "-c", _PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-                )
+                program = [sys.executable, "-c", _PROGRAM]
+                self._process = self._group.start(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
                 fresh = True
             else:
                 fresh = False

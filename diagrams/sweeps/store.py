@@ -12,7 +12,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from ...blocks.core import OptionError, replace_file, write_text
+from ...blocks.core import OptionError, explain_disk_errors, replace_file, write_text
 from .differences import describe_differences
 from .outcome import WORKER_ENDED, Failure, Outcome
 from .revision import Parts, digest_of
@@ -43,16 +43,11 @@ class Store:
     """
 
     def __init__(self, folder: Path, parts: Parts, about: dict[str, Any], *, overwrite: bool = False):
-        self.folder = folder.absolute()  # loading an FMU changes the working folder for a moment
-        try:
+        own = {"block": str(about.get("diagram", "")) or None, "port": "to"}
+        step = "Choose a folder of your own, such as to='sweeps/first'."
+        with explain_disk_errors(f"the sweep can't be kept in {str(folder)!r}", folder, step, OptionError, **own):
+            self.folder = folder.absolute()  # loading an FMU changes the working folder for a moment
             self._open(parts, about, overwrite=overwrite)
-        except OSError as error:
-            raise OptionError(
-                f"the folder {str(folder)!r} can't be made, read or written: {error.strerror or error}; expected one "
-                "that keeps the sweep. Choose a folder of your own, such as to='sweeps/first'.",
-                block=str(about.get("diagram", "")) or None,
-                port="to",
-            ) from error
         self._waiting: list[tuple[str, Outcome]] = []
         self._last = monotonic()
 
@@ -117,13 +112,9 @@ class Store:
     def flush(self) -> None:
         """Write what was not written yet."""
         if self._waiting:
-            try:
+            failed = f"the sweep can't be written to {str(self.folder)!r}; a later call takes what is there already"
+            with explain_disk_errors(failed, self.folder, "Choose another folder for to=….", OptionError, port="to"):
                 _write_part(self.folder / f"part-{secrets.token_hex(8)}.npz", self._waiting)
-            except OSError as error:
-                raise OptionError(
-                    f"the sweep can't be written to {str(self.folder)!r}: {error.strerror or error}. What was written "
-                    "before is kept: make room, and call it again."
-                ) from error
         self._waiting = []
         self._last = monotonic()
 

@@ -159,7 +159,9 @@ def make_plan(
     )
     flat = Simulation(diagram, plan.run_options, duration=duration).flat  # it checks the options
     needed = [*chosen, *(f.signal for f in reductions.values() if isinstance(f, Reduction))]
-    _check_recorded(plan, flat, [resolve(signal, flat.table.names, flat.log.slices) for signal in needed])
+    table = flat.table
+    found = [resolve(signal, table.names, flat.log.slices, table.blocks) for signal in needed]
+    _check_recorded(plan, flat, found)
     if clash := sorted(set(chosen) & set(reductions)):
         raise OptionError(
             f"found {clash[0]!r} among signals and reductions; give the reduction another name.", block=name

@@ -83,7 +83,10 @@ def _check_ports(table: Structure) -> None:
     for path in sorted(table.blocks):
         for port, spec in inputs[path].items():
             if (path, port) not in table.wires and spec.default is None:
-                raise UnwiredInputError("nothing is wired to it; wire it in the block's call.", block=path, port=port)
+                advice = table.blocks[path].advise_unwired([port])
+                raise UnwiredInputError(
+                    f"nothing is wired to it; wire it in the block's call.{advice}", block=path, port=port
+                )
     for (consumer, port), wire in table.wires.items():
         if port not in inputs[consumer]:
             raise UnknownNameError(

@@ -152,7 +152,8 @@ class Collector:
         if needed:
             raise UnwiredInputError(
                 f"an output of this block is used, but the block is never called, so nothing is wired to "
-                f"{', '.join(map(repr, needed))}. Call it, and give the call (or one that it drives) to the Diagram.",
+                f"{', '.join(map(repr, needed))}. Call it, and give the call (or one that it drives) to the Diagram."
+                f"{block.advise_unwired(needed)}",
                 block=block.label,
                 port=needed[0],
             )

@@ -26,7 +26,9 @@ def find_cyclic_parts(keys: Sequence[str], pairs: Iterable[tuple[str, str]]) -> 
     from scipy.sparse.csgraph import connected_components
 
     place = {key: i for i, key in enumerate(keys)}
-    edges = [(place[a], place[b]) for a, b in pairs]
+    edges = sorted(
+        {(place[a], place[b]) for a, b in pairs}
+    )  # each once: SciPy 1.13.0 is wrong or hangs with repeated ones
     if not edges:
         return []
     rows, columns = zip(*edges, strict=True)

@@ -4,6 +4,8 @@ from .binaries import check_binary, find_binary, missing_functions
 from .description import FmuDescription, read_description
 from .exchange import ExchangeInfo
 from .faults import FmuFault, FmuFinding, FmuSeverity
+from .gathering import read_index
+from .joining import join_scalars
 from .library import SharedLibrary, read_library
 from .limits import ArchiveLimits
 from .model import read_model
@@ -29,9 +31,11 @@ __all__ = [
     "check_binary",
     "find_binary",
     "inexact",
+    "join_scalars",
     "missing_functions",
     "parse_xml",
     "read_description",
+    "read_index",
     "read_library",
     "read_model",
     "repair",

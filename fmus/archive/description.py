@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuFileError, Layout, accepts, brief, explain_calls, kinds
+from ...blocks.core import FmuFileError, Layout, accepts, brief, describe_disk_error, explain_calls, kinds
 from ..host_state import FOLDER
 from .aliases import find_aliases
 from .binaries import find_binary, judge_name
@@ -26,11 +26,11 @@ from .model import read_model
 from .negated import judge_negated, read_negated
 from .rules import KNOWN_VERSIONS, check_dimensions, unknown_version
 from .sizes import resize
-from .states import find_states
+from .states import find_states, read_derivatives
 from .units import FmuUnits
 from .variables import WIRE_TYPES, FmuVariable, OtherVariable, fmi3_type, read_other, read_variable
 from .xml_text import parse_xml
-from .zip_file import DESCRIPTION, FmuArchive
+from .zip_file import DESCRIPTION, OTHER_PLACE, FmuArchive
 
 _DROPPED = ("UInt", "Clock")
 """Beginnings of the types of FMI 3.0 of which FMPy drops attributes."""
@@ -60,6 +60,16 @@ class FmuDescription:
     """Array and index, from 0 on, of each scalar that was gathered."""
     aliases: dict[str, str] = field(default_factory=dict)
     """First name of each input and parameter by its further names; a wire is for the first."""
+    scalars: Mapping[str, FmuVariable] = field(default_factory=dict, repr=False)
+    """Variables with numbers as values as the file has them, before any were gathered."""
+    derivatives: Mapping[str, str] = field(default_factory=dict, repr=False)
+    """Continuous states by their derivatives, as the file has them."""
+    joined: Mapping[str, str] = field(default_factory=dict, repr=False)
+    """Ports of the arrays that the user has put together of scalars, by the names of these arrays in `variables`."""
+    members: Mapping[str, FmuVariable] = field(default_factory=dict, repr=False)
+    """The scalars of these, as the file has them, by name."""
+    spelled: Mapping[str, str] = field(default_factory=dict, repr=False)
+    """These scalars' names by those of the elements that they are, such as ``position[1]``."""
     complaints: tuple[str, ...] = ()
     """Rules of the standard that the description breaks, as FMPy's validation words them."""
     unit_complaints: tuple[str, ...] = ()
@@ -113,7 +123,7 @@ class FmuDescription:
         kinds = "co-simulation" * self.co_simulation, "model exchange" * bool(self.model_exchange)
         facts = f"FMI {self.fmi}", " and ".join(filter(None, kinds)), f"{len(self.variables)} variables"
         return brief(
-            f"description of {self.file.name!r}", *facts, then=".variables, .states, loopwright.fmus.examine(file)"
+            f"description of {self.file.name!r}", *facts, then=".variables, .states, loopwright.fmus.doctor(file)"
         )
 
     def layout(self, names: Iterable[str]) -> Layout:
@@ -138,6 +148,7 @@ class FmuDescription:
         KeyError
             If the FMU has no such variable with numbers as values.
         """
+        name = self.spelled.get(name, name)
         return self.element(name) if name in self.elements and name not in self.variables else self.variables[name]
 
     def feeds_through(self, source: FmuVariable, output: FmuVariable) -> bool:
@@ -147,7 +158,7 @@ class FmuDescription:
     @property
     def names(self) -> set[str]:
         """Names of all variables with numbers as values, and of scalars that were gathered."""
-        return {*self.variables, *self.elements}
+        return {*self.variables, *self.elements, *self.spelled}
 
     def of(self, causality: str) -> dict[str, FmuVariable]:
         """Return the variables of a causality, in the file's order."""
@@ -159,6 +170,8 @@ class FmuDescription:
 
     def element(self, name: str) -> FmuVariable:
         """Return a scalar that was gathered into an array."""
+        if name in self.members:
+            return self.members[name]
         array, index = self.elements[name]
         v = self.variables[array]
 
@@ -227,17 +240,27 @@ def read_description(
     path = os.path.expanduser(os.fspath(file))  # blocks ask often: pathlib would take most of the time
     if not os.path.isabs(path):
         with FOLDER:  # another thread may load a library, which takes place in its folder
-            path = os.path.abspath(path)
+            try:
+                path = os.path.abspath(path)
+            except OSError as error:
+                raise _unreadable(path, error) from error
     try:
         status = os.stat(path)
     except (FileNotFoundError, NotADirectoryError):
         status = None
+    except OSError as error:
+        raise _unreadable(path, error) from error
     if status is None or not stat.S_ISREG(status.st_mode):
         shown = str(Path(os.path.expanduser(os.fspath(file))))
         found = f"{shown!r} is a folder" if os.path.isdir(path) else f"there is no file {shown!r}"
         raise FmuFileError(f"{found}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
     identity = (status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size)
     return _read(os.path.abspath(path), identity, limits or _USUAL, tuple(sorted(sizes.items())) if sizes else ())
+
+
+def _unreadable(path: str, error: OSError) -> FmuFileError:
+    found = describe_disk_error(error, path, OTHER_PLACE)
+    return FmuFileError(f"{path!r} can't be read: {found}", fault=FmuFault.NO_FILE)
 
 
 _USUAL = ArchiveLimits()
@@ -315,13 +338,16 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
                 ) from error
         else:
             other[v.name] = read_other(v, dropped.get(v.name, {}))
-    variables, elements = gather(scalars, frozenset(other))
-    states, order = find_states(model, scalars, variables, elements)
+    variables, elements, _ = gather(scalars, frozenset(other))
+    derivatives = read_derivatives(model)
+    states, order = find_states(derivatives, scalars, variables, elements)
     variables, aliases = find_aliases(variables)
     return {
         "variables": variables,
         "other": other,
         "elements": elements,
+        "scalars": scalars,
+        "derivatives": derivatives,
         "aliases": aliases,
         "dependencies": read_feedthrough(model),
         "states": states,

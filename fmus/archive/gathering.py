@@ -15,9 +15,21 @@ _INDEXED = re.compile(r"(?P<stem>.*[^\[\]])\[(?P<index>\d+(?: *, *\d+)*)\](?P<ta
 
 Elements = dict[str, tuple[str, tuple[int, ...]]]
 """Array and index, from 0 on, of scalars that were gathered, by their names."""
+Join = tuple[tuple[FmuVariable, tuple[int, ...]], ...]
+"""Scalars of an array that the user has put together, with their indices from 0 on, in C order."""
 
 
-def gather(scalars: Mapping[str, FmuVariable], taken: frozenset[str]) -> tuple[dict[str, FmuVariable], Elements]:
+def read_index(name: str) -> tuple[str, tuple[int, ...]]:
+    """Return the array and the index of an element's name, ``("s", (1,))`` of ``"s[1]"``; no index for other names."""
+    match = _INDEXED.fullmatch(name)
+    if match is None:
+        return name, ()
+    return match["stem"] + match["tail"], tuple(int(i) for i in match["index"].split(","))
+
+
+def gather(
+    scalars: Mapping[str, FmuVariable], taken: frozenset[str], joins: Mapping[str, Join] | None = None
+) -> tuple[dict[str, FmuVariable], Elements, dict[str, str]]:
     """Gather scalars with indices into arrays, where they are contiguous from 0 or 1, and alike.
 
     Alike are scalars of one type, causality, variability, ``initial`` and unit, that all or none have start values. A
@@ -29,19 +41,23 @@ def gather(scalars: Mapping[str, FmuVariable], taken: frozenset[str]) -> tuple[d
         All variables by name; those with a shape, and those without an index, stay.
     taken : frozenset of str
         Further names that an array can't have.
+    joins : mapping, optional
+        Arrays that the user has put together, by their ports; an array of the FMU's own that has one of their scalars
+        is not gathered.
 
     Returns
     -------
-    dict, dict
-        Variables by name, and array and index of each scalar that was gathered.
+    dict, dict, dict
+        Variables by name, array and index of each scalar that was gathered, and the ports of the joins by the names of
+        their arrays: the port's, where no variable has it, else those of the scalars.
     """
+    joins = joins or {}
+    port_of = {v.name: port for port, join in joins.items() for v, _ in join}
     groups: dict[str, list[tuple[tuple[int, ...], FmuVariable]]] = {}
     stem_of: dict[str, str] = {}
     for name, variable in scalars.items():
-        match = _INDEXED.fullmatch(name) if not variable.shape else None
-        if match is not None:
-            stem = match["stem"] + match["tail"]
-            index = tuple(int(i) for i in match["index"].split(","))
+        stem, index = read_index(name) if not variable.shape else (name, ())
+        if index:
             groups.setdefault(stem, []).append((index, variable))
             stem_of[name] = stem
     found: dict[str, FmuVariable] = {}
@@ -49,16 +65,28 @@ def gather(scalars: Mapping[str, FmuVariable], taken: frozenset[str]) -> tuple[d
     arrays = {
         stem: array
         for stem, group in groups.items()
-        if stem not in scalars and stem not in taken and (array := _array(stem, group)) is not None
+        if stem not in scalars
+        and stem not in taken
+        and not any(v.name in port_of for _, v in group)
+        and (array := _array(stem, group)) is not None
+    }
+    names = {
+        port: port if not (port in scalars or port in taken or port in arrays) else ", ".join(v.name for v, _ in join)
+        for port, join in joins.items()
     }
     for name, variable in scalars.items():
         stem = stem_of.get(name, "")
-        if stem not in arrays:
+        if name in port_of:
+            array_name, join = names[port_of[name]], joins[port_of[name]]
+            if array_name not in found:
+                found[array_name] = _join(array_name, join)
+                elements.update({v.name: (array_name, index) for v, index in join})
+        elif stem not in arrays:
             found[name] = variable
         elif stem not in found:
             found[stem] = arrays[stem][0]
             elements.update({v.name: (stem, index) for v, index in arrays[stem][1]})
-    return found, elements
+    return found, elements, {array: port for port, array in names.items()}
 
 
 def _array(
@@ -74,18 +102,29 @@ def _array(
     complete = len(set(indices)) == len(indices) == np.prod(shape, dtype=int)
     if base not in (0, 1) or not complete or len({_kind(v) for v in members}) > 1:
         return None
-    first = members[0]
-    array = replace(
-        first,
+    array = _make_array(name, members, shape)
+    return array, [(v, tuple(i - base for i in index)) for v, index in zip(members, indices, strict=True)]
+
+
+def _join(name: str, join: Join) -> FmuVariable:
+    """Return the array of scalars that the user has put together; it has a start value if all of them have."""
+    members, shape = [v for v, _ in join], tuple(int(n) + 1 for n in np.max([index for _, index in join], axis=0))
+    same = len({v.initial for v in members}) == 1
+    return replace(_make_array(name, members, shape), initial=members[0].initial if same else "calculated")
+
+
+def _make_array(name: str, members: list[FmuVariable], shape: tuple[int, ...]) -> FmuVariable:
+    has_start = all(v.start is not None for v in members)
+    return replace(
+        members[0],
         name=name,
         references=tuple(r for v in members for r in v.references),
         shape=shape,
-        start=None if first.start is None else np.array([v.start for v in members], dtype=float).reshape(shape),
+        start=np.array([v.start for v in members], dtype=float).reshape(shape) if has_start else None,
         minimum=_common([v.minimum for v in members], -np.inf, shape),
         maximum=_common([v.maximum for v in members], np.inf, shape),
         nominal=_common([v.nominal for v in members], 1.0, shape),
     )
-    return array, [(v, tuple(i - base for i in index)) for v, index in zip(members, indices, strict=True)]
 
 
 def _kind(v: FmuVariable) -> tuple[Any, ...]:

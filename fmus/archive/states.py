@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -9,8 +10,24 @@ from .gathering import Elements
 from .variables import FmuVariable
 
 
+def read_derivatives(model: Any) -> dict[str, str]:
+    """Return the continuous states' names by those of their derivatives, in the order of the model structure.
+
+    There are none if one of the states is no variable.
+
+    Parameters
+    ----------
+    model : fmpy.model_description.ModelDescription
+        The description, as FMPy has read it.
+    """
+    pairs = {
+        u.variable.derivative.name: u.variable.name for u in model.derivatives if u.variable.derivative is not None
+    }
+    return pairs if len(pairs) == len(model.derivatives) else {}
+
+
 def find_states(
-    model: Any, scalars: dict[str, FmuVariable], variables: dict[str, FmuVariable], elements: Elements
+    pairs: Mapping[str, str], scalars: Mapping[str, FmuVariable], variables: dict[str, FmuVariable], elements: Elements
 ) -> tuple[dict[str, str], tuple[int, ...]]:
     """Return states with their derivatives, and the order of their elements (FMI 2.0, 2.2.8; FMI 3.0, 2.4.8).
 
@@ -19,8 +36,8 @@ def find_states(
 
     Parameters
     ----------
-    model : fmpy.model_description.ModelDescription
-        The description, as FMPy has read it.
+    pairs : mapping
+        See `read_derivatives`.
     scalars : dict
         Variables before they were gathered.
     variables : dict
@@ -34,11 +51,8 @@ def find_states(
         Names of derivatives by those of their states, and the place of each of the FMU's states among the elements of
         these.
     """
-    pairs = {
-        u.variable.derivative.name: u.variable.name for u in model.derivatives if u.variable.derivative is not None
-    }
     names = {*pairs, *pairs.values()}
-    if len(pairs) != len(model.derivatives) or any(n not in scalars or scalars[n].type != "Float64" for n in names):
+    if any(n not in scalars or scalars[n].type != "Float64" for n in names):
         return {}, ()
     members: dict[str, list[str]] = {}
     for name, (array, _) in elements.items():
@@ -64,7 +78,7 @@ def find_states(
 def _derivative(
     state: str,
     parts: list[str],
-    scalars: dict[str, FmuVariable],
+    scalars: Mapping[str, FmuVariable],
     variables: dict[str, FmuVariable],
     elements: Elements,
     members: dict[str, list[str]],

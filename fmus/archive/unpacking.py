@@ -5,14 +5,19 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
-from ...blocks.core import FmuError, FmuFileError
-from ..platform import cache_folder, check_cache
+from ...blocks.core import FmuFileError
+from ..platform import cache_folder, check_cache, explain_cache_errors
 from .binaries import check_binary
 from .description import FmuDescription
 from .faults import FmuFault
 from .zip_file import FmuArchive
+
+RESOURCES = "resources"
+"""Folder whose place an FMU gets when it is instantiated (FMI 2.0, 2.1.5; FMI 3.0, 2.3.1): it is there, empty or not.
+"""
 
 
 def unpack(description: FmuDescription) -> Path:
@@ -26,9 +31,10 @@ def unpack(description: FmuDescription) -> Path:
         If the archive can't be unpacked or is not the file that was described, or if the library for this platform
         can't be loaded safely.
     """
-    folder = cache_folder().absolute() / "unpacked" / description.digest[:32]
-    if folder.is_dir():
-        return folder
+    folder = cache_folder() / "unpacked" / description.digest[:32]
+    with explain_cache_errors():
+        if (folder / RESOURCES).exists():
+            return folder
     archive = FmuArchive.open(description.file, description.limits)
     if archive.digest != description.digest:
         raise FmuFileError(
@@ -52,23 +58,23 @@ def unpack_archive(archive: FmuArchive, folder: Path) -> None:
         If a file in the archive is damaged.
     """
     check_cache()
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(dir=folder.parent))
-    try:
-        write_files(archive, fresh)
+    with explain_cache_errors(f"the FMU {str(archive.path)!r} can't be unpacked"):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        fresh = Path(tempfile.mkdtemp(dir=folder.parent))
         try:
-            fresh.rename(folder)
-        except OSError:  # another process was faster
-            if not folder.is_dir():
-                raise
-    except OSError as error:
-        raise FmuError(
-            f"the FMU {str(archive.path)!r} can't be unpacked into {str(fresh)!r}: {error}. Make room there, or "
-            "set LOOPWRIGHT_CACHE to another folder."
-        ) from error
-    finally:
-        if fresh.is_dir():
-            shutil.rmtree(fresh, ignore_errors=True)
+            write_files(archive, fresh)
+            with suppress(FileExistsError):
+                (fresh / RESOURCES).mkdir()
+            try:
+                fresh.rename(folder)
+            except OSError:  # another process was faster, or an earlier version has left the empty folder out
+                if not folder.is_dir():
+                    raise
+                with suppress(FileExistsError):
+                    (folder / RESOURCES).mkdir()
+        finally:
+            if fresh.is_dir():
+                shutil.rmtree(fresh, ignore_errors=True)
 
 
 def write_files(archive: FmuArchive, folder: Path, names: Iterable[str] | None = None) -> None:

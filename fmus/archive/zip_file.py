@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ...blocks.core import FmuFileError
+from ...blocks.core import FmuFileError, describe_disk_error
 from .entries import check_entries
 from .faults import FmuFault, FmuFinding
 from .library import LFS_POINTER
@@ -21,6 +21,8 @@ from .xml_text import parse_xml
 
 DESCRIPTION = "modelDescription.xml"
 BUILD_DESCRIPTION = "sources/buildDescription.xml"
+OTHER_PLACE = "Copy it to a folder that you can read."
+"""Step where the file can't be read."""
 _CHUNK = 1 << 20
 _END = struct.Struct("<4s4H2LH")
 """End of the table of contents of a zip archive."""
@@ -66,10 +68,10 @@ class FmuArchive:
             If the file is missing or no zip archive, or is refused by `check_entries`.
         """
         path, limits = Path(file).expanduser(), limits or ArchiveLimits()
-        if not path.is_file():
-            found = f"{str(path)!r} is a folder" if path.is_dir() else f"there is no file {str(path)!r}"
-            raise FmuFileError(f"{found}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
         with _reading(path):
+            if not path.is_file():
+                found = f"{str(path)!r} is a folder" if path.is_dir() else f"there is no file {str(path)!r}"
+                raise FmuFileError(f"{found}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
             if path.stat().st_size > limits.size:
                 raise FmuFileError(
                     f"{str(path)!r} has {path.stat().st_size:.3g} bytes; expected at most {limits.size:.3g}. If you "
@@ -176,9 +178,8 @@ def _reading(path: Path) -> Iterator[None]:
         ) from None
     except OSError as error:
         raise FmuFileError(
-            f"{str(path)!r} can't be read: {error}. Check its permissions, or copy or export it again.",
-            fault=FmuFault.DAMAGED,
-        ) from None
+            f"{str(path)!r} can't be read: {describe_disk_error(error, path, OTHER_PLACE)}", fault=FmuFault.DAMAGED
+        ) from error
     except Exception as error:  # zipfile raises many kinds of errors on damaged archives
         raise FmuFileError(
             f"{str(path)!r} is no FMU: it is a damaged zip archive ({str(error) or type(error).__name__}). Copy it "

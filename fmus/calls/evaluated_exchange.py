@@ -6,13 +6,13 @@ import ctypes
 import math
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 
 from ...blocks.core import EvaluationVectors, FmuRuntimeError, Layout, Wanted, elements
 from ..archive import ExchangeInfo, FmuVariable
-from ..platform import is_built_here
 from .bound_calls import DISCARD, ERROR, FATAL, Call
 from .evaluation import DirectEvaluation, Evaluation, Vector
 from .exchange_states import SavedExchange
@@ -22,12 +22,13 @@ from .loaded_library import MakeCalls
 from .transfer import OutOfRangeError, Transfer, UnfitError
 
 _NOTHING = nullcontext()
-_MOVED, _SAME, _MOST_PATTERNS = 1e-4, 1e-8, 50
-"""Relative distance by which a check of the model structure moves states and inputs; change that is none; patterns."""
-_CHECKED: set[tuple[str, float, bytes, bytes]] = set()
+_MOVED, _SAME, _MOST_PATTERNS, _MOST_NOTES = 1e-4, 1e-8, 50, 5
+"""Relative distance by which a check of the model structure moves states and inputs; change that is none; patterns, and
+notes on values that change by themselves."""
+_CHECKED: dict[tuple[str, float, bytes, bytes], Sequence[str]] = {}
 _MOST_CHECKED = 10_000
-"""Points at which the model structure of an FMU has been checked in this process: its digest, t, x and u; and how many
-are kept."""
+"""Points at which the model structure of an FMU has been checked in this process: its digest, t, x and u, with notes on
+what was found there; and how many are kept."""
 
 
 class EvaluatedExchange(SavedExchange):
@@ -41,8 +42,8 @@ class EvaluatedExchange(SavedExchange):
 
     def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):
         super().__init__(block, model_exchange=True, make_calls=make_calls)
-        assert self.description.exchange is not None
-        self.about: ExchangeInfo = self.description.exchange
+        assert block.exchange_info is not None
+        self.about: ExchangeInfo = block.exchange_info
         self._ports = dict(block.input_variables)
         self._places = Layout.of({port: v.shape for port, v in self._ports.items()}).slices
         self._wired = {port: self._ports[port] for port in wired}
@@ -54,7 +55,7 @@ class EvaluatedExchange(SavedExchange):
         self._x, self._dx = (self._allocate(n) for _ in range(2))
         self._indicators = self._allocate(len(self.about.indicators))
         self._evaluations: dict[Wanted, Evaluation] = {}
-        self._is_own = self.fmi.in_process and is_built_here(self.description.digest)
+        self._is_own = self.fmi.in_process and self.is_built_here
         self._guarded = self.fmi.in_process and not self._is_own
         self._is_placed = False
         """Whether a bound evaluation has just set time and states."""
@@ -100,8 +101,20 @@ class EvaluatedExchange(SavedExchange):
             rates=wanted.rates,
             indicators=Vector("indicators", self._indicators) if wanted.indicators else None,
             then=then,
-            lazy=not self._is_own,
+            asked_first=None if self.is_built_here or (then and wanted == Wanted()) else self._asked_first,
         )
+
+    @cached_property
+    def _asked_first(self) -> Transfer:
+        """Transfer of one variable that is computed, if there is one: to read it lets the FMU compute all of them."""
+        about = self.description
+        states, rates = (list(map(about.find, names)) for names in (about.states, about.states.values()))
+        given = {v.keys for v in states}
+        computed = [
+            v for v in about.variables.values() if v.causality == "output" and is_smooth(v) and v.keys not in given
+        ]
+        read = {v.name: v for v in sorted(computed or rates or states, key=lambda v: v.size)[:1]}
+        return Transfer(self.fmi, "Get", read, self._allocate(sum(v.size for v in read.values())))
 
     def bound_evaluation(self, wanted: Wanted, vectors: EvaluationVectors, *, again: bool) -> Callable[[], None]:
         """Return the call that reads and writes these vectors as `evaluation` does its arguments and its result.
@@ -243,10 +256,16 @@ class EvaluatedExchange(SavedExchange):
 
         FMUs that Loopwright has built are right. An input may act in some mode only, so every start is looked at. The
         order of evaluation and linear models rest on it. Everything that some values should not follow is moved.
+
+        Values that differ between evaluations at one point, such as a processor time, follow nothing: that is noted.
         """
         about = self.description
         key = about.digest, t, x.tobytes(), u.tobytes()
-        if is_built_here(about.digest) or key in _CHECKED or (x.size and not about.states):
+        if key in _CHECKED:
+            for text in _CHECKED[key]:
+                self.add_note(text)
+            return
+        if self.is_built_here or self.block.dependencies == "all" or (x.size and not about.states):
             return
         ports = [p for p, v in self.block.output_variables.items() if v.type == "Float64" and is_smooth(v)]
         rows = [self.block.output_variables[p] for p in ports]
@@ -273,31 +292,45 @@ class EvaluatedExchange(SavedExchange):
                     first += v.size
             return self._run(bound, t, moved[: x.size], inputs).copy()
 
-        base, whole = values(start), np.abs(values(start + step))
+        names = [label for v in rows for label in elements(v.name, v.shape)]
+        base, again, whole = values(start), values(start), np.abs(values(start + step))
+        least, drift = _SAME * (np.abs(base) + whole), np.abs(again - base)
         for pattern in np.unique(declared, axis=0)[:_MOST_PATTERNS]:
             mine, free = np.all(declared == pattern, axis=1), ~pattern & (step != 0.0)
-            least = _SAME * (np.abs(base) + whole)
-            off = mine & (np.abs(values(np.where(free, start + step, start)) - base) > least) if free.any() else []
-            if not np.any(off):
+            if not free.any():
                 continue
-            values(start)
-            names = [label for v in rows for label in elements(v.name, v.shape)]
+            off = mine & (np.abs(values(np.where(free, start + step, start)) - base) > least)
+            if off.any():  # a value that grows by itself, in steps of a clock, may have waited for just this moment
+                drift = np.fmax(drift, np.abs(values(start) - base))
+            off &= ~(drift > least)
+            if not off.any():
+                continue
             knowns = [label for v, _ in columns for label in elements(v.name, v.shape)]
             row = int(np.flatnonzero(off)[0])
             alone = (np.where(np.arange(start.size) == k, start + step, start) for k in np.flatnonzero(free))
             sizes = [abs(values(moved)[row] - base[row]) for moved in alone]
+            values(start)
             k = int(np.flatnonzero(free)[int(np.argmax(sizes))])
             raise FmuRuntimeError(
                 f"its model structure says that {names[row]!r} does not depend on {knowns[k]!r}; found a change of "
                 f"{max(sizes):.3g} where that moves by {step[k]:.3g}. The order of evaluation would be wrong. Take "
-                "interface='co_simulation' if it is offered, and tell its makers.",
+                "interface='co_simulation' if it is offered, or dependencies='all', by which everything may depend on "
+                "everything, and tell its makers.",
                 block=self.block.label,
                 t=t,
             )
         values(start)
+        notes = [
+            f"{names[row]!r} changes by itself: it differs by {drift[row]:.3g} between evaluations at one time, with "
+            "the same states and inputs, as a processor time or a random number does. Runs with it are not repeatable "
+            "where it is read, and its dependencies can't be checked"
+            for row in np.flatnonzero(drift > least)[:_MOST_NOTES]
+        ]
+        for text in notes:
+            self.add_note(text)
         if len(_CHECKED) >= _MOST_CHECKED:
             _CHECKED.clear()
-        _CHECKED.add(key)
+        _CHECKED[key] = notes
 
     def _error(self, action: str, status: int, t: float) -> FmuRuntimeError:
         self.failed, self.fatal = status >= ERROR, status >= FATAL

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from .fmi_calls import WARNING, FmiCalls
 from .native_step import ActionKind, NativeAction, call_action, copy_action, transfer_actions
 from .transfer import Transfer
 
+T = TypeVar("T")
 _Named = tuple[Callable[..., int], tuple[Any, ...], str]
 """A function, its arguments, and the name of the call."""
 
@@ -32,7 +33,9 @@ class Evaluation:
     """Calls that set time, states and inputs, and get outputs, derivatives and indicators; ``then`` follow others.
 
     Each call is bound once, to vectors that stay where they are: a process of its own can make one round trip of it.
-    ``lazy`` says that variables may be computed with the derivatives alone, so that these come first, wanted or not.
+
+    The order of questions is that of `order_questions`. ``asked_first`` are the variables that are read before the
+    derivatives where no outputs are wanted; None for an FMU that computes all that it is asked for, in any order.
 
     Attributes
     ----------
@@ -59,7 +62,7 @@ class Evaluation:
         rates: bool,
         indicators: Vector | None,
         then: Sequence[tuple[Call, str]] = (),
-        lazy: bool = True,
+        asked_first: Transfer | None = None,
     ):
         self._time, self._inputs, self._index, self._outputs = time, inputs, index, outputs
         self._states = states.values
@@ -73,11 +76,13 @@ class Evaluation:
         given = [(group.function, group.arguments, "setting the inputs") for group in inputs.groups]
         got = [(group.function, group.arguments, "reading the outputs") for group in outputs.groups]
         starting = [*given, *got]  # derivatives and indicators can't be computed yet (FMI 2.0, 3.2.3)
-        # Derivatives come before outputs: FMUs of older tools compute their variables with them alone.
-        slopes = []
-        if rates or (got and lazy):
-            slopes = _vector_call(fmi, derivatives, "computing the derivatives of its states")
-        more = [*given, *slopes, *got, *_vector_call(fmi, indicators, "computing the event indicators")]
+        slopes = _vector_call(fmi, derivatives, "computing the derivatives of its states")
+        if asked_first is None:
+            asked = [*(slopes if rates else ()), *got]
+        else:
+            others = [(group.function, group.arguments, "reading a variable") for group in asked_first.groups]
+            asked = order_questions(got or others, slopes, got)
+        more = [*given, *asked, *_vector_call(fmi, indicators, "computing the event indicators")]
         more += [(*call, action) for call, action in then]
         self._running, self._starting = (_bind(fmi, calls) for calls in ([*at, *more], starting))
 
@@ -133,6 +138,17 @@ class Evaluation:
         if self.indicators is not None:
             made += copy_action(give, into, places[self._indicators_at], self.indicators.values)
         return made
+
+
+def order_questions(values: Sequence[T], derivatives: Sequence[T], values_again: Sequence[T]) -> list[T]:
+    """Return the calls that read variables and derivatives of an FMU at one point, in an order that holds for all.
+
+    The getter of the derivatives of some FMUs computes the differential equations alone, and then says that all is
+    computed: variables that are read after it only are those of an earlier point, and so are event indicators.
+    Variables of others are computed with the derivatives alone. So variables come first, then the derivatives, wanted
+    or not, then the variables that are wanted once more.
+    """
+    return [*values, *derivatives, *(values_again if derivatives else ())]
 
 
 class DirectEvaluation:

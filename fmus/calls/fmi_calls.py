@@ -250,7 +250,17 @@ class FmiCalls(ABC):
         """
         function = self.fmu.dll[self.exported(name)]
         function.restype = ctypes.c_uint
+        if self._after is not None:
+            function.errcheck = self._after
         return function  # type: ignore[no-any-return]
+
+    _after: Callable[..., Any] | None = None
+
+    def settle_by(self, after: Callable[..., Any]) -> None:
+        """Let ctypes call a function after each function of the library, with what that has returned."""
+        self._after = after
+        for function in self.fmu._functions.values():
+            function.errcheck = after
 
     # ---- steps ----
 

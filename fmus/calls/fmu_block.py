@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 from ...blocks.core import FmuRuntimeError
-from ..archive import FmuDescription, FmuVariable, OtherVariable
+from ..archive import ExchangeInfo, FmuDescription, FmuVariable, OtherVariable
 from .step_options import StepOptions
 
 
@@ -41,6 +41,14 @@ class FmuBlock(Protocol):
     @property
     def text_variables(self) -> Mapping[str, OtherVariable]:
         """Texts and binary data that are recorded in a run, by their ports."""
+
+    @property
+    def exchange_info(self) -> ExchangeInfo | None:
+        """Its model exchange, with the dependencies that hold for it; None without one."""
+
+    @property
+    def dependencies(self) -> str:
+        """Dependencies of its outputs and derivatives in model exchange: "declared" or "all"."""
 
     @property
     def stepping(self) -> StepOptions:

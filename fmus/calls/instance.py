@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import partial
@@ -19,7 +20,7 @@ from .native_step import NativeStep, native_step
 from .saved_state import FmuState, StepMemory, pack_state, unpack_state
 from .shared_steps import QuietSteps, SharedSteps
 from .step_failures import NEAR, StepFailures
-from .step_options import needs_care
+from .step_options import adds_alone, needs_care
 from .stepping import CarefulSteps
 from .texts import Text, TextRecord, watch_texts
 from .transfer import BoundStart, Transfer, UnfitError
@@ -91,6 +92,8 @@ class FmuInstance(StepFailures):
             Start values beside those of the block, which they override, by the FMU's names.
         """
         self.reset()
+        if self._careful is not None:
+            self._careful.added[:] = math.nan
         given = {**self.block.start, **values}
         if (names := tuple(given)) not in self._starts:
             fits = self._native is not None and self.is_built_here and BoundStart.fits(self.description, names)
@@ -123,19 +126,23 @@ class FmuInstance(StepFailures):
         call = self.fmi.step_call(self._now, self._width, self._final)
         plain = ins.is_plain and outs.is_plain and not ins.has_limits
         careful = needs_care(self.description, self.block.stepping)
+        if careful:
+            self._careful = CarefulSteps(self, self._inputs, inputs, outs, call)
+        adds = not self.fmi.in_process and adds_alone(self.description, self.block.stepping)
         if self.fmi.in_process:
             self.step, self.exchange, self.read = (self._bind_plain if plain else self._bind_typed)(ins, outs, call)
         else:
             self._watch = watch = watch_texts(self.fmi, self._texts.variables.values())
-            shared = SharedSteps(self, ins, outs, call, None if careful else watch)
+            added = self._careful.added if adds and self._careful is not None else None
+            shared = SharedSteps(self, ins, outs, call, None if careful and not adds else watch, added)
             self.step, self.exchange, self.read = shared.bind_step(), shared.exchange, shared.read
             self.start_step, self.finish_step = shared.start, shared.finish
-            self._shared = shared if not careful and (watch is not None or not self._texts.variables) else None
+            plain = (adds or not careful) and (watch is not None or not self._texts.variables)
+            self._shared = shared if plain else None
         self._call = call
         plain = plain and self.fmi.in_process and not careful and not self._texts.variables
         self._native = (call, ins, outs) if plain else None
-        if careful:
-            self._careful = CarefulSteps(self, self._inputs, inputs, outs, call)
+        if self._careful is not None and not adds:
             self.step = partial(self._step_marked, self._careful.step)
             if not self.fmi.in_process and (self._watch is not None or not self._texts.variables):
                 self._quiet = QuietSteps(self, self._careful, self._watch)

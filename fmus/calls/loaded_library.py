@@ -10,10 +10,19 @@ from weakref import WeakSet
 
 import numpy as np
 
-from ...blocks.core import FmuError, FmuFileError, FmuProcessError, FmuRuntimeError, UnknownNameError, near
+from ...blocks.core import (
+    FmuError,
+    FmuFileError,
+    FmuProcessError,
+    FmuRuntimeError,
+    UnknownNameError,
+    describe_disk_error,
+    near,
+)
 from ..archive import FmuFault, FmuVariable, inexact, unpack
 from ..host_state import FOLDER, HostState, guard_host
 from ..platform import is_built_here
+from .evaluation import order_questions
 from .fmi1 import Fmi1Calls
 from .fmi2 import Fmi2Calls
 from .fmi3 import Fmi3Calls
@@ -64,6 +73,8 @@ class LoadedFmu:
                     model_exchange=model_exchange,
                 )
                 self._fmu, self.fmi.lose, self._reading = self.fmi.fmu, self.lose, SharedReading(self.fmi)
+                if self.fmi.in_process and not self.is_built_here:
+                    self.fmi.settle_by(self.host.settle)
                 self._check_version()
                 if not model_exchange:
                     choose_modes(self.fmi, description, block.stepping)
@@ -76,8 +87,12 @@ class LoadedFmu:
                 raise
             except Exception as error:
                 self._end_calls()
-                text = f"the FMU {str(description.file)!r} can't be loaded: {error}{self._quote_messages()} "
-                text += f"Look for its fault with 'loopwright doctor {description.file}'."
+                step = f"Look for its fault with 'loopwright doctor {description.file}'."
+                if isinstance(error, OSError) and error.errno is not None:  # not the loader's, which is a text alone
+                    found = f"{describe_disk_error(error, files, step)}{self._quote_messages()}"
+                else:
+                    found = f"{error}{self._quote_messages()} {step}"
+                text = f"the FMU {str(description.file)!r} can't be loaded: {found}"
                 raise FmuFileError(text, fault=FmuFault.LOADING, block=block.label) from error
         self._open = True
         if description.only_once and self.fmi.in_process:
@@ -177,9 +192,11 @@ class LoadedFmu:
             text = self.description.texts.get(name)
             kept = self.values([name]).tolist() if text is None else read_text(self.fmi, text)
             put = value if text is not None else np.ravel(value).tolist()
+            advice = "Leave it out, or set the parameters that it depends on."
+            if name in (v.name for v in self.block.input_variables.values()):
+                advice = "Wire it, with Constant, say: a wire sets it before each step."
             raise FmuRuntimeError(
-                f"its start value was set to {put!r}, but is {kept!r}{moment}: the FMU does not keep it. "
-                "Leave it out, or set the parameters that it depends on.",
+                f"its start value was set to {put!r}, but is {kept!r}{moment}: the FMU does not keep it. {advice}",
                 block=self.block.label,
                 port=f"start.{name}",
                 t=self._began,
@@ -259,7 +276,8 @@ class LoadedFmu:
             If the FMU's function returns an error.
         """
         try:
-            return function(*arguments)
+            with self.host if self.fmi.in_process and not self.is_built_here else nullcontext():
+                return function(*arguments)
         except FmuProcessError as error:
             raise self.lose(error) from None
         except Exception as error:
@@ -369,6 +387,28 @@ class LoadedFmu:
         """Set all continuous states in model exchange, in the order of the description's `states`."""
         given = x[np.array(self.description.state_order, dtype=int)]
         self.call("setting the continuous states", self.fmi.set_continuous_states, given)
+
+    def rates_and_values(self, order: np.ndarray, rates: Sequence[str], names: Sequence[str]) -> np.ndarray:
+        """Return the derivatives of all states in model exchange, then the elements of variables.
+
+        Parameters
+        ----------
+        order : ndarray of int
+            Where the derivatives, as the FMU orders them, stand in the result: the description's ``state_order``.
+        rates, names : sequence of str
+            Variables of the derivatives, and others to be read.
+        """
+        found = {"values": np.zeros(0), "rates": np.zeros(order.size)}
+
+        def read() -> None:
+            found["values"] = self.values(names or rates)
+
+        def derive() -> None:
+            found["rates"][order] = self.call("computing the derivatives", self.fmi.state_derivatives, order.size)
+
+        for ask in order_questions([read], [derive] if order.size else [], [read]):
+            ask()
+        return np.concatenate([found["rates"], found["values"] if names else np.zeros(0)])
 
     # ---- the end ----
 

@@ -147,6 +147,9 @@ class QuietStep:
         Address of the flag of an event at the end of a step; 0 where it makes no difference.
     changed : int
         Address of the word that tells that texts have changed; 0 without texts.
+    added : ndarray, shape (1,), or None
+        Time in s that steps have added up to, at which the next one begins; NaN before the first one. None where steps
+        begin at the times of the run.
     """
 
     until: np.ndarray
@@ -159,6 +162,7 @@ class QuietStep:
     slopes: np.ndarray | None
     event: int
     changed: int
+    added: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)

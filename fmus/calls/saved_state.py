@@ -61,7 +61,7 @@ class StepMemory:
 
     next_event: float
     last: np.ndarray
-    added: float | None
+    added: float
     fresh: bool
     clocks: tuple[tuple[float, float, int, float], ...]
     clocked: tuple[np.ndarray, ...]

@@ -15,7 +15,7 @@ from .bound_calls import WARNING, BoundCalls
 from .fmi_calls import FmiCalls, StepCall
 from .native_step import QuietStep, RemoteStep, remote_step
 from .saved_state import FmuState
-from .step_options import StepTime
+from .step_options import StepTime, add_step
 from .stepped_instance import SteppedInstance as Judge
 from .stepping import CarefulSteps
 from .texts import TextWatch
@@ -61,12 +61,21 @@ class SharedSteps:
         The step.
     watch : TextWatch, optional
         Calls that note whether texts have changed.
+    added : ndarray, shape (1,), optional
+        Time in s that steps have added up to; see `add_step`. Without it steps begin at the times of the run.
     """
 
     def __init__(
-        self, instance: SteppedInstance, ins: Transfer, outs: Transfer, call: StepCall, watch: TextWatch | None = None
+        self,
+        instance: SteppedInstance,
+        ins: Transfer,
+        outs: Transfer,
+        call: StepCall,
+        watch: TextWatch | None = None,
+        added: np.ndarray | None = None,
     ):
         self.instance, self.ins, self.outs, self.call, self._watch = instance, ins, outs, call, watch
+        self._added = added
         bind, self._t, self._h = instance.fmi.bind, 0.0, 0.0
         self._n_in, self._n_out = len(ins.calls), len(ins.calls) + len(outs.calls)
         texts = [] if watch is None else watch.calls
@@ -77,7 +86,7 @@ class SharedSteps:
     def bind_step(self) -> Callable[[float, float], None]:
         """Return `step`, for ports that are Float64 all as one function, which costs less."""
         instance, call, run = self.instance, self.call, self._step.runner()
-        if not (self.ins.is_whole and self.outs.is_whole) or self.ins.has_limits:
+        if not (self.ins.is_whole and self.outs.is_whole) or self.ins.has_limits or self._added is not None:
             return self.step
         filled, spread = self.ins.views, self.outs.views  # (from, to) each, in the sense of setting
         now, width, any_flag, reached = instance.now, instance.width, call.any_flag, call.reached
@@ -105,23 +114,26 @@ class SharedSteps:
         if request is None:
             return None
         step = remote_step(request, instance.now, instance.width, self.call, self.ins, self.outs)
-        if step is None or self._watch is None:
+        if step is None or (self._watch is None and self._added is None):
             return step
-        none, changed = np.zeros(0, dtype=np.int64), ctypes.addressof(self._watch.changed)
-        texts = QuietStep(
-            np.full(1, math.inf), self.ins.vector, none, np.zeros(0), none, np.zeros(1), None, None, 0, changed
-        )
-        return replace(step, quiet=texts)
+        none, changed = np.zeros(0, dtype=np.int64), 0 if self._watch is None else ctypes.addressof(self._watch.changed)
+        quiet = QuietStep(
+            np.full(1, math.inf), self.ins.vector, none, np.zeros(0), none, np.zeros(1), None, None, 0, changed,
+            self._added,
+        )  # fmt: skip
+        return replace(step, quiet=quiet)
 
     def take_over(self, t: float, h: float) -> None:
         """Go on with a step from t over h, both in s, that C has begun: `finish` ends it."""
-        self._t, self._h = t, h
+        self._t, self._h = t if self._added is None else self.instance.now.value, h
         self.instance.is_stepping = True
 
     def start(self, t: float, h: float) -> None:
         """Set the inputs, and begin a step from a time over a length, both in s."""
         instance = self.instance
         self._fill(t, in_step=True)
+        if self._added is not None:
+            t = add_step(self._added, t, h)
         instance.set_span(t, h)
         self._t, self._h = t, h
         instance.is_stepping = True

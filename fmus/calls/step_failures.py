@@ -274,7 +274,8 @@ class StepFailures(LoadedFmu):
             self._note_texts(t + h)
 
     def _note_texts(self, t: float) -> None:
-        if self._careful is not None or self._watch is None or self._watch.take():
+        each = self._careful is not None and self._shared is None
+        if each or self._watch is None or self._watch.take():
             self.call("reading its texts", self._texts.note, t)
             if self._watch is not None:
                 self._watch.take()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from fractions import Fraction
+
+import numpy as np
 
 from ...blocks.core import ParameterError, explain_calls
 from ..archive import FmuDescription
@@ -165,6 +167,18 @@ def choose_modes(fmi: FmiCalls, about: FmuDescription, options: StepOptions) -> 
 
 def _slopes_flag(about: FmuDescription) -> str:
     return "providesIntermediateUpdate" if about.fmi.startswith("3") else "canInterpolateInputs"
+
+
+def adds_alone(about: FmuDescription, options: StepOptions) -> bool:
+    """Whether the times at which steps begin are added up, and steps are but for that setting, stepping and getting."""
+    return options.time is StepTime.ADDED and not needs_care(about, replace(options, time=StepTime.MULTIPLIED))
+
+
+def add_step(added: np.ndarray, t: float, h: float) -> float:
+    """Return where a step of h begins whose times are added up, and add it; t where it is the first one. In s."""
+    start = t if math.isnan(added[0]) else float(added[0])
+    added[0] = start + h
+    return start
 
 
 def needs_care(about: FmuDescription, options: StepOptions) -> bool:

@@ -18,7 +18,7 @@ from ..archive import FmuVariable
 from .fmi_calls import DISCARD, MOST_ROUNDS, WARNING, StepCall
 from .fmu_block import check_next_time
 from .saved_state import Clock, FmuState, StepMemory
-from .step_options import StepTime, allows_early_return, uses_event_mode
+from .step_options import StepTime, add_step, allows_early_return, uses_event_mode
 from .stepped_instance import SavedInstance
 from .transfer import PartTransfer, Transfer, UnfitError
 
@@ -88,7 +88,8 @@ class CarefulSteps:
         self.last = np.full(1 + self.sloped.size, math.nan)
         """Time in s and values of these inputs at the step before; NaN without one."""
         self._taken: tuple[int, FmuState | None] | None = None  # status of a step that C has taken, state before it
-        self._added: float | None = None
+        self.added = np.full(1, math.nan)
+        """Time in s that steps have added up to; NaN before the first one. With `StepTime.ADDED` steps begin there."""
         self._has_told = False
         self._fresh = True  # discrete inputs have not been set since the start
 
@@ -99,7 +100,7 @@ class CarefulSteps:
 
         It is called only if Event Mode is used.
         """
-        self.last[:], self._added, self._fresh = math.nan, None, True
+        self.last[:], self.added[:], self._fresh = math.nan, math.nan, True
         self.next_event = math.inf
         for clock in self.clocks:
             if clock.variable.is_periodic and clock.variable.interval is not None:
@@ -118,20 +119,22 @@ class CarefulSteps:
         clocks = tuple((clock.interval, clock.next, clock.count, clock.origin) for clock in self.clocks)
         clocked = tuple(part.values.copy() for _, part in self.clocked)
         jumping = self.jumping.values.copy()
-        return StepMemory(self.next_event, self.last.copy(), self._added, self._fresh, clocks, clocked, jumping)
+        return StepMemory(
+            self.next_event, self.last.copy(), float(self.added[0]), self._fresh, clocks, clocked, jumping
+        )
 
     def return_to(self, t: float, memory: StepMemory | None) -> None:
         """Go on from a restored state at a time in s; without a memory Event Mode tells the next events anew."""
         if memory is not None:
             self.next_event, self.last[:] = memory.next_event, memory.last
-            self._added, self._fresh = memory.added, memory.fresh
+            self.added[:], self._fresh = memory.added, memory.fresh
             self.jumping.values[:] = memory.jumping
             for (_, part), values in zip(self.clocked, memory.clocked, strict=True):
                 part.values[:] = values
             for clock, kept in zip(self.clocks, memory.clocks, strict=True):
                 clock.interval, clock.next, clock.count, clock.origin = kept
             return
-        self.last[:], self._added, self._fresh, self.next_event = math.nan, None, True, math.inf
+        self.last[:], self.added[:], self._fresh, self.next_event = math.nan, math.nan, True, math.inf
         for clock in self.clocks:
             if clock.variable.is_periodic and math.isfinite(clock.interval):
                 ahead = (t - clock.origin) / clock.interval
@@ -143,10 +146,7 @@ class CarefulSteps:
     def step(self, t: float, h: float) -> None:
         """Set the inputs, go from t to t + h (both in s), and get the outputs."""
         instance = self.instance
-        start = t
-        if self.options.time is StepTime.ADDED:
-            start = t if self._added is None else self._added
-            self._added = start + h
+        start = add_step(self.added, t, h) if self.options.time is StepTime.ADDED else t
         changed = self.jumping.take()
         due = [c for c in self.clocks if c.next <= start + _ROUNDED * h]
         waiting = {name for names, part in self.clocked if part.differs for name in names if name in self.triggered}

@@ -44,9 +44,18 @@ _RUNNERS = {
 }
 
 
-@accepts(file=kinds.path, run=kinds.flag, limits=kinds.one_of_class(ArchiveLimits, "ArchiveLimits(…)"))
+@accepts(
+    file=kinds.path,
+    run=kinds.flag,
+    limits=kinds.one_of_class(ArchiveLimits, "ArchiveLimits(…)"),
+    progress=kinds.flag,
+)
 def doctor(
-    file: str | os.PathLike[str], *, run: bool | None = None, limits: ArchiveLimits | None = None
+    file: str | os.PathLike[str],
+    *,
+    run: bool | None = None,
+    limits: ArchiveLimits | None = None,
+    progress: bool = True,
 ) -> FmuDiagnosis:
     """Examine an FMU of any tool: its content, whether it runs here, and violations of the standard.
 
@@ -60,6 +69,8 @@ def doctor(
         Whether to try it; without it, it is tried unless it says that it needs another program.
     limits : ArchiveLimits, optional
         Limits of its size; the usual ones without it.
+    progress : bool
+        Whether a trial run that takes more than 2 s is announced on the standard error, with the limit of its calls.
 
     Returns
     -------
@@ -91,7 +102,7 @@ def doctor(
     errors = [a for a in found if a.severity == FmuSeverity.ERROR]
     trials: list[FmuTrial] = []
     for kind in summary["interfaces"]:
-        trial, finding = _try(path, kind, archive, summary, run, hopeless=bool(errors))
+        trial, finding = _try(path, kind, archive, summary, run, hopeless=bool(errors), progress=progress)
         trials.append(trial)
         found += [] if finding is None else [finding]
     failed = [a for a in found if a.severity == FmuSeverity.ERROR and a.fault == FmuFault.TRIAL]
@@ -301,7 +312,14 @@ def _warning(problem: FmuProblem) -> FmuFinding:
 
 
 def _try(
-    path: Path, kind: str, archive: FmuArchive, summary: Mapping[str, Any], run: bool | None, *, hopeless: bool
+    path: Path,
+    kind: str,
+    archive: FmuArchive,
+    summary: Mapping[str, Any],
+    run: bool | None,
+    *,
+    hopeless: bool,
+    progress: bool,
 ) -> tuple[FmuTrial, FmuFinding | None]:
     """Run an interface in a process of its own, if it is to be tried."""
     attributes = summary["interfaces"][kind]
@@ -316,7 +334,7 @@ def _try(
     if left:
         return FmuTrial(kind, ran=False, left=left), None
     began = time.perf_counter()
-    problem = try_out(path, kind, summary["default_experiment"], archive.limits)
+    problem = try_out(path, kind, summary["default_experiment"], archive.limits, progress=progress)
     took = time.perf_counter() - began
     if problem is None:
         step = None

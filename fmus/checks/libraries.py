@@ -6,12 +6,13 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from ...blocks.core import FmuError, temporary_folder
 from ..archive import FmuArchive, read_library, write_files
+from ..child_processes import run_in_group
 from ..export import SUFFIXES
 
 # Folders of binaries in FMI 1.0 and 2.0 (2.3.1) as platform tuples of FMI 3.0 (2.5.1.4).
@@ -112,19 +113,17 @@ def find_missing(archive: FmuArchive, native: str, folder: str, names: Iterable[
     missing: set[str] = set()
     undefined: set[str] = set()
     ldd = shutil.which("ldd") if sys.platform.startswith("linux") else None
-    with tempfile.TemporaryDirectory(prefix="loopwright-") as made:
+    with temporary_folder(f"the libraries of {str(archive.path)!r} can't be checked", FmuError) as made:
         # all files in the folder, since it may bring its own libraries
-        write_files(archive, Path(made), [name for name in archive.files if name.startswith(f"binaries/{folder}/")])
+        write_files(archive, made, [name for name in archive.files if name.startswith(f"binaries/{folder}/")])
         for name in names:
             header = read_library(archive.read(f"binaries/{folder}/{name}"))
             if header.damage or native not in header.platforms:
                 continue
-            library = str(Path(made) / "binaries" / folder / name)
+            library = str(made / "binaries" / folder / name)
             command = [ldd, library] if ldd else [sys.executable, "-c", _LOAD, library]
             try:
-                done = subprocess.run(
-                    command, cwd=made, capture_output=True, text=True, errors="replace", timeout=60, check=False
-                )
+                done = run_in_group(command, folders=[Path(made)], cwd=made, seconds=60)
             except (OSError, subprocess.TimeoutExpired):
                 continue
             if not ldd:

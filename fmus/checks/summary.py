@@ -116,7 +116,7 @@ def _interfaces(root: Any, model: Any) -> dict[str, dict[str, Any]]:
         kind = "CoSimulation" if model.coSimulation is not None else "ModelExchange"
         return {kind: {"modelIdentifier": root.get("modelIdentifier")}}
     return {
-        kind: {name: _flag(value) for name, value in element.attrib.items()}
+        kind: {name: value if name == "modelIdentifier" else _flag(value) for name, value in element.attrib.items()}
         for kind in INTERFACES
         if (element := root.find(kind)) is not None
     }

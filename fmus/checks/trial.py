@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,8 @@ from .summary import INTERFACES
 
 PATIENCE = 120.0
 """Seconds that a call of the FMU may take before it counts as hung."""
+NOTICE = 2.0
+"""Seconds after which a trial run is announced, so that nobody waits in silence for a call that hangs."""
 STEPS = 10
 """Number of steps in co-simulation."""
 RUNS = {"CoSimulation": f"run for {STEPS} steps", "ModelExchange": "evaluated at its start"}
@@ -56,7 +60,12 @@ class FmuProblem:
 
 
 def try_out(
-    file: Path, interface: str, experiment: dict[str, Any], limits: ArchiveLimits | None = None
+    file: Path,
+    interface: str,
+    experiment: dict[str, Any],
+    limits: ArchiveLimits | None = None,
+    *,
+    progress: bool = True,
 ) -> FmuProblem | None:
     """Run an FMU for some steps in a process of its own; return its fault, or None.
 
@@ -72,8 +81,14 @@ def try_out(
         Default experiment: ``start_time``, ``stop_time`` and ``step_size`` in s, where they are given.
     limits : ArchiveLimits, optional
         Limits of its size; the usual ones without it.
+    progress : bool
+        Whether it is announced on the standard error after some time.
     """
     name = INTERFACES[interface]
+    notice = Timer(NOTICE, _announce, [file, interface])
+    notice.daemon = True
+    if progress:
+        notice.start()
     try:
         plant = Fmu(
             file,
@@ -93,9 +108,20 @@ def try_out(
         found, step = split_step(error.message)
         when = "" if error.t is None else f" at t = {error.t:.9g} s"
         return FmuProblem(f"{name}{when}: {found}", step, FmuFault.TRIAL)
+    finally:
+        notice.cancel()
     if lost:
         return FmuProblem(f"{name}: {lost} is no finite number.", _LOOK, FmuFault.TRIAL)
     return None
+
+
+def _announce(file: Path, interface: str) -> None:
+    print(
+        f"{file.name} is being {RUNS[interface]} by {INTERFACES[interface]}, in a process of its own. A call that "
+        f"takes longer than {PATIENCE:g} s counts as hung; Ctrl-C ends it before.",
+        file=sys.stderr,
+        flush=True,
+    )
 
 
 def find_step(description: FmuDescription, experiment: dict[str, Any]) -> float:

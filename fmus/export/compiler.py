@@ -11,20 +11,26 @@ import importlib.util
 import os
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
-from ...blocks.core import CompilerError, near
+from ...blocks.core import (
+    OTHER_TEMPORARY,
+    CompilerError,
+    describe_disk_error,
+    explain_disk_errors,
+    find_disk_error,
+    near,
+)
 from ..build_notes import tell_build
-from ..platform import cache_folder, check_cache, native_platform
+from ..child_processes import run_in_group
+from ..platform import OWN_CACHE, cache_folder, check_cache, native_platform
 
 #: FMI 3.0 platform tuples (2.5.1.4) of the platforms to build for, and zig's name of each with the oldest system:
 #: glibc 2.17, macOS 11. On Windows the C library belongs to the system since version 10.
@@ -94,7 +100,7 @@ def find_compiler() -> Compiler:
 @lru_cache(maxsize=8)
 def _version(command: tuple[str, ...]) -> str:
     try:
-        done = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=60, check=False)
+        done = run_in_group([*command, "--version"], seconds=60)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise CompilerError(f"the C compiler {shlex.join(command)} can't be run: {error}. {_INSTALL}") from error
     return done.stdout + done.stderr
@@ -162,7 +168,8 @@ def compile_shared(
     Raises
     ------
     CompilerError
-        If there is no compiler, it does not end, or it fails; then its message is quoted.
+        If there is no compiler, it does not end, or it fails; then its message is quoted. If the folder of ``out``
+        can't be written.
     FmuError
         If the cache can't be written.
     """
@@ -172,9 +179,10 @@ def compile_shared(
     check_platform(compiler, platform)
     names = [name for name in sources if name.endswith(".c")] if compiled is None else list(compiled)
     out = Path(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".building-", dir=out.parent) as temporary:
-        folder = Path(temporary)
+    with (
+        explain_disk_errors("the C code can't be compiled", out, OWN_CACHE, CompilerError),
+        _build_folder(out.parent) as folder,
+    ):
         for name, text in sources.items():
             (folder / name).write_text(text, encoding="utf-8", newline="\n")
         library = out.name  # a relative name, since some formats contain it
@@ -189,64 +197,72 @@ def compile_shared(
         os.replace(folder / library, out)
 
 
+@contextmanager
+def _build_folder(place: Path) -> Iterator[Path]:
+    """Yield a fresh folder in ``place``, which is made, and remove it when the block ends."""
+    place.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".building-", dir=place, ignore_cleanup_errors=True) as made:
+        yield Path(made)
+
+
+def _zig_caches() -> dict[str, str]:
+    """Return the folders of zig's own caches, by the environment variable that names each."""
+    own = str(cache_folder() / "zig")
+    return {name: os.environ.get(name, own) for name in ("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR")}
+
+
 def _note(compiler: Compiler) -> str:
-    first = compiler.zig and not Path(os.environ.get("ZIG_GLOBAL_CACHE_DIR", cache_folder() / "zig")).is_dir()
+    first = compiler.zig and not os.path.isdir(_zig_caches()["ZIG_GLOBAL_CACHE_DIR"])
     return (
         "compiling C code; the compiler's first start on a machine takes some seconds" if first else "compiling C code"
     )
 
 
+def _link_caches(folder: Path) -> dict[str, str]:
+    """Return zig's caches under plain relative names, as links in the folder where it runs.
+
+    zig hands the paths of its cache to tools that read some letters in another way: its linker fills each % of an
+    output's path with a digit, and in lists of dependencies a colon ends a name. A relative path through a link has no
+    letter of the user's.
+    """
+    found = {}
+    for name, cache in _zig_caches().items():
+        link = folder / f".{name.lower()}"
+        found[name] = cache
+        with suppress(OSError):  # Windows may allow no links
+            link.symlink_to(os.path.abspath(cache), target_is_directory=True)
+            Path(cache).mkdir(parents=True, exist_ok=True)
+            found[name] = link.name
+    return found
+
+
 def _run(command: Sequence[str], folder: Path, platform: str) -> None:
-    environment = dict(os.environ)
-    zig = cache_folder() / "zig"
-    environment.setdefault("ZIG_GLOBAL_CACHE_DIR", str(zig))
-    environment.setdefault("ZIG_LOCAL_CACHE_DIR", str(zig))
-    code, output, errors = _wait(command, folder, environment)
+    code, output, errors = _wait(command, folder, {**os.environ, **_link_caches(folder)})
     if code:
         lines = (errors.strip() or output.strip() or "(nothing)").splitlines()
         said = "\n".join(lines if len(lines) <= 40 else [*lines[:20], "...", *lines[-20:]])  # the first error matters
+        failed = f"the C compiler failed for {platform} with exit code {code}"
+        temporary = os.environ.get("TMPDIR", folder)
+        for place, instead in ((folder, OWN_CACHE), (cache_folder(), OWN_CACHE), (temporary, OTHER_TEMPORARY)):
+            if (error := find_disk_error(place)) is not None:  # the compiler has words of its own for it
+                found = describe_disk_error(error, place, instead)
+                raise CompilerError(f"{failed}. Its message:\n{said}\nThe cause: {found}") from error
         raise CompilerError(
-            f"the C compiler failed for {platform} with exit code {code}. Its message:\n{said}\n"
+            f"{failed}. Its message:\n{said}\n"
             f"The command was: {shlex.join(command)}\n"
             "Check the model's equations, or try another compiler with LOOPWRIGHT_CC."
         )
 
 
 def _wait(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> tuple[int, str, str]:
-    """Run a compiler; it and all processes that it started end with this call, whatever happens."""
-    group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
+    """Run a compiler; it and all processes that it started end with this call and with this process."""
     try:
-        process = subprocess.Popen(
-            command,
-            cwd=folder,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            **group,
-        )
+        done = run_in_group(command, folders=[folder], cwd=folder, environment=environment, seconds=TIMEOUT)
     except OSError as error:
         raise CompilerError(f"the C compiler {command[0]} can't be run: {error}. {_INSTALL}") from error
-    with process:
-        try:
-            output, errors = process.communicate(timeout=TIMEOUT)
-        except BaseException as error:
-            _kill(process)
-            if isinstance(error, subprocess.TimeoutExpired):
-                raise CompilerError(
-                    f"the C compiler did not end within {TIMEOUT:g} s and was stopped. The command was: "
-                    f"{shlex.join(command)}\nRun it by hand, or try another compiler with LOOPWRIGHT_CC."
-                ) from error
-            raise
-    return process.returncode, output, errors
-
-
-def _kill(process: subprocess.Popen[str]) -> None:
-    """End a process and, on POSIX, all processes that it started."""
-    with suppress(OSError):
-        if sys.platform != "win32":
-            os.killpg(process.pid, signal.SIGKILL)
-        else:
-            process.kill()
+    except subprocess.TimeoutExpired as error:
+        raise CompilerError(
+            f"the C compiler did not end within {TIMEOUT:g} s and was stopped. The command was: "
+            f"{shlex.join(command)}\nRun it by hand, or try another compiler with LOOPWRIGHT_CC."
+        ) from error
+    return done.returncode, done.stdout, done.stderr

@@ -10,9 +10,7 @@ import hashlib
 import importlib.metadata
 import importlib.util
 import io
-import os
 import shutil
-import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
@@ -23,8 +21,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import FmuError, accepts, explain_calls, kinds
-from ..platform import cache_folder, native_platform, record_build
+from ...blocks.core import FmuError, accepts, explain_calls, explain_disk_errors, kinds, replace_file, temporary_folder
+from ..platform import OWN_CACHE, cache_folder, explain_cache_errors, native_platform, record_build
 from .c_code import generate, runtime
 from .compiler import SUFFIXES, TARGETS, Compiler, check_platform, compile_shared, find_compiler, flags
 from .html_page import index_html
@@ -33,6 +31,8 @@ from .scalars import scalarize
 from .xml_fmi2 import model_description2
 from .xml_fmi3 import build_description, model_description, package_version
 
+OTHER_FOLDER = "Name another folder."
+"""Step where an FMU can't be written where its user wants it."""
 _TOKEN = "{instantiation-token}"
 _DATE = (1980, 1, 1, 0, 0, 0)
 # Folders of binaries in FMI 2.0 (2.3.1), where they differ from FMI 3.0's platform tuples.
@@ -121,8 +121,8 @@ def _binary(
     spec: ModelSpec, fmi: int, platform: str, sources: Mapping[str, str], compiler: Compiler
 ) -> dict[str, bytes]:
     suffix = SUFFIXES.get(platform.rpartition("-")[2], ".so")
-    with tempfile.TemporaryDirectory(prefix="loopwright-") as folder:
-        library = Path(folder) / f"{spec.name}{suffix}"
+    with temporary_folder(f"the FMU {spec.name!r} can't be built", FmuError) as folder:
+        library = folder / f"{spec.name}{suffix}"
         headers = fmi_headers()[0]
         compile_shared(sources, library, platform=platform, compiled=["model.c"], include=[headers], compiler=compiler)
         name = FOLDERS2.get(platform, platform) if fmi == 2 else platform
@@ -158,29 +158,32 @@ def file_for(out: Path | str, name: str) -> Path:
     """Return the file of an FMU: ``<name>.fmu`` in a folder; a path without the ending ``.fmu`` gets it.
 
     Other tools find FMUs by their ending, so none is written without it. Other endings stay: ``pend.v2.fmu``.
+
+    Raises
+    ------
+    FmuError
+        If this user can't look there.
     """
     out = Path(out)
-    if out.is_dir():
-        return out / f"{name}.fmu"
+    with explain_disk_errors(f"the FMU can't be written to {str(out)!r}", out, OTHER_FOLDER, FmuError):
+        if out.is_dir():
+            return out / f"{name}.fmu"
     return out if out.suffix.lower() == ".fmu" else out.with_name(f"{out.name}.fmu")
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file so that it is complete or does not exist, never half written."""
-    temporary = None
-    try:
+def write_atomically(path: Path, data: bytes, instead: str = OTHER_FOLDER) -> None:
+    """Write a file so that it is complete or does not exist, never half written; make its folder.
+
+    Raises
+    ------
+    FmuError
+        If it can't be written; ``instead`` says how to use another place.
+    """
+    with explain_disk_errors(f"the FMU can't be written to {str(path)!r}", path, instead, FmuError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=".writing-", dir=path.parent)
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException as error:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise FmuError(f"can't write {path}: {error}. Give another folder, or set LOOPWRIGHT_CACHE.") from error
-        raise
+        with replace_file(path) as fresh:
+            fresh.write_bytes(data)
+            fresh.chmod(0o644)
 
 
 @accepts(
@@ -247,9 +250,12 @@ def build_fmu(
     for name in platforms:
         check_platform(compiler, name)
     cached = cache_folder() / "fmus" / build_key(spec, options, compiler)[:32] / f"{spec.name}.fmu"
-    if not cached.is_file():
-        write_atomically(cached, _archive(spec, options, compiler, notify or (lambda message: None)))
-    data = cached.read_bytes()
+    with explain_cache_errors(f"the FMU {spec.name!r} can't be kept in the cache"):
+        is_there = cached.is_file()
+    if not is_there:
+        write_atomically(cached, _archive(spec, options, compiler, notify or (lambda message: None)), OWN_CACHE)
+    with explain_cache_errors(f"the FMU {spec.name!r} can't be read from the cache"):
+        data = cached.read_bytes()
     record_build(hashlib.sha256(data).hexdigest())
     if out is None:
         return cached

@@ -11,10 +11,9 @@ import importlib.util
 import inspect
 import io
 import json
+import os
 import pickle
-import subprocess
 import sys
-import tempfile
 import zipfile
 from collections.abc import Callable, Iterable
 from html import escape
@@ -25,8 +24,18 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from ...blocks.core import Block, DefinitionError, FmuError, Port, accepts, kinds
+from ...blocks.core import (
+    Block,
+    DefinitionError,
+    FmuError,
+    Port,
+    accepts,
+    explain_disk_errors,
+    kinds,
+    temporary_folder,
+)
 from ...blocks.tracing import bundle, traced_parameters
+from ..child_processes import run_in_group
 from ..platform import record_build
 from .html_page import block_text
 from .model import check_file_name
@@ -128,8 +137,7 @@ def build_python(
     about["guid"] = digest.hexdigest()[:32]
     about["module"] = f"loopwright_{name}_{about['guid'][:8]}"  # one interpreter runs all FMUs, so names must differ
     (notify or (lambda message: None))(f"packing {name} with PythonFMU")
-    with tempfile.TemporaryDirectory(prefix="loopwright-") as made:
-        folder = Path(made)
+    with temporary_folder("the FMU can't be made", FmuError, block=name) as folder:
         (folder / "in").mkdir()
         script = folder / "in" / f"{about['module']}.py"
         script.write_text(slave, encoding="utf-8")
@@ -138,7 +146,8 @@ def build_python(
         own = [folder / "in" / "loopwright.json", folder / "in" / "loopwright.pickle"]
         archive = _make(script, folder / "out", [*own, *taken], name, kind)
         data = _complete(archive, about, values, block)
-    target = file_for(Path.cwd() if out is None else out, name)
+    with explain_disk_errors("the FMU can't be written", os.curdir, "Name a folder: out=….", FmuError, block=name):
+        target = file_for(Path.cwd() if out is None else out, name)
     write_atomically(target, data)
     record_build(hashlib.sha256(data).hexdigest())
     return target
@@ -334,9 +343,7 @@ def _make(script: Path, out: Path, files: list[Path], name: str, kind: str) -> P
         "canSerializeFMUstate": True,
     }
     given = json.dumps([str(script), str(out), [str(path.resolve()) for path in files], options])
-    done = subprocess.run(
-        [sys.executable, "-c", _MAKE, given], cwd=script.parent, capture_output=True, text=True, check=False
-    )
+    done = run_in_group([sys.executable, "-c", _MAKE, given], cwd=script.parent)
     made = out / f"{name}.fmu"
     if done.returncode or not made.is_file():
         said = "\n".join((done.stderr.strip() or done.stdout.strip() or "(nothing)").splitlines()[-12:])

@@ -11,7 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from ...blocks.core import FmuError, FmuFileError, accepts, kinds
-from ..platform import cache_folder, is_built_here, native_platform, record_build
+from ..platform import cache_folder, explain_cache_errors, is_built_here, native_platform, record_build
 from .compiler import compile_shared, describe_compiler, find_compiler
 from .package import FOLDERS2, fmi_headers, zip_files
 
@@ -61,22 +61,23 @@ def tune(path: str | os.PathLike[str]) -> Path:
     compiler, target, flags = find_compiler(), native_platform(), processor_flags()
     parts = (*describe_compiler(target), *flags, describe_processor())
     key = hashlib.sha256(content + "\0".join(parts).encode()).hexdigest()
-    out = cache_folder().absolute() / "tuned" / key[:32] / file.name
-    if out.is_file() and is_built_here(hashlib.sha256(out.read_bytes()).hexdigest()):
-        return out
-    with zipfile.ZipFile(file) as archive:
-        files = {name: archive.read(name) for name in archive.namelist()}
-    binaries = [name for name in files if name.startswith("binaries/")]
-    (own,) = (name for name in binaries if name.split("/")[1] in (target, FOLDERS2.get(target)))
-    sources = {n.removeprefix("sources/"): t.decode() for n, t in files.items() if n.endswith((".c", ".h"))}
-    out.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    with tempfile.TemporaryDirectory(prefix=".tuning-", dir=out.parent) as folder:
-        library = Path(folder) / Path(own).name
-        headers = [fmi_headers()[0]]
-        compile_shared(sources, library, compiled=["model.c"], include=headers, compiler=compiler, more_flags=flags)
-        tuned = zip_files({n: t for n, t in files.items() if n not in binaries} | {own: library.read_bytes()})
-        (made := Path(folder) / file.name).write_bytes(tuned)
-        os.replace(made, out)
+    out = cache_folder() / "tuned" / key[:32] / file.name
+    with explain_cache_errors(f"the FMU {str(file)!r}, compiled for this processor, can't be kept in the cache"):
+        if out.is_file() and is_built_here(hashlib.sha256(out.read_bytes()).hexdigest()):
+            return out
+        with zipfile.ZipFile(file) as archive:
+            files = {name: archive.read(name) for name in archive.namelist()}
+        binaries = [name for name in files if name.startswith("binaries/")]
+        (own,) = (name for name in binaries if name.split("/")[1] in (target, FOLDERS2.get(target)))
+        sources = {n.removeprefix("sources/"): t.decode() for n, t in files.items() if n.endswith((".c", ".h"))}
+        out.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with tempfile.TemporaryDirectory(prefix=".tuning-", dir=out.parent) as folder:
+            library = Path(folder) / Path(own).name
+            headers = [fmi_headers()[0]]
+            compile_shared(sources, library, compiled=["model.c"], include=headers, compiler=compiler, more_flags=flags)
+            tuned = zip_files({n: t for n, t in files.items() if n not in binaries} | {own: library.read_bytes()})
+            (made := Path(folder) / file.name).write_bytes(tuned)
+            os.replace(made, out)
     record_build(hashlib.sha256(tuned).hexdigest())
     return out
 

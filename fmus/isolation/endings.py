@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+from collections.abc import Sequence
 from pathlib import Path
 
 from ...blocks.core import FmuEnd
@@ -66,5 +67,26 @@ def count_cores() -> int:
 
 
 def copy_files(source: Path, target: Path) -> None:
-    """Copy the files of an FMU that its library may read or write: sources and documentation are left out."""
-    shutil.copytree(source, target, ignore=lambda where, names: SKIPPED & set(names) if where == str(source) else ())
+    """Copy the files of an FMU that its library may read or write: sources and documentation are left out.
+
+    Raises
+    ------
+    OSError
+        The first one of a file: that of shutil lists the texts of all.
+    """
+    faults: list[OSError] = []
+
+    def copy(one: str, other: str) -> None:
+        try:
+            shutil.copy2(one, other)
+        except OSError as error:
+            faults.append(error)
+            raise
+
+    def skip(where: str, names: Sequence[str]) -> set[str]:
+        return SKIPPED & {*names} if where == str(source) else set()
+
+    try:
+        shutil.copytree(source, target, ignore=skip, copy_function=copy)
+    except shutil.Error as error:
+        raise (faults or [error])[0] from error

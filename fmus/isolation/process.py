@@ -11,7 +11,6 @@ import signal
 import struct
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -20,7 +19,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from ...blocks.core import FmuEnd, FmuError, FmuProcessError
+from ...blocks.core import FmuEnd, FmuError, FmuProcessError, describe_disk_error, make_temporary_folder
 from ..calls import ChildRequest, printf
 from . import wire
 from .endings import copy_files, count_cores, read_end
@@ -60,7 +59,8 @@ class ChildProcess:
         self.told: Callable[[int, str], None] = lambda status, text: None
         self.lose: Callable[[FmuProcessError], FmuProcessError] = lambda error: error
         self.used = self.alive = self.arrived = self._runs_in_c = False
-        self.folder = Path(tempfile.mkdtemp(prefix="loopwright-fmu-"))
+        failed = f"the process for the FMU {name!r} can't be started"
+        self.folder = make_temporary_folder(failed, FmuError, prefix="loopwright-fmu-")
         self._peak = 0
         self._output = ChildOutput(self.folder)
         self.number, self._allotted = 0, DATA
@@ -73,10 +73,8 @@ class ChildProcess:
             self._spawn(files)
         except OSError as error:
             self.end()
-            raise FmuError(
-                f"the process for the FMU {name!r} can't be started: {error}. Make room in {tempfile.gettempdir()!r}, "
-                "or load it in this process: isolate=False."
-            ) from error
+            step = "Load it in this process: isolate=False."
+            raise FmuError(f"{failed}: {describe_disk_error(error, self.folder, step)}") from error
         except BaseException:
             self.end()
             raise

@@ -5,6 +5,7 @@ from .exchange import check_exchange_slopes, find_exchange_slopes
 from .fmu import Fmu
 from .fmu_point import FmuLinearization
 from .known_models import linearize_fmu, step_gap
+from .replacement import suggest_names
 from .restored_point import RestoredPoint
 
 __all__ = [
@@ -17,4 +18,5 @@ __all__ = [
     "find_exchange_slopes",
     "linearize_fmu",
     "step_gap",
+    "suggest_names",
 ]

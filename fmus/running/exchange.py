@@ -4,21 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...blocks.core import Array, Event, FmuError, FmuFileError, Layout, ParameterError, State
 from ...blocks.tracing import NEXT
-from ..archive import FmuDescription, FmuVariable
+from ..archive import ExchangeInfo, FmuDescription, FmuVariable
 from ..calls import ExchangeInstance, StepOptions, is_smooth
 from ..isolation import open_fmu
+from ..platform import is_built_here
 from .differences import Column, Differences, differentiate
 from .port_members import PortMembers
 from .slope_check import SlopeCheck, check_slopes
 
 INTERFACES = ("co_simulation", "model_exchange")
 """Interfaces of an FMU, as the parameter ``interface`` names them."""
+DEPENDENCIES = ("declared", "all")
+"""Dependencies in model exchange, as the parameter ``dependencies`` names them."""
 EQUATIONS = 1e-5
 """Relative distance of differences of equations."""
 UNNAMED = "continuous_states"
@@ -61,6 +65,7 @@ class ExchangeMembers(PortMembers):
 
     if TYPE_CHECKING:
         interface: str | None
+        dependencies: str
         stepping: StepOptions
 
         @property
@@ -80,6 +85,29 @@ class ExchangeMembers(PortMembers):
     def evaluated_outside(self) -> bool:  # type: ignore[override]
         """Whether a run's solver integrates its states (model exchange)."""
         return self.used_interface == INTERFACES[1]
+
+    @property
+    def exchange_info(self) -> ExchangeInfo | None:
+        """Model exchange as the description states it, without its dependencies where these are not to count.
+
+        A state that is an output follows itself alone in any case. Other continuous outputs and derivatives may follow
+        all states and the time, but in an FMU that Loopwright has built: tools leave these out of the lists, and so do
+        some Reference FMUs. No order of evaluation needs them, as states and time are known before it.
+        """
+        found, about = self.description.exchange, self.description
+        if found is None:
+            return None
+        states = {key for name in about.states for key in about.find(name).keys}
+        if self.dependencies != DEPENDENCIES[0]:
+            return replace(found, dependencies={key: frozenset([key]) for key in states})
+        if is_built_here(about.digest):
+            return found
+        smooth = {key for v in about.variables.values() if is_smooth(v) for key in v.keys} - states
+        always = states | {found.time} if found.time is not None else states
+        declared = {
+            key: of if of is None or key not in smooth else of | always for key, of in found.dependencies.items()
+        }
+        return replace(found, dependencies=declared)
 
     @property
     def interface_text(self) -> str:
@@ -152,7 +180,7 @@ def dependence(block: ExchangeMembers, equation: str, rates: str) -> dict[str, n
 
     The states stand under ``"x"``, inputs under their ports. Discrete inputs and parameters act at events alone.
     """
-    about, exchange = block.description, block.description.exchange
+    about, exchange = block.description, block.exchange_info
     assert exchange is not None
     n = exchange.state_count
     states = [about.find(name) for name in about.states]

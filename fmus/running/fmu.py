@@ -17,10 +17,10 @@ from ...blocks.core import (
     kinds,
     parameter,
 )
-from ..archive import ArchiveLimits, FmuDescription, read_description
+from ..archive import ArchiveLimits, FmuDescription, join_scalars, read_description
 from ..calls import FmuInstance, StepOptions, check_offered
 from ..isolation import Isolation, check_isolation, open_fmu
-from .exchange import ExchangeMembers, choose_interface
+from .exchange import DEPENDENCIES, ExchangeMembers, choose_interface
 from .fmu_point import FmuLinearization
 from .linearization import linear_model
 from .replacement import check_replacement
@@ -49,7 +49,7 @@ class Fmu(ExchangeMembers):
     opaque = True
     file: str | os.PathLike[str] = parameter(kw_only=False, description="path of the .fmu")
     start: Mapping[str, Any] = parameter(
-        default={}, description="start values of parameters, states and inputs, by the FMU's names"
+        default={}, description="start values of parameters, states and inputs, by the FMU's names, in its units"
     )
     rename: Mapping[str, str] = parameter(default={}, description="FMU's name → name of the port")
     isolate: bool | Isolation | None = parameter(
@@ -68,6 +68,11 @@ class Fmu(ExchangeMembers):
     )
     interface: str | None = parameter(
         default=None, description="'co_simulation' or 'model_exchange'; None for co-simulation where it is offered"
+    )
+    dependencies: str = parameter(
+        default="declared",
+        description="of outputs and derivatives in model exchange: 'declared' by its model structure, or 'all', by "
+        "which everything may depend on everything",
     )
     limits: ArchiveLimits | None = parameter(default=None, description="limits of the file; None for the usual ones")
 
@@ -88,7 +93,14 @@ class Fmu(ExchangeMembers):
         description, sizes = read_sized(self.file, self.start, self.limits, who)
         object.__setattr__(self, "_content", description.digest)
         object.__setattr__(self, "_sizes", sizes)
+        description = join_scalars(description, self.rename, who)
         choose_interface(description, self.interface, who)
+        if self.dependencies not in DEPENDENCIES:
+            raise ParameterError(
+                f"found {self.dependencies!r}; expected {' or '.join(map(repr, DEPENDENCIES))}.",
+                block=who,
+                port="dependencies",
+            )
         check_offered(self.stepping, description, who)
         ports, others = self._choose_ports(description), description.other_ports("output")
         if others and not ports.outputs:
@@ -112,7 +124,7 @@ class Fmu(ExchangeMembers):
     def entries_of(self, parameter: str) -> Collection[str]:
         """Return the FMU's names for `start` and `rename`: its variables, and the elements of its arrays."""
         about = self.description
-        return [*about.variables, *about.elements] if parameter in ("start", "rename") else ()
+        return [*about.variables, *about.elements, *about.spelled] if parameter in ("start", "rename") else ()
 
     def start_value(self, description: FmuDescription, name: str, value: Any) -> Any:
         """Return a start value in the variable's shape, after checking it.
@@ -161,7 +173,7 @@ class Fmu(ExchangeMembers):
                 block=self.label,
                 port="file",
             )
-        return found
+        return join_scalars(found, self.rename, self.label)
 
     @property
     def variable_step(self) -> bool:

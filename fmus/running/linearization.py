@@ -104,11 +104,10 @@ def _values(point: FmuPoint, instance: LoadedFmu) -> np.ndarray:
     In model exchange the FMU's function for derivatives is asked: their variables may be those of an earlier call.
     """
     order = np.array(point.about.state_order, dtype=int)
+    rates = [point.about.states[n] for n in point.states]
     if not instance.model_exchange or len(order) != point.about.layout(point.states).total:
-        return instance.values([*(point.about.states[n] for n in point.states), *point.outputs])
-    rates = np.zeros(len(order))
-    rates[order] = instance.call("computing the derivatives", instance.fmi.state_derivatives, len(order))
-    return np.concatenate([rates, instance.values(point.outputs)])
+        return instance.values([*rates, *point.outputs])
+    return instance.rates_and_values(order, rates, point.outputs)
 
 
 def _linearize_by_directions(point: FmuPoint, instance: LoadedFmu) -> FmuLinearization:

@@ -2,10 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ...blocks.core import Block, Call, Input, Output, Signal, UnknownAttributeError, UnknownNameError, near
+import numpy as np
+
+from ...blocks.core import (
+    Block,
+    Call,
+    Input,
+    Output,
+    Signal,
+    UnitError,
+    UnknownAttributeError,
+    UnknownNameError,
+    convert_unit,
+    describe_mismatch,
+    near,
+    same_dimension,
+    same_unit,
+)
 from ..archive import FmuDescription, FmuVariable, OtherVariable
 from .ports import FmuPorts, choose_ports, find_element, other_name
 
@@ -17,6 +33,7 @@ class PortMembers(Block):
         start: Mapping[str, Any]
         rename: Mapping[str, str]
         ports: Sequence[str] | None
+        convert_units: bool
 
         @property
         def description(self) -> FmuDescription: ...  # noqa: D102
@@ -61,6 +78,60 @@ class PortMembers(Block):
         if array in self.start:
             return self.start[array][index]
         return v.start if v.causality == "parameter" else None
+
+    def advise_unwired(self, ports: Collection[str]) -> str:
+        """Return how inputs get values without a wire: by `start`, which the FMU's own start values don't replace."""
+        names = [self.input_variables[port].name for port in ports]
+        shown = ", ".join(f"{name!r}: …" for name in names[:3]) + (", …" if len(names) > 3 else "")
+        return f" An input that is to keep one value gets it by Fmu(…, start={{{shown}}})."
+
+    @property
+    def held_inputs(self) -> tuple[str, ...]:
+        """Input ports that need no wire, as `start` gives them values; where they are not wired they keep these."""
+        return tuple(
+            port for port, v in self.input_variables.items() if v.causality == "input" and self._default(v) is not None
+        )
+
+    def start_of(self, name: str, value: Any, unit: str) -> dict[str, Any]:
+        """Return the entry of `start` for a value in a unit that need not be the FMU's: converted as the port's wires.
+
+        Whoever gives a start value to an FMU by its port, in the unit of a wire, asks here: `start` is in the FMU's
+        units.
+
+        Parameters
+        ----------
+        name : str
+            Port, or a variable by the FMU's name.
+        value : array_like
+            The value.
+        unit : str
+            Its unit.
+
+        Raises
+        ------
+        UnknownNameError
+            If the FMU has neither such a port nor such a variable.
+        UnitError
+            If the variable is in another unit, and the block doesn't convert units, or they are of other dimensions.
+        """
+        about = self.description
+        variable = {**self.input_variables, **self.output_variables}.get(name)
+        if variable is None:
+            if name not in about.names:
+                raise UnknownNameError(f"the FMU has no variable {name!r}. {near(name, about.names)}", block=self.label)
+            variable = about.find(name)
+        own = variable.unit
+        if own is None or same_unit(unit, own):
+            return {variable.name: value}
+        if not (self.convert_units and same_dimension(unit, own)):
+            advice = ", or give its FMU convert_units=True" if same_dimension(unit, own) else ""
+            raise UnitError(
+                f"found a start value in {unit}; expected {own}: {describe_mismatch(unit, own)}{advice}",
+                block=self.label,
+                port=name,
+            )
+        factor, offset = convert_unit(unit, own)
+        return {variable.name: factor * np.asarray(value, dtype=float) + offset}
 
     @property
     def outputs(self) -> Mapping[str, Output]:  # type: ignore[override]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from ...blocks.core import ParameterError, UnknownNameError, near
-from ..archive import FmuDescription, FmuVariable, OtherVariable
+from ..archive import FmuDescription, FmuVariable, OtherVariable, read_index
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ def choose_ports(
         The FMU's description.
     rename : tuple of pairs of str
         Variables and the names of their ports. Scalars of a gathered array that are renamed are ports of their own,
-        and so are the array's other scalars.
+        and so are the array's other scalars; those that are renamed to elements are one port (`join_scalars`).
     chosen : tuple of str, optional
         Variables that are ports; None for all inputs and outputs.
     label : str
@@ -43,9 +43,12 @@ def choose_ports(
     UnknownNameError, ParameterError
         For a name that is no variable, a variable that can't be a port, and two ports of one name.
     """
-    names = dict(rename)
+    members = {n: description.elements[n][0] for n in description.members}
+    names = {n: port for n, port in rename if n not in members} | dict(description.joined)
     if chosen is not None:
+        chosen = tuple(part for name in chosen for part in taken_apart(description, name) or (name,))
         _check_chosen(description, chosen, label)
+        chosen = _choose_joined(description, chosen, members, label)
     split = {description.elements[n][0] for n in (*names, *(chosen or ())) if _is_part(description, n)}
     split -= set(chosen or ())
     both: tuple[dict[str, FmuVariable], dict[str, FmuVariable]] = {}, {}
@@ -70,12 +73,49 @@ def choose_ports(
         if text.causality == "output" if chosen is None else name in chosen:
             known.append(name)
             texts[names.get(name, name)] = text
-    for old in names:
-        if old not in known and old in description.aliases:
+    known += [n for n, array in members.items() if array in known]
+    for old in (n for n in dict(rename) if n not in known):
+        if array := members.get(old, ""):
+            joined = description.find(old)
+            raise ParameterError(
+                f"found {old!r}, {_kind_of(joined)}, as an element of the port {description.joined[array]!r}; expected "
+                "an input or an output, or a variable that ports= names. Add it there.",
+                block=label,
+                port="rename",
+            )
+        if old in description.aliases:
             raise ParameterError(other_name(description, old), block=label, port="rename")
-        if old not in known:
-            raise UnknownNameError(f"it has no port {old!r} to rename. {near(old, known)}", block=label, port="rename")
+        raise UnknownNameError(f"it has no port {old!r} to rename. {near(old, known)}", block=label, port="rename")
     return FmuPorts(*both, texts)
+
+
+def taken_apart(description: FmuDescription, array: str) -> tuple[str, ...]:
+    """Return the scalars of an array that would have been gathered, were some not elements of another port now."""
+    if array in description.names or array in description.other:
+        return ()
+    parts = tuple(n for n in description.scalars if read_index(n)[0] == array)
+    return parts if any(part in description.members for part in parts) else ()
+
+
+def _choose_joined(
+    description: FmuDescription, chosen: tuple[str, ...], members: Mapping[str, str], label: str
+) -> tuple[str, ...]:
+    """Return the names of ``ports`` with the arrays that the user has put together in place of their scalars."""
+    own = [description.spelled.get(name, name) for name in chosen]
+    for name, array in members.items():
+        among = [n for n, other in members.items() if other == array and n in own]
+        if among and name not in own:
+            raise ParameterError(
+                f"found {among[0]!r} and not {name!r}, which rename makes elements of one port, "
+                f"{description.joined[array]!r}; expected all of them. Add it, or leave ports out.",
+                block=label,
+                port="ports",
+            )
+    return tuple(dict.fromkeys(members.get(name, name) for name in own))
+
+
+def _kind_of(variable: FmuVariable) -> str:
+    return f"a {variable.variability} {variable.causality}"
 
 
 def _is_part(description: FmuDescription, name: str) -> bool:
@@ -157,7 +197,7 @@ def find_element(
     UnknownNameError
         For an element of a matrix.
     """
-    array, index = description.elements.get(name, ("", ()))
+    array, index = description.elements.get(description.spelled.get(name, name), ("", ()))
     ports = [port for port, v in outputs.items() if v.name == array]
     if not ports:
         return None

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import math
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 from typing import Protocol, Self
+
+import numpy as np
 
 from ...blocks.core import (
     Block,
@@ -28,6 +31,8 @@ from ..archive import FmuVariable
 _ALIKE = 0.5
 """Similarity of two names, from 0 to 1, from which on one is suggested in place of the other."""
 _SHOWN = 12
+_AXES = frozenset({*map(str, range(10)), "x", "y", "z", "X", "Y", "Z"})
+"""Letters that name the entries of a vector; those that follow one another belong together."""
 
 
 class _WithVariables(Protocol):
@@ -69,10 +74,10 @@ def check_replacement(fmu: _WithVariables, old: Block, wired: Collection[str], r
         old.inputs, old.outputs  # noqa: B018
     except FmuError:  # its file has changed or is gone
         return
-    misfits, rename = _find_misfits(fmu, old, wired, read)
+    misfits, rename, elements = _find_misfits(fmu, old, wired, read)
     if not misfits:
         return
-    both = _find_names(fmu, old, wired, read, rename) if rename else {}
+    both = _find_names(fmu, old, wired, read, {**rename, **elements}) if rename or elements else {}
     kinds = {misfit.error for misfit in misfits if misfit.error is not UnwiredInputError or not both}
     lines = "\n".join(f"- {misfit.text}" for misfit in misfits)
     advice = "Wire what is extra, give it a value in start=, or take another FMU."
@@ -80,6 +85,12 @@ def check_replacement(fmu: _WithVariables, old: Block, wired: Collection[str], r
         advice = f"Perhaps only names differ: Fmu({str(fmu.file)!r}, rename={both!r})."
         left = _find_misfits(fmu.replace(rename=both), old, wired, read)[0]
         advice += " Wire what is then extra, or give it a value in start=." if left else ""
+    elif elements:
+        named = {**fmu.rename, **elements}
+        advice = (
+            f"Perhaps scalars are elements of a port: Fmu({str(fmu.file)!r}, rename={named!r}); "
+            "name the others that are missing, too."
+        )
     raise (kinds.pop() if len(kinds) == 1 else WiringError)(
         f"{fmu.drawn_as} does not fit the wires of {old.drawn_as}:\n{lines}\n{advice}", block=old.name or fmu.label
     )
@@ -100,9 +111,9 @@ def _find_names(
 
 def _find_misfits(
     fmu: _WithVariables, old: Block, wired: Collection[str], read: Collection[str]
-) -> tuple[list[_Misfit], dict[str, str]]:
-    """Return the ports that don't fit, and names for those that may only be called otherwise."""
-    misfits, rename = list[_Misfit](), dict[str, str]()
+) -> tuple[list[_Misfit], dict[str, str], dict[str, str]]:
+    """Return the ports that don't fit, names for those that may only be called otherwise, and for elements of ports."""
+    misfits, rename, elements = list[_Misfit](), dict[str, str](), dict[str, str]()
     ports_before = old.inputs, old.outputs
     for side, ports, before, used, variables in (
         ("input", fmu.inputs, ports_before[0], wired, fmu.input_variables),
@@ -123,9 +134,42 @@ def _find_misfits(
         for name in (name for name in before if name in used and name in ports):
             pair = ports[name], before[name], variables[name], _variable(old, side, name)
             misfits += _compare(side, name, *pair, converts=fmu.convert_units)
-        pairs = _match({n: before[n] for n in missing}, {n: ports[n] for n in spare if n not in before})
+        wanted, free = {n: before[n] for n in missing}, {n: ports[n] for n in spare if n not in before}
+        pairs = _match(wanted, free)
         rename |= {variables[new].name: name for name, new in pairs.items()}
-    return misfits, rename
+        elements |= _match_elements(
+            {n: p for n, p in wanted.items() if n not in pairs},
+            {n: p for n, p in free.items() if n not in pairs.values()},
+            variables,
+        )
+    return misfits, rename, elements
+
+
+def suggest_names(fmu: _WithVariables, inputs: Mapping[str, Input], outputs: Mapping[str, Output]) -> dict[str, str]:
+    """Return the entries of ``rename`` that an FMU may need to have some ports, as far as they are unique.
+
+    Parameters
+    ----------
+    fmu : Fmu
+        The FMU.
+    inputs, outputs : mapping
+        The ports that are wanted, with shapes and units; those that the FMU has are left alone.
+    """
+    found: dict[str, str] = {}
+    for wanted, ports, variables in (
+        (inputs, fmu.inputs, fmu.input_variables),
+        (outputs, fmu.outputs, fmu.output_variables),
+    ):
+        missing = {n: p for n, p in wanted.items() if n not in ports}
+        free = {n: p for n, p in ports.items() if n not in wanted}
+        pairs = _match(missing, free)
+        found |= {variables[new].name: name for name, new in pairs.items()}
+        found |= _match_elements(
+            {n: p for n, p in missing.items() if n not in pairs},
+            {n: p for n, p in free.items() if n not in pairs.values()},
+            variables,
+        )
+    return found
 
 
 def _text(side: str, name: str, port: Input | Output | State) -> str:
@@ -204,6 +248,66 @@ def _match(
         if name not in found and len(left) == 1 and not rivals:
             found[name] = left[0]
     return found
+
+
+def _match_elements(
+    missing: Mapping[str, Input | Output | State],
+    spare: Mapping[str, Input | Output | State],
+    variables: Mapping[str, FmuVariable],
+) -> dict[str, str]:
+    """Return elements of missing array ports by the FMU's names of the scalars that may be these.
+
+    They are as many scalars as the port has entries, of its unit and alike, that are the only ones for it: all that
+    there are, or those whose names differ by an axis or a number only, ``s_y`` and ``s_z``.
+    """
+    families: dict[str, list[tuple[str, ...]]] = {}
+    for name, port in missing.items():
+        size = math.prod(port.shape or ())
+        fitting = [n for n, q in spare.items() if not q.shape and _same(q.unit, port.unit)]
+        known = _families(fitting, size)
+        if len(fitting) == size and not known:
+            known = [tuple(fitting)]
+        families[name] = [f for f in known if port.shape and len({_likeness(variables[n]) for n in f}) == 1]
+    found: dict[str, tuple[str, ...]] = {}
+    ranked = sorted((-_alike(name, _common_part(f)), name, f) for name, known in families.items() for f in known)
+    for value, name, family in ranked:
+        if -value >= _ALIKE and name not in found and family not in found.values():
+            found[name] = family
+    for name, known in families.items():
+        left = [f for f in known if f not in found.values()]
+        rivals = [n for n, other in families.items() if n not in found and n != name and set(other) & set(left)]
+        if name not in found and len(left) == 1 and not rivals:
+            found[name] = left[0]
+    return {
+        variables[scalar].name: f"{name}[{','.join(str(i + 1) for i in index)}]"
+        for name, family in found.items()
+        for scalar, index in zip(family, np.ndindex(missing[name].shape or ()), strict=True)
+    }
+
+
+def _families(names: Sequence[str], size: int) -> list[tuple[str, ...]]:
+    """Return the groups of so many names that differ in one character only: consecutive axes (x, y, z) or digits."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for name in names:
+        for i, letter in enumerate(name):
+            if letter in _AXES:
+                groups.setdefault((name[:i], name[i + 1 :]), []).append(name)
+    found = []
+    for (head, _), group in groups.items():
+        letters = sorted(name[len(head)] for name in group)
+        if len(group) == size and [*map(ord, letters)] == [ord(letters[0]) + k for k in range(size)]:
+            found.append(tuple(sorted(group, key=lambda name: name[len(head)])))
+    return found
+
+
+def _common_part(names: Sequence[str]) -> str:
+    """Return the letters that names have in common, place by place, without marks at their ends."""
+    same = "".join(letters[0] for letters in zip(*names, strict=False) if len(set(letters)) == 1)
+    return same.strip("_.[]() ")
+
+
+def _likeness(v: FmuVariable) -> tuple[object, ...]:
+    return v.type, v.causality, v.variability, v.clocks, tuple(v.items.items())
 
 
 def _same(a: object, b: object) -> bool:

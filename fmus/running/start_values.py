@@ -11,6 +11,7 @@ import numpy as np
 
 from ...blocks.core import FmuError, ParameterError, UnknownNameError, near
 from ..archive import ArchiveLimits, FmuDescription, FmuVariable, read_description
+from .ports import taken_apart
 
 
 def check_start(description: FmuDescription, start: Mapping[str, Any], label: str) -> dict[str, Any]:
@@ -25,6 +26,15 @@ def check_start(description: FmuDescription, start: Mapping[str, Any], label: st
     parts: dict[str, dict[str, Any]] = {}
     for name, value in start.items():
         checked = check_value(description, name, value, label)
+        if (own := description.spelled.get(name)) is not None:
+            if own in start and not np.array_equal(check_value(description, own, start[own], label), checked):
+                raise ParameterError(
+                    f"found {value!r} for {name!r}, and {start[own]!r} for {own!r}; expected one value, as these are "
+                    f"two names of one variable. Leave one out.",
+                    block=label,
+                    port=f"start.{name}",
+                )
+            name = own
         first = description.aliases.get(name, "")
         if first in start and not np.array_equal(check_value(description, first, start[first], label), checked):
             raise ParameterError(
@@ -39,9 +49,10 @@ def check_start(description: FmuDescription, start: Mapping[str, Any], label: st
         else:
             parts.setdefault(array, {})[name] = checked
     for array, values in parts.items():
-        whole, total = description.variables[array], sum(1 for a, _ in description.elements.values() if a == array)
-        base = found.get(array, whole.start)
-        if base is None and len(values) < total:
+        whole = description.variables[array]
+        # of an input, elements that nobody gives are not given: its values need not come from the FMU's own
+        base = found.get(array, None if whole.causality == "input" else whole.start)
+        if base is None and len(values) < whole.size:
             found.update(values)
             continue
         merged = np.zeros(whole.shape) if base is None else np.array(base)
@@ -75,7 +86,14 @@ def check_value(description: FmuDescription, name: str, value: Any, label: str) 
     port = f"start.{name}"
     if name in description.other:
         return _check_text(description, name, value, label)
-    if name not in description.variables and name not in description.elements:
+    if not any(name in known for known in (description.variables, description.elements, description.spelled)):
+        if parts := taken_apart(description, name):
+            raise UnknownNameError(
+                f"found {name!r}, of which rename puts elements into another port; expected these by their own names. "
+                f"Name them one by one: {', '.join(parts)}.",
+                block=label,
+                port="start",
+            )
         known = {*description.names, *description.texts}
         raise UnknownNameError(f"the FMU has no variable {name!r}. {near(name, known)}", block=label, port="start")
     variable = description.find(name)

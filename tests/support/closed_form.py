@@ -81,7 +81,7 @@ int fmi2DoStep(void *p, double t, double h, int final) {
 
 def closed_form_fmu(
     folder, fmi, equations, states=1, inputs=1, outputs=1, *, number="double", attributes="", of_input="continuous",
-    dependencies=None, check="", name="small", changes=(),
+    dependencies=None, check="", name="small", changes=(), description=(),
 ):  # fmt: skip
     """Build it into a folder, for a version of FMI, and return its path.
 
@@ -100,8 +100,8 @@ def closed_form_fmu(
         Dependencies of ``"dx1"``, …, ``"y1"``, … as names, ``"x1 u1"``; of the others none are stated.
     check : str
         C code at the beginning of a step.
-    changes : sequence of (str, str)
-        Texts of the source, and what stands in for them.
+    changes, description : sequence of (str, str)
+        Texts of the source, and of the description, and what stands in for them.
     """
     prefix = f"fmi{fmi}"
     several = [equations] if isinstance(equations, str) else equations
@@ -124,13 +124,11 @@ def closed_form_fmu(
     reals += [(f"u{i}", 20 + i, "input", of_input, None, "0", None) for i in range(1, inputs + 1)]
     reals += [(f"y{i}", 30 + i, "output", "continuous", "calculated", None, None) for i in range(1, outputs + 1)]
     reals.append(("which", 41, "parameter", "fixed", "exact", "0", None))
-    return small_fmu(
-        folder,
-        prefix,
-        source,
-        (_describe2 if fmi == 2 else _describe3)(reals, attributes, dependencies or {}),
-        name=name,
-    )
+    text = (_describe2 if fmi == 2 else _describe3)(reals, attributes, dependencies or {})
+    for before, after in description:
+        assert before in text, before
+        text = text.replace(before, after)
+    return small_fmu(folder, prefix, source, text, name=name)
 
 
 def _unknowns(reals, dependencies, tag_of):

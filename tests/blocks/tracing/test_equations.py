@@ -509,6 +509,7 @@ def test_rounding_to_even_is_refused(equation):
         traced(function_block(equation))
 
 
+@pytest.mark.filterwarnings("ignore:numpy.fix is deprecated:DeprecationWarning")  # since NumPy 2.5
 @pytest.mark.parametrize(
     "equation",
     [

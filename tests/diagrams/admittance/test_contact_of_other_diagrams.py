@@ -54,6 +54,20 @@ def test_a_cart_on_a_damper_has_the_limit_of_routh():
     assert cart_contact().stability_limit(damping=b).value == pytest.approx(k, rel=1e-10)
 
 
+def test_a_cart_without_friction_bounces_on_any_spring_for_ever():
+    # M s² + k = 0: undamped for every k, which is not unstable
+    cart, hand = Cart(name="cart"), Constant(value=0.0, unit="N", name="hand")
+    felt = Gain(gain=1.0, name="sensor")(hand).named("felt")
+    here = Diagram("cart", cart(motor=0.0 * felt, push=hand)).contact(
+        "cart.push", direction=[1.0], position="cart.position", velocity="cart.velocity", force="felt"
+    )
+    found = here.stability_limit()
+    assert found.value == math.inf
+    assert "the motion does not decay" in found.confirmed_by
+    # (τ s + 1)(M s² + b s + k) + DRAG s = 0 with DRAG = 0 and any damper is stable
+    assert here.stability_limit("damping", stiffness=100.0).value == math.inf
+
+
 def test_without_damping_a_spring_breaks_the_loop_where_the_admittance_is_no_longer_passive():
     here = cart_contact()
     limit, w = here.stability_limit(), here.passivity().frequency

@@ -14,7 +14,7 @@ from loopwright.diagrams import experiments
 from loopwright.diagrams.admittance import stability_limits as _stability_limits
 from loopwright.diagrams.admittance.compliance_loop import AdmittanceLoop
 from loopwright.diagrams.admittance.coupled import close_loop, growth_rate, growth_rate_by_control, poles
-from loopwright.diagrams.admittance.growth_limits import find_brackets
+from loopwright.diagrams.admittance.growth_limits import GrowthScan, find_first_limit
 from loopwright.diagrams.admittance.stability_limits import (
     rule_of_thumb,
     stability_limit,
@@ -329,7 +329,11 @@ def test_an_island_between_two_points_of_the_scan_is_found(sign):
         return sign * (1e-4 - (math.log(x) - 1.03) ** 2)
 
     grid = np.geomspace(0.5, 20.0, 9)  # 0.46 apart in ln x, the island is 0.02 wide
-    edges = [x for pair in find_brackets(at, grid, np.array([at(x) for x in grid])) for x in pair]
+    edges = [
+        x
+        for pair in GrowthScan(grid, np.array([at(x) for x in grid]), at, lambda _: 1e-14).find_brackets()
+        for x in pair[:2]
+    ]
     assert edges[0] < math.exp(1.02) < edges[1] == edges[2] < math.exp(1.04) < edges[3]
 
 
@@ -524,3 +528,25 @@ def test_an_environment_that_is_none_is_refused(implementation, environment):
     for call in (growth_rate, stability_limit):
         with pytest.raises(ParameterError, match=rf"environment\.{name}: found .*not negative"):
             call(made, **environment)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("limit", [math.inf, 100.0, 123.4])
+def test_a_rate_that_is_zero_but_for_rounding_is_not_unstable(limit, seed):
+    """σ is 0, up to rounding of either sign that differs between a stack of values and a single one; then it grows."""
+    noise, grid = 1e-13, np.geomspace(1e-2, 1e4, 241)  # 100 is a point of the grid
+
+    def rate(x, salt):
+        rounding = np.random.default_rng([seed, salt, int.from_bytes(np.float64(x).tobytes())]).uniform(-noise, noise)
+        return rounding + (0.02 * (x / limit - 1.0) if x > limit else 0.0)
+
+    stacked = np.array([rate(x, 1) for x in grid])
+    found = find_first_limit(
+        "stiffness", grid, stacked, lambda x: rate(x, 2), lambda x: rate(x, 3), lambda _: 2.0 * noise
+    )
+    assert found.restabilizes == ()
+    if limit == math.inf:
+        assert found.value == math.inf
+        assert "at 241 of its 241 values the motion does not decay" in found.confirmed_by
+    else:
+        assert found.value == pytest.approx(limit, rel=1e-10)

@@ -115,3 +115,22 @@ def test_an_arm_that_is_lighter_than_twice_the_impedance_has_no_limit_of_mass():
     assert here.stability_limit("mass", stiffness=100.0).value == math.inf
     heavy = gantry.nominal.mass
     assert np.all(np.asarray(heavy) > 2 * IMPEDANCE["perp"])
+
+
+def test_another_tool_of_an_arm_without_friction_has_a_limit():
+    """Its acceleration has no slope but that by the forces: what it has by its states is rounding of zero.
+
+    The tool's inertia comes back through one sample, a⁺ = −m (diag(1/m_d) − Λ⁻¹) a, with the limit z = −1. The slower
+    modes move it by the sample time over their time constants.
+    """
+    here = contact("scara", "par", friction=False)
+    limit = here.stability_limit("tool_mass")
+    arm = scara.nominal
+    q = arm.joint_angles((0.8, 0.5))
+    J, M = np.array(arm.dh(q), dtype=float), np.array(arm.inertia(q), dtype=float)
+    across = np.diag([1 / IMPEDANCE["perp"], 1 / IMPEDANCE["par"]])  # the path goes along y there
+    by_hand = 1 / np.linalg.eigvalsh(across - J @ np.linalg.solve(M, J.T)).max()
+    assert limit.value == pytest.approx(by_hand, rel=2e-3)
+    assert limit.value == pytest.approx(0.5410575772, rel=1e-9)  # by the matrices of the sampled loop, set up apart
+    found = here.confirm(limit)
+    assert found.below.measured < 0.0 < found.above.measured

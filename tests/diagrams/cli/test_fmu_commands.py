@@ -1,6 +1,7 @@
 """``loopwright build``, ``inspect``, ``validate``: files, texts, exit statuses; FMUs of ours and of others."""
 
 import ctypes
+import errno
 import hashlib
 import json
 import os
@@ -22,6 +23,7 @@ from loopwright.fmus.checks import trial as _trial
 from loopwright.fmus.export.compiler import find_compiler
 from loopwright.fmus.export.package import zip_files
 from loopwright.fmus.platform import native_platform
+from support.failing_disk import fail_below
 from support.zoo import zoo_fmu
 
 LINUX = pytest.mark.skipif(
@@ -338,9 +340,9 @@ def test_models_that_cant_be_built(here, capsys, monkeypatch):
     unlucky = f"Unlucky() can't be made in line {line_of('raise RuntimeError')}: RuntimeError: no luck. Correct it."
     assert unlucky in fails("mine.py:Unlucky")
     (here / "folder").mkdir()
-    (here / "folder").chmod(0o500)
-    if os.geteuid() != 0:  # root may write anywhere
-        assert "can't write" in fails("mine.py:Lag", "--out", "folder")
+    with monkeypatch.context() as failing:
+        fail_below(failing, here / "folder", errno.EROFS)
+        assert " is on a file system that can only be read; " in fails("mine.py:Lag", "--out", "folder")
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(here / "cache"))
     monkeypatch.setenv("LOOPWRIGHT_CC", f"{shutil.which('cc') or 'cc'} -include no_such_header.h")
     err = fails("mine.py:Lag")

@@ -292,7 +292,7 @@ def test_a_plant_that_is_no_fmu(tmp_path, capsys):
 def test_out_is_a_file(tmp_path, capsys):
     (tmp_path / "out").write_text("")
     assert main(["run", "A", "--out", str(tmp_path / "out")]) == 2
-    assert "--out: the folder" in capsys.readouterr().err
+    assert "out' is a file; expected a folder. Name another folder." in capsys.readouterr().err
 
 
 def test_a_plant_of_ones_own(tmp_path, undrawn):
@@ -301,6 +301,24 @@ def test_a_plant_of_ones_own(tmp_path, undrawn):
     plant = gantry.build(out=tmp_path / "mine.fmu")
     assert main(["run", "A", "--plant", str(plant), "--out", str(tmp_path / "out")]) == 0
     assert json.loads((tmp_path / "out" / "A.json").read_text())["overshoot_par"] == pytest.approx(0.248935, abs=2e-3)
+
+
+def test_a_plant_with_scalar_ports(tmp_path, capsys, undrawn):
+    from support.scalar_gantry import RENAME, scalar_gantry
+
+    plant = ["--plant", str(scalar_gantry(tmp_path)), "--out", str(tmp_path / "out")]
+    renames = [text for name, port in RENAME.items() for text in ("--rename", f"{name}={port}")]
+    assert main(["run", "A", *plant, *renames]) == 0
+    assert json.loads((tmp_path / "out" / "A.json").read_text())["overshoot_par"] == pytest.approx(0.248935, abs=2e-3)
+    capsys.readouterr()
+    for words, text in (
+        (["run", "A", *plant, "--rename", "s_Y"], "found --rename 's_Y'; expected NAME=PORT"),
+        (["run", "A", *plant, *renames[:2], *renames[:2]], "--rename F_my: it is given twice; give it once."),
+        (["run", "A", *renames], "--rename: it names ports of another plant; give that plant, too."),
+        (["run", "A", *plant, *renames[:-4], *renames[-2:]], "no variable that is renamed to acceleration[1]"),
+    ):
+        assert main(words) == 2
+        assert text in capsys.readouterr().err
 
 
 # --- the process ----------------------------------------------------------------------------------------------------
@@ -392,5 +410,9 @@ def test_files_that_cannot_be_written_leave_the_earlier_ones(tmp_path, capsys, m
     monkeypatch.setattr("loopwright.diagrams.results.save", full)
     capsys.readouterr()
     assert main(["run", "A", "--out", str(tmp_path)]) == 1
-    assert "its files can't be written: [Errno 28] No space left on device; the files of an" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert (
+        f"its files can't be written; the files of an earlier run stay in {tmp_path}: no space is left on the" in said
+    )
+    assert said.count("Make room there.") >= 1
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before

@@ -48,8 +48,8 @@ def named(case):
 
 
 def public_blocks():
-    public = {v for v in vars(loopwright.blocks).values() if isinstance(v, type) and issubclass(v, Block)}
-    return [cls for cls in public if not is_base(cls)]
+    public = {getattr(loopwright.blocks, name) for name in loopwright.blocks.__all__}
+    return [cls for cls in public if isinstance(cls, type) and issubclass(cls, Block) and not is_base(cls)]
 
 
 # --- the library ----------------------------------------------------------------------------------------------------------

@@ -76,6 +76,39 @@ def test_a_start_on_the_floor_without_a_way_out_is_a_rest(speed):
     assert caught.value.t == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("solver", ["auto", "RK45", "Radau", "LSODA", "CVODE_Adams", "rk4"])
+@pytest.mark.parametrize(
+    ("restitution", "height", "floor"),
+    [(0.8, 0.0, 0.0), (0.8, 0.0, 1000.0), (0.99, 0.0, 0.0), (0.5, 1e-12, 0.0), (0.8, 1e-9, 0.1), (0.8, 1e-6, 0.0)],
+)
+@pytest.mark.drawn(6)
+def test_a_ball_whose_flights_shrink_to_nothing_ends_in_an_error_soon_after(
+    restitution, height, floor, solver, compiled
+):
+    """The last flight is over after (1 + e)/(1 − e) times the fall: then it would rest, whether it has fallen or not."""
+    ball = Drop(name="mass", restitution=restitution, floor=floor, start_height=floor + height)
+    tick = 0.01
+    with pytest.raises(
+        SimulationError, match=r"'impact' (rests in contact|shows Zeno behaviour).*state of rest"
+    ) as caught:
+        Diagram("d", ball).simulate(1.0, step=tick, solver=solver, compile=compiled, progress=False)
+    end = np.sqrt(2 * height / G) * (1 + restitution) / (1 - restitution)
+    assert caught.value.t <= end + 0.1 * tick
+    assert len(caught.value.run.events) < 3000
+    assert caught.value.run["mass.h"].min() >= floor - 1e-9
+
+
+def test_a_ball_that_loses_nothing_bounces_however_low_it_is():
+    """From 1e-11 m: 350 impacts, in ten ticks."""
+    height = 1e-11
+    ball = Drop(name="mass", restitution=1.0, start_height=height, to_floor=False)
+    run = Diagram("d", ball).simulate(1e-3, step=1e-4, rtol=1e-10, atol=1e-22, progress=False)
+    half = np.sqrt(2 * height / G)
+    assert len(run.events) == int((1e-3 / half + 1) / 2)
+    assert run.events[20].t == pytest.approx(41 * half, rel=1e-6)
+
+
 def test_a_start_in_contact_that_leaves_it_is_no_impact():
     block = Drop(name="mass", restitution=0.5, start_height=0.0, start_speed=1.0)
     run = Diagram("d", block).simulate(0.3, step=0.01, rtol=1e-10, atol=1e-12, progress=False)

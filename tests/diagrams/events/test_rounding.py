@@ -3,9 +3,22 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Compare, Counter, Gain, Integrator, PulseTrain, Relay, TransportDelay
+from loopwright.blocks import (
+    Block,
+    Compare,
+    Counter,
+    Event,
+    Gain,
+    Integrator,
+    PulseTrain,
+    Relay,
+    State,
+    TransportDelay,
+    parameter,
+)
 from loopwright.diagrams import Diagram
-from loopwright.diagrams.solvers import Problem, make_solver
+from loopwright.diagrams.events import Domains, evaluate_many
+from loopwright.diagrams.solvers import AcceptedStep, Problem, make_solver
 from support.hybrid_blocks import Lag
 
 
@@ -73,3 +86,120 @@ def test_rounding_of_an_indicator_itself_fires_nothing(solver):
             len(run.events) % 2
         )
         assert np.min(np.diff([e.t for e in run.events])) > 0.23
+
+
+# --- rounding errors of an indicator, of a size that is given ---------------------------------------------------------
+
+
+class Watched(Block):
+    """A block with an event, of which `crossings` takes the place of the indicator."""
+
+    x = State()
+    cross = Event("both")
+
+    def derivative(self, t, x, u):
+        return 0.0 * x.x
+
+    def indicators(self, t, x, u):
+        return x.x
+
+    def jump(self, t, x, u, fired):
+        return x.x
+
+
+def crossings(indicator, begin, end, restart):
+    """Return the events that the search finds: in one step first, after each in steps that grow from a short one."""
+    opened = np.ones(1)
+
+    def g(t, x):
+        return np.array([indicator(t)])
+
+    def many(times, states):
+        return evaluate_many(g, opened, times, states)
+
+    flat = Diagram("d", Watched(name="watched")).flatten(10.0)
+    domains = Domains(flat, g, many, lambda t, x: np.zeros(1), opened, 10.0)
+    domains.begin(begin, np.zeros(1))
+    t, h, found = begin, end - begin, []
+    while t < end:
+        step = AcceptedStep(t, min(t + h, end), np.zeros(1), lambda: lambda time: np.zeros(1))
+        event = domains.locate(step)
+        if event is None:
+            t, h = step.t, 4.0 * h
+            continue
+        t, fired = event
+        found.append(t)
+        domains.count(t, np.zeros(1), fired)
+        assert not domains.update(t, np.zeros(1)).any()
+        h = restart
+    return found
+
+
+def rounding(size, seed):
+    """Return an error up to a size, independent at any two instants, always the same at one."""
+
+    def error(t):
+        key = np.frombuffer(np.float64(t).tobytes(), np.uint32)
+        return size * (2.0 * np.random.default_rng([seed, *key.tolist()]).random() - 1.0)
+
+    return error
+
+
+@pytest.mark.parametrize("size", [3e-16, 3e-13])
+@pytest.mark.parametrize("restart", [1e-12, 1e-9, 1e-6, 1e-3, 0.1])
+def test_an_indicator_with_rounding_errors_crosses_zero_once_however_short_the_next_step_is(restart, size):
+    for seed in range(40):
+        draw = np.random.default_rng(seed)
+        at, slope = 10.0 ** draw.uniform(-1.0, 1.5), draw.choice([-1.0, 1.0]) * 10.0 ** draw.uniform(-3.0, 1.0)
+        error = rounding(size, seed)
+        begin = at - 0.3 * min(1.0, at)
+        found = crossings(lambda t, a=at, s=slope, e=error: s * (t - a) + e(t), begin, at + 1.0, restart)
+        assert found == pytest.approx([at], rel=1e-15, abs=2.0 * size / abs(slope) + 1e-14), seed
+
+
+@pytest.mark.parametrize("apart", [1e-3, 1e-5, 1e-7])
+@pytest.mark.parametrize("restart", [1e-9, 1e-6, 0.1])
+def test_a_second_crossing_soon_after_is_found(restart, apart):
+    """(t − a)(a + d − t), with errors of 1e-12 d²: the second one is where it is to 1e-12 d, and to ulps of the time."""
+    for seed in range(5):
+        at = 10.0 ** np.random.default_rng(seed).uniform(-1.0, 1.0)
+        error = rounding(1e-12 * apart**2, seed)
+        begin = at - 0.1 * apart  # the next crossing is in the same step
+        found = crossings(
+            lambda t, a=at, e=error: (t - a) * ((a + apart) - t) + e(t), begin, at + 10.0 * apart, restart
+        )
+        assert found == pytest.approx([at, at + apart], abs=1e-11 * apart + 1e-13)
+
+
+class Angle(Block):
+    """ẍ = −x: the cosine of its phase, with an error as rounding makes it, against a level."""
+
+    level: float = parameter(default=0.3)
+    x = State(start=1.0, output=True)
+    v = State(start=0.0, output=True)
+    cross = Event("both")
+
+    def derivative(self, t, x, u):
+        return x.v, -x.x
+
+    def indicators(self, t, x, u):
+        return x.x / np.sqrt(x.x * x.x + x.v * x.v) - self.level + 2e-15 * np.sin(3e16 * t)
+
+    def jump(self, t, x, u, fired):
+        return x.x, x.v
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize(
+    "solver", ["auto", "RK45", "DOP853", "Radau", "rk4", "BDF", "LSODA", "CVODE_Adams", "CVODE_BDF"]
+)
+@pytest.mark.drawn(6)
+def test_the_phase_of_an_oscillator_crosses_a_level_twice_a_turn(solver, compiled):
+    for level in (0.3, 0.99):
+        for rtol in (1e-5, 1e-8):
+            options = {"solver": solver, "rtol": rtol, "step": 0.05, "compile": compiled}
+            run = Diagram("d", Angle(level=level, name="angle")).simulate(32.0, progress=False, **options)
+            turns = 2 * np.pi * np.arange(6)
+            expected = np.sort(np.concatenate([turns + np.arccos(level), turns - np.arccos(level)]))
+            expected = expected[(expected > 0.0) & (expected < 32.0)]
+            assert [e.t for e in run.events] == pytest.approx(expected.tolist(), abs=0.02)

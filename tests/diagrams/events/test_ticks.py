@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Clock, Compare, Constant, Gain, Integrator
+from loopwright.blocks import Block, Clock, Compare, Constant, Event, Gain, Integrator, State
 from loopwright.diagrams import Diagram, subsystem
 from support.hybrid_blocks import Crossings
 
@@ -41,3 +41,33 @@ def test_an_event_at_a_tick_fires_once_and_jumps_on_the_far_side():
     found = Diagram("d", sampled(crossings.count)).simulate(1.0, rtol=1e-10, progress=False)
     assert [e.t for e in found.events] == pytest.approx([0.7], abs=4 * np.spacing(0.7))
     assert found["seen"].tolist() == [0.0] * 7 + [1.0] * 4
+
+
+class Saw(Block):
+    """It rises by 1 in a second, and goes back to 0 where it comes to 1."""
+
+    y = State(start=0.0, output=True)
+    full = Event("rising")
+
+    def derivative(self, t, x, u):
+        return 1.0 + 0.0 * x.y
+
+    def indicators(self, t, x, u):
+        return x.y - 1.0
+
+    def jump(self, t, x, u, fired):
+        return 0.0 * x.y
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("solver", ["auto", "rk4", "RK45", "Radau", "LSODA", "CVODE_Adams", "BDF"])
+@pytest.mark.xfail(
+    strict=True,
+    raises=AssertionError,
+    reason="samples of step= that no subsystem acts at are no ticks yet: an event a few ulps later comes after them, and "
+    "events that follow each other drift by more than 4 ulp",
+)
+def test_a_sample_of_a_diagram_in_continuous_time_sees_an_event_that_belongs_to_it(solver, compiled):
+    """y = t modulo 1, from the right, at 1, 2, … 6 s."""
+    run = Diagram("d", Saw(name="saw")).simulate(6.0, step=0.5, solver=solver, compile=compiled, progress=False)
+    np.testing.assert_allclose(run["saw.y"], run.t % 1.0, rtol=0.0, atol=1e-12)

@@ -174,7 +174,7 @@ def test_nothing_destabilizes_where_nothing_is_fed_back(n):
     assert disk.mu_bound(np.zeros((n, n))) == disk.mu_lower_bound(np.zeros((n, n)))[0] == 0.0
     nilpotent = np.diag(np.ones(n - 1), 1)
     assert disk.mu_bound(nilpotent) < 1e-3  # the scaling that makes it vanish is infinite
-    assert disk.mu_lower_bound(nilpotent)[0] == 0.0
+    assert disk.mu_lower_bound(nilpotent)[0] < 1e-12
 
 
 def test_an_unstable_loop_has_no_disk_margin():

@@ -6,6 +6,7 @@ import control
 import numpy as np
 import pytest
 from hypothesis import strategies as st
+from scipy.optimize import brentq, minimize_scalar
 
 from loopwright.blocks import ConfirmationError
 from loopwright.diagrams import margins
@@ -102,3 +103,90 @@ def test_an_equation_without_a_solution_is_an_error_with_a_next_step(monkeypatch
     monkeypatch.setattr("loopwright.diagrams.frequency.loop_margins._MarginFinder.find_margins", singular)
     with pytest.raises(ConfirmationError, match=r"margins: found an equation .* \(Singular matrix\); .*balanced"):
         margins(control.tf([1.0], [1.0, 1.0]))
+
+
+@pytest.mark.parametrize("gain", [0.01, 0.3])
+@pytest.mark.parametrize("samples", [1, 14, 15, 16, 23, *(pytest.param(n, marks=pytest.mark.slow) for n in (40, 60))])
+def test_a_delay_written_into_the_polynomials_has_the_margins_of_its_closed_form(samples, gain):
+    """K/(zⁿ (z − 1)): |L| = K/(2 sin(θ/2)), and its phase is −π/2 − (n + 1/2) θ."""
+    K, T = gain / (samples + 1), 0.01
+    found = margins(control.tf([K], [1.0, -1.0, *[0.0] * samples], T))
+    crossing = 2 * np.arcsin(K / 2)
+    limit = np.pi / (2 * samples + 1)
+    phase = np.pi / 2 - (samples + 0.5) * crossing
+    exact = {"phase_margin_deg": np.degrees(phase), "gain_margin_high": 2 * np.sin(limit / 2) / K}
+    exact["delay_margin_s"] = phase / crossing * T
+    assert found.stable
+    for name, value in exact.items():
+        number = found.numbers()[name]
+        assert number.value == pytest.approx(value, rel=1e-9), name
+        assert abs(number.value - value) <= number.tolerance + 1e-13 * abs(value), name
+
+
+def test_poles_at_zero_are_a_chain_of_delays():
+    """A moving average of 30 samples, one beside a resonance, and a plant with a common factor z."""
+    mean = np.ones(30) / 30
+    cases = [
+        (0.5 * mean, [1.0, *[0.0] * 29]),
+        (0.5 * mean, [1.0, *[0.0] * 30]),
+        (np.convolve(mean, [0.1, 0.2]), np.convolve([1.0, -1.9, 0.95], [1.0, *[0.0] * 29])),
+        ([1.0, 2.0, 3.0], [2.0, 0.0, 0.0]),
+        ([1.0, 0.5, 0.0], [1.0, -0.5, 0.0]),
+        ([3.0], [2.0, 0.0]),
+    ]
+    for over, under in cases:
+        A, B, C, D, _ = read_matrices(control.tf(over, under, 0.1))
+        assert len(A) == len(under) - 1
+        for z in (Fraction(9, 7), Fraction(-5, 4), Fraction(21, 20)):
+            got = (C @ np.linalg.solve(float(z) * np.eye(len(A)) - A, B) + D).item()
+            assert got == pytest.approx(exact_value(over, under, z), rel=1e-11)
+
+
+def test_a_filter_of_delays_alone_has_its_margins():
+    """L = K (1 + z⁻¹ + … + z⁻²⁹)/30 · z⁻¹: at z = 1 it is K, and 1/M_t = 1 + 1/K there."""
+    K = 0.5
+    found = margins(control.tf(K * np.ones(30) / 30, [1.0, *[0.0] * 30], 0.01))
+    theta = np.linspace(1e-6, np.pi, 2_000_001)
+    L = K * np.exp(-1j * theta) * (1 - np.exp(-30j * theta)) / (30 * (1 - np.exp(-1j * theta)))
+    assert found.ms.value == pytest.approx(np.max(1 / np.abs(1 + L)), rel=1e-9)
+    assert found.mt.value == pytest.approx(np.max(np.abs(L / (1 + L))), rel=1e-9)
+
+
+@pytest.mark.parametrize("T", [1e-4, 1e-5, 1e-6])
+@pytest.mark.parametrize("form", ["as it is", "observable", "turned"])
+def test_a_companion_form_of_integrators_that_are_sampled_fast_has_its_margins(T, form):
+    """L = k (z − q)²/(z − 1)³ with q = 1 − P T, as `ss(zpk(…))` makes it: exact with w = z − 1 = exp(jωT) − 1."""
+    P, k = 20.0, 60.0 * T
+    made = control.ss(control.zpk([1 - P * T] * 2, [1, 1, 1], k, dt=T))
+    if form == "observable":
+        made = control.ss(made.A.T, made.C.T, made.B.T, made.D, T)
+    if form == "turned":
+        made = control.ss(made.A[::-1, ::-1], made.B[::-1], made.C[:, ::-1], made.D, T)
+
+    def L(omega):
+        w = np.expm1(1j * omega * T)
+        return k * (w + P * T) ** 2 / w**3
+
+    crossing = brentq(lambda w: abs(L(w)) - 1, 10.0, 1000.0, xtol=1e-12)
+    phase = np.degrees(np.angle(-L(crossing)))
+    found = margins(made)
+    assert found.stable
+    rounding = 10 * np.finfo(float).eps / (P * T) ** 2  # of the numerator's coefficients
+    number = found.phase_margin_deg
+    assert number.value == pytest.approx(phase, rel=max(1e-9, rounding))
+    assert abs(number.value - phase) <= max(number.tolerance, 1e-12 * phase) < 1e-2
+    peak = minimize_scalar(
+        lambda w: -abs(1 / (1 + L(w))), bounds=(50.0, 500.0), method="bounded", options={"xatol": 1e-9}
+    )
+    assert found.ms.value == pytest.approx(-peak.fun, rel=max(1e-8, rounding))
+
+
+def test_a_realization_without_digits_is_refused_with_a_next_step(monkeypatch):
+    def singular(*args, **options):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr("loopwright.diagrams.frequency.realization.Realization.reduce", singular)
+    with pytest.raises(
+        ConfirmationError, match=r"rig: found an equation .* \(Singular matrix\); .* transfer function\."
+    ):
+        margins(control.tf([1.0], [1.0, 1.0], name="rig"))

@@ -87,6 +87,16 @@ def test_the_slopes_to_both_sides_are_found_where_they_differ(case):
     assert (kink.below, kink.above) == pytest.approx((below, above), rel=1e-6)  # by hand
     assert lin.loop("v").findings == (kink,)
     assert lin.findings_on_loops == (kink,)
+    (slope,) = np.ravel(0.0 - lin.A)  # ẋ = block(−x)
+    assert kink.slope == slope
+    assert f"the model has {slope:.6g}" in str(kink)
+
+
+def test_the_model_of_an_absolute_value_has_the_mean_of_both_slopes_at_zero():
+    lin = around(on(lambda u: 2.0 * u + 3.0 * np.abs(u))).linearize()
+    (kink,) = lin.findings
+    assert (kink.below, kink.above, kink.slope) == pytest.approx((-1.0, 5.0, 2.0), rel=1e-12)
+    assert str(kink).endswith("slope -1 below the point and 5 above; the model has 2")
 
 
 SMOOTH = {
@@ -226,7 +236,7 @@ def test_only_numbers_that_depend_on_a_finding_carry_it():
     (fact,) = bent.as_dict()["phase_margin_deg"]["findings"]
     assert fact == {
         "kind": "Kink", "block": "block", "port": "y", "source": "e", "below": kink.below, "above": kink.above,
-        "jump": 0.0, "text": str(kink),
+        "jump": 0.0, "slope": kink.slope, "text": str(kink),
     }  # fmt: skip
     assert json.dumps(fact)
 

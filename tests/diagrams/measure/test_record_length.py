@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, DiscreteIntegrator, TransferFunction
+from loopwright.blocks import BandLimitedNoise, Constant, DiscreteIntegrator, Gain, Integrator, TransferFunction
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.measure.measurement import Measurement, measure_part
 from loopwright.diagrams.measure.waveforms import SAMPLES, plan_signal
@@ -63,8 +63,71 @@ def test_noise_is_not_waited_for_and_is_in_the_uncertainty():
     noise = 1e-4 * np.random.default_rng(3).standard_normal(40)
     played, found = measured(noise)
     assert played < 12
+    assert found.settled[0]
+    assert np.std(noise) / 3 < found.uncertainty[0] < 10 * np.std(noise)
+
+
+def test_noise_that_swamps_a_line_is_not_settled():
+    _, found = measured(np.random.default_rng(3).standard_normal(40))
     assert not found.settled[0]
-    assert found.uncertainty[0] > np.std(noise)
+
+
+class NoisyWindows(Windows):
+    """A run with v = d and white noise of a standard deviation in it, and u = v + d."""
+
+    def __init__(self, part, deviation, seed):
+        super().__init__(part, ())
+        self.deviation, self.rng = deviation, np.random.default_rng(seed)
+
+    def record(self, n, every):
+        self.played += 1
+        d = np.sin(self.part.omega[0] * 0.01 * np.arange(n + 1))[:, None]
+        v = d + self.deviation * self.rng.standard_normal((n + 1, 1))
+        return v, v + d, np.zeros((n + 1, 0))
+
+
+@pytest.mark.parametrize("deviation", [1e-4, 1e-2])
+def test_the_noise_in_an_uncertainty_covers_the_true_value_in_its_share_of_draws(deviation):
+    """The share is 95 %, of v; that of L is more, as the errors of v and u add up, which are one noise."""
+    (part,) = plan_signal("sine", np.array([20.0]), 0.01, 1.0)
+    draws, covered, settled, sizes = 400, np.zeros(3), 0, []
+    for seed in range(draws):
+        run, found = NoisyWindows(part, deviation, seed), Measurement(1, 1, 0)
+        measure_part(run, part, 0, 0, 1, 40, 1e-6, found, 0)
+        v, u = found.v.item(), found.u.item()
+        covered[0] += abs(v - 1.0) <= found.noise[0, 0] * abs(v)
+        covered[1] += abs(u - 2.0) <= found.noise[1, 0] * abs(u)
+        covered[2] += abs((v / u) / 0.5 - 1.0) <= found.uncertainty[0]
+        settled += found.settled[0]
+        sizes.append(found.uncertainty[0])
+    share = covered / draws
+    assert settled == draws
+    assert np.all(np.abs(share[:2] - 0.95) < 0.04)  # 3.7 standard deviations of 400 draws
+    assert share[2] >= 0.95
+    # a phasor of n samples has the deviation 2 σ/√n, and the mean of some windows less
+    assert np.median(sizes) < 3 * 1.5 * 2 * deviation / np.sqrt(part.samples)
+
+
+def noisy_loop(variance, seed):
+    """L = 3 T/(z − 1) with T = 0.01 s, and noise in what the controller reads."""
+    lag, noise = Integrator(name="lag"), BandLimitedNoise(variance=variance, sample_time=0.01, seed=seed, name="noise")
+
+    @subsystem(sample_time=0.01)
+    def controller(y, n):
+        return Gain(gain=3.0, name="gain")(0.0 - y - n).named("u")
+
+    return Diagram("noisy", lag(controller(lag.y, noise.y)))
+
+
+@pytest.mark.parametrize("variance", [1e-8, 1e-4])
+def test_a_loop_with_noise_settles_with_an_uncertainty_that_holds(variance):
+    for seed in (1, 2):
+        found = noisy_loop(variance, seed).frequency_response("u", [8.0], amplitude=1.0)
+        L = 0.03 / (np.exp(0.01j * found.omega) - 1)
+        off = abs(found.L.frdata[0, 0] / L - 1)
+        assert found.settled.all()
+        assert np.all(off <= found.uncertainty)
+        assert np.all(found.uncertainty < 100 * np.sqrt(variance) / np.sqrt(256))
 
 
 def sampled(tau, T, held):

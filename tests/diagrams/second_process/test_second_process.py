@@ -1,13 +1,17 @@
 """Parts of a result from two processes are those of one, in their order, whatever happens to the second one."""
 
 import os
+import signal
 from dataclasses import dataclass, field
+from itertools import repeat
+from pathlib import Path
 
 import pytest
 
 from loopwright.blocks import LoopwrightError, OptionError
 from loopwright.diagrams.report.analysis import check_workers
 from loopwright.diagrams.second_process import SecondProcess
+from support.marked import ON_LINUX, Host
 from support.waiting import wait_for
 
 KEYS = ("a", "b", "c", "d")
@@ -105,3 +109,35 @@ def test_a_report_is_the_same_from_one_process_and_from_two(tmp_path):
         assert {"poles", "inner", "injection"} <= set(told)
     one, two = ([line for line in page.splitlines() if "UTC" not in line] for page in pages)
     assert one == two
+
+
+@dataclass
+class Holds:
+    """Runs in C for hours in the second process, and holds the interpreter lock there."""
+
+    folder: Path
+
+    def make(self, key, tell):
+        (self.folder / str(os.getpid())).touch()
+        sum(repeat(1, 10**13))
+
+
+HOST = f"""
+import sys, time
+from pathlib import Path
+sys.path[:0] = {[os.path.dirname(__file__), str(Path(__file__).parents[2])]!r}
+from loopwright.diagrams.second_process import SecondProcess
+from test_second_process import Holds
+with SecondProcess(Holds(Path(sys.argv[1])), "letters") as second:
+    second.share(["a", "b"], lambda key: time.sleep(1e4), print)
+"""
+
+
+@ON_LINUX
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_the_second_process_ends_with_its_host(tmp_path, number):
+    with Host(HOST, str(tmp_path)) as host:
+        assert wait_for(lambda: [int(path.name) in host.others() for path in tmp_path.iterdir()], [True], 60.0) == [
+            True
+        ]
+        assert host.kill(number) == {}

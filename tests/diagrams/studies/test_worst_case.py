@@ -85,7 +85,7 @@ def test_entries_of_an_array_are_ranges_by_the_names_that_sensitivity_gives():
     assert found.worst.value == pytest.approx(
         lag_delay_margin(0.05, found.parameters["motor.denominator[2]"]), rel=1e-9
     )
-    assert found.worst.value <= lag_delay_margin(0.05, 0.5)
+    assert found.worst.value <= lag_delay_margin(0.05, 0.5) * (1.0 + 1e-12)
     assert found.diagram.blocks["motor"].denominator[0] == 0.05
 
 
@@ -170,7 +170,7 @@ def test_an_unstable_case_is_the_worst_and_a_run_grows():
     assert found.worst.state is CaseState.UNSTABLE
     assert found.parameters["p.gain"] == -2.0
     roots = np.roots([1.0, 2.0 + 2.0 * -2.0, 2.0 * 0.5])
-    assert found.worst.growth == pytest.approx(roots.real.max(), rel=1e-9)
+    assert found.worst.growth == pytest.approx(roots.real.max(), rel=3e-7)  # a double root: the square root of rounding
     assert all(case.growth <= found.worst.growth for case in found.unstable)
     confirmed = found.confirm()
     assert confirmed.kind is ConfirmationKind.GROWTH

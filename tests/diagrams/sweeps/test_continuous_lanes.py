@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import (
+    BandLimitedNoise,
     Constant,
     Gain,
     Integrator,
     PulseTrain,
+    Recorded,
     Relay,
     Saturation,
     Sine,
@@ -62,6 +64,36 @@ def test_a_lag_behind_a_jump_at_a_tick_is_what_the_method_gives_in_closed_form(s
             if n >= round(row["jump.times"] / T):
                 y = growth * y + (1.0 - growth) * row["jump.values"]
         np.testing.assert_allclose(values, wanted, rtol=0, atol=1e-14)
+
+
+HEIGHTS = [0.3, -1.2, 0.8, 2.0, -0.4, 0.9, -2.1]
+NOISE = BandLimitedNoise(sample_time=T, seed=3, name="source")
+JUMPING = {
+    "a step at the end": (Step(times=12 * T, values=1.0, name="source"), lambda n: float(n >= 12)),
+    "pulses": (PulseTrain(period=4 * T, name="source"), lambda n: float(n % 4 < 2)),
+    "a record": (
+        Recorded(times=[2 * T * k for k in range(7)], values=HEIGHTS, interpolation="previous", name="source"),
+        lambda n: HEIGHTS[n // 2],
+    ),
+    "noise": (NOISE, lambda n: float(NOISE.output(n * T, None, None))),
+}
+
+
+@pytest.mark.parametrize("solver", GROWTH)
+@pytest.mark.parametrize("kind", JUMPING)
+def test_a_source_that_jumps_at_ticks_reaches_a_lag_behind_them_up_to_the_last_one(kind, solver):
+    """Between ticks the source is constant: y(n + 1) = G y(n) + (1 − G) K u(nT). The last tick has a jump, too."""
+    source, value = JUMPING[kind]
+    delayed = TransferFunction(numerator=(1.0,), denominator=(0.05, 1.0), name="lag")(source)
+    diagram = Diagram("lag", Gain(gain=1.0, name="k")(delayed).named("y"))
+    table = [{"k.gain": k} for k in (1.0, -0.7, 2.0)]
+    found = swept(diagram, table, ["y"], 12 * T, solver=solver)
+    assert not apart(found)
+    growth, y = GROWTH[solver](-T / 0.05), [0.0]
+    for n in range(12):
+        y.append(growth * y[-1] + (1.0 - growth) * value(n))
+    for row, values in zip(table, found["y"], strict=True):
+        np.testing.assert_allclose(values, row["k.gain"] * np.array(y), rtol=0, atol=1e-14)
 
 
 def machine(plants):

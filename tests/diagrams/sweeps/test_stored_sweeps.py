@@ -301,7 +301,9 @@ def test_other_numbers_that_a_reduction_takes_are_another_sweep(tmp_path, monkey
             guarded().sweep({"guard.gain": (1.0,)}, 0.1, reduce={"e": reduce}, to=tmp_path / place, **QUIET)
 
 
-@pytest.mark.parametrize(("to", "found"), [("a_file/x", "can't be made"), (3, "found 3"), ("\0", "found '\\x00'")])
+@pytest.mark.parametrize(
+    ("to", "found"), [("a_file/x", "a_file' is a file; expected a folder. "), (3, "found 3"), ("\0", "found '\\x00'")]
+)
 def test_a_folder_that_cannot_be_made_is_told_before_the_first_run(to, found, runs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a_file").write_text("")

@@ -520,7 +520,8 @@ def test_fused_runs_have_the_bits_of_fused_single_runs(how):
     experiment = experiments.hand_guiding()
     single = experiment.simulate(fuse=True, compile=how.get("compile", True), **QUIET)
     found = experiment.sweep({"plant.coulomb_scale": (1.0, 0.5)}, signals="plant.position", fuse=True, **how, **QUIET)
-    assert not np.array_equal(single["plant.position"], experiment.simulate(**QUIET)["plant.position"])
+    if how.get("compile", True):  # the plant alone may be fused without another bit
+        assert not np.array_equal(single["plant.position"], experiment.simulate(**QUIET)["plant.position"])
     assert np.array_equal(found["plant.position"][0], single["plant.position"])
     assert any("Fused: plant" in message for message in found.messages)
 

@@ -335,6 +335,38 @@ def test_of_several_solutions_the_other_ones_are_told():
     assert str(message) in repr(run)
 
 
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_start_from_which_newtons_method_gets_stuck_is_sought_from_other_values(compiled):
+    """Of y = 3 cos 2y: from 0 the residual has a minimum of 0.02 near y = 3 that is no solution."""
+
+    def left(y):
+        return 3 * np.cos(2 * y) - y
+
+    near, second, third = brentq(left, 0.5, 1.0), brentq(left, -1.2, -0.8), brentq(left, -2.1, -1.9)
+    assert max(left(np.linspace(2.5, 3.5, 10001))) < -0.09
+    f = Function(lambda v: 3 * np.cos(2 * v), name="f")
+    run = Diagram("loop", f(f.y), loops="solve").simulate(0.2, step=0.1, compile=compiled, progress=False)
+    assert run["f.y"] == pytest.approx([near] * 3, abs=1e-12)
+    (message,) = run.messages
+    for other in (second, third):
+        assert f"{other:.6g}" in message
+
+
+def test_a_loop_without_a_solution_is_refused_after_the_search():
+    f = Function(lambda v: v + 1.0 + v**2, name="f")
+    with pytest.raises(SimulationError, match="was not solved.*from a few other values, got no closer"):
+        run_of(f(f.y))
+
+
+def test_a_solution_that_ends_later_is_refused_where_it_ends():
+    """y = y² + c has a solution up to c = 1/4 only: none is looked for elsewhere then."""
+    f = Function(lambda v, c: v**2 + c, name="f")
+    with pytest.raises(
+        SimulationError, match=r"t = 0\.3 s: the algebraic loop was not solved.*from the last solution, got"
+    ):
+        Diagram("loop", f(f.y, Clock()), loops="solve").simulate(0.4, step=0.1, progress=False)
+
+
 def test_three_solutions_are_told_and_a_unique_one_is_not():
     """Y = tanh(3 y) has 0 and ± y with y = 0.9949; y = −tanh(3 y) has 0 only."""
     up, down = Function(lambda v: np.tanh(3 * v), name="f"), Function(lambda v: -np.tanh(3 * v), name="f")

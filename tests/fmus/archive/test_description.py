@@ -57,14 +57,12 @@ def test_ports_that_no_wire_carries_are_said_in_the_runs_messages(file, tmp_path
     more = changed(file, tmp_path / "more.fmu", (b"</ModelVariables>", MODE + b"</ModelVariables>"))
     plant = Fmu(more, name="plant", start={"force": 1.0})
     run = Diagram("d", plant()).simulate(0.01, step=1e-3, progress=False)
-    (message,) = run.messages
+    _, message = run.messages  # the first says that the force keeps its start value
     assert message == (
         "plant: no wire carries texts, binaries and clocks: the inputs mode (String) keep their start values"
     )
-    assert (
-        Diagram("d", Fmu(file, name="plant", start={"force": 1.0})()).simulate(0.01, step=1e-3, progress=False).messages
-        == ()
-    )
+    plain = Diagram("d", Fmu(file, name="plant", start={"force": 1.0})()).simulate(0.01, step=1e-3, progress=False)
+    assert len(plain.messages) == 1
 
 
 def test_using_such_a_port_says_its_type(file, tmp_path):
@@ -256,7 +254,7 @@ def test_a_file_that_may_not_be_read(tmp_path, monkeypatch):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(type(path), "read_bytes", read_bytes)
-    with pytest.raises(FmuFileError, match=r"can't be read: .*Permission denied"):
+    with pytest.raises(FmuFileError, match=r"can't be read: there is no permission to use "):
         Fmu(path)
 
 

@@ -136,7 +136,7 @@ def test_the_messages_of_a_run_tell_what_is_wrong_with_the_file(good, tmp_path, 
     path = tmp_path / "plant.fmu"
     path.write_bytes(CASES["library: of another name"].make(good))
     plant = Fmu(path, name="plant", start={"force": 1.0}, isolate=False)
-    (message,) = Diagram("d", plant()).simulate(0.01, step=1e-3, progress=False).messages
+    _, message = Diagram("d", plant()).simulate(0.01, step=1e-3, progress=False).messages
     assert message == (
         "plant: its library is called other.so, as the only one in its folder; expected the model identifier, "
         "mass_spring_damper"

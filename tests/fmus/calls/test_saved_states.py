@@ -447,7 +447,7 @@ def test_a_cache_that_cannot_be_written_is_not_the_fmus_fault(file, tmp_path, mo
     blocked = tmp_path / "file"
     blocked.write_text("no folder")
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(blocked / "cache"))
-    with pytest.raises(FmuError, match=r"^plant: can't write the cache folder .* Set LOOPWRIGHT_CACHE") as e:
+    with pytest.raises(FmuError, match=r"^plant: the cache folder .* can't be used: .* Set LOOPWRIGHT_CACHE") as e:
         Loop("gantry", file).open().__enter__()
     assert not isinstance(e.value, FmuFileError)
 

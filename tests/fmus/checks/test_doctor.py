@@ -169,7 +169,7 @@ def test_nothing_is_loaded_without_a_run_where_the_system_cannot_be_asked(examin
 
 def test_an_fmu_that_needs_another_program_is_tried_if_asked_only(examine, monkeypatch):
     tried = []
-    monkeypatch.setattr("loopwright.fmus.checks.examination.try_out", lambda path, kind, *_: tried.append(kind))
+    monkeypatch.setattr("loopwright.fmus.checks.examination.try_out", lambda path, kind, *_, **__: tried.append(kind))
     needs = described((r"<CoSimulation ", '<CoSimulation needsExecutionTool="true" '))
     diagnosis = examine(needs, run=None)
     assert tried == ["ModelExchange"]
@@ -256,10 +256,41 @@ def test_a_trial_run_may_crash(tmp_path, fault):
         assert diagnosis.headline.startswith("runs here")
 
 
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_trial_run_that_hangs_is_announced(tmp_path, monkeypatch, capsys, fmi):
+    monkeypatch.setattr("loopwright.fmus.checks.trial.PATIENCE", 1.5)
+    monkeypatch.setattr("loopwright.fmus.checks.trial.NOTICE", 0.01)
+    diagnosis = doctor(zoo_fmu(tmp_path, fmi, "enter hang 0"))
+    assert diagnosis.verdict == FmuVerdict.FAILS
+    assert "may wait for a licence" in diagnosis.findings[0].step
+    said = capsys.readouterr().err.splitlines()
+    assert [line for line in said if "10 steps by co-simulation" in line and "longer than 1.5 s counts as hung" in line]
+    doctor(zoo_fmu(tmp_path, fmi, "enter hang 0"), progress=False)
+    assert not capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["true", "false", "12", "1e3"])
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_model_identifier_is_a_text_whatever_it_reads_as(tmp_path, fmi, name):
+    """No C identifier, which is said; the library has that name nevertheless, and is found."""
+    sound = zoo_fmu(tmp_path, fmi)
+    file = tmp_path / "named.fmu"
+    with zipfile.ZipFile(sound) as old, zipfile.ZipFile(file, "w") as new:
+        for item in old.namelist():
+            data = old.read(item)
+            if item == "modelDescription.xml":
+                data = data.replace(b'modelIdentifier="zoo"', f'modelIdentifier="{name}"'.encode())
+            new.writestr(item.replace("zoo.so", f"{name}.so"), data)
+    diagnosis = doctor(file)
+    assert diagnosis.summary["interfaces"]["CoSimulation"]["modelIdentifier"] == name
+    assert diagnosis.verdict == FmuVerdict.RUNS, diagnosis.headline
+    assert str(diagnosis)
+
+
 def test_one_of_two_interfaces_may_fail(examine, monkeypatch):
     from loopwright.fmus.checks.trial import FmuProblem
 
-    def run(path, kind, *_):
+    def run(path, kind, *_, **__):
         return FmuProblem("its first step crashed.", "Report it.") if kind == "CoSimulation" else None
 
     monkeypatch.setattr("loopwright.fmus.checks.examination.try_out", run)

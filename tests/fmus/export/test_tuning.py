@@ -46,7 +46,8 @@ def test_a_fused_run_differs_by_rounding_and_says_so(letter):
     plain = diagram.simulate(3.0, progress=False, compile=True)
     fused = diagram.simulate(3.0, progress=False, compile=True, fuse=True)
     size = np.maximum(1e-3, np.abs(plain.data).max(axis=0))
-    assert 0.0 < (np.abs(plain.data - fused.data) / size).max() < 1e-11  # 1e-12 in all four experiments
+    rounding = 100 * np.finfo(float).eps * len(plain.data)  # of some hundred operations, tick by tick
+    assert 0.0 < (np.abs(plain.data - fused.data) / size).max() < rounding
     assert [m for m in fused.messages if m.startswith("Fused: plant") and "differ by rounding" in m]
     assert not [m for m in plain.messages if "used" in m]
 

@@ -5,6 +5,9 @@ equations gives those of the gantry.
 """
 
 import importlib.util
+import shutil
+import sys
+import zipfile
 
 import numpy as np
 import pytest
@@ -96,6 +99,21 @@ def test_a_gantry_that_another_tool_has_exported(tmp_path, tool, letter):
         pytest.skip(f"{tool} is not installed (extra: test)")
     run, own = run_experiment(TOOLS[tool](tmp_path), letter=letter), run_experiment(gantry.build(), letter=letter)
     assert max(largest_differences(run, own, SIGNALS).values()) < 1e-12  # tanh of two libraries: 1 ulp, in a loop
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+def test_such_an_export_has_its_binaries_whatever_was_loaded_here(tmp_path, monkeypatch, tool):
+    """As an FMU of the tool leaves it that was loaded into this process: its own package, without binaries, is first."""
+    if (found := importlib.util.find_spec(tool)) is None:
+        pytest.skip(f"{tool} is not installed (extra: test)")
+    (package,) = found.submodule_search_locations
+    carried = tmp_path / "resources"
+    shutil.copytree(package, carried / tool, ignore=shutil.ignore_patterns("binaries", "__pycache__"))
+    monkeypatch.syspath_prepend(str(carried))
+    for name in [name for name in sys.modules if name.partition(".")[0] == tool]:
+        monkeypatch.delitem(sys.modules, name)
+    with zipfile.ZipFile(TOOLS[tool](tmp_path)) as archive:
+        assert [name for name in archive.namelist() if name.startswith("binaries/") and name.endswith(".so")]
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import subprocess
 import sys
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from loopwright.blocks import Constant, Integrator
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu
+from support.closed_form import closed_form_fmu
 from support.small_fmus import small_fmu, values
 
 # `fault` tells the place: 1 initialization, 2 step, 3 terminate; `kind` the thing: 1 rounding, 2 traps, 3 folder.
@@ -173,3 +175,48 @@ def test_a_compiled_run_computes_in_its_own_modes_beside_an_fmu_that_rounds_upwa
     assert run.tier == "compiled"
     assert np.all(run["total"] == 1.0)
     assert any("the FMU has changed the rounding mode or the traps" in text for text in run.messages)
+
+
+# Every call enables traps; "all" includes that of a rounded result, which any sum in Python would set off.
+TRAPPED = """
+extern int feenableexcept(int);
+static void trap(void) { feclearexcept(FE_ALL_EXCEPT); feenableexcept(TRAPS); }
+"""
+_RUN = """
+import sys
+import numpy as np
+from loopwright.blocks import Constant
+from loopwright.diagrams import Diagram
+from loopwright.fmus import Fmu
+plant = Fmu(sys.argv[1], name="plant", interface=sys.argv[2], isolate=False, start={"x1": 1.0})
+diagram = Diagram("d", plant(u1=Constant(value=1 / 3, name="push")()))
+run = diagram.simulate(0.7, step=0.1, rtol=1e-9, atol=1e-11, compile=sys.argv[3] == "True", progress=False)
+exact = 1 / 3 + (1 - 1 / 3) * np.exp(-run.t)
+assert abs(run["plant.y1"] - exact).max() < (1e-7 if sys.argv[2] == "model_exchange" else 1e-6)
+assert any("the rounding mode or the traps" in text for text in run.messages), run.messages
+model = plant.linear_model(0.1, state={"x1": 0.3}, inputs={"u1": 0.7})
+assert abs(model.A[0, 0] + 1) < 1e-8, model.A
+print("done", 1 / 3 + 1 / 7)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="modes are kept on Linux alone")
+@pytest.mark.parametrize(
+    ("compiled", "traps"),
+    [(False, "FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW"), (True, "FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW"),
+     (False, "FE_ALL_EXCEPT")],  # C sets them back after several calls, between which this FMU would be its own victim
+    ids=["interpreted", "compiled", "all traps"],
+)  # fmt: skip
+@pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
+@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.drawn
+def test_nothing_is_computed_with_the_traps_of_an_fmu(cache, tmp_path, fmi, traps, interface, compiled):
+    """A process of its own, as a trap that is set off ends it: in FMI 2.0 a step's end is compared with no number."""
+    ends = [("return 0; }\n#if FMI == 3\nint fmi3DoStep", "trap(); return 0; }\n#if FMI == 3\nint fmi3DoStep"),
+            ("c->step++; c->t = t + 20 * h; return 0; }", "c->step++; c->t = t + 20 * h; trap(); return 0; }"),
+            ("for (size_t i = 0; i < n; i++) dx[i] = d[i];", "for (size_t i = 0; i < n; i++) dx[i] = d[i]; trap();"),
+            ("int NAME(EnterEventMode)", TRAPPED.replace("TRAPS", traps) + "int NAME(EnterEventMode)")]  # fmt: skip
+    file = closed_form_fmu(tmp_path, fmi, "dx[0] = u[0] - x[0]; y[0] = x[0];", changes=ends)
+    arguments = [sys.executable, "-c", _RUN, str(file), interface, str(compiled)]
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=300, check=False)
+    assert (done.returncode, done.stdout[:4]) == (0, "done"), done.stderr

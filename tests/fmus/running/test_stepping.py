@@ -17,7 +17,9 @@ from loopwright.blocks import (
     Sine,
 )
 from loopwright.diagrams import Diagram
+from loopwright.diagrams.compiled.remote import PythonSteps
 from loopwright.fmus import Fmu, StepOptions
+from loopwright.fmus.isolation.process import ChildProcess
 from support.careful_fmus import (
     BETWEEN,
     BETWEEN_MODEL,
@@ -425,6 +427,49 @@ def test_the_time_that_the_fmu_is_told_is_that_of_the_chosen_arithmetic(events, 
         t += 0.1
     assert run["plant.told"][1:].tolist() == want
     assert want[10] == (0.9999999999999999 if time == "added" else 1.0)
+
+
+TOLD = (
+    """
+typedef struct { double t, u; } instance;
+int fmi2DoStep(void *p, double t, double h, int f) { ((instance *)p)->t = t; return 0; }
+"""
+    + values("fmi2", "Get", "Real", "double", {1: "c->t"})
+    + values("fmi2", "Set", "Real", "double", {2: "c->u"}),
+    """<CoSimulation modelIdentifier="small" canHandleVariableCommunicationStepSize="true"/>
+<ModelVariables><ScalarVariable name="told" valueReference="1" causality="output"><Real/></ScalarVariable>
+<ScalarVariable name="u" valueReference="2" causality="input" variability="continuous"><Real start="0"/></ScalarVariable>
+</ModelVariables><ModelStructure><Outputs><Unknown index="1"/></Outputs></ModelStructure>""",
+)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("isolate", [False, True])
+def test_added_times_cost_no_requests_of_their_own(cache, tmp_path, monkeypatch, isolate, compiled):
+    """In another process a step is one request: nothing else is done but with plain times."""
+    asked = []
+    original = PythonSteps.take
+    monkeypatch.setattr(PythonSteps, "take", lambda self, *step: asked.append(step) or original(self, *step))
+    requests = []
+    ask = ChildProcess.request
+    monkeypatch.setattr(ChildProcess, "request", lambda self, *a, **k: requests.append(a) or ask(self, *a, **k))
+    plant = Fmu(small_fmu(tmp_path, "fmi2", *TOLD), name="plant", isolate=isolate, stepping=StepOptions(time="added"))
+    diagram = Diagram("d", plant(Gain(gain=1.0, name="k")(Constant(value=1.0))))
+    found = diagram.sweep(
+        None, 2.0, samples=[{"k.gain": 1.0}, {"k.gain": 2.0}], step=0.1, compile=compiled, workers=1, progress=False,
+        signals=["plant.told"],
+    )  # fmt: skip
+    want, t = [0.0], 0.0
+    for _ in range(20):
+        want.append(t)
+        t += 0.1
+    assert want[11] == 0.9999999999999999
+    assert found["plant.told"].tolist() == [want, want]
+    run = diagram.simulate(2.0, step=0.1, compile=compiled, progress=False)
+    assert run["plant.told"].tolist() == want
+    if isolate:
+        assert not asked
+        assert len(requests) < 60  # in three runs of 20 steps; those of steps are words that are shared
 
 
 def test_the_tolerance_is_told(events):

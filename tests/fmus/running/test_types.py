@@ -148,8 +148,10 @@ def test_an_integer_that_no_signal_holds_is_an_error_with_its_port(folder):
 
 
 def test_arrays_of_integers_count_from_0_too(folder):
-    plant = Fmu(typed_fmu(folder, 2), name="plant", start={"u_vector[2]": 5})
-    assert plant.start["u_vector"].tolist() == [0.0, 0.0, 5.0]
+    plant = Fmu(typed_fmu(folder, 2), name="plant", start={f"u_vector[{i}]": 3 + i for i in range(3)})
+    assert plant.start["u_vector"].tolist() == [3.0, 4.0, 5.0]
+    one = Fmu(typed_fmu(folder, 2), name="plant", start={"u_vector[2]": 5})  # the others need a wire
+    assert {name: float(v) for name, v in one.start.items()} == {"u_vector[2]": 5.0}
     assert repr(plant["y_vector[2]"]) == "<signal plant.y_vector[2]>"
 
 

@@ -142,7 +142,7 @@ CRASHES = [
     slow("stack", "crash", "SIGSEGV"),
     slow("scribble", "crash", "SIGSEGV"),
     slow("thread_crash", "crash", "SIGSEGV"),
-    slow("kill", "crash", "SIGKILL"),
+    slow("kill", "killed", "SIGKILL"),
     quick("exit", "exit", "status 3"),
     slow("exit0", "exit", "status 0"),
     slow("quick_exit", "exit", "status 0"),
