@@ -227,17 +227,27 @@ class Diagram(VariedDiagram):
         return linearize_batch(self, points, variants, **options)
 
     def contact(
-        self, port: str = "plant.external_force", *, position: str = "plant.position", velocity: str = "plant.velocity",
-        force: str | None = "force", direction: Any = "perp", at: Any = None, **options: Any,
-    ) -> Contact:  # fmt: skip
+        self,
+        port: str | None = None,
+        *,
+        position: str | None = None,
+        velocity: str | None = None,
+        force: str | None = "force",
+        direction: Any = "perp",
+        at: Any = None,
+        **options: Any,
+    ) -> Contact:
         """Return the contact of an environment with the plant: admittance, passivity and limits of coupled stability.
 
         The plant is the block or FMU with the port; all the rest of the diagram is its controller.
 
         Parameters
         ----------
-        port, position, velocity : str
-            Port at which the environment pushes; position and velocity there, in its axes.
+        port : str, optional
+            Port at which the environment pushes; a diagram of Fig. 3 needs no name for it.
+        position, velocity : str, optional
+            Position and velocity there, in its axes; the outputs ``position`` and ``velocity`` of the port's block
+            without them.
         force : str or None
             Wire of the measured force on the robot; None if the controller does not measure it.
         direction : {"perp", "par"} or vector
@@ -250,9 +260,9 @@ class Diagram(VariedDiagram):
         UnknownNameError, ShapeError, OptionError, ParameterError
             Ports that don't fit; a point not at rest; a plant without a model of its equations; a force behind states.
         """
-        from .admittance import make_contact
+        from .admittance import PortNames, make_contact
 
-        return make_contact(self, port, (position, velocity, force), direction, at, options)
+        return make_contact(self, PortNames(port, position, velocity, force), direction, at, options)
 
     def report(
         self,

@@ -5,6 +5,7 @@ from .contact import Contact, make_contact
 from .contact_admittance import ContactAdmittance
 from .contact_confirmation import ContactConfirmation, ContactTrial, try_limit
 from .contact_limits import ContactLimit, ContactMap
+from .contact_ports import PortNames
 from .contact_trials import TrialMethod
 from .coupled import crossing_frequency, growth_rate, poles
 from .moored_plant import hold_sources
@@ -31,6 +32,7 @@ __all__ = [
     "ContactTrial",
     "Passivity",
     "PassivityReason",
+    "PortNames",
     "PortPassivity",
     "StabilityLimit",
     "StabilityMap",

@@ -26,7 +26,7 @@ from .contact_arguments import (
 from .contact_limits import ContactLimit, ContactMap, CoupledLoop, check_properties, find_limit, map_growth
 from .contact_loop import close_loop, join_environment
 from .contact_parts import ContactParts, take_apart
-from .contact_ports import Ports
+from .contact_ports import PortNames, Ports
 from .growth_limits import PER_DECADE
 from .port_passivity import find_passivity
 from .rendered import CONTINUOUS, HIGHEST, LOWEST, OFF_PATH, PERIODIC, SAMPLED, Passivity, find_negative
@@ -77,10 +77,10 @@ class Contact:
     side: str
     point: OperatingPoint
     parts: ContactParts = field(repr=False)
-    filter: AdmittanceFilter | None = field(default=None, repr=False)
-    scale: float = 1.0
-    ports: Ports = field(default=Ports("plant", "external_force", "position", "velocity"), repr=False)
-    measured: str | None = field(default=None, repr=False)
+    filter: AdmittanceFilter | None = field(repr=False)
+    scale: float
+    ports: Ports = field(repr=False)
+    measured: str | None = field(repr=False)
 
     def __repr__(self) -> str:
         along = self.side or "[" + ", ".join(f"{v:.4g}" for v in self.direction) + "]"
@@ -292,20 +292,19 @@ class Contact:
 
 def make_contact(
     diagram: WiredDiagram,
-    port: str,
-    names: tuple[str, str, str | None],
+    names: PortNames,
     direction: str | Sequence[float] | np.ndarray,
     at: PointLike,
     options: Mapping[str, Any],
 ) -> Contact:
-    """Return the contact of a diagram, with the names of position, velocity and force; see `Diagram.contact`."""
-    position, velocity, force = names
+    """Return the contact of a diagram; see `Diagram.contact`."""
+    force = names.force
     taken = {name: options[name] for name in ("stairs", "step") if name in options}
     options = {name: value for name, value in options.items() if name != "stairs"}
     check_options(diagram, options, "contact")
     point = operating_point(diagram, at, options)
     diagram = diagram.replace(point.parameters) if point.parameters else diagram  # parameters that a trim has found
-    ports = Ports.find(diagram, diagram.flatten_like(point), port, position, velocity)
+    ports = Ports.find(diagram, diagram.flatten_like(point), names)
     if not diagram.has_clock and point.t == 0.0:  # a sensor's first value lacks its tool; at rest, a later one does not
         point = _move_on(point, 0, SOON)
     parts, unusual = take_apart(diagram, ports, force, point, taken)

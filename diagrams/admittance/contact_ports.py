@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,24 @@ from ..linearization import Tap, find_signal
 
 if TYPE_CHECKING:
     from ..flat import FlatDiagram, WiredDiagram
+
+
+class PortNames(NamedTuple):
+    """Names that a user gives to the ports of a contact; None where they follow from the diagram and the port.
+
+    The measured force is a wire; None where the controller doesn't measure it.
+    """
+
+    port: str | None = None
+    position: str | None = None
+    velocity: str | None = None
+    force: str | None = "force"
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> PortNames:
+        """Return the names among given entries; ``force=False`` is None, which a TOML file doesn't have."""
+        names = cls(**{name: given[name] for name in cls._fields if name in given})
+        return names._replace(force=None) if names.force is False else names
 
 
 @dataclass(frozen=True)
@@ -25,7 +43,7 @@ class Ports:
     velocity: str
 
     @classmethod
-    def find(cls, diagram: WiredDiagram, flat: FlatDiagram, force: str, position: str, velocity: str) -> Ports:
+    def find(cls, diagram: WiredDiagram, flat: FlatDiagram, names: PortNames) -> Ports:
         """Return the ports that names denote.
 
         Raises
@@ -33,6 +51,14 @@ class Ports:
         UnknownNameError, OptionError
             If a name denotes none, or position and velocity are not outputs of the block with the force port.
         """
+        force = diagram.contact_port if names.port is None else names.port
+        if force is None:
+            raise UnknownNameError(
+                "found no port at which the environment pushes; expected an input of the plant. Name it, such as "
+                "port='robot.force'.",
+                block=diagram.name,
+                port="port",
+            )
         parts = str(force).split(".")  # an FMU's port may have a name with dots
         pairs = [(".".join(parts[:cut]), ".".join(parts[cut:])) for cut in range(len(parts) - 1, 0, -1)]
         plant, port = next((pair for pair in pairs if pair[0] in diagram.blocks), ("", ""))
@@ -46,7 +72,8 @@ class Ports:
                 f"it has no input {port!r}. {near(port, diagram.blocks[plant].inputs)}", block=plant, port=port
             )
         found = []
-        for name, quantity in ((position, "position"), (velocity, "velocity")):
+        for given, quantity in ((names.position, "position"), (names.velocity, "velocity")):
+            name = f"{plant}.{quantity}" if given is None else given
             signal = find_signal(flat, name)
             if signal.port[0] != plant or signal.entry:
                 raise OptionError(

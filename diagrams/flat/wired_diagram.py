@@ -5,7 +5,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Mapping
 from fractions import Fraction
-from typing import Protocol, Self
+from typing import ClassVar, Protocol, Self
 
 from ...blocks.core import Block
 from ..wiring import CheckedDiagram, Structure, exact_time, stepped_blocks
@@ -33,6 +33,8 @@ class HasBase(Protocol):
 class WiredDiagram(CheckedDiagram):
     """A wired diagram with its functions, each made once: the diagram that runs, and that linear models are made of."""
 
+    contact_port: ClassVar[str | None] = None
+    """Port at which an environment pushes unless a contact names another; known where the kind of diagram is."""
     _flat: dict[tuple[Fraction | None, bool], FlatDiagram]
     _origin: tuple[WiredDiagram, dict[str, Block]] | None
     _variants: list[weakref.ref[WiredDiagram]]

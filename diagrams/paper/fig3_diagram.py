@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from ...blocks import Path, PlanarModel
 from ...blocks.core import explain_calls
@@ -22,6 +22,8 @@ class Fig3Diagram(Diagram):
     `fig3` makes one. Fig. 3 wired by hand, with the names of its blocks, is one as well when it is made as
     ``Fig3Diagram("mine", plant(…))`` in place of ``Diagram("mine", plant(…))``.
     """
+
+    contact_port: ClassVar[str | None] = "plant.external_force"
 
     @property
     def report_kind(self) -> MakesSections:

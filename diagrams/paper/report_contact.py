@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import LoopwrightError, OptionError
-from ..admittance import SIDES, Contact, ContactLimit, StabilityLimit, make_contact, try_limit
+from ..admittance import SIDES, Contact, ContactLimit, PortNames, StabilityLimit, make_contact, try_limit
 from ..frequency import Number, with_findings
 from ..linearization import StepsOnly
 from ..report import SIGN_COLUMNS, Implementation, sign_of_admittance
 from ..report_writing import Plot, Section, Table, Texts
-from .report_case import PLANT, Fig3Case
+from .report_case import Fig3Case
 from .report_figures import TARGET, draw_admittances
 
 TEXTS = Texts(__package__, "admittance")
@@ -34,14 +34,11 @@ def find_contacts(case: Fig3Case) -> Contacts | None:
     if case.has_events:
         return None
     variants = list(case.designs(*Implementation))
-    names = (f"{PLANT}.position", f"{PLANT}.velocity", "force")
     found: dict[str, dict[Implementation, Contact]] = {side: {} for side in SIDES}
     try:
         for side, v in ((side, v) for side in SIDES for v in variants):
             options = {} if v.stairs is None else {"stairs": v.stairs}
-            found[side][v.implementation] = make_contact(
-                v.diagram, f"{PLANT}.external_force", names, side, v.point, options
-            )
+            found[side][v.implementation] = make_contact(v.diagram, PortNames(), side, v.point, options)
     except LoopwrightError:
         return None
     every = [contact for side in found.values() for contact in side.values()]

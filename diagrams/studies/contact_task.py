@@ -8,15 +8,13 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 from ...blocks.core import LoopwrightError, OptionError
-from ..admittance import Contact, make_contact
+from ..admittance import Contact, PortNames, make_contact
 from ..flat import WiredDiagram
 from ..requirements import REQUIRED, ContactLimits, TomlFile, read_contact_limits
 
 TABLE = "contact"
 """Name of the tables, [contact.NAME]."""
-PLACES = {"port": "plant.external_force", "position": "plant.position", "velocity": "plant.velocity", "force": "force"}
-"""Entries that name ports and wires, with the names that they have without them."""
-KEYS = (*PLACES, "direction", "at", "stairs", REQUIRED)
+KEYS = (*PortNames._fields, "direction", "at", "stairs", REQUIRED)
 """Entries of a contact's table."""
 
 
@@ -106,14 +104,11 @@ class ContactTask:
         for name, given in self.places.items():
             if name in self._made and self._made[name].diagram is diagram:
                 continue
-            where = {key: given.get(key, own) for key, own in PLACES.items()}
-            force = None if where["force"] is False else where["force"]
             options = {key: given[key] for key in ("stairs",) if key in given}
             try:
                 self._made[name] = make_contact(
-                    diagram, where["port"], (where["position"], where["velocity"], force),
-                    given.get("direction", "perp"), given.get("at"), options,
-                )  # fmt: skip
+                    diagram, PortNames.of(given), given.get("direction", "perp"), given.get("at"), options
+                )
             except LoopwrightError as error:
                 known = error.port if error.port in KEYS else ""
                 key = ".".join(part for part in (TABLE, name, known) if part)

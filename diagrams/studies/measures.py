@@ -12,19 +12,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...blocks.core import LoopwrightError, OptionError, near
-from ..admittance import Contact, ContactLimit, make_contact
+from ..admittance import Contact, ContactLimit, PortNames, make_contact
 from ..flat import WiredDiagram
 from ..frequency import Number
 from .confirmation import GROWTH_AGREEMENT, ConfirmationKind, RunConfirmation
 
-OF_CONTACT: Mapping[str, Any] = {
-    "port": "plant.external_force",
-    "position": "plant.position",
-    "velocity": "plant.velocity",
-    "force": "force",
-    "direction": "perp",
-}
-"""Arguments of `Diagram.contact` with their defaults."""
+OF_CONTACT = (*PortNames._fields, "direction")
+"""Arguments of `Diagram.contact`."""
 OF_LIMIT = ("vary", "low", "high", "per_decade", "stiffness", "damping", "mass", "tool_mass")
 """Arguments of `Contact.stability_limit`."""
 
@@ -49,8 +43,8 @@ class ContactMeasure:
     ----------
     given : mapping
         Arguments of `Diagram.contact` and of `Contact.stability_limit`, together.
-    diagram : str
-        Name of the diagram, for errors.
+    diagram : WiredDiagram
+        The diagram.
     options : mapping
         Options of the run, and ``stairs``.
 
@@ -60,28 +54,24 @@ class ContactMeasure:
         An unknown argument.
     """
 
-    def __init__(self, given: Mapping[str, Any], diagram: str, options: Mapping[str, Any]):
+    def __init__(self, given: Mapping[str, Any], diagram: WiredDiagram, options: Mapping[str, Any]):
         if not isinstance(given, Mapping):
             raise OptionError(
                 f"found {given!r}; expected arguments of a contact and its limit, such as {{'vary': 'stiffness', "
-                "'damping': 10.0}. Give a mapping.", block=diagram, port="contact",
+                "'damping': 10.0}. Give a mapping.", block=diagram.name, port="contact",
             )  # fmt: skip
         for key in given:
             if key not in OF_CONTACT and key not in OF_LIMIT:
                 hint = near(str(key), [*OF_CONTACT, *OF_LIMIT])
-                raise OptionError(f"a contact's limit has no {key!r}. {hint}", block=diagram, port="contact")
-        self._ports = {key: given.get(key, default) for key, default in OF_CONTACT.items()}
+                raise OptionError(f"a contact's limit has no {key!r}. {hint}", block=diagram.name, port="contact")
+        self._names, self._direction = PortNames.of(given), given.get("direction", "perp")
         self._limit = {key: given[key] for key in OF_LIMIT if key in given}
-        if self._ports["force"] is False:  # as in a TOML file, which has no None
-            self._ports["force"] = None
         self._options = dict(options)
-        self.place = str(self._ports["port"])
+        self.place = str(diagram.contact_port if self._names.port is None else self._names.port)
         self.name = f"{self._limit.get('vary', 'stiffness')}_limit"
 
     def _find(self, diagram: WiredDiagram, at: Any) -> tuple[Contact, ContactLimit]:
-        ports = self._ports
-        names = (ports["position"], ports["velocity"], ports["force"])
-        contact = make_contact(diagram, ports["port"], names, ports["direction"], at, self._options)
+        contact = make_contact(diagram, self._names, self._direction, at, self._options)
         return contact, contact.stability_limit(**self._limit)
 
     def __call__(self, diagram: WiredDiagram, at: Any) -> Number:

@@ -246,7 +246,7 @@ def _make_measure(
                 port=name,
             )
     if contact is not None:
-        return ContactMeasure(contact, diagram.name, options)
+        return ContactMeasure(contact, diagram, options)
     assert callable(quantity)
     return FunctionMeasure(quantity, diagram.name)
 

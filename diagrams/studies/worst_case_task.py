@@ -132,7 +132,7 @@ class WorstCaseTask:
                     Box.of(values)
         with _Placed(self.file, TABLE):
             if "contact" in self.options:
-                ContactMeasure(self.options["contact"], diagram.name, {})
+                ContactMeasure(self.options["contact"], diagram, {})
             else:
                 self._goal(diagram, requirements)
             count = self.options.get("count", 100 if samples == "latin" else None)

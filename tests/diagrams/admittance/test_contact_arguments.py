@@ -113,3 +113,15 @@ def test_a_limit_that_is_confirmed_is_one_of_the_contact():
     for method in (3, "insde", ["inside"]):
         with pytest.raises(LoopwrightError, match="method: found "):
             here.confirm(limit, method=method)
+
+
+def test_position_and_velocity_are_those_of_the_ports_block_unless_others_are_named():
+    names = {key: name for key, name in PORTS.items() if key not in ("position", "velocity")}
+    here = cart_diagram().contact("cart.push", direction=[1.0], **names)
+    assert (here.ports.position, here.ports.velocity) == ("position", "velocity")
+    assert here.stability_limit().value == cart_contact().stability_limit().value
+
+
+def test_a_diagram_that_knows_no_port_asks_for_its_name():
+    with pytest.raises(UnknownNameError, match="found no port at which the environment pushes.*port='robot.force'"):
+        cart_diagram().contact(direction=[1.0], **PORTS)
