@@ -29,8 +29,8 @@ class PortNames(NamedTuple):
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> PortNames:
         """Return the names among given entries; ``force=False`` is None, which a TOML file doesn't have."""
-        names = cls(**{name: given[name] for name in cls._fields if name in given})
-        return names._replace(force=None) if names.force is False else names
+        names = {name: given[name] for name in cls._fields if name in given}
+        return cls(**{name: None if name == "force" and value is False else value for name, value in names.items()})
 
 
 @dataclass(frozen=True)
