@@ -72,8 +72,7 @@ from .linearization import (
 )
 from .measure import FrequencyResponse, StepResponse
 from .paper import Channel, Fig3Diagram, Rig, experiments, fig3
-from .report import analyse
-from .report_writing import Plot, Report, Section, Table
+from .report import Plot, Report, Section, Table, analyse
 from .requirements import Requirements, Review, Verdict
 from .results import Occurrence, OperatingPoint, Run, RunState, Snapshot, Stopped, TextSignal
 from .simulation import Interrupted, RunOptions, Simulation, SimulationView

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .drawing import Drawing
     from .linearization import Linearization
     from .measure import FrequencyResponse
-    from .report_writing import Report
+    from .report import Report
 
 
 class Diagram(VariedDiagram):
@@ -294,8 +294,7 @@ class Diagram(VariedDiagram):
         OptionError, ConfirmationError
             A path that does not end in ``.html``, a PDF without its library; a number that its confirmation refutes.
         """
-        from .report import analyse, with_drawing
-        from .report_writing import check_files, write_report
+        from .report import analyse, check_files, with_drawing, write_report
 
         check_files(path, pdf=pdf, json=json, paper=paper)
         made = with_drawing(analyse(self, _written=path is not None, **options), self)

@@ -24,13 +24,13 @@ from ...blocks.core import (
 from ...fmus.models import gantry
 from ..diagram import Diagram
 from ..paper import EXPERIMENTS, Experiment
-from ..report_writing import Report, quantity
 from ..requirements import STUDIES, Reason, Requirements, Review, TomlFile, Verdict, read_requirements
 from .options import parse_options, share
 from .text import say
 from .user_models import load_user_file
 
 if TYPE_CHECKING:
+    from ..report import Report
     from ..studies import ContactTask, WorstCaseTask
 
 KEY, CONTACT = "worst_case", "contact"
@@ -113,7 +113,7 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def report_command(arguments: argparse.Namespace) -> int:
     """Make the diagram, analyse it, write the files; return the exit status."""
-    from ..report_writing import check_files, write_report
+    from ..report import check_files, write_report
 
     file = None if arguments.requirements is None else TomlFile.read(arguments.requirements, "--requirements")
     asked = None if file is None else read_requirements(file)
@@ -228,6 +228,8 @@ def _read_measured(given: Sequence[str]) -> dict[str, Any]:
 
 def verdict_text(reviewed: Review) -> str:
     """Return the verdict as lines of text: all requirements that are not met, by the paths of their numbers."""
+    from ..report import quantity
+
     lines = [f"Requirements: {reviewed.verdict}."]
     for result in (*reviewed.of(Verdict.FAILED), *reviewed.of(Verdict.UNDECIDED)):
         place = result.path or ".".join(part for part in (result.loop, result.variant, result.quantity) if part)

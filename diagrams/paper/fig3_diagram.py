@@ -29,8 +29,8 @@ class Fig3Diagram(Diagram):
     def report_kind(self) -> MakesSections:
         """The report of Fig. 3, as long as the error dynamics and the feedback linearization are in the diagram."""
         from ..report import ANY_DIAGRAM  # a run has no need of the report
-        from .report_case import has_parts
-        from .report_kind import FIG3
+        from .fig3_case import has_parts
+        from .fig3_report import FIG3
 
         return FIG3 if has_parts(self) else ANY_DIAGRAM
 

@@ -1,6 +1,5 @@
-"""The general design report."""
+"""The general design report, which knows no paper: its variants, sections, figures and pages."""
 
-from ..report_figures import with_drawing
 from .analysis import (
     ANY_DIAGRAM,
     CLOSED_LOOPS,
@@ -16,19 +15,33 @@ from .analysis import (
     analyse,
 )
 from .case import OUTSIDE, Basis, Case, InjectionPlan
-from .disks import disk_numbers, disk_range
+from .figures import AxisUnits, DrawnLoops, bode, fill_growth, set_powers, tint, with_drawing
+from .pages import (
+    DEFINITIONS,
+    Plot,
+    Report,
+    Section,
+    Table,
+    Texts,
+    check_files,
+    quantity,
+    read_definitions,
+    write_report,
+)
 from .parts import MakesSections, ReportKind, ReportPart
 from .points import point_of
-from .section_contact import SIGN_COLUMNS, sign_of_admittance
-from .section_limits import LIMITS_TITLE
-from .section_poles import POLES_TITLE, list_poles
-from .section_subject import SUBJECT_TITLE
+from .sections.contacts import SIGN_COLUMNS, sign_of_admittance
+from .sections.disks import disk_numbers, disk_range
+from .sections.not_modelled import LIMITS_TITLE
+from .sections.poles import POLES_TITLE, list_poles
+from .sections.subject import SUBJECT_TITLE
 from .stability import scatter, without_memory
 from .variant import Implementation, Variant, in_s, look_of
 
 __all__ = [
     "ANY_DIAGRAM",
     "CLOSED_LOOPS",
+    "DEFINITIONS",
     "INJECTION",
     "INNER_LOOPS",
     "LIMITS",
@@ -43,23 +56,38 @@ __all__ = [
     "STEPS",
     "SUBJECT",
     "SUBJECT_TITLE",
+    "AxisUnits",
     "Basis",
     "Case",
+    "DrawnLoops",
     "Implementation",
     "InjectionPlan",
     "MakesSections",
+    "Plot",
+    "Report",
     "ReportKind",
     "ReportPart",
+    "Section",
+    "Table",
+    "Texts",
     "Variant",
     "analyse",
+    "bode",
+    "check_files",
     "disk_numbers",
     "disk_range",
+    "fill_growth",
     "in_s",
     "list_poles",
     "look_of",
     "point_of",
+    "quantity",
+    "read_definitions",
     "scatter",
+    "set_powers",
     "sign_of_admittance",
+    "tint",
     "with_drawing",
     "without_memory",
+    "write_report",
 ]

@@ -11,27 +11,27 @@ from ...blocks.core import OptionError, accepts, kinds, offer_elsewhere, on_one_
 from ...fmus.running import Fmu
 from ..flat import WiredDiagram
 from ..linearization import find_signal
-from ..report_figures import AxisUnits
-from ..report_writing import DEFINITIONS, Report
 from ..requirements import Requirements, TomlFile, read_requirements
 from ..second_process import processors
 from ..studies import ContactTask, WorstCase, WorstCaseTask
 from .case import Case, ReportedExperiment
 from .content_hash import content_hash
+from .figures import AxisUnits
+from .pages import DEFINITIONS, Report
 from .parts import HasReportKind, MakesSections, ReportKind, ReportPart
 from .points import STEP
 from .review import review
-from .section_contact import contact_sections, contacts_on_first_page, read_contacts
-from .section_injection import injected
-from .section_limits import not_modelled
-from .section_loops import inner
-from .section_measured import measured_loops, read_measured
-from .section_poles import closed_loops, memory
-from .section_sensitivity import sensitivity
-from .section_steps import steps
-from .section_subject import operating_points, remarks, subject, versions
-from .section_summary import summary
-from .section_worst_case import find_reported, read_task, worst_case_of
+from .sections.contacts import contact_sections, contacts_on_first_page, read_contacts
+from .sections.injection import injected
+from .sections.loops import inner
+from .sections.measured_loops import measured_loops, read_measured
+from .sections.not_modelled import not_modelled
+from .sections.poles import closed_loops, memory
+from .sections.sensitivity import sensitivity
+from .sections.step_responses import steps
+from .sections.subject import operating_points, remarks, subject, versions
+from .sections.summary import summary
+from .sections.worst_case import find_reported, read_task, worst_case_of
 
 _HEADING = ("title", "author", "project", "date", "revision")  # lines of ``about``
 SUBJECT = ReportPart("subject", subject)

@@ -10,13 +10,13 @@ import numpy as np
 from ...blocks.core import LoopwrightError, SampleTimeError
 from ..flat import WiredDiagram
 from ..linearization import UnusualStart
-from ..report_figures import AxisUnits
-from ..report_writing import Texts
 from ..requirements import Requirements
+from .figures import AxisUnits
+from .pages import Texts
 from .variant import Implementation, Variant, in_s, look_of
 from .wires import wires_on_loops
 
-TEXTS = Texts(__package__, "subject")
+TEXTS = Texts(__package__, "variants")
 AS_IT_IS = "as it is"
 """Title of the variant that leaves nothing out."""
 LATER = 10

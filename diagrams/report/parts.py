@@ -15,12 +15,12 @@ from typing import Any, Generic, Protocol, TypeVar, cast, runtime_checkable
 
 from ...blocks.core import OptionError
 from ..flat import WiredDiagram
-from ..report_figures import AxisUnits
-from ..report_writing import Section, draw_section, keep_drawings
 from ..requirements import Requirements
 from ..results import Snapshot
 from ..second_process import SecondProcess
 from .case import Case, ReportedExperiment
+from .figures import AxisUnits
+from .pages import Section, draw_section, keep_drawings
 from .review import check_names
 
 RADIANS = AxisUnits()

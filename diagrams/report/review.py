@@ -25,11 +25,11 @@ from ..studies import Case as StudyCase
 from ..studies import CaseState
 from .case import Case
 from .points import STEP
-from .section_contact import ReportedContacts
-from .section_injection import REFUTED
-from .section_measured import MEASURED, MeasuredLoop
-from .section_steps import key_of_step
-from .section_worst_case import MissingWorstCase, ReportedWorstCase
+from .sections.contacts import ReportedContacts
+from .sections.injection import REFUTED
+from .sections.measured_loops import MEASURED, MeasuredLoop
+from .sections.step_responses import key_of_step
+from .sections.worst_case import MissingWorstCase, ReportedWorstCase
 from .stability import Stability
 from .variant import Cut, Variant
 

@@ -25,7 +25,7 @@ from loopwright.diagrams import (
     stability_map,
     target_admittance,
 )
-from loopwright.diagrams.paper.report_case import NO_FRICTION
+from loopwright.diagrams.paper.fig3_case import NO_FRICTION
 from loopwright.fmus import gantry, gantry_elastic
 from support.contact import FORCE_TRACKING
 from support.plants import hidden, undirected

@@ -10,8 +10,8 @@ import pytest
 from loopwright.blocks import ConfirmationError
 from loopwright.diagrams.cli.command_line import _make_parser, main
 from loopwright.diagrams.frequency.number import Number
-from loopwright.diagrams.report_writing.model import Section
-from loopwright.diagrams.report_writing.report import Report
+from loopwright.diagrams.report.pages.document import Section
+from loopwright.diagrams.report.pages.report import Report
 
 LOOP = """
 from loopwright.blocks import Gain, Integrator, Sine, Sum

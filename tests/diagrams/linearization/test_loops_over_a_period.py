@@ -9,7 +9,7 @@ from loopwright.blocks.core.errors import ConfirmationError, WiringError
 from loopwright.diagrams import Diagram, margins, subsystem
 from loopwright.diagrams.linearization.loops_over_a_period import confirm_loop
 from loopwright.diagrams.linearization.over_a_period import Model
-from loopwright.diagrams.report_writing.definitions import definition
+from loopwright.diagrams.report.pages.definitions import definition
 
 
 def offset(phase, gain=1.0, behind=False):

@@ -32,12 +32,12 @@ direction = [1.0]
 @pytest.fixture
 def untried(monkeypatch):
     """Runs beside limits are left out: they have tests of their own."""
-    from loopwright.diagrams.report import section_contact
+    from loopwright.diagrams.report.sections import contacts
 
     def refuse(contact, limit):
         raise OptionError("it is left out here")
 
-    monkeypatch.setattr(section_contact, "try_limit", refuse)
+    monkeypatch.setattr(contacts, "try_limit", refuse)
 
 
 def review(contact, contacts=None, **asked):

@@ -9,13 +9,13 @@ import pytest
 from loopwright.blocks import Constant, Gain, Integrator, StateSpace, TransferFunction
 from loopwright.diagrams import Diagram, Number, Report, Section, Table, Verdict, analyse
 from loopwright.diagrams.report.case import Case
-from loopwright.diagrams.report.gang import gang_of_four
-from loopwright.diagrams.report_figures import AxisUnits, Measured, contact_admittance, contact_map, measured
-from loopwright.diagrams.report_figures.loop_figures import DrawnLoops, bode, nyquist
-from loopwright.diagrams.report_writing import Judged
-from loopwright.diagrams.report_writing.definitions import definition
-from loopwright.diagrams.report_writing.figures import embedded
-from loopwright.diagrams.report_writing.html import to_html
+from loopwright.diagrams.report.figures import AxisUnits, Measured, contact_admittance, contact_map, measured
+from loopwright.diagrams.report.figures.loop_figures import DrawnLoops, bode, nyquist
+from loopwright.diagrams.report.pages import Judged
+from loopwright.diagrams.report.pages.definitions import definition
+from loopwright.diagrams.report.pages.html import to_html
+from loopwright.diagrams.report.pages.svg import embedded
+from loopwright.diagrams.report.sections.gang import gang_of_four
 from loopwright.diagrams.results import BLUE
 from tests.support import reviewed
 

@@ -11,7 +11,7 @@ import pytest
 from loopwright.blocks import Constant, Integrator, OptionError, TransferFunction, UnknownNameError
 from loopwright.diagrams import Diagram, Requirements, Verdict, analyse
 from loopwright.diagrams.cli.command_line import main
-from loopwright.diagrams.report_writing.json import to_json
+from loopwright.diagrams.report.pages.json import to_json
 from loopwright.diagrams.requirements import Limit, Reason, judge_interval
 
 

@@ -340,7 +340,7 @@ def test_values_of_python_control_that_fail_leave_the_margins_in_a_report(monkey
     def fails(*args):
         raise ConfirmationError("found something else", block="gain_margin_low")
 
-    monkeypatch.setattr("loopwright.diagrams.report.section_loops.compare_margins", fails)
+    monkeypatch.setattr("loopwright.diagrams.report.sections.loops.compare_margins", fails)
     report = analyse(held_integrator(1.0), only=("inner",))
     assert report.numbers()["inner.u.sampled_d0.gain_margin_high"].value == pytest.approx(20.0, rel=1e-9)
     (part,) = next(s for s in report.sections if s.key == "inner").sections

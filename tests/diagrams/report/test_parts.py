@@ -9,7 +9,7 @@ import pytest
 import loopwright.diagrams.report
 from loopwright.blocks import Integrator, OptionError
 from loopwright.diagrams import Diagram, Fig3Diagram, Section, analyse, experiments
-from loopwright.diagrams.paper.report_kind import FIG3
+from loopwright.diagrams.paper.fig3_report import FIG3
 from loopwright.diagrams.report.analysis import ANY_DIAGRAM, SUBJECT
 from loopwright.diagrams.report.case import Case
 from loopwright.diagrams.report.parts import ReportKind, ReportPart

@@ -8,7 +8,7 @@ import pytest
 
 from loopwright.blocks import OptionError
 from loopwright.diagrams import Requirements, Verdict, analyse
-from loopwright.diagrams.report_writing.definitions import definition
+from loopwright.diagrams.report.pages.definitions import definition
 from loopwright.diagrams.requirements import Reason
 from loopwright.diagrams.studies import CaseState, ConfirmationKind, RunConfirmation
 from support.tuned_loops import make_pi_loop, pi_phase_margin

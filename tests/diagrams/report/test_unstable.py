@@ -8,7 +8,8 @@ import pytest
 from loopwright.blocks import Constant, Gain, SimulationError, TransferFunction
 from loopwright.diagrams import Diagram, analyse, subsystem
 from loopwright.diagrams.report import Case
-from loopwright.diagrams.report.stability import Stability, unstable_first
+from loopwright.diagrams.report.sections.poles import unstable_first
+from loopwright.diagrams.report.stability import Stability
 
 K, T = 200.0, 0.01
 

@@ -7,7 +7,7 @@ from loopwright.blocks import Constant, Gain, TransferFunction
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.frequency import Realization, find_disk_frequency
 from loopwright.diagrams.report import Case, analyse
-from loopwright.diagrams.report.section_summary import _weakest
+from loopwright.diagrams.report.sections.summary import _weakest
 
 
 def test_the_disk_margin_is_told_at_its_own_frequency():

@@ -1,0 +1,91 @@
+"""Axes of a report's figures: their units, and ticks that don't overlap."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ....blocks.core import with_unit
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+
+DECADES = 2.0
+"""Decades from which on the ticks of a logarithmic axis are powers of ten."""
+
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+class AxisUnits(NamedTuple):
+    """Units of the axes of frequency responses: plain or in dB, over rad/s or Hz."""
+
+    decibels: bool = False
+    hertz: bool = False
+
+    def magnitude(self, value: Any) -> np.ndarray:
+        """Return magnitudes in the unit of their axis."""
+        data = np.asarray(value, dtype=float)
+        with np.errstate(divide="ignore"):
+            return np.asarray(20 * np.log10(data)) if self.decibels else data
+
+    def frequency(self, omega: Any) -> np.ndarray:
+        """Return frequencies, which are in rad/s, in the unit of their axis."""
+        return np.asarray(omega, dtype=float) / (2 * np.pi if self.hertz else 1.0)
+
+    @property
+    def frequency_label(self) -> str:
+        """Label of the frequency axis."""
+        return with_unit("frequency", "Hz") if self.hertz else with_unit("ω", "rad/s")
+
+    def magnitude_label(self, name: str) -> str:
+        """Return the label of a magnitude's axis."""
+        return with_unit(name, "dB" if self.decibels else "1")
+
+
+def set_magnitudes(ax: Axes, axes: AxisUnits) -> None:
+    """Set the scale of a magnitude's axis, with few ticks."""
+    from matplotlib.ticker import MaxNLocator
+
+    if axes.decibels:
+        ax.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 4, 5, 10]))
+    else:
+        ax.set_yscale("log")
+        set_powers(ax.yaxis, ax.get_ylim(), 6)
+
+
+def set_powers(axis: Axis, ends: tuple[float, float], most: int) -> None:
+    """Set ticks of a logarithmic axis: powers of ten, and over few decades 1, 2 and 5 times them, as plain numbers."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_minor_formatter(NullFormatter())
+    decades = abs(math.log10(ends[1] / ends[0])) if min(ends) > 0 else DECADES
+    if decades >= DECADES:
+        axis.set_major_formatter(FuncFormatter(_power))
+        axis.set_major_locator(LogLocator(numticks=most))
+        return
+    axis.set_major_formatter(FuncFormatter(_label))
+    subs = (1.0, 2.0, 5.0) if decades > 0.5 else (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
+    axis.set_major_locator(LogLocator(subs=subs, numticks=10 * most))
+
+
+def _power(value: float, position: int | None = None) -> str:
+    """Return a power of ten in plain characters: parsing mathematics takes more time than drawing all else."""
+    return "10" + str(round(math.log10(value))).translate(_RAISED) if value > 0 else ""
+
+
+def _label(value: float, position: int | None = None) -> str:
+    """Return a number in plain characters, a large or a small one by its power of ten."""
+    if not value > 0 or 1e-3 < value < 1e4:
+        return f"{value:.6g}".replace("-", "−")
+    power = math.floor(math.log10(value) + 1e-9)
+    factor = value / 10.0**power
+    return ("" if abs(factor - 1) < 1e-6 else f"{factor:.6g}·") + "10" + str(power).translate(_RAISED)
+
+
+def set_frequencies(ax: Axes, most: int = 5) -> None:
+    """Set so many ticks at most on the frequency axis, so that none overlap: few on that of a narrow figure."""
+    set_powers(ax.xaxis, ax.get_xlim(), most)

@@ -1,0 +1,42 @@
+"""Drawings of the diagram in the first section of its report."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+
+from ...drawing import draw
+from ...flat import WiredDiagram
+from ..pages import Plot, Report, Texts
+
+TEXTS = Texts(__package__, "figures")
+
+ACROSS = 1200.0
+"""Width in pixels up to which a diagram is drawn as one."""
+
+
+def with_drawing(report: Report, diagram: WiredDiagram) -> Report:
+    """Return a report with the drawing of its diagram in the section about it, or in the first one.
+
+    A large one is drawn with closed subsystems, and the inside of each subsystem by itself.
+    """
+    if not report.sections:
+        return report
+    at = next((i for i, section in enumerate(report.sections) if section.key == "subject"), 0)
+    sections = list(report.sections)
+    sections[at] = replace(sections[at], plots=(*_drawings(diagram), *sections[at].plots))
+    return replace(report, sections=tuple(sections))
+
+
+def _drawings(diagram: WiredDiagram) -> Iterator[Plot]:
+    whole = draw(diagram, closed=False)
+    found = re.search(r'width="([\d.]+)"', whole)
+    subsystems = [path for path in diagram.subsystems if path]
+    if not subsystems or (found is not None and float(found[1]) <= ACROSS):
+        yield Plot("diagram", TEXTS.line("diagram", closed=False), whole)
+        return
+    yield Plot("diagram", TEXTS.line("diagram", closed=True), draw(diagram, closed=True))
+    for subsystem in subsystems:
+        inside = draw(diagram, subsystem=subsystem, closed=True)
+        yield Plot(f"diagram.{subsystem}", TEXTS.line("inside", subsystem=subsystem), inside, details=True)

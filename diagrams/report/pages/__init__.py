@@ -1,0 +1,25 @@
+"""A report as a document: sections, tables and numbers, written as HTML, PDF and JSON."""
+
+from .definitions import DEFINITIONS, read_definitions
+from .document import Judged, Plot, Section, Table
+from .report import Report, check_files, write_report
+from .svg import draw_section, keep_drawings
+from .templating import Texts
+from .values import plain, quantity
+
+__all__ = [
+    "DEFINITIONS",
+    "Judged",
+    "Plot",
+    "Report",
+    "Section",
+    "Table",
+    "Texts",
+    "check_files",
+    "draw_section",
+    "keep_drawings",
+    "plain",
+    "quantity",
+    "read_definitions",
+    "write_report",
+]

@@ -1,0 +1,128 @@
+"""Content of a report: sections with text, tables, figures, and numbers by dotted paths."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ....blocks.core import brief, explain_calls
+from ...frequency import Number
+from ...requirements import Review, Verdict
+
+
+@explain_calls
+@dataclass(frozen=True)
+class Table:
+    """A table: a title, column headings, and rows of texts or numbers.
+
+    One of ``details`` stands in the appendix. Numbers have ``digits`` significant digits at most, fewer where their
+    tolerance bears no more. Columns without a single entry are not shown. ``terms`` names the definitions of numbers
+    that have no dotted path, by their columns.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
+    note: str = ""
+    details: bool = False
+    digits: int = 6
+    terms: Mapping[str, str] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        facts = f"{len(self.rows)} rows", ", ".join(map(str, self.columns))
+        return brief(f"table {self.title!r}", *facts, then=".rows")
+
+
+class Judged(str):
+    """A text that is shown in the color of its verdict: a cell of a table, or a paragraph."""
+
+    verdict: Verdict
+
+    def __new__(cls, text: str, verdict: Verdict) -> Judged:
+        """Make a text with its verdict."""
+        made = super().__new__(cls, text)
+        made.verdict = verdict
+        return made
+
+
+@explain_calls
+@dataclass(frozen=True, eq=False)
+class Plot:
+    """A figure: a key for its file, a caption, the matplotlib figure or SVG text; ``ahead`` of the tables or not.
+
+    One of ``details`` stands in the appendix.
+    """
+
+    key: str
+    caption: str
+    figure: Any
+    ahead: bool = False
+    details: bool = False
+
+    def __repr__(self) -> str:
+        return brief(f"figure {self.key!r}", self.caption[:80], then=".figure")
+
+
+@explain_calls
+@dataclass(frozen=True, eq=False)
+class Section:
+    """A section: what it is about in words, then tables and figures; ``key`` starts the paths of its numbers."""
+
+    key: str
+    title: str
+    text: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    plots: tuple[Plot, ...] = ()
+    numbers: Mapping[str, Number] = field(default_factory=dict)
+    """By path within the section, such as ``par.sampled_d0.phase_margin_deg``."""
+    sections: tuple[Section, ...] = ()
+
+    def __repr__(self) -> str:
+        facts = (
+            f"{len(self.tables)} tables",
+            f"{len(self.plots)} figures",
+            f"{len(self.numbers)} numbers",
+            f"{len(self.sections)} parts",
+        )
+        return brief(f"section {self.title!r}", *facts, then=".text, .tables, .plots, .sections")
+
+
+@explain_calls
+@dataclass(frozen=True, eq=False)
+class Document:
+    """Sections with their numbers, and what they are about.
+
+    Attributes
+    ----------
+    title : str
+        Its heading.
+    sections : tuple of Section
+        In order.
+    meta : mapping
+        Subject of the analysis, its time, and the versions of the libraries.
+    review : Review, optional
+        Verdicts on the requirements; None where none were given.
+    """
+
+    title: str
+    sections: tuple[Section, ...]
+    meta: Mapping[str, Any] = field(default_factory=dict)
+    review: Review | None = None
+
+    def __repr__(self) -> str:
+        verdict = "" if self.review is None else self.review.verdict.value
+        facts = f"{len(self.sections)} sections", f"{len(self.numbers())} numbers", verdict
+        return brief(f"report {self.title!r}", *facts, then=".numbers(), .sections, .save(…)")
+
+    def numbers(self) -> dict[str, Number]:
+        """Return every number by its dotted path, such as ``inner.par.sampled_d0.phase_margin_deg``."""
+
+        def walk(sections: Iterable[Section], prefix: str) -> Iterator[tuple[str, Number]]:
+            for section in sections:
+                here = f"{prefix}{section.key}."
+                for path, number in section.numbers.items():
+                    yield here + path, number
+                yield from walk(section.sections, here)
+
+        return dict(walk(self.sections, ""))

@@ -1,0 +1,75 @@
+"""A report as PDF: the same page as in a browser, laid out by PlutoPrint, which brings all that it needs."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from ....blocks.core import OptionError
+from .filled_pages import fill_pages
+
+
+def printer() -> Any:
+    """Return the library that lays pages out.
+
+    Raises
+    ------
+    OptionError
+        It is not installed.
+    """
+    try:
+        import plutoprint
+    except ImportError as error:
+        raise OptionError(
+            'a PDF needs PlutoPrint, which is not installed. Install it: pip install "loopwright[pdf]"; or print the '
+            "HTML page from a browser.",
+            port="pdf",
+        ) from error
+    return plutoprint
+
+
+PAPERS = ("A4", "letter")
+
+
+def check_paper(paper: str) -> None:
+    """Refuse an unknown size of paper.
+
+    Raises
+    ------
+    OptionError
+        It is none of the known ones.
+    """
+    if paper not in PAPERS:
+        raise OptionError(f"found {paper!r}; expected one of {', '.join(PAPERS)}. Choose one of them.", port="paper")
+
+
+def write_pdf(html: str, path: str | os.PathLike[str], paper: str = "A4") -> int:
+    """Write a page as PDF; return the number of its pages.
+
+    Parameters
+    ----------
+    html : str
+        The report's page.
+    path : path
+        The file.
+    paper : {"A4", "letter"}
+        Size of the paper.
+
+    Raises
+    ------
+    OptionError
+        Another paper, or no library for PDF.
+    """
+    check_paper(paper)
+    library = printer()
+    size = library.PAGE_SIZE_LETTER if paper == "letter" else library.PAGE_SIZE_A4
+
+    def lay_out(page: str) -> Any:
+        book = library.Book(size, library.PAGE_MARGINS_NONE, library.MEDIA_TYPE_PRINT)
+        book.load_html(page, base_url="file:///report.html")
+        return book
+
+    book = lay_out(fill_pages(html, lay_out, library.ImageCanvas))
+    book.write_to_pdf(str(Path(path)))
+    return int(book.get_page_count())

@@ -1,0 +1,95 @@
+"""Margins over parameters: sensitivity of the loops of the diagram as it is."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+from ....blocks.core import LoopwrightError
+from ...frequency import Number
+from ...studies import Sensitivities, Sensitivity, confirm_parameter, sensitivities_of
+from .. import figures
+from ..case import Case
+from ..pages import Section, Table, Texts
+from .loops import ROWS
+
+TEXTS = Texts(__package__, "sensitivity")
+QUANTITIES = ("disk_margin", "phase_margin_deg", "ms")
+"""Numbers of a loop whose changes are shown; the first that any parameter changes orders the parameters."""
+SHOWN = 4
+"""Number of parameters of a loop that are shown and confirmed."""
+SMALL = 1e-6
+"""Change per 1 %, relative to the number, below which a parameter counts as without effect."""
+
+
+def sensitivity(case: Case) -> Section | None:
+    """Return the section on sensitivities, one part for each loop; None where no loop has any."""
+    variant = case.actual
+    if variant is None or variant.problem:
+        return None
+    text, parts = [*TEXTS.paragraphs("about", title=variant.title)], []
+    for key, wire in case.sensitivity_wires().items():
+        try:
+            found = sensitivities_of(variant.model, (wire,))
+        except LoopwrightError as error:
+            text.append(TEXTS.line("left_out", wire=wire, message=error.message))
+            continue
+        if not found.stable:
+            text.append(TEXTS.line("unstable", wire=wire))
+        elif found.rows:
+            parts.append(_part(case, key, wire, found))
+    return Section("sensitivity", "Sensitivity to parameters", tuple(text), sections=tuple(parts)) if parts else None
+
+
+def _part(case: Case, key: str, wire: str, found: Sensitivities) -> Section:
+    shown = [name for name in QUANTITIES if name in found.quantities]
+    first = next((name for name in shown if any(map(_acts, found.of(name)))), shown[0])
+    largest = [row for row in found.of(first) if _acts(row)]
+    names = [row.parameter for row in largest[:SHOWN]]
+    others = [row.parameter for row in largest[SHOWN:]]
+    rows: list[tuple[object, ...]] = []
+    numbers: dict[str, Number] = {}
+    bars: dict[str, float] = {}
+    kinks: list[str] = []
+    lost: list[str] = []
+    text: list[str] = []
+    for name in names:
+        try:
+            made = confirm_parameter(found, name, shown)
+        except LoopwrightError as error:
+            text.append(TEXTS.line("left_out", wire=wire, message=error.message))
+            rough = [found[name, quantity] for quantity in shown]
+            made = [replace(row, slope=replace(row.slope, confirmed_by="")) for row in rough]
+        bars[name] = next(row for row in made if row.quantity == first).per_percent.value
+        for row in made:
+            numbers[f"{_path(name)}.{row.quantity}_per_percent"] = row.per_percent
+            kinks += [name] if row.kink else []
+            lost += [name] if row.rest_lost else []
+        cells = [row.per_percent for row in made]
+        value = found[name, first]
+        rows.append((name, Number(value.value, value.unit or "1", 0.0, "", given=True), *cells))
+    if kinks:
+        text.append(TEXTS.line("kink", names=", ".join(dict.fromkeys(kinks))))
+    if lost:
+        text.append(TEXTS.line("lost", names=", ".join(dict.fromkeys(lost))))
+    if others:
+        text.append(TEXTS.line("others", names=", ".join(others), number=ROWS[first]))
+    small = [row.parameter for row in found.of(first) if not _acts(row)]
+    none = sorted({*found.without_effect, *small})
+    if none:
+        text.append(TEXTS.line("without", count=len(none), number=ROWS[first]))
+    columns = ("parameter", "value", *(f"{ROWS[quantity]} per +1 %" for quantity in shown))
+    table = Table(
+        f"Largest sensitivities at {wire}", columns, tuple(rows), digits=4, terms={"value": "parameter_value"}
+    )
+    plot = figures.sensitivity_bars(f"sensitivity_{key}", wire, ROWS[first], bars)
+    return Section(key, f"Sensitivity of {wire}", tuple(text), (table,), (plot,), numbers)
+
+
+def _acts(row: Sensitivity) -> bool:
+    return abs(row.per_percent.value) > SMALL * abs(row.number.value)
+
+
+def _path(parameter: str) -> str:
+    """Return a parameter's part of dotted paths."""
+    return re.sub(r"\W+", "_", parameter).strip("_")

@@ -1,0 +1,328 @@
+"""Responses of the running diagram to steps, beside those of its linear model, and the effort that they take."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ....blocks import Saturation
+from ....blocks.core import LoopwrightError, PeriodicLoopError
+from ...flat import WiredDiagram
+from ...frequency import Confirmation, Number, Realization
+from ...linearization import find_signal
+from ...measure import StepResponse, is_at_rest, measure_step, step_response
+from ...requirements import StepLimits
+from .. import figures
+from ..case import Case
+from ..pages import Plot, Section, Table, Texts
+from ..stability import Stability
+from ..variant import Variant, in_s
+from ..wires import blocks_on_loops
+
+TEXTS = Texts(__package__, "steps")
+TITLE = "Step and disturbance responses"
+TIME_CONSTANTS = 10.0
+"""Length of a run, in time constants of the loop's slowest pole."""
+BEYOND = 3.0
+"""Length of a run at least, in times of the limits of its settling and its rise."""
+SAMPLES = (100, 20000)
+"""Fewest and most samples of a run."""
+ROUNDING = 1e-12
+"""Size of rounding errors, relative to the largest signal."""
+SOLVER_ERROR = 1e-7
+"""Error of a response that a solver had a part in, relative to its largest change; 100 times its relative tolerance."""
+TICK_ERROR = 1e-9
+"""That of one that was computed at ticks alone."""
+AGREEMENT = 0.01
+"""Difference of co-simulation and linear model, relative to the largest change, up to which they agree."""
+SIZE = 100.0
+"""Size of a step, in amplitudes of the injection check, where none is given."""
+SLOWEST = 1e-6
+"""Poles slower than that, relative to the fastest, are taken as integrators that nothing feeds back."""
+NAMES: Mapping[str, str] = {
+    "overshoot": "overshoot",
+    "settling": "settling time, 2 %",
+    "rise": "rise time, 10 to 90 %",
+    "peak": "largest change",
+}
+
+
+@dataclass(frozen=True)
+class StepTest:
+    """A step that is tried: its key in the report, the wires, and its limits where there are some."""
+
+    key: str
+    wire: str
+    output: str = ""
+    limits: StepLimits | None = None
+
+
+def step_tests(case: Case, v: Variant) -> Iterator[StepTest]:
+    """Yield the steps that are tried in a variant: at the wire of each loop, and those that are required besides."""
+    asked = case.requirements
+    for key, wire in case.loop_wires().items():
+        yield StepTest(key, wire, "", None if asked is None else asked.step_of((key, wire), v.key))
+    for limits in () if asked is None else asked.steps:
+        yield StepTest(key_of_step(limits), limits.input, limits.output, limits)
+
+
+def key_of_step(limits: StepLimits) -> str:
+    """Return the key of a required step that names its wires."""
+    ends = [limits.input, limits.output] if limits.output else [limits.input]
+    return "_to_".join(end.replace(".", "_") for end in ends)
+
+
+def steps(case: Case) -> Section | None:
+    """Return the section with the responses to steps of the diagram as it is, and of the variants that are judged."""
+    numbers: dict[str, Number] = {}
+    rows: list[tuple[Any, ...]] = []
+    effort: list[tuple[Any, ...]] = []
+    text: list[str] = []
+    found: dict[StepTest, dict[str, StepResponse]] = {}
+    for v in case.judged():
+        if v.problem:
+            continue
+        if Stability.of(v) is Stability.UNSTABLE:
+            text.append(TEXTS.line("unstable", variant=v.title))
+            continue
+        for test in step_tests(case, v):
+            try:
+                ran = _run(case, v, test)
+            except LoopwrightError as error:
+                text.append(TEXTS.line("failed", variant=v.title, wire=test.wire, message=str(error)))
+                continue
+            if ran is None:
+                continue
+            got, slowest = ran
+            where = f"{test.key}.{v.key}"
+            own = _numbers(got, test, v, slowest)
+            numbers |= {f"{where}.{name}": number for name, number in own.items()}
+            for name, said in NAMES.items():
+                linear = own.get(f"linear.{name}")
+                if name != "peak":
+                    rows.append((_said(test), v.title, said, own[name], linear))
+            saturated = _limits_reached(v.diagram, got)
+            for name, before, change, off in _effort(got, test, slowest):
+                key = f"effort.{name.replace('.', '_')}"
+                unit = _unit(v.diagram, name)
+                numbers[f"{where}.{key}"] = Number(change, unit, off, _how(got))
+                at_first = Number(before, unit, 1e-9 * abs(before), "the run before the step", given=True)
+                effort.append((_said(test), v.title, name, at_first, numbers[f"{where}.{key}"]))
+            text += [TEXTS.line("saturated", variant=v.title, wire=test.wire, blocks=saturated)] if saturated else []
+            if got.prediction is None:
+                text.append(TEXTS.line("unpredicted", variant=v.title, wire=test.wire))
+            if not own["settled"].value:
+                text.append(TEXTS.line("unsettled", variant=v.title, wire=test.wire, length=own["length"].value))
+            if got.moved > 1e-6:
+                text.append(TEXTS.line("moved", variant=v.title, wire=test.wire, moved=got.moved))
+            found.setdefault(replace(test, limits=None), {})[v.key] = got
+    if not found:
+        return Section("steps", TITLE, tuple(dict.fromkeys(text))) if text else None
+    tables = [Table("Step responses", ("step", "variant", "number", "co-simulation", "linear"), tuple(rows))]
+    if effort:
+        tables.append(Table("Effort", ("step", "variant", "signal", "before", "largest change"), tuple(effort),
+                            terms={"before": "before_step"}))  # fmt: skip
+    plots = [_plot(case, test, curves) for test, curves in found.items()]
+    whole = (*TEXTS.paragraphs("responses"), *dict.fromkeys(text))
+    return Section("steps", TITLE, whole, tuple(tables), tuple(plots), numbers)
+
+
+def _said(test: StepTest) -> str:
+    return f"{test.wire} → {test.output}" if test.output else test.wire
+
+
+def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | None] | None:
+    """Return a response and the rate of its slowest mode in 1/s, None if it has none.
+
+    None at a wire with several entries, which has no single step.
+    """
+    try:
+        plan = case.excitation(v, test.wire)
+        poles = _poles(v, test)
+        if poles is None:
+            return None
+    except LoopwrightError:
+        if test.limits is None:
+            return None
+        raise
+    limits = test.limits
+    dt = v.model.dt or 0.0
+    s = poles[np.abs(poles.real) > SLOWEST * np.max(np.abs(poles), initial=0.0)]
+    slowest = float(np.min(np.abs(s.real))) if s.size else None
+    length = TIME_CONSTANTS / slowest if slowest else 1.0
+    if limits is not None:
+        ends = [limits.limits[name].high for name in ("settling", "rise") if name in limits.limits]
+        length = max([length, *(BEYOND * end for end in ends if math.isfinite(end))])
+    if dt:
+        length = float(np.clip(length, SAMPLES[0] * dt, SAMPLES[1] * dt))
+    if limits is not None and limits.length is not None:
+        length = limits.length
+    size = SIZE * plan.amplitude if limits is None or limits.size is None else limits.size
+    outputs = [*([test.output] if test.output else []), *_commands(v.diagram, test.wire), *_excesses(v.diagram)]
+    got = step_response(
+        plan.variant.diagram, test.wire, size=size, length=length, at=plan.variant.point, outputs=outputs,
+        stairs=v.stairs,
+    )  # fmt: skip
+    return got, slowest
+
+
+def _poles(v: Variant, test: StepTest) -> np.ndarray | None:
+    """Return the poles that decide how long a response lasts, in 1/s; None at a wire with several entries."""
+    if test.output:
+        return in_s(v.model.poles, v.model.dt)
+    if len(find_signal(v.diagram.flatten_like(v.point), test.wire).entries) > 1:
+        return None
+    try:
+        L = v.loop(test.wire)
+    except PeriodicLoopError:
+        return in_s(v.model.poles, v.model.dt)
+    r = Realization.of(L)
+    poles = np.linalg.eigvals(r.closed_matrix())
+    return in_s(1 + poles if r.dt else poles, r.dt)
+
+
+def _commands(diagram: WiredDiagram, wire: str) -> list[str]:
+    """Return the signals that drive FMUs, or go from sampled subsystems to continuous blocks."""
+    table = diagram.structure
+    names = {(w.block, w.port): name for name, w in diagram.names.items() if w.index is None}
+    found: dict[str, None] = {}
+    inside = blocks_on_loops(diagram)
+    for (block, _), w in table.wires.items():
+        if w.block not in inside:
+            continue
+        source = table.clock(table.subsystem_of[w.block])
+        sampled = source is not None and table.clock(table.subsystem_of[block]) is None
+        if table.blocks[block].stepped or (sampled and not table.blocks[w.block].stepped):
+            found[names.get((w.block, w.port), f"{w.block}.{w.port}")] = None
+    return [name for name in found if name != wire]
+
+
+def _excesses(diagram: WiredDiagram) -> list[str]:
+    return [f"{path}.excess" for path, block in sorted(diagram.blocks.items()) if isinstance(block, Saturation)]
+
+
+def _limits_reached(diagram: WiredDiagram, got: StepResponse) -> list[str]:
+    """Return the saturations that cut something off during a response."""
+    reached = []
+    for path in (name.rpartition(".")[0] for name in _excesses(diagram)):
+        own = [i for i, label in enumerate(got.outputs) if label.partition("[")[0] == f"{path}.excess"]
+        if own and np.any(np.abs(got.y[:, own]) > 0.0):
+            reached.append(path)
+    return reached
+
+
+def _effort(got: StepResponse, test: StepTest, slowest: float | None) -> Iterator[tuple[str, float, float, float]]:
+    """Yield signals with their values before the step, their largest changes, and the errors of these."""
+    if not test.output:
+        change, error = _largest(got, 0, slowest)
+        yield test.wire, _rounded(got.wire_before, 1.0), change, error
+    for i, name in enumerate(got.outputs):
+        plain = name.partition("[")[0]
+        if plain.rpartition(".")[2] != "excess":
+            largest = float(np.max(np.abs(got.before)))
+            change, error = _largest(got, 1 + i, slowest)
+            change = _rounded(change, max(largest, float(np.max(np.abs(got.y)))))
+            yield name, _rounded(float(got.before[i]), largest), change, error
+
+
+def _largest(got: StepResponse, column: int, slowest: float | None) -> tuple[float, float]:
+    """Return the largest change of v (column 0) or of an output, and its error, with the rounding of two runs."""
+    r, before = (got.v, got.wire_before) if column == 0 else (got.y[:, column - 1], got.before[column - 1])
+    value, tolerance = measure_step(
+        got.t, r, held=got.is_steady(column), expected=got.expected(column), slowest=slowest, accuracy=_accuracy(got)
+    )["peak"]
+    return value, tolerance + ROUNDING * abs(float(before))
+
+
+def _accuracy(got: StepResponse) -> float:
+    return SOLVER_ERROR if got.solved else TICK_ERROR
+
+
+def _unit(diagram: WiredDiagram, name: str) -> str:
+    """Return the unit of a signal, "1" where it is not known or its entries differ."""
+    plain = name.partition("[")[0]
+    wire = diagram.names.get(plain)
+    block, _, port = plain.rpartition(".")
+    unit = diagram.checked.units.get((block, port) if wire is None else (wire.block, wire.port))
+    return unit if isinstance(unit, str) and unit else "1"
+
+
+def _rounded(value: float, size: float) -> float:
+    """Return a value, 0 where it is rounding beside values of a size."""
+    return 0.0 if abs(value) <= ROUNDING * max(size, 1e-300) else value
+
+
+def _numbers(got: StepResponse, test: StepTest, v: Variant, slowest: float | None) -> dict[str, Number]:
+    """Return the numbers of a response by the ends of their paths."""
+    output = bool(test.output)
+    begins = int(np.argmax(got.d != 0.0))
+    t = got.t[begins:] - got.t[begins]
+    column = int(output)
+    expected = got.expected(column, got.size if output else -got.size, begins)
+    options: dict[str, Any] = {"held": got.is_steady(column), "expected": expected, "accuracy": _accuracy(got)}
+    how = _how(got)
+    units = {"settling": "s", "rise": "s", "peak": _unit(v.diagram, test.output or test.wire)}
+    found = {}
+    answer = got.answer(output)[begins:]
+    settled = is_at_rest(t, answer, expected, slowest)
+    measured = measure_step(t, answer, slowest=slowest, **options)
+    found["length"] = Number(float(t[-1]), "s", 0.0, "given: the last sample", given=True)
+    found["settled"] = Number(float(settled), "1", 0.0, how)
+    for name, (value, tolerance) in measured.items():
+        factor = abs(got.size) if name == "peak" else 1.0
+        found[name] = Number(factor * value, units.get(name, "1"), factor * tolerance, how)
+    if expected is not None:
+        known = measure_step(t, expected.response, **options | {"accuracy": TICK_ERROR})
+        unknown = tuple(finding for finding in v.model.findings if finding.leaves_error_unknown)
+        for name, (value, tolerance) in known.items():
+            factor = abs(got.size) if name == "peak" else 1.0
+            said = "the linear model's matrix, sample by sample"
+            found[f"linear.{name}"] = Number(
+                factor * value, units.get(name, "1"), factor * tolerance, said, findings=unknown
+            )
+        found["difference"] = Number(_deviation(got), "1", 1e-9, "co-simulation and linear model, sample by sample")
+    return found
+
+
+def _deviation(got: StepResponse) -> float:
+    """Return the largest difference of co-simulation and linear model, relative to the largest change of its signal.
+
+    Entries of one signal share their largest change: one that hardly moves beside the others has no scale of its own.
+    A signal that moves by rounding only does not count.
+    """
+    assert got.prediction is not None  # callers look
+    both = np.column_stack([got.v, got.y])
+    signals = ["", *(name.partition("[")[0] for name in got.outputs)]
+    sizes, off = np.max(np.abs(both), axis=0), np.max(np.abs(both - got.prediction), axis=0)
+    before = np.abs([got.wire_before, *got.before])
+    least = ROUNDING * max(np.max(before, initial=0.0), np.max(sizes, initial=0.0))
+    found = 0.0
+    for signal in set(signals):
+        own = [i for i, name in enumerate(signals) if name == signal]
+        size = float(np.max(sizes[own]))
+        found = max(found, float(np.max(off[own])) / size) if size > least else found
+    return found
+
+
+def _how(got: StepResponse) -> Confirmation:
+    run = Confirmation(
+        f"the nonlinear co-simulation, {len(got.t)} samples, with and without the step",
+        "the nonlinear co-simulation, with and without the step",
+    )
+    if got.prediction is None:
+        return run
+    deviation = _deviation(got)
+    agrees = f"the linear model {'agrees' if deviation <= AGREEMENT else 'does not agree'} to {100 * AGREEMENT:g} %"
+    return run.and_by(f"the linear model differs by {deviation:.2g} of the largest change", agrees)
+
+
+def _plot(case: Case, test: StepTest, curves: Mapping[str, StepResponse]) -> Plot:
+    said, titles = _said(test), {key: case.variants[key].title for key in curves}
+    caption = TEXTS.line("figure_to", said=said) if test.output else TEXTS.line("figure", said=said)
+    return Plot(
+        f"steps_{test.key}", caption, figures.step_responses(curves, titles, case.looks, to_output=bool(test.output))
+    )

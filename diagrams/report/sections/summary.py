@@ -1,0 +1,276 @@
+"""The first page of a report: verdicts, the weakest margin, and all that was not analysed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from ....blocks.core import LoopwrightError, print_unit
+from ...frequency import Number, Realization, find_disk_frequency
+from ...linearization import Linearization, find_signal
+from ...requirements import Limit, RequirementResult, Review, Verdict
+from ...studies import CaseState
+from ..case import Case
+from ..pages import Judged, Section, Table, Texts
+from ..review import weakest
+from ..variant import Cut, Implementation, Variant
+from .contacts import KEY as CONTACT
+from .loops import ROWS
+from .measured_loops import MEASURED
+from .poles import unstable_first
+from .step_responses import NAMES
+from .worst_case import KEY as WORST_CASE
+from .worst_case import MissingWorstCase, ReportedWorstCase
+
+TEXTS = Texts(__package__, "summary")
+TITLE = "Summary"
+LOOP_NUMBERS = (
+    "phase_margin_deg", "gain_margin_low", "gain_margin_high", "delay_margin_s", "disk_margin", "ms", "bandwidth",
+)  # fmt: skip
+"""Numbers of the loops that stand on the first page."""
+DIGITS = 4
+"""Significant digits on the first page; the appendix has more."""
+ALIKE = 0.05
+"""Relative difference up to which a margin is hardly changed."""
+ORDER = (Verdict.FAILED, Verdict.UNDECIDED, Verdict.PASSED)
+
+
+def summary(
+    case: Case,
+    reviewed: Review | None,
+    numbers: Mapping[str, Number],
+    worst_case: ReportedWorstCase | MissingWorstCase | None = None,
+    more: Sequence[Table] = (),
+) -> Section:
+    """Return the first section of a report.
+
+    Parameters
+    ----------
+    case : Case
+        The diagram with its variants.
+    reviewed : Review, optional
+        The verdicts on its requirements.
+    numbers : mapping of str to Number
+        All numbers of the report by their dotted paths.
+    worst_case : ReportedWorstCase or MissingWorstCase, optional
+        The worst case that has a section.
+    more : sequence of Table
+        Tables behind that of the loops.
+    """
+    unstable = unstable_first(case)
+    text = [*(unstable.text if unstable is not None else ())]
+    tables = []
+    if reviewed is None:
+        text.append(TEXTS.line("no_requirements"))
+    else:
+        counts = {verdict.name.lower(): len(reviewed.of(verdict)) for verdict in Verdict}
+        said = TEXTS.line("verdict", verdict=reviewed.verdict.name, total=len(reviewed.results), **counts)
+        text.append(Judged(said, reviewed.verdict))
+        tables.append(_requirements(case, reviewed))
+    text += _weakest(case, numbers)
+    text += [_worst_case(worst_case)] if worst_case is not None else []
+    loops = _loops(case, numbers)
+    tables += [*([loops] if loops is not None else []), *more]
+    missing = list(dict.fromkeys([*_not_analysed(case, numbers), *_not_confirmed(worst_case)]))
+    if missing:
+        text += [TEXTS.line("not_analysed"), *(f"- {line}" for line in missing)]
+    return Section("summary", TITLE, tuple(text), tuple(tables))
+
+
+def _requirements(case: Case, reviewed: Review) -> Table:
+    """Return the table of requirements: those that fail first, then those that are not decided."""
+    ranked = sorted(reviewed.results, key=lambda r: (ORDER.index(r.verdict), _relative(r)))
+    rows = tuple(_row(case, result) for result in ranked)
+    columns = ("verdict", "requirement", "at", "variant", "required", "found", "distance")
+    return Table("Requirements", columns, rows, TEXTS.line("distance"), digits=DIGITS,
+                 terms={"distance": "distance_to_limit"})  # fmt: skip
+
+
+def _relative(result: RequirementResult) -> float:
+    return math.inf if math.isnan(result.relative) else result.relative
+
+
+def _row(case: Case, result: RequirementResult) -> tuple[Any, ...]:
+    variant = case.variants.get(result.variant)
+    unit = "" if result.number is None or result.number.unit == "1" else result.number.unit
+    touches = result.variant == CONTACT
+    facts = {"verdict": result.verdict.value, "reason": result.reason.name, "contact": touches}
+    said = TEXTS.line("outcome", **facts, detail=result.detail)
+    distance: Any = "–"
+    if result.number is not None and not math.isnan(result.distance):
+        number = result.number
+        distance = Number(result.distance, number.unit, number.tolerance, number.confirmed_by, findings=number.findings)
+    place = case.loop_wires().get(result.loop, result.loop) or (result.detail if result.quantity[:5] == "step." else "")
+    place = f"{place}, with {result.detail}" if touches and place and result.detail else place
+    others = {MEASURED: "measured", WORST_CASE: "worst case", CONTACT: "as it is"}
+    title = variant.title if variant else others.get(result.variant, "–")
+    return (
+        Judged(said, result.verdict), words_of(result.quantity), place or "whole diagram", title,
+        _required(result.limit, unit), result.number if result.number is not None else "–", distance,
+    )  # fmt: skip
+
+
+def _required(limit: Limit, unit: str) -> str:
+    shown = print_unit(unit) if unit else ""
+    return f"{limit}{'' if shown in ('', '°') else ' '}{shown}"
+
+
+def words_of(quantity: str) -> str:
+    """Return the name of a quantity in words."""
+    if quantity == "stable":
+        return TEXTS.line("stable")
+    head, _, tail = quantity.partition(".")
+    if head == CONTACT:
+        return TEXTS.line("contact", vary=tail)
+    return NAMES.get(tail, tail) if head == "step" else ROWS.get(quantity, quantity)
+
+
+def _weakest(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
+    """Yield the weakest margin of the diagram as it is, and the same place in variants that leave something out."""
+    actual = case.actual
+    if actual is None:
+        return
+    found = weakest(numbers, [actual.key])
+    if found is None and not case.loop_wires():
+        return
+    if found is None:
+        yield TEXTS.line("no_margin")
+        return
+    path, number = found
+    alpha = number.value
+    facts: dict[str, Any] = {"wire": _wire(case, path), "alpha": alpha, "place": case.name_place(_place(path))}
+    if path.rpartition(".")[2] != "disk_margin":
+        yield TEXTS.line("weakest_modulus", **facts)
+        return
+    facts |= {"low": (2 - alpha) / (2 + alpha), "high": (2 + alpha) / (2 - alpha) if alpha < 2 else math.inf}
+    facts |= {
+        "phase": 2 * math.degrees(math.atan(alpha / 2)),
+        "frequency": _frequency(actual, facts["wire"], path, numbers),
+    }
+    yield TEXTS.line("weakest", **facts)
+    others = [(v, numbers[p].value) for v, p in _elsewhere(case, path) if p in numbers]
+    raised = [(v.title, value) for v, value in others if value > alpha * (1 + ALIKE)]
+    if raised:
+        best = sorted(raised, key=lambda item: -item[1])
+        yield TEXTS.line("why", others=best)
+    elif others:
+        yield TEXTS.line("why_not", titles=[v.title for v, _ in others])
+
+
+def _worst_case(reported: ReportedWorstCase | MissingWorstCase) -> str:
+    """Return the line on a worst case: its number, its growth, or the reason why it could not be analysed."""
+    if isinstance(reported, MissingWorstCase):
+        return TEXTS.line("no_worst_case", reason=reported.problem)
+    found, worst = reported.found, reported.found.worst
+    number = worst.numbers.get(worst.loop, {}).get(worst.quantity)
+    shown = "" if number is None else print_unit(number.unit)
+    return TEXTS.line(
+        "worst_case",
+        state=worst.state.name,
+        wire=", ".join(worst.loop),
+        cases=len(found.cases),
+        quantity=words_of(worst.quantity),
+        value=worst.value,
+        unit=shown,
+        spaced=shown not in ("", "°"),
+        growth=worst.growth,
+        reason=worst.reason.rstrip("."),
+    )
+
+
+def _not_confirmed(reported: ReportedWorstCase | MissingWorstCase | None) -> Iterator[str]:
+    """Yield a line on a worst case that no run confirms."""
+    if isinstance(reported, ReportedWorstCase) and reported.found.worst.state is not CaseState.FAILED:
+        run = reported.run
+        if run is None or not run.agrees:
+            trial = "" if run is None else run.trial
+            yield TEXTS.line("worst_case_not_confirmed", trial=trial, problem=reported.problem)
+
+
+def _frequency(v: Variant, wire: str, path: str, numbers: Mapping[str, Number]) -> float | None:
+    """Return the frequency in rad/s of a disk margin; None where it is not known. It need not be that of M_s."""
+    start = path.rpartition(".")[0]
+    for name in ("disk_frequency", "frequency"):
+        if f"{start}.{name}" in numbers and math.isfinite(numbers[f"{start}.{name}"].value):
+            return numbers[f"{start}.{name}"].value
+    if f"{start}.ms_frequency" not in numbers:
+        return None
+    try:
+        cut, _, L = v.fullest_loop(wire)
+    except LoopwrightError:
+        return None
+    is_this = path.split(".")[3:-1] == ([] if cut is Cut.PLAIN else [cut.value])
+    found = find_disk_frequency(Realization.of(L)) if is_this else math.inf
+    return found if math.isfinite(found) else None
+
+
+def _elsewhere(case: Case, path: str) -> Iterator[tuple[Variant, str]]:
+    first, loop, key, *rest = path.split(".")
+    for v in case.usable():
+        if v.key != key:
+            yield v, ".".join([first, loop, v.key, *rest])
+
+
+def _wire(case: Case, path: str) -> str:
+    key = path.split(".")[1]
+    return case.loop_wires().get(key, key)
+
+
+def _place(path: str) -> str:
+    """Return the part of a path between the variant and the number, such as a point of the path."""
+    return ".".join(path.split(".")[3:-1])
+
+
+def _loops(case: Case, numbers: Mapping[str, Number]) -> Table | None:
+    """Return the table of the loops of the diagram as it is."""
+    actual = case.actual
+    if actual is None:
+        return None
+    found: dict[str, list[Number | None]] = {}
+    for key, wire in case.loop_wires().items():
+        starts = (f"inner.{key}.{actual.key}.{cut}" for cut in ("", "periodic."))
+        start = next((s for s in starts if f"{s}stable" in numbers or f"{s}disk_margin" in numbers), None)
+        if start is not None:
+            found[wire] = [numbers.get(f"{start}{name}") for name in LOOP_NUMBERS]
+    if not found:
+        return None
+    all_rows = ((ROWS[name], *(values[i] for values in found.values())) for i, name in enumerate(LOOP_NUMBERS))
+    rows = tuple(row for row in all_rows if any(number is not None for number in row[1:]))
+    return Table(TEXTS.line("loops"), ("", *found), rows, digits=DIGITS)
+
+
+def _not_analysed(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
+    if case.actual is None:
+        yield TEXTS.line("no_actual")
+    for v in case.variants.values():
+        if v.problem:
+            yield TEXTS.line("variant_left_out", variant=v.title, problem=v.problem)
+    actual = case.actual
+    if actual is None or actual.problem:
+        return
+    for key, wire in case.loop_wires().items():
+        start = f"inner.{key}.{actual.key}."
+        if "inner" in case.keys and not any(path.startswith(start) for path in numbers):
+            yield TEXTS.line("loop_left_out", wire=wire)
+    model = _model(actual)
+    if model is not None and not actual.rests and not actual.moving_alone:
+        yield TEXTS.line("moving", largest=actual.point.largest)
+    for finding in () if model is None else model.findings:
+        yield str(finding)
+    if "inner" in case.keys and not case.loop_wires():
+        yield TEXTS.line("no_loop")
+        return
+    flat = actual.diagram.flatten_like(actual.point)
+    several = all(len(find_signal(flat, wire).entries) > 1 for wire in case.loop_wires().values())
+    sampled = any(case.usable(Implementation.SAMPLED, Implementation.DELAYED, Implementation.OWN))
+    for key in ("steps", "injection"):
+        if key in case.keys and not any(path.split(".")[0] == key for path in numbers):
+            yield TEXTS.line("no_run", key=key, several=several, sampled=sampled)
+
+
+def _model(v: Variant) -> Linearization | None:
+    try:
+        return v.model
+    except LoopwrightError:
+        return None

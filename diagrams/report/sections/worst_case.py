@@ -1,0 +1,276 @@
+"""Worst case over ranges of parameters: its section, its run, and verdicts on the limits of the search."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ....blocks.core import LoopwrightError, OptionError
+from ...flat import WiredDiagram
+from ...frequency import Number
+from ...requirements import Limit, Reason, RequirementResult, Requirements, TomlFile, Verdict, judge
+from ...studies import Case as StudyCase
+from ...studies import CaseOrigin, CaseState, RunConfirmation, WorstCase, WorstCaseTask
+from ..content_hash import content_hash
+from ..pages import Plot, Section, Table, Texts
+from .loops import ROWS
+
+TEXTS = Texts(__package__, "worst_case")
+KEY = "worst_case"
+GROWING, GROWTH = "worst_growth", "growth of the fastest pole"
+"""Key of the section, and the variant that its verdicts belong to."""
+
+
+def check_worst_case(diagram: WiredDiagram, found: Any) -> None:
+    """Check that a worst case is one of this diagram.
+
+    Raises
+    ------
+    OptionError
+        If there is something else, or a worst case of another diagram.
+    """
+    if not isinstance(found, WorstCase):
+        raise OptionError(
+            f"found {found!r}; expected a worst case. Give diagram.worst_case(…), or a TOML file.", port="worst_case"
+        )
+    if content_hash(found.base) != content_hash(diagram):
+        raise OptionError(
+            f"found a worst case of another diagram; expected one of {diagram.name!r} with its present parameters. "
+            "Make it by diagram.worst_case(…).",
+            port="worst_case",
+        )
+
+
+def read_task(
+    diagram: WiredDiagram,
+    given: WorstCase | WorstCaseTask | str | os.PathLike[str] | None,
+    file: TomlFile | None,
+    requirements: Requirements | None,
+) -> WorstCase | WorstCaseTask | None:
+    """Return the worst case of a report, or the task to find it, checked; None where none is asked for.
+
+    Parameters
+    ----------
+    diagram : Diagram
+        The diagram.
+    given : WorstCase, WorstCaseTask or path, optional
+        The option of the report.
+    file : TomlFile, optional
+        The file of its requirements, which may have the table.
+    requirements : Requirements, optional
+        The requirements.
+
+    Raises
+    ------
+    OptionError
+        A worst case of another diagram; a file that asks for something that isn't there; two worst cases.
+    """
+    if file is not None and file.table(KEY):
+        if given is not None:
+            raise file.error(
+                "found a worst case here, and another one in worst_case; expected one. Leave one out.", KEY
+            )
+        given = WorstCaseTask.read(file)
+    elif isinstance(given, str | os.PathLike):
+        given = WorstCaseTask.read(given)
+    if isinstance(given, WorstCaseTask):
+        given.check(diagram, requirements)
+    elif given is not None:
+        check_worst_case(diagram, given)
+    return given
+
+
+def find_reported(
+    diagram: WiredDiagram,
+    given: WorstCase | WorstCaseTask,
+    requirements: Requirements | None,
+    at: Any,
+    stairs: str | None,
+    tell: Callable[[str], None],
+    wires: Mapping[str, str],
+) -> ReportedWorstCase | MissingWorstCase:
+    """Return the worst case of a report: one that was found, or one that a file asks for, with its run."""
+    if isinstance(given, WorstCaseTask):
+        options = {} if stairs is None else {"stairs": stairs}
+        asked = None if requirements is None else _name_wires(requirements, wires, given.loops)
+        task = given
+        try:
+            given = task.find(diagram, asked, at=at, progress=lambda line: tell(f"{KEY}: {line}"), **options)
+        except LoopwrightError as error:
+            return MissingWorstCase(task.find_limits(diagram, asked), error.message)
+    try:
+        return ReportedWorstCase(given, given.confirm())
+    except LoopwrightError as error:
+        return ReportedWorstCase(given, problem=error.message)
+
+
+def _name_wires(requirements: Requirements, wires: Mapping[str, str], loops: tuple[str, ...]) -> Requirements:
+    """Return requirements whose loops are named by wires, as a worst case names them, and not by keys of the report.
+
+    Parameters
+    ----------
+    requirements : Requirements
+        The requirements.
+    wires : mapping of str to str
+        Wires of the report's loops by their keys.
+    loops : tuple of str
+        Names of wires, or unique ends of them, that the worst case is looked for at; those of the report without any.
+    """
+    short = {wire: next((w for w in loops if wire == w or wire.endswith(f".{w}")), wire) for wire in wires.values()}
+    names = {name: short[wire] for key, wire in wires.items() for name in (key, wire)}
+    made = copy(requirements)
+    made.loops = {names.get(name, name): limits for name, limits in requirements.loops.items()}
+    return made
+
+
+@dataclass(frozen=True)
+class MissingWorstCase:
+    """Worst case that a file asks for, and that could not be looked for.
+
+    Attributes
+    ----------
+    limits : mapping
+        Limits that it was to be looked for with, by loops and numbers.
+    problem : str
+        The reason, with the file and the entry.
+    """
+
+    limits: Mapping[tuple[str, ...], Mapping[str, Limit | None]]
+    problem: str
+
+    def outcomes(self) -> dict[str, StudyCase]:
+        """Return no case."""
+        return {}
+
+    def results(self) -> Iterator[RequirementResult]:
+        """Yield an open verdict on each limit."""
+        for loop, limits in self.limits.items():
+            for quantity, limit in limits.items():
+                if limit is not None:
+                    place = ", ".join(loop)
+                    yield RequirementResult(quantity, place, KEY, limit, Verdict.UNDECIDED, Reason.NOT_ANALYSED)
+
+    def section(self) -> Section:
+        """Return the section, which has the reason alone."""
+        return Section(KEY, "Worst case", (TEXTS.line("missing", message=self.problem),))
+
+
+@dataclass(frozen=True)
+class ReportedWorstCase:
+    """Worst case of a report.
+
+    Attributes
+    ----------
+    found : WorstCase
+        The worst case.
+    run : RunConfirmation, optional
+        Its run; None where it has none.
+    problem : str
+        Why it has none.
+    """
+
+    found: WorstCase
+    run: RunConfirmation | None = None
+    problem: str = ""
+
+    def outcomes(self) -> dict[str, StudyCase]:
+        """Return the diagram as it is and the worst case, by the paths that their numbers stand below."""
+        nominal = min(self.found.nominal, key=lambda case: case.goodness)
+        return {f"{KEY}.as_it_is": nominal, f"{KEY}.worst": self.found.worst}
+
+    def results(self) -> Iterator[RequirementResult]:
+        """Yield the verdicts on the limits that the worst case was looked for with, one for each loop and number."""
+        for loop, limits in self.found.goal.loops.items():
+            for quantity, limit in limits.items():
+                if limit is not None:
+                    yield self._result(loop, quantity, limit)
+
+    def _result(self, loop: tuple[str, ...], quantity: str, limit: Limit) -> RequirementResult:
+        found = self.found
+        result = RequirementResult(quantity, ", ".join(loop), KEY, limit, Verdict.UNDECIDED, Reason.NO_NUMBER)
+        if found.unstable:
+            return replace(result, verdict=Verdict.FAILED, reason=Reason.UNSTABLE)
+        mine = [case for case in found.cases if quantity in case.numbers.get(loop, {})]
+        numbers = [(case, case.numbers[loop][quantity]) for case in mine]
+        known = [(case, n) for case, n in numbers if not math.isnan(n.value)]
+        if not known:
+            return result
+        case, number = min(known, key=lambda pair: limit.distance(pair[1].value))
+        verdict, reason, distance = judge(number, limit)
+        path = f"{KEY}.worst.{quantity}" if case is found.worst and quantity == case.quantity else ""
+        result = replace(result, verdict=verdict, reason=reason, distance=distance, number=number, path=path)
+        if found.failures and verdict is not Verdict.FAILED:
+            told = found.failures[0].reason.rstrip(".")
+            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.NOT_ANALYSED, detail=told)
+        if verdict is Verdict.PASSED and len(known) < len(numbers):  # some case has no such number
+            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.NO_VALUE)
+        if verdict is Verdict.PASSED and any(one.state is CaseState.MOVING for one in found.cases):
+            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.MOVING)
+        if case is found.worst and self.run is not None and not self.run.agrees:
+            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.REFUTED)
+        return result
+
+
+def _text(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _ranges(found: WorstCase) -> Table:
+    """Return the table of the ranges that were searched, or of the samples that were given in their place."""
+    rows: list[tuple[str, str, str, str]] = []
+    for name in dict.fromkeys(name for case in found.cases for name in case.parameters):
+        box = found.boxes.get(name)
+        if box is not None:
+            rows.append((name, _text(box.low), _text(box.high), f"range, {box.scale}"))
+            continue
+        values = [case.parameters[name] for case in found.cases if name in case.parameters]
+        plain = all(isinstance(value, float | int) and not isinstance(value, bool) for value in values)
+        low, high = (_text(min(values)), _text(max(values))) if plain else ("–", "–")
+        rows.append((name, low, high, "given samples"))
+    return Table("Ranges of the parameters", ("parameter", "from", "to", "values"), tuple(rows))
+
+
+def worst_case_of(reported: ReportedWorstCase | MissingWorstCase) -> Section:
+    """Return the section on a worst case: its parameters, its number beside the nominal one, its run, and a scatter."""
+    if isinstance(reported, MissingWorstCase):
+        return reported.section()
+    found, run = reported.found, reported.run
+    nominal, worst = reported.outcomes().values()
+    origins = {case.origin for case in found.cases}
+    facts = {"corners": CaseOrigin.CORNER in origins, "searched": CaseOrigin.SEARCH in origins}
+    counts = {"cases": len(found.cases), "unstable": len(found.unstable), "failed": len(found.failures)}
+    text = [TEXTS.line("worst", **counts, **facts)]
+    if found.goal.left_out:
+        text.append(TEXTS.line("not_looked_at", names=found.goal.left_out))
+    confirmed = run.trial if run is not None and run.agrees else ""
+    if run is None:
+        text.append(TEXTS.line("left_out", wire=", ".join(worst.loop) or "worst case", message=reported.problem))
+    else:
+        text.append(f"{str(run)[0].upper()}{str(run)[1:]}.")
+    numbers: dict[str, Number] = {}
+    for name, case in (("as_it_is", nominal), ("worst", worst)):
+        if case.state is CaseState.UNSTABLE:
+            numbers[f"{name}.{GROWING}"] = Number(case.growth, "1/s", 1e-6 * abs(case.growth), confirmed)
+        elif case.quantity:
+            number = case.numbers[case.loop][case.quantity]
+            how = f"{number.confirmed_by}; {confirmed}" if confirmed and case is worst else number.confirmed_by
+            numbers[f"{name}.{case.quantity}"] = replace(number, confirmed_by=how)
+    rows = [
+        (case.replace("_", " "), ROWS.get(name, GROWTH if name == GROWING else name), number)
+        for (case, _, name), number in ((path.partition("."), number) for path, number in numbers.items())
+    ]
+    tables = [Table("Worst case, beside the diagram as it is", ("case", "number", "value"), tuple(rows), digits=4)]
+    given = tuple((name, _text(value)) for name, value in worst.parameters.items())
+    if given:
+        tables.append(Table("Parameters of the worst case", ("parameter", "value"), given))
+    tables.append(_ranges(found))
+    plots = []
+    if any(np.ndim(value) == 0 for value in worst.parameters.values()):
+        plots.append(Plot("worst_case", TEXTS.line("scatter"), found.plot()))
+    return Section(KEY, "Worst case", tuple(text), tuple(tables), tuple(plots), numbers)

@@ -1,0 +1,32 @@
+"""Figures that another process has drawn: the drawing is used once, and a figure that travels is the same figure."""
+
+import pickle
+
+from loopwright.diagrams.report.pages import Plot, Section, draw_section, keep_drawings
+from loopwright.diagrams.report.pages.svg import embedded
+from loopwright.diagrams.results import new_figure
+
+
+def make_section():
+    figure = new_figure(2.0)
+    figure.add_subplot().plot([0.0, 1.0], [1.0, 3.0])
+    inner = Section("b", "B", plots=(Plot("second", "", "<svg></svg>"),))
+    return Section("a", "A", plots=(Plot("first", "", figure),), sections=(inner,)), figure
+
+
+def test_a_figure_from_another_process_is_drawn_the_same():
+    section, figure = make_section()
+    sent = pickle.dumps(section)
+    here = draw_section(section)
+    assert here[1] == "<svg></svg>"
+    assert draw_section(pickle.loads(sent)) == here
+    assert type(pickle.loads(pickle.dumps(figure))) is type(figure)
+
+
+def test_a_drawing_is_used_once():
+    section, figure = make_section()
+    plain = embedded(figure, "f").screen
+    keep_drawings(section, ("<svg><g></g></svg>", ""))
+    assert "<g></g>" in embedded(figure, "f").screen
+    figure.axes[0].set_title("changed")  # a figure that is changed later is drawn anew
+    assert embedded(figure, "f").screen not in (plain, "<svg><g></g></svg>")
