@@ -161,6 +161,25 @@ def cache(tmp_path_factory):
         yield folder
 
 
+@pytest.fixture(scope="module")
+def processes_of_earlier_tests_ended():
+    """End FMUs that earlier files left in circles of references, such as an exception in a variable of its frame."""
+    from loopwright.fmus.isolation import end_idle
+
+    gc.collect()
+    end_idle()
+
+
+@pytest.fixture
+def no_process_left(processes_of_earlier_tests_ended):
+    """The test leaves no process of an FMU behind."""
+    from loopwright.fmus.isolation import count_processes, end_idle
+
+    yield
+    end_idle()
+    assert count_processes() == (0, 0)
+
+
 @pytest.fixture
 def uncompiled(tmp_path_factory, monkeypatch):
     """Builds have an empty file as their binary, in a cache of their own: for tests of what else is in the file."""

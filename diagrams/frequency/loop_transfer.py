@@ -52,6 +52,26 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
     wires: tuple[str, ...] = ()
     inexactness: float = 0.0
 
+    # python-control keeps two functions in a state space that refer to it. Such a circle of references, and with it the
+    # linear model and the processes of its FMUs, would stay until garbage is collected.
+    @property
+    def updfcn(self) -> Any:
+        """Function ``(t, x, u, params)`` of python-control that returns dx/dt, or x at the next tick."""
+        return lambda t, x, u, params: self.A @ np.atleast_1d(x) + self.B @ np.atleast_1d(u)
+
+    @updfcn.setter
+    def updfcn(self, function: Any) -> None:
+        """Do nothing: the matrices are the function."""
+
+    @property
+    def outfcn(self) -> Any:
+        """Function ``(t, x, u, params)`` of python-control that returns y."""
+        return lambda t, x, u, params: self.C @ np.atleast_1d(x) + self.D @ np.atleast_1d(u)
+
+    @outfcn.setter
+    def outfcn(self, function: Any) -> None:
+        """Do nothing: the matrices are the function."""
+
     def __repr__(self) -> str:
         sampling = f"T = {self.dt:g} s" if self.dt else "continuous"
         facts = count_of(self.nstates, "state"), sampling, count_of(len(self.findings), "finding") * bool(self.findings)

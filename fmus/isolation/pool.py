@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import gc
 import os
 import threading
 import time
@@ -13,6 +14,8 @@ from .process import ChildProcess
 
 _MOST, _IDLE = 4, 20.0
 """Number of idle processes, and seconds after which an idle one is ended."""
+_COLLECTED_AT = 8
+"""Number of processes in use at which garbage is collected, as circles of references may hold FMUs."""
 Key = tuple[str, int, int, bool]
 """Digest of the FMU, limits of memory and output, and whether it is kept."""
 
@@ -20,6 +23,8 @@ _LOCKS = [threading.RLock()]
 _IDLE_ONES: list[tuple[Key, ChildProcess, float]] = []
 _ALL: dict[int, tuple[Key, ChildProcess]] = {}
 _TIMER: list[threading.Timer] = []
+_COLLECTED_NEXT = [_COLLECTED_AT]
+"""Number of processes in use at which garbage is collected next: twice those that the last collection left."""
 
 
 def take(key: Key, name: str, files: Path, size: int) -> ChildProcess:
@@ -47,6 +52,9 @@ def take(key: Key, name: str, files: Path, size: int) -> ChildProcess:
             process.begin_again()
             return process
         _drop(process)
+    if len(_ALL) - len(_IDLE_ONES) >= _COLLECTED_NEXT[0]:
+        gc.collect()
+        _COLLECTED_NEXT[0] = max(_COLLECTED_AT, 2 * (len(_ALL) - len(_IDLE_ONES)))
     process = ChildProcess(name, files, size, key[1], key[2])
     with _LOCKS[0]:
         _ALL[id(process)] = key, process

@@ -17,14 +17,7 @@ from support.waiting import Interruption
 SHORT = Isolation(step_time=1.0)
 """For calls that never end; no other test has a limit that a busy machine reaches."""
 EXACT = {"rtol": 1e-9, "atol": 1e-12, "progress": False}
-
-
-@pytest.fixture(autouse=True)
-def nothing_left():
-    """No test leaves a process behind."""
-    yield
-    end_idle()
-    assert count_processes() == (0, 0)
+pytestmark = pytest.mark.usefixtures("no_process_left")
 
 
 @pytest.fixture(scope="module")

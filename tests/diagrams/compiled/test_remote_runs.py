@@ -29,19 +29,12 @@ SHORT = Isolation(step_time=1.0)
 """For calls that never end; no other test has a limit that a busy machine reaches."""
 QUIET = {"progress": False}
 ROUNDED = 1e-12  # of sums of some thousand steps
+pytestmark = pytest.mark.usefixtures("no_process_left")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("zoo")
-
-
-@pytest.fixture(autouse=True)
-def nothing_left():
-    """No test leaves a process behind."""
-    yield
-    end_idle()
-    assert count_processes() == (0, 0)
 
 
 def zoo(file, name="plant", isolate=True, **options):

@@ -12,14 +12,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopwright.blocks import FmuError, FmuRuntimeError
+from loopwright.blocks import PID, FmuError, FmuRuntimeError
+from loopwright.diagrams import Diagram, margins, subsystem
 from loopwright.fmus import Fmu, Isolation
 from loopwright.fmus.calls import LoadedFmu
 from loopwright.fmus.isolation import count_processes, end_idle, open_fmu
+from support.misstated import misstated_fmu
 from support.waiting import FAR, is_there, wait_for
 from support.zoo import zoo_fmu
 
 ON_LINUX = pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
+pytestmark = pytest.mark.usefixtures("no_process_left")
 
 
 @pytest.fixture(scope="module")
@@ -198,6 +201,45 @@ def test_the_child_ends_with_its_parent_and_removes_its_folder(folder, tmp_path_
     parent.stdout.close()
     assert wait_for(lambda: is_there(pid) or Path(place).exists(), False) is False
     assert [*temporary.iterdir()] == []
+
+
+@pytest.fixture
+def uncollected():
+    """Circles of references are not collected; the import of matplotlib leaves exceptions with all callers' frames."""
+    import control  # noqa: F401  it imports matplotlib, and is imported when it is needed first
+
+    gc.collect()
+    gc.disable()
+    yield
+    gc.enable()
+
+
+def test_a_loop_that_nobody_refers_to_any_more_has_no_process(tmp_path, uncollected):
+    @subsystem(sample_time=0.01)
+    def controller(v):
+        return PID(kp=4.0, ki=20.0)(0.0, v)
+
+    plant = Fmu(misstated_fmu(tmp_path, 3), interface="model_exchange", name="plant")
+    diagram = Diagram("loop", plant(u=controller(plant["v"]).named("u")))
+    loop = diagram.linearize().loop("u")
+    found = margins(loop)
+    assert count_processes()[0] >= 1
+    del loop, found
+    end_idle()
+    assert count_processes() == (0, 0)
+
+
+def test_processes_that_only_garbage_holds_are_ended_before_many_are_there(folder, uncollected):
+    plant = Fmu(zoo_fmu(folder, 3), name="plant", isolate=True)
+    most = 0
+    for _ in range(12):
+        circle = [plant.instantiate(["u"], None)]
+        circle[0].__enter__()
+        circle.append(circle)
+        most = max(most, count_processes()[0])
+    assert most <= 9
+    del circle
+    gc.collect()
 
 
 def test_an_idle_process_ends_after_a_while(folder, monkeypatch):

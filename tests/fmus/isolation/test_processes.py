@@ -24,19 +24,12 @@ from support.zoo import zoo_fmu
 
 SHORT = Isolation(step_time=1.0)
 """For calls that never end; no other test has a limit that a busy machine reaches."""
+pytestmark = pytest.mark.usefixtures("no_process_left")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("zoo")
-
-
-@pytest.fixture(autouse=True)
-def nothing_left():
-    """No test leaves a process or a folder behind."""
-    yield
-    end_idle()
-    assert count_processes() == (0, 0)
 
 
 def simulate(file, isolate=True, duration=0.1, **options):
