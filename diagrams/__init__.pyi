@@ -1,5 +1,4 @@
 from .admittance import (
-    AdmittanceLoop,
     Contact,
     ContactAdmittance,
     ContactConfirmation,
@@ -9,21 +8,7 @@ from .admittance import (
     Passivity,
     PassivityReason,
     PortPassivity,
-    StabilityLimit,
-    StabilityMap,
     TrialMethod,
-    crossing_frequency,
-    growth_rate,
-    passivity,
-    poles,
-    rendered_admittance,
-    rendered_response,
-    rendered_system,
-    rule_of_thumb,
-    stability_limit,
-    stability_map,
-    stiffness_limits,
-    target_admittance,
 )
 from .contract import BlockReport, check_block
 from .coupling import Coupling, CouplingReport
@@ -71,7 +56,28 @@ from .linearization import (
     ZeroSlope,
 )
 from .measure import FrequencyResponse, StepResponse
-from .paper import Channel, Fig3Diagram, Rig, experiments, fig3
+from .paper import (
+    AdmittanceLoop,
+    Channel,
+    Fig3Diagram,
+    Rig,
+    StabilityLimit,
+    StabilityMap,
+    crossing_frequency,
+    experiments,
+    fig3,
+    growth_rate,
+    passivity,
+    poles,
+    rendered_admittance,
+    rendered_response,
+    rendered_system,
+    rule_of_thumb,
+    stability_limit,
+    stability_map,
+    stiffness_limits,
+    target_admittance,
+)
 from .report import Plot, Report, Section, Table, analyse
 from .requirements import Requirements, Review, Verdict
 from .results import Occurrence, OperatingPoint, Run, RunState, Snapshot, Stopped, TextSignal

@@ -1,58 +1,51 @@
 """Admittance that an environment feels, and coupled stability."""
 
-from .compliance_loop import SIDES, AdmittanceLoop, control_rate
-from .contact import Contact, make_contact
-from .contact_admittance import ContactAdmittance
+from .contact import SIDES, Contact, find_sign, make_contact
+from .contact_admittance import ContactAdmittance, compute_admittance
 from .contact_confirmation import ContactConfirmation, ContactTrial, try_limit
-from .contact_limits import ContactLimit, ContactMap
+from .contact_limits import ContactLimit, ContactMap, find_limit, find_poles, to_rates
+from .contact_loop import check_environment, close_loop, controller_rows, hold_inputs, join_environment
+from .contact_parts import restrict
 from .contact_ports import PortNames
 from .contact_trials import TrialMethod
-from .coupled import crossing_frequency, growth_rate, poles
+from .growth_limits import PER_DECADE, UNITS, GrowthMap, describe_limit, scan_points
 from .moored_plant import hold_sources
+from .passivity import LOWEST, Passivity
 from .port_passivity import PassivityReason, PortPassivity
-from .rendered import Passivity, passivity, rendered_admittance, rendered_response, rendered_system, target_admittance
-from .shown_plant import check_plant, is_discrete
-from .stability_limits import (
-    StabilityLimit,
-    StabilityMap,
-    rule_of_thumb,
-    stability_limit,
-    stability_map,
-    stiffness_limits,
-)
+from .sensed_tool import Tool
 
 __all__ = [
+    "LOWEST",
+    "PER_DECADE",
     "SIDES",
-    "AdmittanceLoop",
+    "UNITS",
     "Contact",
     "ContactAdmittance",
     "ContactConfirmation",
     "ContactLimit",
     "ContactMap",
     "ContactTrial",
+    "GrowthMap",
     "Passivity",
     "PassivityReason",
     "PortNames",
     "PortPassivity",
-    "StabilityLimit",
-    "StabilityMap",
+    "Tool",
     "TrialMethod",
-    "check_plant",
-    "control_rate",
-    "crossing_frequency",
-    "growth_rate",
+    "check_environment",
+    "close_loop",
+    "compute_admittance",
+    "controller_rows",
+    "describe_limit",
+    "find_limit",
+    "find_poles",
+    "find_sign",
+    "hold_inputs",
     "hold_sources",
-    "is_discrete",
+    "join_environment",
     "make_contact",
-    "passivity",
-    "poles",
-    "rendered_admittance",
-    "rendered_response",
-    "rendered_system",
-    "rule_of_thumb",
-    "stability_limit",
-    "stability_map",
-    "stiffness_limits",
-    "target_admittance",
+    "restrict",
+    "scan_points",
+    "to_rates",
     "try_limit",
 ]

@@ -13,7 +13,6 @@ from ...blocks import AdmittanceFilter, ForceProjection, PathProjection
 from ...blocks.core import Array, Finding, OptionError, UnknownNameError, brief, explain_calls
 from ...fmus.running import Derivation
 from ..linearization import check_options, operating_point
-from .compliance_loop import SIDES
 from .contact_admittance import ContactAdmittance, compute_admittance, look_again
 from .contact_arguments import (
     check_property,
@@ -23,13 +22,13 @@ from .contact_arguments import (
     read_row,
     read_vector,
 )
-from .contact_limits import ContactLimit, ContactMap, CoupledLoop, check_properties, find_limit, map_growth
+from .contact_limits import ContactLimit, ContactMap, CoupledLoop, check_properties, find_limit, map_growth, read_scan
 from .contact_loop import close_loop, join_environment
 from .contact_parts import ContactParts, take_apart
 from .contact_ports import PortNames, Ports
 from .growth_limits import PER_DECADE
+from .passivity import CONTINUOUS, HIGHEST, LOWEST, OFF_PATH, PERIODIC, SAMPLED, Passivity, find_negative
 from .port_passivity import find_passivity
-from .rendered import CONTINUOUS, HIGHEST, LOWEST, OFF_PATH, PERIODIC, SAMPLED, Passivity, find_negative
 
 if TYPE_CHECKING:
     from ..flat import WiredDiagram
@@ -38,6 +37,8 @@ if TYPE_CHECKING:
     from .contact_confirmation import ContactConfirmation
     from .contact_trials import TrialMethod
 
+SIDES = ("par", "perp")
+"""Directions of a path: along it and across it."""
 SOON = 1e-9
 """Time in s just behind the start of a continuous diagram."""
 _FREQUENCY = "frequency in rad/s"
@@ -153,32 +154,8 @@ class Contact:
         OptionError
             If an end of the scan is not positive, or not below the Nyquist frequency.
         """
-        T = self.parts.shortest
-        nyquist = math.pi / T if T else math.inf
-        top = (nyquist * (1.0 - 1e-9) if T else HIGHEST) if high is None else read_positive(high, "high", _FREQUENCY)
-        low = read_positive(low, "low", _FREQUENCY)
-        if not low < top < nyquist:
-            raise OptionError(
-                f"found a scan from {low:g} to {top:g} rad/s; expected it to rise"
-                f"{f', below the Nyquist frequency {nyquist:.6g} rad/s' if T else ''}. Give other ends.",
-                port="low",
-            )
-        per_decade = read_density(per_decade, 1)
-        intervals = find_negative(lambda w: compute_admittance(self.parts, self.direction, w), low, top, per_decade)
-        poles = np.linalg.eigvals(close_loop(self.parts, join_environment(self.parts, self.direction)).A)
-        stable = bool(np.all(np.abs(poles) <= 1.0 + 1e-6) if T else np.all(poles.real <= 1e-4))
-        off_path = self.side == "par" and abs(self.scale - 1.0) > 1e-9
-        return Passivity(
-            frequency=intervals[0][0] if intervals else math.inf,
-            intervals=intervals,
-            scanned=(low, top),
-            stable=stable,
-            caveat=(SAMPLED if T else CONTINUOUS)
-            + (PERIODIC if self.parts.ticks else "")
-            + (OFF_PATH if off_path else ""),
-            findings=self.findings,
-            port=find_passivity(self.parts, self.direction, stable=stable),
-        )
+        sign = find_sign(self, low=low, high=high, per_decade=per_decade)
+        return replace(sign, port=find_passivity(self.parts, self.direction, stable=sign.stable))
 
     def loop(self, vary: str, **environment: float) -> CoupledLoop:
         """Return the loop with an environment of which one property varies; see `stability_limit`."""
@@ -216,7 +193,7 @@ class Contact:
             If python-control's interconnection of the same parts disagrees.
         """
         held = check_properties(environment, vary)
-        found = find_limit(self.parts, self.direction, vary, held, low=low, high=high, per_decade=per_decade)
+        found = find_limit(self.parts, self.direction, vary, held, read_scan(vary, low, high, per_decade))
         alone = not any(held.values()) and "tool_mass" not in held
         if vary == "stiffness" and alone and 0.0 < found.value < math.inf:
             found = replace(found, second_look=look_again(self.parts, self.direction, found.frequency))
@@ -288,6 +265,35 @@ class Contact:
         check_properties({**environment, x: 0.0}, check_property(y, "y"))
         across, up = read_row(x_values, x, rising=True), read_row(y_values, y, rising=False)
         return map_growth(self.parts, self.direction, (x, across), (y, up), held)
+
+
+def find_sign(contact: Contact, *, low: float, high: float | None, per_decade: int) -> Passivity:
+    """Return the frequencies at which the real part of an admittance is negative; see `Contact.passivity`."""
+    T = contact.parts.shortest
+    nyquist = math.pi / T if T else math.inf
+    top = (nyquist * (1.0 - 1e-9) if T else HIGHEST) if high is None else read_positive(high, "high", _FREQUENCY)
+    low = read_positive(low, "low", _FREQUENCY)
+    if not low < top < nyquist:
+        raise OptionError(
+            f"found a scan from {low:g} to {top:g} rad/s; expected it to rise"
+            f"{f', below the Nyquist frequency {nyquist:.6g} rad/s' if T else ''}. Give other ends.",
+            port="low",
+        )
+    per_decade = read_density(per_decade, 1)
+    intervals = find_negative(lambda w: compute_admittance(contact.parts, contact.direction, w), low, top, per_decade)
+    poles = np.linalg.eigvals(close_loop(contact.parts, join_environment(contact.parts, contact.direction)).A)
+    stable = bool(np.all(np.abs(poles) <= 1.0 + 1e-6) if T else np.all(poles.real <= 1e-4))
+    off_path = contact.side == "par" and abs(contact.scale - 1.0) > 1e-9
+    return Passivity(
+        frequency=intervals[0][0] if intervals else math.inf,
+        intervals=intervals,
+        scanned=(low, top),
+        stable=stable,
+        caveat=(SAMPLED if T else CONTINUOUS)
+        + (PERIODIC if contact.parts.ticks else "")
+        + (OFF_PATH if off_path else ""),
+        findings=contact.findings,
+    )
 
 
 def make_contact(

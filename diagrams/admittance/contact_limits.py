@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Finding, OptionError, explain_calls, on_one_thread
+from ...blocks.core import Array, Finding, OptionError, explain_calls, on_one_thread
 from ..frequency import Number
 from .contact_arguments import check_property, read_density, read_number, read_positive
 from .contact_loop import ClosedLoop, Modes, close_loop, controller_rows, join_environment, split_modes
@@ -218,6 +218,19 @@ class CoupledLoop:
         return float(np.max(to_rates(parts, poles).real))
 
 
+def find_poles(parts: ContactParts, direction: np.ndarray, **environment: Array) -> np.ndarray:
+    """Return the poles s or z of the modes that an environment can move, NaN where the loop has no solution.
+
+    Properties of the environment may be arrays; the poles are along the last axis.
+    """
+    used = {"stiffness", "damping", "mass"} | ({"tool_mass"} & set(environment))
+    alone = close_loop(parts, join_environment(parts, direction))
+    A = close_loop(parts, join_environment(parts, direction, **environment)).A
+    solvable = np.isfinite(A).all(axis=(-1, -2))[..., None]
+    reduced = split_modes(parts, direction, alone, used).reduce(np.where(solvable[..., None], A, 0.0))
+    return np.where(solvable, np.linalg.eigvals(reduced), np.nan)
+
+
 def to_rates(parts: ContactParts, poles: np.ndarray) -> np.ndarray:
     """Return poles in 1/s: as they are, or s = ln z/T in a sampled loop."""
     if not parts.sample_time:
@@ -231,23 +244,17 @@ def find_limit(
     direction: np.ndarray,
     vary: str,
     held: Mapping[str, float],
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    per_decade: int = PER_DECADE,
+    grid: np.ndarray,
 ) -> ContactLimit:
     """Return the first value of a property at which the coupled loop loses its stability; see `Contact`.
 
     Raises
     ------
-    OptionError
-        If the property is unknown, the scan does not rise or is too coarse.
     ParameterError
         If a property is NaN, infinite or negative.
     ConfirmationError
         If python-control's interconnection of the same parts is not stable below the limit and unstable above it.
     """
-    grid = _read_scan(vary, low, high, per_decade)
     loop = CoupledLoop.of(parts, direction, vary, held)
     frequency, moved = math.nan, tuple[float, ...]()
     if (fixed := loop.find_fixed_growth()) is not None:
@@ -294,8 +301,8 @@ def map_growth(
         loop = CoupledLoop.of(parts, direction, x[0], environment)
         fixed = loop.find_fixed_growth()
         rows.append(np.maximum(loop.growth(across), -np.inf if fixed is None else fixed[0]))
-        low, high = float(across[0]), float(across[-1])
-        limits.append(find_limit(parts, direction, x[0], environment, low=low, high=high))
+        grid = scan_points(x[0], (float(across[0]), float(across[-1])), PER_DECADE)
+        limits.append(find_limit(parts, direction, x[0], environment, grid))
     return ContactMap(x[0], y[0], across, up, np.array(rows).reshape(len(up), len(across)), tuple(limits))
 
 
@@ -318,7 +325,14 @@ def check_properties(held: Mapping[str, Any], vary: str) -> dict[str, float]:
     return {name: read_number(value, name, UNITS[name]) for name, value in held.items()}
 
 
-def _read_scan(vary: str, low: Any, high: Any, per_decade: Any) -> np.ndarray:
+def read_scan(vary: str, low: Any, high: Any, per_decade: Any) -> np.ndarray:
+    """Return the values of a property at which its scan looks.
+
+    Raises
+    ------
+    OptionError
+        If the scan does not rise or is too coarse.
+    """
     unit = f"value in {UNITS[vary]}"
     first, last = (
         None if end is None else read_positive(end, name, unit) for name, end in (("low", low), ("high", high))

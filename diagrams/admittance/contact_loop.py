@@ -27,9 +27,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...blocks.core import Array
-from .compliance_loop import StateMatrices, check_environment
+from ...blocks.core import Array, ParameterError
 from .contact_parts import ContactParts
+from .contact_ticks import StateMatrices
 
 SLOW, SLOW_RATE = 1e-3, 1.0
 """Distance of |z| from 1, and rate in 1/s, within which a stable mode is looked at."""
@@ -91,6 +91,18 @@ def join_environment(
     y = (plant.C + shown @ f_x, plant.D + shown @ f_u, shown * f_F)
     inertia = more * parts.velocity
     return Joined(A, B, G, y, (d @ f_x - inertia @ A, d @ f_u - inertia @ B, d * f_F - inertia @ G))
+
+
+def check_environment(**values: Array | None) -> None:
+    """Refuse a property of the environment that is NaN, infinite or negative."""
+    for name, value in values.items():
+        numbers = np.asarray(0.0 if value is None else value, dtype=float)
+        if not np.all((numbers >= 0.0) & np.isfinite(numbers)):
+            raise ParameterError(
+                f"found {value!r}; expected finite numbers that are not negative. Correct it.",
+                block="environment",
+                port=name,
+            )
 
 
 def controller_rows(parts: ContactParts, joined: Joined) -> Rows:

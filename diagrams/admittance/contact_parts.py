@@ -8,7 +8,7 @@ continuous: the rest of the diagram, with its actuators, sensors and delays.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,9 +33,8 @@ from ..linearization import (
     model_ticks,
     moves_between_ticks,
 )
-from .compliance_loop import StateMatrices
 from .contact_ports import Ports, Source, check_command, check_unit, force_wire_error
-from .contact_ticks import ControllerTick, Four, hold_signals
+from .contact_ticks import ControllerTick, Four, StateMatrices, hold_signals
 from .force_entry import find_entry
 from .sensed_tool import Tool, find_tool
 
@@ -47,6 +46,8 @@ AT_REST = 1e-9
 """Largest change of a state in one second or over a sample, relative to 1 + its size, at a point that is at rest."""
 _ROUNDED = 1e-9
 """Relative size of an entry that should be zero."""
+_NOTHING = 1e-12
+"""Size of an entry, relative to others of its row and column, that is rounding."""
 _DOUBTFUL = 10.0
 """Factor by which a stated error of differences may be too small."""
 
@@ -84,6 +85,8 @@ class ContactParts:
         Wire to which the environment's force is added; None if the controller does not measure it.
     ticks : tuple of ControllerTick
         Controllers at the ticks of a period with several; empty with one.
+    states : pair of tuple of str
+        Names of the plant's states and of the controller's; the latter are empty in several rates.
     """
 
     plant: StateMatrices
@@ -100,6 +103,7 @@ class ContactParts:
     findings: tuple[Finding, ...]
     entry: str | None = None
     ticks: tuple[ControllerTick, ...] = ()
+    states: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
 
     @property
     def tool_mass(self) -> float:
@@ -199,6 +203,7 @@ def take_apart(
         findings=_collect_findings(model, path),
         entry=None if entry is None else entry.name,
         ticks=ticks,
+        states=(tuple(m.states), () if ticks else tuple(name for name in model.states if not _is_of(path, name))),
     )
     return parts, any(isinstance(f, UnusualStart) for f in model.findings)
 
@@ -258,7 +263,7 @@ def _cut_controller(
 ) -> StateMatrices:  # fmt: skip
     """Return the matrices from the plant's outputs and the measured force to its inputs, without the plant's states."""
     A, B, C, D = matrices
-    own = [name.startswith((f"{path}.", f"held({path}.")) for name in states]
+    own = [_is_of(path, name) for name in states]
     keep = [i for i, mine in enumerate(own) if not mine]
     rows, start, shapes = dict[tuple[str, str], np.ndarray](), 0, flat.checked.shapes
     for block, port in dict.fromkeys((wire.block, wire.port) for wire in wires.values()):
@@ -283,6 +288,82 @@ def _cut_controller(
         for j, entry in enumerate(taken, D.shape[1] - len(taken)):
             D[[i for i, one in enumerate(picked) if one == entry], j] += 1.0
     return StateMatrices(A[np.ix_(keep, keep)], B[keep], C[np.ix_(picked, keep)], D)
+
+
+def _is_of(path: str, state: str) -> bool:
+    """Return whether a state is the plant's, or an output of it that is held."""
+    return state.startswith((f"{path}.", f"held({path}."))
+
+
+def restrict(parts: ContactParts, axes: np.ndarray) -> ContactParts:
+    """Return the parts of a contact in one rate with forces and motions along some axes alone.
+
+    States and signals are left out that forces along these axes don't reach, or that don't move the contact along them.
+    """
+    P, K, many = parts.plant, parts.controller, len(parts.plant.C)
+    felt = many + axes
+    # signals in one row: states x, inputs u and outputs y of the plant, states k of the controller, forces f
+    sizes = {"x": len(P.A), "u": P.B.shape[1], "y": many, "k": len(K.A), "f": len(axes)}
+    ends = np.cumsum(list(sizes.values()))
+    place = {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends.tolist(), strict=True)}
+    leads = np.zeros((ends[-1], ends[-1]), dtype=bool)
+    for ways, M in {
+        "x from x": P.A,
+        "x from u": P.B,
+        "x from f": parts.force[:, axes],
+        "y from x": P.C,
+        "y from u": P.D,
+        "y from f": parts.force_shown[:, axes],
+        "k from k": K.A,
+        "k from y": K.B[:, :many],
+        "k from f": K.B[:, felt],
+        "u from k": K.C,
+        "u from y": K.D[:, :many],
+        "u from f": K.D[:, felt],
+        # the environment answers a motion by its force
+        "f from x": np.abs(parts.position[axes]) + np.abs(parts.velocity[axes]),
+    }.items():
+        leads[place[ways[0]], place[ways[-1]]] = _acts(M)
+    forces = np.arange(ends[-1]) >= place["f"].start
+    kept = _reach(leads, forces) & _reach(leads.T, forces)
+    x, u, y, k = (np.flatnonzero(kept[place[name]]) for name in "xuyk")
+    into = np.concatenate([y, felt])
+
+    def cut(M: StateMatrices) -> StateMatrices:
+        return StateMatrices(M.A[np.ix_(x, x)], M.B[np.ix_(x, u)], M.C[np.ix_(y, x)], M.D[np.ix_(y, u)])
+
+    errors, of_contact = parts.errors
+    return replace(
+        parts,
+        plant=cut(P),
+        force=parts.force[np.ix_(x, axes)],
+        force_shown=parts.force_shown[np.ix_(y, axes)],
+        position=parts.position[np.ix_(axes, x)],
+        velocity=parts.velocity[np.ix_(axes, x)],
+        controller=StateMatrices(K.A[np.ix_(k, k)], K.B[np.ix_(k, into)], K.C[np.ix_(u, k)], K.D[np.ix_(u, into)]),
+        errors=(
+            cut(errors),
+            StateMatrices(
+                of_contact.A[np.ix_(x, x)], of_contact.B[np.ix_(x, axes)], *(M[np.ix_(axes, x)] for M in of_contact[2:])
+            ),
+        ),
+        states=(tuple(parts.states[0][i] for i in x), tuple(parts.states[1][i] for i in k)),
+    )
+
+
+def _acts(M: np.ndarray) -> np.ndarray:
+    """Return which entries are more than rounding beside the largest of their row or column."""
+    size = np.abs(M)
+    largest = np.maximum(size.max(axis=1, initial=0.0)[:, None], size.max(axis=0, initial=0.0))
+    return np.asarray(size > _NOTHING * largest)
+
+
+def _reach(leads: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return the entries that a start leads to, itself too; ``leads[i, j]`` is a way from j to i."""
+    found, before = start, np.zeros_like(start)
+    while (found != before).any():
+        found, before = found | leads[:, found].any(axis=1), found
+    return found
 
 
 def _linearize_plant(diagram: WiredDiagram, at: OperatingPoint, path: str) -> PlantEquations:

@@ -13,9 +13,17 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from ..linearization import TickModel
-from .compliance_loop import StateMatrices
 
 Four: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+class StateMatrices(NamedTuple):
+    """State-space matrices; axes in front of the last two are those of a batch."""
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
 
 
 class ControllerTick(NamedTuple):

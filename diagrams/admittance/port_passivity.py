@@ -33,9 +33,9 @@ from enum import StrEnum
 import numpy as np
 
 from ...blocks.core import explain_calls, on_one_thread
-from .compliance_loop import StateMatrices
 from .contact_loop import close_loop, controller_rows, hold_inputs, join_environment
 from .contact_parts import ContactParts
+from .contact_ticks import StateMatrices
 
 ALIASES = 16
 """Aliases on each side that are summed one by one."""

@@ -9,21 +9,16 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import ConfirmationError
-from ..admittance import (
-    SIDES,
-    AdmittanceLoop,
-    growth_rate,
-    passivity,
-    rendered_admittance,
-    stability_limit,
-    target_admittance,
-)
+from ..admittance import SIDES
 from ..frequency import Number, with_findings
 from ..report import Implementation, Plot, Section, Table, Texts
+from .compliance_loop import AdmittanceLoop
+from .coupled_stability import growth_rate, stability_limit
 from .fig3_admittance_figures import RULE, TARGET, draw_admittances, draw_stability
 from .fig3_case import Fig3Case
 from .fig3_contact import DAMPINGS, SPRING, again, contact_sections, find_contacts
 from .reduced_loops import FRICTION, OPTIONS, ReducedLoops, each_implementation
+from .rendered_admittance import passivity, rendered_admittance, target_admittance
 
 TEXTS = Texts(__package__, "admittance")
 TITLE = "Admittance and coupled stability"

@@ -23,11 +23,12 @@ from ...blocks import (
 from ...blocks.core import LoopwrightError, OptionError
 from ...fmus.models import Gantry
 from ...fmus.running import Fmu
-from ..admittance import check_plant, control_rate, is_discrete
 from ..flat import WiredDiagram
 from ..report import OUTSIDE, Basis, Case, Implementation, InjectionPlan, Texts, Variant, point_of
 from ..results import OperatingPoint
+from .compliance_loop import control_rate
 from .reduced_loops import FRICTION, NO_FRICTION, ReducedLoops
+from .shown_plant import check_plant, is_discrete
 
 TEXTS = Texts(__package__, "subject")
 PLANT = "plant"

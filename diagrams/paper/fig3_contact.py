@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import LoopwrightError, OptionError
-from ..admittance import SIDES, Contact, ContactLimit, PortNames, StabilityLimit, make_contact, try_limit
+from ..admittance import SIDES, Contact, ContactLimit, PortNames, make_contact, try_limit
 from ..frequency import Number, with_findings
 from ..linearization import StepsOnly
 from ..report import SIGN_COLUMNS, Implementation, Plot, Section, Table, Texts, sign_of_admittance
+from .coupled_stability import StabilityLimit
 from .fig3_admittance_figures import TARGET, draw_admittances
 from .fig3_case import Fig3Case
 

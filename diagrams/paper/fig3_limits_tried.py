@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from typing import Any
 
 from ...blocks.core import ConfirmationError, LoopwrightError
-from ..admittance import AdmittanceLoop, growth_rate
 from ..frequency import Confirmation, Number
 from ..report import Implementation, Section, Table, Texts
+from .compliance_loop import AdmittanceLoop
+from .coupled_stability import growth_rate
 from .fig3_admittance import not_shown
 from .fig3_case import Fig3Case
 from .moored_gantry import deviation, measured_growth, moored_diagram

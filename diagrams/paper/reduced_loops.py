@@ -10,10 +10,12 @@ import numpy as np
 
 from ...blocks import Path
 from ...fmus.models import Gantry
-from ..admittance import SIDES, AdmittanceLoop, StabilityLimit, stability_limit
+from ..admittance import SIDES
 from ..flat import WiredDiagram
 from ..report import Implementation
 from ..results import OperatingPoint
+from .compliance_loop import AdmittanceLoop
+from .coupled_stability import StabilityLimit, stability_limit
 
 FRICTION = "_friction"
 """End of the keys of what has the plant's friction, where it is told apart from the same without it."""

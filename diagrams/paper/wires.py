@@ -177,7 +177,7 @@ def check_plant(plant: Fmu) -> None:
     ]
     shapes = {n: p.shape for n, p in inputs.items() if n in INPUTS}
     shapes |= {n: p.shape for n, p in outputs.items() if n in OUTPUTS or n in OPTIONAL}
-    wrong = [f"{n!r} of shape {shape}" for n, shape in shapes.items() if shape != (2,)]
+    wrong = [f"{n!r} of shape {shape}" for n, shape in shapes.items() if shape not in ((2,), None)]
     if not missing and not wrong:
         return
 

@@ -5,12 +5,12 @@ from functools import cache
 import numpy as np
 
 from loopwright.blocks import AdmittanceFilter, Array, ErrorDynamics, Line, Output, Reference, Step, parameter
-from loopwright.diagrams import Channel, Rig, fig3
-from loopwright.diagrams.admittance.compliance_loop import SIDES, AdmittanceLoop
+from loopwright.diagrams import AdmittanceLoop, Channel, Rig, fig3
 from loopwright.diagrams.paper.wires import IMPEDANCE_PAR, IMPEDANCE_PERP, POLES_PAR, POLES_PERP
 from loopwright.fmus import Fmu, build, gantry
 
 PATH = Line(start=(-1.0, 0.0), end=(1.0, 0.0))  # the tangent is the axis y, the normal the axis z
+SIDES = ("par", "perp")
 MIDDLE = 1.0  # arc length at the origin
 FREE = {"coulomb_friction": (0.0, 0.0), "viscous_friction": (0.0, 0.0)}
 ROUGH = gantry.nominal.replace(gravity=0.0)  # with its friction, whose slope is largest at rest
@@ -56,7 +56,7 @@ def moored():
 
 
 def loop(side="perp", model=SMOOTH, tracking=False, **options):
-    """The reduced model of the diagram below."""
+    """The loop of the diagram below, by its parameters."""
     filters = FORCE_TRACKING if tracking else {}
     return AdmittanceLoop(
         options.pop("path", PATH),

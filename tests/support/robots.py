@@ -77,7 +77,7 @@ def arm(at, eta, delay, *, friction):
 
 @cache
 def contact(name, side, eta=0.0, delay=0, friction=True):
-    return robot(name, eta, delay, friction).contact(direction=side)
+    return robot(name, eta, delay, friction).contact("plant.external_force", direction=side)
 
 
 def regime(name, friction, found):

@@ -10,19 +10,22 @@ import pytest
 
 from loopwright.blocks import AdmittanceFilter, ConfirmationError, Ellipse, OptionError, ParameterError
 from loopwright.blocks.core.errors import UnknownNameError
-from loopwright.diagrams import experiments
-from loopwright.diagrams.admittance import stability_limits as _stability_limits
-from loopwright.diagrams.admittance.compliance_loop import AdmittanceLoop
-from loopwright.diagrams.admittance.coupled import close_loop, growth_rate, growth_rate_by_control, poles
-from loopwright.diagrams.admittance.growth_limits import GrowthScan, find_first_limit
-from loopwright.diagrams.admittance.stability_limits import (
+from loopwright.diagrams import (
+    AdmittanceLoop,
+    experiments,
+    growth_rate,
+    poles,
+    rendered_admittance,
     rule_of_thumb,
     stability_limit,
     stability_map,
     stiffness_limits,
 )
+from loopwright.diagrams.admittance.contact_limits import CoupledLoop
+from loopwright.diagrams.admittance.growth_limits import GrowthScan, find_first_limit
 from loopwright.fmus import gantry_contact
 from loopwright.fmus.models.scara import nominal as scara
+from support import reduced_loop
 from support.contact import (
     FORCE_TRACKING,
     MIDDLE,
@@ -115,9 +118,9 @@ def from_the_start(model, push, ticks, **environment):
     last = model.motions[0].damping @ v + b * there @ v + k * there @ p  # no acceleration is measured at t = 0
     parts = [p, v, last, np.zeros(3 * n)]
     if model.delay:  # u₀ acts in the first two ticks
-        at_once = model.replace(delay=0).controller_matrices.D
+        at_once = reduced_loop.controller_matrices(model.replace(delay=0)).D
         parts.append(at_once @ np.concatenate([p, v, -b * there @ v - k * there @ p]))
-    x, A = np.concatenate(parts), close_loop(model, **environment)
+    x, A = np.concatenate(parts), reduced_loop.close_loop(model, **environment)
     found = []
     for _ in range(ticks):
         found.append(x[n + i])
@@ -135,6 +138,35 @@ def test_the_reduced_model_moves_as_the_running_co_simulation(side, name):
     run = moored_run(model, 0.3, **ENVIRONMENT)
     want = from_the_start(model, 1e-6, len(run.t), **ENVIRONMENT)
     np.testing.assert_allclose(deviation(model, run, "velocity"), want, atol=2e-7 * 1e-6, rtol=0.0)
+
+
+OTHERS = {
+    "ideal": {"implementation": "ideal", "tool_mass": 0.2},
+    "continuous": {"implementation": "continuous", "model": ROUGH, "plant": MORE_FRICTION, "tool_mass": 0.1},
+    "continuous, ellipse": {"path": ELLIPSE, "eta": 0.1, "xi": -0.02, "implementation": "continuous", "tool_mass": 0.1},
+    "shares": {"feed_forward": 0.6, "cancelled": 0.8, "tool_mass": 0.2, "delay": 2},
+    "moving": {"model": ROUGH, "velocity": (0.5, 0.1)},
+    "beside the ellipse": {"path": ELLIPSE, "eta": 0.2, "xi": 0.03, "model": ROUGH, "plant": MORE_FRICTION, "delay": 1},
+}
+ENVIRONMENTS = (
+    {},
+    {"stiffness": 500.0},
+    ENVIRONMENT,
+    {"stiffness": 3e4, "tool_mass": 0.15},
+    {"damping": 40.0, "mass": 2.0},
+)
+
+
+@SIDE
+@pytest.mark.parametrize("name", [*VARIANTS, *OTHERS])
+def test_growth_and_admittance_are_those_of_the_reduction_by_hand(side, name):
+    model = loop(side, **{**VARIANTS, **OTHERS}[name])
+    for environment in ENVIRONMENTS:
+        want = reduced_loop.growth_rate(model, **environment)
+        assert growth_rate(model, **environment) == pytest.approx(float(want), rel=1e-7, abs=1e-7)
+    omega = np.geomspace(0.1, 1500.0, 7)
+    want = reduced_loop.rendered_admittance(model, omega)
+    np.testing.assert_allclose(rendered_admittance(model, omega), want, rtol=1e-8, atol=1e-10 * np.abs(want).max())
 
 
 def test_the_friction_slope_is_that_at_the_operating_velocity():
@@ -178,7 +210,8 @@ def test_growth_rates_of_arrays_are_those_of_their_numbers():
 def test_python_controls_interconnection_has_the_same_growth(name):
     model = loop(**VARIANTS[name])
     for k in (100.0, 5000.0, 1e5):
-        assert growth_rate_by_control(model, stiffness=k) == pytest.approx(growth_rate(model, stiffness=k), abs=1e-6)
+        by_control = model.contact.loop("stiffness").growth_by_control(k)
+        assert by_control == pytest.approx(growth_rate(model, stiffness=k), abs=1e-6)
 
 
 # --- limits ----------------------------------------------------------------------------------------------------------
@@ -269,7 +302,8 @@ def test_a_limit_says_what_it_is():
     assert limit.scanned == (1e-2, 1e8)
     assert limit.confirmed_by == "closed-loop eigenvalues of python-control's interconnection at 0.99 and 1.01"
     assert limit.growth_below < 0.0 < limit.growth_above
-    assert limit.growth_above == growth_rate(loop(), stiffness=1.03 * limit.value, damping=10.0)
+    beyond = growth_rate(loop(), stiffness=1.03 * limit.value, damping=10.0)
+    assert limit.growth_above == pytest.approx(beyond, rel=1e-9)
     number = limit.number.as_dict()
     assert number == {
         "value": limit.value,
@@ -299,7 +333,7 @@ def test_the_tool_may_weigh_about_the_virtual_mass(side):
 
 
 def test_a_limit_that_is_confirmed_by_nothing_is_an_error(monkeypatch):
-    monkeypatch.setattr(_stability_limits, "growth_rate_by_control", lambda loop, **environment: -1.0)
+    monkeypatch.setattr(CoupledLoop, "growth_by_control", lambda loop, value: -1.0)
     with pytest.raises(
         ConfirmationError, match=r"stiffness 26118.9 N/m is no limit: python-control's .* growth rates -1"
     ):
@@ -357,7 +391,7 @@ def test_acceleration_that_is_fed_back_with_the_wrong_sign_has_no_continuous_sol
     mass = 2.0 * SMOOTH.mass[1]
     assert math.isfinite(growth_rate(model, mass=0.99 * mass))
     assert growth_rate(model, mass=1.01 * mass) == math.inf
-    assert growth_rate_by_control(model, mass=1.01 * mass) == math.inf
+    assert model.contact.loop("mass").growth_by_control(1.01 * mass) == math.inf
 
 
 def test_a_map_holds_growth_and_limits():

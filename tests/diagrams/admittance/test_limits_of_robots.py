@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from loopwright.diagrams import AdmittanceLoop, stability_limit
+from loopwright.diagrams import AdmittanceLoop
 from loopwright.fmus import gantry, scara
+from support.reduced_loop import stability_limit
 from support.robots import POINTS, PUSH, ROBOTS, contact, is_linear, regime, robot
 
 ENVIRONMENTS = [("stiffness", {"damping": b}) for b in (0.0, 10.0, 50.0)] + [("mass", {"stiffness": 100.0})]

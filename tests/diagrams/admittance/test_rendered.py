@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Circle, Ellipse, HandForce, OptionError, Step
-from loopwright.diagrams.admittance.rendered import (
+from loopwright.diagrams import (
     passivity,
     rendered_admittance,
     rendered_response,
     rendered_system,
+    stability_limit,
     target_admittance,
 )
 from support.contact import FREE, MIDDLE, ROUGH, SMOOTH, deviation, diagram, loop, moored_start
@@ -206,8 +207,6 @@ def test_without_feed_forward_passivity_ends_where_the_polynomial_says(side):
 
 @pytest.mark.parametrize("name", LOOPS)
 def test_a_sampled_loop_is_not_passive_and_a_spring_at_that_frequency_is_the_limit(name):
-    from loopwright.diagrams.admittance.stability_limits import stability_limit
-
     # where Y = jB, the spring k = −ω/B oscillates undamped with it; the aliases shift that by 1e-6
     model = loop(**LOOPS[name])
     found, limit = passivity(model), stability_limit(model)

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 from loopwright.blocks import Block, Gain, Input, Output, ParameterError, State, UnitDelay
 from loopwright.diagrams import AdmittanceLoop, analyse, experiments, stability_limit
-from loopwright.diagrams.admittance import shown_plant as _shown_plant
+from loopwright.diagrams.paper import shown_plant as _shown_plant
 from loopwright.diagrams.paper.fig3_case import Fig3Case
 from loopwright.diagrams.report.pages.html import to_html
 from loopwright.fmus import Fmu, build, gantry, gantry_contact, gantry_elastic, gantry_stiction, scara

@@ -1,11 +1,15 @@
-"""Limits of coupled stability: the environments that the compliance loop can touch."""
+"""Coupled stability of Fig. 3's compliance loop: poles, growth rates, limits and maps.
+
+Robot and environment, a mass m_e, a damper b_e and a spring k_e, make one closed loop. Its growth rate σ is the largest
+real part of its poles, ln|z|/T in a sampled loop. It is stable if σ < 0. The loop is that of `AdmittanceLoop.contact`.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -20,10 +24,97 @@ from ...blocks.core import (
     near,
     on_one_thread,
 )
+from ..admittance import (
+    PER_DECADE,
+    UNITS,
+    Contact,
+    GrowthMap,
+    check_environment,
+    describe_limit,
+    find_limit,
+    find_poles,
+    scan_points,
+    to_rates,
+)
 from ..frequency import Number
 from .compliance_loop import AdmittanceLoop
-from .coupled import ROBOT, close_loop, crossing_frequency, find_rates, growth_rate, growth_rate_by_control
-from .growth_limits import PER_DECADE, UNITS, GrowthMap, describe_limit, find_first_limit, growth_rounding, scan_points
+
+ROBOT = kinds.one_of_class(AdmittanceLoop, "an AdmittanceLoop(…), such as AdmittanceLoop.of(diagram)")
+"""Kind of the first argument of functions of a robot's admittance."""
+
+
+@accepts(loop=ROBOT, stiffness=kinds.numbers, damping=kinds.numbers, mass=kinds.numbers, tool_mass=kinds.numbers)
+def poles(
+    loop: AdmittanceLoop,
+    *,
+    stiffness: Array = 0.0,
+    damping: Array = 0.0,
+    mass: Array = 0.0,
+    tool_mass: Array | None = None,
+) -> Array:
+    """Return the poles of the coupled loop, s in 1/s or z.
+
+    Parameters
+    ----------
+    loop : AdmittanceLoop
+        Robot and controller.
+    stiffness, damping, mass : float or array
+        Environment: k_e in N/m, b_e in N s/m, m_e in kg. Arrays are broadcast.
+    tool_mass : float or array, optional
+        Mass of the tool in kg, in place of the loop's own.
+
+    Returns
+    -------
+    ndarray
+        Poles along the last axis, without the pure drift of a coupled direction that has neither environment nor
+        stiffness.
+    """
+    given = {"stiffness": stiffness, "damping": damping, "mass": mass, "tool_mass": tool_mass}
+    contact, environment = _without_tool(loop, given)
+    return find_poles(contact.parts, contact.direction, **environment)
+
+
+@accepts(loop=ROBOT, environment=kinds.numbers)
+def growth_rate(loop: AdmittanceLoop, **environment: Array) -> Array:
+    """Return σ in 1/s: the coupled loop grows like exp(σ t), and is stable if σ < 0.
+
+    Parameters
+    ----------
+    loop : AdmittanceLoop
+        Robot and controller.
+    **environment
+        Environment, as `poles` takes it.
+
+    Returns
+    -------
+    float or ndarray
+        σ; infinite where the continuous equations have no solution.
+    """
+    rates = _rates(loop, poles(loop, **environment)).real
+    sigma = np.where(np.isnan(rates).any(axis=-1), np.inf, np.max(rates, axis=-1))
+    return float(sigma) if np.ndim(sigma) == 0 else sigma
+
+
+@accepts(loop=ROBOT, environment=kinds.number)
+def crossing_frequency(loop: AdmittanceLoop, **environment: Array) -> float:
+    """Return the frequency of the pole that grows fastest, rad/s."""
+    rates = _rates(loop, poles(loop, **environment))
+    return float(abs(rates[np.argmax(rates.real)].imag))
+
+
+def _rates(loop: AdmittanceLoop, values: np.ndarray) -> np.ndarray:
+    return to_rates(loop.contact.parts, values)
+
+
+def _without_tool(loop: AdmittanceLoop, given: Mapping[str, Any]) -> tuple[Contact, dict[str, Any]]:
+    """Return the contact of a loop, and its environment; a perfect inner loop feels a tool as a mass."""
+    environment = {name: value for name, value in given.items() if value is not None}
+    if loop.implementation != "ideal":
+        return loop.contact, environment
+    tool = environment.pop("tool_mass", loop.tool_mass)
+    check_environment(tool_mass=tool, mass=environment.get("mass"))
+    mass = np.asarray(environment.pop("mass", 0.0), dtype=float) + np.asarray(tool, dtype=float)
+    return loop.replace(tool_mass=0.0).contact, {**environment, "mass": mass}
 
 
 @explain_calls
@@ -150,29 +241,30 @@ def stability_limit(
         If python-control's interconnection of the same parts is not stable below the limit and unstable above it.
     """
     _check(over, environment)
+    check_environment(**environment)
     grid = scan_points(over, (low, high), per_decade)
-    sigma: np.ndarray = growth_rate(loop, **{over: grid}, **environment)
-
-    def growth_at(x: float) -> float:
-        return float(growth_rate(loop, **{over: x}, **environment))
-
-    def growth_by_control(x: float) -> float:
-        return growth_rate_by_control(loop, **{over: x}, **environment)
-
-    def rounding_at(x: float) -> float:
-        return growth_rounding(partial(find_rates, loop), close_loop(loop, **{over: x}, **environment))
-
-    found = find_first_limit(over, grid, sigma, growth_at, growth_by_control, rounding_at)
+    vary, held = over, dict(environment)
+    if loop.implementation == "ideal":  # a tool is a mass: the one that is held belongs to the robot
+        own = held.pop("tool_mass", loop.tool_mass)
+        if over == "tool_mass":
+            vary, own = "mass", held.pop("mass", 0.0)
+        loop = loop.replace(tool_mass=own)
+    found = find_limit(loop.contact.parts, loop.contact.direction, vary, held, grid)
     is_found = 0.0 < found.value < math.inf
     return StabilityLimit(
         over=over,
-        unit=UNITS[over],
-        frequency=crossing_frequency(loop, **{over: found.value}, **environment) if is_found else math.nan,
+        frequency=crossing_frequency(loop, **{vary: found.value}, **held) if is_found else math.nan,
         rule_of_thumb=rule_of_thumb(loop, environment.get("damping", 0.0)) if over == "stiffness" else math.nan,
-        scanned=(float(grid[0]), float(grid[-1])),
         environment=dict(environment),
         findings=loop.findings,
-        **found._asdict(),
+        value=found.value,
+        unit=found.unit,
+        restabilizes=found.restabilizes,
+        growth_below=found.growth_below,
+        growth_above=found.growth_above,
+        scanned=found.scanned,
+        tolerance=found.tolerance,
+        confirmed_by=found.confirmed_by,
     )
 
 

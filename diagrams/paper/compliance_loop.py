@@ -1,23 +1,20 @@
-"""The compliance loop of one direction against an environment, reduced to a linear model.
+"""The compliance loop of one direction of Fig. 3 against an environment: its parameters, its diagram and its contact.
 
 Fig. 3 is linear for small motions around rest on, or beside, the path. Let p be the displacement in m in the frame of
 the path, first along the tangent t, then along the normal n. Then η = p∥/q and ξ = p⊥ with q = 1 − κ ξ₁ (E22), or
 w = Q⁻¹ p, Q = diag(q, 1). With E = [t n] and the model (2) of the plant, the mobility is G = Eᵀ G_v E, the inertia
 M = G⁻¹, and the slope of the friction C = −M Eᵀ (∂f_v/∂x_v) E. At rest C contains the slope F_c/w of the Coulomb
-friction. Robot and environment are one continuous system:
+friction. The controller inverts its own model M̂, Ĉ, with the gains (a₂, a₁, a₀) of the error dynamics and (m, d, k) of
+the admittance in its direction:
 
-    (M + m_e) p̈ = u − (C + b_e) ṗ − k_e p + F                                          plant
-    F_meas = F − k_e p − b_e ṗ − (m_e + m_tool) p̈                                      force sensor
-
-u is the motor force and F any other force; M contains the mass of a tool beyond the sensor. The controller inverts its
-own model M̂, Ĉ, with the gains (a₂, a₁, a₀) of the error dynamics and (m, d, k) of the admittance in its direction:
-
+    M p̈ = u − C ṗ + F                                                                  robot
     m ë = F_meas − d ė − k e                                                           admittance (15)
     v = φ ë − a₂ (ẇ − ė) − a₁ (w − e) − a₀ ∫(w − e) dt                                 error dynamics (12)
     u = M̂ Q v + Ĉ ṗ − β F_meas                                                         linearization (10)
 
-φ = 1 feeds the acceleration forward by its point value, φ = 0 does not; β = 1 cancels the measured force. There are
-three implementations:
+u is the motor force and F any other force; M contains the mass of a tool beyond the sensor. φ = 1 feeds the
+acceleration forward by its point value, φ = 0 does not; β = 1 cancels the measured force. There are three
+implementations:
 
 ``ideal``
     The inner loop is perfect, w = e: (m + q (m_e + m_tool)) ë + (d + q b_e) ė + (k + q k_e) e = 0.
@@ -30,43 +27,57 @@ three implementations:
     its blocks compute: the admittance by the discretization of `AdmittanceFilter`, the integral by Euler's method. u
     acts ``delay`` samples later.
 
-One direction stands alone where M, C, M̂ and Ĉ are diagonal in the frame of the path, such as at rest on a path along an
-axis. Elsewhere unequal axes couple the two directions: the model then has both, and the environment acts in one.
+`AdmittanceLoop.contact` is the contact of a diagram: Fig. 3 around robots with these M, C and M̂, Ĉ, at a point with
+the same q of a path whose frame is the axes, a line or a circle. One direction stands alone where M, C, M̂ and Ĉ are
+diagonal in the frame of the path, such as at rest on a path along an axis. Elsewhere unequal axes couple the two
+directions: the contact then has both, and the environment acts in one.
 
-The reduction is exact for small motions if no static force acts or the path is straight. On a curved path the frame
-turns under a static force F₀: for each metre along it F∥ changes by κ F₀⊥ and F⊥ by −κ F₀∥. The model leaves this out,
-and the limits of an `AdmittanceFilter`, which small motions don't reach.
+The loop is exact for small motions if no static force acts or the path is straight. On a curved path the frame turns
+under a static force F₀: for each metre along it F∥ changes by κ F₀⊥ and F⊥ by −κ F₀∥. The loop leaves this out, and the
+limits of an `AdmittanceFilter`, which small motions don't reach.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple, Self, cast
 
 import numpy as np
 
-from ...blocks import AdmittanceFilter, ErrorDynamics, FeedbackLinearization, ForceSensor, Frame, Path, PlanarModel
+from ...blocks import (
+    AdmittanceFilter,
+    Circle,
+    Constant,
+    ErrorDynamics,
+    FeedbackLinearization,
+    ForceSensor,
+    Frame,
+    Gain,
+    Line,
+    Path,
+    PlanarModel,
+    Reference,
+)
 from ...blocks.core import Array, Finding, ParameterError, UnknownNameError, Value, parameter
 from ...blocks.path_following import expect_model, expect_path, planar_slopes
 from ...blocks.tracing import check_method
+from ..admittance import SIDES, Contact, PortNames, Tool, make_contact, restrict
+from ..diagram import Diagram
 from ..flat import WiredDiagram
 from ..results import OperatingPoint
+from ..wiring import Wire
 from .fig3_parts import check_wires, delay_of, find_kinks, plant_path
+from .robots_at_rest import PerfectRobot, RobotAtRest
 from .shown_plant import check_plant
+from .wires import Channel, Rig, wire
 
-SIDES = ("par", "perp")
 IMPLEMENTATIONS = ("ideal", "continuous", "sampled")
+LINEARIZATION = "controller.feedback_linearization"
+HALF = 1.0
+"""Half the length in m of a line in whose middle the robot rests."""
 _DECOUPLED = 1e-12
 """Size off the diagonal, relative to it, that a rounded tangent leaves."""
-
-
-class StateMatrices(NamedTuple):
-    """State-space matrices; axes in front of the last two are those of a batch."""
-
-    A: np.ndarray
-    B: np.ndarray
-    C: np.ndarray
-    D: np.ndarray
 
 
 class Motion(NamedTuple):
@@ -77,7 +88,7 @@ class Motion(NamedTuple):
 
 
 class AdmittanceLoop(Value):
-    """One direction of Fig. 3's compliance loop at rest, as its environment feels it; this module derives the model.
+    """One direction of Fig. 3's compliance loop at rest, as its environment feels it; this module has its equations.
 
     Raises
     ------
@@ -260,9 +271,14 @@ class AdmittanceLoop(Value):
         return np.stack([self._path_frame.tangent, self._path_frame.normal], axis=-1)
 
     @cached_property
+    def both_motions(self) -> tuple[Motion, Motion]:
+        """Inertia and friction slope of the plant and of the model, in both directions."""
+        return _reduce_to_motion(self, self.true_plant), _reduce_to_motion(self, self.model)
+
+    @cached_property
     def motions(self) -> tuple[Motion, Motion]:
         """Inertia and friction slope of the plant and of the model; of one direction if it stands alone."""
-        both = _reduce_to_motion(self, self.true_plant), _reduce_to_motion(self, self.model)
+        both = self.both_motions
         diagonal = all(abs(X[0, 1]) + abs(X[1, 0]) <= _DECOUPLED * np.abs(X).max() for m in both for X in m)
         if diagonal or self.implementation == "ideal":
             i = SIDES.index(self.side)
@@ -275,107 +291,15 @@ class AdmittanceLoop(Value):
         """The directions in the model: one, or both if they are coupled."""
         return (self.side,) if len(self.motions[0].mass) == 1 else SIDES
 
-    @property
-    def drift_count(self) -> int:
-        """Number of coupled directions without environment and without stiffness: each has one pole of pure drift."""
-        return sum(self.filters[s].stiffness == 0.0 for s in self.directions if s != self.side)
-
-    def plant_matrices(
-        self, stiffness: Array = 0.0, damping: Array = 0.0, mass: Array = 0.0, tool_mass: Array | None = None
-    ) -> StateMatrices:
-        """Return the matrices of robot and environment, from (u, F) to (p, ṗ, F_meas) with the states (p, ṗ).
-
-        Stiffness in N/m, damping in N s/m and masses in kg may be arrays; the matrices then have their axes in front.
-        """
-        check_environment(stiffness=stiffness, damping=damping, mass=mass, tool_mass=tool_mass)
-        n = len(self.directions)
-        M, C = self.motions[0]
-        there = np.diag([float(s == self.side) for s in self.directions])  # the environment acts in one direction
-        tool = self.tool_mass if tool_mass is None else tool_mass
-        k, b, m, tool = (
-            v[..., None, None] for v in np.broadcast_arrays(*map(_as_floats, (stiffness, damping, mass, tool)))
-        )
-        eye, zero = np.eye(n), np.zeros((*k.shape[:-2], n, n))
-        W = np.linalg.inv(M + m * there)
-        on_p, on_v = -W @ (k * there), -W @ (C + b * there)  # p̈ = on_p p + on_v ṗ + W (u + F)
-        felt = m * there + tool * eye
-        A = _join_blocks([[zero, zero + eye], [on_p, on_v]])
-        B = _join_blocks([[zero, zero], [W, W]])
-        C_ = _join_blocks(
-            [[zero + eye, zero], [zero, zero + eye], [-k * there - felt @ on_p, -b * there - felt @ on_v]]
-        )
-        D = _join_blocks([[zero, zero], [zero, zero], [-felt @ W, eye - felt @ W]])
-        return StateMatrices(A, B, C_, D)
-
     @cached_property
-    def controller_matrices(self) -> StateMatrices:
-        """Matrices of the controller from (p, ṗ, F_meas) to u; its states are ∫(w − e) dt, e, ė, and the delayed u."""
-        n, T = len(self.directions), self.sample_time
-        eye, zero = np.eye(n), np.zeros((n, n))
-        Q_inv = np.diag([1.0 / self.q if s == "par" else 1.0 for s in self.directions])
-        pids, filters = ([parts[s] for s in self.directions] for parts in (self.pids, self.filters))
-        a2, a1, a0 = np.diag([p.a2 for p in pids]), np.diag([p.a1 for p in pids]), np.diag([p.a0 for p in pids])
-        m_inv, k = np.diag([1.0 / a.mass for a in filters]), np.diag([a.stiffness for a in filters])
-        d = np.diag([a.effective_damping for a in filters])
-        M, C = self.motions[1]
-        MQ = M @ np.linalg.inv(Q_inv)
-        phi = self.feed_forward * m_inv
-        D = np.hstack([-MQ @ a1 @ Q_inv, -MQ @ a2 @ Q_inv + C, MQ @ phi - self.cancelled * eye])
-        C_ = MQ @ np.hstack([-a0, a1 - phi @ k, a2 - phi @ d])
-        if self.implementation != "sampled":
-            A = np.block([[zero, -eye, zero], [zero, zero, eye], [zero, -m_inv @ k, -m_inv @ d]])
-            B = np.block([[Q_inv, zero, zero], [zero, zero, zero], [zero, zero, m_inv]])
-            return StateMatrices(A, B, C_, D)
-        made = [a.constants(T, self.method) for a in filters]
-        step = [[np.diag([c["transition"][i, j] for c in made]) for j in range(2)] for i in range(2)]
-        push = [np.diag([c["forcing"][i, 1] for c in made]) @ m_inv for i in range(2)]
-        A = np.block([[eye, -T * eye, zero], [zero, *step[0]], [zero, *step[1]]])
-        B = np.block([[T * Q_inv, zero, zero], [zero, zero, push[0]], [zero, zero, push[1]]])
-        for _ in range(self.delay):  # u waits one more sample
-            A = np.block([[A, np.zeros((len(A), n))], [C_, np.zeros((n, n))]])
-            B, C_ = np.vstack([B, D]), np.hstack([np.zeros((n, len(A) - n)), eye])
-            D = np.zeros((n, 3 * n))
-        return StateMatrices(A, B, C_, D)
+    def contact(self) -> Contact:
+        """The contact of the environment with Fig. 3, with these parameters."""
+        return _contact_of(self)
 
 
 def control_rate(pid: ErrorDynamics) -> float:
     """Return the rate of an error dynamics in 1/s: the largest of a₂, √a₁ and ∛a₀."""
     return float(max(abs(pid.a2), np.sqrt(abs(pid.a1)), np.cbrt(abs(pid.a0))))
-
-
-def check_environment(**values: Array | None) -> None:
-    """Refuse a property of the environment that is NaN, infinite or negative."""
-    for name, value in values.items():
-        if value is not None and not np.all((_as_floats(value) >= 0.0) & np.isfinite(_as_floats(value))):
-            raise ParameterError(
-                f"found {value!r}; expected finite numbers that are not negative. Correct it.",
-                block="environment",
-                port=name,
-            )
-
-
-def hold_force(plant: StateMatrices, T: float, n: int) -> StateMatrices:
-    """Return the plant under a motor force that is held over T; the last force is a state, since it gave the last p̈."""
-    from scipy.linalg import expm
-
-    A, B = plant.A, plant.B[..., :n]
-    batch, x = A.shape[:-2], A.shape[-1]
-    whole = np.zeros((*batch, x + n, x + n))
-    whole[..., :x, :x], whole[..., :x, x:] = A, B
-    whole = np.asarray(expm(whole * T))
-    none = np.zeros((*batch, n, n))
-    A = _join_blocks([[whole[..., :x, :x], np.zeros((*batch, x, n))], [np.zeros((*batch, n, x)), none]])
-    B = _join_blocks([[whole[..., :x, x:]], [none + np.eye(n)]])
-    return StateMatrices(A, B, _join_blocks([[plant.C, plant.D[..., :n]]]), np.zeros((*batch, 3 * n, n)))
-
-
-def _join_blocks(rows: list[list[np.ndarray]]) -> np.ndarray:
-    """Return the matrix of these blocks; axes in front of the last two are those of a batch."""
-    return np.concatenate([np.concatenate(row, axis=-1) for row in rows], axis=-2)
-
-
-def _as_floats(value: Array) -> np.ndarray:
-    return np.asarray(value, dtype=float)
 
 
 def _make_error(port: str, found: object, expected: str) -> ParameterError:
@@ -397,3 +321,78 @@ def _reduce_to_motion(loop: AdmittanceLoop, model: PlanarModel) -> Motion:
         )
     M = np.linalg.inv(E.T @ made.G_v @ E)
     return Motion(M, -M @ E.T @ made.slope @ E)
+
+
+# ---- the diagram and its contact ----
+
+
+def _contact_of(loop: AdmittanceLoop) -> Contact:
+    """Return the contact of a loop, in its own direction where that stands alone, else in both."""
+    if loop.implementation == "ideal":
+        made = make_contact(_perfect_diagram(loop), PortNames("plant.external_force", force=None), [1.0], None, {})
+        return replace(made, side=loop.side, filter=loop.admittance, scale=loop.scale)
+    axis = np.eye(2)[SIDES.index(loop.side)]
+    made = make_contact(_diagram_at_rest(loop), PortNames("plant.external_force"), axis, None, {})
+    parts = replace(made.parts, is_stepped=True, tool=Tool(made.parts.tool.sensor, loop.tool_mass))
+    axes = np.array([SIDES.index(side) for side in loop.directions])
+    parts = restrict(parts, axes)
+    return replace(made, parts=parts, direction=axis[axes], side=loop.side, filter=loop.admittance, scale=loop.scale)
+
+
+def _perfect_diagram(loop: AdmittanceLoop) -> Diagram:
+    a, q = loop.admittance, loop.scale
+    mass, damping, stiffness = a.mass / q + loop.tool_mass, float(a.effective_damping) / q, a.stiffness / q
+    plant = PerfectRobot(mass=mass, damping=damping, stiffness=stiffness, name="plant")
+    return Diagram("compliance", plant(external_force=Constant(value=0.0, unit="N", name="free_space")))
+
+
+def _diagram_at_rest(loop: AdmittanceLoop) -> Diagram:
+    """Return Fig. 3 with the parameters of a loop, around robots that are linear at rest."""
+    path, place = _path_like(loop)
+    robot, model = (_robot_of(motion, path, place) for motion in loop.both_motions)
+    plant: Any = robot.replace(name="plant")
+    references = (Reference(v, unit="m", name=f"{n}_d") for v, n in zip(place, ("eta", "xi"), strict=True))
+    channels = [Channel(r, _unlimited(loop.filters[side])) for r, side in zip(references, SIDES, strict=True)]
+    rig = Rig(tool_mass=loop.tool_mass, sample_time=loop.sample_time, admittance_method=loop.method)
+    # the acceleration is that under the new motor force here, so that it is one with the measured force
+    made = Diagram("compliance", wire(plant, path, *channels, model=model, rig=rig), loops="solve")
+    changes: dict[str, Any] = {
+        f"controller.pid_{side}": pid.replace(name=f"pid_{side}") for side, pid in loop.pids.items()
+    }
+    changes[f"{LINEARIZATION}.minimum_determinant"] = 0.0
+    is_sampled = loop.implementation == "sampled"
+    made = made.replace({**changes, "controller.delay": loop.delay if is_sampled else 0})
+    made = made if is_sampled else made.continuous()
+    if loop.cancelled != 1.0:
+        made = _with_gain(made, LINEARIZATION, "force", loop.cancelled)
+    if loop.feed_forward != 1.0:
+        for side in SIDES:
+            made = _with_gain(made, f"controller.pid_{side}", "reference", np.diag([1.0, 1.0, loop.feed_forward]))
+    return made
+
+
+def _path_like(loop: AdmittanceLoop) -> tuple[Path, tuple[float, float]]:
+    """Return a path whose frame is the axes at a point with the q of a loop, and η and ξ of that point."""
+    if loop.q == 1.0:
+        return Line(start=(-HALF, 0.0), end=(HALF, 0.0)), (HALF, 0.0)
+    circle = Circle(radius=1.0, center=(0.0, 1.0))  # the frame is that of the axes three quarters around
+    return circle, (0.75 * circle.length, 1.0 - loop.q)
+
+
+def _robot_of(motion: Motion, path: Path, place: tuple[float, float]) -> RobotAtRest:
+    mobility = np.linalg.inv(motion.mass)
+    return RobotAtRest(mobility=mobility, slope=-mobility @ motion.damping, start=path.to_plane(*place))
+
+
+def _unlimited(admittance: AdmittanceFilter) -> AdmittanceFilter:
+    return admittance.replace(velocity_limit=None, acceleration_limit=None)
+
+
+def _with_gain(diagram: Diagram, block: str, port: str, gain: Any) -> Diagram:
+    """Return a diagram with a gain on the wire to an input."""
+    table, name = diagram.structure.copy(), f"{port}_share_of_{block.rpartition('.')[2]}"
+    subsystem = table.subsystem_of[block]
+    path = f"{subsystem}.{name}"
+    table.blocks[path], table.subsystem_of[path] = Gain(gain=gain, name=name), subsystem
+    table.wires[path, "u"], table.wires[block, port] = table.wires[block, port], Wire(path, "y")
+    return diagram.with_structure(table)

@@ -1,0 +1,55 @@
+from . import experiments
+from .compliance_loop import AdmittanceLoop
+from .coupled_stability import (
+    StabilityLimit,
+    StabilityMap,
+    crossing_frequency,
+    growth_rate,
+    poles,
+    rule_of_thumb,
+    stability_limit,
+    stability_map,
+    stiffness_limits,
+)
+from .experiment_numbers import DEFINITIONS, key_numbers
+from .experiments import DEFAULTS, EXPERIMENTS, Experiment
+from .fig3_diagram import Fig3Diagram, fig3
+from .figures import plot_experiment, plot_path
+from .rendered_admittance import (
+    passivity,
+    rendered_admittance,
+    rendered_response,
+    rendered_system,
+    target_admittance,
+)
+from .wires import Channel, Rig
+
+__all__ = [
+    "DEFAULTS",
+    "DEFINITIONS",
+    "EXPERIMENTS",
+    "AdmittanceLoop",
+    "Channel",
+    "Experiment",
+    "Fig3Diagram",
+    "Rig",
+    "StabilityLimit",
+    "StabilityMap",
+    "crossing_frequency",
+    "experiments",
+    "fig3",
+    "growth_rate",
+    "key_numbers",
+    "passivity",
+    "plot_experiment",
+    "plot_path",
+    "poles",
+    "rendered_admittance",
+    "rendered_response",
+    "rendered_system",
+    "rule_of_thumb",
+    "stability_limit",
+    "stability_map",
+    "stiffness_limits",
+    "target_admittance",
+]
