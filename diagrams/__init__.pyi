@@ -1,4 +1,4 @@
-from .admittance import (
+from .contact import (
     Contact,
     ContactAdmittance,
     ContactConfirmation,

@@ -14,7 +14,7 @@ from .results import OperatingPoint
 from .varied_diagram import VariedDiagram
 
 if TYPE_CHECKING:
-    from .admittance import Contact
+    from .contact import Contact
     from .drawing import Drawing
     from .linearization import Linearization
     from .measure import FrequencyResponse
@@ -260,7 +260,7 @@ class Diagram(VariedDiagram):
         UnknownNameError, ShapeError, OptionError, ParameterError
             Ports that don't fit; a point not at rest; a plant without a model of its equations; a force behind states.
         """
-        from .admittance import PortNames, make_contact
+        from .contact import PortNames, make_contact
 
         return make_contact(self, PortNames(port, position, velocity, force), direction, at, options)
 

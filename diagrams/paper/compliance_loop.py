@@ -62,7 +62,7 @@ from ...blocks import (
 from ...blocks.core import Array, Finding, ParameterError, UnknownNameError, Value, parameter
 from ...blocks.path_following import expect_model, expect_path, planar_slopes
 from ...blocks.tracing import check_method
-from ..admittance import SIDES, Contact, PortNames, Tool, make_contact, restrict
+from ..contact import SIDES, Contact, PortNames, Tool, make_contact, restrict
 from ..diagram import Diagram
 from ..flat import WiredDiagram
 from ..results import OperatingPoint

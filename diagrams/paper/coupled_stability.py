@@ -24,7 +24,7 @@ from ...blocks.core import (
     near,
     on_one_thread,
 )
-from ..admittance import (
+from ..contact import (
     PER_DECADE,
     UNITS,
     Contact,

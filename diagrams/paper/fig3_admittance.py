@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import ConfirmationError
-from ..admittance import SIDES
+from ..contact import SIDES
 from ..frequency import Number, with_findings
 from ..report import Implementation, Plot, Section, Table, Texts
 from .compliance_loop import AdmittanceLoop

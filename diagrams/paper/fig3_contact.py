@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import LoopwrightError, OptionError
-from ..admittance import SIDES, Contact, ContactLimit, PortNames, make_contact, try_limit
+from ..contact import SIDES, Contact, ContactLimit, PortNames, make_contact, try_limit
 from ..frequency import Number, with_findings
 from ..linearization import StepsOnly
 from ..report import SIGN_COLUMNS, Implementation, Plot, Section, Table, Texts, sign_of_admittance

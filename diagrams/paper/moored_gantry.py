@@ -10,7 +10,7 @@ import numpy as np
 from ...blocks import Array, Output, Reference, parameter
 from ...fmus import Fmu, build
 from ...fmus.models import Gantry
-from ..admittance import SIDES
+from ..contact import SIDES
 from ..diagram import Diagram
 from .compliance_loop import AdmittanceLoop
 from .wires import Channel, Rig, wire

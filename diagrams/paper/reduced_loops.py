@@ -10,7 +10,7 @@ import numpy as np
 
 from ...blocks import Path
 from ...fmus.models import Gantry
-from ..admittance import SIDES
+from ..contact import SIDES
 from ..flat import WiredDiagram
 from ..report import Implementation
 from ..results import OperatingPoint

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import Array, accepts, kinds
-from ..admittance import (
+from ..contact import (
     LOWEST,
     SIDES,
     Passivity,

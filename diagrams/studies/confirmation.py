@@ -19,7 +19,7 @@ from ...blocks.core import (
     explain_calls,
     kinds,
 )
-from ..admittance import hold_sources
+from ..contact import hold_sources
 from ..flat import WiredDiagram
 from ..frequency import Confirmation, Margins, Number, Realization, disk_margin, margins, mimo_disk_margin, mu_bound
 from ..linearization import Linearization, find_signal, linearize, loop_of_variant, trim

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 from ...blocks.core import LoopwrightError, OptionError
-from ..admittance import Contact, PortNames, make_contact
+from ..contact import Contact, PortNames, make_contact
 from ..flat import WiredDiagram
 from ..requirements import REQUIRED, ContactLimits, TomlFile, read_contact_limits
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...blocks.core import LoopwrightError, OptionError, near
-from ..admittance import Contact, ContactLimit, PortNames, make_contact
+from ..contact import Contact, ContactLimit, PortNames, make_contact
 from ..flat import WiredDiagram
 from ..frequency import Number
 from .confirmation import GROWTH_AGREEMENT, ConfirmationKind, RunConfirmation

@@ -31,7 +31,7 @@ SIZE = 1e-15
 
 NUMBERS = (
     "tests/blocks/tracing/",
-    "tests/diagrams/admittance/",
+    "tests/diagrams/contact/",
     "tests/diagrams/frequency/",
     "tests/diagrams/linearization/",
     "tests/diagrams/measure/",

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ....blocks.core import ConfirmationError, LoopwrightError, OptionError, UnknownNameError, near, print_unit
-from ...admittance import Contact, ContactLimit, try_limit
+from ...contact import Contact, ContactLimit, try_limit
 from ...flat import WiredDiagram
 from ...frequency import Number, with_findings
 from ...requirements import ContactLimits, Reason, RequirementResult, Requirements, TomlFile, Verdict, judge

@@ -1,14 +1,17 @@
-"""Arguments of a contact's methods, read and checked."""
+"""Properties of an environment, by name: their units, and values of them and of other arguments, read and checked."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, ParameterError, UnknownArgumentError
-from .growth_limits import UNITS
+from ...blocks.core import Array, OptionError, ParameterError, UnknownArgumentError
+
+UNITS = {"stiffness": "N/m", "damping": "N.s/m", "mass": "kg", "tool_mass": "kg"}
+"""Unit of each property."""
 
 
 def read_number(value: Any, port: str, unit: str) -> float:
@@ -115,6 +118,37 @@ def check_property(name: Any, port: str) -> str:
     if not isinstance(name, str) or name not in UNITS:
         raise UnknownArgumentError(str(name), UNITS, block=None, found="an environment has no").at(port=port)
     return name
+
+
+def check_environment(**values: Array | None) -> None:
+    """Refuse a property of the environment that is NaN, infinite or negative."""
+    for name, value in values.items():
+        numbers = np.asarray(0.0 if value is None else value, dtype=float)
+        if not np.all((numbers >= 0.0) & np.isfinite(numbers)):
+            raise ParameterError(
+                f"found {value!r}; expected finite numbers that are not negative. Correct it.",
+                block="environment",
+                port=name,
+            )
+
+
+def check_properties(held: Mapping[str, Any], vary: str) -> dict[str, float]:
+    """Return the properties of an environment that are held, as numbers.
+
+    Raises
+    ------
+    OptionError, ParameterError
+        If a property is unknown, or held and varied; if its value is no finite number that is not negative.
+    """
+    check_property(vary, "vary")
+    for name in held:
+        check_property(name, str(name))
+        if name == vary:
+            raise OptionError(
+                "found it among the held properties, too; expected it only as the one that varies. Leave it out.",
+                port=name,
+            )
+    return {name: read_number(value, name, UNITS[name]) for name, value in held.items()}
 
 
 def _as_array(value: Any) -> np.ndarray | None:

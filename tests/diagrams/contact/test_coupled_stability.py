@@ -21,8 +21,7 @@ from loopwright.diagrams import (
     stability_map,
     stiffness_limits,
 )
-from loopwright.diagrams.admittance.contact_limits import CoupledLoop
-from loopwright.diagrams.admittance.growth_limits import GrowthScan, find_first_limit
+from loopwright.diagrams.contact.stability_limits import CoupledLoop, GrowthScan, find_first_limit
 from loopwright.fmus import gantry_contact
 from loopwright.fmus.models.scara import nominal as scara
 from support import reduced_loop

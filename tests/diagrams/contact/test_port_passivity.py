@@ -8,7 +8,7 @@ from scipy.optimize import brentq
 
 from loopwright.blocks import Constant, Gain
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.admittance.port_passivity import PassivityReason, find_zeros_of_real_part
+from loopwright.diagrams.contact.passivity import PassivityReason, find_zeros_of_real_part
 from support.haptic import DRAG, HANDLE, Handle, T, haptic
 
 

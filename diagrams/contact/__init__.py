@@ -1,18 +1,26 @@
-"""Admittance that an environment feels, and coupled stability."""
+"""Contact of an environment with a plant: the admittance that it feels, and coupled stability."""
 
+from .admittance import ContactAdmittance, compute_admittance
+from .confirmation import ContactConfirmation, ContactTrial, TrialMethod, try_limit
 from .contact import SIDES, Contact, find_sign, make_contact
-from .contact_admittance import ContactAdmittance, compute_admittance
-from .contact_confirmation import ContactConfirmation, ContactTrial, try_limit
-from .contact_limits import ContactLimit, ContactMap, find_limit, find_poles, to_rates
-from .contact_loop import check_environment, close_loop, controller_rows, hold_inputs, join_environment
-from .contact_parts import restrict
-from .contact_ports import PortNames
-from .contact_trials import TrialMethod
-from .growth_limits import PER_DECADE, UNITS, GrowthMap, describe_limit, scan_points
+from .environment import UNITS, check_environment
+from .loop import close_loop, controller_rows, hold_inputs, join_environment
+from .measured_force import Tool
 from .moored_plant import hold_sources
-from .passivity import LOWEST, Passivity
-from .port_passivity import PassivityReason, PortPassivity
-from .sensed_tool import Tool
+from .parts import restrict
+from .passivity import LOWEST, Passivity, PassivityReason, PortPassivity
+from .ports import PortNames
+from .stability_limits import (
+    PER_DECADE,
+    ContactLimit,
+    ContactMap,
+    GrowthMap,
+    describe_limit,
+    find_limit,
+    find_poles,
+    scan_points,
+    to_rates,
+)
 
 __all__ = [
     "LOWEST",

@@ -18,18 +18,22 @@ next, and its poles z are those of the period.
 
 Modes that the environment can't reach or doesn't feel stay as they are, whatever its properties, such as a drift in
 another direction. `split_modes` tells them by controllability and observability, not by the place of their poles.
+
+A mode's pole z over the time T gives its frequency up to multiples of 2π/T, and its sign. `find_frequency` takes that
+of the strongest part of the motion in continuous time.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from ...blocks.core import Array, ParameterError
-from .contact_parts import ContactParts
-from .contact_ticks import StateMatrices
+from ...blocks.core import Array
+from .environment import check_environment
+from .parts import ContactParts, StateMatrices
 
 SLOW, SLOW_RATE = 1e-3, 1.0
 """Distance of |z| from 1, and rate in 1/s, within which a stable mode is looked at."""
@@ -91,18 +95,6 @@ def join_environment(
     y = (plant.C + shown @ f_x, plant.D + shown @ f_u, shown * f_F)
     inertia = more * parts.velocity
     return Joined(A, B, G, y, (d @ f_x - inertia @ A, d @ f_u - inertia @ B, d * f_F - inertia @ G))
-
-
-def check_environment(**values: Array | None) -> None:
-    """Refuse a property of the environment that is NaN, infinite or negative."""
-    for name, value in values.items():
-        numbers = np.asarray(0.0 if value is None else value, dtype=float)
-        if not np.all((numbers >= 0.0) & np.isfinite(numbers)):
-            raise ParameterError(
-                f"found {value!r}; expected finite numbers that are not negative. Correct it.",
-                block="environment",
-                port=name,
-            )
 
 
 def controller_rows(parts: ContactParts, joined: Joined) -> Rows:
@@ -309,3 +301,74 @@ def _not_reached(A: np.ndarray, B: np.ndarray, lengths: np.ndarray, size: float)
         new, reference = A @ found, np.full(found.shape[1], size)
     whole, _ = np.linalg.qr(V, mode="complete")
     return whole[:, V.shape[1] :]
+
+
+SAMPLES = 16
+"""Samples of the motion in the shortest time between ticks."""
+STRONGER = 1.01
+"""Factor by which a part must be stronger than one of a lower frequency."""
+_ROUNDED = 1e-9
+"""Entry of a unit vector below which it is rounding."""
+
+
+def find_direction(parts: ContactParts, direction: np.ndarray, state: np.ndarray) -> tuple[float, ...]:
+    """Return the unit vector of the largest motion of the contact in a mode, towards the environment's direction."""
+    n = len(parts.plant.A)
+    moved = parts.position @ state[:n]
+    if np.linalg.norm(moved) <= _ROUNDED * np.linalg.norm(np.abs(parts.position) @ np.abs(state[:n])):
+        moved = parts.velocity @ state[:n]
+    axis = np.linalg.svd(np.stack([moved.real, moved.imag], axis=-1))[0][:, 0]
+    towards = axis @ direction
+    if abs(towards) <= _ROUNDED:  # across the environment: towards the first axis that it has a part in
+        towards = axis[int(np.argmax(np.abs(axis) > _ROUNDED))]
+    axis = axis if towards >= 0.0 else -axis
+    return tuple(float(v) if abs(v) > _ROUNDED else 0.0 for v in axis)
+
+
+def find_frequency(parts: ContactParts, loop: ClosedLoop, rate: complex, state: np.ndarray) -> float:
+    """Return the frequency in rad/s of a mode.
+
+    Parameters
+    ----------
+    parts : ContactParts
+        Plant and controller.
+    loop : ClosedLoop
+        The coupled loop, without axes of a batch.
+    rate : complex
+        Its pole in 1/s.
+    state : ndarray
+        State of the mode at the beginning of the period.
+    """
+    T = parts.sample_time
+    if not T:
+        return float(abs(rate.imag))
+    t, weights, velocity = _follow(parts, loop, state)
+    turns = math.ceil(0.25 * SAMPLES * T / parts.shortest)
+    aliases = rate.imag + 2.0 * math.pi / T * np.arange(-turns, turns + 1)
+    aliases = aliases[np.argsort(np.abs(aliases), kind="stable")]
+    decays = np.exp(-np.outer(rate.real + 1j * aliases, t)) * weights
+    sizes = np.linalg.norm(decays @ velocity, axis=1)
+    return float(abs(aliases[int(np.argmax(sizes * STRONGER >= np.max(sizes)))]))
+
+
+def _follow(parts: ContactParts, loop: ClosedLoop, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times over the period, their weights, and the velocities of the contact at them."""
+    from scipy.linalg import expm
+
+    joined = loop.joined
+    n, many = joined.B.shape
+    whole = np.zeros((n + many, n + many))
+    whole[:n, :n], whole[:n, n:] = joined.A, joined.B
+    times, weights, velocities, begin = [], [], [], 0.0
+    for step, tick in zip(loop.every_step, parts.controllers, strict=True):
+        count = math.ceil(SAMPLES * tick.duration / parts.shortest)
+        h = tick.duration / count
+        here = expm(whole * 0.5 * h) @ np.concatenate([state[:n], step.inputs[0] @ state])
+        further = expm(whole * h)
+        for i in range(count):
+            times.append(begin + (i + 0.5) * h)
+            weights.append(h)
+            velocities.append(parts.velocity @ here[:n])
+            here = further @ here
+        state, begin = step.A @ state, begin + tick.duration
+    return np.array(times), np.array(weights), np.array(velocities)

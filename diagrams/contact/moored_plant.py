@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from ..flat import WiredDiagram
     from ..linearization import Tap
 
+
 INTERNAL_STEP = 1e-4
 """Longest internal step in s of an FMU with an environment: its contact is faster than the plant alone."""
 LIBRARY = {

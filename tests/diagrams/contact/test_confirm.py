@@ -7,8 +7,8 @@ import pytest
 
 from loopwright.blocks import AdmittanceFilter, ConfirmationError, Line, OptionError, Reference
 from loopwright.diagrams import Channel, Rig, experiments, fig3
-from loopwright.diagrams.admittance.contact_confirmation import measure_growth
-from loopwright.diagrams.admittance.moored_plant import LIBRARY, library_class
+from loopwright.diagrams.contact.confirmation import measure_growth
+from loopwright.diagrams.contact.moored_plant import LIBRARY, library_class
 from loopwright.diagrams.paper.wires import IMPEDANCE_PAR, IMPEDANCE_PERP
 from loopwright.fmus import Fmu, gantry, gantry_elastic, gantry_stiction
 

@@ -3,13 +3,18 @@
 The plant is one block or FMU with a force port. Its equations are linearized in continuous time. All its outputs are
 opened; what then leads from them, and from the measured force, to the plant's inputs is the controller, sampled or
 continuous: the rest of the diagram, with its actuators, sensors and delays.
+
+A sampled controller is one at each tick of its period. In one rate the period is the sample time, and there is one
+tick. In several rates, at each tick some subsystems act, and the others hold their outputs; an FMU exchanges signals at
+its own communication points. The signals that are held are states of the controller, so that at every tick it leads
+from all signals of the plant to all its inputs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -26,6 +31,7 @@ from ..linearization import (
     Linearization,
     PlantEquations,
     Tap,
+    TickModel,
     UnusualStart,
     find_signal,
     linearize,
@@ -33,14 +39,90 @@ from ..linearization import (
     model_ticks,
     moves_between_ticks,
 )
-from .contact_ports import Ports, Source, check_command, check_unit, force_wire_error
-from .contact_ticks import ControllerTick, Four, StateMatrices, hold_signals
-from .force_entry import find_entry
-from .sensed_tool import Tool, find_tool
+from .measured_force import Tool, find_entry, find_tool
+from .ports import Ports, Source, check_command, check_unit, force_wire_error
 
 if TYPE_CHECKING:
     from ..flat import FlatDiagram, WiredDiagram
     from ..results import OperatingPoint
+
+
+Four: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+class StateMatrices(NamedTuple):
+    """State-space matrices; axes in front of the last two are those of a batch."""
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+
+
+class ControllerTick(NamedTuple):
+    """Controller at one tick of a period, and the time in s to the next one."""
+
+    matrices: StateMatrices
+    duration: float
+
+
+def hold_signals(
+    models: Sequence[TickModel],
+    cut: Callable[[Four], StateMatrices],
+    shown: int,
+    felt_wire: int | None,
+    *,
+    inside: bool,
+) -> tuple[ControllerTick, ...]:
+    """Return the controllers of all ticks, with the signals that are held as states.
+
+    Parameters
+    ----------
+    models : sequence of TickModel
+        Models of the ticks.
+    cut : function
+        Controller at a tick, from the matrices there: its inputs are the plant's outputs and the measured force.
+    shown : int
+        Number of entries of the plant's outputs.
+    felt_wire : int or None
+        Number of the injected wire of the measured force; None if nothing renews or holds it by itself.
+    inside : bool
+        Whether the plant measures the force itself, and shows it at its communication points.
+    """
+    matrices = [cut(model.matrices) for model in models]
+    many, entries = len(matrices[0].C), matrices[0].B.shape[1]
+    renewed = []
+    for model in models:
+        felt = model.steps if inside else felt_wire is None or model.renews[felt_wire]
+        renewed.append(np.array([model.steps] * shown + [felt] * (entries - shown)))
+    held = [i for i in range(entries) if not all(r[i] for r in renewed)]
+    keeps = [not model.steps for model in models]
+    found = []
+    for model, K, r, keep in zip(models, matrices, renewed, keeps, strict=True):
+        found.append(ControllerTick(_hold(K, r, held, any(keeps), keep, many), model.duration))
+    return tuple(found)
+
+
+def _hold(
+    K: StateMatrices, renewed: np.ndarray, held: list[int], has_kept: bool, keep: bool, many: int
+) -> StateMatrices:
+    """Return a controller with further states: held inputs, and the plant's inputs where it doesn't take new ones."""
+    n, entries, kept = len(K.A), len(renewed), many if has_kept else 0
+    now = np.diag(renewed.astype(float))  # the inputs as the controller sees them: now h + last held
+    last = np.zeros((entries, len(held)))
+    last[held, range(len(held))] = ~renewed[held]
+    on_s = np.hstack([K.C, K.D @ last, np.zeros((many, kept))])
+    on_h = K.D @ now
+    if keep:
+        on_s, on_h = np.hstack([np.zeros((many, n + len(held))), np.eye(many)]), np.zeros((many, entries))
+    rows_s = [np.hstack([K.A, K.B @ last, np.zeros((n, kept))]),
+              np.hstack([np.zeros((len(held), n)), last[held], np.zeros((len(held), kept))])]  # fmt: skip
+    rows_h = [K.B @ now, now[held]]
+    if has_kept:
+        rows_s.append(on_s)
+        rows_h.append(on_h)
+    return StateMatrices(np.vstack(rows_s), np.vstack(rows_h), on_s, on_h)
+
 
 AT_REST = 1e-9
 """Largest change of a state in one second or over a sample, relative to 1 + its size, at a point that is at rest."""

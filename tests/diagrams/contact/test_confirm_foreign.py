@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 from loopwright.blocks import Block, ConfirmationError, Constant, Gain, Input, OptionError, Output, State
 from loopwright.diagrams import Diagram, TrialMethod, subsystem
-from loopwright.diagrams.admittance.contact_trials import Trials
+from loopwright.diagrams.contact.confirmation import Trials
 from loopwright.fmus import Fmu, build
 
 M, SHARE, DRAG, T, SUBSTEPS = 0.5, 8.0, 40.0, 5e-3, 10

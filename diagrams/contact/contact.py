@@ -13,8 +13,9 @@ from ...blocks import AdmittanceFilter, ForceProjection, PathProjection
 from ...blocks.core import Array, Finding, OptionError, UnknownNameError, brief, explain_calls
 from ...fmus.running import Derivation
 from ..linearization import check_options, operating_point
-from .contact_admittance import ContactAdmittance, compute_admittance, look_again
-from .contact_arguments import (
+from .admittance import ContactAdmittance, compute_admittance, look_again
+from .environment import (
+    check_properties,
     check_property,
     read_density,
     read_frequencies,
@@ -22,20 +23,28 @@ from .contact_arguments import (
     read_row,
     read_vector,
 )
-from .contact_limits import ContactLimit, ContactMap, CoupledLoop, check_properties, find_limit, map_growth, read_scan
-from .contact_loop import close_loop, join_environment
-from .contact_parts import ContactParts, take_apart
-from .contact_ports import PortNames, Ports
-from .growth_limits import PER_DECADE
-from .passivity import CONTINUOUS, HIGHEST, LOWEST, OFF_PATH, PERIODIC, SAMPLED, Passivity, find_negative
-from .port_passivity import find_passivity
+from .loop import close_loop, join_environment
+from .parts import ContactParts, take_apart
+from .passivity import (
+    CONTINUOUS,
+    HIGHEST,
+    LOWEST,
+    OFF_PATH,
+    PERIODIC,
+    SAMPLED,
+    Passivity,
+    find_negative,
+    find_passivity,
+)
+from .ports import PortNames, Ports
+from .stability_limits import PER_DECADE, ContactLimit, ContactMap, CoupledLoop, find_limit, map_growth, read_scan
 
 if TYPE_CHECKING:
     from ..flat import WiredDiagram
     from ..linearization import PointLike
     from ..results import OperatingPoint
-    from .contact_confirmation import ContactConfirmation
-    from .contact_trials import TrialMethod
+    from .confirmation import ContactConfirmation, TrialMethod
+
 
 SIDES = ("par", "perp")
 """Directions of a path: along it and across it."""
@@ -236,7 +245,7 @@ class Contact:
         ConfirmationError
             If the runs contradict the limit.
         """
-        from .contact_confirmation import confirm_limit
+        from .confirmation import confirm_limit
 
         return confirm_limit(self, limit, push, method)
 
