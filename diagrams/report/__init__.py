@@ -15,13 +15,14 @@ from .analysis import (
     analyse,
 )
 from .case import OUTSIDE, Basis, Case, InjectionPlan
-from .figures import AxisUnits, DrawnLoops, bode, fill_growth, set_powers, tint, with_drawing
+from .figures import DOTTED, AxisUnits, DrawnLoops, bode, draw_admittances, fill_growth, with_drawing
 from .pages import (
     DEFINITIONS,
     Plot,
     Report,
     Section,
     Table,
+    TableForm,
     Texts,
     check_files,
     quantity,
@@ -30,7 +31,6 @@ from .pages import (
 )
 from .parts import MakesSections, ReportKind, ReportPart
 from .points import point_of
-from .sections.contacts import SIGN_COLUMNS, sign_of_admittance
 from .sections.disks import disk_numbers, disk_range
 from .sections.not_modelled import LIMITS_TITLE
 from .sections.poles import POLES_TITLE, list_poles
@@ -42,6 +42,7 @@ __all__ = [
     "ANY_DIAGRAM",
     "CLOSED_LOOPS",
     "DEFINITIONS",
+    "DOTTED",
     "INJECTION",
     "INNER_LOOPS",
     "LIMITS",
@@ -52,7 +53,6 @@ __all__ = [
     "POLES_TITLE",
     "REMARKS",
     "SENSITIVITY",
-    "SIGN_COLUMNS",
     "STEPS",
     "SUBJECT",
     "SUBJECT_TITLE",
@@ -69,6 +69,7 @@ __all__ = [
     "ReportPart",
     "Section",
     "Table",
+    "TableForm",
     "Texts",
     "Variant",
     "analyse",
@@ -76,6 +77,7 @@ __all__ = [
     "check_files",
     "disk_numbers",
     "disk_range",
+    "draw_admittances",
     "fill_growth",
     "in_s",
     "list_poles",
@@ -84,9 +86,6 @@ __all__ = [
     "quantity",
     "read_definitions",
     "scatter",
-    "set_powers",
-    "sign_of_admittance",
-    "tint",
     "with_drawing",
     "without_memory",
     "write_report",

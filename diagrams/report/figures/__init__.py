@@ -1,7 +1,7 @@
 """Figures of a design report, drawn without pyplot."""
 
-from .axes import AxisUnits, set_powers
-from .contact_figures import contact_admittance, contact_map, fill_growth, tint
+from .axes import AxisUnits
+from .contact_figures import DOTTED, contact_admittance, contact_map, draw_admittances, fill_growth
 from .drawings import with_drawing
 from .loop_figures import DrawnLoops, bode, gang, nyquist, response, sensitivities
 from .measured_figures import Measured, injected, measured
@@ -9,12 +9,14 @@ from .sensitivity_figures import sensitivity_bars
 from .step_figures import step_responses
 
 __all__ = [
+    "DOTTED",
     "AxisUnits",
     "DrawnLoops",
     "Measured",
     "bode",
     "contact_admittance",
     "contact_map",
+    "draw_admittances",
     "fill_growth",
     "gang",
     "injected",
@@ -23,8 +25,6 @@ __all__ = [
     "response",
     "sensitivities",
     "sensitivity_bars",
-    "set_powers",
     "step_responses",
-    "tint",
     "with_drawing",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from .axes import set_frequencies, set_powers
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 TEXTS = Texts(__package__, "figures")
 
@@ -23,19 +25,18 @@ def level_text(value: float, position: int | None = None) -> str:
     return f"{value:g}".replace("-", "−")
 
 
-def contact_admittance(
-    key: str, name: str, w: np.ndarray, rendered: np.ndarray, target: np.ndarray | None = None
-) -> Plot:
-    """Draw the admittance of a contact over ω in rad/s, and that of its filter: magnitude and phase."""
+DOTTED: Mapping[str, Any] = {"color": DARK, "linestyle": (0, (1, 1.5)), "linewidth": 1.6}
+"""Look of a target beside what is rendered."""
+
+
+def draw_admittances(w: np.ndarray, curves: Iterable[tuple[str, np.ndarray, Mapping[str, Any]]]) -> Figure:
+    """Draw admittances over ω in rad/s, with their titles and looks: magnitude, phase, and where Re Y < 0."""
     with style():
         figure = new_figure(3.2)
         top, bottom = figure.subplots(2, 1, sharex=True)
-        if target is not None:
-            look = {"color": DARK, "linestyle": (0, (1, 1.5)), "linewidth": 1.6}
-            top.loglog(w, np.abs(target), label="filter", **look)
-            bottom.semilogx(w, np.degrees(np.angle(target)), **look)
-        top.loglog(w, np.abs(rendered), label="rendered", color=BLUE)
-        bottom.semilogx(w, np.degrees(np.angle(rendered)), color=BLUE)
+        for title, Y, look in curves:
+            top.loglog(w, np.abs(Y), label=title, **look)
+            bottom.semilogx(w, np.degrees(np.angle(Y)), **look)
         for y in (-90, 90):
             bottom.axhline(y, color=DARK, linewidth=0.6)
         for low in (90, -180):
@@ -48,6 +49,15 @@ def contact_admittance(
         set_frequencies(bottom, 9)
         set_powers(top.yaxis, top.get_ylim(), 6)
         legend_above(figure, top)
+    return figure
+
+
+def contact_admittance(
+    key: str, name: str, w: np.ndarray, rendered: np.ndarray, target: np.ndarray | None = None
+) -> Plot:
+    """Draw the admittance of a contact over ω in rad/s, and that of its filter: magnitude and phase."""
+    filtered = [] if target is None else [("filter", target, DOTTED)]
+    figure = draw_admittances(w, [*filtered, ("rendered", rendered, {"color": BLUE})])
     return Plot(key, TEXTS.line("contact_admittance", name=name, filtered=target is not None), figure)
 
 

@@ -1,7 +1,7 @@
 """A report as a document: sections, tables and numbers, written as HTML, PDF and JSON."""
 
 from .definitions import DEFINITIONS, read_definitions
-from .document import Judged, Plot, Section, Table
+from .document import Judged, Plot, Section, Table, TableForm
 from .report import Report, check_files, write_report
 from .svg import draw_section, keep_drawings
 from .templating import Texts
@@ -14,6 +14,7 @@ __all__ = [
     "Report",
     "Section",
     "Table",
+    "TableForm",
     "Texts",
     "check_files",
     "draw_section",

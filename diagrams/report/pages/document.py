@@ -1,4 +1,4 @@
-"""Content of a report: sections with text, tables, figures, and numbers by dotted paths."""
+"""Content of a report: sections with text, tables, figures, and numbers by dotted paths; declarations of tables."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Table:
 
     One of ``details`` stands in the appendix. Numbers have ``digits`` significant digits at most, fewer where their
     tolerance bears no more. Columns without a single entry are not shown. ``terms`` names the definitions of numbers
-    that have no dotted path, by their columns.
+    that have no dotted path, by their columns; ``numbers`` has those with a path within the section.
     """
 
     title: str
@@ -28,10 +28,43 @@ class Table:
     details: bool = False
     digits: int = 6
     terms: Mapping[str, str] = field(default_factory=dict)
+    numbers: Mapping[str, Number] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         facts = f"{len(self.rows)} rows", ", ".join(map(str, self.columns))
         return brief(f"table {self.title!r}", *facts, then=".rows")
+
+
+@dataclass(frozen=True)
+class TableForm:
+    """Declaration of a table: the facts of a row that its columns show, and the paths of the row's numbers.
+
+    ``columns`` has the facts by heading, and ``paths`` the paths within the section by fact, such as
+    ``"{key}.slowest"``: other facts of the row fill the braces. A number need not be shown to have a path. Braces in
+    the title and in headings are filled with what `fill` is given.
+    """
+
+    title: str
+    columns: Mapping[str, str]
+    paths: Mapping[str, str] = field(default_factory=dict)
+    terms: Mapping[str, str] = field(default_factory=dict)
+    details: bool = False
+    digits: int = 6
+
+    def fill(self, rows: Iterable[Mapping[str, Any]], note: str = "", **facts: Any) -> Table:
+        """Return the table of rows of facts; a fact that a row doesn't have is an empty entry."""
+        rows = list(rows)
+        found = ((path.format(**row), row.get(fact)) for row in rows for fact, path in self.paths.items())
+        return Table(
+            self.title.format(**facts),
+            tuple(heading.format(**facts) for heading in self.columns),
+            tuple(tuple(row.get(fact) for fact in self.columns.values()) for row in rows),
+            note,
+            self.details,
+            self.digits,
+            self.terms,
+            {path: number for path, number in found if isinstance(number, Number)},
+        )
 
 
 class Judged(str):
@@ -75,8 +108,12 @@ class Section:
     tables: tuple[Table, ...] = ()
     plots: tuple[Plot, ...] = ()
     numbers: Mapping[str, Number] = field(default_factory=dict)
-    """By path within the section, such as ``par.sampled_d0.phase_margin_deg``."""
+    """By path within the section, such as ``par.sampled_d0.phase_margin_deg``; those of the tables are among them."""
     sections: tuple[Section, ...] = ()
+
+    def __post_init__(self) -> None:
+        of_tables = {path: number for table in self.tables for path, number in table.numbers.items()}
+        object.__setattr__(self, "numbers", {**self.numbers, **of_tables, **self.numbers})
 
     def __repr__(self) -> str:
         facts = (

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from ....blocks.core import ConfirmationError, LoopwrightError, OptionError, UnknownNameError, near, print_unit
-from ...contact import Contact, ContactLimit, try_limit
+from ....blocks.core import ConfirmationError, Finding, LoopwrightError, OptionError, UnknownNameError, near, print_unit
+from ...contact import Contact, ContactConfirmation, ContactLimit, Passivity, try_limit
 from ...flat import WiredDiagram
 from ...frequency import Number, with_findings
 from ...requirements import ContactLimits, Reason, RequirementResult, Requirements, TomlFile, Verdict, judge
 from ...studies import ContactTask
 from .. import figures
 from ..content_hash import content_hash
-from ..pages import Plot, Section, Table, Texts
+from ..pages import Plot, Section, Table, TableForm, Texts
 
 TEXTS = Texts(__package__, "contact")
 KEY = "contact"
@@ -29,6 +29,7 @@ SYMBOLS = {"stiffness": "ke", "damping": "be", "mass": "me", "tool_mass": "tool"
 """Names of an environment's properties in dotted paths."""
 WORDS = {"stiffness": "k_e", "damping": "b_e", "mass": "m_e", "tool_mass": "tool"}
 """Properties of an environment in tables."""
+UNITS = {"stiffness": "N/m", "damping": "N.s/m", "mass": "kg", "tool_mass": "kg"}
 ALONE = "alone"
 """Environment with nothing but what varies, in tables."""
 SCANNED = {"stiffness": 1e8, "damping": 1e8, "mass": 1e4, "tool_mass": 1e4}
@@ -38,23 +39,123 @@ BEYOND = 1.1
 DAMPINGS = (0.0, 10.0, 100.0)
 """Dampings in N·s/m of the environments whose stiffness is limited."""
 TRIED_DAMPING = 10.0
-"""Damping of the environment whose limit is tried in the nonlinear run."""
+"""Damping in N·s/m of the environment whose limit is tried in the nonlinear run."""
 SPRING = 10.0
 """Spring in N/m that holds a mass."""
-SIGN_COLUMNS = ("first Re Y < 0 at", "all of Re Y < 0 [rad/s]", "stable alone", "passive")
-"""Columns of `sign_of_admittance`; the last is the verdict against all passive environments, with all aliases."""
 WIDE = 50.0
 """Factor of the limit of stiffness to both ends of a map, and of the damping k/ω that belongs to it."""
 
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+SIGN = {
+    "first Re Y < 0 at": "first",
+    "all of Re Y < 0 [rad/s]": "spans",
+    "stable alone": "stable",
+    "passive": "passive",  # against all passive environments, with all aliases
+}
+FOUND = {"oscillates at": "frequency", "moves": "direction", "stable again": "again"}
+LIMIT_PATHS = {"limit": "{key}.{place}", "frequency": "{key}_frequency.{place}"}
+TRIED = {
+    "of the limit": "factor",
+    "k_e [N/m]": "value",
+    "growth rate, measured": "measured",
+    "predicted [1/s]": "predicted",
+    "speeds up to [m/s]": "fastest",
+}
+
+WEAKEST = TableForm(
+    "Contacts: weakest limits of stiffness",
+    {
+        "contact": "contact",
+        "stable up to k_e": "limit",
+        "with": "environment",
+        "oscillates at": "frequency",
+        "first Re Y < 0 at": "first",
+    },
+    digits=4,
+)
+PASSIVITY = TableForm("Sign of Re Y(jω)", SIGN, {"first": "first_non_passive"})
+STIFFNESS = TableForm(
+    "Largest stiffness of the environment",
+    {"b_e [N·s/m]": "damping", "largest k_e": "limit", **FOUND, "from Re Y = 0 [N/m]": "second_look"},
+    LIMIT_PATHS,
+)
+MASSES = TableForm(
+    f"Largest masses, on a spring of {SPRING:g} N/m", {"mass": "mass", "largest": "limit", **FOUND}, LIMIT_PATHS
+)
+REQUIRED = TableForm(
+    "Limits that are required",
+    {"largest": "property", "with": "environment", "required": "required", "found": "limit", **FOUND},
+    LIMIT_PATHS,
+)
+IN_RUNS = TableForm(
+    "Limit of stiffness{environment}, tried in the nonlinear run",
+    TRIED,
+    {"measured": "tried.ke_limit.{place}.{side}.growth_rate"},
+)
+
+
+def sign_of_admittance(p: Passivity, admittance: Callable[[np.ndarray], np.ndarray]) -> dict[str, Any]:
+    """Return the facts of `SIGN`; the first frequency is confirmed by the sign of Re Y, in m/(N·s), around it."""
+    known, error = f"Re Y ≥ 0 on the whole scan up to {p.scanned[1]:.6g} rad/s", 0.0
+    if math.isfinite(p.frequency):
+        below, above = admittance(p.frequency * np.array([1 - 1e-6, 1 + 1e-6])).real
+        known, error = "sign of Re Y just below and just above", p.tolerance * p.frequency
+        if not below > 0 > above:
+            known = "Re Y changes its sign within rounding there"
+    passive = None if p.port is None else p.port.passive
+    return {
+        "first": Number(p.frequency, "rad/s", error, known, findings=p.findings),
+        "spans": ", ".join(f"{low:.5g} … {high:.5g}" for low, high in p.intervals) or "none",
+        "stable": "yes" if p.stable else "no",
+        "passive": {True: "yes", False: "no", None: "–"}[passive],
+    }
+
+
+def limit_facts(found: ContactLimit) -> dict[str, Any]:
+    """Return the limit of a contact, its frequency, and what `FOUND` shows of it; texts are empty without a limit."""
+    return {
+        "limit": found.number,
+        "frequency": frequency_number(found.frequency, found.confirmed_by, found.findings),
+        "direction": "(" + ", ".join(f"{v:.3g}" for v in found.direction) + ")" if found.direction else "",
+        "again": stable_again(found.restabilizes, found.unit),
+    }
+
+
+def frequency_number(frequency: float, confirmed_by: str, findings: Sequence[Finding]) -> Number | None:
+    """Return the frequency in rad/s at which the loop oscillates at a limit; None without one (NaN)."""
+    if not math.isfinite(frequency):
+        return None
+    return with_findings(Number(frequency, "rad/s", 1e-6 * frequency, confirmed_by), tuple(findings))
+
+
+def stable_again(restabilizes: Sequence[float], unit: str) -> str:
+    """Return the values beyond a limit at which the loop is stable again as text; empty without any."""
+    ends = [*restabilizes, None]
+    return ", ".join(
+        f"from {low:.6g}" + (f" to {high:.6g}" if high is not None else "") + f" {unit}"
+        for low, high in zip(restabilizes[::2], ends[1::2], strict=False)
+    )
+
+
+def trial_facts(found: ContactConfirmation, how: str) -> Iterator[dict[str, Any]]:
+    """Yield the facts of `TRIED` for the runs below and above a limit."""
+    for side, trial in zip(("below", "above"), found.trials, strict=True):
+        yield {
+            "side": side,
+            "factor": f"{trial.factor:g}",
+            "value": trial.value,
+            "measured": Number(trial.measured, "1/s", found.within, f"{how}, beside the linear loop's poles"),
+            "predicted": float(f"{trial.predicted:.4g}"),
+            "fastest": float(f"{trial.fastest:.2g}"),
+        }
+
+
+# --- the contacts of a report -----------------------------------------------------------------------------------------
+
 
 def check_contacts(diagram: WiredDiagram, contacts: Mapping[str, Any]) -> Mapping[str, Contact]:
-    """Return contacts by the names of their sections, which stand in dotted paths.
-
-    Raises
-    ------
-    OptionError
-        If there is something else, a name with a dot, or a contact of another diagram.
-    """
+    """Return contacts by the names of their sections; refuse others, those of another diagram, and names with dots."""
     own = content_hash(diagram)
     for name, contact in contacts.items():
         if not isinstance(contact, Contact):
@@ -85,19 +186,19 @@ class ReportedContacts:
         Contacts by their names.
     limits : mapping of str to tuple of ContactLimits
         Required limits by the contacts' names; those of all contacts have the name "".
-    weakest : list of tuple
-        Row of each contact on the first page, once its section is made.
+    weakest : list of mapping
+        Facts of each contact on the first page, once its section is made.
     refuted : set of str
         Paths of limits that a nonlinear run contradicts.
     """
 
     contacts: Mapping[str, Contact]
     limits: Mapping[str, tuple[ContactLimits, ...]]
-    weakest: list[tuple[Any, ...]] = field(default_factory=list)
+    weakest: list[Mapping[str, Any]] = field(default_factory=list)
     refuted: set[str] = field(default_factory=set)
 
     def limits_of(self, name: str) -> tuple[ContactLimits, ...]:
-        """Return the limits that are required of a contact: those of all, but for what it has limits of its own."""
+        """Return the limits that are required of a contact: its own, and the general ones that it doesn't replace."""
         own = self.limits.get(name, ())
         mine = {(vary, _place(vary, one.environment)) for one in own for vary in one.limits}
         found = []
@@ -133,26 +234,11 @@ def read_contacts(
     diagram: WiredDiagram,
     given: Mapping[str, Any] | ContactTask | str | os.PathLike[str] | None,
     file: TomlFile | None,
-    asked: Requirements | None,
+    required: Requirements | None,
 ) -> ReportedContacts | None:
     """Return the contacts of a report and the limits that are required of them; None without both.
 
-    Parameters
-    ----------
-    diagram : Diagram
-        The diagram.
-    given : mapping, ContactTask or path, optional
-        The option of the report.
-    file : TomlFile, optional
-        The file of its requirements, which may have the tables.
-    asked : Requirements, optional
-        The requirements.
-
-    Raises
-    ------
-    OptionError, UnknownNameError
-        As `check_contacts`; contacts from two places; a file that asks for something that isn't there; limits of a
-        contact that the report does not have.
+    ``given`` is the option of the report; ``file``, that of its requirements, may have the tables in its place.
     """
     if file is not None and file.table(KEY):
         if given:
@@ -160,7 +246,7 @@ def read_contacts(
         given = ContactTask.read(file)
     if isinstance(given, str | os.PathLike):
         given = ContactTask.read(given)
-    own = {} if asked is None else dict(asked.contacts)
+    own = {} if required is None else dict(required.contacts)
     if isinstance(given, ContactTask):
         contacts = given.find(diagram)
         for name, limits in given.limits.items():
@@ -176,16 +262,18 @@ def read_contacts(
     return ReportedContacts(contacts, own) if contacts or own else None
 
 
+# --- the sections -----------------------------------------------------------------------------------------------------
+
+
 def contact_sections(reported: ReportedContacts) -> Section:
-    """Return the section on contacts, each in a section of its own."""
+    """Return the section on contacts, with a section for each."""
     parts = tuple(_contact(name, contact, reported) for name, contact in reported.contacts.items())
     return Section(KEY, "Contact with an environment", TEXTS.paragraphs("meaning"), sections=parts)
 
 
 def contacts_on_first_page(reported: ReportedContacts) -> Table:
     """Return the weakest limit of stiffness of each contact."""
-    columns = ("contact", "stable up to k_e", "with", "oscillates at", "first Re Y < 0 at")
-    return Table("Contacts: weakest limits of stiffness", columns, tuple(reported.weakest), digits=4)
+    return WEAKEST.fill(reported.weakest)
 
 
 def _place(vary: str, environment: Mapping[str, float]) -> str:
@@ -196,81 +284,64 @@ def _place(vary: str, environment: Mapping[str, float]) -> str:
 
 def _describe(environment: Mapping[str, float]) -> str:
     """Return the properties of an environment in words, empty without any."""
-    units = {"stiffness": "N/m", "damping": "N.s/m", "mass": "kg", "tool_mass": "kg"}
-    parts = (f"{WORDS[p]} = {environment[p]:g} {print_unit(units[p])}" for p in WORDS if p in environment)
-    return ", ".join(parts)
+    return ", ".join(f"{WORDS[p]} = {environment[p]:g} {print_unit(UNITS[p])}" for p in WORDS if p in environment)
 
 
 def _contact(name: str, contact: Contact, reported: ReportedContacts) -> Section:
-    numbers: dict[str, Number] = {}
     required = reported.limits_of(name)
     soft = contact.stability_limit("stiffness")
-    tables = [_passivity(contact, numbers), _stiffness(contact, soft, numbers), _masses(contact, numbers)]
-    tables += _required(contact, required, numbers)
-    reported.weakest.append(_find_weakest(name, required, numbers))
-    tried, said, refuted = _tried(contact, required, numbers)
+    sign = sign_of_admittance(contact.passivity(), lambda w: contact.admittance(w).rendered)
+    stiffness = _stiffness(contact, soft)
+    limits = list(_required(contact, required))
+    tables = [PASSIVITY.fill([sign]), STIFFNESS.fill(stiffness), MASSES.fill(_masses(contact))]
+    tables += [REQUIRED.fill(limits)] if limits else []
+    candidates = [*stiffness, *(row for row in limits if row["key"] == LIMITS["stiffness"])]
+    weakest = min(candidates, key=lambda row: row["limit"].value)
+    shown = {"frequency": "–"} | {fact: v for fact, v in weakest.items() if v is not None}
+    reported.weakest.append({**shown, "contact": name, "first": sign["first"]})
+    tried, remarks, refuted = _tried(contact, required)
     reported.refuted |= {f"{KEY}.{name}.{path}" for path in refuted}
     parts, seen = contact.parts, contact.passivity()
     text = TEXTS.paragraphs(
-        "place", port=f"{contact.plant}.{contact.ports.force}", measured=contact.measured, entry=contact.entry,
+        "place",
+        port=f"{contact.plant}.{contact.ports.force}",
+        measured=contact.measured,
+        entry=contact.entry,
         t=contact.point.t,
-        direction=", ".join(f"{v:.4g}" for v in contact.direction), derivation=str(contact.derivation),
-        sample_time=parts.sample_time, ticks=len(parts.ticks), caveat=f"{seen.caveat} {seen.port}",
-    )  # fmt: skip
+        direction=", ".join(f"{v:.4g}" for v in contact.direction),
+        derivation=str(contact.derivation),
+        sample_time=parts.sample_time,
+        ticks=len(parts.ticks),
+        caveat=f"{seen.caveat} {seen.port}",
+    )
     plots = (_admittance(name, contact), *_map(name, contact, soft))
-    return Section(name, f"Contact {name!r}", (*text, *said), (*tables, *tried), plots, numbers)
+    return Section(name, f"Contact {name!r}", (*text, *remarks), (*tables, *tried), plots)
 
 
-def sign_of_admittance(contact: Contact) -> tuple[Number, str, str, str]:
-    """Return the first frequency at which Re Y is negative, all such spans, and whether the loop alone is stable.
-
-    The number is confirmed by the sign of Re Y on its two sides.
-    """
-    p = contact.passivity()
-    known = f"Re Y ≥ 0 on the whole scan up to {p.scanned[1]:.6g} rad/s"
-    if math.isfinite(p.frequency):
-        below, above = contact.admittance([p.frequency * f for f in (1 - 1e-6, 1 + 1e-6)]).rendered.real
-        known = "sign of Re Y just below and just above"
-        if not below > 0 > above:
-            known = "Re Y changes its sign within rounding there"
-    error = p.tolerance * p.frequency if math.isfinite(p.frequency) else 0.0
-    spans = ", ".join(f"{low:.5g} … {high:.5g}" for low, high in p.intervals) or "none"
-    number = Number(p.frequency, "rad/s", error, known, findings=p.findings)
-    passive = None if p.port is None else p.port.passive
-    return number, spans, "yes" if p.stable else "no", {True: "yes", False: "no", None: "–"}[passive]
+def _row(found: ContactLimit, vary: str, environment: Mapping[str, float]) -> dict[str, Any]:
+    """Return the facts of a limit with the name of its environment, in dotted paths and in words."""
+    place, words = _place(vary, environment), _describe(environment) or ALONE
+    return {**limit_facts(found), "key": LIMITS[vary], "place": place, "environment": words}
 
 
-def _passivity(contact: Contact, numbers: dict[str, Number]) -> Table:
-    rows = (sign_of_admittance(contact),)
-    numbers["first_non_passive"] = rows[0][0]
-    return Table("Sign of Re Y(jω)", SIGN_COLUMNS, rows)
-
-
-def _stiffness(contact: Contact, soft: ContactLimit, numbers: dict[str, Number]) -> Table:
+def _stiffness(contact: Contact, soft: ContactLimit) -> list[dict[str, Any]]:
     rows = []
     for b in DAMPINGS:
         found = soft if b == 0.0 else contact.stability_limit("stiffness", damping=b)
-        again = found.second_look if math.isfinite(found.second_look) else None
-        rows.append((f"{b:g}", *_enter(found, "ke_limit", f"be_{b:g}", numbers), again))
-    columns = ("b_e [N·s/m]", "largest k_e", "oscillates at", "moves", "stable again", "from Re Y = 0 [N/m]")
-    return Table("Largest stiffness of the environment", columns, tuple(rows))
+        second = found.second_look if math.isfinite(found.second_look) else None
+        row = _row(found, "stiffness", {"damping": b} if b else {})
+        rows.append({**row, "damping": f"{b:g}", "second_look": second})
+    return rows
 
 
-def _masses(contact: Contact, numbers: dict[str, Number]) -> Table:
-    rows = []
-    kinds = {"mass": ("me_limit", "m_e")}
-    if contact.measured is not None and not contact.parts.tool.problem:
-        kinds["tool_mass"] = ("tool_mass_limit", "tool")
-    for vary, (key, symbol) in kinds.items():
+def _masses(contact: Contact) -> Iterator[dict[str, Any]]:
+    has_tool = contact.measured is not None and not contact.parts.tool.problem
+    for vary in ("mass", "tool_mass") if has_tool else ("mass",):
         found = contact.stability_limit(vary, stiffness=SPRING)
-        rows.append((symbol, *_enter(found, key, f"ke_{SPRING:g}", numbers)))
-    columns = ("mass", "largest", "oscillates at", "moves", "stable again")
-    return Table(f"Largest masses, on a spring of {SPRING:g} N/m", columns, tuple(rows))
+        yield {**_row(found, vary, {"stiffness": SPRING}), "mass": WORDS[vary]}
 
 
-def _required(contact: Contact, required: tuple[ContactLimits, ...], numbers: dict[str, Number]) -> list[Table]:
-    """Return the table of the limits that are required."""
-    rows = []
+def _required(contact: Contact, required: Sequence[ContactLimits]) -> Iterator[dict[str, Any]]:
     for one in required:
         for vary, limit in one.limits.items():
             if contact.parts.tool.problem and "tool_mass" in {vary, *one.environment}:
@@ -279,75 +350,30 @@ def _required(contact: Contact, required: tuple[ContactLimits, ...], numbers: di
             high = max([SCANNED[vary], *(BEYOND * end for end in ends)])
             environment: dict[str, Any] = dict(one.environment)
             found = contact.stability_limit(vary, high=high, **environment)
-            cells = _enter(found, LIMITS[vary], _place(vary, one.environment), numbers)
-            asked = f"{limit} {print_unit(found.unit)}"
-            rows.append((WORDS[vary], _describe(one.environment) or ALONE, asked, *cells))
-    columns = ("largest", "with", "required", "found", "oscillates at", "moves", "stable again")
-    return [Table("Limits that are required", columns, tuple(rows))] if rows else []
+            shown = {"property": WORDS[vary], "required": f"{limit} {print_unit(found.unit)}"}
+            yield {**_row(found, vary, one.environment), **shown}
 
 
-def _find_weakest(name: str, required: tuple[ContactLimits, ...], numbers: Mapping[str, Number]) -> tuple[Any, ...]:
-    """Return the row of a contact on the first page: its weakest limit of stiffness."""
-    key = LIMITS["stiffness"]
-    environments: list[Mapping[str, float]] = [*({"damping": b} for b in DAMPINGS), *(o.environment for o in required)]
-    words = {_place("stiffness", one): _describe(one) or ALONE for one in environments}
-    words[_place("stiffness", {})] = ALONE
-    places = [path.partition(".")[2] for path in numbers if path.startswith(f"{key}.")]
-    place = min(places, key=lambda p: numbers[f"{key}.{p}"].value)
-    frequency = numbers.get(f"{key}_frequency.{place}", "–")
-    return name, numbers[f"{key}.{place}"], words[place], frequency, numbers["first_non_passive"]
-
-
-def _enter(found: ContactLimit, key: str, place: str, numbers: dict[str, Number]) -> Iterator[Any]:
-    """Enter the numbers of a limit, and yield its cells: value, frequency, direction and changes beyond."""
-    numbers[f"{key}.{place}"] = found.number
-    yield found.number
-    frequency = None
-    if math.isfinite(found.frequency):
-        frequency = Number(found.frequency, "rad/s", 1e-6 * found.frequency, found.confirmed_by)
-        frequency = numbers[f"{key}_frequency.{place}"] = with_findings(frequency, found.findings)
-    yield frequency
-    yield "(" + ", ".join(f"{v:.3g}" for v in found.direction) + ")" if found.direction else ""
-    spans = [*found.restabilizes, None]
-    yield ", ".join(
-        f"from {low:.6g}" + (f" to {high:.6g}" if high is not None else "") + f" {found.unit}"
-        for low, high in zip(found.restabilizes[::2], spans[1::2], strict=False)
-    )
-
-
-def _tried(
-    contact: Contact, required: tuple[ContactLimits, ...], numbers: dict[str, Number]
-) -> tuple[list[Table], tuple[str, ...], list[str]]:
-    """Return the table of the limit that was tried in the nonlinear run, what is to be said of it, and what it refutes.
+def _tried(contact: Contact, required: Sequence[ContactLimits]) -> tuple[list[Table], tuple[str, ...], list[str]]:
+    """Return the table of the limit that was tried in the nonlinear run, remarks on it, and paths that it refutes.
 
     The first limit of stiffness that is required is tried, or that with a damper.
     """
     wanted = (dict(one.environment) for one in required if "stiffness" in one.limits)
     environment: dict[str, Any] = next(wanted, {"damping": TRIED_DAMPING})
-    place = _place("stiffness", environment)
+    place, words = _place("stiffness", environment), _describe(environment)
     limit = contact.stability_limit("stiffness", **environment)
     if not (math.isfinite(limit.value) and limit.value > 0.0):
-        return [], TEXTS.paragraphs("nothing_to_try", limit=limit.value, environment=_describe(environment)), []
+        return [], TEXTS.paragraphs("nothing_to_try", limit=limit.value, environment=words), []
     try:
         found = try_limit(contact, limit)
     except ConfirmationError as error:
         return [], TEXTS.paragraphs("refuted", message=str(error)), [f"{LIMITS['stiffness']}.{place}"]
     except LoopwrightError as error:
         return [], TEXTS.paragraphs("not_tried", message=str(error)), []
-    rows = []
-    for where, trial in zip(("below", "above"), found.trials, strict=True):
-        path = f"tried.ke_limit.{place}.{where}.growth_rate"
-        how = f"the nonlinear run with {found.method.value}, beside the linear loop's poles"
-        numbers[path] = Number(trial.measured, "1/s", found.within, how)
-        rows.append((
-            f"{trial.factor:g}", trial.value, numbers[path], float(f"{trial.predicted:.4g}"),
-            float(f"{trial.fastest:.2g}"),
-        ))  # fmt: skip
-    columns = ("of the limit", "k_e [N/m]", "growth rate, measured", "predicted [1/s]", "speeds up to [m/s]")
-    besides = f" with {_describe(environment)}" if environment else ""
-    title = f"Limit of stiffness{besides}, tried in the nonlinear run"
-    held = TEXTS.paragraphs("tried", method=found.method.value, tried=found.tried, limit=limit.value)
-    return [Table(title, columns, tuple(rows))], held, []
+    rows = ({**row, "place": place} for row in trial_facts(found, f"the nonlinear run with {found.method.value}"))
+    remarks = TEXTS.paragraphs("tried", method=found.method.value, tried=found.tried, limit=limit.value)
+    return [IN_RUNS.fill(rows, environment=f" with {words}" if words else "")], remarks, []
 
 
 def _admittance(name: str, contact: Contact) -> Plot:

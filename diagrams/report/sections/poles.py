@@ -8,7 +8,7 @@ import numpy as np
 
 from ...frequency import Number, order_key, with_findings
 from ..case import Case
-from ..pages import Section, Table, Texts
+from ..pages import Section, TableForm, Texts
 from ..stability import ON_THE_LIMIT, Stability, poles_in_s, scatter, stability_margin
 from ..variant import Variant, in_s
 from .subject import SUBJECT_TITLE
@@ -21,24 +21,33 @@ REAL = 1e-9
 """Size of an imaginary part, relative to the pole, up to which it is rounding."""
 
 
+POLES = TableForm(
+    "Poles",
+    {
+        "variant": "variant",
+        "poles": "count",
+        "stable": "stable",
+        "largest Re s": "slowest",
+        "smallest Re s [1/s]": "fastest",
+    },
+    {"slowest": "{key}.slowest"},
+)
+
+
 def closed_loops(case: Case) -> Section | None:
     """Return the table of each variant's slowest and fastest poles, all loops closed; None without any states."""
-    numbers: dict[str, Number] = {}
     rows = []
     for v in case.usable():
         s = in_s(v.model.poles, v.model.dt)
         if s.size:
-            slowest, fastest = float(np.max(s.real)), float(np.min(s.real))
-            number = Number(slowest, "1/s", scatter(v), "eigenvalues; tolerance by perturbing the matrix")
-            number = with_findings(number, v.model.findings_on_loops)
-            numbers[f"{v.key}.slowest"] = number
-            rows.append((v.title, len(s), Stability.of(v), number, fastest))
+            how = "eigenvalues; tolerance by perturbing the matrix"
+            slowest = with_findings(Number(float(np.max(s.real)), "1/s", scatter(v), how), v.model.findings_on_loops)
+            facts = {"count": len(s), "stable": Stability.of(v), "slowest": slowest, "fastest": float(np.min(s.real))}
+            rows.append({"variant": v.title, "key": v.key, **facts})
     if not rows:
         return None
-    columns = ("variant", "poles", "stable", "largest Re s", "smallest Re s [1/s]")
-    table = Table("Poles", columns, tuple(rows), TEXTS.line("closed_loop", limit=ON_THE_LIMIT))
     title = POLES_TITLE if case.loop_wires() else TEXTS.line("no_loop")
-    return Section("poles", title, (), (table,), (), numbers)
+    return Section("poles", title, (), (POLES.fill(rows, TEXTS.line("closed_loop", limit=ON_THE_LIMIT)),))
 
 
 def memory(case: Case) -> Section | None:
