@@ -144,14 +144,7 @@ def _reduced_side(case: Fig3Case, loops: ReducedLoops, side: str) -> Section:
         for suffix, of in loops.suffixed(side).items()
         for key, variant in each_implementation(of).items()
     ]
-    signs = (
-        {
-            **facts,
-            **contacts.sign_of_admittance(passivity(v), lambda w, v=v: rendered_admittance(v, w)),
-            "passive": None,
-        }
-        for facts, v in variants
-    )
+    signs = ({**facts, **_reduced_sign(v)} for facts, v in variants)
     environment, held = _held(loop.admittance)
     masses = (
         {**facts, "name": contacts.LIMITS[vary], "mass": contacts.WORDS[vary], "limit": found.number,
@@ -272,10 +265,7 @@ def _contact_side(case: Fig3Case, found: Mapping[Implementation, Contact], side:
     one = variants[0][1]
     a = one.filter
     assert a is not None  # _find_contacts looks
-    signs = (
-        {**facts, **contacts.sign_of_admittance(c.passivity(), lambda w, c=c: c.admittance(w).rendered)}
-        for facts, c in variants
-    )
+    signs = ({**facts, **contacts.contact_sign(c)} for facts, c in variants)
     stiffness = (
         {**facts, **_limit(c, "stiffness", damping=b), "damping": b} for facts, c in variants for b in contacts.DAMPINGS
     )
@@ -298,7 +288,7 @@ def _contact_side(case: Fig3Case, found: Mapping[Implementation, Contact], side:
     return _section(side, text, a, tables, _draw_admittances(side, w, curves, case.looks))
 
 
-def _limit(contact: Contact, vary: str, **environment: float) -> dict[str, Any]:
+def _limit(contact: Contact, vary: str, **environment: Any) -> dict[str, Any]:
     """Return the facts of a limit, with words where there is no direction and no change beyond."""
     facts = contacts.limit_facts(contact.stability_limit(vary, **environment))
     return {**facts, "direction": facts["direction"] or "–", "again": facts["again"] or "no"}

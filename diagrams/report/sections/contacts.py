@@ -112,6 +112,11 @@ def sign_of_admittance(p: Passivity, admittance: Callable[[np.ndarray], np.ndarr
     }
 
 
+def contact_sign(contact: Contact) -> dict[str, Any]:
+    """Return the facts of `SIGN` of a contact."""
+    return sign_of_admittance(contact.passivity(), lambda w: contact.admittance(w).rendered)
+
+
 def limit_facts(found: ContactLimit) -> dict[str, Any]:
     """Return the limit of a contact, its frequency, and what `FOUND` shows of it; texts are empty without a limit."""
     return {
@@ -290,7 +295,7 @@ def _describe(environment: Mapping[str, float]) -> str:
 def _contact(name: str, contact: Contact, reported: ReportedContacts) -> Section:
     required = reported.limits_of(name)
     soft = contact.stability_limit("stiffness")
-    sign = sign_of_admittance(contact.passivity(), lambda w: contact.admittance(w).rendered)
+    sign = contact_sign(contact)
     stiffness = _stiffness(contact, soft)
     limits = list(_required(contact, required))
     tables = [PASSIVITY.fill([sign]), STIFFNESS.fill(stiffness), MASSES.fill(_masses(contact))]
