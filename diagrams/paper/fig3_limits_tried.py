@@ -8,7 +8,7 @@ from typing import Any
 
 from ...blocks.core import ConfirmationError, LoopwrightError
 from ..frequency import Confirmation, Number
-from ..report import Implementation, Section, Table, Texts
+from ..report import Implementation, Section, TableForm, Texts
 from .compliance_loop import AdmittanceLoop
 from .coupled_stability import growth_rate
 from .fig3_admittance import not_shown
@@ -29,6 +29,18 @@ TRIED = (
     ("perp", "force_tracking.ke_limit", Implementation.SAMPLED, 10.0),
 )
 """Which limits are tried: direction, which of its limits, implementation, damping in N s/m."""
+
+GROWTH = TableForm(
+    "Growth",
+    {
+        "limit": "limit",
+        "share of it": "share",
+        "k_e [N/m]": "stiffness",
+        "growth rate, measured": "measured",
+        "predicted [1/s]": "predicted",
+    },
+    {"measured": "{path}.{where}.growth_rate"},
+)
 
 
 def is_tried(case: Fig3Case) -> bool:
@@ -52,8 +64,7 @@ def limits_tried(case: Fig3Case) -> Section:
         return Section("time_domain", TITLE, (*text, TEXTS.line("no_gantry")))
     if case.has_events:
         return Section("time_domain", TITLE, (*text, TEXTS.line("discrete_states")))
-    numbers: dict[str, Number] = {}
-    rows: list[tuple[Any, ...]] = []
+    rows: list[dict[str, Any]] = []
     for side, key, implementation, damping in TRIED:
         path = f"{side}.{key}.{implementation}.be_{damping:g}"
         if key not in loops.kinds(side):
@@ -67,15 +78,14 @@ def limits_tried(case: Fig3Case) -> Section:
         said = TEXTS.line("limit", along=side == "par", tracking="." in key, damping=damping, variant=title)
         try:
             for where, number, predicted in _tried(loop, limit, damping, path):
-                numbers[f"{path}.{where}.growth_rate"] = number
-                k = FACTORS[where] * limit.value
-                rows.append((said, FACTORS[where], k, number, predicted))
+                share = FACTORS[where]
+                facts = {"limit": said, "share": share, "stiffness": share * limit.value, "predicted": predicted}
+                rows.append({**facts, "measured": number, "path": path, "where": where})
         except ConfirmationError:
             raise
         except LoopwrightError as error:
             text.append(f"{path}: {error}")
-    columns = ("limit", "share of it", "k_e [N/m]", "growth rate, measured", "predicted [1/s]")
-    return Section("time_domain", TITLE, tuple(text), (Table("Growth", columns, tuple(rows)),), (), numbers)
+    return Section("time_domain", TITLE, tuple(text), (GROWTH.fill(rows),))
 
 
 def _tried(loop: AdmittanceLoop, limit: Number, damping: float, path: str) -> Iterator[tuple[str, Number, float]]:

@@ -31,7 +31,7 @@ from .pages import (
 )
 from .parts import MakesSections, ReportKind, ReportPart
 from .points import point_of
-from .sections.disks import disk_numbers, disk_range
+from .sections.loops import DISK_NUMBERS, disk_numbers, disk_range
 from .sections.not_modelled import LIMITS_TITLE
 from .sections.poles import POLES_TITLE, list_poles
 from .sections.subject import SUBJECT_TITLE
@@ -42,6 +42,7 @@ __all__ = [
     "ANY_DIAGRAM",
     "CLOSED_LOOPS",
     "DEFINITIONS",
+    "DISK_NUMBERS",
     "DOTTED",
     "INJECTION",
     "INNER_LOOPS",

@@ -12,7 +12,7 @@ from ...linearization import Linearization
 from ...measure import FrequencyResponse, frequency_response
 from .. import figures
 from ..case import Case, InjectionPlan
-from ..pages import Section, Table, Texts
+from ..pages import Section, TableForm, Texts
 from ..stability import Stability
 from ..variant import Implementation, Variant
 
@@ -24,11 +24,23 @@ REFUTED = 0.05
 """A relative deviation beyond which a linear model is wrong."""
 CONFIRMED = 1e-3
 
+INJECTED = TableForm(
+    "Injected against linearized",
+    {
+        "wire": "wire",
+        "variant": "variant",
+        "frequencies": "span",
+        "largest deviation": "deviation",
+        "uncertainty": "uncertainty",
+        f"within {CONFIRMED:g}": "confirmed",
+    },
+    {"deviation": "{loop}.{key}.deviation", "uncertainty": "{loop}.{key}.uncertainty"},
+)
+
 
 def injected(case: Case) -> Section | None:
     """Return the section that compares each sampled loop with its measured response."""
-    numbers: dict[str, Number] = {}
-    rows: list[tuple[Any, ...]] = []
+    rows: list[dict[str, Any]] = []
     text: list[str] = []
     plots = []
     taken, skipped = 0, list[str]()
@@ -69,20 +81,22 @@ def injected(case: Case) -> Section | None:
                 continue
             if worst - 10 * own > REFUTED:
                 text.append(TEXTS.line("refuted", variant=v.title, wire=wire, deviation=worst))
-            where = f"{key}.{v.key}"
             low, high = float(found.omega[0]), float(found.omega[-1])
             how = Confirmation(
                 f"{len(found.omega)} sines from {low:.4g} to {high:.4g} rad/s, amplitude {found.amplitude:g}",
                 "sines at these frequencies in the running co-simulation",
             )
-            numbers[f"{where}.deviation"] = Number(worst, "1", max(own, 1e-12), how)
-            numbers[f"{where}.uncertainty"] = Number(
-                own, "1", own, "the last windows, a second amplitude, and the movement of the operating point"
-            )
-            span = f"{low:.4g} … {high:.4g} rad/s"
-            shown = (numbers[f"{where}.{n}"] for n in ("deviation", "uncertainty"))
-            verdict = "yes" if worst <= CONFIRMED and own <= CONFIRMED else "no"
-            rows.append((wire, v.title, span, *shown, verdict))
+            windows = "the last windows, a second amplitude, and the movement of the operating point"
+            rows.append({
+                "wire": wire,
+                "variant": v.title,
+                "loop": key,
+                "key": v.key,
+                "span": f"{low:.4g} … {high:.4g} rad/s",
+                "deviation": Number(worst, "1", max(own, 1e-12), how),
+                "uncertainty": Number(own, "1", own, windows),
+                "confirmed": "yes" if worst <= CONFIRMED and own <= CONFIRMED else "no",
+            })  # fmt: skip
             measured[v.key] = _curve(v.title, found, L)
         if refused and not measured:
             skipped.append(wire)
@@ -98,9 +112,7 @@ def injected(case: Case) -> Section | None:
         count, samples = len(shortened.frequencies), shortened.samples
         text = [TEXTS.line("shortened", count=count, every=count + shortened.left_out, samples=samples), *text]
     text = [*TEXTS.paragraphs("measurement"), *text]
-    columns = ("wire", "variant", "frequencies", "largest deviation", "uncertainty", f"within {CONFIRMED:g}")
-    table = Table("Injected against linearized", columns, tuple(rows))
-    return Section("injection", "Injection check", tuple(text), (table,), tuple(plots), numbers)
+    return Section("injection", "Injection check", tuple(text), (INJECTED.fill(rows),), tuple(plots))
 
 
 def _moving(v: Variant) -> dict[str, Any]:

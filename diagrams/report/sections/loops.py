@@ -1,34 +1,39 @@
-"""Margins of the loops at the wires of a case: those with names that lie on loops, where nothing else is said."""
+"""Margins of the loops at the wires of a case: of one channel with the gang of four, and of several channels."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import fields
+import math
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
 from ....blocks.core import LoopwrightError
+from ....fmus.running import DerivativeMethod
 from ...frequency import (
     Comparison,
+    Confirmation,
+    DiskMargin,
     Margins,
     Number,
     PeriodicMargins,
     Realization,
     compare_margins,
     margins,
+    mimo_disk_margin,
     periodic_margins,
     with_findings,
 )
+from ...linearization import StepsOnly, linearize
+from ...wiring import CheckedDiagram
 from .. import figures
 from ..case import Case
-from ..pages import Section, Table, Texts
+from ..pages import Plot, Section, Table, Texts
 from ..variant import Cut, Variant, in_s
 from ..wires import blocks_on_loops
-from .disks import several
-from .gang import gang_of_four
 from .poles import list_poles
-from .uncertainty import LoopPart, cut_key, left_out, widened
 
 TEXTS = Texts(__package__, "loops")
 ROWS: Mapping[str, str] = {
@@ -47,6 +52,15 @@ ROWS: Mapping[str, str] = {
 }
 LOOPS_TITLE = "Loops"
 PERIODIC = frozenset(f.name for f in fields(PeriodicMargins))
+PEAKS = ("ms", "mt")
+"""The numbers that say how much an error of L is amplified."""
+LINEAR = 1e-3
+"""A difference between an FMU's step and its equations beyond which it is not the solver's: it moves as it steps."""
+NOTHING = 1e-12
+"""Size of a loop that is zero but for rounding."""
+POINTS = 400
+WHOLE = 1e-6
+"""Relative deviation of PS·CS from S·T below which the loop goes through both wires."""
 
 
 def inner(case: Case) -> Section | None:
@@ -223,3 +237,264 @@ def _crossings(found: Mapping[str, Margins], titles: Mapping[str, str]) -> Itera
 
 def _poles(poles: Iterable[complex], dt: float) -> str:
     return list_poles(in_s(list(poles), dt), dt)
+
+
+# --- tolerances, and reasons for no margins ---------------------------------------------------------------------------
+
+
+def left_out(case: Case, wire: str, on_cycles: Collection[str]) -> list[str]:
+    """Return why there are no margins at a wire."""
+    said: dict[str, None] = {}
+    for v in case.usable():
+        try:
+            L = v.loop(wire)
+            if _is_zero(L):
+                said |= dict.fromkeys([_zero(v, wire, on_cycles)])
+            else:
+                margins(L)
+        except LoopwrightError as error:
+            said |= dict.fromkeys([f"{wire}, {v.title}: {error.message}"])
+    return list(said)
+
+
+def _is_zero(L: Any) -> bool:
+    points = np.exp(1j * np.geomspace(1e-3, 3.0, 9)) if L.dt else 1j * np.geomspace(1e-3, 1e3, 9)
+    return all(bool(np.max(np.abs(_model_response(L, p)), initial=0.0) <= NOTHING) for p in points)
+
+
+def _zero(v: Variant, wire: str, on_cycles: Collection[str]) -> str:
+    names = v.diagram.names
+    block = names[wire].block if wire in names else wire.rpartition(".")[0]
+    if block not in on_cycles:
+        return TEXTS.line("off_loops", wire=wire)
+    steps = [str(finding) for finding in v.model.findings if isinstance(finding, StepsOnly)]
+    return TEXTS.line("slope_is_zero", wire=wire, steps=steps)
+
+
+@dataclass(frozen=True)
+class LoopPart:
+    """The section of a loop.
+
+    Attributes
+    ----------
+    section : Section
+        The section.
+    numbers : mapping of (Variant, Cut) to mapping of str to Number
+        Those of its numbers that come from each variant's loop, by path behind the key of `cut_key`.
+    """
+
+    section: Section
+    numbers: Mapping[tuple[Variant, Cut], Mapping[str, Number]]
+
+
+def cut_key(v: Variant, cut: Cut) -> str:
+    """Return the part of dotted paths of a variant's loop, such as ``sampled_d0`` or ``sampled_d0.periodic``."""
+    return f"{v.key}.{cut}" if cut else v.key
+
+
+def widened(wire: str, part: LoopPart) -> Section:
+    """Return the section of a loop with tolerances that know how far the linear models of its FMUs are right.
+
+    The error of a response is found at the frequencies of the section: by moving the model's entries by the
+    differences' own uncertainty, and by the equations held over a step in place of the step that the FMU's solver
+    makes, where it tells them.
+    """
+    changed: dict[int, Number] = {}
+    numbers, text = dict(part.section.numbers), list(part.section.text)
+    for (v, cut), own in part.numbers.items():
+        exact = all(derivation.is_exact for derivation in v.model.derivations.values())
+        if exact and not v.model.uncertainty:
+            continue
+        w = [n.value for n in own.values() if n.unit == "rad/s" and 0 < n.value < math.inf]
+        if not w:
+            continue
+        error, said = _relative_error(v, wire, cut, np.unique(w))
+        text += [f"{v.title}: {said}"] if said else []
+        peaks = [own[name].value for name in PEAKS if name in own and math.isfinite(own[name].value)]
+        slopes = 1.0 + 2.0 * max([1.0, *peaks])
+        for name, n in own.items():
+            more = _floor(n, error * slopes)
+            if more > n.tolerance:
+                why = Confirmation(n.confirmed_by).and_by(
+                    f"tolerance: its FMUs' linear models are right to {error:.1e} of L",
+                    "tolerance: from the error of its FMUs' linear models",
+                )
+                new = replace(n, tolerance=more, confirmed_by=why)
+                changed[id(n)] = numbers[f"{cut_key(v, cut)}.{name}"] = new
+    tables = tuple(_renewed(table, changed) for table in part.section.tables)
+    return replace(part.section, numbers=numbers, tables=tables, text=tuple(text))
+
+
+def _floor(n: Number, error: float) -> float:
+    """Return the error of a number that a relative error of L makes."""
+    if not math.isfinite(n.value) or n.value == 0.0:
+        return 0.0
+    if n.unit == "deg":
+        return math.degrees(error)
+    whole = n.unit == "1" and n.tolerance == 0.0  # counted
+    return 0.0 if whole else error * abs(n.value)
+
+
+def _relative_error(v: Variant, wire: str, cut: Cut, w: np.ndarray) -> tuple[float, str]:
+    """Return the largest relative error of L at frequencies, and the notes on it."""
+    L = v.loop(wire, cut=cut)
+    points = np.exp(1j * w * L.dt) if L.dt else 1j * w
+    nominal = [_model_response(L, p) for p in points]
+    sizes = [np.linalg.norm(n) or 1.0 for n in nominal]
+
+    def off(other: Any) -> float:
+        moved = [_model_response(other, p) for p in points]
+        return float(np.nanmax([np.linalg.norm(m - n) / s for m, n, s in zip(moved, nominal, sizes, strict=True)]))
+
+    rng = np.random.default_rng(0)
+    largest = max([1e-300, *(float(np.max(np.abs(M), initial=0.0)) for M in (L.A, L.B, L.C, L.D))])
+    relative = 0.0 if math.isnan(v.model.uncertainty) else v.model.uncertainty / largest  # tolerances are NaN already
+    error = 0.0
+    for _ in range(4):
+        error = max(error, off(_Moved(*(M * (1 + relative * rng.choice([-1, 1], M.shape)) for M in _matrices(L)))))
+    if not any(d.method is DerivativeMethod.STEP_DIFFERENCES for d in v.model.derivations.values()):
+        return error, ""
+    try:
+        held = cut.loop(linearize(v.diagram, v.point, plants="equations", stairs=v.stairs), wire)
+    except LoopwrightError:
+        return error, TEXTS.line("no_equations")
+    solver = off(held)
+    if solver > LINEAR:
+        return error, TEXTS.line("coarse_step", difference=solver)
+    return error + solver, ""
+
+
+class _Moved:
+    """A state-space model, no more than its matrices."""
+
+    def __init__(self, A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray):
+        self.A, self.B, self.C, self.D = A, B, C, D
+
+
+def _matrices(L: Any) -> tuple[np.ndarray, ...]:
+    return tuple(np.asarray(M, dtype=float) for M in (L.A, L.B, L.C, L.D))
+
+
+def _model_response(L: Any, p: complex) -> np.ndarray:
+    try:
+        return np.asarray(L.C @ np.linalg.solve(p * np.eye(len(L.A)) - L.A, L.B.astype(complex)) + L.D)
+    except np.linalg.LinAlgError:  # on a pole
+        return np.full(np.shape(L.D), np.nan + 0j)
+
+
+def _renewed(table: Table, changed: dict[int, Number]) -> Table:
+    return replace(table, rows=tuple(tuple(changed.get(id(cell), cell) for cell in row) for row in table.rows))
+
+
+# --- several channels -------------------------------------------------------------------------------------------------
+
+
+def several(case: Case, key: str, wire: str) -> LoopPart | None:
+    """Return the section about a wire with several entries: its MIMO disk margin; None where it has none."""
+    own: dict[tuple[Variant, Cut], Mapping[str, Number]] = {}
+    rows, notes = [], []
+    for v in case.usable():
+        try:
+            cut, title, L = v.fullest_loop(wire)
+            disk = mimo_disk_margin(L)
+        except LoopwrightError as error:
+            notes.append(f"{v.title}: {error.message}")
+            continue
+        own[v, cut] = disk_numbers(disk)
+        rows.append((title, disk.alpha, disk.frequency, disk_range(disk)))
+    if not rows:
+        return None
+    table = Table(
+        f"MIMO disk margin at {wire}", ("variant", "α", "at", "gains and phase of all entries at once"), tuple(rows)
+    )
+    numbers = {f"{cut_key(*at)}.{name}": number for at, mine in own.items() for name, number in mine.items()}
+    return LoopPart(Section(key, f"Loops at {wire}", tuple(notes), (table,), (), numbers), own)
+
+
+DISK_NUMBERS = ("disk_margin", "frequency", "gain_low", "gain_high", "phase_deg")
+"""Numbers of a disk margin, by the ends of their paths."""
+
+
+def disk_numbers(disk: DiskMargin) -> dict[str, Number]:
+    """Return the numbers of a disk margin by the ends of their paths."""
+    how = disk.alpha.confirmed_by
+    found = {
+        "disk_margin": disk.alpha,
+        "frequency": disk.frequency,
+        "gain_low": Number(disk.gain_low, "1", disk.alpha.tolerance, how),
+        "gain_high": Number(disk.gain_high, "1", disk.alpha.tolerance * disk.gain_high**2, how),
+        "phase_deg": Number(disk.phase_deg, "deg", 60 * disk.alpha.tolerance, how),
+    }
+    return with_findings(found, disk.findings)
+
+
+def disk_range(disk: DiskMargin) -> str:
+    """Return the gains and the phase that a disk allows, as text."""
+    return f"{disk.gain_low:.4g} … {disk.gain_high:.4g}, ± {disk.phase_deg:.4g}°"
+
+
+# --- the gang of four -------------------------------------------------------------------------------------------------
+
+
+def gang_of_four(case: Case, key: str, wire: str) -> tuple[Plot, ...]:
+    """Return the figure of the responses PS and CS, which S and T leave open; none where no other wire cuts the loop.
+
+    P leads from the wire to the nearest named one downstream that the whole loop goes through, C back from there.
+    """
+    for other in wires_downstream(case.diagram, wire):
+        curves = {}
+        for v in case.usable():
+            if v.is_design or v.is_actual:
+                try:
+                    found = _gang_responses(v, wire, other)
+                except LoopwrightError:
+                    continue
+                if found is None:
+                    break  # the wires are those of all variants
+                curves[v.key] = (v.title, *found)
+        if curves:
+            return (figures.gang(f"inner_{key}_gang", curves, wire, other, case.axes, case.looks),)
+    return ()
+
+
+def wires_downstream(diagram: CheckedDiagram, wire: str) -> Iterator[str]:
+    """Yield the named scalar wires downstream of a wire on its loops, the nearest first."""
+    names, table = diagram.names, diagram.structure
+    if wire not in names:
+        return
+    inside = blocks_on_loops(diagram)
+    sources = {(w.block, w.port, str(w.index)): name for name, w in names.items() if name != wire}
+    start = names[wire]
+    known: Mapping[tuple[str, str], Any] = diagram.checked.shapes
+    waiting, seen = deque([(start.block, start.port)]), {start.block}
+    while waiting:
+        at, port = waiting.popleft()
+        for (block, _), w in table.wires.items():
+            if w.block != at or block in seen or block not in inside or (at == start.block and w.port != port):
+                continue
+            seen.add(block)
+            yield from sorted(
+                name for (b, p, i), name in sources.items() if b == block and i == "None" and known[b, p] == ()
+            )
+            waiting.append((block, ""))
+
+
+def _gang_responses(v: Variant, wire: str, other: str) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Return frequencies in rad/s, and the responses from a disturbance at the wire to the other, and back.
+
+    None where the loop does not go through the other wire alone: PS·CS is not S·T then.
+    """
+    model = linearize(v.diagram, v.point, inputs=[wire, other], outputs=[wire, other], stairs=v.stairs)
+    s = np.abs(in_s(model.poles, model.dt))
+    s = s[s > 1e-6 * max(1e-300, float(np.max(s, initial=0.0)))]
+    top = 0.999 * np.pi / model.dt if model.dt else 30 * float(np.max(s, initial=1.0))
+    low = min(float(np.min(s, initial=1.0)) / 10, top / 100)
+    w = np.geomspace(max(low, top / 1e6), top, POINTS)
+    points = np.exp(1j * w * model.dt) if model.dt else 1j * w
+    eye = np.eye(len(model.A))
+    G = np.array([model.C @ np.linalg.solve(p * eye - model.A, model.B.astype(complex)) + model.D for p in points])
+    L = figures.response(v.loop(wire), w)
+    both, expected = np.abs(G[:, 1, 0] * G[:, 0, 1]), np.abs(L / (1 + L) ** 2)
+    if np.max(np.abs(both - expected)) > WHOLE * np.max(expected):
+        return None
+    return w, np.abs(G[:, 1, 0]), np.abs(G[:, 0, 1])

@@ -14,7 +14,7 @@ from ...frequency import Number
 from ...results import PointOrigin
 from ...wiring import Wire
 from ..case import Case
-from ..pages import Section, Table, Texts, plain
+from ..pages import Section, Table, TableForm, Texts, plain
 from ..variant import AT_REST, Variant
 
 TEXTS = Texts(__package__, "subject")
@@ -29,6 +29,19 @@ FEW = 4
 """Entries up to which a parameter is shown with nine digits, else with six."""
 SUBJECT_TITLE = "What was analysed"
 PACKAGES = ("loopwright", "numpy", "scipy", "casadi", "control", "fmpy", "matplotlib")
+
+OPERATING_POINTS = TableForm(
+    "Operating points",
+    {
+        "variant": "variant",
+        "t": "t",
+        "how": "how",
+        "residual": "residual",
+        "largest of": "largest",
+        "derivative of FMUs": "plants",
+    },
+    {"t": "{key}.t", "residual": "{key}.residual", "affine": "{key}.affine"},
+)
 
 
 def versions() -> dict[str, str]:
@@ -165,26 +178,28 @@ def _plant(path: str, block: Fmu) -> tuple[Any, ...]:
 
 def operating_points(case: Case) -> Section:
     """Return the section about where the linear models were made."""
-    numbers: dict[str, Number] = {}
     rows, notes = [], []
     for v in case.usable():
         point, model = v.point, v.model
         how = CONFIRMED.get(point.how, str(point.how))
-        numbers[f"{v.key}.t"] = Number(point.t, "s", 0.0, "given", given=True)
-        numbers[f"{v.key}.residual"] = Number(point.residual, "1", 1e-15, how)
         worst = float(np.max(np.abs(model.affine), initial=0.0))
-        numbers[f"{v.key}.affine"] = Number(worst, "1", 1e-12 * (1 + worst), "the linear model's affine term")
-        plants = "; ".join(f"{p}: {h}" for p, h in model.how.items())
-        rows.append((v.title, numbers[f"{v.key}.t"], point.how, numbers[f"{v.key}.residual"], point.largest, plants))
+        rows.append({
+            "variant": v.title,
+            "key": v.key,
+            "t": Number(point.t, "s", 0.0, "given", given=True),
+            "how": point.how,
+            "residual": Number(point.residual, "1", 1e-15, how),
+            "largest": point.largest,
+            "affine": Number(worst, "1", 1e-12 * (1 + worst), "the linear model's affine term"),
+            "plants": "; ".join(f"{p}: {h}" for p, h in model.how.items()),
+        })  # fmt: skip
         if not point.residual < AT_REST:
             notes.append(_moving(v))
         hidden = [p for p, b in v.diagram.blocks.items() if isinstance(b, Fmu) and not b.description.states]
         if hidden:
             notes.append(TEXTS.line("hidden_states", variant=v.title, plants=sorted(hidden)))
         notes += [f"{v.title}: {finding}" for finding in model.findings]
-    tables = [
-        Table("Operating points", ("variant", "t", "how", "residual", "largest of", "derivative of FMUs"), tuple(rows))
-    ]
+    tables = [OPERATING_POINTS.fill(rows)]
     first = next(case.usable(), None)
     if first is not None:
         values = [
@@ -195,7 +210,7 @@ def operating_points(case: Case) -> Section:
         named = f"Named wires there ({first.title})"
         tables.append(Table(named, ("wire", "value"), tuple(values), details=True))
     text = (*TEXTS.paragraphs("operating_points"), *notes)
-    return Section("operating_points", "Operating points", text, tuple(tables), (), numbers)
+    return Section("operating_points", "Operating points", text, tuple(tables))
 
 
 def _moving(v: Variant) -> str:

@@ -15,7 +15,7 @@ from loopwright.diagrams.report.pages import Judged
 from loopwright.diagrams.report.pages.definitions import definition
 from loopwright.diagrams.report.pages.html import to_html
 from loopwright.diagrams.report.pages.svg import embedded
-from loopwright.diagrams.report.sections.gang import gang_of_four
+from loopwright.diagrams.report.sections.loops import gang_of_four
 from loopwright.diagrams.results import BLUE
 from tests.support import reviewed
 
