@@ -6,21 +6,27 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
+from ...blocks import Reference
 from ...blocks.core import ConfirmationError, LoopwrightError
+from ...fmus import Fmu
+from ...fmus.models import gantry
+from ..contact import SIDES, ContactTrial, PortNames, make_contact, try_limit
+from ..diagram import Diagram
 from ..frequency import Confirmation, Number
 from ..report import Implementation, Section, TableForm, Texts
 from .compliance_loop import AdmittanceLoop
-from .coupled_stability import growth_rate
 from .fig3_admittance import not_shown
 from .fig3_case import Fig3Case
-from .moored_gantry import deviation, measured_growth, moored_diagram
 from .reduced_loops import FRICTION, ReducedLoops, each_implementation
+from .wires import Channel, Rig, wire
 
 TEXTS = Texts(__package__, "limits_tried")
 TITLE = "Limits tried in time domain"
 FACTORS = {"below": 0.97, "above": 1.03}
-START, SPAN, WINDOW = 3.5, 1.0, 1.0  # s: when the growth is taken, over what, in windows of which length
-WITHIN = 0.01  # 1/s: the growth factor over 1 s is then within 1 %
+WITHIN = 0.01
+"""Largest difference of growth rates in 1/s: the growth factor over 1 s is then within 1 %."""
+SAME = 1e-6
+"""Relative difference of the limits of a loop and of its gantry's contact, above which they are two."""
 TRIED = (
     ("perp", "ke_limit", Implementation.SAMPLED, 10.0),
     ("perp", "ke_limit", Implementation.DELAYED, 0.0),
@@ -59,7 +65,7 @@ def limits_tried(case: Fig3Case) -> Section:
     loops = case.reduced
     if not isinstance(loops, ReducedLoops):
         return Section("time_domain", TITLE, not_shown(case))
-    text = [*TEXTS.paragraphs("pushed", below=FACTORS["below"], above=FACTORS["above"], span=SPAN)]
+    text = [*TEXTS.paragraphs("pushed", below=FACTORS["below"], above=FACTORS["above"])]
     if case.plant_model is None:
         return Section("time_domain", TITLE, (*text, TEXTS.line("no_gantry")))
     if case.has_events:
@@ -77,9 +83,8 @@ def limits_tried(case: Fig3Case) -> Section:
         title = case.variants[variant].title if variant in case.variants else variant
         said = TEXTS.line("limit", along=side == "par", tracking="." in key, damping=damping, variant=title)
         try:
-            for where, number, predicted in _tried(loop, limit, damping, path):
-                share = FACTORS[where]
-                facts = {"limit": said, "share": share, "stiffness": share * limit.value, "predicted": predicted}
+            for where, number, trial in _tried(loop, limit, damping, path):
+                facts = {"limit": said, "share": trial.factor, "stiffness": trial.value, "predicted": trial.predicted}
                 rows.append({**facts, "measured": number, "path": path, "where": where})
         except ConfirmationError:
             raise
@@ -88,22 +93,40 @@ def limits_tried(case: Fig3Case) -> Section:
     return Section("time_domain", TITLE, tuple(text), (GROWTH.fill(rows),))
 
 
-def _tried(loop: AdmittanceLoop, limit: Number, damping: float, path: str) -> Iterator[tuple[str, Number, float]]:
-    for where, factor in FACTORS.items():
-        stiffness = factor * limit.value
-        predicted = float(growth_rate(loop, stiffness=stiffness, damping=damping))
-        run = moored_diagram(loop, 1e-5, stiffness=stiffness, damping=damping).simulate(
-            START + SPAN + WINDOW, progress=False, record=["plant.position"], states=False
+def _tried(
+    loop: AdmittanceLoop, limit: Number, damping: float, path: str
+) -> Iterator[tuple[str, Number, ContactTrial]]:
+    contact = make_contact(_gantry_diagram(loop), PortNames("plant.external_force"), loop.side, None, {})
+    found = contact.stability_limit("stiffness", damping=damping)
+    if not abs(found.value - limit.value) <= SAME * limit.value:
+        raise ConfirmationError(
+            f"found a limit of {limit.value:.9g} N/m, and {found.value:.9g} N/m of the contact with the gantry itself; "
+            "expected the same.",
+            block=path,
         )
-        measured = measured_growth(deviation(loop, run), loop.sample_time, START, SPAN, WINDOW)
-        if not abs(measured - predicted) < WITHIN or (measured < 0) is not (predicted < 0):
+    for where, trial in zip(FACTORS, try_limit(contact, found).trials, strict=True):
+        if not abs(trial.measured - trial.predicted) < WITHIN:
             raise ConfirmationError(
-                f"found a growth rate of {measured:.5g} 1/s in the co-simulation at {factor:g} of the limit "
-                f"{limit.value:.6g} N/m, predicted {predicted:.5g} 1/s; expected them within {WITHIN:g} 1/s.",
+                f"found a growth rate of {trial.measured:.5g} 1/s in the co-simulation at {trial.factor:g} of the "
+                f"limit {limit.value:.6g} N/m, predicted {trial.predicted:.5g} 1/s; expected them within {WITHIN:g} "
+                "1/s.",
                 block=path,
             )
         how = Confirmation(
-            f"σ = {predicted:.6g} 1/s predicted by the eigenvalues of the reduced loop",
+            f"σ = {trial.predicted:.6g} 1/s predicted by the eigenvalues of the reduced loop",
             "the prediction by the eigenvalues of the reduced loop",
         )
-        yield where, Number(measured, "1/s", WITHIN, how), predicted
+        yield where, Number(trial.measured, "1/s", WITHIN, how), trial
+
+
+def _gantry_diagram(loop: AdmittanceLoop) -> Diagram:
+    """Return Fig. 3 with the parameters of a loop, around the FMU of its gantry at rest."""
+    robot = loop.true_plant
+    start = {name: getattr(robot, name) for name in robot.parameter_specs if not name.startswith("start_")}
+    start["position"] = loop.path.to_plane(loop.eta, loop.xi)
+    references = (Reference(loop.eta, unit="m", name="eta_d"), Reference(loop.xi, unit="m", name="xi_d"))
+    channels = [Channel(reference, loop.filters[side]) for reference, side in zip(references, SIDES, strict=True)]
+    rig = Rig(tool_mass=loop.tool_mass, delay=loop.delay, sample_time=loop.sample_time, admittance_method=loop.method)
+    plant = Fmu(gantry.build(), name="plant", start=start)
+    made = Diagram("tried", wire(plant, loop.path, *channels, model=loop.model, rig=rig))
+    return made.replace({f"controller.pid_{side}": pid.replace(name=f"pid_{side}") for side, pid in loop.pids.items()})
