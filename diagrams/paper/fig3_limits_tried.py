@@ -55,13 +55,7 @@ def is_tried(case: Fig3Case) -> bool:
 
 
 def limits_tried(case: Fig3Case) -> Section:
-    """Return the section in which the nonlinear co-simulation is run on both sides of limits.
-
-    Raises
-    ------
-    ConfirmationError
-        If the co-simulation does not grow as predicted.
-    """
+    """Return the section in which the nonlinear co-simulation is run on both sides of limits."""
     loops = case.reduced
     if not isinstance(loops, ReducedLoops):
         return Section("time_domain", TITLE, not_shown(case))

@@ -61,26 +61,7 @@ class ReducedLoops:
     def of(
         cls, base: WiredDiagram, smooth: WiredDiagram | None, plant: Gantry | None, path: Path, point: OperatingPoint
     ) -> ReducedLoops:
-        """Return the loops of a diagram.
-
-        Parameters
-        ----------
-        base : WiredDiagram
-            The diagram at rest.
-        smooth : WiredDiagram, optional
-            The diagram without its friction, where it has some.
-        plant : Gantry, optional
-            The model that the plant is shown to be, where the controller inverts another one.
-        path : Path
-            The path that is followed.
-        point : OperatingPoint
-            Where.
-
-        Raises
-        ------
-        ParameterError
-            If the plant is not shown to be the reduced model.
-        """
+        """Return the loops of a diagram."""
         coordinates = (point.values[f"controller.transverse_transform.{name}"] for name in ("eta", "xi"))
         eta, xi = (float(np.ravel(value)[0]) for value in coordinates)
         period = path.length if path.period is not None else None

@@ -54,13 +54,7 @@ ANY_DIAGRAM = ReportKind(
 
 
 def check_workers(given: int | None, written: bool) -> int:
-    """Return the number of processes that make the sections of a report.
-
-    Raises
-    ------
-    OptionError
-        If it is no whole number from 1 on.
-    """
+    """Return the number of processes that make the sections of a report."""
     if given is None:
         return min(processors(), 2) if written else 1
     if isinstance(given, bool) or not isinstance(given, int) or given < 1:

@@ -120,13 +120,7 @@ class ReportKind(Generic[C]):
         return tuple(dict.fromkeys(part.key for part in self.parts))
 
     def check_keys(self, keys: Iterable[str]) -> None:
-        """Refuse keys of sections that it doesn't have.
-
-        Raises
-        ------
-        OptionError
-            An unknown section.
-        """
+        """Refuse keys of sections that it doesn't have."""
         for key in keys:
             if key not in self.keys:
                 raise OptionError(f"there is no section {key!r}; expected some of {', '.join(self.keys)}.", port="only")
@@ -149,25 +143,8 @@ class ReportKind(Generic[C]):
     ) -> tuple[Case, tuple[Section, ...]]:
         """Return the case of a diagram, and its sections.
 
-        Parameters
-        ----------
-        diagram, point, experiment, wires, stairs
-            As `Case` takes them.
-        only : iterable of str, optional
-            Keys of the sections that are made; all without it.
-        requirements : Requirements, optional
-            Requirements on the design, which decide on the variants and steps that are tried.
-        axes : AxisUnits
-            Units of the axes of frequency responses.
-        measured : collection of str
-            Wires of loops that were measured, on which there may be requirements, too.
-        tell : callable
-            Told "variants" before the case is made, and the key of each section before it is made; of the injection
-            check each measurement, too.
-        workers : int
-            With two, a second process makes sections of a diagram with FMUs, from the last one on.
-        drawn : bool
-            Whether that process draws the figures of its sections at once.
+        ``tell`` gets the key of each section before it is made. With two workers, a second process makes sections of a
+        diagram with FMUs, from the last one on; where they are ``drawn``, it draws their figures, too.
         """
         tell("variants")
         wanted = set(self.keys if only is None else only)

@@ -19,15 +19,8 @@ STEP = Fraction(1, 1000)
 def point_of(diagram: WiredDiagram, where: Any, source: WiredDiagram | None = None) -> OperatingPoint:
     """Return the operating point of a variant.
 
-    Parameters
-    ----------
-    diagram : Diagram
-        The variant.
-    where : OperatingPoint, Snapshot or float, optional
-        A time to which the variant itself is run; or a point of the diagram that it is a variant of. One that a run has
-        reached is run to anew; one that was found or given is taken over by the names of its states.
-    source : Diagram, optional
-        The diagram of a point that is taken over.
+    The variant is run to a time in s, or to that of a point which a run has reached. A point that was found or given is
+    taken over by the names of its states; ``source`` is its diagram.
     """
     options: dict[str, Any] = {}
     if diagram.has_fmu and not diagram.has_clock:

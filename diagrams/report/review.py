@@ -45,13 +45,7 @@ HAS_NONE = (
 
 
 def check_names(case: Case, asked: Requirements, measured: Collection[str] = ()) -> None:
-    """Refuse names in requirements that the diagram does not have.
-
-    Raises
-    ------
-    UnknownNameError
-        A loop, a variant or a wire that isn't there.
-    """
+    """Refuse names in requirements that the diagram does not have."""
     wires = case.loop_wires()
     known = {*wires, *wires.values(), *case.extra_loops(), *measured}
     for name in asked.loops:
@@ -90,23 +84,7 @@ def review(
     worst_case: ReportedWorstCase | MissingWorstCase | None = None,
     contacts: ReportedContacts | None = None,
 ) -> Review:
-    """Return the verdicts on requirements.
-
-    Parameters
-    ----------
-    case : Case
-        The diagram with its variants.
-    asked : Requirements
-        The requirements.
-    numbers : mapping of str to Number
-        All numbers of the report by their dotted paths.
-    measured : sequence of MeasuredLoop
-        Loops that were measured; limits of their margins hold for the measured ones, too.
-    worst_case : ReportedWorstCase or MissingWorstCase, optional
-        The worst case of the report.
-    contacts : ReportedContacts, optional
-        Its contacts, with the limits that are required of them.
-    """
+    """Return the verdicts on requirements."""
     felt = () if contacts is None else contacts.results(numbers)
     outcomes = {} if worst_case is None else worst_case.outcomes()
     searched = () if worst_case is None else worst_case.results()

@@ -167,15 +167,7 @@ class Variant:
         return tuple(model.states[i] for i in moving)
 
     def with_parameters(self, changes: Mapping[str, Any], where: Any = ...) -> Variant:
-        """Return the variant with other parameters, at its own operating point, or at another one.
-
-        Parameters
-        ----------
-        changes : mapping
-            As `WiredDiagram.replace` takes them.
-        where : OperatingPoint, Snapshot or float, optional
-            The other point.
-        """
+        """Return the variant with other parameters, at its own operating point, or at another one."""
         return Variant(
             self.key,
             self.title,

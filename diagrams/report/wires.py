@@ -14,13 +14,8 @@ MOST = 4
 def wires_on_loops(diagram: CheckedDiagram, wires: Sequence[str] | None = None) -> dict[str, str]:
     """Return the wires at which loops are looked at, by their keys in a report.
 
-    Parameters
-    ----------
-    diagram : CheckedDiagram
-        The diagram.
-    wires : sequence of str, optional
-        The wires, where they were chosen. Without it, all that have names and lie on loops; where none has a name, the
-        inputs of FMUs on loops, or else outputs of blocks on loops.
+    Without a choice these are all that have names and lie on loops; where none has a name, the inputs of FMUs on loops,
+    or else outputs of blocks on loops.
     """
     if wires is not None:
         return {_key(name): name for name in wires}

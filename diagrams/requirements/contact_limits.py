@@ -74,25 +74,13 @@ def _read_environment(given: Any, limits: Mapping[str, Limit], port: str) -> dic
 
 
 def read_contact_limits(given: Any, port: str = "contact") -> tuple[ContactLimits, ...]:
-    """Return limits that are given as one mapping, or as a list of them for several environments.
-
-    Raises
-    ------
-    OptionError
-        As `ContactLimits`.
-    """
+    """Return limits that are given as one mapping, or as a list of them for several environments."""
     every = given if isinstance(given, list | tuple) else [given]
     return tuple(one if isinstance(one, ContactLimits) else ContactLimits(one, port) for one in every)
 
 
 def read_contacts(given: Any) -> dict[str, tuple[ContactLimits, ...]]:
-    """Return limits by the names of contacts; those of all contacts have the name "".
-
-    Raises
-    ------
-    OptionError
-        As `ContactLimits`.
-    """
+    """Return limits by the names of contacts; those of all contacts have the name ""."""
     if given is None:
         return {}
     if not isinstance(given, Mapping):

@@ -116,24 +116,7 @@ STEP_SENSES: Mapping[str, Sense] = MappingProxyType(
 
 
 def make_limit(name: str, given: Any, sense: Sense | None, port: str = "") -> Limit:
-    """Return a limit as a range.
-
-    Parameters
-    ----------
-    name : str
-        Name of the number.
-    given : float or (float, float)
-        One number, which is the least or the most by ``sense``; or both ends, infinite where there is none.
-    sense : Sense or None
-        Meaning of one number; None where both ends are needed.
-    port : str
-        Place of the limit, for errors.
-
-    Raises
-    ------
-    OptionError
-        Neither a number nor two in ascending order.
-    """
+    """Return a limit as a range; without a ``sense`` both ends have to be given."""
     where = port or name
     expected = "two numbers, low and high" if sense is None else f"a number ({sense}), or two: low and high"
     ends = given if isinstance(given, tuple | list) else (given,)

@@ -43,20 +43,7 @@ class TomlFile:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str], port: str) -> Self:
-        """Return a file's content.
-
-        Parameters
-        ----------
-        path : path
-            The file.
-        port : str
-            The option that named it, for errors.
-
-        Raises
-        ------
-        OptionError
-            A file that isn't there or isn't TOML.
-        """
+        """Return a file's content."""
         file = Path(path).expanduser()
         try:
             text = file.read_text(encoding="utf-8-sig")  # some editors put a mark of the byte order first
@@ -78,13 +65,7 @@ class TomlFile:
         return self.error(error.message, ".".join(part for part in (key, error.port) if part))
 
     def table(self, name: str) -> Mapping[str, Any]:
-        """Return a table, empty where the file has none.
-
-        Raises
-        ------
-        OptionError
-            If there is something else by its name.
-        """
+        """Return a table, empty where the file has none."""
         found: Any = self.content
         for part in name.split("."):
             found = found.get(part, {}) if isinstance(found, Mapping) else found
@@ -93,13 +74,7 @@ class TomlFile:
         return found
 
     def check_keys(self, table: str, known: tuple[str, ...]) -> None:
-        """Refuse entries of a table that it does not have.
-
-        Raises
-        ------
-        OptionError
-            An unknown name.
-        """
+        """Refuse entries of a table that it does not have."""
         for key in self.table(table):
             if key not in known:
                 raise self.error(f"[{table}] has no {key!r}. {near(key, known)}", f"{table}.{key}")
@@ -122,30 +97,7 @@ class TomlFile:
 
 
 def read_requirements(path: str | os.PathLike[str] | TomlFile) -> Requirements:
-    """Return the requirements that a TOML file has; its names are those of `Requirements`.
-
-    Parameters
-    ----------
-    path : path or TomlFile
-        File such as this one::
-
-            phase_margin_deg = 45
-            bandwidth = [50, 200]
-            variants = ["sampled_d1"]
-
-            [step]
-            overshoot = 0.3
-
-            [loops.u]
-            ms = 1.6
-
-        Tables of studies beside them, such as ``[worst_case]``, are those of the report.
-
-    Raises
-    ------
-    OptionError
-        A file that isn't there or isn't TOML; an unknown name; a limit that is none.
-    """
+    """Return the requirements that a TOML file has; its names are those of `Requirements`."""
     file = path if isinstance(path, TomlFile) else TomlFile.read(path, "requirements")
     given = {key: value for key, value in file.content.items() if key not in STUDIES}
     try:

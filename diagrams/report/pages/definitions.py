@@ -12,13 +12,7 @@ LOOP_TERMS = frozenset({"phase_margin_deg", "gain_margin_low", "gain_margin_high
 
 
 def read_definitions(package: str) -> Mapping[str, str]:
-    """Return the definitions that a package has in its file ``definitions.toml``, by term.
-
-    Parameters
-    ----------
-    package : str
-        Import name of the package, such as ``__package__``.
-    """
+    """Return the definitions that a package has in its file ``definitions.toml``, by term."""
     text = files(package).joinpath("definitions.toml").read_text(encoding="utf-8")
     return MappingProxyType({term: str(said) for term, said in tomllib.loads(text).items()})
 
@@ -32,13 +26,6 @@ def definition(path: str, more: Mapping[str, str] = MappingProxyType({})) -> tup
 
     A term stands for the names that go on behind it, too: ``gain_crossover`` for ``gain_crossover_1``. A term of two
     parts, such as ``gain_crossover.phase_margin_deg``, comes before those of one.
-
-    Parameters
-    ----------
-    path : str
-        Dotted path of the number.
-    more : mapping, optional
-        Further definitions, which come first.
     """
     parts = path.split(".")
     if (

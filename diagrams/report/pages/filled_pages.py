@@ -58,15 +58,6 @@ def fill_pages(html: str, lay_out: Any, canvas: Any) -> str:
 
     A figure that just misses the end of a sheet is set smaller, by `LEAST` at most; a table of more than `ROWS` rows
     that leaves much of a sheet empty may go over to the next one, where its head stands again.
-
-    Parameters
-    ----------
-    html : str
-        The page.
-    lay_out : callable
-        Lays a page out: returns a book of plutoprint.
-    canvas : type
-        plutoprint's ImageCanvas.
     """
     places = list(_PLACE.finditer(html))
     if not places:

@@ -20,11 +20,6 @@ def to_json(report: Document) -> str:
 
     Every leaf is ``{"value", "unit", "tolerance", "confirmed_by"}``. JSON has no infinity: it is the text "inf" or
     "-inf", which ``float()`` reads; what does not exist (NaN) is null.
-
-    Raises
-    ------
-    DefinitionError
-        A path that is a number and the beginning of another one's path as well.
     """
     tree: dict[str, Any] = {"meta": _plain(report.meta)}
     if report.review is not None:

@@ -11,13 +11,7 @@ from .filled_pages import fill_pages
 
 
 def printer() -> Any:
-    """Return the library that lays pages out.
-
-    Raises
-    ------
-    OptionError
-        It is not installed.
-    """
+    """Return the library that lays pages out."""
     try:
         import plutoprint
     except ImportError as error:
@@ -33,34 +27,13 @@ PAPERS = ("A4", "letter")
 
 
 def check_paper(paper: str) -> None:
-    """Refuse an unknown size of paper.
-
-    Raises
-    ------
-    OptionError
-        It is none of the known ones.
-    """
+    """Refuse an unknown size of paper."""
     if paper not in PAPERS:
         raise OptionError(f"found {paper!r}; expected one of {', '.join(PAPERS)}. Choose one of them.", port="paper")
 
 
 def write_pdf(html: str, path: str | os.PathLike[str], paper: str = "A4") -> int:
-    """Write a page as PDF; return the number of its pages.
-
-    Parameters
-    ----------
-    html : str
-        The report's page.
-    path : path
-        The file.
-    paper : {"A4", "letter"}
-        Size of the paper.
-
-    Raises
-    ------
-    OptionError
-        Another paper, or no library for PDF.
-    """
+    """Write a page as PDF; return the number of its pages."""
     check_paper(paper)
     library = printer()
     size = library.PAGE_SIZE_LETTER if paper == "letter" else library.PAGE_SIZE_A4

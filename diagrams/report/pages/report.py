@@ -38,13 +38,7 @@ class Report(Document):
 
 
 def check_files(path: str | os.PathLike[str] | None, *, pdf: bool, json: bool, paper: str = "A4") -> None:
-    """Find out, before anything is computed, whether the files of a report can be written.
-
-    Raises
-    ------
-    OptionError
-        A name that does not end in ``.html``, a folder that isn't there, an unknown paper, or no library for PDF.
-    """
+    """Find out, before anything is computed, whether the files of a report can be written."""
     check_paper(paper)
     if path is None:
         if pdf or json:

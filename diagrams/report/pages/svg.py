@@ -64,14 +64,8 @@ def _plots(section: Section) -> Iterator[Plot]:
 def embedded(figure: Any, key: str, caption: str = "") -> Picture:
     """Return a figure as a page holds it; a wide one twice, for the screen and, to be turned, for paper.
 
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure or str
-        The figure, or SVG.
-    key : str
-        Goes ahead of every id in it, so that the figures of a page don't share any.
-    caption : str
-        Its text for people who don't see it.
+    ``key`` begins every id in it, so that the figures of a page don't share any; ``caption`` is its text for people who
+    don't see it.
     """
     svg = figure if isinstance(figure, str) else _KEPT.pop(figure, "") or _drawn(figure)
     svg = re.sub(r"<\?xml.*?\?>|<!DOCTYPE.*?>|<!--.*?-->|<metadata>.*?</metadata>", "", svg, flags=re.DOTALL).strip()

@@ -19,11 +19,6 @@ def environment(package: str) -> Environment:
     """Return the templates of a package, in its folder ``templates``.
 
     Names that a template asks for and nobody gave are errors. All templates escape but those of plain text.
-
-    Parameters
-    ----------
-    package : str
-        Import name of the package, such as ``__package__``.
     """
     import jinja2
 
@@ -71,22 +66,7 @@ class Texts:
     name: str
 
     def paragraphs(self, macro: str, **facts: Any) -> tuple[str, ...]:
-        """Return the paragraphs of a macro, which blank lines part; a line's end is a space, in facts as well.
-
-        Parameters
-        ----------
-        macro : str
-            Name of the macro.
-        **facts
-            Its arguments.
-
-        Raises
-        ------
-        AttributeError
-            A macro that isn't there.
-        jinja2.UndefinedError
-            A fact that it needs, and nobody gave.
-        """
+        """Return the paragraphs of a macro, which blank lines part; a line's end is a space, in facts as well."""
         facts = {name: _one_line(fact) if isinstance(fact, str) else fact for name, fact in facts.items()}
         text = str(getattr(self._template().module, macro)(**facts))
         return tuple(part for part in map(_one_line, re.split(r"\n[ \n]*\n", text)) if part)

@@ -74,20 +74,7 @@ class MeasuredLoop:
 
 
 def read_measured(case: Case, measured: Mapping[str, Any]) -> tuple[MeasuredLoop, ...]:
-    """Return measured loops with their margins.
-
-    Parameters
-    ----------
-    case : Case
-        The diagram with its variants.
-    measured : mapping of str to data
-        By wire: data as `measured_margins` takes them, or the path of a CSV file of them.
-
-    Raises
-    ------
-    OptionError
-        If data don't fit, or two are given for one loop.
-    """
+    """Return measured loops with their margins."""
     flat = case.diagram.flatten(None if case.diagram.has_clock else STEP)
     known = {_place(flat, wire): key for key, wire in case.loop_wires().items()}
     found: dict[str, MeasuredLoop] = {}
@@ -121,13 +108,7 @@ def _place(flat: FlatDiagram, wire: str) -> tuple[Any, ...]:
 
 
 def measured_loops(case: Case, loops: Sequence[MeasuredLoop]) -> Section:
-    """Return the section on measured loops: their margins with intervals, and those of the diagram as it is.
-
-    Raises
-    ------
-    OptionError
-        If no variant can be analysed.
-    """
+    """Return the section on measured loops: their margins with intervals, and those of the diagram as it is."""
     variant = case.actual if case.actual is not None and not case.actual.problem else next(case.usable(), None)
     if variant is None:
         raise OptionError("found no variant that can be analysed; expected one. Mend the diagram.", port="measured")

@@ -43,21 +43,7 @@ def summary(
     worst_case: ReportedWorstCase | MissingWorstCase | None = None,
     more: Sequence[Table] = (),
 ) -> Section:
-    """Return the first section of a report.
-
-    Parameters
-    ----------
-    case : Case
-        The diagram with its variants.
-    reviewed : Review, optional
-        The verdicts on its requirements.
-    numbers : mapping of str to Number
-        All numbers of the report by their dotted paths.
-    worst_case : ReportedWorstCase or MissingWorstCase, optional
-        The worst case that has a section.
-    more : sequence of Table
-        Tables behind that of the loops.
-    """
+    """Return the first section of a report."""
     unstable = unstable_first(case)
     text = [*(unstable.text if unstable is not None else ())]
     tables = []

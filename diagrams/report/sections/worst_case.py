@@ -28,13 +28,7 @@ GROWING, GROWTH = "worst_growth", "growth of the fastest pole"
 
 
 def check_worst_case(diagram: WiredDiagram, found: Any) -> None:
-    """Check that a worst case is one of this diagram.
-
-    Raises
-    ------
-    OptionError
-        If there is something else, or a worst case of another diagram.
-    """
+    """Check that a worst case is one of this diagram."""
     if not isinstance(found, WorstCase):
         raise OptionError(
             f"found {found!r}; expected a worst case. Give diagram.worst_case(…), or a TOML file.", port="worst_case"
@@ -53,24 +47,7 @@ def read_task(
     file: TomlFile | None,
     requirements: Requirements | None,
 ) -> WorstCase | WorstCaseTask | None:
-    """Return the worst case of a report, or the task to find it, checked; None where none is asked for.
-
-    Parameters
-    ----------
-    diagram : Diagram
-        The diagram.
-    given : WorstCase, WorstCaseTask or path, optional
-        The option of the report.
-    file : TomlFile, optional
-        The file of its requirements, which may have the table.
-    requirements : Requirements, optional
-        The requirements.
-
-    Raises
-    ------
-    OptionError
-        A worst case of another diagram; a file that asks for something that isn't there; two worst cases.
-    """
+    """Return the worst case of a report, or the task to find it, checked; None where none is asked for."""
     if file is not None and file.table(KEY):
         if given is not None:
             raise file.error(
@@ -111,17 +88,7 @@ def find_reported(
 
 
 def _name_wires(requirements: Requirements, wires: Mapping[str, str], loops: tuple[str, ...]) -> Requirements:
-    """Return requirements whose loops are named by wires, as a worst case names them, and not by keys of the report.
-
-    Parameters
-    ----------
-    requirements : Requirements
-        The requirements.
-    wires : mapping of str to str
-        Wires of the report's loops by their keys.
-    loops : tuple of str
-        Names of wires, or unique ends of them, that the worst case is looked for at; those of the report without any.
-    """
+    """Return requirements whose loops are named by wires, as a worst case names them, and not by keys of the report."""
     short = {wire: next((w for w in loops if wire == w or wire.endswith(f".{w}")), wire) for wire in wires.values()}
     names = {name: short[wire] for key, wire in wires.items() for name in (key, wire)}
     made = copy(requirements)
