@@ -105,7 +105,7 @@ def analyse(
     """Analyse a diagram, and return the content of its report.
 
     Any diagram gets its parameters, operating points, poles, and the margins at every named wire on a loop: continuous,
-    and sampled without and with a sample of delay. A diagram of `fig3` gets besides what the paper claims, its
+    and sampled without and with a sample of delay. A diagram of `fig3` also gets what the paper claims, its
     admittances, the environments that they can touch, and these limits tried in the co-simulation. Parts that don't
     apply are left out. Where the plant is not shown to be the rigid robot that admittances and limits are reduced to,
     the section on them has no numbers, and says why.
@@ -128,15 +128,15 @@ def analyse(
         slope is zero.
     requirements : Requirements or path, optional
         Requirements on the design, or a TOML file of them. `Report.review` has the verdicts, which the first page and
-        the JSON tell.
+        the JSON show.
     about : mapping of str to str, optional
         Lines of the heading: ``title``, ``author``, ``project``, ``date``, ``revision``, or any other.
     decibels, hertz : bool
         Whether magnitudes are drawn in dB, and over a frequency in Hz; without it plain, over rad/s.
     measured : mapping of str to data, optional
         Loops that were measured, by their wires: data as `measured_margins` takes them, or the path of a CSV file (see
-        `read_frequency_data`). Their margins, with intervals, stand beside the model's, and requirements hold for them
-        as for the model's: passed only if the whole interval is within the limits.
+        `read_frequency_data`). Their margins, with intervals, are given next to the model's, and requirements hold
+        for them as for the model's: passed only if the whole interval is within the limits.
     contacts : mapping of str to Contact, or path, optional
         Contacts of an environment with the plant, by names that stand in dotted paths: ``{"tool":
         diagram.contact(…)}``; or a TOML file with tables ``[contact.NAME]``, which may be that of ``requirements``,
@@ -148,7 +148,7 @@ def analyse(
         The limits that it was looked for with get verdicts of their own. Limits of its numbers fail where it is
         unstable. One that can't be looked for, as at a wire without a loop, is left out with the reason.
     progress : callable, optional
-        Told the key of each section before it is made, and of the injection check each measurement, too.
+        Called with the key of each section before it is made, and with each measurement of the injection check.
     workers : int, optional
         1 makes all sections in this process; with 2, a second process makes some of a diagram with FMUs. The report is
         the same. Without it there are two where the report is written, and two processors.

@@ -40,7 +40,7 @@ def test_a_measured_loop_stands_beside_the_model():
     assert float(row[4]) == pytest.approx(margin, abs=1e-6)
     assert row[5] == "yes"
     assert {plot.key for plot in section.plots} == {"measured_e"}
-    assert any("the measured L is at most" in text for text in section.text)
+    assert any("the measured L differs from the model's by at most" in text for text in section.text)
     assert any("not real and negative" in text for text in section.text)
 
 
@@ -48,7 +48,7 @@ def test_a_model_that_is_not_the_machine_is_outside_of_the_interval():
     report = analyse(drive(), only=("poles",), measured={"e": data(8.0, 0.02)})
     rows = {row[1]: row for row in report.sections[-1].tables[0].rows}
     assert rows["phase margin"][5] == "no"
-    assert any("100 % of the model's" in text for text in report.sections[-1].text)
+    assert any("differs from the model's by at most 100 %" in text for text in report.sections[-1].text)
 
 
 def test_a_file_is_read_and_a_wire_that_is_not_there_is_named(tmp_path):

@@ -84,7 +84,7 @@ def test_a_worst_case_that_no_run_confirms_is_told_on_the_first_page(monkeypatch
     refuted = RunConfirmation(ConfirmationKind.INJECTION, "u", 3.0, found.worst.value, 47.65, agrees=False)
     monkeypatch.setattr(type(found), "confirm", lambda _: refuted)
     text = "\n".join(map(str, page().sections[0].text))
-    assert "Not analysed, or known less well" in text
+    assert "Not analysed, or less certain" in text
     assert f"The worst case over the parameters: the run does not confirm it ({refuted.trial})." in text
     monkeypatch.setattr(type(found), "confirm", lambda _: replace(refuted, agrees=True))
     assert "confirm" not in "\n".join(map(str, page().sections[0].text))
