@@ -15,7 +15,7 @@ from .analysis import (
     analyse,
 )
 from .case import OUTSIDE, Basis, Case, InjectionPlan
-from .figures import DOTTED, AxisUnits, DrawnLoops, bode, draw_admittances, fill_growth, with_drawing
+from .figures import DOTTED, draw_admittances, fill_growth, with_drawing
 from .pages import (
     DEFINITIONS,
     Plot,
@@ -57,10 +57,8 @@ __all__ = [
     "STEPS",
     "SUBJECT",
     "SUBJECT_TITLE",
-    "AxisUnits",
     "Basis",
     "Case",
-    "DrawnLoops",
     "Implementation",
     "InjectionPlan",
     "MakesSections",
@@ -74,7 +72,6 @@ __all__ = [
     "Texts",
     "Variant",
     "analyse",
-    "bode",
     "check_files",
     "disk_numbers",
     "disk_range",
