@@ -1,29 +1,36 @@
 """Margins, Nyquist, disks and pole placement of linear systems."""
 
+from __future__ import annotations
+
 from typing import TYPE_CHECKING
 
-from .carried import with_findings
-from .disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin, mu_bound
-from .features import find_hidden_unstable
-from .loop_class import loop_class
-from .loop_margins import find_disk_frequency, margins
+from .delayed_hold import delayed_hold, delayed_hold_margin
+from .disk_margins import DiskMargin, disk_margin, loop_at, mimo_disk_margin, mu_bound
+from .loop_margins import GainCrossover, Margins, PhaseCrossover, find_disk_frequency, margins
 from .margin_slopes import MarginSlope, margin_slopes
-from .margins_found import GainCrossover, Margins, PhaseCrossover
-from .measured_margins import Interval, MeasuredMargins, measured_margins, read_frequency_data
-from .number import MARK, Confirmation, Number, method_of
+from .measured_margins import MeasuredMargins, measured_margins, read_frequency_data
+from .number import MARK, Confirmation, Interval, Number, method_of, with_findings
 from .nyquist import NyquistCount, nyquist_count
 from .periodic_margins import PeriodicMargins, periodic_margins
-from .pole_placement import SampledDesign, place, sampled_gains, sampled_poles
-from .polynomials import relative_difference
+from .pole_placement import place, relative_difference
+from .poles_and_zeros import find_hidden_unstable
 from .python_control import Comparison, compare_margins, compare_with_control
 from .realization import Realization
-from .sensitivities import GangOfFour, complementary, delayed_hold, delayed_hold_margin, gang_of_four, sensitivity
-from .sign_changes import refine_sign_change
+from .sampled_design import SampledDesign, sampled_gains, sampled_poles
+from .scan_refine_confirm import first_largest, order_key, refine_sign_change
+from .sensitivities import GangOfFour, complementary, gang_of_four, sensitivity
 from .state_space import read_matrices
-from .ties import first_largest, order_key
 
 if TYPE_CHECKING:
     from .loop_transfer import LoopTransfer as LoopTransfer
+
+
+def loop_class() -> type[LoopTransfer]:
+    """Return `LoopTransfer`, loaded when the first loop is made: python-control takes a second to import."""
+    from .loop_transfer import LoopTransfer
+
+    return LoopTransfer
+
 
 __all__ = [
     "MARK",

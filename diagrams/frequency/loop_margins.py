@@ -2,34 +2,124 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, get_type_hints
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, ParameterError, accepts, kinds, on_one_thread
-from .carried import carries_findings
-from .confirm import (
-    confirm_crossing,
-    confirm_delay,
-    confirm_limit,
-    confirm_no_limit,
-    confirm_on_limit,
-    confirm_peak,
-    count_unstable,
-    find_level_frequencies,
-)
-from .crossings import Crossing, Peak, Scan
-from .features import find_hidden_unstable
-from .margins_found import GainCrossover, Margins, PhaseCrossover
-from .number import Confirmation, Number
-from .nyquist import count_encirclements
-from .realization import Realization, refuse_singular
+from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, explain_calls, kinds, on_one_thread
+from .loop_scan import Crossing, Peak, Scan
+from .margin_analysis import EIGENVALUES, MarginFinder, StabilityMargins
+from .number import Confirmation, Number, carries_findings
+from .nyquist import count_encirclements, winding_number
+from .poles_and_zeros import Features, find_hidden_unstable
+from .realization import Realization
+from .scan_refine_confirm import confirm_no_limit, number_of_limit
+from .sensitivity_peaks import confirm_peak, find_level_frequencies
 
 if TYPE_CHECKING:
     from .state_space import LinearSystem
 
-EIGENVALUES = "closed-loop eigenvalues"
 GAINS = (1.5, 2.0, 5.0, 10.0, 100.0, 1e3)
+"""Factors, and reciprocals of factors, that are tried where no limit of the gain was found."""
+MOST_SAMPLES = 100
+"""Samples of delay up to which closed-loop eigenvalues count the unstable poles; beyond, encirclements do."""
+
+
+@explain_calls
+@dataclass(frozen=True)
+class GainCrossover:
+    """A frequency at which |L| = 1, and the rotation that takes L to −1 there (−180° to 180°)."""
+
+    frequency: Number
+    phase_margin_deg: Number
+
+
+@explain_calls
+@dataclass(frozen=True)
+class PhaseCrossover:
+    """A frequency at which L is real and negative, and the factor that takes it to −1 there."""
+
+    frequency: Number
+    gain_margin: Number
+
+
+@explain_calls
+@dataclass(frozen=True, repr=False)
+class Margins(StabilityMargins):
+    """Margins of a loop L with S = 1/(1 + L) and T = L/(1 + L).
+
+    The margins of an unstable closed loop are NaN; its crossings and poles are there.
+
+    Parameters
+    ----------
+    stable : bool
+        Whether all of `closed_loop_poles` are stable. Hidden modes are not among them: see `hidden_unstable`.
+    gain_crossovers, phase_crossovers : tuple
+        All crossovers by rising frequency; phase crossovers also at 0, at π/T and at infinity.
+    gain_margin_low, gain_margin_high : Number
+        Largest factor below 1, and smallest above 1, on L that ends stability; 0 and infinity where there is none.
+    phase_margin_deg : Number
+        Smallest rotation of L, to either side, that ends stability; infinite where |L| = 1 nowhere.
+    delay_margin_s, delay_margin_samples : Number
+        Smallest delay τ in series, e^(−jωτ), that ends stability. In a sampled loop it is read from the response
+        between the samples. Where |L| > 1 at π/T that has no meaning: the whole samples that the loop bears are given.
+        `delayed_hold_margin` gives another number, the delay in front of the plant's hold.
+    modulus_margin : Number
+        Smallest distance of L to −1, 1/M_s.
+    disk_margin : Number
+        α of the symmetric disk (S − T), or of that with the given skew; see `disk_margin`.
+    ms, ms_frequency, mt, mt_frequency : Number
+        Largest |S| and |T|, and their frequencies.
+    bandwidth : Number
+        Lowest frequency at which |T| falls below 1/√2 (3.0103 dB) of its value at low frequency.
+    closed_loop_poles : tuple of complex
+        In the s plane (continuous) or the z plane (sampled). Multiple poles scatter, as ε^(1/multiplicity).
+    hidden_poles : tuple of complex
+        Poles that are not controllable or not observable in the loop; none of the numbers above contains them.
+    hidden_unstable : tuple of complex
+        Hidden poles beyond the limit of stability. No gain in this loop stabilizes them: another loop must.
+    encirclements : int
+        Clockwise encirclements of −1 by L.
+    dt : float
+        Sample time of the loop in s, 0 of a continuous one.
+    findings : tuple of Finding
+        Effects on the loop that its linear model leaves out, such as a kink at the operating point. Every number
+        carries them.
+    """
+
+    stable: bool
+    gain_crossovers: tuple[GainCrossover, ...]
+    phase_crossovers: tuple[PhaseCrossover, ...]
+    gain_margin_low: Number
+    gain_margin_high: Number
+    phase_margin_deg: Number
+    delay_margin_s: Number
+    delay_margin_samples: Number
+    modulus_margin: Number
+    disk_margin: Number
+    ms: Number
+    ms_frequency: Number
+    mt: Number
+    mt_frequency: Number
+    bandwidth: Number
+    closed_loop_poles: tuple[complex, ...]
+    hidden_poles: tuple[complex, ...]
+    hidden_unstable: tuple[complex, ...]
+    encirclements: int
+    dt: float = 0.0
+    findings: tuple[Finding, ...] = ()
+
+    def _further_lines(self) -> list[str]:
+        lines: list[str] = []
+        if not self.stable:
+            lines += [f"gain_crossover        {c.frequency}" for c in self.gain_crossovers]
+            lines += [f"phase_crossover       {c.frequency}, factor {c.gain_margin}" for c in self.phase_crossovers]
+        if self.hidden_unstable:
+            poles = ", ".join(f"{p:.6g}" for p in self.hidden_unstable)
+            lines.append(f"hidden_unstable       {poles}: not in this loop")
+        return lines
 
 
 @accepts(delay=kinds.finite, skew=kinds.number)
@@ -83,109 +173,86 @@ def margins(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Margins
             "loop's direct feedthrough D.",
             block="margins",
         )
-    with refuse_singular("margins"):
-        return _MarginFinder(r, skew).find_margins()
+    return _LoopMarginFinder(r, skew).find_margins()
 
 
-class _MarginFinder:
+class _LoopMarginFinder(MarginFinder[Margins]):
     """A scanned loop; each ``_find_…`` computes some of the margins and confirms them."""
 
-    def __init__(self, r: Realization, skew: float):
-        self.r, self.skew, self.scan = r, skew, Scan(r)
-        self.gain, self.phase = self.scan.find_gain_crossovers(), self.scan.find_phase_crossovers()
-        self.unstable = r.count_unstable()
+    result = Margins
 
-    def find_margins(self) -> Margins:
-        r = self.r
-        poles = r.eigenvalues()
-        if self.unstable:
-            near = r.growth(poles).max()
-            reason = f"the closed loop is not stable: {self.unstable} of its poles are not (largest growth {near:.3g})"
-            units = {"phase_margin_deg": "deg", "delay_margin_s": "s", "delay_margin_samples": "samples"}
-            units |= dict.fromkeys(("ms_frequency", "mt_frequency", "bandwidth"), "rad/s")
-            names = [name for name, kind in get_type_hints(Margins).items() if kind is Number]
-            found = {name: Number(np.nan, units.get(name, "1"), np.nan, reason) for name in names}
-            try:
-                encirclements = count_encirclements(r, self.scan.features).encirclements
-            except ConfirmationError:  # a pole on the limit itself: the curve passes through −1
-                encirclements = self.unstable - self.scan.features.unstable_poles()
-        else:
-            encirclements = count_encirclements(r, self.scan.features).encirclements
-            found = {**self._find_gain_margins(), **self._find_phase_margin()}
-            found |= {**self._find_delay_margin(), **self._find_peaks()}
-        return Margins(
-            stable=not self.unstable,
-            gain_crossovers=tuple(self._make_gain_crossover(c) for c in self.gain),
-            phase_crossovers=tuple(self._make_phase_crossover(c) for c in self.phase),
-            closed_loop_poles=tuple(complex(p) for p in np.sort_complex(poles + 1 if r.dt else poles)),
-            hidden_poles=tuple(complex(p) for p in (r.hidden + 1 if r.dt else r.hidden)),
-            hidden_unstable=find_hidden_unstable(r),
-            encirclements=encirclements,
-            dt=r.dt,
-            findings=(),
-            **found,
-        )
+    def __init__(self, r: Realization, skew: float):
+        super().__init__(r)
+        self.skew, self.scan = skew, Scan(r)
+        self.gain, self.phase = self.scan.find_gain_crossovers(), self.scan.find_phase_crossovers()
+
+    def find_numbers(self) -> dict[str, Number]:
+        return {
+            **self._find_gain_margins(),
+            "phase_margin_deg": self._find_phase_margin(),
+            **self._find_delay_margin(),
+            **self._find_peaks(),
+        }
+
+    def describe(self) -> dict[str, Any]:
+        r, features = self.r, self.scan.features
+        try:
+            encirclements = count_encirclements(r, features).encirclements
+        except ConfirmationError:  # of an unstable loop a pole may lie on the limit: the curve passes through −1
+            if not self.unstable:
+                raise
+            encirclements = self.unstable - features.unstable_poles()
+        return {
+            "gain_crossovers": tuple(self._make_gain_crossover(c) for c in self.gain),
+            "phase_crossovers": tuple(self._make_phase_crossover(c) for c in self.phase),
+            "hidden_poles": tuple(complex(p) for p in (r.hidden + 1 if r.dt else r.hidden)),
+            "hidden_unstable": find_hidden_unstable(r),
+            "encirclements": encirclements,
+        }
 
     def _frequency(self, c: Crossing, how: str) -> Number:
         ends = c.omega in (0.0, np.inf) or c.omega == self.r.nyquist
         return Number(c.omega, "rad/s", 0.0 if ends else c.tolerance * c.omega, how)
 
     def _make_gain_crossover(self, c: Crossing) -> GainCrossover:
-        how = confirm_crossing(self.r, c, -1 / c.L, "gain_crossover")
+        how = _confirm_crossing(self.r, c, -1 / c.L, "gain_crossover")
         return GainCrossover(
             self._frequency(c, how), Number(_missing_phase(c), "deg", 2 * np.degrees(c.tolerance), how)
         )
 
     def _make_phase_crossover(self, c: Crossing) -> PhaseCrossover:
         k = -1 / c.L.real
-        how = confirm_crossing(self.r, c, k, "phase_crossover")
+        how = _confirm_crossing(self.r, c, k, "phase_crossover")
         return PhaseCrossover(self._frequency(c, how), Number(k, "1", k * 2 * c.tolerance, how))
 
     def _find_gain_margins(self) -> dict[str, Number]:
         factors = {-1 / c.L.real: c for c in self.phase}
         low = max((k for k in factors if k < 1), default=0.0)
         high = min((k for k in factors if k > 1), default=np.inf)
+        tried: dict[str, Sequence[float]] = {"gain_margin_low": [1 / g for g in GAINS[:-1]], "gain_margin_high": GAINS}
         found = {}
         for name, k in (("gain_margin_low", low), ("gain_margin_high", high)):
-            if k in factors:
-                how = confirm_limit(name, k, [o for o in factors if o != k], 1.0, self.r.is_stable, EIGENVALUES)
-                found[name] = Number(k, "1", k * 2 * factors[k].tolerance, how)
-            else:
-                values = [1 / g for g in GAINS[:-1]] if k == 0.0 else GAINS
-                found[name] = Number(k, "1", 0.0, confirm_no_limit(name, values, self.r.is_stable, EIGENVALUES))
+            error = k * 2 * factors[k].tolerance if k in factors else 0.0
+            others = [o for o in factors if o != k]
+            found[name] = self.make_gain_margin(name, k, error, others=others, tried=tried[name])
         return found
 
-    def _find_phase_margin(self) -> dict[str, Number]:
-        def stable(degrees: float) -> bool:
-            return self.r.is_stable(np.exp(-1j * np.radians(degrees)))
-
-        name = "phase_margin_deg"
+    def _find_phase_margin(self) -> Number:
         if not self.gain:
-            how = confirm_no_limit(name, [30.0, 60.0, 90.0, 120.0, 150.0, 180.0], stable, EIGENVALUES)
-            return {name: Number(np.inf, "deg", 0.0, how)}
+            return self.make_phase_margin(np.inf, 0.0)
         margin, c = min(((abs(_missing_phase(c)), c) for c in self.gain), key=lambda pair: pair[0])
         if margin > 180 - 1e-6:  # L = 1: both directions have the same limit
-            return {name: Number(180.0, "deg", 1e-6, confirm_crossing(self.r, c, -1 / c.L, name))}
+            return Number(180.0, "deg", 1e-6, _confirm_crossing(self.r, c, -1 / c.L, "phase_margin_deg"))
         others = [abs(_missing_phase(o)) for o in self.gain if o is not c]
-        others += [360 - o for o in (margin, *others)]  # the same limits, reached by rotating to the other side
-        how = confirm_limit(name, margin, others, 0.0, stable, EIGENVALUES + " with L rotated")
-        return {name: Number(margin, "deg", 2 * np.degrees(c.tolerance), how)}
+        return self.make_phase_margin(margin, 2 * np.degrees(c.tolerance), others=others)
 
     def _find_delay_margin(self) -> dict[str, Number]:
         r = self.r
         lags = {c: np.radians(_missing_phase(c)) % (2 * np.pi) for c in self.gain if 0 < c.omega < np.inf}
         limits = sorted((lag / c.omega, c.tolerance * (1 + 1 / lag)) for c, lag in lags.items())
         if not r.dt:
-            tau, error = limits[0] if limits else (np.inf, 0.0)
-            others = [(lag + 2 * np.pi * k) / c.omega for c, lag in lags.items() for k in range(50)]
-            if abs(r.D[0, 0]) >= 1:
-                tau, error, how = 0.0, 0.0, "|L| ≥ 1 at infinite frequency: any delay has poles beyond the limit"
-            elif not limits:
-                how = "|L| < 1 at all frequencies: no delay matters"
-            else:
-                how = confirm_delay(r, self.scan.features, tau, [o for o in others if o != tau])
             samples = Number(np.nan, "samples", np.nan, "the loop is not sampled")
-            return {"delay_margin_s": Number(tau, "s", tau * error, how), "delay_margin_samples": samples}
+            return {"delay_margin_s": self._find_continuous_delay(lags, limits), "delay_margin_samples": samples}
         end = self.scan.ends()[1][1]
         if abs(end) >= 1:
             n, how = self._count_whole_samples()
@@ -198,6 +265,24 @@ class _MarginFinder:
             "delay_margin_samples": Number(n, "samples", n * error if error else 0.0, how),
         }
 
+    def _find_continuous_delay(self, lags: dict[Crossing, float], limits: list[tuple[float, float]]) -> Number:
+        """Return the delay margin in s of a continuous loop, confirmed by the encirclements of 1 + L e^(−sτ)."""
+        r, features = self.r, self.scan.features
+        if abs(r.D[0, 0]) >= 1:
+            return Number(0.0, "s", 0.0, "|L| ≥ 1 at infinite frequency: any delay has poles beyond the limit")
+        if not limits:
+            return Number(np.inf, "s", 0.0, "|L| < 1 at all frequencies: no delay matters")
+        unstable = features.unstable_poles()
+
+        def stable(tau: float) -> bool:
+            return winding_number(r, features, delay=tau) + unstable == 0
+
+        tau, error = limits[0]
+        others = [(lag + 2 * np.pi * k) / c.omega for c, lag in lags.items() for k in range(50)]
+        others = [o for o in others if o != tau]
+        how = "encirclements of 1 + L exp(−sτ)"
+        return number_of_limit("delay_margin_s", tau, "s", tau * error, stable, how, others=others)
+
     def _confirm_samples(self, n: float, lags: dict[Crossing, float]) -> str:
         """Confirm a margin by the number of unstable poles with the whole samples next to it; return the computation.
 
@@ -207,20 +292,20 @@ class _MarginFinder:
         whole = abs(n - round(n)) <= 1e-9 * max(n, 1.0) and n > 0.5
         if whole:  # with exactly these samples poles lie on the unit circle
             below, above = round(n) - 1, round(n) + 1
-            confirm_on_limit(self.r, round(n))
+            _confirm_on_limit(self.r, round(n))
         for samples in (below, above):
             expected = 0
             for c, lag in lags.items():
                 passed = 1 + np.floor((samples * c.omega * self.r.dt - lag) / (2 * np.pi))
                 expected += 2 * int(max(0, passed)) * (1 if c.slope < 0 else -1)
-            found = count_unstable(self.r, self.scan.features, samples)
+            found = _count_unstable(self.r, self.scan.features, samples)
             if found != expected:
                 raise ConfirmationError(
                     f"found a margin of {n:.9g} samples, but {found} unstable poles with {samples} samples of delay; "
                     f"expected {expected}. Look at closed_loop_poles.",
                     block="delay_margin",
                 )
-        with_z = EIGENVALUES if above <= 100 else "encirclements"
+        with_z = EIGENVALUES if above <= MOST_SAMPLES else "encirclements"
         on_it = f", on the limit at n = {round(n)}" if whole else ""
         return Confirmation(
             f"{with_z} with z⁻ⁿ: stable at n = {below}{on_it}, as many unstable at n = {above} as crossovers say",
@@ -231,14 +316,14 @@ class _MarginFinder:
         """Confirm that no number of samples ends stability; return the computation."""
 
         def stable(n: float) -> bool:
-            return count_unstable(self.r, self.scan.features, int(n)) == 0
+            return _count_unstable(self.r, self.scan.features, int(n)) == 0
 
         return confirm_no_limit("delay_margin", [1, 2, 5, 10], stable, EIGENVALUES + " with z⁻ⁿ")
 
     def _count_whole_samples(self) -> tuple[float, str]:
         """Return the whole samples of delay that the loop bears, and the computation that says so."""
         n = 0
-        while n < 100 and count_unstable(self.r, self.scan.features, n + 1) == 0:
+        while n < MOST_SAMPLES and _count_unstable(self.r, self.scan.features, n + 1) == 0:
             n += 1
         return float(n), Confirmation(
             f"{EIGENVALUES} with z⁻ⁿ: stable at n = {n}, unstable at n = {n + 1} (|L| ≥ 1 at π/T)",
@@ -291,12 +376,52 @@ class _MarginFinder:
         return Number(omega, "rad/s", 1e-10 * omega, how)
 
 
-def find_disk_frequency(r: Realization) -> float:
-    """Return the frequency in rad/s at which |S − T| is largest: that of the disk margin."""
-    return float(Scan(r).find_peak(0.5, -0.5).omega)
+def find_disk_frequency(r: Realization, skew: float = 0.0) -> float:
+    """Return the frequency in rad/s at which |S + (σ − 1)/2| is largest: that of the disk margin."""
+    return float(Scan(r).find_peak((1 + skew) / 2, -(1 - skew) / 2).omega)
 
 
 def _missing_phase(c: Crossing) -> float:
     """Return the phase by which L is ahead of −1, in degrees above −180 and up to 180."""
     degrees = float(np.degrees(np.angle(-c.L)))
     return degrees if degrees > -180 else 180.0
+
+
+def _confirm_crossing(r: Realization, c: Crossing, factor: complex, name: str) -> str:
+    """Confirm that the loop, multiplied by this factor, has a closed-loop pole at the crossing's frequency."""
+    if np.isinf(c.omega):
+        ok = abs(1 + factor * r.D[0, 0]) < 1e-9
+        where = "1 + D vanishes with this factor: a closed-loop pole passes through infinity"
+    else:
+        p = complex(r.point(np.array(1j * c.omega)))
+        distance = np.min(np.abs(r.eigenvalues(factor) - p), initial=np.inf)
+        ok = distance <= 1e-5 * abs(p) + 1e-7 * r.scale
+        where = "a closed-loop eigenvalue that lies there with this factor"
+    if not ok:
+        raise ConfirmationError(
+            f"found a crossing at {c.omega:.12g} rad/s, but no closed-loop eigenvalue there with the factor "
+            f"{factor:.6g}; expected one. Look at closed_loop_poles: the realization may be ill-conditioned.",
+            block=name,
+        )
+    return where
+
+
+def _confirm_on_limit(r: Realization, n: int) -> None:
+    """Confirm that n samples of delay in series put a closed-loop pole on the unit circle, up to 100 samples."""
+    if n > MOST_SAMPLES:
+        return
+    delayed = r.delay_by(n)
+    nearest = float(np.min(np.abs(delayed.growth(delayed.eigenvalues()))))
+    if nearest > 1e-6:
+        raise ConfirmationError(
+            f"found a margin of {n} samples, but with that delay no closed-loop pole is nearer than {nearest:.3g} to "
+            "the unit circle; expected one on it. Look at closed_loop_poles.",
+            block="delay_margin",
+        )
+
+
+def _count_unstable(r: Realization, features: Features, n: int) -> int:
+    """Return the number of closed-loop poles that are not stable with n samples of delay in series."""
+    if n > MOST_SAMPLES:
+        return winding_number(r, features, delay=n * r.dt) + features.unstable_poles()
+    return r.delay_by(n).count_unstable()

@@ -1,19 +1,30 @@
-"""A loop transfer function: a state space of python-control that plots itself."""
+"""A loop transfer function: a state space of python-control that plots itself, alone or with further loops."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from control import StateSpace, feedback
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError, accepts, brief, count_of, explain_calls, kinds
-from . import loop_plots
+from ...blocks.core import OptionError, accepts, brief, count_of, explain_calls, kinds, shorten, with_unit
+from ..results import BLUE, DARK, GREEN, GREY, PURPLE, STONE, VERMILION, legend_above, new_figure, style
+from .realization import Realization
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+COLORS = (BLUE, VERMILION, GREEN, PURPLE, DARK)
+LINES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
+POINTS = 800
+BELOW = 1 - 1e-6
+"""Part of π/T up to which a sampled loop is drawn."""
+FAR = 8.0
+"""Largest part of the plane that a Nyquist plot shows: the real and imaginary part up to this."""
 
 
 class Model(Protocol):
@@ -111,7 +122,8 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
         OptionError
             If a loop has several inputs or outputs, or the labels or frequencies don't fit.
         """
-        return loop_plots.bode((self, *others), omega, labels, db=db, hz=hz)
+        loops = (self, *others)
+        return _plot_bode(loops, _name_loops(loops, labels), omega, db=db, hz=hz)
 
     @accepts(labels=kinds.names)
     def nyquist(self, *others: Any, omega: ArrayLike | None = None, labels: Sequence[str] | None = None) -> Figure:
@@ -120,12 +132,14 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
         The arrow points to rising frequencies, the thin line is that of negative ones, and the circle is |L| = 1. See
         `bode` for the parameters.
         """
-        return loop_plots.nyquist((self, *others), omega, labels)
+        loops = (self, *others)
+        return _plot_nyquist(loops, _name_loops(loops, labels), omega)
 
     @accepts(labels=kinds.names)
     def nichols(self, *others: Any, omega: ArrayLike | None = None, labels: Sequence[str] | None = None) -> Figure:
         """Return gain over phase, with contours of |T| in dB. See `bode` for the parameters."""
-        return loop_plots.nichols((self, *others), omega, labels)
+        loops = (self, *others)
+        return _plot_nichols(loops, _name_loops(loops, labels), omega)
 
     @accepts(t=kinds.numbers, labels=kinds.names)
     def step(self, *others: Any, t: float | None = None, labels: Sequence[str] | None = None) -> Figure:
@@ -146,10 +160,9 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
             If a loop has several inputs or outputs or is measured data, or the closed loop is not stable.
         """
         loops = (self, *others)
-        loop_plots.check_single(loops)
-        names = loop_plots.labels_of(loops, labels)
-        closed = [closed_loop(loop) for loop in loops]
-        return loop_plots.step(closed, names, t, max(map(_horizon, loops)))
+        names = _name_loops(loops, labels)
+        closed = [_close_loop(loop) for loop in loops]
+        return _plot_step(closed, names, t, max(map(_horizon, loops)))
 
     @accepts(measured=kinds.text, labels=kinds.names)
     def gang_of_four(
@@ -175,19 +188,12 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
             If one of them was not made by `Linearization.loop` at one wire with one entry.
         """
         loops = (self, *others)
-        loop_plots.check_single(loops)
-        names = loop_plots.labels_of(loops, labels)
-        return loop_plots.four([four_of(loop, measured) for loop in loops], names, omega)
+        names = _name_loops(loops, labels)
+        return _plot_gang_of_four([_find_gang_of_four(loop, measured) for loop in loops], names, omega)
 
 
-def four_of(loop: Any, measured: str) -> dict[str, StateSpace]:
-    """Return L, S, PS, CS and T at the wire of a loop and a measured one, as `control.StateSpace`.
-
-    Raises
-    ------
-    OptionError
-        If the loop was not made by `Linearization.loop`, or the measured wire has several entries.
-    """
+def _find_gang_of_four(loop: Any, measured: str) -> dict[str, StateSpace]:
+    """Return L, S, PS, CS and T at the wire of a loop and a measured one, as `control.StateSpace`."""
     model = getattr(loop, "linearization", None)
     if model is None or len(loop.wires) != 1:
         raise OptionError(
@@ -205,16 +211,10 @@ def four_of(loop: Any, measured: str) -> dict[str, StateSpace]:
     return {"L": loop, "S": both[0, 0], "PS": both[1, 0], "CS": -both[0, 1], "T": 1 - both[0, 0]}
 
 
-def closed_loop(loop: Any) -> StateSpace:
-    """Return T = L/(1 + L): the model's own, where a loop knows its model.
-
-    Raises
-    ------
-    OptionError
-        If it is measured data, or is not stable.
-    """
+def _close_loop(loop: Any) -> StateSpace:
+    """Return T = L/(1 + L), which must be stable: the model's own, where a loop knows its model."""
     name = str(getattr(loop, "name", None) or "loop")
-    if loop_plots.is_measured(loop):
+    if _is_measured(loop):
         raise OptionError(
             "found frequency-response data; expected a linear system: data has no step response. Leave it out.",
             block=name,
@@ -235,7 +235,277 @@ def closed_loop(loop: Any) -> StateSpace:
 
 def _horizon(loop: Any) -> float:
     """Return the time in s over which a step response is shown: 30 divided by the lowest gain crossover."""
-    w = loop_plots.frequencies(loop)
-    size = np.abs(loop_plots.response(loop, w))
+    w = _frequencies(loop)
+    size = np.abs(_response(loop, w))
     crossed = w[1:][(size[1:] > 1.0) != (size[:-1] > 1.0)]
     return 30.0 / float(crossed[0] if crossed.size else np.sqrt(w[0] * w[-1]))
+
+
+def _is_measured(loop: Any) -> bool:
+    """Whether a loop is frequency-response data rather than a linear system."""
+    return hasattr(loop, "frdata") and hasattr(loop, "omega")
+
+
+def _name_loops(loops: Sequence[Any], labels: Sequence[str] | None) -> list[str]:
+    """Return a label for each loop with one input and one output: its name, numbered where it repeats."""
+    for loop in loops:
+        size = getattr(loop, "noutputs", None), getattr(loop, "ninputs", None)
+        if size != (1, 1):
+            found = f"{size[0]} outputs and {size[1]} inputs" if size[0] else f"{type(loop).__name__}"
+            raise OptionError(
+                f"found {found}; expected a loop with one input and one output, as linearize().loop('u') or a "
+                "python-control system. Plot an entry, L[0, 0], or look at mimo_disk_margin(L).",
+                block=str(getattr(loop, "name", None) or "loop"),
+            )
+    if labels is None:
+        names = [str(getattr(loop, "name", None) or "loop") for loop in loops]
+        return [f"{n} ({names[: i + 1].count(n)})" if names.count(n) > 1 else n for i, n in enumerate(names)]
+    if len(labels) != len(loops):
+        raise OptionError(
+            f"found {len(labels)} labels for {len(loops)} loops; expected one for each. Give as many.",
+            port="labels",
+        )
+    return [str(label) for label in labels]
+
+
+def _frequencies(loop: Any) -> np.ndarray:
+    """Return frequencies in rad/s over which a loop is worth looking at: around its crossovers, poles and zeros."""
+    if _is_measured(loop):
+        return np.asarray(loop.omega, dtype=float)
+    dt = float(loop.dt or 0.0)
+    limit = np.pi / dt if dt else np.inf
+    marks = np.abs(np.concatenate([np.ravel(loop.poles()), np.ravel(loop.zeros())]))
+    if dt:
+        roots = np.concatenate([np.ravel(loop.poles()), np.ravel(loop.zeros())]).astype(complex)
+        with np.errstate(all="ignore"):
+            marks = np.abs(np.log(roots[np.abs(roots) > 1e-6]) / dt)
+    marks = marks[np.isfinite(marks) & (marks > 1e-6) & (marks < limit)]
+    high = min(1e3 * float(np.max(marks, initial=1.0)), limit)
+    wide = np.geomspace(1e-3 * float(np.min(marks, initial=min(1.0, 0.1 * limit))), high, 2000)
+    size = np.abs(Realization.of(loop).response(wide * (1 - 1e-9))[0])
+    crossed = wide[1:][(size[1:] > 1.0) != (size[:-1] > 1.0)]
+    if crossed.size:
+        low, high = float(crossed[0]) / 50, min(float(crossed[-1]) * 50, limit)
+    else:
+        low, high = wide[0] * 100, min(high / 30, limit)
+    return np.geomspace(min(low, high / 100), high * (1 - 1e-9 if dt else 1.0), POINTS)
+
+
+def _response(loop: Any, omega: np.ndarray) -> np.ndarray:
+    """Return the values of a loop at frequencies in rad/s; of data those that it has."""
+    if _is_measured(loop):
+        return np.asarray(np.reshape(loop.frdata, (1, 1, -1))[0, 0], dtype=complex)
+    return np.asarray(Realization.of(loop).response(omega)[0])
+
+
+def _span(loops: Sequence[Any], omega: ArrayLike | None) -> list[np.ndarray]:
+    """Return the frequencies of each loop: those that are asked for, below half its sampling frequency."""
+    own = [_frequencies(loop) for loop in loops]
+    low, high = min(float(w[0]) for w in own), max(float(w[-1]) for w in own)
+    spans = []
+    for loop, w in zip(loops, own, strict=True):
+        if _is_measured(loop):
+            spans.append(w)
+            continue
+        if omega is None:
+            spans.append(Realization.of(loop).grid(low, high, POINTS))
+            continue
+        asked = _read_omega(omega)
+        limit = _limit(loop)
+        shown = asked[asked < limit]
+        if not shown.size:
+            raise OptionError(
+                f"found {shorten(omega)} rad/s, none below π/T = {limit:.6g} rad/s of the loop sampled every "
+                f"{float(loop.dt):g} s; expected one at least. Give lower ones, or leave the loop out.",
+                port="omega",
+            )
+        spans.append(
+            np.append(shown, limit * BELOW) if shown.size < asked.size and shown[-1] < limit * BELOW else shown
+        )
+    return spans
+
+
+def _read_omega(omega: Any) -> np.ndarray:
+    """Return frequencies that were given, in ascending order, each once."""
+    try:
+        asked = np.unique(np.asarray(omega, dtype=float))
+    except (TypeError, ValueError):
+        asked = np.zeros(0)
+    if not (asked.size and np.all(np.isfinite(asked)) and np.all(asked > 0.0)):
+        raise OptionError(f"found {shorten(omega)}; expected positive frequencies in rad/s. Give some.", port="omega")
+    return asked
+
+
+def _limit(loop: Any) -> float:
+    """Return half the sampling frequency of a loop in rad/s; infinite of a continuous one, and of data."""
+    dt = 0.0 if _is_measured(loop) else float(loop.dt or 0.0)
+    return float(np.pi) / dt if dt else np.inf
+
+
+def _write_ends(axes: Axes, loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | None) -> None:
+    """Say in a figure which loops end at π/T although higher frequencies were asked for."""
+    if omega is None:
+        return
+    highest = _read_omega(omega)[-1]
+    cut = [
+        f"{name} at π/T = {_limit(loop):.4g} rad/s"
+        for name, loop in zip(names, loops, strict=True)
+        if highest >= _limit(loop)
+    ]
+    if cut:
+        axes.set_title("Ends: " + ", ".join(cut), loc="left", fontsize="small")
+
+
+def _style_of(i: int, loop: Any) -> dict[str, Any]:
+    color = COLORS[i % len(COLORS)]
+    if _is_measured(loop):
+        return {"color": color, "linestyle": "none", "marker": "o", "markersize": 3.5, "fillstyle": "none"}
+    return {"color": color, "linestyle": LINES[(i // len(COLORS) + i) % len(LINES)]}
+
+
+def _phase(values: np.ndarray) -> np.ndarray:
+    """Return the phase in degrees without jumps; at the lowest frequency it lies in (−270°, 90°]."""
+    phase = np.degrees(np.unwrap(np.angle(values)))
+    return np.asarray(phase - 360.0 * np.ceil((phase[0] - 90.0) / 360.0))
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    legend_above(figure, axes)
+    figure.align_ylabels()
+
+
+def _plot_bode(loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | None, *, db: bool, hz: bool) -> Figure:
+    """Return the gain and the phase over frequency; see `LoopTransfer.bode`."""
+    unit = 2.0 * np.pi if hz else 1.0
+    with style():
+        figure = new_figure(4.4)
+        gain, phase = figure.subplots(2, 1, sharex=True)
+        for i, (loop, w) in enumerate(zip(loops, _span(loops, omega), strict=True)):
+            values = _response(loop, w)
+            size = np.abs(values)
+            gain.plot(w / unit, 20.0 * np.log10(size) if db else size, label=names[i], **_style_of(i, loop))
+            phase.plot(w / unit, _phase(values), **_style_of(i, loop))
+        gain.set_xscale("log")
+        if not db:
+            gain.set_yscale("log")
+        gain.axhline(0.0 if db else 1.0, color=GREY, linewidth=0.8, zorder=0)
+        phase.axhline(-180.0, color=GREY, linewidth=0.8, zorder=0)
+        low, high = phase.get_ylim()
+        step = 45.0 if high - low < 400.0 else 90.0 if high - low < 900.0 else 360.0
+        phase.set_yticks(np.arange(np.ceil(low / step) * step, high + 1e-9, step))
+        gain.set_ylabel(with_unit("|L|", "dB" if db else "1"))
+        phase.set_ylabel(with_unit("phase of L", "deg"))
+        phase.set_xlabel(with_unit("frequency", "Hz") if hz else with_unit("ω", "rad/s"))
+        _write_ends(gain, loops, names, omega)
+        _legend(figure, gain)
+    return figure
+
+
+def _plot_nyquist(loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | None) -> Figure:
+    """Return the loci of the loops around −1; see `LoopTransfer.nyquist`."""
+    reach = 1.6
+    with style():
+        figure = new_figure(5.0)
+        axes = figure.subplots()
+        axes.plot(np.cos(turn := np.linspace(0, 2 * np.pi, 200)), np.sin(turn), color=GREY, linewidth=0.8, zorder=0)
+        for i, (loop, w) in enumerate(zip(loops, _span(loops, omega), strict=True)):
+            values = _response(loop, w)
+            look = _style_of(i, loop)
+            axes.plot(values.real, values.imag, label=names[i], **look)
+            crossed = np.flatnonzero((values.imag[1:] > 0) != (values.imag[:-1] > 0))
+            left = -values.real[crossed]
+            reach = max(reach, 1.2 * float(np.max(left[left < FAR], initial=0.0)))
+            if _is_measured(loop):
+                continue
+            axes.plot(values.real, -values.imag, color=look["color"], linewidth=0.6, alpha=0.6)
+            near = np.flatnonzero(np.abs(values) < 0.8 * max(reach, 1.6))
+            if near.size and near[0] + 1 < len(values):
+                k = min(int(near[0]) + 1, len(values) - 2)
+                axes.annotate(
+                    "",
+                    xy=(values[k + 1].real, values[k + 1].imag),
+                    xytext=(values[k].real, values[k].imag),
+                    arrowprops={"arrowstyle": "-|>", "color": look["color"], "mutation_scale": 12},
+                )
+        axes.plot([-1.0], [0.0], marker="+", color=DARK, markersize=9, linestyle="none")
+        axes.annotate("−1", (-1.0, 0.0), (-6, 5), textcoords="offset points", ha="right", fontsize=7)
+        axes.axhline(0.0, color=GREY, linewidth=0.6, zorder=0)
+        axes.axvline(0.0, color=GREY, linewidth=0.6, zorder=0)
+        axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="Re L", ylabel="Im L")
+        _write_ends(axes, loops, names, omega)
+        _legend(figure, axes)
+    return figure
+
+
+def _plot_nichols(loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | None) -> Figure:
+    """Return gain over phase, with contours of |T|; see `LoopTransfer.nichols`."""
+    with style():
+        figure = new_figure(4.6)
+        axes = figure.subplots()
+        for i, (loop, w) in enumerate(zip(loops, _span(loops, omega), strict=True)):
+            values = _response(loop, w)
+            axes.plot(_phase(values), 20.0 * np.log10(np.abs(values)), label=names[i], **_style_of(i, loop))
+        left, right = axes.get_xlim()
+        left, right = min(left, -225.0), max(right, -90.0)
+        low, high = max(axes.get_ylim()[0], -40.0), min(axes.get_ylim()[1], 40.0)
+        low, high = min(low, -20.0), max(high, 20.0)
+        phase, gain = np.meshgrid(np.linspace(left, right, 400), np.linspace(low, high, 300))
+        value = 10.0 ** (gain / 20.0) * np.exp(1j * np.radians(phase))
+        with np.errstate(divide="ignore"):
+            closed = 20.0 * np.log10(np.abs(value / (1.0 + value)))
+        lines = axes.contour(phase, gain, closed, levels=[-12, -6, -3, 0, 3, 6, 12], colors=STONE, linewidths=0.5)
+        axes.clabel(lines, fmt=lambda value: f"{value:g} dB".replace("-", "−"), fontsize=6)
+        axes.plot([-180.0], [0.0], marker="+", color=DARK, markersize=9, linestyle="none")
+        axes.set(
+            xlim=(left, right), ylim=(low, high), xlabel=with_unit("phase of L", "deg"), ylabel=with_unit("|L|", "dB")
+        )
+        _write_ends(axes, loops, names, omega)
+        _legend(figure, axes)
+    return figure
+
+
+def _plot_step(closed: Sequence[Any], names: Sequence[str], times: ArrayLike | None, horizon: float) -> Figure:
+    """Return the step responses of closed loops; see `LoopTransfer.step`."""
+    import control
+
+    with style():
+        figure = new_figure(3.4)
+        axes = figure.subplots()
+        end = horizon if times is None else float(np.max(np.asarray(times, dtype=float)))
+        if not 0.0 < end < np.inf:
+            raise OptionError(f"found {times!r}; expected times in s above 0. Give some.", port="t")
+        for i, system in enumerate(closed):
+            dt = float(system.dt or 0.0)
+            grid = dt * np.arange(int(end / dt * (1 + 1e-9)) + 1) if dt else np.linspace(0.0, end, POINTS)
+            found = control.step_response(system, T=grid)
+            look = _style_of(i, system)
+            axes.plot(found.t, np.ravel(found.y), label=names[i], drawstyle="steps-post" if dt else "default", **look)
+        axes.axhline(1.0, color=GREY, linewidth=0.8, zorder=0)
+        axes.set(xlim=(0.0, end), xlabel=with_unit("t", "s"), ylabel="response to a unit step")
+        _legend(figure, axes)
+    return figure
+
+
+def _plot_gang_of_four(systems: Sequence[Mapping[str, Any]], names: Sequence[str], omega: ArrayLike | None) -> Figure:
+    """Return the gains of S, T, PS and CS; see `LoopTransfer.gang_of_four`."""
+    with style():
+        figure = new_figure(4.8)
+        panels = figure.subplots(2, 2, sharex=True)
+        for axes, key in zip(np.ravel(panels), ("S", "PS", "CS", "T"), strict=True):
+            own = [found[key] for found in systems]
+            spans = _span([found["L"] for found in systems], omega)
+            for i, (system, w) in enumerate(zip(own, spans, strict=True)):
+                if omega is None:  # closed loops have resonances of their own, up to π/T
+                    top = _limit(system) * BELOW if system.dt else float(w[-1])
+                    w = Realization.of(system).grid(float(w[0]), top, POINTS)
+                axes.plot(w, np.abs(_response(system, w)), label=names[i], **_style_of(i, system))
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            axes.set_ylabel(f"|{key}|")
+            if key in ("S", "T"):
+                axes.axhline(1.0, color=GREY, linewidth=0.8, zorder=0)
+        for axes in panels[1]:
+            axes.set_xlabel(with_unit("ω", "rad/s"))
+        _write_ends(panels[0, 0], [found["L"] for found in systems], names, omega)
+        _legend(figure, panels[0, 0])
+    return figure

@@ -14,10 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import ParameterError, on_one_thread
-from .crossings import Scan
-from .disk import disk_margin, mimo_disk_margin, mu_bound
-from .loop_margins import margins
-from .margins_found import Margins
+from .disk_margins import mimo_disk_margin, mu_bound
+from .loop_margins import Margins, find_disk_frequency, margins
 from .number import Number
 from .realization import Realization
 from .state_space import read_matrices
@@ -30,73 +28,29 @@ KINK = 1e-6
 """Relative difference of two candidates of a margin below which it has a kink."""
 NEAR_POLE = 1e-13
 """Distance of a point from a pole, relative to its size and the pole's, at which L is infinite."""
-
 LOW = 1e-5
-"""Frequency that stands for 0, in parts of the slowest pole that is not 0."""
+"""Frequency in place of 0, in parts of the slowest pole that is not 0."""
 PLACES = ("ms_frequency", "mt_frequency")
-"""Numbers that tell where a peak lies; they have no slopes here."""
+"""Places of peaks, which have no slopes here."""
 
 
 @dataclass(frozen=True)
 class MarginSlope:
-    """A number of a loop, and its slopes along changes of the loop's matrices.
-
-    Attributes
-    ----------
-    number : Number
-        The number, such as a phase margin in degrees.
-    slopes : tuple of float
-        Its derivative along each change; NaN where it has none, as of an infinite margin.
-    kink : bool
-        Whether another crossing has nearly the same margin: the slopes are those of one of them.
-    """
+    """A number of a loop, and its derivatives along changes of the loop's matrices; NaN where it has none."""
 
     number: Number
     slopes: tuple[float, ...]
     kink: bool = False
+    """Whether another crossing has nearly the same margin: the slopes are those of one of them."""
 
 
 @on_one_thread
 def margin_slopes(
     loop: LinearSystem, changes: Sequence[Four], *, delay: int = 0, skew: float = 0.0, found: Margins | None = None
 ) -> dict[str, MarginSlope]:
-    """Return the margins of a loop, and their derivatives along changes of its matrices.
+    """Return the margins of a loop by name, with their derivatives along changes (dA, dB, dC, dD) of its matrices.
 
-    Parameters
-    ----------
-    loop : control.StateSpace
-        L with S = 1/(1 + L), as of `margins`. Of a loop with several channels there is the disk margin alone.
-    changes : sequence of (dA, dB, dC, dD)
-        Derivatives of the loop's matrices by each parameter.
-    delay : int
-        Whole samples of delay in series with a sampled loop.
-    skew : float
-        Skew of the disk margin.
-    found : Margins, optional
-        What `margins` has found of this loop, delay and skew.
-
-    Returns
-    -------
-    dict of str to MarginSlope
-        By the names of `Margins`. Without a stable closed loop the numbers are NaN.
-
-    Raises
-    ------
-    ParameterError
-        If a change does not have the loop's shapes; and as `margins`.
-
-    Examples
-    --------
-    L = k / (s (s + 1)) at k = 1: the phase margin falls with k by the law of its crossover.
-
-    >>> import control
-    >>> import numpy as np
-    >>> loop = control.ss([[0.0, 1.0], [0.0, -1.0]], [[0.0], [1.0]], [[1.0, 0.0]], 0.0)
-    >>> by_k = (np.zeros((2, 2)), np.zeros((2, 1)), np.array([[1.0, 0.0]]), np.zeros((1, 1)))
-    >>> w = np.sqrt((np.sqrt(5) - 1) / 2)
-    >>> slope = -np.degrees(1 / (1 + w**2)) / (w * np.sqrt(1 + w**2) * (1 / w + w / (1 + w**2)) )
-    >>> bool(abs(margin_slopes(loop, [by_k])["phase_margin_deg"].slopes[0] / slope - 1) < 1e-9)
-    True
+    ``found`` are its `margins`, where they are known. Of a loop with several channels there is the disk margin alone.
     """
     A, B, C, D, dt = read_matrices(loop)
     for change in changes:
@@ -254,7 +208,7 @@ class _Slopes:
         """Return the slopes of the peaks of |a + b T|, T = L/(1 + L), and of margins that are their inverses."""
         f, made = self.found, {}
         upper, lower = (1 + self.skew) / 2, -(1 - self.skew) / 2
-        disk = Scan(self.r).find_peak(upper, lower).omega
+        disk = find_disk_frequency(self.r, self.skew)
         places = {"ms": (f.ms_frequency.value, 1.0, 0.0), "mt": (f.mt_frequency.value, 0.0, 1.0)}
         for name, (omega, a, b) in {**places, "disk_margin": (disk, upper, lower)}.items():
             S, along = self.response.sensitivity(omega)
@@ -283,7 +237,7 @@ def _has_near(every: Sequence[float], value: float) -> bool:
 
 def _disk(loop: LinearSystem, response: _Response, delay: int, skew: float) -> MarginSlope:
     """Return the disk margin of a loop with several channels, α = 1/μ, with its slopes at the frequency of the peak."""
-    found = (mimo_disk_margin if len(response.matrices[3]) > 1 else disk_margin)(loop, delay=delay, skew=skew)
+    found = mimo_disk_margin(loop, delay=delay, skew=skew)
     here, n = response.at(found.frequency.value), len(response.matrices[3])
     if here is None:
         return MarginSlope(found.alpha, (np.nan,) * len(response.changes))

@@ -15,13 +15,15 @@ import csv
 import itertools
 import math
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...blocks.core import OptionError, accepts, brief, describe_disk_error, explain_calls, kinds
+from .margin_analysis import MarginTable
+from .number import Interval
 
 if TYPE_CHECKING:
     from control import FrequencyResponseData
@@ -32,33 +34,12 @@ FREQUENCY = {"rad/s": 1.0, "omega": 1.0, "hz": 2.0 * math.pi, "frequency_hz": 2.
 """Names of a frequency's column, with the factor to rad/s."""
 
 
-@dataclass(frozen=True)
-class Interval:
-    """A number and the least and largest value that the data's uncertainty allows; NaN where the data don't tell."""
-
-    value: float
-    low: float
-    high: float
-    unit: str
-
-    def __float__(self) -> float:
-        return self.value
-
-    def __contains__(self, value: float) -> bool:
-        return self.low <= value <= self.high
-
-    def __str__(self) -> str:
-        if math.isnan(self.value):
-            return "not in the data"
-        return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]" + ("" if self.unit == "1" else f" {self.unit}")
-
-
 NOTHING = (math.nan, math.nan, math.nan)
 
 
 @explain_calls
 @dataclass(frozen=True)
-class MeasuredMargins:
+class MeasuredMargins(MarginTable):
     """Margins of a measured loop; the quantities are those of `Margins`.
 
     Attributes
@@ -75,7 +56,7 @@ class MeasuredMargins:
     crossover : Interval
         Gain crossover of the phase margin, in rad/s.
     notes : tuple of str
-        Remarks on margins that the data don't tell.
+        Remarks on margins that are not in the data.
     """
 
     gain_margin_low: Interval
@@ -96,8 +77,7 @@ class MeasuredMargins:
         return brief("measured margins", *facts, then="print(…) shows all")
 
     def __str__(self) -> str:
-        rows = [f"{f.name:18s} {getattr(self, f.name)}" for f in fields(self) if f.name != "notes"]
-        return "\n".join([*rows, *self.notes])
+        return "\n".join([*self._rows(), *self.notes])
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,10 +247,7 @@ def _phase_margin(curve: _Curve) -> tuple[tuple[float, float, float], ...]:
     k, d = int(np.argmin(rotation)), int(np.argmin(forward / w))
 
     def around(i: int) -> slice:
-        """Return the frequencies at which this crossing may lie."""
-        outside = np.flatnonzero(~found)
-        first, last = outside[outside < crossed[i]], outside[outside > crossed[i] + 1]
-        return slice(int(first[-1]) + 1 if first.size else 0, int(last[0]) if last.size else len(found))
+        return _find_range(found, crossed[i])
 
     error = curve.turn_error / curve.w
     return (
@@ -284,6 +261,13 @@ def _phase_margin(curve: _Curve) -> tuple[tuple[float, float, float], ...]:
     )
 
 
+def _find_range(possible: np.ndarray, crossed: int) -> slice:
+    """Return the frequencies around a crossing at which it may lie, as the data's uncertainty makes it possible."""
+    outside = np.flatnonzero(~possible)
+    first, last = outside[outside < crossed], outside[outside > crossed + 1]
+    return slice(int(first[-1]) + 1 if first.size else 0, int(last[0]) if last.size else len(possible))
+
+
 def _gain_margins(curve: _Curve) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Return the gain margins below and above 1, with their bounds."""
     turn = (curve.turn + np.pi) % (2.0 * np.pi) - np.pi
@@ -294,9 +278,7 @@ def _gain_margins(curve: _Curve) -> tuple[tuple[float, float, float], tuple[floa
     for i in crossed:
         part = -turn[i] / (turn[i + 1] - turn[i])
         value = math.exp(-(curve.gain[i] + part * (curve.gain[i + 1] - curve.gain[i])))
-        outside = np.flatnonzero(~possible)
-        first, last = outside[outside < i], outside[outside > i + 1]
-        where = slice(int(first[-1]) + 1 if first.size else 0, int(last[0]) if last.size else len(turn))
+        where = _find_range(possible, i)
         least = math.exp(-float(np.max((curve.gain + curve.gain_error)[where])))
         most = math.exp(-float(np.min((curve.gain - curve.gain_error)[where])))
         found = value, min(least, value), max(most, value)

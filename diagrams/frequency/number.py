@@ -1,32 +1,27 @@
-"""A number of a report, with its unit, its tolerance and its confirmation."""
+"""A number of a loop with its unit, tolerance, confirmation and findings; findings pass from systems to numbers."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar, cast
 
-from ...blocks.core import Finding, explain_calls
+import numpy as np
 
+from ...blocks.core import ConfirmationError, Finding, explain_calls
+from .state_space import findings_of, inexactness_of
+
+P = ParamSpec("P")
+R = TypeVar("R")
 MARK = "†"
 """Mark of a number with findings."""
 
 
 class Confirmation(str):
-    """Text on how a number was confirmed, with the values of the single case.
-
-    Parameters
-    ----------
-    text : str
-        The text.
-    method : str, optional
-        The same without values that differ from number to number, for a table of many; without it that of the text.
-
-    Examples
-    --------
-    >>> Confirmation("eigenvalues: stable at 0.99, unstable at 1.01", "eigenvalues on both sides").method
-    'eigenvalues on both sides'
-    """
+    """Text on how a number was confirmed, with ``method``: the same without values that differ between numbers."""
 
     method: str
 
@@ -37,15 +32,7 @@ class Confirmation(str):
         return made
 
     def and_by(self, text: str, method: str | None = None) -> Confirmation:
-        """Return this confirmation with a further one behind it.
-
-        Parameters
-        ----------
-        text : str
-            The further one; it brings its own method, if it is a `Confirmation`.
-        method : str, optional
-            Its method; empty if only single cases have it.
-        """
+        """Return this confirmation followed by a further one; an empty method leaves the method as it is."""
         own = method_of(text) if method is None else method
         return Confirmation(f"{self}; {text}", "; ".join(part for part in (self.method, own) if part))
 
@@ -108,3 +95,98 @@ class Number:
         """Return the four entries by name, as in a report's JSON, and ``findings`` if there are any."""
         found = {name: getattr(self, name) for name in ("value", "unit", "tolerance", "confirmed_by")}
         return found | ({"findings": [f.as_dict() for f in self.findings]} if self.findings else {})
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A number and the least and largest value that the data's uncertainty allows; NaN where it is not in the data."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+    def __float__(self) -> float:
+        return self.value
+
+    def __contains__(self, value: float) -> bool:
+        return self.low <= value <= self.high
+
+    def __str__(self) -> str:
+        if math.isnan(self.value):
+            return "not in the data"
+        return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]" + ("" if self.unit == "1" else f" {self.unit}")
+
+
+def carries_findings(function: Callable[P, R]) -> Callable[P, R]:
+    """Give a result the findings of the systems among the arguments, and explain equations without a solution."""
+
+    @wraps(function)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        given = [*args, *kwargs.values()]
+        try:
+            with explain_singular(function.__name__):
+                made = function(*args, **kwargs)
+        except ConfirmationError as error:
+            for system in given:
+                _add_inexactness(error, cast("Any", system))
+            raise
+        return with_findings(made, tuple(f for system in given for f in findings_of(cast("Any", system))))
+
+    return run
+
+
+@contextmanager
+def explain_singular(name: str) -> Iterator[None]:
+    """Raise a ConfirmationError of a function for an equation that rounding leaves without a solution."""
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        raise ConfirmationError(
+            f"found an equation of the loop without a solution ({error}); expected one at every frequency off the "
+            "poles. The realization is ill-conditioned: give the loop as a state space with balanced states, or as its "
+            "transfer function.",
+            block=name,
+        ) from error
+
+
+def _add_inexactness(error: ConfirmationError, system: Any) -> None:
+    """Add to an error that its system is not known well enough, if it isn't."""
+    inexactness = inexactness_of(system)
+    if inexactness:
+        why = "; ".join(map(str, findings_of(system)))
+        error.add(
+            f" The loop itself is known to {inexactness:.1g} of its largest entry alone"
+            f"{f' ({why})' if why else ', by differences of an FMU'}: a pole and a zero that cancel may seem apart."
+        )
+
+
+def with_findings(value: R, findings: tuple[Finding, ...]) -> R:
+    """Return a number, a system, or a collection or result of them, with findings added to each number and system."""
+    if not findings:
+        return value
+    return cast("R", _add(value, findings))
+
+
+def _add(value: Any, findings: tuple[Finding, ...]) -> Any:
+    from control import StateSpace
+
+    if isinstance(value, Number):
+        return replace(value, findings=_join(value.findings, findings))
+    if isinstance(value, StateSpace):
+        value.findings = _join(findings_of(value), findings)
+        return value
+    if isinstance(value, Mapping):
+        return {key: _add(entry, findings) for key, entry in value.items()}
+    if isinstance(value, tuple) and type(value) is tuple:
+        return tuple(_add(entry, findings) for entry in value)
+    if is_dataclass(value) and not isinstance(value, Finding | type):
+        changed = {f.name: _add(getattr(value, f.name), findings) for f in fields(value) if f.name != "findings"}
+        if any(f.name == "findings" for f in fields(value)):
+            changed["findings"] = _join(getattr(value, "findings"), findings)  # noqa: B009 - of any dataclass
+        return replace(value, **changed)
+    return value
+
+
+def _join(first: tuple[Finding, ...], second: tuple[Finding, ...]) -> tuple[Finding, ...]:
+    return tuple(dict.fromkeys((*first, *second)))

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, explain_calls, kinds
-from .carried import carries_findings
-from .features import Features, scan
+from .loop_scan import make_grid
+from .number import carries_findings
+from .poles_and_zeros import Features
 from .realization import Realization
 
 if TYPE_CHECKING:
@@ -121,7 +122,7 @@ def winding_number(r: Realization, features: Features, *, delay: float = 0.0) ->
 
 def _make_contour(r: Realization, features: Features, delay: float) -> list[np.ndarray]:
     """Return the upper half of the contour as lines and arcs of points s."""
-    segments = scan(r, features, delay=delay)
+    segments = make_grid(r, features, delay=delay)
     others = np.concatenate([features.poles, features.closed, features.zeros])
     spots = [a.omega for a in features.axis_poles]
     top = segments[-1][-1]

@@ -8,20 +8,21 @@ system find the limits of gain, rotation and delay, and confirm the disk margin.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, ParameterError, brief, explain_calls, on_one_thread
-from .carried import carries_findings
-from .confirm import confirm_limit, confirm_no_limit
-from .disk import disk_gains, sensitivity_at
-from .features import SIDES
-from .number import MARK, Confirmation, Number
-from .realization import Realization, refuse_singular
-from .sign_changes import refine_sign_change
+from ...blocks.core import ConfirmationError, Finding, ParameterError, explain_calls, on_one_thread
+from .disk_margins import disk_gains
+from .margin_analysis import MarginFinder, StabilityMargins
+from .number import Confirmation, Number, carries_findings
+from .poles_and_zeros import SIDES
+from .realization import Realization
+from .scan_refine_confirm import find_first_limit, find_largest, first_largest
+from .sensitivity_peaks import sensitivity_at
 
 if TYPE_CHECKING:
     from .state_space import LinearSystem
@@ -40,8 +41,8 @@ ON_RIM = 180
 
 
 @explain_calls
-@dataclass(frozen=True)
-class PeriodicMargins:
+@dataclass(frozen=True, repr=False)
+class PeriodicMargins(StabilityMargins):
     """Margins of a periodic loop, of one static factor on the wire; those of an unstable closed loop are NaN.
 
     Parameters
@@ -85,31 +86,11 @@ class PeriodicMargins:
     dt: float
     findings: tuple[Finding, ...] = ()
 
-    def __repr__(self) -> str:
-        facts = f"period {self.dt:g} s", "stable" if self.stable else "the closed loop is unstable"
-        names = ("gain_margin_high", "phase_margin_deg", "disk_margin")
-        told = [f"{name} {getattr(self, name)}" for name in names] if self.stable else []
-        return brief("margins of a periodic loop", *facts, *told, then="print(…) shows all")
+    def _title(self) -> str:
+        return f"margins of a periodic loop, period {self.dt:g} s"
 
-    def numbers(self) -> dict[str, Number]:
-        """Return the single numbers by name."""
-        found = {f.name: getattr(self, f.name) for f in fields(self)}
-        return {name: value for name, value in found.items() if isinstance(value, Number)}
-
-    @property
-    def unstable_poles(self) -> tuple[complex, ...]:
-        """The closed-loop poles z that are not stable; empty for a stable loop."""
-        return () if self.stable else tuple(p for p in self.closed_loop_poles if abs(p) >= 1.0 - 1e-12)
-
-    def __str__(self) -> str:
-        lines = [f"{name:22s}{number}" for name, number in self.numbers().items()]
-        if not self.stable:
-            poles = ", ".join(f"{p:.6g}" for p in self.unstable_poles)
-            lines = [
-                "unstable: the closed loop has no margins",
-                f"unstable_poles        z = {poles} over the period of {self.dt:g} s (stable: |z| < 1)",
-            ]
-        return "\n".join([*lines, *(f"{MARK} {finding}" for finding in self.findings)])
+    def _further_lines(self) -> list[str]:
+        return [f"period                {self.dt:g} s, in which the wire is renewed {self.renewals} times"]
 
 
 @explain_calls
@@ -163,117 +144,81 @@ def periodic_margins(loop: LinearSystem) -> PeriodicMargins:
             "regular. Look at the feedthrough of the loop.",
             block="periodic_margins",
         )
-    with refuse_singular("periodic_margins"):
-        return PeriodicMarginFinder(r).find_margins()
+    return PeriodicMarginFinder(r).find_margins()
 
 
-class PeriodicMarginFinder:
-    """Factors that destabilize a lifted loop, on a grid of θ; each ``_find_…`` computes and confirms margins.
+class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
+    """Factors that destabilize a lifted loop, on a grid of θ; each ``_find_…`` computes and confirms margins."""
 
-    Parameters
-    ----------
-    r : Realization
-        The lifted loop.
-    """
+    result = PeriodicMargins
+    eigenvalues = EIGENVALUES
+    rotated = " with the factor rotated"
 
     def __init__(self, r: Realization):
-        self.r = r
+        super().__init__(r)
         self.theta = _make_grid(r)
-        self.factors = np.array([self.destabilizing(theta) for theta in self.theta])
-        self.all_factors = np.concatenate([self.factors.ravel(), np.conj(self.factors.ravel())])
+        self.factor = complex(np.nan)
 
-    def find_margins(self) -> PeriodicMargins:
-        """Return all margins."""
-        r = self.r
-        poles = r.eigenvalues()
-        stable = r.is_stable()
-        if stable:
-            found = {**self._find_gain_margins(), **self._find_phase_margin(), **self._find_delay_margin()}
-            disk, factor = self._find_disk_margin()
-            found |= disk
-        else:
-            reason = f"the closed loop is not stable: {r.count_unstable()} of its poles are not"
-            units = {"phase_margin_deg": "deg", "delay_margin_s": "s", "delay_margin_samples": "samples"}
-            units |= {"disk_frequency": "rad/s"}
-            names = [f.name for f in fields(PeriodicMargins) if f.type == "Number"]
-            found = {name: Number(np.nan, units.get(name, "1"), np.nan, reason) for name in names}
-            factor = complex(np.nan)
-        return PeriodicMargins(
-            stable=stable,
-            destabilizing=factor,
-            closed_loop_poles=tuple(complex(p) for p in np.sort_complex(poles + 1)),
-            renewals=len(r.D),
-            dt=r.dt,
-            findings=(),
-            **found,
-        )
+    @cached_property
+    def all_factors(self) -> np.ndarray:
+        """All factors that destabilize, with their conjugates."""
+        upper = np.concatenate([self.destabilizing(theta) for theta in self.theta])
+        return np.concatenate([upper, np.conj(upper)])
+
+    def find_numbers(self) -> dict[str, Number]:  # noqa: D102 - as in the base
+        disk, self.factor = self._find_disk_margin()
+        return {**self._find_gain_margins(), **self._find_phase_margin(), **self._find_delay_margin(), **disk}
+
+    def describe(self) -> dict[str, Any]:  # noqa: D102 - as in the base
+        return {"destabilizing": self.factor, "renewals": len(self.r.D)}
+
+    def sensitivities(self, theta: float) -> np.ndarray:
+        """Return the eigenvalues of S = (I + L)⁻¹ at e^(jθ) that aren't 1: S is finite where L is not."""
+        s = np.linalg.eigvals(sensitivity_at(self.r, theta / self.r.dt))
+        return np.asarray(s[np.abs(s - 1.0) > 1e-14])
 
     def destabilizing(self, theta: float) -> np.ndarray:
-        """Return the factors −1/λ that put a closed-loop pole at e^(jθ); infinite ones as NaN.
-
-        They are s/(s − 1) of the eigenvalues s of S = (I + L)⁻¹, which is finite where L is not.
-        """
-        s = np.linalg.eigvals(sensitivity_at(self.r, theta / self.r.dt))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            factors = s / (s - 1.0)
-        return np.where(np.isfinite(factors) & (np.abs(s - 1.0) > 1e-14), factors, np.nan)
+        """Return the finite factors −1/λ = s/(s − 1) that put a closed-loop pole at e^(jθ)."""
+        s = self.sensitivities(theta)
+        return np.asarray(s / (s - 1.0))
 
     def _distance(self, f: complex) -> float:
         """Return the distance of a factor to the nearest one of the grid that destabilizes."""
-        return float(np.nanmin(np.abs(self.all_factors - f), initial=np.inf))
+        return float(np.min(np.abs(self.all_factors - f), initial=np.inf))
 
-    def _march(self, at: Callable[[float], complex], begin: float, end: float) -> float | None:
+    def _find_limit(self, at: Callable[[float], complex], begin: float, end: float) -> float | None:
         """Return the first limit of stability along a curve of factors; None if there is none.
 
-        A step is as long as the distance to the destabilizing factors allows, so that no limit is stepped over.
-
-        Parameters
-        ----------
-        at : callable
-            From a number to the factor there; its derivative has the size of the factor.
-        begin, end : float
-            First and last number.
+        ``at`` is the factor at a number; its derivative has the size of the factor. A step is as long as the distance
+        to the destabilizing factors allows, so that no limit is stepped over.
         """
 
         def growth(x: float) -> float:
             return float(np.max(self.r.growth(self.r.eigenvalues(at(x)))))
 
-        x, sign = begin, np.sign(end - begin)
-        while (end - x) * sign > 0:
-            f = at(x)
-            step = max(0.5 * self._distance(f) / abs(f), SMALLEST_STEP)
-            following = x + sign * min(step, abs(end - x))
-            if growth(following) >= 0:
-                return refine_sign_change(growth, x, following, xtol=1e-14 * abs(following))
-            x = following
-        return None
+        def steps() -> Iterator[float]:
+            x, sign = begin, np.sign(end - begin)
+            while (end - x) * sign > 0:
+                f = at(x)
+                step = max(0.5 * self._distance(f) / abs(f), SMALLEST_STEP)
+                x = x + sign * min(step, abs(end - x))
+                yield x
+
+        return find_first_limit(growth, begin, steps())
 
     def _find_gain_margins(self) -> dict[str, Number]:
         found = {}
-        for name, end in (("gain_margin_low", -1.0), ("gain_margin_high", 1.0)):
-            x = self._march(lambda x: complex(np.exp(x)), 0.0, end * np.log(LARGEST))
-            if x is None:
-                values = LARGEST ** (end * np.linspace(0.1, 1.0, 10))
-                how = confirm_no_limit(name, [float(v) for v in values], self.r.is_stable, EIGENVALUES)
-                found[name] = Number(0.0 if end < 0 else np.inf, "1", 0.0, how)
-                continue
-            k = float(np.exp(x))
-            how = confirm_limit(name, k, [], 1.0, self.r.is_stable, EIGENVALUES)
-            found[name] = Number(k, "1", 1e-9 * k, how)
+        for name, none, end in (("gain_margin_low", 0.0, -1.0), ("gain_margin_high", np.inf, 1.0)):
+            x = self._find_limit(lambda x: complex(np.exp(x)), 0.0, end * np.log(LARGEST))
+            k = none if x is None else float(np.exp(x))
+            tried = [float(v) for v in LARGEST ** (end * np.linspace(0.1, 1.0, 10))]
+            found[name] = self.make_gain_margin(name, k, 1e-9 * k, tried=tried)
         return found
 
     def _find_phase_margin(self) -> dict[str, Number]:
-        def stable(degrees: float) -> bool:
-            return self.r.is_stable(np.exp(1j * np.radians(degrees)))
-
-        name = "phase_margin_deg"
-        x = self._march(lambda x: complex(np.exp(1j * x)), 0.0, np.pi)
-        if x is None:
-            how = confirm_no_limit(name, [30.0, 60.0, 90.0, 120.0, 150.0, 180.0], stable, EIGENVALUES)
-            return {name: Number(np.inf, "deg", 0.0, how)}
-        degrees = float(np.degrees(x))
-        how = confirm_limit(name, degrees, [360 - degrees], 0.0, stable, EIGENVALUES + " with the factor rotated")
-        return {name: Number(degrees, "deg", 1e-7, how)}
+        x = self._find_limit(lambda x: complex(np.exp(1j * x)), 0.0, np.pi)
+        degrees = np.inf if x is None else float(np.degrees(x))
+        return {"phase_margin_deg": self.make_phase_margin(degrees, 1e-7)}
 
     def _find_delay_margin(self) -> dict[str, Number]:
         n, delayed, T = 0, _delay_by_a_renewal(self.r), self.r.dt / len(self.r.D)
@@ -305,26 +250,15 @@ class PeriodicMarginFinder:
             return False
 
     def _find_disk_margin(self) -> tuple[dict[str, Number], complex]:
-        from scipy.optimize import minimize_scalar
+        def reach(theta: float) -> float:
+            """Return the largest |s − 1/2|, 1/α of the factors of an angle: (f + 1)/(f − 1) = 2 s − 1."""
+            s = self.sensitivities(theta)
+            return float(np.max(np.abs(s - 0.5), initial=0.0))
 
-        def size(factors: np.ndarray) -> np.ndarray:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                return np.asarray(2 * np.abs((factors - 1) / (factors + 1)))
-
-        def smallest(theta: float) -> float:
-            return float(np.nanmin(size(self.destabilizing(theta)), initial=np.inf))
-
-        on_grid = np.nanmin(np.where(np.isnan(self.factors), np.inf, size(self.factors)), axis=1)
-        theta = float(self.theta[int(np.argmin(on_grid))])
-        padded = np.concatenate([[np.inf], on_grid, [np.inf]])
-        valleys = np.flatnonzero((padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]))
-        for m in valleys[np.argsort(on_grid[valleys], kind="stable")][:8]:
-            low, high = self.theta[max(m - 1, 0)], self.theta[min(m + 1, len(self.theta) - 1)]
-            found = minimize_scalar(smallest, bounds=(low, high), method="bounded", options={"xatol": 1e-13 * high})
-            theta = min(theta, float(found.x), key=smallest)
-        factors = self.destabilizing(theta)
-        factor = complex(factors[int(np.nanargmin(size(factors)))])
-        alpha = smallest(theta)
+        largest, theta = find_largest(reach, self.theta, np.array([reach(theta) for theta in self.theta]))
+        values = self.sensitivities(theta)
+        s = complex(values[first_largest(np.abs(values - 0.5))])
+        alpha, factor = 1 / largest, s / (s - 1.0)
         how = self._confirm_disk(alpha, factor, theta)
         low, high, phase = disk_gains(alpha, 0.0)
         how = how.and_by(f"gains {low:.6g} … {high:.6g} and phases up to ± {phase:.6g}° may vary together", "")

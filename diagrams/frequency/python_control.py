@@ -1,4 +1,4 @@
-"""Margins by python-control beside ours, with a verdict and its reason where they differ."""
+"""Margins by python-control next to ours, with a verdict and its reason where they differ."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from ...blocks.core import ConfirmationError, ParameterError, accepts, explain_calls, kinds, on_one_thread
-from .confirm import confirm_limit, pick_test_values
-from .crossings import Scan
-from .loop_margins import margins
-from .margins_found import Margins
+from .loop_margins import Margins, margins
+from .loop_scan import Scan
 from .realization import Realization
+from .scan_refine_confirm import confirm_limit, pick_test_values
 
 if TYPE_CHECKING:
     from control import StateSpace
@@ -57,7 +56,7 @@ class Comparison:
 
 @accepts(delay=kinds.finite)
 def compare_with_control(loop: LinearSystem, *, delay: int = 0) -> tuple[Comparison, ...]:
-    """Return each margin beside python-control's value, with a verdict and its reason.
+    """Return each margin with python-control's value, with a verdict and its reason.
 
     A value that differs is tested: gains and phases by closed-loop eigenvalues at 0.99 and 1.01 of it, frequencies and
     peaks by the frequency response.
@@ -93,7 +92,7 @@ def compare_with_control(loop: LinearSystem, *, delay: int = 0) -> tuple[Compari
 
 @on_one_thread
 def compare_margins(r: Realization, ours: Margins, L: StateSpace) -> tuple[Comparison, ...]:
-    """Return computed margins beside python-control's values for L; r is the realization of L."""
+    """Return computed margins with python-control's values for L; r is the realization of L."""
     theirs = _ControlValues(L)
     judge = _Judge(r, ours)
     found = []

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, LoopwrightError, ParameterError
+from ...blocks.core import LoopwrightError, ParameterError
+from .number import explain_singular
 from .state_space import inexactness_of, read_coefficients, read_matrices
 from .transfer_functions import Coefficients
 
@@ -34,26 +33,6 @@ LARGE = 1e4
 """|L| above which a difference does not show in the closed loop."""
 
 
-@contextmanager
-def refuse_singular(name: str) -> Iterator[None]:
-    """Raise a ConfirmationError for an equation that rounding leaves without a solution.
-
-    Parameters
-    ----------
-    name : str
-        Function that the error names.
-    """
-    try:
-        yield
-    except np.linalg.LinAlgError as error:
-        raise ConfirmationError(
-            f"found an equation of the loop without a solution ({error}); expected one at every frequency off the "
-            "poles. The realization is ill-conditioned: give the loop as a state space with balanced states, or as its "
-            "transfer function.",
-            block=name,
-        ) from error
-
-
 @dataclass(frozen=True, eq=False)
 class Realization:
     """A linear system (p I − A) x = B u, y = C x + D u with p = s, or p = z − 1 where it is sampled.
@@ -75,23 +54,7 @@ class Realization:
 
     @classmethod
     def of(cls, loop: LinearSystem, *, delay: int = 0) -> Realization:
-        """Return the balanced, minimal realization of a linear system of python-control.
-
-        Parameters
-        ----------
-        loop : control.StateSpace or control.TransferFunction
-            Continuous (dt = 0) or sampled (dt = T in s).
-        delay : int
-            Whole samples of delay in series with a sampled loop.
-
-        Raises
-        ------
-        ParameterError
-            If it is no linear system, has no definite sample time or entries that are not finite, or the delay is not
-            a number of samples.
-        ConfirmationError
-            If it is so ill-conditioned that its equations have no solution off the poles.
-        """
+        """Return the balanced, minimal realization of a linear system, with whole samples of delay in series."""
         name = str(getattr(loop, "name", None) or "loop")
         try:
             A, B, C, D, dt = read_matrices(loop)
@@ -122,7 +85,7 @@ class Realization:
             D = np.where(np.abs(D) <= STRUCTURE * size, 0.0, D)
         for _ in range(int(delay)):
             A, B, C, D = _delay_inputs(A, B, C, D)
-        with refuse_singular(name):
+        with explain_singular(name):
             made = cls(*_balance(A, B, C), D, float(dt), np.zeros(0), None, inexactness_of(loop)).reduce()
         # scaled once more, with input and output: rounding in A alone may have set the first scales
         A, B, C = _scale(made.A, made.B, made.C)
@@ -217,9 +180,11 @@ class Realization:
         """Frobenius norm of A."""
         return float(np.linalg.norm(self.A)) if self.order else 0.0
 
-    def delay_once(self) -> Realization:
-        """Return this sampled system with one more sample of delay."""
-        A, B, C, D = _delay_inputs(self.A, self.B, self.C, self.D)
+    def delay_by(self, samples: int) -> Realization:
+        """Return this sampled system with samples of delay in series."""
+        A, B, C, D = self.A, self.B, self.C, self.D
+        for _ in range(samples):
+            A, B, C, D = _delay_inputs(A, B, C, D)
         return replace(self, A=A, B=B, C=C, D=D, coefficients=None)
 
     def reduce(self) -> Realization:
@@ -234,15 +199,7 @@ class Realization:
         return whole._replace_by(_transpose(part), np.concatenate([first, second]))
 
     def grid(self, low: float, high: float, count: int) -> np.ndarray:
-        """Return frequencies in rad/s at which the response is drawn: evenly over the logarithm, and around resonances.
-
-        Parameters
-        ----------
-        low, high : float
-            Ends; a sampled system's response ends below π/T.
-        count : int
-            Frequencies between them, besides those around resonances.
-        """
+        """Return frequencies in rad/s to draw a response at: ``count`` over the logarithm, and more at resonances."""
         top = min(high, self.nyquist * (1 - 1e-6))
         s = self.logarithm(np.linalg.eigvals(self.A))
         peaks = [abs(p) for p in s if p.imag > 0 and abs(p.real) < LIGHTLY_DAMPED * abs(p)]

@@ -66,8 +66,8 @@ def test_margins_are_computed_on_one_thread(monkeypatch):
     import control
 
     seen = []
-    judge = _margins._MarginFinder
-    monkeypatch.setattr(_margins, "_MarginFinder", lambda *args: seen.append(set(threads())) or judge(*args))
+    judge = _margins._LoopMarginFinder
+    monkeypatch.setattr(_margins, "_LoopMarginFinder", lambda *args: seen.append(set(threads())) or judge(*args))
     margins(control.ss(control.tf([1.0], [1.0, 1.0, 0.0])))
     assert seen == [{1}]
     assert set(threads()) == {2}

@@ -18,7 +18,7 @@ from loopwright.diagrams import (
     mimo_disk_margin,
     sensitivity,
 )
-from loopwright.diagrams.frequency import disk as disk
+from loopwright.diagrams.frequency import disk_margins as disk
 from support.loops import sampled_triple, triple
 from support.random_cases import random_cases
 

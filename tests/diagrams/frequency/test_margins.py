@@ -8,9 +8,10 @@ import pytest
 
 from loopwright.blocks import ConfirmationError, LoopwrightError, ParameterError
 from loopwright.diagrams import Number, margins, nyquist_count
-from loopwright.diagrams.frequency import confirm as confirm
-from loopwright.diagrams.frequency.crossings import Scan
+from loopwright.diagrams.frequency import loop_margins, loop_scan, scan_refine_confirm
+from loopwright.diagrams.frequency.loop_scan import Scan
 from loopwright.diagrams.frequency.realization import Realization
+from loopwright.diagrams.frequency.sensitivity_peaks import confirm_peak
 from support.loops import open_loops, sampled_triple, stabilized_loops, triple
 from support.random_cases import random_cases
 
@@ -292,47 +293,44 @@ def test_every_number_says_its_unit_tolerance_and_confirmation_and_goes_into_jso
 def test_a_wrong_limit_is_not_confirmed():
     r = Realization.of(triple(20.0))
     with pytest.raises(ConfirmationError, match="found the limit 0.12, but eigenvalues say stable at .* and stable at"):
-        confirm.confirm_limit("gain_margin_low", 0.12, [], 1.0, r.is_stable, "eigenvalues")
+        scan_refine_confirm.confirm_limit("gain_margin_low", 0.12, [], 1.0, r.is_stable, "eigenvalues")
     with pytest.raises(ConfirmationError, match="found no limit, but eigenvalues say unstable at 0.1"):
-        confirm.confirm_no_limit("gain_margin_low", [0.5, 0.1], r.is_stable, "eigenvalues")
+        scan_refine_confirm.confirm_no_limit("gain_margin_low", [0.5, 0.1], r.is_stable, "eigenvalues")
     assert issubclass(ConfirmationError, LoopwrightError)
 
 
 @pytest.mark.parametrize("wrong", [0.99, 1.01])
 def test_a_wrong_peak_is_not_confirmed(wrong):
     r = Realization.of(triple(20.0))
-    assert "the peak reaches 0.999" in confirm.confirm_peak(r, 0.0, 1.0, 9 / 7, "mt")
+    assert "the peak reaches 0.999" in confirm_peak(r, 0.0, 1.0, 9 / 7, "mt")
     with pytest.raises(ConfirmationError, match="found the peak"):
-        confirm.confirm_peak(r, 0.0, 1.0, 9 / 7 * wrong, "mt")
+        confirm_peak(r, 0.0, 1.0, 9 / 7 * wrong, "mt")
 
 
 @pytest.mark.parametrize("what", ["gain", "phase", "delay", "peak", "bandwidth"])
 def test_a_scan_that_goes_wrong_is_an_error(what, monkeypatch):
-    from loopwright.diagrams.frequency import crossings as _crossings
-    from loopwright.diagrams.frequency import loop_margins as _margins
-
     def off(self):
-        return [_crossings.Crossing(c.omega * 1.05, c.L * 1.05, c.slope, c.error) for c in real(self)]
+        return [loop_scan.Crossing(c.omega * 1.05, c.L * 1.05, c.slope, c.error) for c in real(self)]
 
     if what in ("gain", "phase"):
-        real = getattr(_crossings.Scan, f"find_{what}_crossovers")
-        monkeypatch.setattr(_crossings.Scan, f"find_{what}_crossovers", off)
+        real = getattr(loop_scan.Scan, f"find_{what}_crossovers")
+        monkeypatch.setattr(loop_scan.Scan, f"find_{what}_crossovers", off)
     elif what == "delay":
-        real = _crossings.Scan.find_gain_crossovers
-        monkeypatch.setattr(_margins, "confirm_crossing", lambda *_: "")
+        real = loop_scan.Scan.find_gain_crossovers
+        monkeypatch.setattr(loop_margins, "_confirm_crossing", lambda *_: "")
         monkeypatch.setattr(
-            _crossings.Scan,
+            loop_scan.Scan,
             "find_gain_crossovers",
-            lambda self: [_crossings.Crossing(c.omega * 1.05, c.L, c.slope, c.error) for c in real(self)],
+            lambda self: [loop_scan.Crossing(c.omega * 1.05, c.L, c.slope, c.error) for c in real(self)],
         )
     elif what == "peak":
-        peak = _crossings.Scan.find_peak
+        peak = loop_scan.Scan.find_peak
         monkeypatch.setattr(
-            _crossings.Scan, "find_peak", lambda *a: _crossings.Peak(peak(*a).value * 0.99, peak(*a).omega)
+            loop_scan.Scan, "find_peak", lambda *a: loop_scan.Peak(peak(*a).value * 0.99, peak(*a).omega)
         )
     else:
-        fall = _crossings.Scan.find_fall_below
-        monkeypatch.setattr(_crossings.Scan, "find_fall_below", lambda *a: fall(*a) * 1.01)
+        fall = loop_scan.Scan.find_fall_below
+        monkeypatch.setattr(loop_scan.Scan, "find_fall_below", lambda *a: fall(*a) * 1.01)
     with pytest.raises(ConfirmationError):
         margins(triple(20.0))
 
@@ -426,7 +424,7 @@ def test_a_delay_margin_of_exactly_one_sample_is_confirmed():
     assert found.delay_margin_s.value == pytest.approx(0.1, abs=1e-13)
     assert "on the limit at n = 1" in found.delay_margin_samples.confirmed_by
     with pytest.raises(ConfirmationError, match="no closed-loop pole is nearer"):
-        confirm.confirm_on_limit(Realization.of(control.tf([0.9], [1.0, -1.0], 0.1)), 1)
+        loop_margins._confirm_on_limit(Realization.of(control.tf([0.9], [1.0, -1.0], 0.1)), 1)
 
 
 @pytest.mark.parametrize(("dt", "pole"), [(0, 2.0), (0.1, 1.2)])

@@ -262,7 +262,7 @@ def test_slower_loops_need_a_clock_at_the_wire():
 
 def test_a_disk_that_is_too_large_is_not_confirmed(monkeypatch, model):
     L = model.loop("voltage", lifted=True)
-    right = PeriodicMarginFinder.destabilizing
-    monkeypatch.setattr(PeriodicMarginFinder, "destabilizing", lambda self, theta: 2.0 * right(self, theta))
+    right = PeriodicMarginFinder.sensitivities
+    monkeypatch.setattr(PeriodicMarginFinder, "sensitivities", lambda self, theta: 0.25 + right(self, theta) / 2)
     with pytest.raises(ConfirmationError, match="factors just inside"):
         periodic_margins(L)

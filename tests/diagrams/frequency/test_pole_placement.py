@@ -93,7 +93,7 @@ def test_what_can_not_be_placed_is_refused(A, B, poles, message):
 
 
 def test_a_gain_that_does_not_place_the_poles_is_an_error(monkeypatch):
-    monkeypatch.setattr(placement, "_place_by_ackermann", lambda *_: np.array([[8000.0, 1200.0, 60.1]]))
+    monkeypatch.setattr(placement, "_place_in_chains", lambda *_: np.array([[8000.0, 1200.0, 60.1]]))
     A, B = np.diag([1.0, 1.0], 1), np.array([[0.0], [0.0], [1.0]])
     with pytest.raises(ConfirmationError, match="differs from the wanted one"):
         place(A, B, [-20.0] * 3)

@@ -8,7 +8,8 @@ import pytest
 
 from loopwright.blocks import ParameterError
 from loopwright.diagrams import compare_with_control, disk_margin, margins, nyquist_count, place
-from loopwright.diagrams.frequency.features import Features, scan
+from loopwright.diagrams.frequency.loop_scan import make_grid
+from loopwright.diagrams.frequency.poles_and_zeros import Features
 from loopwright.diagrams.frequency.python_control import _Judge, compare_margins
 from loopwright.diagrams.frequency.realization import Realization
 from support.loops import sampled_triple, triple
@@ -104,7 +105,7 @@ def test_three_scattered_poles_at_one_are_one_cluster_below_which_nothing_is_rea
     assert [(a.omega, a.multiplicity) for a in features.axis_poles] == [(0.0, 3)]
     assert features.axis_poles[0].scatter > 1e-3  # rad/s, where a triple pole is exact in the original matrices
     assert features.unstable_poles() == 0
-    assert scan(r, features)[0][0] >= 30 * features.axis_poles[0].scatter
+    assert make_grid(r, features)[0][0] >= 30 * features.axis_poles[0].scatter
 
 
 def test_its_polynomial_method_finds_a_gain_margin_of_two_where_there_are_sixteen_hundred():

@@ -100,7 +100,7 @@ def test_an_equation_without_a_solution_is_an_error_with_a_next_step(monkeypatch
     def singular(*args, **options):
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr("loopwright.diagrams.frequency.loop_margins._MarginFinder.find_margins", singular)
+    monkeypatch.setattr("loopwright.diagrams.frequency.loop_margins._LoopMarginFinder.find_margins", singular)
     with pytest.raises(ConfirmationError, match=r"margins: found an equation .* \(Singular matrix\); .*balanced"):
         margins(control.tf([1.0], [1.0, 1.0]))
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from loopwright.diagrams.drawing import shapes, svg
-from loopwright.diagrams.frequency.loop_plots import COLORS
+from loopwright.diagrams.frequency.loop_transfer import COLORS
 from loopwright.diagrams.report import pages
 from loopwright.diagrams.report.variant import LOOKS, OTHER, look_of
 from loopwright.diagrams.results import DARK, STONE

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, brief, explain_calls, kinds
-from .carried import carries_findings
-from .confirm import confirm_limit, confirm_peak
-from .features import Features, scan
-from .loop_margins import EIGENVALUES
-from .number import Confirmation, Number
-from .realization import Realization, refuse_singular
+from .loop_scan import Scan
+from .margin_analysis import EIGENVALUES
+from .number import Confirmation, Number, carries_findings
+from .poles_and_zeros import Features
+from .realization import Realization
+from .scan_refine_confirm import confirm_limit, find_largest
+from .sensitivity_peaks import confirm_peak, sensitivity_at
 from .state_space import make_state_space, read_matrices
-from .ties import first_largest
 
 if TYPE_CHECKING:
     from control import StateSpace
@@ -88,9 +88,7 @@ def disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Dis
     ParameterError
         If the closed loop is not stable.
     """
-    r = Realization.of(loop, delay=delay)
-    with refuse_singular("disk_margin"):
-        return _compute_disk_margin(r, skew)
+    return _compute_disk_margin(Realization.of(loop, delay=delay), skew)
 
 
 @accepts(delay=kinds.finite, skew=kinds.number)
@@ -117,9 +115,7 @@ def mimo_disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -
     ParameterError
         If the closed loop is not stable, or the loop is not square.
     """
-    r = Realization.of(loop, delay=delay)
-    with refuse_singular("disk_margin"):
-        return _compute_disk_margin(r, skew)
+    return _compute_disk_margin(Realization.of(loop, delay=delay), skew)
 
 
 @accepts(plant=kinds.system, controller=kinds.system, where=kinds.text)
@@ -244,7 +240,7 @@ def _compute_disk_margin(r: Realization, skew: float) -> DiskMargin:
     def matrix(omega: float) -> np.ndarray:
         return sensitivity_at(r, omega) + (skew - 1) / 2 * np.eye(n)
 
-    _, omega = _find_largest(r, lambda w: mu_bound(matrix(w), polish=False))
+    omega = _find_largest(r, skew, matrix)
     bound = mu_bound(matrix(omega))
     alpha = 1 / bound
     lower, delta = mu_lower_bound(matrix(omega))
@@ -302,48 +298,26 @@ def _confirm_destabilizing(r: Realization, delta: np.ndarray, skew: float) -> Co
         return Confirmation("I + L F is singular at infinite frequency with δ")
 
 
-def sensitivity_at(r: Realization, omega: float) -> np.ndarray:
-    """Return S = (I + L)⁻¹ at ω, by the closed loop: it is finite where the loop has poles on the axis."""
-    n = len(r.D)
-    if np.isinf(omega):
-        return np.asarray(np.linalg.inv(np.eye(n) + r.D))
-    p = complex(r.point(np.array(1j * omega)))
-    inverse = np.linalg.inv(np.eye(n) + r.D)
-    states = np.linalg.solve(p * np.eye(r.order) - r.closed_matrix(), r.B @ inverse)
-    return np.asarray(inverse - inverse @ r.C @ states)
-
-
-def _find_largest(r: Realization, function: Callable[[float], float]) -> tuple[float, float]:
-    """Return the largest value over frequency, and its frequency, from a scan that is refined."""
-    from scipy.optimize import minimize_scalar
-
-    omega = np.unique(np.concatenate([[0.0], *_make_grid(r), [r.nyquist]]))
-    values = np.array([function(w) for w in omega])
-    best, where = float(values.max()), float(omega[first_largest(values)])
-    inside = [k for k in range(1, len(omega) - 1) if values[k - 1] <= values[k] >= values[k + 1] and omega[k - 1] > 0]
-    for k in sorted(inside, key=lambda k: -values[k])[:5]:
-        high = omega[k + 1] if np.isfinite(omega[k + 1]) else 10 * omega[k]
-        found = minimize_scalar(
-            lambda x: -function(np.exp(x)),
-            bounds=(np.log(omega[k - 1]), np.log(high)),
-            method="bounded",
-            options={"xatol": 1e-12},
-        )
-        if -float(found.fun) > best:
-            best, where = -float(found.fun), float(np.exp(float(found.x)))
-    return best, where
-
-
-def _make_grid(r: Realization) -> list[np.ndarray]:
-    """Return frequencies around every open-loop and closed-loop pole, and 20 a decade besides."""
-    features = Features.of(r)
+def _find_largest(r: Realization, skew: float, matrix: Callable[[float], np.ndarray]) -> float:
+    """Return the frequency in rad/s at which the structured singular value's bound is largest."""
     if len(r.D) == 1:
-        return [segment[:: max(1, len(segment) // 1000)] for segment in scan(r, features)]
+        return Scan(r).find_peak((1 + skew) / 2, -(1 - skew) / 2).omega
+
+    def bound(omega: float) -> float:
+        return mu_bound(matrix(omega), polish=False)
+
+    omega = _make_grid(r)
+    return find_largest(bound, omega, np.array([bound(w) for w in omega]))[1]
+
+
+def _make_grid(r: Realization) -> np.ndarray:
+    """Return frequencies around all open-loop and closed-loop poles, 20 a decade besides, and both ends."""
+    features = Features.of(r)
     sizes = features.sizes()
     low, high = (sizes[0] / 1e3, sizes[-1] * 1e3) if len(sizes) else (1e-3, 1e3)
     high = min(high, r.nyquist)
     low = min(low, high / 10)
-    grid = [np.geomspace(low, high, int(20 * np.log10(high / low)) + 2)]
     sides = np.array([-3, -1, -0.3, 0.0, 0.3, 1, 3])
-    grid += [abs(s.imag) + abs(s.real) * sides for s in features.points()]
-    return [w[(w >= low) & (w <= high)] for w in grid]
+    around = [abs(s.imag) + abs(s.real) * sides for s in features.points()]
+    omega = np.concatenate([np.geomspace(low, high, int(20 * np.log10(high / low)) + 2), *around])
+    return np.unique(np.concatenate([[0.0], omega[(omega >= low) & (omega <= high)], [r.nyquist]]))

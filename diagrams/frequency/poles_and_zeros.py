@@ -1,4 +1,4 @@
-"""Poles and zeros of a loop, and a grid of frequencies that resolves all of them."""
+"""Poles and zeros of a loop; those on the limit of stability gathered, and apart from the others."""
 
 from __future__ import annotations
 
@@ -8,28 +8,18 @@ import numpy as np
 
 from .realization import Realization
 
-PER_DECADE = 40
 SIDES = np.array([-10, -3, -1, -0.3, 0.0, 0.3, 1, 3, 10])
-GAP = 2e-9  # relative distance that a scan keeps from a pole or zero on the axis
+"""Distances from a pole or zero, in parts of its distance from the axis, at which a scan has frequencies."""
 
 
 @dataclass(frozen=True)
 class AxisPole:
-    """A pole, or a zero, on the limit of stability.
-
-    Parameters
-    ----------
-    omega : float
-        Frequency, rad/s, not negative.
-    multiplicity : int
-        Number of coinciding poles.
-    scatter : float
-        Largest distance of a computed eigenvalue from their mean, rad/s.
-    """
+    """Coinciding poles, or zeros, on the limit of stability, at a frequency in rad/s from 0 on."""
 
     omega: float
     multiplicity: int
     scatter: float
+    """Largest distance of a computed eigenvalue from their mean, rad/s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,55 +135,6 @@ def count_zeros_at_infinity(r: Realization) -> int:
             return k
         x, size = r.A @ x, np.abs(r.A) @ size
     return r.order
-
-
-def scan(r: Realization, features: Features, *, delay: float = 0.0) -> list[np.ndarray]:
-    """Return segments of frequencies in rad/s that resolve every pole and zero, cut at those on the axis.
-
-    The grid has 40 points a decade, and more around each pole and zero in proportion to its distance from the axis. It
-    is then bisected until the response L e^(−jω delay) turns by less than 0.15 rad and changes by less than 0.3 in its
-    logarithm from one point to the next.
-    """
-    sizes = features.sizes()
-    low, high = (sizes[0] / 1e4, sizes[-1] * 1e4) if len(sizes) else (1e-3, 1e3)
-    if r.dt:
-        high = r.nyquist
-    low = min(low, high / 10)
-    on_axis = (*features.axis_poles, *features.axis_zeros)
-    low = max([low, *(30 * a.scatter for a in on_axis if a.omega == 0.0)])
-    low = min(low, high / 10)
-    grid = [np.geomspace(low, high, max(2, int(PER_DECADE * np.log10(high / low))))]
-    for s in features.points():
-        grid.append(abs(s.imag) + abs(s.real) * SIDES)
-        grid.append(abs(s) * (1 + 0.1 * np.arange(-3, 4)))
-    close = 10.0 ** np.arange(-8, 0)
-    grid.extend(a.omega * (1 + np.concatenate([-close, close])) for a in on_axis)
-    omega = np.concatenate(grid)
-    omega = np.unique(omega[(omega >= low) & (omega <= high)])
-    cuts = sorted({a.omega for a in on_axis if low < a.omega})
-    segments, start = [], low
-    for cut in [*cuts, np.inf]:
-        end = cut * (1 - GAP) if np.isfinite(cut) else high
-        inside = omega[(omega > start) & (omega < min(end, high))]
-        if start < min(end, high):
-            segments.append(_refine(r, np.array([start, *inside, min(end, high)]), delay))
-        start = cut * (1 + GAP)
-    return segments
-
-
-def _refine(r: Realization, omega: np.ndarray, delay: float) -> np.ndarray:
-    for _ in range(14):
-        L, _ = r.response(omega)
-        L = L * np.exp(-1j * omega * delay)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            step = np.log(L[1:] / L[:-1])
-        coarse = ~((np.abs(step.real) < 0.3) & (np.abs(step.imag) < 0.15)) & (np.diff(omega) > 1e-12 * omega[1:])
-        if delay:  # a delay turns L without end, which does not matter where |L| is small
-            coarse &= np.maximum(np.abs(L[1:]), np.abs(L[:-1])) > 0.3
-        if not coarse.any() or len(omega) > 40_000:
-            break
-        omega = np.sort(np.concatenate([omega, np.sqrt(omega[1:] * omega[:-1])[coarse]]))
-    return omega
 
 
 def find_hidden_unstable(r: Realization) -> tuple[complex, ...]:

@@ -1,4 +1,4 @@
-"""Crossings and peaks of a loop's frequency response: found on a scan, then refined as roots."""
+"""Frequency response of a loop with one channel, scanned: its crossings and peaks, refined as roots."""
 
 from __future__ import annotations
 
@@ -7,36 +7,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .features import Features, scan
+from .poles_and_zeros import SIDES, Features
 from .realization import Realization
-from .sign_changes import refine_sign_change
+from .scan_refine_confirm import refine_sign_change
 
 Function = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """From L and dL/d(log ω) to a value and its slope over log ω."""
+PER_DECADE = 40
+"""Frequencies of a scan, besides those around poles and zeros."""
+GAP = 2e-9
+"""Relative distance that a scan keeps from a pole or zero on the axis."""
 POLISHED = 20
 """Number of candidates of a peak that are refined."""
 
 
 @dataclass(frozen=True)
 class Crossing:
-    """A frequency at which a loop crosses the unit circle or the negative real axis.
-
-    Parameters
-    ----------
-    omega : float
-        Frequency, rad/s.
-    L : complex
-        Value of the loop there.
-    slope : float
-        Slope over log ω of the function whose root the frequency is; zero at the ends of the axis.
-    error : float
-        Relative rounding error of L.
-    """
+    """A frequency in rad/s at which a loop crosses the unit circle or the negative real axis."""
 
     omega: float
     L: complex
     slope: float
+    """Slope over log ω of the function whose root the frequency is; zero at the ends of the axis."""
     error: float
+    """Relative rounding error of L."""
 
     @property
     def tolerance(self) -> float:
@@ -53,18 +47,12 @@ class Peak:
 
 
 class Scan:
-    """Frequency response of a loop with one channel, sampled once; crossings and peaks are refined from the samples.
-
-    Parameters
-    ----------
-    r : Realization
-        The loop.
-    """
+    """Frequency response of a loop with one channel, sampled once; crossings and peaks are refined from the samples."""
 
     def __init__(self, r: Realization):
         self.r = r
         self.features = Features.of(r)
-        self.segments = scan(r, self.features)
+        self.segments = make_grid(r, self.features)
         self.samples = [self._response(omega) for omega in self.segments]
 
     def find_gain_crossovers(self) -> list[Crossing]:
@@ -184,3 +172,52 @@ class Scan:
     def _polish(function: Callable[[float], float], span: tuple[float, float]) -> float:
         low, high = (float(np.log(omega)) for omega in span)
         return float(np.exp(refine_sign_change(lambda x: function(np.exp(x)), low, high, xtol=1e-14)))
+
+
+def make_grid(r: Realization, features: Features, *, delay: float = 0.0) -> list[np.ndarray]:
+    """Return segments of frequencies in rad/s that resolve every pole and zero, cut at those on the axis.
+
+    The grid has 40 points a decade, and more around each pole and zero in proportion to its distance from the axis. It
+    is then bisected until the response L e^(−jω delay) turns by less than 0.15 rad and changes by less than 0.3 in its
+    logarithm from one point to the next.
+    """
+    sizes = features.sizes()
+    low, high = (sizes[0] / 1e4, sizes[-1] * 1e4) if len(sizes) else (1e-3, 1e3)
+    if r.dt:
+        high = r.nyquist
+    low = min(low, high / 10)
+    on_axis = (*features.axis_poles, *features.axis_zeros)
+    low = max([low, *(30 * a.scatter for a in on_axis if a.omega == 0.0)])
+    low = min(low, high / 10)
+    grid = [np.geomspace(low, high, max(2, int(PER_DECADE * np.log10(high / low))))]
+    for s in features.points():
+        grid.append(abs(s.imag) + abs(s.real) * SIDES)
+        grid.append(abs(s) * (1 + 0.1 * np.arange(-3, 4)))
+    close = 10.0 ** np.arange(-8, 0)
+    grid.extend(a.omega * (1 + np.concatenate([-close, close])) for a in on_axis)
+    omega = np.concatenate(grid)
+    omega = np.unique(omega[(omega >= low) & (omega <= high)])
+    cuts = sorted({a.omega for a in on_axis if low < a.omega})
+    segments, start = [], low
+    for cut in [*cuts, np.inf]:
+        end = cut * (1 - GAP) if np.isfinite(cut) else high
+        inside = omega[(omega > start) & (omega < min(end, high))]
+        if start < min(end, high):
+            segments.append(_bisect(r, np.array([start, *inside, min(end, high)]), delay))
+        start = cut * (1 + GAP)
+    return segments
+
+
+def _bisect(r: Realization, omega: np.ndarray, delay: float) -> np.ndarray:
+    for _ in range(14):
+        L, _ = r.response(omega)
+        L = L * np.exp(-1j * omega * delay)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = np.log(L[1:] / L[:-1])
+        coarse = ~((np.abs(step.real) < 0.3) & (np.abs(step.imag) < 0.15)) & (np.diff(omega) > 1e-12 * omega[1:])
+        if delay:  # a delay turns L without end, which does not matter where |L| is small
+            coarse &= np.maximum(np.abs(L[1:]), np.abs(L[:-1])) > 0.3
+        if not coarse.any() or len(omega) > 40_000:
+            break
+        omega = np.sort(np.concatenate([omega, np.sqrt(omega[1:] * omega[:-1])[coarse]]))
+    return omega

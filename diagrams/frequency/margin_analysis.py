@@ -1,0 +1,158 @@
+"""Results of an analysis of margins, and the skeleton that all analyses of a closed loop share."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+
+from ...blocks.core import Finding, brief, explain_calls
+from .number import MARK, Interval, Number
+from .realization import Realization
+from .scan_refine_confirm import number_of_limit
+
+EIGENVALUES = "closed-loop eigenvalues"
+NEAR = 1e-12
+"""Distance from the limit of stability, relative to the largest pole, within which an unstable loop's pole is named."""
+UNITS = {
+    "phase_margin_deg": "deg",
+    "delay_margin_s": "s",
+    "delay_margin_samples": "samples",
+    "ms_frequency": "rad/s",
+    "mt_frequency": "rad/s",
+    "bandwidth": "rad/s",
+    "disk_frequency": "rad/s",
+}
+"""Units of the numbers that are no pure ones."""
+ROTATIONS = (30.0, 60.0, 90.0, 120.0, 150.0, 180.0)
+"""Rotations in degrees that are tried where no limit was found."""
+
+
+@explain_calls
+class MarginTable:
+    """Margins by name. The results for a linear, a periodic and a measured loop are such tables."""
+
+    def numbers(self) -> dict[str, Any]:
+        """Return the single numbers by name, in the order of the report."""
+        found = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        return {name: value for name, value in found.items() if isinstance(value, Number | Interval)}
+
+    def _rows(self) -> list[str]:
+        return [f"{name:22s}{number}" for name, number in self.numbers().items()]
+
+
+@explain_calls
+class StabilityMargins(MarginTable):
+    """Margins of a closed loop that may be unstable: then its numbers are NaN, and its poles say why."""
+
+    stable: bool
+    closed_loop_poles: tuple[complex, ...]
+    dt: float
+    findings: tuple[Finding, ...]
+
+    def __repr__(self) -> str:
+        if self.stable:
+            names = ("gain_margin_high", "phase_margin_deg", "disk_margin", "ms")
+            facts = "stable", *(f"{name} {number}" for name, number in self.numbers().items() if name in names)
+        else:
+            poles = ", ".join(f"{p:.4g}" for p in self.unstable_poles[:3])
+            facts = (f"the closed loop is unstable, poles {poles}",)
+        return brief(self._title(), *facts, then="print(…) shows all")
+
+    def __str__(self) -> str:
+        lines = self._rows()
+        if not self.stable:
+            plane, limit = ("z", "|z| < 1") if self.dt else ("s", "Re s < 0")
+            poles = ", ".join(f"{p:.6g}" for p in self.unstable_poles)
+            lines = [
+                "unstable: the closed loop has no margins",
+                f"unstable_poles        {plane} = {poles} (stable: {limit})",
+            ]
+        return "\n".join([*lines, *self._further_lines(), *(f"{MARK} {finding}" for finding in self.findings)])
+
+    def _title(self) -> str:
+        return "margins"
+
+    def _further_lines(self) -> list[str]:
+        return []
+
+    def as_dict(self) -> dict[str, dict[str, Any]]:
+        """Return the single numbers by name, as in a report's JSON."""
+        return {name: number.as_dict() for name, number in self.numbers().items()}
+
+    @property
+    def unstable_poles(self) -> tuple[complex, ...]:
+        """The closed-loop poles that are not stable, in the plane of `closed_loop_poles`; empty for a stable loop."""
+        if self.stable:
+            return ()
+        poles = np.array(self.closed_loop_poles)
+        growth = np.abs(poles) - 1.0 if self.dt else poles.real
+        limit = min(0.0, float(growth.max(initial=0.0))) - NEAR * float(np.abs(poles).max(initial=0.0))
+        return tuple(complex(p) for p, g in zip(poles, growth, strict=True) if g >= limit)
+
+
+Found = TypeVar("Found", bound=StabilityMargins)
+
+
+class MarginFinder(ABC, Generic[Found]):
+    """An analysis of a closed loop. A subclass scans and refines; the limits are confirmed here."""
+
+    result: type[Any]
+    """Class of the result, `Found`."""
+    eigenvalues: ClassVar[str] = EIGENVALUES
+    rotated: ClassVar[str] = " with L rotated"
+
+    def __init__(self, r: Realization):
+        self.r = r
+        self.unstable = r.count_unstable()
+
+    @abstractmethod
+    def find_numbers(self) -> dict[str, Number]:
+        """Return the numbers of a stable loop by name, confirmed."""
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """Return the further fields of the result, which an unstable loop has as well."""
+
+    def find_margins(self) -> Found:
+        """Return the margins; those of an unstable loop are NaN."""
+        r = self.r
+        poles = r.eigenvalues()
+        if self.unstable:
+            near = r.growth(poles).max()
+            reason = f"the closed loop is not stable: {self.unstable} of its poles are not (largest growth {near:.3g})"
+            names = [f.name for f in fields(self.result) if f.type == "Number"]
+            found = {name: Number(np.nan, UNITS.get(name, "1"), np.nan, reason) for name in names}
+        else:
+            found = self.find_numbers()
+        made: Found = self.result(
+            stable=not self.unstable,
+            closed_loop_poles=tuple(complex(p) for p in np.sort_complex(poles + 1 if r.dt else poles)),
+            dt=r.dt,
+            findings=(),
+            **found,
+            **self.describe(),
+        )
+        return made
+
+    def make_gain_margin(
+        self, name: str, factor: float, tolerance: float, *, others: Sequence[float] = (), tried: Sequence[float]
+    ) -> Number:
+        """Return a gain margin; 0 or infinite where no factor ends stability."""
+        return number_of_limit(
+            name, factor, "1", tolerance, self.r.is_stable, self.eigenvalues, nominal=1.0, others=others, tried=tried
+        )
+
+    def make_phase_margin(self, degrees: float, tolerance: float, *, others: Sequence[float] = ()) -> Number:
+        """Return the phase margin; infinite where no rotation ends stability."""
+
+        def stable(degrees: float) -> bool:
+            return self.r.is_stable(np.exp(-1j * np.radians(degrees)))
+
+        how = self.eigenvalues + (self.rotated if np.isfinite(degrees) else "")
+        others = [*others, *(360 - o for o in (degrees, *others))]  # the same limits, reached by the other direction
+        name = "phase_margin_deg"
+        return number_of_limit(name, degrees, "deg", tolerance, stable, how, others=others, tried=ROTATIONS)
