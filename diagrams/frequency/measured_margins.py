@@ -247,7 +247,7 @@ def _phase_margin(curve: _Curve) -> tuple[tuple[float, float, float], ...]:
     k, d = int(np.argmin(rotation)), int(np.argmin(forward / w))
 
     def around(i: int) -> slice:
-        return _find_range(found, crossed[i])
+        return _find_range(found, int(crossed[i]))
 
     error = curve.turn_error / curve.w
     return (
@@ -278,7 +278,7 @@ def _gain_margins(curve: _Curve) -> tuple[tuple[float, float, float], tuple[floa
     for i in crossed:
         part = -turn[i] / (turn[i + 1] - turn[i])
         value = math.exp(-(curve.gain[i] + part * (curve.gain[i + 1] - curve.gain[i])))
-        where = _find_range(possible, i)
+        where = _find_range(possible, int(i))
         least = math.exp(-float(np.max((curve.gain + curve.gain_error)[where])))
         most = math.exp(-float(np.min((curve.gain - curve.gain_error)[where])))
         found = value, min(least, value), max(most, value)
