@@ -12,8 +12,6 @@ from .disk import (
     describe_disk_error,
     explain_disk_errors,
     find_disk_error,
-    make_temporary_folder,
-    temporary_folder,
 )
 from .errors import (
     AlgebraicLoopError,
@@ -156,7 +154,6 @@ __all__ = [
     "kinds",
     "lay_out",
     "left_of",
-    "make_temporary_folder",
     "move_earlier",
     "near",
     "next_edge",
@@ -178,7 +175,6 @@ __all__ = [
     "shape_of",
     "shorten",
     "source",
-    "temporary_folder",
     "with_unit",
     "without_collection",
     "write_text",

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import Any
 
 from .errors import DiskError, LoopwrightError
@@ -117,46 +115,6 @@ def explain_disk_errors(
         if isinstance(error, ConnectionError):  # a pipe whose reader has had enough
             raise
         raise raised(f"{failed}: {describe_disk_error(error, place, instead)}", **where) from error
-
-
-@contextmanager
-def temporary_folder(failed: str, raised: type[LoopwrightError] = DiskError, **where: Any) -> Iterator[Path]:
-    """Yield a fresh folder among the system's temporary files, which is removed when the block ends.
-
-    Parameters are those of `explain_disk_errors`, which covers the block.
-
-    Raises
-    ------
-    LoopwrightError
-        Of the class ``raised``: the folder can't be made, or a file in it can't be written.
-    """
-    folder = make_temporary_folder(failed, raised, **where)
-    try:
-        with explain_disk_errors(failed, folder, OTHER_TEMPORARY, raised, **where):
-            yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def make_temporary_folder(
-    failed: str, raised: type[LoopwrightError] = DiskError, prefix: str = "loopwright-", **where: Any
-) -> Path:
-    """Return a fresh folder among the system's temporary files, whose name begins with the prefix.
-
-    The other parameters are those of `explain_disk_errors`.
-
-    Raises
-    ------
-    LoopwrightError
-        Of the class ``raised``: it can't be made.
-    """
-    place = next((value for name in ("TMPDIR", "TEMP", "TMP") if (value := os.environ.get(name))), "/tmp")
-    try:
-        return Path(tempfile.mkdtemp(prefix=prefix))
-    except OSError as error:
-        # Where no folder can be written, Python lists those that it has tried, and says of none why.
-        found = (None if error.filename else find_disk_error(place)) or error
-        raise raised(f"{failed}: {describe_disk_error(found, place, OTHER_TEMPORARY)}", **where) from error
 
 
 def find_disk_error(folder: str | os.PathLike[str]) -> OSError | None:

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from tempfile import TemporaryDirectory, TemporaryFile
+from tempfile import TemporaryFile
 from typing import Any
 
 from ...blocks.core import (
@@ -28,6 +28,7 @@ from ...blocks.core import (
     write_text,
 )
 from ...fmus import Fmu
+from ...fmus.child_processes import folder_in
 from ...fmus.models import gantry
 from ..paper import DEFINITIONS, EXPERIMENTS, Experiment, key_numbers
 from ..results import Run
@@ -241,8 +242,7 @@ def _write(
     if problem is not None:
         content["error"] = problem
     names = [file.name for file in _files(letter, folder)]
-    with TemporaryDirectory(prefix=".writing-", dir=folder) as apart:
-        new = Path(apart)
+    with folder_in(folder, ".writing-") as new:
         run.to_csv(new / f"{letter}.csv", *SIGNALS)
         write_text(new / f"{letter}.json", json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
         for name, plot in (("path", plot_path), ("signals", plot_experiment)):

@@ -6,7 +6,6 @@ import ctypes
 import hashlib
 import os
 import re
-import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import CompilerError
+from ...blocks.core import CompilerError, replace_file
 from ...fmus.export import SUFFIXES, compile_shared, describe_compiler
 from ...fmus.platform import OWN_CACHE, cache_folder, explain_cache_errors, native_platform
 
@@ -121,10 +120,8 @@ def is_kept(source: str) -> bool:
 
 def _note_size(library: Path) -> None:
     """Note a library's length beside it; several threads and processes may do so at once."""
-    with tempfile.TemporaryDirectory(prefix=".building-", dir=library.parent) as folder:
-        made = Path(folder) / "size"
-        made.write_text(str(library.stat().st_size))
-        os.replace(made, _size_file(library))
+    with replace_file(_size_file(library)) as fresh:
+        fresh.write_text(str(library.stat().st_size))
 
 
 def _size_file(library: Path) -> Path:

@@ -13,8 +13,8 @@ from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
-from ...blocks.core import OptionError
-from ...fmus.child_processes import ProcessGroup
+from ...blocks.core import LoopwrightError
+from ...fmus.child_processes import ProcessGroup, find_python
 from ..sweeps import receive, send, to_bytes
 from .child import Task
 
@@ -52,14 +52,14 @@ class SecondProcess(Generic[T]):
         self._thread: threading.Thread | None = None
         try:
             data = to_bytes(task, name)
-            program = [sys.executable, "-c", _PROGRAM]
+            program = [find_python(), "-c", _PROGRAM]
             self._group = ProcessGroup()
             try:
                 self._process = self._group.start(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
             except BaseException:
                 self._group.end()
                 raise
-        except (OptionError, OSError):  # such as a class of the main script: everything is made here
+        except (LoopwrightError, OSError):  # such as a class of the main script: everything is made here
             return
         self._send(sys.path)
         self._send(data)

@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import Any, BinaryIO
 
 from ...blocks.core import OptionError
-from ...fmus.child_processes import ProcessGroup
+from ...fmus.child_processes import ProcessGroup, find_python
 from .child import receive, send
 from .desk import Desk
 from .outcome import WORKER_ENDED, Failure, Outcome
@@ -125,7 +125,7 @@ class _Process:
             if self._over:
                 raise EOFError
             if self._process is None:
-                program = [sys.executable, "-c", _PROGRAM]
+                program = [find_python(), "-c", _PROGRAM]
                 self._process = self._group.start(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
                 fresh = True
             else:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
 from ...blocks.core import FmuFileError
+from ..child_processes import folder_in
 from ..platform import cache_folder, check_cache, explain_cache_errors
 from .binaries import check_binary
 from .description import FmuDescription
@@ -60,8 +59,7 @@ def unpack_archive(archive: FmuArchive, folder: Path) -> None:
     check_cache()
     with explain_cache_errors(f"the FMU {str(archive.path)!r} can't be unpacked"):
         folder.parent.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(dir=folder.parent))
-        try:
+        with folder_in(folder.parent, "tmp") as fresh:
             write_files(archive, fresh)
             with suppress(FileExistsError):
                 (fresh / RESOURCES).mkdir()
@@ -72,9 +70,6 @@ def unpack_archive(archive: FmuArchive, folder: Path) -> None:
                     raise
                 with suppress(FileExistsError):
                     (folder / RESOURCES).mkdir()
-        finally:
-            if fresh.is_dir():
-                shutil.rmtree(fresh, ignore_errors=True)
 
 
 def write_files(archive: FmuArchive, folder: Path, names: Iterable[str] | None = None) -> None:

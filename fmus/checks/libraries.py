@@ -10,9 +10,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from ...blocks.core import FmuError, temporary_folder
+from ...blocks.core import FmuError
 from ..archive import FmuArchive, read_library, write_files
-from ..child_processes import run_in_group
+from ..child_processes import find_python, run_in_group, temporary_folder
 from ..export import SUFFIXES
 
 # Folders of binaries in FMI 1.0 and 2.0 (2.3.1) as platform tuples of FMI 3.0 (2.5.1.4).
@@ -121,9 +121,9 @@ def find_missing(archive: FmuArchive, native: str, folder: str, names: Iterable[
             if header.damage or native not in header.platforms:
                 continue
             library = str(made / "binaries" / folder / name)
-            command = [ldd, library] if ldd else [sys.executable, "-c", _LOAD, library]
+            command = [ldd, library] if ldd else [find_python(), "-c", _LOAD, library]
             try:
-                done = run_in_group(command, folders=[Path(made)], cwd=made, seconds=60)
+                done = run_in_group(command, cwd=made, seconds=60)
             except (OSError, subprocess.TimeoutExpired):
                 continue
             if not ldd:

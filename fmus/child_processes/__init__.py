@@ -1,5 +1,15 @@
-"""Child processes that end with this process, however it ends."""
+"""Child processes and temporary folders that end with this process, however it ends."""
 
+from .folders import folder_in, make_temporary_folder, remove_folder, temporary_folder
 from .group import ProcessGroup, run_in_group
+from .keeper import find_python
 
-__all__ = ["ProcessGroup", "run_in_group"]
+__all__ = [
+    "ProcessGroup",
+    "find_python",
+    "folder_in",
+    "make_temporary_folder",
+    "remove_folder",
+    "run_in_group",
+    "temporary_folder",
+]

@@ -1,9 +1,7 @@
 """Groups of child processes, which end with this process, however it ends.
 
-A worker or a compiler does not notice that its parent has been killed while it computes, and a thread that looks for it
-needs the interpreter lock, which others may hold. So each group has a leader, a small process that does nothing else
-(`leader`), and the group ends by a signal that no process can refuse. FMUs in processes of their own have groups of
-their own and look for their parent themselves: see `isolation`.
+On POSIX a group of processes is ended by a signal that no process can refuse, by this process or by its keeper. On
+Windows it is a job object.
 """
 
 from __future__ import annotations
@@ -11,47 +9,38 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-_LEADER = str(Path(__file__).with_name("leader.py"))
-_POSIX = os.name == "posix"
+from .job import CREATE_NEW_PROCESS_GROUP, CREATE_SUSPENDED, Job
+from .keeper import POSIX, Keeper, make_group, release_group
 
 
 class ProcessGroup:
     """Child processes that end with this process, or with `end`, and with them all processes that they start.
 
-    The leader is there before any other process of the group, and a process is in the group before its program begins:
-    at no moment could one be left behind. On Windows, which has no such groups, processes are only started.
-
-    Parameters
-    ----------
-    *folders : Path
-        Folders of the group, which are removed if this process ends before `end`.
+    A process is in the group before its program begins: at no moment could one be left behind.
 
     Raises
     ------
     OSError
-        If its leader can't be started.
+        If the group can't be made.
+    LoopwrightError
+        If Python doesn't know its program.
     """
 
-    def __init__(self, *folders: Path):
-        self._home, self._folders = os.getpid(), [os.path.abspath(folder) for folder in folders]
-        self._killed: list[subprocess.Popen[bytes]] = []  # leaders that somebody else has ended
-        self._leader = self._start_leader() if _POSIX else None
+    def __init__(self) -> None:
+        self._home = os.getpid()
+        self._groups: list[tuple[Keeper, int]] = [make_group()] if POSIX else []
+        """The present group, after those whose keeper was ended by somebody else."""
+        self._job = None if POSIX else Job()
 
-    def _start_leader(self) -> subprocess.Popen[bytes]:
-        return subprocess.Popen(
-            [sys.executable, "-I", "-S", _LEADER, str(self._home), *self._folders],
-            cwd="/",  # the present one may be removed
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            process_group=0,
-        )
+    @property
+    def number(self) -> int | None:
+        """Number of the group of processes; None on Windows, and after its end."""
+        return self._groups[-1][1] if self._groups else None
 
     def start(self, command: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
         """Start a process in the group; ``options`` are those of `subprocess.Popen`.
@@ -61,35 +50,41 @@ class ProcessGroup:
         OSError
             If it can't be started, or the group has ended.
         """
-        if _POSIX:
-            if self._leader is None:
-                raise ProcessLookupError("its group of processes has ended")
-            if _has_ended(self._leader):  # a process that ends its own group ends the leader, too
-                self._killed.append(self._leader)
-                self._leader = self._start_leader()
-            options["process_group"] = self._leader.pid
-        return subprocess.Popen(command, **options)
+        if self._job is not None:
+            flags = options.pop("creationflags", 0) | CREATE_SUSPENDED | CREATE_NEW_PROCESS_GROUP
+            process = subprocess.Popen(command, creationflags=flags, **options)
+            try:
+                self._job.take(int(process._handle), process.pid)  # type: ignore[attr-defined]
+            except BaseException:
+                process.kill()
+                process.wait()
+                raise
+            return process
+        if not self._groups:
+            raise ProcessLookupError("its group of processes has ended")
+        if self._groups[-1][0].has_ended():
+            self._groups.append(make_group())
+        return subprocess.Popen(command, process_group=self._groups[-1][1], **options)
 
     def kill(self) -> None:
-        """End all processes of the group; its leader is not reaped, so that the group keeps its number until `end`."""
-        if self._leader is not None and os.getpid() == self._home:  # a fork of this process leaves the group alone
-            for leader in (*self._killed, self._leader):
-                with suppress(OSError):
-                    os.killpg(leader.pid, signal.SIGKILL)
+        """End all processes of the group; whoever has started them waits for them."""
+        if self._job is not None:
+            self._job.kill()
+        if os.getpid() == self._home:  # a fork of this process leaves the group alone
+            for keeper, group in self._groups:
+                if not keeper.has_ended():  # else the group's number may be that of another one
+                    with suppress(OSError):
+                        os.killpg(group, signal.SIGKILL)
 
     def end(self) -> None:
-        """End all processes of the group, and wait for its leader; whoever has started others waits for them."""
+        """End all processes of the group, and the group itself; whoever has started them waits for them."""
         self.kill()
-        if self._leader is None:
-            return
-        leaders, self._leader, self._killed = [*self._killed, self._leader], None, []
-        for leader in leaders:
-            assert leader.stdin is not None
-            leader.stdin.close()
-            if os.getpid() == self._home:
-                leader.wait()
-            else:
-                leader.returncode = 0  # it is waited for there
+        if self._job is not None:
+            self._job.end()
+        groups, self._groups = self._groups, []
+        if os.getpid() == self._home:
+            for keeper, group in groups:
+                release_group(keeper, group)
 
     def __enter__(self) -> ProcessGroup:
         return self
@@ -98,22 +93,14 @@ class ProcessGroup:
         self.end()
 
 
-def _has_ended(process: subprocess.Popen[bytes]) -> bool:
-    """Whether a process has ended, which is not reaped, so that its number stays its own; False where none can tell."""
-    if not hasattr(os, "waitid"):  # macOS before Python 3.13
-        return False
-    return os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
-
-
 def run_in_group(
     command: Sequence[str],
     *,
-    folders: Sequence[Path] = (),
     cwd: Path | str | None = None,
     environment: Mapping[str, str] | None = None,
     seconds: float | None = None,
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end, and return its status and what it wrote: `subprocess.run` in a group of its own.
+    """Run a command to its end, and return its status and output: `subprocess.run` in a group.
 
     The command and all processes that it has started end with this call, whatever happens, and with this process.
 
@@ -121,8 +108,6 @@ def run_in_group(
     ----------
     command : sequence of str
         Program and arguments.
-    folders : sequence of Path
-        Folders to remove if this process ends before the command.
     cwd, environment
         Its working folder and environment; those of this process if not given.
     seconds : float, optional
@@ -132,10 +117,12 @@ def run_in_group(
     ------
     OSError
         If it can't be started.
+    LoopwrightError
+        If Python doesn't know its program.
     subprocess.TimeoutExpired
         If it has not ended by then.
     """
-    with ProcessGroup(*folders) as group:
+    with ProcessGroup() as group:
         process = group.start(
             command,
             cwd=cwd,

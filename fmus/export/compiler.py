@@ -12,10 +12,8 @@ import os
 import shlex
 import shutil
 import subprocess
-import sys
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -23,13 +21,14 @@ from pathlib import Path
 from ...blocks.core import (
     OTHER_TEMPORARY,
     CompilerError,
+    LoopwrightError,
     describe_disk_error,
     explain_disk_errors,
     find_disk_error,
     near,
 )
 from ..build_notes import tell_build
-from ..child_processes import run_in_group
+from ..child_processes import find_python, folder_in, run_in_group
 from ..platform import OWN_CACHE, cache_folder, check_cache, native_platform
 
 #: FMI 3.0 platform tuples (2.5.1.4) of the platforms to build for, and zig's name of each with the oldest system:
@@ -89,7 +88,7 @@ def find_compiler() -> Compiler:
         return Compiler(command, f"{given}\n{_version(command)}")
     if (spec := importlib.util.find_spec("ziglang")) is not None and spec.origin is not None:
         zig = Path(spec.origin).parent / ("zig.exe" if os.name == "nt" else "zig")
-        command = (str(zig), "cc") if zig.is_file() else (sys.executable, "-m", "ziglang", "cc")
+        command = (str(zig), "cc") if zig.is_file() else (find_python(), "-m", "ziglang", "cc")
         return Compiler(command, f"ziglang {importlib.metadata.version('ziglang')}", zig=True)
     for name in ("cc", "gcc", "clang"):
         if (path := shutil.which(name)) is not None:
@@ -103,6 +102,8 @@ def _version(command: tuple[str, ...]) -> str:
         done = run_in_group([*command, "--version"], seconds=60)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise CompilerError(f"the C compiler {shlex.join(command)} can't be run: {error}. {_INSTALL}") from error
+    except LoopwrightError as error:
+        raise CompilerError(f"the C compiler can't be run: {error}") from error
     return done.stdout + done.stderr
 
 
@@ -179,30 +180,21 @@ def compile_shared(
     check_platform(compiler, platform)
     names = [name for name in sources if name.endswith(".c")] if compiled is None else list(compiled)
     out = Path(out)
-    with (
-        explain_disk_errors("the C code can't be compiled", out, OWN_CACHE, CompilerError),
-        _build_folder(out.parent) as folder,
-    ):
-        for name, text in sources.items():
-            (folder / name).write_text(text, encoding="utf-8", newline="\n")
-        library = out.name  # a relative name, since some formats contain it
-        math = () if platform.endswith("windows") else ("-lm",)
-        includes = [f"-I{path}" for path in include]
-        given = [*flags(compiler, platform), *more_flags]
-        command = [*compiler.command, *given, "-I.", *includes, "-o", library, *names, *math]
-        with tell_build(_note(compiler)):
-            _run(command, folder, platform)
-        if not (folder / library).is_file():
-            raise CompilerError(f"{shlex.join(command)} wrote no library. Check LOOPWRIGHT_CC.")
-        os.replace(folder / library, out)
-
-
-@contextmanager
-def _build_folder(place: Path) -> Iterator[Path]:
-    """Yield a fresh folder in ``place``, which is made, and remove it when the block ends."""
-    place.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".building-", dir=place, ignore_cleanup_errors=True) as made:
-        yield Path(made)
+    with explain_disk_errors("the C code can't be compiled", out, OWN_CACHE, CompilerError):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with folder_in(out.parent, ".building-") as folder:
+            for name, text in sources.items():
+                (folder / name).write_text(text, encoding="utf-8", newline="\n")
+            library = out.name  # a relative name, since some formats contain it
+            math = () if platform.endswith("windows") else ("-lm",)
+            includes = [f"-I{path}" for path in include]
+            given = [*flags(compiler, platform), *more_flags]
+            command = [*compiler.command, *given, "-I.", *includes, "-o", library, *names, *math]
+            with tell_build(_note(compiler)):
+                _run(command, folder, platform)
+            if not (folder / library).is_file():
+                raise CompilerError(f"{shlex.join(command)} wrote no library. Check LOOPWRIGHT_CC.")
+            os.replace(folder / library, out)
 
 
 def _zig_caches() -> dict[str, str]:
@@ -257,9 +249,11 @@ def _run(command: Sequence[str], folder: Path, platform: str) -> None:
 def _wait(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> tuple[int, str, str]:
     """Run a compiler; it and all processes that it started end with this call and with this process."""
     try:
-        done = run_in_group(command, folders=[folder], cwd=folder, environment=environment, seconds=TIMEOUT)
+        done = run_in_group(command, cwd=folder, environment=environment, seconds=TIMEOUT)
     except OSError as error:
         raise CompilerError(f"the C compiler {command[0]} can't be run: {error}. {_INSTALL}") from error
+    except LoopwrightError as error:
+        raise CompilerError(f"the C compiler can't be run: {error}") from error
     except subprocess.TimeoutExpired as error:
         raise CompilerError(
             f"the C compiler did not end within {TIMEOUT:g} s and was stopped. The command was: "

@@ -21,7 +21,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import FmuError, accepts, explain_calls, explain_disk_errors, kinds, replace_file, temporary_folder
+from ...blocks.core import FmuError, accepts, explain_calls, explain_disk_errors, kinds, replace_file
+from ..child_processes import temporary_folder
 from ..platform import OWN_CACHE, cache_folder, explain_cache_errors, native_platform, record_build
 from .c_code import generate, runtime
 from .compiler import SUFFIXES, TARGETS, Compiler, check_platform, compile_shared, find_compiler, flags

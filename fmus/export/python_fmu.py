@@ -32,10 +32,9 @@ from ...blocks.core import (
     accepts,
     explain_disk_errors,
     kinds,
-    temporary_folder,
 )
 from ...blocks.tracing import bundle, traced_parameters
-from ..child_processes import run_in_group
+from ..child_processes import find_python, run_in_group, temporary_folder
 from ..platform import record_build
 from .html_page import block_text
 from .model import check_file_name
@@ -343,7 +342,7 @@ def _make(script: Path, out: Path, files: list[Path], name: str, kind: str) -> P
         "canSerializeFMUstate": True,
     }
     given = json.dumps([str(script), str(out), [str(path.resolve()) for path in files], options])
-    done = run_in_group([sys.executable, "-c", _MAKE, given], cwd=script.parent)
+    done = run_in_group([find_python(), "-c", _MAKE, given], cwd=script.parent)
     made = out / f"{name}.fmu"
     if done.returncode or not made.is_file():
         said = "\n".join((done.stderr.strip() or done.stdout.strip() or "(nothing)").splitlines()[-12:])

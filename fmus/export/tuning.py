@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 import os
 import platform as system
-import tempfile
 import zipfile
 from functools import lru_cache
 from pathlib import Path
 
 from ...blocks.core import FmuError, FmuFileError, accepts, kinds
+from ..child_processes import folder_in
 from ..platform import cache_folder, explain_cache_errors, is_built_here, native_platform, record_build
 from .compiler import compile_shared, describe_compiler, find_compiler
 from .package import FOLDERS2, fmi_headers, zip_files
@@ -71,12 +71,12 @@ def tune(path: str | os.PathLike[str]) -> Path:
         (own,) = (name for name in binaries if name.split("/")[1] in (target, FOLDERS2.get(target)))
         sources = {n.removeprefix("sources/"): t.decode() for n, t in files.items() if n.endswith((".c", ".h"))}
         out.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with tempfile.TemporaryDirectory(prefix=".tuning-", dir=out.parent) as folder:
-            library = Path(folder) / Path(own).name
+        with folder_in(out.parent, ".tuning-") as folder:
+            library = folder / Path(own).name
             headers = [fmi_headers()[0]]
             compile_shared(sources, library, compiled=["model.c"], include=headers, compiler=compiler, more_flags=flags)
             tuned = zip_files({n: t for n, t in files.items() if n not in binaries} | {own: library.read_bytes()})
-            (made := Path(folder) / file.name).write_bytes(tuned)
+            (made := folder / file.name).write_bytes(tuned)
             os.replace(made, out)
     record_build(hashlib.sha256(tuned).hexdigest())
     return out

@@ -13,8 +13,6 @@ import importlib
 import json
 import mmap
 import os
-import select
-import shutil
 import sys
 import threading
 import time
@@ -43,7 +41,7 @@ from .wire import (
 )
 
 _LOOKS = 4000
-_PERIOD = 0.25  # s between two looks at memory, output and parent
+_PERIOD = 0.25  # s between two looks at memory and output
 _KEPT_OUTPUT = 16 << 20  # bytes of output at which its file begins again
 
 
@@ -52,7 +50,7 @@ class Child:
 
     def __init__(self, commands: int, replies: int, about: dict[str, Any]):
         self.commands, self.replies, self.about = commands, replies, about
-        self.parent, self.me = about["parent"], os.getpid()
+        self.me = os.getpid()
         with open(about["shared"], "r+b") as file:
             self.memory = mmap.mmap(file.fileno(), about["size"])
         self.ordered, self.logged, self.is_own = about["ordered"], 0, False
@@ -345,18 +343,10 @@ class Child:
     # ---- the end ----
 
     def watch_over(self) -> None:
-        """End the process when its parent is gone, when it has too much memory, or when it writes too much."""
-        poll = select.poll() if hasattr(select, "poll") else None
-        if poll is not None:
-            poll.register(self.commands, 0)
+        """End the process when it has too much memory, or writes too much."""
         most, written = self.about["memory"], 0
         while True:
-            if poll is None:
-                time.sleep(_PERIOD)
-            elif poll.poll(_PERIOD * 1000):
-                self.leave()
-            if self.parent != os.getppid() and os.name == "posix":
-                self.leave()
+            time.sleep(_PERIOD)
             if resident() > most:
                 self.end(MEMORY)
             with suppress(OSError):
@@ -370,14 +360,11 @@ class Child:
     def end(self, cause: int) -> None:
         """End the process, with the reason for its parent."""
         self.words[CAUSE] = cause
-        kill_group()
+        self.leave()
 
     def leave(self) -> None:
-        """End the process, as its parent is gone, and remove its folder."""
-        with suppress(OSError):
-            os.chdir("/" if os.name == "posix" else os.path.dirname(self.about["folder"]))
-        shutil.rmtree(self.about["folder"], ignore_errors=True)
-        kill_group()
+        """End the process, and those that the FMU has started; its host, or the host's keeper, removes its folder."""
+        kill_group(self.about["group"])
 
 
 def _bytes(text: str) -> bytes:

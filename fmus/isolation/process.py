@@ -6,8 +6,6 @@ import ctypes
 import json
 import mmap
 import os
-import shutil
-import signal
 import struct
 import subprocess
 import sys
@@ -19,8 +17,9 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from ...blocks.core import FmuEnd, FmuError, FmuProcessError, describe_disk_error, make_temporary_folder
+from ...blocks.core import FmuEnd, FmuError, FmuProcessError, describe_disk_error
 from ..calls import ChildRequest, printf
+from ..child_processes import ProcessGroup, find_python, make_temporary_folder, remove_folder
 from . import wire
 from .endings import copy_files, count_cores, read_end
 from .output import ChildOutput
@@ -69,6 +68,7 @@ class ChildProcess:
         self._names: list[list[str]] = []
         self._call = ""
         self._process: subprocess.Popen[bytes] | None = None
+        self._group: ProcessGroup | None = None
         try:
             self._spawn(files)
         except OSError as error:
@@ -80,6 +80,7 @@ class ChildProcess:
             raise
 
     def _spawn(self, files: Path) -> None:
+        self._group = ProcessGroup()
         copy_files(files, self.folder / "fmu")
         (self.folder / "work").mkdir()
         shared = self.folder / "shared"
@@ -91,26 +92,23 @@ class ChildProcess:
         self.words = memoryview(self._memory).cast("Q")
         about = {
             "size": self.size,
-            "parent": os.getpid(),
+            "group": self._group.number,
             "memory": self.memory_limit,
             "output": self.output_limit,
             "watches": self._watches,
             "ordered": wire.ORDERED,
-            "folder": str(self.folder),
             "files": str(self.folder / "fmu"),
             **{name: str(self.folder / name) for name in ("shared", "log", "printed", "mail")},
         }
         here = [str(Path(__file__).parent), str(Path(printf.__file__).parent), json.dumps(about)]
-        group: dict[str, Any] = {"start_new_session": True} if os.name == "posix" else {"creationflags": 0x200}
         with open(self.folder / "printed", "wb") as printed:
-            self._process = subprocess.Popen(
-                [sys.executable, "-c", _START, *here],
+            self._process = self._group.start(
+                [find_python(), "-c", _START, *here],
                 cwd=self.folder / "work",
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=printed,
                 bufsize=0,
-                **group,
             )
         commands, replies = self._process.stdin, self._process.stdout
         self._in, self._out = (pipe.fileno() for pipe in (commands, replies) if pipe is not None)
@@ -301,7 +299,7 @@ class ChildProcess:
             raise self.lose(FmuProcessError(text, call=call, cause=FmuEnd.LOST))
 
     def has_ended(self) -> bool:
-        """Return whether the process has ended; it isn't reaped, so that its group keeps its number."""
+        """Return whether the process has ended; it isn't reaped, so that its memory can be asked for."""
         process = self._process
         if process is None or process.returncode is not None:
             return True
@@ -344,9 +342,8 @@ class ChildProcess:
         if process is None:
             return None
         ended = self.has_ended()
-        if os.name == "posix":
-            with suppress(OSError):
-                os.killpg(process.pid, signal.SIGKILL)
+        if self._group is not None:
+            self._group.kill()
         if not ended:
             with suppress(OSError):
                 process.kill()
@@ -369,7 +366,9 @@ class ChildProcess:
                     with suppress(OSError):
                         pipe.close()
             self._process = None
-        shutil.rmtree(self.folder, ignore_errors=True)
+        if self._group is not None:
+            self._group.end()
+        remove_folder(self.folder)
 
     def disown(self) -> None:
         """Leave the process to the one that this process is a fork of."""

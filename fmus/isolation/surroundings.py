@@ -107,12 +107,12 @@ def resident() -> int:
             return 0
 
 
-def kill_group() -> None:
-    """End this process, and those that the FMU has started, if the group is its own."""
-    if os.name == "posix":
+def kill_group(group: int | None) -> None:
+    """End this process, and those that the FMU has started, unless it has left its group."""
+    if group is not None:
         import signal
 
-        if os.getpgid(0) == os.getpid():
+        if os.getpgid(0) == group:
             os.killpg(0, signal.SIGKILL)
     os._exit(1)
 

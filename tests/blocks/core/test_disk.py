@@ -5,18 +5,16 @@ import os
 import pickle
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import pytest
 
-from loopwright.blocks import DiskError, FmuError, OptionError
+from loopwright.blocks import DiskError, OptionError
 from loopwright.blocks.core import (
     check_file,
     describe_disk_error,
     explain_disk_errors,
     find_disk_error,
-    temporary_folder,
     write_text,
 )
 from support.failing_disk import fail_below
@@ -136,38 +134,6 @@ def test_a_limit_of_this_process_is_not_taken_for_a_full_disk(tmp_path):
         "(RLIMIT_FSIZE); expected no such limit. Lift it with 'ulimit -f unlimited' in the shell that starts Python.\n"
     )
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES])
-def test_no_folder_for_temporary_files(code, tmp_path, monkeypatch):
-    """Python says which ones it has tried, and not why."""
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setattr(tempfile, "tempdir", None)
-    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: [str(tmp_path)])
-    fail_below(monkeypatch, tmp_path, code)
-    with pytest.raises(FmuError) as caught, temporary_folder("the FMU can't be built", FmuError, block="plant"):
-        pass
-    said = str(caught.value)
-    if code == errno.ENOSPC:
-        assert said.startswith("plant: the FMU can't be built: no space is left on the disk at ")
-        assert said.endswith("; expected some. Make room there.")
-    else:
-        assert said.startswith(f"plant: the FMU can't be built: there is no permission to use '{tmp_path}'")
-        assert said.endswith(". Set TMPDIR to a folder of your own.")
-
-
-def test_a_temporary_folder_goes_whatever_happens():
-    seen = []
-
-    def interrupt():
-        with temporary_folder("nothing") as folder:
-            (folder / "a").write_text("a")
-            seen.append(folder)
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupt()
-    assert [folder.exists() for folder in seen] == [False]
 
 
 def test_errors_that_are_explained_are_explained_once(tmp_path):
