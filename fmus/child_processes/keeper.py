@@ -8,7 +8,6 @@ started when it is needed first, and ends when nothing is kept.
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import subprocess
 import sys
@@ -69,7 +68,8 @@ class Keeper:
             If the keeper has ended.
         """
         assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps([request, subject]).encode() + b"\n")
+        text = os.fsencode(subject).hex() if isinstance(subject, str) else f"{subject}"
+        self._process.stdin.write(f"{request} {text}\n".encode())
 
     def make_group(self) -> int:
         """Return the number of a new group of processes.
@@ -95,9 +95,8 @@ class Keeper:
         return self._process.poll() is not None
 
     def end(self) -> None:
-        """Let the keeper end, and wait for it."""
-        with suppress(OSError):
-            self.tell("quit", 0)  # a fork of this process may hold the pipe open
+        """End the keeper, which keeps nothing."""
+        self._process.kill()  # a fork of this process may hold the pipe open
         self.close()
         self._process.wait()
 

@@ -1,18 +1,16 @@
 """Process that outlives its host and ends what the host leaves: groups of processes, then folders.
 
-It is run as a script, and imports the standard library only, to start quickly. It needs nobody's interpreter lock. Its
+It is run as a script, and imports as little as it can, to start quickly. It needs nobody's interpreter lock. Its
 standard input is a pipe that only the host can write to: whatever ends the host closes the pipe. Each line of it is a
-request in JSON: ``["group", n]`` is answered with n and the number of a new group of processes; ``["end", group]``,
-``["folder", path]``, ``["removed", path]`` and ``["quit", 0]`` have no answer. Its argument is the number of the host.
+request: ``group N`` is answered with N and the number of a new group of processes; ``end GROUP``, ``folder PATH`` and
+``removed PATH`` have no answer. Paths are bytes in hexadecimal digits. Its argument is the number of the host.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import sys
-from contextlib import suppress
 
 _POSIX = os.name == "posix"
 _PERIOD = 0.2  # s between two looks at the host: a fork of it may hold the pipe open
@@ -25,18 +23,17 @@ class Keeper:
     def __init__(self, host: int):
         self.host = host
         self.groups: set[int] = set()
-        self.folders: dict[str, None] = {}
-        self.quits = False
+        self.folders: dict[bytes, None] = {}
         self.life = os.pipe() if _POSIX else None
         """Pipe that only this process can write to, and nobody does: its end is seen by the first of each group."""
 
     def serve(self) -> None:
         """Answer requests until the host is gone, then end all groups and remove all folders."""
         rest = b""
-        while not self.quits and (data := self._read()):
+        while data := self._read():
             *lines, rest = (rest + data).split(b"\n")
             for line in lines:
-                self._answer(*json.loads(line))
+                self._answer(*line.decode().split())
         for group in self.groups:
             kill(group)
         remove([*self.folders])
@@ -51,19 +48,18 @@ class Keeper:
                     return b""
         return os.read(0, 1 << 16)
 
-    def _answer(self, request: str, subject: int | str) -> None:
+    def _answer(self, request: str, subject: str) -> None:
         if request == "group":
             os.write(1, f"{subject} {self._make_group()}\n".encode())
-        elif request == "end" and subject in self.groups:
-            self.groups.remove(int(subject))
-            kill(int(subject))
-            os.waitpid(int(subject), 0)
+        elif request == "end":
+            group = int(subject)
+            self.groups.remove(group)
+            kill(group)
+            os.waitpid(group, 0)
         elif request == "folder":
-            self.folders[str(subject)] = None
+            self.folders[bytes.fromhex(subject)] = None
         elif request == "removed":
-            self.folders.pop(str(subject), None)
-        elif request == "quit":
-            self.quits = True
+            self.folders.pop(bytes.fromhex(subject), None)
 
     def _make_group(self) -> int:
         """Make a group of processes with a first one that does nothing, and return its number; 0 if that fails.
@@ -90,11 +86,13 @@ class Keeper:
 
 def kill(group: int) -> None:
     """End all processes of a group."""
-    with suppress(OSError):
+    try:  # contextlib takes time to import
         os.killpg(group, signal.SIGKILL)
+    except OSError:
+        return
 
 
-def remove(folders: list[str]) -> None:
+def remove(folders: list[bytes]) -> None:
     """Remove folders; processes that are just being killed may still write to them."""
     import shutil
     import time

@@ -80,7 +80,6 @@ class ChildProcess:
             raise
 
     def _spawn(self, files: Path) -> None:
-        self._group = ProcessGroup()
         copy_files(files, self.folder / "fmu")
         (self.folder / "work").mkdir()
         shared = self.folder / "shared"
@@ -90,6 +89,7 @@ class ChildProcess:
             self._memory = mmap.mmap(file.fileno(), self.size)
         self._base = ctypes.addressof(ctypes.c_char.from_buffer(self._memory))
         self.words = memoryview(self._memory).cast("Q")
+        self._group = ProcessGroup()  # now, as its keeper started with the folder
         about = {
             "size": self.size,
             "group": self._group.number,
