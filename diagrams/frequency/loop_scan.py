@@ -145,12 +145,16 @@ class Scan:
                 left, right = h[k], h[k + 1]
                 if not (np.isfinite(left) and np.isfinite(right)):
                     continue
+                turns = left * slope[k] < 0 and right * slope[k + 1] > 0
+                if left * right > 0 and not turns:
+                    continue
+                if max(abs(left), abs(right)) <= self._find_rounding(omega[k : k + 2], L[k : k + 2]):
+                    continue
                 if left == 0.0:
                     found.append(span[0])
                 elif left * right < 0:
-                    if max(abs(left), abs(right)) > self._find_rounding(omega[k : k + 2], L[k : k + 2]):
-                        found.append(self._polish(lambda w: self._evaluate(function, w, 0), span))
-                elif left * slope[k] < 0 and right * slope[k + 1] > 0:
+                    found.append(self._polish(lambda w: self._evaluate(function, w, 0), span))
+                elif turns:
                     turn = self._polish(lambda w: self._evaluate(function, w, 1), span)
                     if self._evaluate(function, turn, 0) * left < 0:
                         found.append(self._polish(lambda w: self._evaluate(function, w, 0), (span[0], turn)))

@@ -446,3 +446,13 @@ def test_hidden_integrators_that_rounding_scatters_are_not_called_unstable():
     assert len(found.hidden_poles) == 3
     assert np.abs(found.hidden_poles).max() > 1 + 1e-7  # scattered to both sides
     assert found.hidden_unstable == ()
+
+
+@pytest.mark.parametrize(("w", "seed"), [(5.0, 1), (1.0, 2), (3.0, 4), (2.0, 6)])
+def test_rounding_beside_an_undamped_pole_is_no_crossing(w, seed, disturbance):
+    """L = 0.2 w/(s² + w²) + 1/s: by Routh, the closed loop is stable with every gain."""
+    with disturbance.on(seed):
+        L = control.ss([[0, w, 0], [-w, 0, 0], [0, 0, 0]], [[0], [1], [1]], [[0.2, 0, 1]], 0)
+        found = margins(L)
+    assert found.phase_crossovers == ()
+    assert (found.gain_margin_low.value, found.gain_margin_high.value) == (0.0, np.inf)
