@@ -68,6 +68,7 @@ def children():
 
 def serve(request):
     """Run the FMU of a request in a diagram, and return what came of it."""
+    from loopwright.blocks import Gain
     from loopwright.diagrams import Diagram
     from loopwright.fmus import Fmu
     from loopwright.fmus.isolation import Isolation
@@ -78,7 +79,8 @@ def serve(request):
     before, error, run = look(), None, None
     try:
         block = Fmu(request["file"], name="zoo", start={"u": 1.0, **request.get("start", {})}, **options)
-        run = Diagram("d", block()).simulate(request["duration"], step=request["step"], progress=False)
+        readers = [Gain(name="reader", gain=1.0)(block.y)] if request["read"] else []
+        run = Diagram("d", block(), *readers).simulate(request["duration"], step=request["step"], progress=False)
     except Exception as found:
         error, run = found, getattr(found, "run", None)
     after, family = look(), children()
