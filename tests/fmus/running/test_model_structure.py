@@ -144,6 +144,7 @@ BY_ITSELF = {
 }
 
 
+@pytest.mark.one_tier  # a second run reads other values of y2
 @pytest.mark.parametrize("fmi", [2, 3])
 @pytest.mark.parametrize("kind", BY_ITSELF)
 def test_an_output_that_changes_by_itself_is_not_the_structures_fault(tmp_path, fmi, kind):
