@@ -1,12 +1,12 @@
 """The compiled loop: C code of a diagram's ticks and of what happens between them, and the masters that run it."""
 
 from .background import BackgroundCode
-from .code import LARGEST, TickCode, compile_ticks, find_obstacle, write_ticks
+from .code import LARGEST, TickCode, compile_ticks, find_obstacle, interpret_ticks, write_ticks
 from .fused import FusedPlant, compile_fused, fuse
 from .grouping import make_tables
 from .handed_over import HandedOver, find_exchange_obstacle
 from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOptions, Span
-from .hybrid_code import HybridCode, compile_hybrid, find_hybrid_obstacle, write_hybrid
+from .hybrid_code import HybridCode, compile_hybrid, find_hybrid_obstacle, interpret_hybrid, write_hybrid
 from .kernels import Kernel
 from .libraries import load_compiled
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
@@ -49,6 +49,8 @@ __all__ = [
     "find_hybrid_obstacle",
     "find_obstacle",
     "fuse",
+    "interpret_hybrid",
+    "interpret_ticks",
     "load_compiled",
     "make_tables",
     "write_hybrid",

@@ -9,7 +9,8 @@ from typing import Any
 
 from ...blocks.core import LoopwrightError
 from ..flat import FlatDiagram, TickPattern
-from .code import TickCode, TickSources, write_ticks
+from .code import TickCode, write_ticks
+from .sources import Sources
 
 _WRITING = 3e-5  # s to write the C code of an operation
 _COMPILING = 1e-3  # s to compile it
@@ -48,7 +49,7 @@ class BackgroundCode:
         beside: Callable[[], Any] = lambda: None,
     ):
         self._flat, self._acting, self._beside = flat.origin, acting, beside  # other numbers change no code
-        self._sources: TickSources | None = None
+        self._sources: Sources[TickCode] | None = None
         self._thread: Thread | None = None
         self._over = False
         self.ready = False
@@ -97,7 +98,7 @@ class BackgroundCode:
         if self._thread is not None:
             self._thread.join()
 
-    def _load(self, sources: TickSources) -> None:
+    def _load(self, sources: Sources[TickCode]) -> None:
         try:
             self._beside()
             self.code = sources.load()

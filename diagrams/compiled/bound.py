@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from .functions import CompiledFunction, TickStructure, at, call_for_c, list_vectors
 from .grouped_parts import Differences, DifferencesStructure, GroupedPart, PartStructure, PythonTick
 from .hybrid_code import Between
-from .libraries import CompiledFunction
-from .loop import TickStructure
-from .native_tick import at, bind_python, call_for_c, list_vectors
+from .native_tick import bind_python
 
 
 class BoundFunction:
@@ -42,7 +41,9 @@ class BoundFunction:
     ):
         self._kept: list[Any] = [compiled, arguments, results]
         if isinstance(compiled, CompiledFunction):
-            self.structure = self._bind_straight(compiled, arguments, results)
+            bound = compiled.bind(arguments, results)
+            self._kept.append(bound)
+            self.structure = bound.structure
         elif isinstance(compiled, GroupedPart):
             self.structure = self._bind_part(compiled, arguments, results)
         else:
@@ -57,14 +58,6 @@ class BoundFunction:
         lists = [list_vectors(vectors, n) for vectors, n in zip((arguments, results), sizes, strict=True)]
         self._kept += lists
         return ctypes.addressof(lists[0]), ctypes.addressof(lists[1])
-
-    def _bind_straight(
-        self, compiled: CompiledFunction, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
-    ) -> TickStructure:
-        f = compiled.function
-        iw, w = np.zeros(f.sz_iw() + 1, dtype=np.int64), np.zeros(f.sz_w() + 1)
-        lists = self._lists(arguments, results, f.sz_arg(), f.sz_res())
-        return TickStructure(compiled.address, *lists, self._own(iw), self._own(w))
 
     def _bind_part(
         self, part: GroupedPart, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]

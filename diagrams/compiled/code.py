@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
 from ...blocks.core import CompilerError
 from ..flat import EXACT_LOOP, FlatDiagram, TickPattern, share_terms
+from .functions import CodeOfFunctions, CompiledFunction, GeneratedCode
 from .generated_text import write_functions
 from .grouping import Tables, make_tables
 from .kernels import write_kernels
-from .libraries import CompiledFunction, address_of, is_kept, load_compiled, read_sources
+from .libraries import load_compiled, read_sources
 from .reordered import put_in_order
+from .sources import Sources
 from .staged_functions import Staged, StagedEquations
 
 LARGEST = 6_000
@@ -77,6 +79,7 @@ class TickCode:
 
 
 _COMPILED: WeakKeyDictionary[FlatDiagram, TickCode] = WeakKeyDictionary()
+_INTERPRETED: WeakKeyDictionary[FlatDiagram, TickCode] = WeakKeyDictionary()
 
 
 def find_obstacle(flat: FlatDiagram) -> str | None:
@@ -106,67 +109,46 @@ def compile_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -
     return write_ticks(flat, acting).load()
 
 
-@dataclass(frozen=True, eq=False)
-class TickSources:
-    """The C code of a diagram's ticks, written.
+def interpret_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickCode:
+    """Return the ticks at which these sets of clocks act for the virtual machine; see `compile_ticks`.
 
-    Attributes
-    ----------
-    texts : sequence of str
-        The sources of its libraries.
-    operations : int
-        Operations in them.
-    exact : bool
-        Whether compiled ticks have the bits of interpreted ones; see `TickCode`.
-    make : callable
-        Makes the code of its libraries.
+    Raises
+    ------
+    CompilerError
+        If there is only generated code of them, or the runtime library can't be had.
     """
-
-    texts: Sequence[str]
-    operations: int
-    exact: bool
-    make: Callable[[Sequence[ctypes.CDLL]], TickCode]
-
-    def is_compiled(self) -> bool:
-        """Whether the cache has all libraries, so that none has to be compiled.
-
-        Raises
-        ------
-        CompilerError
-            If there is no compiler.
-        """
-        return all(is_kept(text) for text in (*self.texts, master_source()))
-
-    def load(self) -> TickCode:
-        """Return the code; libraries that the cache lacks are compiled.
-
-        Raises
-        ------
-        CompilerError
-            If there is no compiler, or it fails.
-        FmuError
-            If the cache can't be written.
-        """
-        master()
-        return self.make([load_compiled(text) for text in self.texts])
+    flat = flat.origin
+    if flat not in _INTERPRETED or tuple(_INTERPRETED[flat].ticks) != tuple(acting):
+        if flat.by_block:
+            raise CompilerError("a diagram of many blocks is interpreted block by block, until there is code of it.")
+        _INTERPRETED[flat] = write_ticks(flat, acting, straight=True).on_machine()
+    return _INTERPRETED[flat]
 
 
-def write_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickSources:
-    """Write the C code of the ticks at which these sets of clocks act; see `compile_ticks`."""
-    ticks = None if flat.by_block else _write_straight(flat, acting)
+def write_ticks(
+    flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, straight: bool = False
+) -> Sources[TickCode]:
+    """Return the ticks at which these sets of clocks act, to be written as C code; see `compile_ticks`.
+
+    ``straight`` leaves functions that are no scalar operations as they are.
+    """
+    ticks = None if flat.by_block else _write_straight(flat, acting, always=straight)
     ticks = ticks or _write_grouped(flat, acting)
     loops = loop_functions(flat, acting)
     if not loops:
-        return replace(ticks, make=lambda libraries: _COMPILED.setdefault(flat, ticks.make(libraries)))
-    text = write_loops(loops)
+        return replace(ticks, keep=partial(_keep, flat))
     exact = ticks.exact and all(len(flat.active_loops(clocks)) <= EXACT_LOOP for clocks in loops)
 
-    def make(libraries: Sequence[ctypes.CDLL]) -> TickCode:
-        found = find_loops(loops, libraries[-1])
-        return _COMPILED.setdefault(flat, replace(ticks.make(libraries), exact=exact, loops=found))
+    def make(libraries: Sequence[CodeOfFunctions]) -> TickCode:
+        return replace(ticks.make(libraries[:-1]), exact=exact, loops=find_loops(loops, libraries[-1]))
 
     count = sum(function.n_instructions() for function in loops.values())
-    return TickSources([*ticks.texts, text], ticks.operations + count, exact, make)
+    writers = [*ticks.writers, partial(write_loops, loops)]
+    return Sources(writers, make, ticks.operations + count, exact, partial(_keep, flat))
+
+
+def _keep(flat: FlatDiagram, code: TickCode) -> None:
+    _COMPILED.setdefault(flat, code)
 
 
 def loop_functions(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> dict[frozenset[TickPattern], Any]:
@@ -187,10 +169,10 @@ def write_loops(loops: Mapping[frozenset[TickPattern], Any]) -> str:
 
 
 def find_loops(
-    loops: Mapping[frozenset[TickPattern], Any], library: ctypes.CDLL
+    loops: Mapping[frozenset[TickPattern], Any], code: CodeOfFunctions
 ) -> dict[frozenset[TickPattern], CompiledFunction]:
     """Return the equations of algebraic loops in the library of `write_loops`."""
-    return {clocks: CompiledFunction.find(f, library) for clocks, f in loops.items()}
+    return {clocks: code.find(f) for clocks, f in loops.items()}
 
 
 def compile_loops(
@@ -198,7 +180,7 @@ def compile_loops(
 ) -> dict[frozenset[TickPattern], CompiledFunction]:
     """Return the equations of the algebraic loops at ticks, compiled: their mismatch, and its derivative."""
     loops = loop_functions(flat, acting)
-    return find_loops(loops, load_compiled(write_loops(loops))) if loops else {}
+    return find_loops(loops, GeneratedCode(load_compiled(write_loops(loops)))) if loops else {}
 
 
 def check_size(function: Any) -> None:
@@ -217,49 +199,35 @@ def check_size(function: Any) -> None:
         )
 
 
-def _write_straight(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickSources | None:
-    """Write ticks as one function each; None if they are no scalar operations."""
+def _write_straight(
+    flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, always: bool
+) -> Sources[TickCode] | None:
+    """Return ticks as one function each; None if they are no scalar operations, unless they are ``always`` wanted."""
     found = {clocks: flat.at_tick(clocks).last.fast for clocks in acting}
-    if not all(function.is_a("SXFunction") for function in found.values()):
+    if not always and not all(function.is_a("SXFunction") for function in found.values()):
         return None
     functions = {clocks: share_terms(f, f"tick{i}") for i, (clocks, f) in enumerate(found.items())}
 
-    def make(libraries: Sequence[ctypes.CDLL]) -> TickCode:
-        ticks = {clocks: CompiledFunction.find(f, libraries[0]) for clocks, f in functions.items()}
-        return TickCode(ticks, True, libraries[0])
+    def make(libraries: Sequence[CodeOfFunctions]) -> TickCode:
+        ticks = {clocks: libraries[0].find(f) for clocks, f in functions.items()}
+        return TickCode(ticks, True, libraries[0].library)
 
     count = sum(function.n_instructions() for function in functions.values())
-    return TickSources([put_in_order(write_functions("ticks", functions.values()))], count, True, make)
+    return Sources([lambda: put_in_order(write_functions("ticks", functions.values()))], make, count, exact=True)
 
 
-def _write_grouped(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickSources:
+def _write_grouped(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> Sources[TickCode]:
     programs = {clocks: flat.program_at(clocks) for clocks in acting}
     kernels = write_kernels(flat, [tick.program for tick in programs.values()])
 
-    def make(libraries: Sequence[ctypes.CDLL]) -> TickCode:
-        address, of_python = address_of(libraries[0], "grouped"), kernels.of_python
+    def make(libraries: Sequence[CodeOfFunctions]) -> TickCode:
+        address, of_python = libraries[0].address("grouped"), kernels.of_python
         ticks = {clocks: GroupedTick(make_tables(p, kernels.of), of_python, address) for clocks, p in programs.items()}
-        return TickCode(ticks, kernels.exact, libraries[0])
+        return TickCode(ticks, kernels.exact, libraries[0].library)
 
-    return TickSources([kernels.source], kernels.operations, kernels.exact, make)
-
-
-@lru_cache(maxsize=1)
-def master() -> Any:
-    """Return the C function that goes over ticks; it is compiled once on a machine.
-
-    Raises
-    ------
-    CompilerError
-        If there is no compiler, or it fails.
-    FmuError
-        If the cache can't be written.
-    """
-    function = load_compiled(master_source())[MASTER]
-    function.restype = None
-    return function
+    return Sources([lambda: kernels.source], make, kernels.operations, kernels.exact)
 
 
 def master_source() -> str:
-    """Return the C text of the loop over ticks."""
+    """Return the C text of the loop over ticks, for code that stands in one unit with it."""
     return read_sources("newton.c", "remote.c", "master.c")

@@ -20,9 +20,10 @@ from .code import (
     compile_ticks,
     master_source,
 )
+from .functions import GeneratedCode
 from .generated_text import write_functions
 from .hybrid_code import FUSING
-from .libraries import CompiledFunction, load_compiled
+from .libraries import load_compiled
 from .reordered import reorder
 
 _LIMIT = "0x1p20"  # LW_FAST_LIMIT
@@ -116,7 +117,7 @@ def _compile(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], plants
     notes = tuple(f"Fused: the equations of {path} stand in the loop, compiled with the ticks." for path in inside)
     if not functions:
         return replace(compile_ticks(flat, acting), master=master, notes=notes)
-    bound = {clocks: CompiledFunction.find(f, library) for clocks, f in functions.items()}
+    bound = {clocks: GeneratedCode(library).find(f) for clocks, f in functions.items()}
     notes += (
         "Fused: the ticks are compiled for this processor; values differ by rounding, which some motions magnify.",
     )

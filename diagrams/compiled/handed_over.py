@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..flat import FlatDiagram
-from .hybrid_code import hybrid_master
+from .runtime import load_runtime
 from .staged import NativeBlock, NativeExchange
 
 
@@ -83,7 +83,7 @@ class HandedOver:
         self._notes, self._tell = notes, tell
         self._blocks: dict[str, HandedBlock] = {path: blocks[path] for path in flat.outside}
         first = {path: flat.states.slices[path].start for path in flat.outside}
-        self.native = NativeExchange(self._blocks, first, flat.width, hybrid_master())
+        self.native = NativeExchange(self._blocks, first, flat.width, load_runtime())
         """The blocks as C knows them."""
         self._with_c = False
 

@@ -12,10 +12,11 @@ import numpy as np
 
 from ..flat import NONE, FlatDiagram, TickPattern
 from .bound import BoundFunction, address
-from .hybrid_code import Between, HybridCode, hybrid_master
+from .hybrid_code import Between, HybridCode
 from .hybrid_structures import HybridStructure, MethodStructure, ProblemStructure, SpanStructure
 from .loop import CompiledLoop, NewtonOptions, NewtonStructure, OutcomeStructure
 from .radau import radau_numbers
+from .runtime import load_runtime
 from .staged import NativeExchange
 from .staged_functions import Staged, StagedSlopes
 from .watch import Fired, Watch
@@ -219,7 +220,7 @@ class CompiledHybrid:
         hybrid.taken_first = self._own(np.cumsum([0, *map(len, taken)]).astype(np.int64))
         hybrid.taken_states = self._own(self.taken_states)
         self._outcome = OutcomeStructure()
-        self._run, self._guard = hybrid_master()["loopwright_go"], loop.guard
+        self._run, self._guard = load_runtime()["loopwright_go"], loop.guard
         self._run.restype = None
         self._fresh = [(structure, bytes(structure)) for structure in (hybrid, *self.methods)]
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cache, partial
 from itertools import chain
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -22,21 +21,16 @@ from .code import (
     loop_functions,
     write_loops,
 )
+from .functions import CodeOfFunctions, CompiledFunction, GeneratedCode
 from .generated_text import write_functions
 from .grouped_parts import Differences, GroupedPart, find_differences
 from .grouping import make_part_tables, make_tables
 from .kernels import write_kernels
-from .libraries import CompiledFunction, address_of, load_compiled, read_sources
 from .small_steps import STEPS, write_steps
+from .sources import Sources
 from .staged_functions import Staged, StagedEquations, StagedSlopes
 from .step_outputs import may_fail_at_steps
 
-_SOURCES = (
-    *("newton.c", "remote.c", "master.c", "exchange.c", "problem.c", "methods.c", "radau.c", "events.c", "instants.c"),
-    "hybrid.c",
-)
-
-_FLAGS = ("-fno-unroll-loops",)  # vectors are short: a sixth less for the compiler
 FUSING = ("-finline-functions", "-freciprocal-math", "-fno-tree-vectorize", "-fno-tree-slp-vectorize")
 """Flags of fused code: a parameter's inverse is computed once; vectors of few values cost more than they save."""
 _GROUPED = ("grouped", "grouped_part", "grouped_differences")
@@ -69,42 +63,6 @@ class HybridCode:
     between: Mapping[str, Between]
     steps: Mapping[str, int] = field(default_factory=dict)
     judged: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class HybridSources:
-    """The C code of a diagram with continuous states, written.
-
-    Attributes
-    ----------
-    texts : sequence of str
-        The sources of its libraries.
-    make : callable
-        Makes the code of its libraries.
-    """
-
-    texts: Sequence[str]
-    make: Callable[[Sequence[ctypes.CDLL]], HybridCode]
-
-    def load(self, *, fuse: bool = False) -> HybridCode:
-        """Return the code; libraries that the cache lacks are compiled.
-
-        Parameters
-        ----------
-        fuse : bool, default False
-            Compile it for the processor of this machine, with products and sums fused.
-
-        Raises
-        ------
-        CompilerError
-            If there is no compiler, or it fails.
-        FmuError
-            If the cache can't be written.
-        """
-        more = ((*processor_flags(), *FUSING), describe_processor()) if fuse else ()
-        libraries = [load_compiled(text, *more) for text in self.texts]
-        hybrid_master()  # if it can't be compiled, the run is interpreted
-        return self.make(libraries)
 
 
 _COMPILED: WeakKeyDictionary[FlatDiagram, dict[tuple[Any, ...], HybridCode]] = WeakKeyDictionary()
@@ -144,7 +102,7 @@ def compile_hybrid(
     stiff : bool
         Whether the derivative of the rates is needed, too.
     fuse : bool, default False
-        See `HybridSources.load`.
+        Compile it for the processor of this machine, with products and sums fused.
 
     Raises
     ------
@@ -156,12 +114,28 @@ def compile_hybrid(
     kinds = (NONE, *(clocks for clocks in acting if clocks))
     known = _COMPILED.setdefault(flat.origin, {})
     if (kinds, stiff, fuse) not in known:
-        known[kinds, stiff, fuse] = write_hybrid(flat.origin, acting, stiff=stiff).load(fuse=fuse)
+        more = ((*processor_flags(), *FUSING), describe_processor()) if fuse else ()
+        known[kinds, stiff, fuse] = write_hybrid(flat.origin, acting, stiff=stiff).load(*more)
     return known[kinds, stiff, fuse]
 
 
-def write_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridSources:
-    """Write the C code of a diagram with continuous states; see `compile_hybrid`.
+def interpret_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridCode:
+    """Return the functions of a diagram with continuous states for the virtual machine; see `compile_hybrid`.
+
+    Raises
+    ------
+    CompilerError
+        If there is only generated code of them, or the runtime library can't be had.
+    """
+    key = (NONE, *(clocks for clocks in acting if clocks)), stiff, None
+    known = _COMPILED.setdefault(flat.origin, {})
+    if key not in known:
+        known[key] = write_hybrid(flat.origin, acting, stiff=stiff).on_machine()
+    return known[key]
+
+
+def write_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, stiff: bool) -> Sources[HybridCode]:
+    """Return the functions of a diagram with continuous states, to be written as C code; see `compile_hybrid`.
 
     Small diagrams are expanded: each function is one of scalar operations. Large ones, by the rule of
     `FlatDiagram.by_block`, are grouped, so that the compiler sees each kind of block once. The derivative of the rates
@@ -178,15 +152,15 @@ def write_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *,
     written = write(flat, kinds, stiff=stiff)
     loops, judged = loop_functions(flat, kinds), bool(flat.outside) or may_fail_at_steps(flat)
 
-    def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
+    def make(libraries: Sequence[CodeOfFunctions]) -> HybridCode:
         code = replace(written.make(libraries), judged=judged)
         found = {**code.ticks.loops, **find_loops(loops, libraries[-1])} if loops else code.ticks.loops
         return replace(code, ticks=replace(code.ticks, loops=found))
 
-    return HybridSources([*written.texts, *([write_loops(loops)] if loops else [])], make)
+    return Sources([*written.writers, *([partial(write_loops, loops)] if loops else [])], make)
 
 
-def _write_straight(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridSources:
+def _write_straight(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> Sources[HybridCode]:
     ticks = {clocks: share_terms(flat.at_tick(clocks).last.fast, f"tick{i}") for i, clocks in enumerate(kinds)}
     others = {"flow": flat.flow.last.fast}
     if stiff:
@@ -196,21 +170,28 @@ def _write_straight(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], 
         others |= {"indicators": flat.indicators.last.fast, "jump": flat.jump.last.fast}
     others = {name: share_terms(function, name) for name, function in others.items()}
     functions = [*ticks.values(), *others.values()]
-    for function in functions:
-        check_size(function)
-    steps = "" if flat.active_loops(NONE) else write_steps(flat.flow.last.fast, flat.continuous.tolist())
 
-    def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
-        library = libraries[0]
-        straight = {clocks: CompiledFunction.find(function, library) for clocks, function in ticks.items()}
-        between = {name: CompiledFunction.find(function, library) for name, function in others.items()}
-        made = {method: address_of(library, step) for method, step in STEPS.items()} if steps else {}
-        return HybridCode(TickCode(straight, exact=False, library=library), between, made)
+    @cache
+    def steps() -> str:
+        return "" if flat.active_loops(NONE) else write_steps(flat.flow.last.fast, flat.continuous.tolist())
 
-    return HybridSources([write_functions("hybrid", functions) + steps], make)
+    def write() -> str:
+        for function in functions:
+            check_size(function)
+        return write_functions("hybrid", functions) + steps()
+
+    def make(libraries: Sequence[CodeOfFunctions]) -> HybridCode:
+        code = libraries[0]
+        straight = {clocks: code.find(function) for clocks, function in ticks.items()}
+        between: dict[str, Between] = {name: code.find(function) for name, function in others.items()}
+        generated = isinstance(code, GeneratedCode) and steps()
+        made = {method: code.address(step) for method, step in STEPS.items()} if generated else {}
+        return HybridCode(TickCode(straight, exact=False, library=code.library), between, made)
+
+    return Sources([write], make)
 
 
-def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridSources:
+def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> Sources[HybridCode]:
     """Write functions that go around FMUs in model exchange: one of C for each of their stages."""
     schedules: dict[str, Schedule] = {f"tick{i}": flat.at_tick(clocks) for i, clocks in enumerate(kinds)}
     schedules |= {"flow": flat.flow, "jump": flat.jump}
@@ -223,35 +204,35 @@ def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *,
     for name, schedule in schedules.items():
         traced = [stage.fast for stage in schedule.stages if not isinstance(stage, OpaqueStage)]
         functions[name] = [share_terms(function, f"{name}_{j}") for j, function in enumerate(traced)]
-        for function in functions[name]:
-            check_size(function)
 
-    def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
-        library = libraries[0]
-        staged = {
-            name: Staged(schedule, functions[name], [address_of(library, f.name()) for f in functions[name]])
-            for name, schedule in schedules.items()
-        }
+    def make(libraries: Sequence[CodeOfFunctions]) -> HybridCode:
+        code = libraries[0]
+        staged = {name: Staged(schedule, [*map(code.find, functions[name])]) for name, schedule in schedules.items()}
         ticks = {clocks: staged.pop(f"tick{i}") for i, clocks in enumerate(kinds)}
         loops = {c: StagedEquations(staged.pop(name), flat.active_loops(c)) for name, (c, _) in looped.items()}
         between: dict[str, Between] = {**staged}
         if stiff:
             between["slope"] = StagedSlopes.of(staged["flow"], flat.continuous, looped=bool(flat.active_loops(NONE)))
-        return HybridCode(TickCode(ticks, exact=False, library=library, loops=loops), between)
+        return HybridCode(TickCode(ticks, exact=False, library=code.library, loops=loops), between)
 
-    return HybridSources([write_functions("hybrid", chain(*functions.values()))], make)
+    def write() -> str:
+        for function in chain(*functions.values()):
+            check_size(function)
+        return write_functions("hybrid", chain(*functions.values()))
+
+    return Sources([write], make)
 
 
-def _write_grouped(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridSources:
+def _write_grouped(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> Sources[HybridCode]:
     programs = {clocks: flat.program_at(clocks) for clocks in kinds}
     names = ("flow", "indicators", "jump") if flat.events else ("flow",)
     parts = {name: flat.part_program(name) for name in names}
     every = [tick.program for tick in programs.values()] + [part.program for part in parts.values()]
     kernels = write_kernels(flat, every)
 
-    def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
-        library = libraries[0]
-        tick, part, differences = (address_of(library, name) for name in _GROUPED)
+    def make(libraries: Sequence[CodeOfFunctions]) -> HybridCode:
+        library = libraries[0].library
+        tick, part, differences = (libraries[0].address(name) for name in _GROUPED)
         ticks = {c: GroupedTick(make_tables(p, kernels.of), kernels.of_python, tick) for c, p in programs.items()}
         between: dict[str, Between] = {}
         for name, program in parts.items():
@@ -264,7 +245,7 @@ def _write_grouped(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *
             between["slope"] = find_differences(parts["flow"], flat.continuous, rates, differences)
         return HybridCode(TickCode(ticks, exact=False, library=library), between)
 
-    return HybridSources([kernels.source], make)
+    return Sources([lambda: kernels.source], make)
 
 
 def _sparse_slope(flat: FlatDiagram) -> Any:
@@ -273,17 +254,3 @@ def _sparse_slope(flat: FlatDiagram) -> Any:
     symbols = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
     rates = function.call(symbols)[0]
     return ca.Function("slope", symbols, [ca.jacobian(rates, symbols[1])[:, flat.continuous.tolist()]])
-
-
-@lru_cache(maxsize=1)
-def hybrid_master() -> ctypes.CDLL:
-    """Return the library that goes over ticks and between them; it is compiled once on a machine.
-
-    Raises
-    ------
-    CompilerError
-        If there is no compiler, or it fails.
-    FmuError
-        If the cache can't be written.
-    """
-    return load_compiled(read_sources(*_SOURCES), _FLAGS)

@@ -1,4 +1,4 @@
-"""Libraries of generated C code: compiled, kept in the user's cache, and loaded; and the functions in them."""
+"""Libraries of generated C code: compiled, kept in the user's cache, and loaded."""
 
 from __future__ import annotations
 
@@ -7,13 +7,9 @@ import hashlib
 import os
 import re
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from ...blocks.core import CompilerError, replace_file
 from ...fmus.export import SUFFIXES, compile_shared, describe_compiler
@@ -24,45 +20,6 @@ _FLAGS = ("-fno-math-errno", "-fno-trapping-math", "-fno-builtin-pow")
 
 _OURS = re.compile(r"[0-9a-f]{40}\.(size|so|dll|dylib)")
 """Names of what stands in the folder of compiled diagrams; other files there are the user's."""
-
-
-@dataclass(frozen=True)
-class CompiledFunction:
-    """A CasADi function, and the C function of the same name in a library.
-
-    Attributes
-    ----------
-    function : casadi.Function
-        The function that was compiled.
-    address : int
-        Address of the C function.
-    """
-
-    function: Any
-    address: int
-
-    @classmethod
-    def find(cls, function: Any, library: ctypes.CDLL) -> CompiledFunction:
-        """Return a function that a library holds."""
-        return cls(function, address_of(library, function.name()))
-
-    @property
-    def operations(self) -> int:
-        """Operations of one evaluation."""
-        return int(self.function.n_instructions())
-
-    @property
-    def pattern(self) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column of each entry of its first result that may not be 0."""
-        rows, columns = self.function.sparsity_out(0).get_triplet()
-        return np.array(rows, dtype=np.int64), np.array(columns, dtype=np.int64)
-
-
-def address_of(library: ctypes.CDLL, name: str) -> int:
-    """Return the address of a function in a library."""
-    address = ctypes.cast(library[name], ctypes.c_void_p).value
-    assert address is not None
-    return address
 
 
 def read_sources(*names: str) -> str:
@@ -107,7 +64,7 @@ def load_compiled(source: str, flags: tuple[str, ...] = (), known: str = "") -> 
         ) from error
 
 
-def is_kept(source: str) -> bool:
+def is_kept(source: str, flags: tuple[str, ...] = ()) -> bool:
     """Whether the cache has the library of a C source, so that it needs no compiler's run.
 
     Raises
@@ -115,7 +72,7 @@ def is_kept(source: str) -> bool:
     CompilerError
         If there is no compiler.
     """
-    return _is_whole(_library_of(source))
+    return _is_whole(_library_of(source, flags))
 
 
 def _note_size(library: Path) -> None:

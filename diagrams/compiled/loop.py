@@ -15,9 +15,11 @@ from ...blocks.interrupts import INTERRUPTS
 from ...fmus.calls import NEAR, FmuInstance, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
 from ..flat import TRUE, TickPattern
-from .code import CompiledTick, GroupedTick, TickCode, master
-from .native_tick import at, bind_native
+from .code import CompiledTick, GroupedTick, TickCode
+from .functions import TickStructure, at
+from .native_tick import bind_native
 from .remote import RemotePlants
+from .runtime import load_runtime
 from .staged_functions import Staged, StagedEquations
 
 _SEEN = 1e-6  # least singular value, relative to 1 + the loop's gain, that differences surely tell from 0
@@ -33,12 +35,6 @@ class OutcomeStructure(ctypes.Structure):
     """Where and why the loop has returned, as C knows it."""
 
     _fields_ = [(name, ctypes.c_int64) for name in ("ticks", "rows", "reason", "plant", "stage", "status")]
-
-
-class TickStructure(ctypes.Structure):
-    """A compiled function with its vectors, as C knows it."""
-
-    _fields_ = [(name, ctypes.c_void_p) for name in ("evaluate", "arguments", "results", "iw", "w")]
 
 
 class _Transfer(ctypes.Structure):
@@ -231,7 +227,9 @@ class CompiledLoop:
         if code.loops:
             solvers = [self.bind_loops(code, clocks, arguments, (loops or {}).get(clocks)) for clocks in code.ticks]
             self.structure.loops = self._address(solvers, NewtonStructure)
-        self._outcome, self._run = OutcomeStructure(), code.master or master()
+        self._outcome = OutcomeStructure()
+        self._run = code.master or load_runtime()["loopwright_run"]
+        self._run.restype = None
 
     def _array(self, values: np.ndarray) -> int | None:
         self._kept.append(values)
@@ -257,7 +255,7 @@ class CompiledLoop:
             return self._exchange.bind_equations(tick, arguments, results)
         bound = bind_native(tick, arguments, results)
         self._kept.append(bound)
-        return TickStructure(bound.address, bound.arguments, bound.results, bound.iw, bound.w)
+        return bound.structure
 
     def bind_loops(
         self,

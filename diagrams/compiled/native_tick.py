@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,8 +11,8 @@ import numpy as np
 from ...blocks.interrupts import INTERRUPTS
 from ..flat import bind_function
 from .code import CompiledTick
+from .functions import Bound, CompiledFunction, TickStructure, at, call_for_c, list_vectors
 from .grouping import PythonCall, Tables
-from .libraries import CompiledFunction
 from .staged_functions import Staged
 
 _Tick = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4, ctypes.c_int)
@@ -32,50 +31,11 @@ class _Group(ctypes.Structure):
     ]
 
 
-def call_for_c(call: Callable[[], None]) -> None:
-    """Call Python for C; an interrupt waits until C has returned."""
-    try:
-        INTERRUPTS.heard = True
-        call()
-    except KeyboardInterrupt:
-        INTERRUPTS.came = True
-    finally:
-        INTERRUPTS.heard = False
-
-
-@dataclass(frozen=True)
-class NativeTick:
-    """Addresses of a tick's C function and of all that it takes.
-
-    Attributes
-    ----------
-    address : int
-        Its address.
-    arguments, results : int
-        Addresses of the lists of vectors.
-    iw, w : int or None
-        Addresses of its memory.
-    kept : object
-        Whatever must live as long as this.
-    """
-
-    address: int
-    arguments: int
-    results: int
-    iw: int | None
-    w: int | None
-    kept: Any
-
-
-def bind_native(tick: CompiledTick, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> NativeTick:
+def bind_native(tick: CompiledTick, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Bound:
     """Return a tick bound to the vectors (t, x, w, p) and (x_next, z, log, ok) of a run."""
     assert not isinstance(tick, Staged)
     if isinstance(tick, CompiledFunction):
-        f = tick.function
-        given, made = list_vectors(arguments, f.sz_arg()), list_vectors(results, f.sz_res())
-        iw, w = np.zeros(f.sz_iw() + 1, dtype=np.int64), np.zeros(f.sz_w() + 1)
-        kept: list[Any] = [given, made, iw, w]
-        return NativeTick(tick.address, ctypes.addressof(given), ctypes.addressof(made), at(iw), at(w), kept)
+        return tick.bind(arguments, results)
     given, made, v, tables = (
         list_vectors(arguments, 4),
         list_vectors(results, 4),
@@ -89,19 +49,21 @@ def bind_native(tick: CompiledTick, arguments: Sequence[np.ndarray], results: Se
         return 0
 
     group = _group(tables, arguments, _Python(call))
-    kept = [given, made, v, tables, group, calls]
-    return NativeTick(
-        tick.address, ctypes.addressof(given), ctypes.addressof(made), ctypes.addressof(group), at(v), kept
+    structure = TickStructure(
+        tick.address, ctypes.addressof(given), ctypes.addressof(made), ctypes.addressof(group), at(v)
     )
+    return Bound(structure, [given, made, v, tables, group, calls, arguments, results])
 
 
 def bind_call(tick: CompiledTick, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Callable[[], None]:
     """Return a tick bound to the vectors of a run as a call from Python."""
     bound = bind_native(tick, arguments, results)
-    function = _Tick(bound.address)
+    of = bound.structure
+    function = _Tick(of.evaluate)
 
     def call() -> None:
-        function(bound.arguments, bound.results, bound.iw, bound.w, 0)
+        function(of.arguments, of.results, of.iw, of.w, 0)
+        _ = bound  # it lives as long as this
         if INTERRUPTS.came:
             INTERRUPTS.check()
 
@@ -141,16 +103,3 @@ def bind_python(call: PythonCall, functions: Mapping[int, Any], v: np.ndarray, p
         bound.call()
 
     return evaluate
-
-
-def list_vectors(vectors: Sequence[np.ndarray], length: int) -> Any:
-    """Return the addresses of vectors as C's array of at least this length."""
-    found = (ctypes.c_void_p * length)()
-    for i, vector in enumerate(vectors):
-        found[i] = at(vector)
-    return found
-
-
-def at(vector: np.ndarray) -> int | None:
-    """Return the address of a vector; None without entries."""
-    return vector.ctypes.data if vector.size else None

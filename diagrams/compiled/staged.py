@@ -12,10 +12,9 @@ from ...blocks.core import EvaluationVectors, Wanted
 from ...fmus.calls import BoundCalls, NativeAction, NativeLook
 from ...fmus.host_state import HostState
 from ..flat import JUMP, OpaqueStage
+from .functions import TickStructure, address_of, at, list_vectors
 from .grouped_parts import color_columns
-from .libraries import address_of
-from .loop import NewtonStructure, TickStructure
-from .native_tick import at, list_vectors
+from .loop import NewtonStructure
 from .remote import WAIT, LateReplies, RemotePlants
 from .staged_functions import Staged, StagedEquations, StagedSlopes
 
@@ -118,7 +117,7 @@ class NativeExchange:
     width : int
         Number of all states.
     library : CDLL
-        The library of `hybrid_master`.
+        The runtime library.
     """
 
     def __init__(self, blocks: Mapping[str, NativeBlock], first: Mapping[str, int], width: int, library: ctypes.CDLL):
@@ -160,7 +159,7 @@ class NativeExchange:
 
     def bind(self, staged: Staged, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> TickStructure:
         """Return a schedule bound to vectors, as C knows it; valid as long as this lives."""
-        schedule, functions, addresses = staged.schedule, [*staged.functions], [*staged.addresses]
+        schedule, functions = staged.schedule, [*staged.functions]
         c = np.zeros(schedule.width)
         vectors = [*arguments, c] if schedule.width else [*arguments]
         made, seen = (_Stage * len(schedule.stages))(), set[str]()
@@ -170,17 +169,12 @@ class NativeExchange:
                 self._bind_fmu(structure, stage, arguments[0], c, again=stage.path in seen)
                 seen.add(stage.path)
                 continue
-            f = functions.pop(0)
-            into = [*results] if stage is schedule.last else [c[stage.makes]]
-            given, last = list_vectors(vectors, f.sz_arg()), list_vectors(into, f.sz_res())
-            iw, w = np.zeros(f.sz_iw() + 1, dtype=np.int64), np.zeros(f.sz_w() + 1)
-            self._kept += [given, last, iw, w, vectors, into]
-            structure.f = TickStructure(
-                addresses.pop(0), ctypes.addressof(given), ctypes.addressof(last), at(iw), at(w)
-            )
+            bound = functions.pop(0).bind(vectors, [*results] if stage is schedule.last else [c[stage.makes]])
+            self._kept.append(bound)
+            structure.f, last = bound.structure, bound.structure.results
         found = _Schedule(len(made), ctypes.addressof(made))
         self._kept += [made, found]
-        return TickStructure(self._stages, None, ctypes.addressof(last), ctypes.addressof(found), None)
+        return TickStructure(self._stages, None, last, ctypes.addressof(found), None)
 
     def bind_equations(
         self, equations: StagedEquations, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ..flat import Schedule
+from .functions import CompiledFunction
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,20 +19,17 @@ class Staged:
     ----------
     schedule : Schedule
         The schedule.
-    functions : sequence of casadi.Function
-        The functions of its traced stages, in their order, as they were compiled.
-    addresses : sequence of int
-        Addresses of their C functions.
+    functions : sequence of CompiledFunction
+        Its traced stages, in their order.
     """
 
     schedule: Schedule
-    functions: Sequence[Any]
-    addresses: Sequence[int]
+    functions: Sequence[CompiledFunction]
 
     @property
     def operations(self) -> int:
         """Operations of one evaluation, without those of the FMUs."""
-        return sum(int(function.n_instructions()) for function in self.functions)
+        return sum(function.operations for function in self.functions)
 
     @property
     def pattern(self) -> tuple[np.ndarray, np.ndarray]:

@@ -20,6 +20,7 @@ from ..compiled import (
     compile_hybrid,
     find_exchange_obstacle,
     find_hybrid_obstacle,
+    interpret_hybrid,
 )
 from ..coupling import Plant, PlantSteps
 from ..flat import EVERY, ClockSets, is_exact, kinds_of, ticks_after
@@ -73,6 +74,8 @@ class HybridTicks:
         Entries of the log that end the run where they are true.
     every : bool
         Visit every tick, not only those at which something acts.
+    machine : bool, default False
+        Let the virtual machine evaluate the functions.
     fuse : bool, default False
         Compile for the processor of this machine.
 
@@ -91,6 +94,7 @@ class HybridTicks:
         stops: Sequence[int],
         *,
         every: bool,
+        machine: bool = False,
         fuse: bool = False,
     ):
         flat = self._flat = workspace.flat
@@ -98,7 +102,12 @@ class HybridTicks:
         self._stops = stops
         self._methods = methods_of(continuous)
         stiff = any(method.name == "Radau" for method in self._methods)
-        self._code = compile_hybrid(flat, kinds_of(flat, every=every), stiff=stiff, fuse=fuse)
+        acting = kinds_of(flat, every=every)
+        self._code = (
+            interpret_hybrid(flat, acting, stiff=stiff)
+            if machine
+            else compile_hybrid(flat, acting, stiff=stiff, fuse=fuse)
+        )
         self._clocks = flat.visited if plants else flat.distinct
         self._sampled = every or not self._clocks or EVERY in self._clocks
         lands = continuous.fixed or bool(plants) or continuous.lands
@@ -358,6 +367,7 @@ def make_hybrid(
     every: bool,
     coupled: bool,
     asked: bool = True,
+    machine: bool = False,
     fuse: bool = False,
 ) -> tuple[HybridTicks | None, tuple[str, ...]]:
     """Return the ticks of a run with continuous states in C, None where they can't be had, and messages about them.
@@ -378,14 +388,18 @@ def make_hybrid(
     reason = reason or find_obstacle_at_ticks(workspace.flat, plants, native, steps, coupled=coupled)
     if reason is None:
         try:
-            found = HybridTicks(workspace, continuous, native, steps, stops, every=every, fuse=fuse)
+            found = HybridTicks(workspace, continuous, native, steps, stops, every=every, machine=machine, fuse=fuse)
         except (LoopwrightError, OSError) as error:
+            if machine:
+                return None, ()
             if not asked:
                 return None, tell_failure_once(error)
             if not isinstance(error, CompilerError):
                 raise
             reason = str(error)
         else:
+            if machine:
+                return found, ()
             told = (
                 f"Compiled: {found.solver} runs in C as solver={continuous.solver.name!r}, by the same rules as "
                 "interpreted; values differ from those of an interpreted run by rounding and within the tolerances."

@@ -22,6 +22,7 @@ from ..compiled import (
     compile_fused,
     compile_ticks,
     find_obstacle,
+    interpret_ticks,
 )
 from ..coupling import Plant, PlantSteps
 from ..flat import EVERY, EXACT_LOOP, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of, ticks_after
@@ -254,6 +255,7 @@ def make_compiled(
     steps: PlantSteps,
     every: bool,
     coupled: bool,
+    machine: bool = False,
     fuse: bool = False,
 ) -> tuple[CompiledTicks | None, tuple[str, ...]]:
     """Return the ticks of a run in C, None where they can't be had, and messages about them.
@@ -264,6 +266,8 @@ def make_compiled(
         Steps of the plants.
     coupled : bool
         Whether another coupling than "jacobi" is asked for.
+    machine : bool, default False
+        Let the virtual machine evaluate them; then nothing is said where they can't be had.
     fuse : bool, default False
         Compile ticks and plants of our own together, for the processor of this machine.
     """
@@ -273,12 +277,16 @@ def make_compiled(
     )
     if reason is None:
         try:
+            acting = kinds_of(workspace.flat, every=every)
             code = _fuse(workspace.flat, native, every=every) if fuse else None
+            code = interpret_ticks(workspace.flat, acting) if machine else code
             found = CompiledTicks(workspace, native, stops, every=every, code=code)
         except CompilerError as error:
             reason = str(error)
         else:
-            return found, found.messages
+            return found, () if machine else found.messages
+    if machine:
+        return None, ()
     return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)
 
 

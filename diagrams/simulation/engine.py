@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from .compiled_hybrid import HybridTicks
     from .compiled_ticks import CompiledTicks
 
+import os
+MACHINE = bool(os.environ.get("LW_MACHINE"))
 _FEW = 100  # ticks that are interpreted under "auto" though there is code: C takes some 50 µs to begin
 
 
@@ -135,6 +137,8 @@ class Engine:
         self._find_start(None)
         if self._compile is True:
             self._compiled = self._make_compiled()
+        elif MACHINE:
+            self._compiled = self._make_compiled(machine=True)
 
     def _find_start(self, set_start: Callable[[Workspace], None] | None) -> None:
         delays = None if self.continuous is None else self.continuous.delays
@@ -147,7 +151,7 @@ class Engine:
 
     def take_tier(self) -> str:
         """Return in which form the run has gone on since the last call: "interpreted", "compiled" or "both"."""
-        found = "both" if self._changed else "interpreted" if self._compiled is None else "compiled"
+        found = "both" if self._changed else "interpreted" if self._compiled is None or self._compile is False else "compiled"
         self._changed = False
         return found
 
@@ -184,26 +188,27 @@ class Engine:
             plant.read(0.0)
         self._find_start(set_start)
 
-    def _make_compiled(self) -> CompiledTicks | HybridTicks | None:
+    def _make_compiled(self, *, machine: bool = False) -> CompiledTicks | HybridTicks | None:
         """Return the ticks in C; None, with a message, where they can't be had."""
         from .compiled_ticks import make_compiled
 
         if self.continuous is not None:
-            return self._make_hybrid()
+            return self._make_hybrid(machine=machine)
         found, message = make_compiled(
             self.workspace, self.plants, self._stops.entries, steps=self.steps, every=self.every_tick,
-            coupled=self.coupled is not None, fuse=self._fuse,
+            coupled=self.coupled is not None, machine=machine, fuse=self._fuse,
         )  # fmt: skip
         self.messages += message
         return found
 
-    def _make_hybrid(self) -> HybridTicks | None:
+    def _make_hybrid(self, *, machine: bool = False) -> HybridTicks | None:
         from .compiled_hybrid import make_hybrid
 
         assert self.continuous is not None
         ticks, message = make_hybrid(
             self.workspace, self.continuous, self.plants, self.steps, self._stops.entries, every=self.every_tick,
-            coupled=self.coupled is not None, asked=self._compile is True, fuse=self._fuse,
+            coupled=self.coupled is not None, asked=self._compile is True, machine=machine,
+            fuse=self._fuse,
         )  # fmt: skip
         self.messages += message
         return ticks

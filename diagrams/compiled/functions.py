@@ -1,0 +1,203 @@
+"""Functions of a diagram as the loop in C calls them: by generated code, by the virtual machine, or by Python."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Protocol
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from ...blocks.core import CompilerError
+from ...blocks.interrupts import INTERRUPTS
+from ..flat import bind_function
+from .machine import Program, make_program
+
+
+class TickStructure(ctypes.Structure):
+    """A function with its vectors, as C knows it."""
+
+    _fields_ = [(name, ctypes.c_void_p) for name in ("evaluate", "arguments", "results", "iw", "w")]
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A function bound to vectors: it as C knows it, and whatever must live as long as that."""
+
+    structure: TickStructure
+    kept: Sequence[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledFunction:
+    """A CasADi function, and the C function of the same name in a library.
+
+    Attributes
+    ----------
+    function : casadi.Function
+        The function that was compiled.
+    address : int
+        Address of the C function.
+    """
+
+    function: Any
+    address: int
+
+    @property
+    def operations(self) -> int:
+        """Operations of one evaluation."""
+        return int(self.function.n_instructions())
+
+    @property
+    def pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column of each entry of its first result that may not be 0."""
+        rows, columns = self.function.sparsity_out(0).get_triplet()
+        return np.array(rows, dtype=np.int64), np.array(columns, dtype=np.int64)
+
+    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Bound:
+        """Return it bound to vectors, for one call at a time."""
+        f = self.function
+        return self._bind(arguments, results, np.zeros(f.sz_iw() + 1, dtype=np.int64), np.zeros(f.sz_w() + 1))
+
+    def _bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], iw: Any, w: np.ndarray) -> Bound:
+        given = list_vectors(arguments, self.function.sz_arg())
+        made = list_vectors(results, self.function.sz_res())
+        first = at(iw) if isinstance(iw, np.ndarray) else ctypes.addressof(iw)
+        structure = TickStructure(self.address, ctypes.addressof(given), ctypes.addressof(made), first, at(w))
+        return Bound(structure, [self, arguments, results, given, made, iw, w])
+
+
+@dataclass(frozen=True, eq=False)
+class MachineFunction(CompiledFunction):
+    """A CasADi function as a program of the virtual machine, whose C function stands at the address."""
+
+    program: Program
+
+    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Bound:
+        """Return it bound to vectors, for one call at a time."""
+        return self._bind(arguments, results, *self.program.bind())
+
+
+_Vectors = ctypes.POINTER(ctypes.c_void_p)
+_Call = ctypes.CFUNCTYPE(ctypes.c_int, _Vectors, _Vectors, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int)
+
+
+@dataclass(frozen=True, eq=False)
+class CalledFunction(CompiledFunction):
+    """A CasADi function that C has Python evaluate: one of matrices, such as a table."""
+
+    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Bound:
+        """Return it bound to vectors, for one call at a time."""
+        f = self.function
+        taken, made = (
+            [np.zeros(size(i)) for i in range(n)] for size, n in ((f.numel_in, f.n_in()), (f.nnz_out, f.n_out()))
+        )
+        bound = bind_function(f, taken, made)
+        inputs = [(i, v.ctypes.data, v.nbytes) for i, v in enumerate(taken) if v.size]
+        outputs = [(i, v.ctypes.data, v.nbytes) for i, v in enumerate(made) if v.size]
+
+        def call(given: Any, wanted: Any, *_: Any) -> int:
+            for i, address, size in inputs:
+                ctypes.memmove(address, given[i], size)
+            call_for_c(bound.call)
+            for i, address, size in outputs:
+                ctypes.memmove(wanted[i], address, size)
+            return 0
+
+        function = _Call(call)
+        lists = list_vectors(arguments, f.n_in()), list_vectors(results, f.n_out())
+        structure = TickStructure(
+            ctypes.cast(function, ctypes.c_void_p).value, *map(ctypes.addressof, lists), None, None
+        )
+        return Bound(structure, [self, arguments, results, taken, made, bound, function, lists])
+
+
+def call_for_c(call: Callable[[], None]) -> None:
+    """Call Python for C; an interrupt waits until C has returned."""
+    try:
+        INTERRUPTS.heard = True
+        call()
+    except KeyboardInterrupt:
+        INTERRUPTS.came = True
+    finally:
+        INTERRUPTS.heard = False
+
+
+class CodeOfFunctions(Protocol):
+    """Where C finds functions: a library of generated code, or the virtual machine."""
+
+    library: ctypes.CDLL
+
+    def find(self, function: Any) -> CompiledFunction:
+        """Return a CasADi function as C calls it."""
+
+    def address(self, name: str) -> int:
+        """Return the address of a C function that was generated."""
+
+
+@dataclass(frozen=True, eq=False)
+class GeneratedCode:
+    """A library with the code of functions."""
+
+    library: ctypes.CDLL
+
+    def find(self, function: Any) -> CompiledFunction:
+        """Return a function that the library holds."""
+        return CompiledFunction(function, self.address(function.name()))
+
+    def address(self, name: str) -> int:
+        """Return the address of a C function."""
+        return address_of(self.library, name)
+
+
+@dataclass(frozen=True, eq=False)
+class Machine:
+    """The virtual machine of a library; functions that are no scalar operations are evaluated by Python."""
+
+    library: ctypes.CDLL
+
+    def find(self, function: Any) -> CompiledFunction:
+        """Return a function as a program, or as a call of Python."""
+        if not function.is_a("SXFunction"):
+            return CalledFunction(function, 0)
+        if (program := _PROGRAMS.get(function)) is None:
+            program = _PROGRAMS[function] = make_program(function, operation_names(self.library))
+        return MachineFunction(function, address_of(self.library, "loopwright_machine"), program)
+
+    def address(self, name: str) -> int:
+        """Refuse functions that there is only generated code of."""
+        raise CompilerError(f"{name} needs generated code.")
+
+
+_PROGRAMS: WeakKeyDictionary[Any, Program] = WeakKeyDictionary()
+
+
+@lru_cache(maxsize=4)
+def operation_names(library: ctypes.CDLL) -> tuple[str, ...]:
+    """Return the names of the virtual machine's operations, by their codes."""
+    function = library["loopwright_operations"]
+    function.restype = ctypes.c_char_p
+    return tuple(function().decode().split())
+
+
+def address_of(library: ctypes.CDLL, name: str) -> int:
+    """Return the address of a function in a library."""
+    address = ctypes.cast(library[name], ctypes.c_void_p).value
+    assert address is not None
+    return address
+
+
+def list_vectors(vectors: Sequence[np.ndarray], length: int) -> Any:
+    """Return the addresses of vectors as C's array of at least this length."""
+    found = (ctypes.c_void_p * length)()
+    for i, vector in enumerate(vectors):
+        found[i] = at(vector)
+    return found
+
+
+def at(vector: np.ndarray) -> int | None:
+    """Return the address of a vector; None without entries."""
+    return vector.ctypes.data if vector.size else None

@@ -1,0 +1,129 @@
+"""Programs of the virtual machine: CasADi functions of scalar operations, sorted into runs of one operation."""
+
+from __future__ import annotations
+
+import ctypes
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ...blocks.core import CompilerError
+
+_INPUT, _OUTPUT = 0, 1
+
+
+class _ProgramStructure(ctypes.Structure):
+    _fields_ = [("runs", ctypes.c_int64), ("code", ctypes.c_void_p)]
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """A function as a list of runs; see `machine.c`.
+
+    Attributes
+    ----------
+    runs : int
+        Number of runs.
+    code : ndarray of int32
+        The runs, one behind the other.
+    start : ndarray, shape (n,)
+        The values before the first evaluation: constants, and zeros.
+    """
+
+    runs: int
+    code: np.ndarray
+    start: np.ndarray
+
+    def bind(self) -> tuple[ctypes.Structure, np.ndarray]:
+        """Return the program as C knows it, and memory for one use of it at a time; valid as long as both live."""
+        return _ProgramStructure(self.runs, self.code.ctypes.data), self.start.copy()
+
+
+def make_program(function: Any, names: Sequence[str]) -> Program:
+    """Return a CasADi function of scalar operations as a program.
+
+    Every operation writes to a place that nothing else is written to. So operations may be done in any order in which
+    the operands come first; those of one kind are done together where that is possible.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        A function of scalar operations.
+    names : sequence of str
+        Names of the machine's operations, by their codes.
+
+    Raises
+    ------
+    CompilerError
+        If it has an operation that the machine does not have.
+    """
+    codes = {getattr(ca, f"OP_{name}"): code for code, name in enumerate(names)}
+    place: dict[int, int] = {}  # of the last value that was written to a place of CasADi's memory
+    start: list[float] = []
+    rows: list[tuple[tuple[int, ...], tuple[int, ...]]] = []  # of each operation: its kind, and its row
+    made: list[int] = []  # by place: the operation that writes there; -1: a constant
+    for k in range(function.n_instructions()):
+        op = function.instruction_id(k)
+        given, written = function.instruction_input(k), function.instruction_output(k)
+        if op == ca.OP_CONST:
+            place[written[0]] = len(start)
+            start.append(function.instruction_constant(k))
+            made.append(-1)
+            continue
+        if op not in codes:
+            raise CompilerError(f"a function has CasADi's operation {op}, which the virtual machine does not have.")
+        code = codes[op]
+        if code == _OUTPUT:
+            rows.append(((code, written[0]), (place[given[0]], written[1])))
+            continue
+        operands = () if code == _INPUT else tuple(place[i] for i in given)
+        place[written[0]] = len(start)
+        kind, row = ((code, given[0]), (len(start), given[1])) if code == _INPUT else ((code,), (len(start), *operands))
+        made.append(len(rows))
+        start.append(0.0)
+        rows.append((kind, row))
+    runs = _sort(rows, made)
+    code_of: list[int] = []
+    for kind, members in runs:
+        code_of += [kind[0], len(members), *kind[1:]]
+        for i in members:
+            code_of += rows[i][1]
+    return Program(len(runs), np.array(code_of, dtype=np.int32), np.array(start or [0.0]))
+
+
+def _sort(
+    rows: Sequence[tuple[tuple[int, ...], tuple[int, ...]]], made: Sequence[int]
+) -> list[tuple[tuple[int, ...], list[int]]]:
+    """Return the operations in runs of one kind: of the kinds that can go on, the one with most operations is next."""
+    waits, readers = [0] * len(rows), defaultdict[int, list[int]](list)
+    for i, (kind, row) in enumerate(rows):
+        operands = () if kind[0] == _INPUT else row[:1] if kind[0] == _OUTPUT else row[1:]
+        for before in {made[v] for v in operands} - {-1}:
+            waits[i] += 1
+            readers[before].append(i)
+    ready = defaultdict[tuple[int, ...], list[int]](list)
+    for i, (kind, _) in enumerate(rows):
+        if not waits[i]:
+            ready[kind].append(i)
+    found = []
+    while ready:
+        kind = max(ready, key=lambda k: (k[0] != _OUTPUT, len(ready[k]), tuple(-v for v in k)))
+        members = ready.pop(kind)
+        for i in members:  # what becomes ready by these joins them, if it is of their kind
+            for reader in readers[i]:
+                waits[reader] -= 1
+                if not waits[reader]:
+                    (members if rows[reader][0] == kind else ready[rows[reader][0]]).append(reader)
+        found.append((kind, members))
+    return found
+
+
+@lru_cache(maxsize=4096)
+def _operation_names(address: int) -> tuple[str, ...]:
+    text = ctypes.CFUNCTYPE(ctypes.c_char_p)(address)()
+    return tuple(text.decode().split())
