@@ -6,12 +6,20 @@ from .fused import FusedPlant, compile_fused, fuse
 from .grouping import make_tables
 from .handed_over import HandedOver, find_exchange_obstacle
 from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOptions, Span
-from .hybrid_code import HybridCode, compile_hybrid, find_hybrid_obstacle, interpret_hybrid, write_hybrid
+from .hybrid_code import (
+    HybridCode,
+    compile_hybrid,
+    find_hybrid_obstacle,
+    hybrid_sources,
+    interpret_hybrid,
+    write_hybrid,
+)
 from .kernels import Kernel
 from .libraries import load_compiled
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
 from .native_tick import bind_call
 from .remote import REFUSED, TOLD, UNDER_WAY, compile_other_side
+from .sources import Code
 from .staged import NativeExchange
 from .watch import RECENT, Fired, Watch
 
@@ -23,6 +31,7 @@ __all__ = [
     "TOLD",
     "UNDER_WAY",
     "BackgroundCode",
+    "Code",
     "CompiledHybrid",
     "CompiledLoop",
     "Fired",
@@ -49,6 +58,7 @@ __all__ = [
     "find_hybrid_obstacle",
     "find_obstacle",
     "fuse",
+    "hybrid_sources",
     "interpret_hybrid",
     "interpret_ticks",
     "load_compiled",

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from threading import Thread
-from typing import Any
+from typing import Any, Generic
 
 from ...blocks.core import LoopwrightError
-from ..flat import FlatDiagram, TickPattern
-from .code import TickCode, write_ticks
-from .sources import Sources
+from ..flat import FlatDiagram
+from .sources import Code, Sources
 
 _WRITING = 3e-5  # s to write the C code of an operation
 _COMPILING = 1e-3  # s to compile it
@@ -18,7 +17,7 @@ _SHARE = 0.2  # of the time that a run still takes, at most, for writing code
 _LEAST = 0.1  # s that a run still takes at least, for code that is in the cache; beside a compiler ten times as much
 
 
-class BackgroundCode:
+class BackgroundCode(Generic[Code]):
     """C code of a diagram's ticks, made while they are interpreted, as soon as the run is long enough for it.
 
     A run that is short never waits, and starts no compiler. The compiler is a process of its own.
@@ -27,8 +26,8 @@ class BackgroundCode:
     ----------
     flat : FlatDiagram
         The diagram.
-    acting : sequence of frozenset
-        The sets of clocks that act together at some tick.
+    write : callable
+        Returns its functions, to be compiled.
     beside : callable, optional
         Makes whatever else the run needs.
 
@@ -36,7 +35,7 @@ class BackgroundCode:
     ----------
     ready : bool
         Whether ``code`` is there.
-    code : TickCode or None
+    code : TickCode, HybridCode or None
         The code; None before, and where it can't replace interpreted ticks to the last bit.
     failure : Exception or None
         Why there is none: no compiler, one that fails, or a cache that does.
@@ -45,15 +44,15 @@ class BackgroundCode:
     def __init__(
         self,
         flat: FlatDiagram,
-        acting: Sequence[frozenset[TickPattern]],
+        write: Callable[[], Sources[Code]],
         beside: Callable[[], Any] = lambda: None,
     ):
-        self._flat, self._acting, self._beside = flat.origin, acting, beside  # other numbers change no code
-        self._sources: Sources[TickCode] | None = None
+        self._flat, self._write, self._beside = flat.origin, write, beside  # other numbers change no code
+        self._sources: Sources[Code] | None = None
         self._thread: Thread | None = None
         self._over = False
         self.ready = False
-        self.code: TickCode | None = None
+        self.code: Code | None = None
         self.failure: Exception | None = None
 
     def look(self, spent: float, rest: float) -> None:
@@ -72,7 +71,7 @@ class BackgroundCode:
             if rest < max(_LEAST, _WRITING * self._flat.operations / _SHARE):
                 return
             try:
-                self._sources = write_ticks(self._flat, self._acting)
+                self._sources = self._write()
             except LoopwrightError as error:
                 self._end(error)
                 return
@@ -98,7 +97,7 @@ class BackgroundCode:
         if self._thread is not None:
             self._thread.join()
 
-    def _load(self, sources: Sources[TickCode]) -> None:
+    def _load(self, sources: Sources[Code]) -> None:
         try:
             self._beside()
             self.code = sources.load()

@@ -79,7 +79,8 @@ class TickCode:
 
 
 _COMPILED: WeakKeyDictionary[FlatDiagram, TickCode] = WeakKeyDictionary()
-_INTERPRETED: WeakKeyDictionary[FlatDiagram, TickCode] = WeakKeyDictionary()
+_INTERPRETED: WeakKeyDictionary[FlatDiagram, tuple[Sequence[frozenset[TickPattern]], Sources[TickCode]]]
+_INTERPRETED = WeakKeyDictionary()
 
 
 def find_obstacle(flat: FlatDiagram) -> str | None:
@@ -118,11 +119,13 @@ def interpret_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]])
         If there is only generated code of them, or the runtime library can't be had.
     """
     flat = flat.origin
-    if flat not in _INTERPRETED or tuple(_INTERPRETED[flat].ticks) != tuple(acting):
+    known, sources = _INTERPRETED.get(flat, ((), None))
+    if sources is None or [*known] != [*acting]:
         if flat.by_block:
             raise CompilerError("a diagram of many blocks is interpreted block by block, until there is code of it.")
-        _INTERPRETED[flat] = write_ticks(flat, acting, straight=True).on_machine()
-    return _INTERPRETED[flat]
+        sources = write_ticks(flat, acting, straight=True)
+        _INTERPRETED[flat] = [*acting], sources
+    return sources.on_machine()
 
 
 def write_ticks(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Protocol
 from weakref import WeakKeyDictionary
@@ -28,7 +28,9 @@ class Bound:
     """A function bound to vectors: it as C knows it, and whatever must live as long as that."""
 
     structure: TickStructure
-    kept: Sequence[Any]
+    arguments: Sequence[np.ndarray]
+    results: Sequence[np.ndarray]
+    kept: list[Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +69,7 @@ class CompiledFunction:
         made = list_vectors(results, self.function.sz_res())
         first = at(iw) if isinstance(iw, np.ndarray) else ctypes.addressof(iw)
         structure = TickStructure(self.address, ctypes.addressof(given), ctypes.addressof(made), first, at(w))
-        return Bound(structure, [self, arguments, results, given, made, iw, w])
+        return Bound(structure, arguments, results, [given, made, iw, w])
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,10 +77,21 @@ class MachineFunction(CompiledFunction):
     """A CasADi function as a program of the virtual machine, whose C function stands at the address."""
 
     program: Program
+    _bound: list[tuple[Any, Bound]] = field(default_factory=list)
 
     def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Bound:
         """Return it bound to vectors, for one call at a time."""
-        return self._bind(arguments, results, *self.program.bind())
+        program, values = self.program.bind()
+        self._bound.append((program, self._bind(arguments, results, program, values)))
+        return self._bound[-1][1]
+
+    def hand_over(self, to: CompiledFunction) -> None:
+        """Let generated code of the same function take its place wherever it is bound; C must not run meanwhile."""
+        for program, bound in self._bound:
+            made = to.bind(bound.arguments, bound.results)
+            program.iw, program.w = made.structure.iw, made.structure.w
+            program.generated = made.structure.evaluate
+            bound.kept.append(made)
 
 
 _Vectors = ctypes.POINTER(ctypes.c_void_p)
@@ -112,7 +125,7 @@ class CalledFunction(CompiledFunction):
         structure = TickStructure(
             ctypes.cast(function, ctypes.c_void_p).value, *map(ctypes.addressof, lists), None, None
         )
-        return Bound(structure, [self, arguments, results, taken, made, bound, function, lists])
+        return Bound(structure, arguments, results, [taken, made, bound, function, lists])
 
 
 def call_for_c(call: Callable[[], None]) -> None:

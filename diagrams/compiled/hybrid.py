@@ -196,6 +196,7 @@ class CompiledHybrid:
                 hybrid.p.row, hybrid.p.column = (self._own(np.array([*v, 0], dtype=np.int64)) for v in (rows, columns))
         of = ctypes.addressof(hybrid) + HybridStructure.p.offset
         self.methods = [self._method(options, n, of, code.steps.get(options.name)) for options in methods]
+        self._names = [options.name for options in methods]
         for i, method in enumerate(self.methods):
             hybrid.methods[i] = ctypes.addressof(method)
         hybrid.before = self._own(np.zeros(width))
@@ -308,6 +309,11 @@ class CompiledHybrid:
     def take_fired(self) -> list[Fired]:
         """Return the events that have fired since the last call."""
         return [] if self.watch is None else self.watch.take(self._hybrid.w)
+
+    def take_steps(self, steps: Mapping[str, int]) -> None:
+        """Take generated steps of the methods, by name; to the last bit they do what the methods do."""
+        for method, name in zip(self.methods, self._names, strict=True):
+            method.step = steps.get(name)
 
     def plan(self, steps: Sequence[float | None]) -> None:
         """Let the methods take steps of some lengths in s next; None: they choose their first step."""

@@ -11,6 +11,7 @@ from weakref import WeakKeyDictionary
 
 import casadi as ca
 
+from ...blocks.core import CompilerError
 from ...fmus.export import describe_processor, processor_flags
 from ..flat import NONE, FlatDiagram, OpaqueStage, Schedule, TickPattern, share_terms
 from .code import (
@@ -21,7 +22,7 @@ from .code import (
     loop_functions,
     write_loops,
 )
-from .functions import CodeOfFunctions, CompiledFunction, GeneratedCode
+from .functions import CodeOfFunctions, CompiledFunction, GeneratedCode, MachineFunction
 from .generated_text import write_functions
 from .grouped_parts import Differences, GroupedPart, find_differences
 from .grouping import make_part_tables, make_tables
@@ -64,8 +65,31 @@ class HybridCode:
     steps: Mapping[str, int] = field(default_factory=dict)
     judged: bool = False
 
+    def hand_over(self, to: HybridCode) -> None:
+        """Let generated code take the place of the virtual machine wherever these functions are bound."""
+        for clocks, tick in self.ticks.ticks.items():
+            _hand_over(tick, to.ticks.ticks[clocks])
+        for clocks, equations in self.ticks.loops.items():
+            _hand_over(equations, to.ticks.loops[clocks])
+        for name, function in self.between.items():
+            _hand_over(function, to.between[name])
+
+
+def _hand_over(function: Any, to: Any) -> None:
+    match function:
+        case MachineFunction():
+            function.hand_over(to)
+        case Staged():
+            for one, other in zip(function.functions, to.functions, strict=True):
+                _hand_over(one, other)
+        case StagedEquations():
+            _hand_over(function.mismatch, to.mismatch)
+        case StagedSlopes():
+            pass  # its rates are those between ticks
+
 
 _COMPILED: WeakKeyDictionary[FlatDiagram, dict[tuple[Any, ...], HybridCode]] = WeakKeyDictionary()
+_KNOWN: WeakKeyDictionary[FlatDiagram, dict[tuple[Any, ...], Sources[HybridCode]]] = WeakKeyDictionary()
 
 
 def find_hybrid_obstacle(flat: FlatDiagram, solver: str) -> str | None:
@@ -115,7 +139,7 @@ def compile_hybrid(
     known = _COMPILED.setdefault(flat.origin, {})
     if (kinds, stiff, fuse) not in known:
         more = ((*processor_flags(), *FUSING), describe_processor()) if fuse else ()
-        known[kinds, stiff, fuse] = write_hybrid(flat.origin, acting, stiff=stiff).load(*more)
+        known[kinds, stiff, fuse] = hybrid_sources(flat, acting, stiff=stiff).load(*more)
     return known[kinds, stiff, fuse]
 
 
@@ -127,10 +151,17 @@ def interpret_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]
     CompilerError
         If there is only generated code of them, or the runtime library can't be had.
     """
-    key = (NONE, *(clocks for clocks in acting if clocks)), stiff, None
-    known = _COMPILED.setdefault(flat.origin, {})
+    if flat.by_block and not flat.active_loops(NONE) and not flat.outside:
+        raise CompilerError("a diagram of many blocks is interpreted block by block, until there is code of it.")
+    return hybrid_sources(flat, acting, stiff=stiff).on_machine()
+
+
+def hybrid_sources(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, stiff: bool) -> Sources[HybridCode]:
+    """Return the functions of a diagram with continuous states; the same ones for the next run. See `write_hybrid`."""
+    key = (NONE, *(clocks for clocks in acting if clocks)), stiff
+    known = _KNOWN.setdefault(flat.origin, {})
     if key not in known:
-        known[key] = write_hybrid(flat.origin, acting, stiff=stiff).on_machine()
+        known[key] = write_hybrid(flat.origin, acting, stiff=stiff)
     return known[key]
 
 
@@ -157,7 +188,9 @@ def write_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *,
         found = {**code.ticks.loops, **find_loops(loops, libraries[-1])} if loops else code.ticks.loops
         return replace(code, ticks=replace(code.ticks, loops=found))
 
-    return Sources([*written.writers, *([partial(write_loops, loops)] if loops else [])], make)
+    writers = [*written.writers, *([partial(write_loops, loops)] if loops else [])]
+    exact = written.exact and all(function.is_a("SXFunction") for function in loops.values())
+    return replace(written, writers=writers, make=make, exact=exact)
 
 
 def _write_straight(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> Sources[HybridCode]:
@@ -188,7 +221,8 @@ def _write_straight(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], 
         made = {method: code.address(step) for method, step in STEPS.items()} if generated else {}
         return HybridCode(TickCode(straight, exact=False, library=code.library), between, made)
 
-    return Sources([write], make)
+    exact = all(function.is_a("SXFunction") for function in functions)
+    return Sources([write], make, sum(function.n_instructions() for function in functions), exact)
 
 
 def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> Sources[HybridCode]:
@@ -220,7 +254,9 @@ def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *,
             check_size(function)
         return write_functions("hybrid", chain(*functions.values()))
 
-    return Sources([write], make)
+    every = [*chain(*functions.values())]
+    exact = all(function.is_a("SXFunction") for function in every)
+    return Sources([write], make, sum(function.n_instructions() for function in every), exact)
 
 
 def _write_grouped(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> Sources[HybridCode]:

@@ -35,6 +35,9 @@ VISIBLE const char *loopwright_operations(void) {
 typedef struct {
     int64_t runs;
     const int32_t *code;
+    tick_function generated; /* generated code of the same function, which is called instead; NULL: there is none yet */
+    long long *iw;           /* its memory */
+    double *w;
 } program;
 
 #define UNARY_RUN(name, value)             \
@@ -56,7 +59,7 @@ typedef struct {
 VISIBLE int loopwright_machine(const double **arguments, double **results, long long *iw, double *v, int memory) {
     const program *of = (const program *)iw;
     const int32_t *c = of->code;
-    (void)memory;
+    if (of->generated) return of->generated(arguments, results, of->iw, of->w, memory);
     for (int64_t run = 0; run < of->runs; run++) {
         const int32_t code = c[0];
         int32_t n = c[1];

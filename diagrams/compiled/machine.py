@@ -6,7 +6,6 @@ import ctypes
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -18,7 +17,7 @@ _INPUT, _OUTPUT = 0, 1
 
 
 class _ProgramStructure(ctypes.Structure):
-    _fields_ = [("runs", ctypes.c_int64), ("code", ctypes.c_void_p)]
+    _fields_ = [("runs", ctypes.c_int64), *((name, ctypes.c_void_p) for name in ("code", "generated", "iw", "w"))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,9 +120,3 @@ def _sort(
                     (members if rows[reader][0] == kind else ready[rows[reader][0]]).append(reader)
         found.append((kind, members))
     return found
-
-
-@lru_cache(maxsize=4096)
-def _operation_names(address: int) -> tuple[str, ...]:
-    text = ctypes.CFUNCTYPE(ctypes.c_char_p)(address)()
-    return tuple(text.decode().split())

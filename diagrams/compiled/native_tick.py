@@ -52,7 +52,7 @@ def bind_native(tick: CompiledTick, arguments: Sequence[np.ndarray], results: Se
     structure = TickStructure(
         tick.address, ctypes.addressof(given), ctypes.addressof(made), ctypes.addressof(group), at(v)
     )
-    return Bound(structure, [given, made, v, tables, group, calls, arguments, results])
+    return Bound(structure, arguments, results, [given, made, v, tables, group, calls])
 
 
 def bind_call(tick: CompiledTick, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Callable[[], None]:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from ..coupling import Plant, PlantSteps, runs_apart
+from ..coupling import Plant, runs_apart
 from .continuous import Continuous
 from .view import Position
-from .workspace import Workspace
 
 if TYPE_CHECKING:
     from .compiled_hybrid import HybridTicks
-    from .compiled_ticks import CompiledTicks, LaterTicks
+    from .compiled_ticks import LaterCode
 
 _PATIENCE = 0.02  # s of interpreted ticks before which nobody thinks of a compiler
 _PATIENCE_OF_WORK = 0.05  # s of counted work before which it says nothing about the rest
@@ -24,47 +23,25 @@ _START, _COMPILING, _LARGE = 0.4, 1e-3, 2000  # s to begin with C, and to compil
 
 
 class ChangeOver:
-    """Watches interpreted ticks, and has C code made for them if they take long.
+    """Watches an interpreted run, and has C code generated for it if it takes long.
 
     Parameters
     ----------
-    workspace : Workspace
-        The run's numbers.
     position : Position
         The instant that the run has reached.
-    plants : mapping of str to Plant
-        The plants by path; it may be filled later.
-    steps : PlantSteps
-        Their steps.
-    stops : sequence of int
-        Entries of the log that end the run where they are true.
-    every : bool
-        Visit every tick, not only those at which a subsystem acts.
-    plain : bool
-        Whether nothing but the plants' steps happens between ticks.
+    make : callable
+        Returns the code that is to be made; None where it can't be had.
     """
 
-    def __init__(
-        self,
-        workspace: Workspace,
-        position: Position,
-        plants: Mapping[str, Plant],
-        steps: PlantSteps,
-        stops: Sequence[int],
-        *,
-        every: bool,
-        plain: bool,
-    ):
-        self._workspace, self._position, self._stops = workspace, position, stops
-        self._plants, self._steps = plants, steps
-        self._every, self._possible = every, plain
-        self._later: LaterTicks | None = None
+    def __init__(self, position: Position, make: Callable[[], LaterCode[Any] | None]):
+        self._position, self._make, self._possible = position, make, True
+        self._later: LaterCode[Any] | None = None
         self._spent = 0.0
 
     def watch(
         self, last: int, progress: Callable[[float], Any], note_due: Callable[[], None]
     ) -> Callable[[float], Any]:
-        """Return a ``progress`` for interpreted ticks from here up to a tick, which has the code made in time.
+        """Return a ``progress`` for an interpreted run from here up to a tick, which has the code made in time.
 
         It calls ``note_due`` once the code is there: nothing is looked at in every tick.
         """
@@ -76,7 +53,8 @@ class ChangeOver:
             self._spent = before + spent
             if self._possible and self._spent > _PATIENCE and done:
                 self._look(spent * (last - position.tick) / done)
-                if self._later is not None and self._later.code.ready:
+                if self.code is not None:
+                    self._possible = False
                     note_due()
             progress(t)
 
@@ -84,21 +62,20 @@ class ChangeOver:
 
     def _look(self, rest: float) -> None:
         if self._later is None:
-            from .compiled_ticks import make_later
-
-            self._later = make_later(self._workspace, self._plants, self._stops, steps=self._steps, every=self._every)
+            self._later = self._make()
         if self._later is None:
             self._possible = False
         else:
-            self._later.code.look(self._spent, rest)
+            self._later.background.look(self._spent, rest)
 
     def tell_failure(self) -> tuple[str, ...]:
         """Return a message that there is no compiler, or one that fails; once in a process."""
         return () if self._later is None else self._later.tell_failure()
 
-    def take_over(self) -> CompiledTicks | None:
-        """Return the ticks in C; None while there is no code."""
-        return None if self._later is None else self._later.take_over()
+    @property
+    def code(self) -> Any:
+        """The code; None while there is none."""
+        return self._later.background.code if self._later is not None and self._later.background.ready else None
 
 
 class HybridChange:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -11,15 +12,18 @@ import numpy as np
 from ...blocks.core import CompilerError, LoopwrightError, SimulationError
 from ...fmus.calls import FmuInstance
 from ..compiled import (
+    BackgroundCode,
     CompiledHybrid,
     Fired,
     HandedOver,
+    HybridCode,
     HybridOutcome,
     HybridReason,
     Span,
     compile_hybrid,
     find_exchange_obstacle,
     find_hybrid_obstacle,
+    hybrid_sources,
     interpret_hybrid,
 )
 from ..coupling import Plant, PlantSteps
@@ -39,6 +43,7 @@ from .compiled_hand_over import (
     name_methods,
     planned_steps,
     plants_for_c,
+    prepare,
     restore_plans,
     take_back_domains,
     tell_fired,
@@ -47,6 +52,7 @@ from .compiled_ticks import (
     FIRST,
     LARGEST_CHUNK,
     WISHED,
+    LaterCode,
     find_obstacle_at_ticks,
     tell_failure_once,
 )
@@ -101,12 +107,12 @@ class HybridTicks:
         self._workspace, self._continuous, self._plants, self._steps = workspace, continuous, plants, steps
         self._stops = stops
         self._methods = methods_of(continuous)
-        stiff = any(method.name == "Radau" for method in self._methods)
-        acting = kinds_of(flat, every=every)
+        self._stiff = any(method.name == "Radau" for method in self._methods)
+        self._acting = kinds_of(flat, every=every)
         self._code = (
-            interpret_hybrid(flat, acting, stiff=stiff)
+            interpret_hybrid(flat, self._acting, stiff=self._stiff)
             if machine
-            else compile_hybrid(flat, acting, stiff=stiff, fuse=fuse)
+            else compile_hybrid(flat, self._acting, stiff=self._stiff, fuse=fuse)
         )
         self._clocks = flat.visited if plants else flat.distinct
         self._sampled = every or not self._clocks or EVERY in self._clocks
@@ -128,6 +134,17 @@ class HybridTicks:
     def reaches(self, last: int) -> bool:
         """Whether times up to a tick are quotients of integers that a float64 holds."""
         return is_exact(self._flat, last)
+
+    def hand_over(self, code: HybridCode) -> None:
+        """Let generated code of the same functions go on; C must not run meanwhile."""
+        self._code.hand_over(code)
+        if self._loop is not None:
+            self._loop.take_steps(code.steps)
+
+    def make_later(self) -> LaterCode[HybridCode] | None:
+        """Return generated code of these functions that is made while they are interpreted."""
+        write = partial(hybrid_sources, self._flat, self._acting, stiff=self._stiff)
+        return LaterCode(BackgroundCode(self._flat, write, prepare(self._plants)))
 
     # --- going on ----------------------------------------------------------------------------------------------------
 

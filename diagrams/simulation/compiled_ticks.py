@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from ...blocks.core import CompilerError, SimulationError
 from ...fmus.calls import FmuInstance
 from ..compiled import (
     BackgroundCode,
+    Code,
     CompiledLoop,
     FusedPlant,
     Outcome,
@@ -23,6 +25,7 @@ from ..compiled import (
     compile_ticks,
     find_obstacle,
     interpret_ticks,
+    write_ticks,
 )
 from ..coupling import Plant, PlantSteps
 from ..flat import EVERY, EXACT_LOOP, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of, ticks_after
@@ -127,6 +130,10 @@ class CompiledTicks:
         """Whether times up to a tick are quotients of integers that a float64 holds."""
         return is_exact(self._flat, last)
 
+    def hand_over(self, code: TickCode) -> None:
+        """Let generated code of the same ticks go on; C must not run meanwhile."""
+        self._code, self._loop = code, None
+
     def run(
         self,
         k: int,
@@ -154,8 +161,9 @@ class CompiledTicks:
         self, window: _Window, recorder: Recorder, arrived: Callable[..., bool], progress: Callable[[float], Any]
     ) -> bool:
         """Run some ticks; return whether the run ends there."""
-        loop, at, k = self._bind(recorder), 0, window.before
+        at, k = 0, window.before
         while at < len(window.kinds):
+            loop = self._bind(recorder)  # generated code may have come
             rows = recorder.room(float(window.times[at]))
             loop.skip = recorder.skip
             stop = window.known(at, min(at + self._chunk, at + recorder.skip + (len(rows) - 1) * recorder.every + 1))
@@ -314,33 +322,21 @@ def _is_plain(block: Fmu) -> bool:
     return integrator == _RK4 and all(v.causality in ("input", "output") for v in ports)
 
 
-class LaterTicks:
-    """Interpreted ticks that C takes over from once its code is there: to the last bit it makes no difference when.
-
-    Parameters
-    ----------
-    workspace, plants, stops, every
-        See `CompiledTicks`.
+@dataclass(frozen=True, eq=False)
+class LaterCode(Generic[Code]):
+    """Generated code that takes over from an interpreted run: to the last bit it makes no difference when.
 
     Attributes
     ----------
-    code : BackgroundCode
+    background : BackgroundCode
         The code that is being made.
     """
 
-    def __init__(self, workspace: Workspace, plants: Mapping[str, Plant], stops: Sequence[int], *, every: bool):
-        self._workspace, self._native, self._stops, self._every = workspace, plants_for_c(plants), stops, every
-        self.code = BackgroundCode(workspace.flat, kinds_of(workspace.flat, every=every), prepare(self._native))
-
-    def take_over(self) -> CompiledTicks | None:
-        """Return the ticks in C; None while there is no code."""
-        if self.code.code is None:
-            return None
-        return CompiledTicks(self._workspace, self._native, self._stops, every=self._every, code=self.code.code)
+    background: BackgroundCode[Code]
 
     def tell_failure(self) -> tuple[str, ...]:
         """Return a message that there is no compiler, or one that fails; once in a process."""
-        return () if self.code.failure is None else tell_failure_once(self.code.failure)
+        return () if self.background.failure is None else tell_failure_once(self.background.failure)
 
 
 _TOLD: list[Exception] = []  # the failure that this process has told
@@ -356,13 +352,14 @@ def tell_failure_once(failure: Exception) -> tuple[str, ...]:
 
 
 def make_later(
-    workspace: Workspace, plants: Mapping[str, Plant], stops: Sequence[int], *, steps: PlantSteps, every: bool
-) -> LaterTicks | None:
-    """Return ticks that C takes over from where a run is long enough; None where it can't. See `make_compiled`."""
-    flat = workspace.flat
-    if find_obstacle(flat) or find_obstacle_at_ticks(flat, plants, plants_for_c(plants), steps, coupled=False):
+    workspace: Workspace, plants: Mapping[str, Plant], *, steps: PlantSteps, every: bool
+) -> LaterCode[TickCode] | None:
+    """Return the code of ticks that is made beside them; None where they can't go in C. See `make_compiled`."""
+    flat, native = workspace.flat, plants_for_c(plants)
+    if find_obstacle(flat) or find_obstacle_at_ticks(flat, plants, native, steps, coupled=False):
         return None
-    return LaterTicks(workspace, plants, stops, every=every)
+    write = partial(write_ticks, flat.origin, kinds_of(flat, every=every))
+    return LaterCode(BackgroundCode(flat, write, prepare(native)))
 
 
 def find_obstacle_at_ticks(

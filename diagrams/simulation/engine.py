@@ -29,12 +29,11 @@ from .view import Position, SimulationView
 from .workspace import Workspace
 
 if TYPE_CHECKING:
+    from ..compiled import TickCode
     from .compiled_hybrid import HybridTicks
-    from .compiled_ticks import CompiledTicks
+    from .compiled_ticks import CompiledTicks, LaterCode
 
-import os
-MACHINE = bool(os.environ.get("LW_MACHINE"))
-_FEW = 100  # ticks that are interpreted under "auto" though there is code: C takes some 50 µs to begin
+_FEW = 100  # sampled ticks that Python goes through unless compile=True: C takes some 50 µs to begin
 
 
 class Engine:
@@ -74,8 +73,9 @@ class Engine:
         self._stops = StopConditions(flat, self.workspace.log, self._find_asking)
         self._passes_on = check_start_exchange(options.start_exchange)
         self._compile, self._fuse = check_compile(options.compile, fuse=options.fuse), options.fuse
-        self._changed = self._due = False  # whether C has taken over within the run, or does so at the next tick
+        self._changed = self._due = False  # whether code has taken over within the run, or does so at the next tick
         self._compiled: CompiledTicks | HybridTicks | None = None
+        self._generated = self._asked_machine = False  # whether it is generated code; whether the machine can be had
         self.messages: tuple[str, ...] = ()
         self._can_stop = self._stops.exist or bool(self.exchanged)
         self.is_ahead = False
@@ -97,8 +97,7 @@ class Engine:
             flat, self.plants, self.workspace.z, self.workspace.here.w, self.position.time_of,
             every_tick=self.every_tick, coupled=is_coupled,
         )  # fmt: skip
-        numbers = self.workspace, self.position, self.plants, self.steps, self._stops.entries
-        self._change_over = ChangeOver(*numbers, every=self.every_tick, plain=self.coupling.is_plain)
+        self._change_over = ChangeOver(self.position, self._make_later)
         part = self.continuous if self._compile == "auto" and not is_coupled else None
         parts = self.position, self.plants, self._make_hybrid, self.every_tick
         self._hybrid = None if part is None else HybridChange(part, *parts)
@@ -137,8 +136,7 @@ class Engine:
         self._find_start(None)
         if self._compile is True:
             self._compiled = self._make_compiled()
-        elif MACHINE:
-            self._compiled = self._make_compiled(machine=True)
+            self._generated = self._compiled is not None
 
     def _find_start(self, set_start: Callable[[Workspace], None] | None) -> None:
         delays = None if self.continuous is None else self.continuous.delays
@@ -151,14 +149,19 @@ class Engine:
 
     def take_tier(self) -> str:
         """Return in which form the run has gone on since the last call: "interpreted", "compiled" or "both"."""
-        found = "both" if self._changed else "interpreted" if self._compiled is None or self._compile is False else "compiled"
+        found = "both" if self._changed else "compiled" if self._generated else "interpreted"
         self._changed = False
         return found
 
+    @staticmethod
+    def may_use_machine(option: bool | str) -> bool:
+        """Whether the virtual machine evaluates a run with this ``compile``; tests compare Python's own loop."""
+        return option is not True
+
     @property
     def is_compiled(self) -> bool:
-        """Whether it goes from tick to tick in C."""
-        return self._compiled is not None
+        """Whether generated code is gone through from tick to tick."""
+        return self._generated
 
     @property
     def can_begin_anew(self) -> bool:
@@ -180,7 +183,8 @@ class Engine:
         self.position.restore(0, None)
         if self._hybrid is not None:
             self._hybrid.begin_anew()
-            self._compiled = None
+            if not self._asked_machine:
+                self._compiled, self._generated = None, False
         if self.continuous is not None:
             self.continuous.begin_anew(flat)
         for plant in self.plants.values():
@@ -243,9 +247,12 @@ class Engine:
         workspace, plants, position, row = self.workspace, self.plants, self.position, recorder.row
         self.is_ahead = False
         try:
-            few = self._compile == "auto" and self.continuous is None and last - position.tick < _FEW
+            few = self._compile is not True and self.continuous is None and last - position.tick < _FEW
+            if self._compiled is None and not few and not self._asked_machine and self.may_use_machine(self._compile):
+                self._asked_machine = True
+                self._compiled = self._make_compiled(machine=True)
             if self._hybrid is not None and self._compiled is None and self._hybrid.is_due(last):
-                self._compiled = self._hybrid.ticks
+                self._compiled, self._generated = self._hybrid.ticks, True
             if self._compiled is not None and not few and self._compiled.reaches(last):
                 self._go_in_c(last, recorder, progress)
                 return
@@ -258,8 +265,8 @@ class Engine:
                 )  # fmt: skip
                 self._due = False
                 self.messages += self._change_over.tell_failure()
-                if auto and (ticks := self._change_over.take_over()) is not None:
-                    self._compiled, self._changed = ticks, True
+                if auto and (code := self._change_over.code) is not None:
+                    self._compiled, self._changed, self._generated = self._ticks_of(code), True, True
                     if position.stopped is None and position.tick < last:
                         self.go(last, recorder, progress)
                 return
@@ -273,7 +280,8 @@ class Engine:
             if ended is not None and start is None:
                 position.stopped = self._stops.met_at(ended)
             elif change is not None and change.ticks is not None and position.stopped is None:
-                self._compiled, self._changed, change.ticks.start = change.ticks, True, start
+                self._compiled, change.ticks.start = change.ticks, start
+                self._changed = self._generated = True
                 self._go_in_c(last, recorder, progress)
         except SimulationError as error:
             if not self._end_within_step(error):
@@ -282,9 +290,35 @@ class Engine:
 
     def _go_in_c(self, last: int, recorder: Recorder, progress: Progress) -> None:
         assert self._compiled is not None
+        if self._compile == "auto" and not self._generated:
+            progress = self._change_over.watch(last, progress, self._hand_over)
         ended = self._compiled.run(self.position.tick, last, recorder, arrived=self._arrive, progress=progress)
+        self.messages += self._change_over.tell_failure()
         if ended is not None:
             self.position.stopped = self._stops.met_at(ended)
+
+    def _hand_over(self) -> None:
+        """Let generated code go on where the virtual machine has come to."""
+        assert self._compiled is not None
+        self._compiled.hand_over(self._change_over.code)
+        self._changed = self._generated = True
+
+    def _make_later(self) -> LaterCode[Any] | None:
+        """Return the code that is generated while the run is interpreted; None where it can't be had."""
+        from .compiled_hybrid import HybridTicks
+        from .compiled_ticks import make_later
+
+        if isinstance(self._compiled, HybridTicks):
+            return self._compiled.make_later()
+        if self.continuous is not None or not self.coupling.is_plain:
+            return None
+        return make_later(self.workspace, self.plants, steps=self.steps, every=self.every_tick)
+
+    def _ticks_of(self, code: TickCode) -> CompiledTicks:
+        from .compiled_ticks import CompiledTicks, plants_for_c
+
+        native = plants_for_c(self.plants)
+        return CompiledTicks(self.workspace, native, self._stops.entries, every=self.every_tick, code=code)
 
     def end_between_ticks(self, end: float, row: Row, progress: Progress) -> None:
         """Go on from a tick to the end of the run, before the next tick, and record it; see `go`."""

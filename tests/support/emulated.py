@@ -21,7 +21,7 @@ import unicorn
 from unicorn import arm64_const as arm
 from unicorn import x86_const as x86
 
-from loopwright.diagrams.compiled import code, hybrid_code, libraries, native_tick, remote
+from loopwright.diagrams.compiled import libraries, native_tick, remote, runtime
 from loopwright.fmus.export import compile_shared
 
 lief.logging.disable()
@@ -302,8 +302,7 @@ def emulate(patch, platform, folder):
         made.processor = processor
         return made
 
-    for original in (code.master, hybrid_code.hybrid_master):
-        _replace(patch, original, lru_cache(original.__wrapped__))
+    _replace(patch, runtime.load_runtime, lru_cache(runtime.load_runtime.__wrapped__))
     _replace(patch, libraries.load_compiled, load)
     patch.setattr(remote, "load_compiled", original_load)  # code of other processes
     patch.setattr(native_tick, "_Tick", function)

@@ -18,12 +18,12 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, Run, subsystem
-from loopwright.diagrams.compiled import background, code, libraries
+from loopwright.diagrams.compiled import background, libraries, runtime
 from loopwright.diagrams.simulation import RunOptions, change_over, compiled_ticks
 from loopwright.fmus import Fmu, dc_motor
 from support.both_forms import assert_same_bits
 
-pytestmark = pytest.mark.one_tier  # it counts calls
+pytestmark = [pytest.mark.one_tier, pytest.mark.python_loop]  # it counts calls; see `test_machine_runs.py`, too
 
 QUIET = {"progress": False}
 
@@ -149,7 +149,7 @@ def test_a_missing_compiler_is_told_once(eager, no_compiler):
 
 def test_a_cache_that_fails_leaves_the_run_interpreted_and_is_told(eager, monkeypatch, tmp_path):
     libraries.load_compiled.cache_clear()
-    code.master.cache_clear()
+    runtime.load_runtime.cache_clear()
     (tmp_path / "file").touch()
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "file"))
     run = sums().simulate(20.0, compile="auto", **QUIET)
@@ -162,7 +162,7 @@ def test_a_cache_that_fails_leaves_the_run_interpreted_and_is_told(eager, monkey
 
 
 def test_a_short_run_asks_for_no_code():
-    with mock.patch.object(background, "write_ticks", side_effect=AssertionError("written")):
+    with mock.patch.object(compiled_ticks, "write_ticks", side_effect=AssertionError("written")):
         assert len(sums().simulate(20.0, compile="auto", **QUIET).t) == 2001
 
 

@@ -23,7 +23,7 @@ from loopwright.diagrams.simulation import change_over, compiled_hybrid, compile
 from loopwright.fmus import Fmu, dc_motor
 from support.both_forms import assert_same_bits
 
-pytestmark = pytest.mark.one_tier
+pytestmark = [pytest.mark.one_tier, pytest.mark.python_loop]  # see `test_machine_runs.py`, too
 QUIET = {"progress": False}
 T = 1e-3
 
@@ -185,10 +185,10 @@ def test_a_stop_condition_ends_it_in_c_at_its_event(little):
 
 
 def test_without_a_compiler_the_bits_are_those_of_an_interpreted_run(little, monkeypatch):
-    from loopwright.diagrams.compiled import hybrid_code
+    from loopwright.diagrams.compiled import sources
 
-    monkeypatch.setattr(hybrid_code, "load_compiled", _fail)
-    monkeypatch.setattr(hybrid_code, "hybrid_master", _fail)
+    monkeypatch.setattr(sources, "load_compiled", _fail)
+    monkeypatch.setattr(sources, "load_runtime", _fail)
     runs = [thermostat().simulate(10.0, step=0.05, **QUIET) for _ in range(2)]
     assert [len(run.messages) for run in runs] == [1, 0]
     assert "no such compiler" in runs[0].messages[0]

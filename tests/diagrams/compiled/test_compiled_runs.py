@@ -19,7 +19,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, Interrupted, Run, experiments, subsystem
-from loopwright.diagrams.compiled import code, libraries
+from loopwright.diagrams.compiled import libraries, runtime
 from loopwright.fmus import Fmu, dc_motor
 from support.random_cases import random_cases
 from support.random_linear import BASE, PERIOD, Matrices, diagram, specs
@@ -288,7 +288,7 @@ def test_a_folder_that_others_can_write_is_not_trusted(tmp_path, monkeypatch, fr
 
 def test_a_library_that_was_cut_off_is_compiled_again(tmp_path, monkeypatch, fresh):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path))
-    source = code.master_source()
+    source = runtime.runtime_source()
     library = libraries._library_of(source)
     libraries.load_compiled(source)
     part = library.read_bytes()[: library.stat().st_size // 2]
@@ -296,6 +296,6 @@ def test_a_library_that_was_cut_off_is_compiled_again(tmp_path, monkeypatch, fre
     library.write_bytes(part)
     assert not libraries.is_kept(source)
     libraries.load_compiled.cache_clear()
-    assert code.MASTER in str(libraries.load_compiled(source)[code.MASTER].__name__)
+    assert libraries.load_compiled(source)["loopwright_run"].__name__ == "loopwright_run"
     assert library.stat().st_size > len(part)
     assert libraries.is_kept(source)

@@ -7,7 +7,7 @@ import pytest
 
 from loopwright.blocks import Constant, Gain, Integrator, Product, PythonFunction, Relay, Sine, Sum, TransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.diagrams.compiled import code, fused, hybrid_code, libraries, write_hybrid, write_ticks
+from loopwright.diagrams.compiled import fused, libraries, runtime, write_hybrid, write_ticks
 from loopwright.diagrams.lanes import lane_code
 from loopwright.diagrams.simulation.compiled_ticks import kinds_of
 from loopwright.fmus.export.compiler import TARGETS
@@ -52,8 +52,7 @@ def between_ticks():
 def sources():
     """All C code that runs compile, by name."""
     found = {
-        "loop": code.master_source(),
-        "hybrid loop": libraries.read_sources(*hybrid_code._SOURCES),
+        "runtime": runtime.runtime_source(),
         "other process": libraries.read_sources("newton.c", "remote.c", "child.c"),
     }
     with pytest.MonkeyPatch.context() as patch:

@@ -10,7 +10,7 @@ from loopwright.blocks import Clock, Gain, Integrator, OptionError, ParameterErr
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, StepOptions, mass_spring_damper
 
-pytestmark = pytest.mark.one_tier  # it counts calls
+pytestmark = [pytest.mark.one_tier, pytest.mark.python_loop]  # it counts calls
 
 P = mass_spring_damper.MassSpringDamper()
 A = np.array([[0.0, 1.0], [-P.stiffness / P.mass, -P.damping / P.mass]])
