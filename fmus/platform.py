@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import platform
-import sys
 import tempfile
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
@@ -13,17 +11,10 @@ from typing import Any
 import platformdirs
 
 from ..blocks.core import FmuError, LoopwrightError, explain_disk_errors
+from .toolchain import native_platform as native_platform
 
 OWN_CACHE = "Set LOOPWRIGHT_CACHE to a folder of your own."
 """Step where the cache folder can't be used."""
-
-
-def native_platform() -> str:
-    """Return this machine's platform as FMI 3.0 names it (2.5.1.4), such as ``x86_64-linux``."""
-    machine = platform.machine().lower()
-    arch = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}.get(machine, machine)
-    system = {"linux": "linux", "windows": "windows", "darwin": "darwin"}.get(platform.system().lower(), sys.platform)
-    return f"{arch}-{system}"
 
 
 def cache_folder() -> Path:

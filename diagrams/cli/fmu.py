@@ -25,10 +25,11 @@ from ...blocks.core import (
     near,
 )
 from ...fmus.checks import INTERFACES, summarize, validate
-from ...fmus.export import TARGETS, build_python
 from ...fmus.export import build as build_model
+from ...fmus.export import build_python
 from ...fmus.models import gantry
 from ...fmus.platform import native_platform
+from ...fmus.toolchain import TARGETS
 from .doctor import add_doctor, run_doctor
 from .text import check_file, fit, say
 from .user_models import load_user_model

@@ -12,11 +12,9 @@ from importlib.resources import files
 from pathlib import Path
 
 from ...blocks.core import CompilerError, replace_file
-from ...fmus.export import SUFFIXES, compile_shared, describe_compiler
+from ...fmus.export import compile_shared, describe_compiler
 from ...fmus.platform import OWN_CACHE, cache_folder, explain_cache_errors, native_platform
-
-_FLAGS = ("-fno-math-errno", "-fno-trapping-math", "-fno-builtin-pow")
-# Nobody reads errno, so that sine and cosine of one angle are one call; a power of two stays a power in every bit.
+from ...fmus.toolchain import DIAGRAM_FLAGS, SUFFIXES
 
 _OURS = re.compile(r"[0-9a-f]{40}\.(size|so|dll|dylib)")
 """Names of what stands in the folder of compiled diagrams; other files there are the user's."""
@@ -25,6 +23,13 @@ _OURS = re.compile(r"[0-9a-f]{40}\.(size|so|dll|dylib)")
 def read_sources(*names: str) -> str:
     """Return C sources of this package, one behind the other."""
     return "\n".join(files(__package__).joinpath(name).read_text(encoding="utf-8") for name in names)
+
+
+def read_unit(name: str) -> str:
+    """Return a C source of this package with the files that it includes; `install/backend.py` reads it alike."""
+    own = '#include "'
+    lines = read_sources(name).splitlines()
+    return "\n".join(read_unit(line[len(own) : -1]) if line.startswith(own) else line for line in lines)
 
 
 @lru_cache(maxsize=64)
@@ -53,7 +58,7 @@ def load_compiled(source: str, flags: tuple[str, ...] = (), known: str = "") -> 
     library = _library_of(source, flags, known)
     with explain_cache_errors("compiled code can't be kept in the cache", CompilerError):
         if not _is_whole(library):
-            compile_shared({"code.c": source}, library, more_flags=(*_FLAGS, *flags))
+            compile_shared({"code.c": source}, library, more_flags=(*DIAGRAM_FLAGS, *flags))
             _note_size(library)
     try:
         return ctypes.CDLL(str(library))
@@ -97,7 +102,7 @@ def _library_of(source: str, flags: tuple[str, ...] = (), known: str = "") -> Pa
     """Return the file of a source's library in the cache, whether it is there or not."""
     platform = native_platform()
     key = hashlib.sha256(
-        "\0".join((platform, *describe_compiler(platform), *_FLAGS, *flags, known, source)).encode()
+        "\0".join((platform, *describe_compiler(platform), *DIAGRAM_FLAGS, *flags, known, source)).encode()
     ).hexdigest()
     folder = cache_folder() / "compiled"
     with explain_cache_errors("the folder of compiled diagrams can't be made", CompilerError):

@@ -1,27 +1,32 @@
-"""The runtime library: the loops over ticks and time, their methods, and the virtual machine. It knows no diagram."""
+"""The runtime library: the loops over ticks and time, their methods and events, and the virtual machine."""
 
 from __future__ import annotations
 
 import ctypes
 from functools import lru_cache
+from pathlib import Path
 
-from .libraries import is_kept, load_compiled, read_sources
-
-_SOURCES = (
-    *("newton.c", "machine.c", "remote.c", "master.c", "exchange.c", "problem.c", "methods.c", "radau.c", "events.c"),
-    *("instants.c", "hybrid.c"),
-)
-_FLAGS = ("-fno-unroll-loops",)  # vectors are short: a sixth less for the compiler
+from ...fmus.toolchain import RUNTIME_FLAGS, native_platform, runtime_name
+from .libraries import is_kept, load_compiled, read_unit
 
 
+@lru_cache(maxsize=1)
 def runtime_source() -> str:
     """Return the C text of the runtime library."""
-    return read_sources(*_SOURCES)
+    return read_unit("runtime.c")
+
+
+def installed_runtime() -> Path:
+    """Return the file of the runtime library that was compiled when the package was installed; it may not be there.
+
+    Its name holds the hash of the source: after a change of a checkout there is none.
+    """
+    return Path(__file__).parent / "built" / runtime_name(runtime_source(), native_platform())
 
 
 @lru_cache(maxsize=1)
 def load_runtime() -> ctypes.CDLL:
-    """Return the runtime library; it is compiled once on a machine, unless it was installed with the package.
+    """Return the runtime library: that of the installation, else that of the cache, where it is compiled once.
 
     Raises
     ------
@@ -30,9 +35,12 @@ def load_runtime() -> ctypes.CDLL:
     FmuError
         If the cache can't be written.
     """
-    return load_compiled(runtime_source(), _FLAGS)
+    try:
+        return ctypes.CDLL(str(installed_runtime()))
+    except OSError:
+        return load_compiled(runtime_source(), RUNTIME_FLAGS)
 
 
 def runtime_is_kept() -> bool:
     """Whether the runtime library can be loaded without a compiler."""
-    return is_kept(runtime_source(), _FLAGS)
+    return installed_runtime().is_file() or is_kept(runtime_source(), RUNTIME_FLAGS)

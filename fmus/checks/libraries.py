@@ -13,7 +13,7 @@ from typing import Any
 from ...blocks.core import FmuError
 from ..archive import FmuArchive, read_library, write_files
 from ..child_processes import find_python, run_in_group, temporary_folder
-from ..export import SUFFIXES
+from ..toolchain import SUFFIXES
 
 # Folders of binaries in FMI 1.0 and 2.0 (2.3.1) as platform tuples of FMI 3.0 (2.5.1.4).
 _FOLDERS = {

@@ -1,6 +1,6 @@
 """Export of a block as an FMU: equations, C code, model description, binaries."""
 
-from .compiler import SUFFIXES, TARGETS, compile_shared, describe_compiler
+from .compiler import compile_shared, describe_compiler
 from .from_block import build, model_spec
 from .inlined import inline_model, own_functions
 from .model import Integrator, ModelSpec, Variable
@@ -10,8 +10,6 @@ from .tuning import describe_processor, processor_flags, tune
 from .written_equations import WrittenEquations, read_equations
 
 __all__ = [
-    "SUFFIXES",
-    "TARGETS",
     "Integrator",
     "ModelSpec",
     "Variable",

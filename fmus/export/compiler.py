@@ -30,24 +30,8 @@ from ...blocks.core import (
 from ..build_notes import tell_build
 from ..child_processes import find_python, folder_in, run_in_group
 from ..platform import OWN_CACHE, cache_folder, check_cache, native_platform
+from ..toolchain import TARGETS, flags
 
-#: FMI 3.0 platform tuples (2.5.1.4) of the platforms to build for, and zig's name of each with the oldest system:
-#: glibc 2.17, macOS 11. On Windows the C library belongs to the system since version 10.
-TARGETS = {
-    "x86_64-linux": "x86_64-linux-gnu.2.17",
-    "aarch64-linux": "aarch64-linux-gnu.2.17",
-    "x86_64-windows": "x86_64-windows-gnu",
-    "x86_64-darwin": "x86_64-macos.11.0",
-    "aarch64-darwin": "aarch64-macos.11.0",
-}
-SUFFIXES = {"linux": ".so", "windows": ".dll", "darwin": ".dylib"}
-
-# -ffp-contract=off: no fused multiply-add, so that every platform and every compiler rounds alike.
-FLAGS = ("-O2", "-std=c11", "-shared", "-fvisibility=hidden", "-ffp-contract=off", "-g0", "-s")
-# Only what is declared inline is inlined, the integrators and the equations: a fifth of the time of a build less.
-_ZIG_FLAGS = ("-finline-hint-functions",)
-# Models use double and int alone: nothing of zig's own runtime, which takes seconds to build on a machine's first use.
-_ZIG_RUNTIME = ("-rtlib=none",)
 TIMEOUT = 600.0
 """Seconds after which a compilation is stopped. The first one on a machine takes seconds, on a slow one a minute."""
 
@@ -107,13 +91,6 @@ def _version(command: tuple[str, ...]) -> str:
     return done.stdout + done.stderr
 
 
-def flags(compiler: Compiler, platform: str) -> tuple[str, ...]:
-    """Return all flags for a platform, without sources, include folders and the output."""
-    windows = platform.endswith("windows")
-    target = ("-target", TARGETS[platform], *_ZIG_FLAGS, *(() if windows else _ZIG_RUNTIME)) if compiler.zig else ()
-    return (*target, *FLAGS, *(() if windows else ("-fPIC",)))
-
-
 def describe_compiler(platform: str) -> tuple[str, ...]:
     """Return the compiler's name, version and flags for a platform, for keys of caches.
 
@@ -123,7 +100,7 @@ def describe_compiler(platform: str) -> tuple[str, ...]:
         If there is none.
     """
     compiler = find_compiler()
-    return (compiler.identity, *flags(compiler, platform))
+    return (compiler.identity, *flags(platform, zig=compiler.zig))
 
 
 def check_platform(compiler: Compiler, platform: str) -> None:
@@ -188,7 +165,7 @@ def compile_shared(
             library = out.name  # a relative name, since some formats contain it
             math = () if platform.endswith("windows") else ("-lm",)
             includes = [f"-I{path}" for path in include]
-            given = [*flags(compiler, platform), *more_flags]
+            given = [*flags(platform, zig=compiler.zig), *more_flags]
             command = [*compiler.command, *given, "-I.", *includes, "-o", library, *names, *math]
             with tell_build(_note(compiler)):
                 _run(command, folder, platform)

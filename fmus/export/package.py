@@ -24,8 +24,9 @@ import numpy as np
 from ...blocks.core import FmuError, accepts, explain_calls, explain_disk_errors, kinds, replace_file
 from ..child_processes import temporary_folder
 from ..platform import OWN_CACHE, cache_folder, explain_cache_errors, native_platform, record_build
+from ..toolchain import SUFFIXES, TARGETS, flags
 from .c_code import generate, runtime
-from .compiler import SUFFIXES, TARGETS, Compiler, check_platform, compile_shared, find_compiler, flags
+from .compiler import Compiler, check_platform, compile_shared, find_compiler
 from .html_page import index_html
 from .model import ModelSpec
 from .scalars import scalarize
@@ -100,7 +101,7 @@ def _code_parts(fmi: int) -> list[str]:
 
 def build_key(spec: ModelSpec, options: Options, compiler: Compiler) -> str:
     """Return the hash of everything that goes into a build; nothing is generated for it."""
-    toolchain = [f"{p} {flags(compiler, p)}" for p in options.platforms]
+    toolchain = [f"{p} {flags(p, zig=compiler.zig)}" for p in options.platforms]
     made = [_text(spec), _text(options), *_code_parts(options.fmi)]
     return _hash(*made, compiler.identity, fmi_headers()[1], *toolchain)
 

@@ -23,6 +23,7 @@ from unicorn import x86_const as x86
 
 from loopwright.diagrams.compiled import libraries, native_tick, remote, runtime
 from loopwright.fmus.export import compile_shared
+from loopwright.fmus.toolchain import DIAGRAM_FLAGS
 
 lief.logging.disable()
 PAGE, AT_ONCE, STACK = 0x1000, 1 << 20, 1 << 20
@@ -271,7 +272,7 @@ class Library:
 
 def compile_for(platform, source, out, *more):
     """Compile a source of compiled runs for a platform, without the instructions of this machine's processor."""
-    flags = [flag for flag in (*libraries._FLAGS, *more) if "native" not in flag]
+    flags = [flag for flag in (*DIAGRAM_FLAGS, *more) if "native" not in flag]
     compile_shared({"code.c": source}, out, platform=platform, more_flags=flags)
 
 

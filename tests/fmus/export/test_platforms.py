@@ -12,8 +12,8 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from loopwright.fmus import build_fmu
-from loopwright.fmus.export.compiler import TARGETS
 from loopwright.fmus.platform import native_platform
+from loopwright.fmus.toolchain import TARGETS
 from support import TESTS
 from support.exported import pendulums
 
