@@ -45,14 +45,13 @@ class ChangeOver:
 
         It calls ``note_due`` once the code is there: nothing is looked at in every tick.
         """
-        position, started, before = self._position, perf_counter(), self._spent
-        first = position.tick
+        started, before, first, end = perf_counter(), self._spent, self._position.t, self._position.time_of(last)
 
         def tell(t: float) -> None:
-            spent, done = perf_counter() - started, position.tick - first
+            spent = perf_counter() - started
             self._spent = before + spent
-            if self._possible and self._spent > _PATIENCE and done:
-                self._look(spent * (last - position.tick) / done)
+            if self._possible and self._spent > _PATIENCE and t > first:
+                self._look(spent * (end - t) / (t - first))
                 if self.code is not None:
                     self._possible = False
                     note_due()
