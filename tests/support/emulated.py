@@ -303,6 +303,7 @@ def emulate(patch, platform, folder):
         made.processor = processor
         return made
 
+    patch.setattr(runtime, "installed_runtime", lambda: folder / "none")
     _replace(patch, runtime.load_runtime, lru_cache(runtime.load_runtime.__wrapped__))
     _replace(patch, libraries.load_compiled, load)
     patch.setattr(remote, "load_compiled", original_load)  # code of other processes
