@@ -129,15 +129,14 @@ class RunOptions:
         Exchange of values with FMUs while they initialize: until inputs and outputs agree, one pass, or none, where
         inputs keep their start values until the first step. Tools differ in this.
     compile : {"auto", True, False}
-        Go from tick to tick in C. "auto": a diagram of sampled subsystems is interpreted at first; a compiler works
-        beside it if the run is long enough, and C takes over at some tick, with the same results to the last bit. With
-        continuous states results are the same within the tolerances: there the work is counted (ticks, steps, events),
-        and C takes over at the step at which the count says so, the same one wherever it runs (before the first
-        tick where there are many; beside FMUs, and where the step ends at a tick, at the next tick). With tables it is
-        interpreted. ``run.tier`` says what was done. True: in C from the beginning. It needs a compiler (the extra
-        ``build``), and a diagram without transport delays and FMUs in processes of their own; between ticks one of the
-        solvers "auto", "RK23", "RK45", "DOP853", "Radau" and those of fixed step. Where one of these fails, the run is
-        interpreted, and ``run.messages`` says why.
+        Generate C code of the diagram. Runs go from tick to tick in C whatever this says, where C has all that they
+        need; a virtual machine evaluates the diagram's functions unless there is generated code of them, to the same
+        bits. "auto": a run begins with the machine; a compiler works beside it if the run is long enough, and its code
+        takes over. False: no code is generated, and no compiler is started. True: code is generated before the first
+        tick. That needs a compiler (the extra ``build``), and a diagram without transport delays at FMUs; between ticks
+        one of the solvers "auto", "RK23", "RK45", "DOP853", "Radau" and those of fixed step. Where one of these fails,
+        the run is interpreted, and ``run.messages`` says why. ``run.tier`` says what was done. Diagrams of more than
+        2000 operations a tick are interpreted by Python until there is code of them.
     fuse : bool
         Compile the ticks, the loop over them and the equations of FMUs that Loopwright has built on this machine
         together, for its processor, with products and sums fused (FMA): faster, and values differ by rounding, as
