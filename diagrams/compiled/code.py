@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -146,7 +146,7 @@ def write_ticks(
         return replace(ticks.make(libraries[:-1]), exact=exact, loops=find_loops(loops, libraries[-1]))
 
     count = sum(function.n_instructions() for function in loops.values())
-    writers = [*ticks.writers, partial(write_loops, loops)]
+    writers: list[Callable[[], str]] = [*ticks.writers, partial(write_loops, loops)]
     return Sources(writers, make, ticks.operations + count, exact, partial(_keep, flat))
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import ctypes
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -139,23 +140,24 @@ def call_for_c(call: Callable[[], None]) -> None:
         INTERRUPTS.heard = False
 
 
-class CodeOfFunctions(Protocol):
+@dataclass(frozen=True, eq=False)
+class CodeOfFunctions(ABC):
     """Where C finds functions: a library of generated code, or the virtual machine."""
 
     library: ctypes.CDLL
 
+    @abstractmethod
     def find(self, function: Any) -> CompiledFunction:
         """Return a CasADi function as C calls it."""
 
+    @abstractmethod
     def address(self, name: str) -> int:
         """Return the address of a C function that was generated."""
 
 
 @dataclass(frozen=True, eq=False)
-class GeneratedCode:
+class GeneratedCode(CodeOfFunctions):
     """A library with the code of functions."""
-
-    library: ctypes.CDLL
 
     def find(self, function: Any) -> CompiledFunction:
         """Return a function that the library holds."""
@@ -167,10 +169,8 @@ class GeneratedCode:
 
 
 @dataclass(frozen=True, eq=False)
-class Machine:
+class Machine(CodeOfFunctions):
     """The virtual machine of a library; functions that are no scalar operations are evaluated by Python."""
-
-    library: ctypes.CDLL
 
     def find(self, function: Any) -> CompiledFunction:
         """Return a function as a program, or as a call of Python."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import chain
@@ -188,7 +188,7 @@ def write_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *,
         found = {**code.ticks.loops, **find_loops(loops, libraries[-1])} if loops else code.ticks.loops
         return replace(code, ticks=replace(code.ticks, loops=found))
 
-    writers = [*written.writers, *([partial(write_loops, loops)] if loops else [])]
+    writers: list[Callable[[], str]] = [*written.writers, *([partial(write_loops, loops)] if loops else [])]
     exact = written.exact and all(function.is_a("SXFunction") for function in loops.values())
     return replace(written, writers=writers, make=make, exact=exact)
 

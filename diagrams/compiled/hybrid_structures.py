@@ -5,7 +5,8 @@ from __future__ import annotations
 import ctypes
 from typing import Any
 
-from .loop import LoopStructure, TickStructure
+from .functions import TickStructure
+from .loop import LoopStructure
 from .watch import WatchStructure
 
 

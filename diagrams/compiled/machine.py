@@ -82,7 +82,8 @@ def make_program(function: Any, names: Sequence[str]) -> Program:
             continue
         operands = () if code == _INPUT else tuple(place[i] for i in given)
         place[written[0]] = len(start)
-        kind, row = ((code, given[0]), (len(start), given[1])) if code == _INPUT else ((code,), (len(start), *operands))
+        kind: tuple[int, ...] = (code, given[0]) if code == _INPUT else (code,)
+        row: tuple[int, ...] = (len(start), given[1]) if code == _INPUT else (len(start), *operands)
         made.append(len(rows))
         start.append(0.0)
         rows.append((kind, row))

@@ -13,8 +13,8 @@ import numpy as np
 from ...blocks.core import LoopwrightError
 from ...blocks.interrupts import INTERRUPTS
 from ...fmus.calls import ERROR, BoundCalls, ChildFace, ChildRequest, FmuInstance, QuietStep, RemoteStep, SharedValues
+from .functions import at
 from .libraries import load_compiled, read_sources
-from .native_tick import at
 
 UNDER_WAY, REFUSED, TOLD = 3, 4, 5
 """Stages at which such an FMU is left to Python: its step has begun; no step has, as an input doesn't fit; Python has

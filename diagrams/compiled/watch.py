@@ -10,8 +10,8 @@ import numpy as np
 
 from ..flat import FlatDiagram
 from .bound import BoundFunction, address
+from .functions import TickStructure
 from .hybrid_code import Between
-from .loop import TickStructure
 from .staged import NativeExchange
 from .staged_functions import Staged
 

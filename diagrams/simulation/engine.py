@@ -315,7 +315,8 @@ class Engine:
         return make_later(self.workspace, self.plants, steps=self.steps, every=self.every_tick)
 
     def _ticks_of(self, code: TickCode) -> CompiledTicks:
-        from .compiled_ticks import CompiledTicks, plants_for_c
+        from .compiled_hand_over import plants_for_c
+        from .compiled_ticks import CompiledTicks
 
         native = plants_for_c(self.plants)
         return CompiledTicks(self.workspace, native, self._stops.entries, every=self.every_tick, code=code)

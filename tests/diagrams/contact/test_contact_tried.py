@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from loopwright.diagrams import experiments
-from loopwright.diagrams.paper.moored_gantry import measured_growth
 from loopwright.fmus import build, gantry_elastic, gantry_stiction
-from support.contact import ROUGH, deviation, diagram, loop, moor, moored_start, parameters
+from support.contact import ROUGH, deviation, diagram, loop, measured_growth, moor, moored_start, parameters
 
 PLANTS = {
     "elastic": (gantry_elastic, {"deflection": (0.0, 0.0)}, 1e-6),

@@ -99,6 +99,7 @@ def exact(force, times):
     return np.array([(expm(A * t) @ (x0 - rest) + rest)[0] for t in times])
 
 
+@pytest.mark.python_loop  # it counts calls of a method
 def test_an_fmu_steps_where_a_subsystem_acts_and_not_at_the_base(cache, monkeypatch):
     plant = oscillator()
     steps = counted(plant, monkeypatch)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from loopwright.fmus.export import compile_shared
-from loopwright.fmus.export.compiler import SUFFIXES, TARGETS
 from loopwright.fmus.models import gantry_contact, scara
 from loopwright.fmus.platform import native_platform
+from loopwright.fmus.toolchain import SUFFIXES, TARGETS
 
 from . import test_elementary_functions as elementary
 
