@@ -15,6 +15,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +25,18 @@ from setuptools.build_meta import *  # noqa: F403 - the hooks that stay as they 
 ROOT = Path(__file__).resolve().parent.parent
 RUNTIME = ROOT / "diagrams" / "compiled"
 BUILT = RUNTIME / "built"
-ZIG = "ziglang>=0.13"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+COMPILER = PROJECT["optional-dependencies"]["build"]
 
 
 def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
     """Ask for zig where the machine has no compiler."""
-    return [*build_meta.get_requires_for_build_wheel(config_settings), *([] if find_compiler() else [ZIG])]
+    return [*build_meta.get_requires_for_build_wheel(config_settings), *([] if find_compiler() else COMPILER)]
 
 
 def get_requires_for_build_editable(config_settings: Any = None) -> list[str]:
     """Ask for zig where the machine has no compiler."""
-    return [*build_meta.get_requires_for_build_editable(config_settings), *([] if find_compiler() else [ZIG])]
+    return [*build_meta.get_requires_for_build_editable(config_settings), *([] if find_compiler() else COMPILER)]
 
 
 def build_wheel(wheel_directory: str, config_settings: Any = None, metadata_directory: str | None = None) -> str:
