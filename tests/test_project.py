@@ -97,7 +97,7 @@ def test_every_subpackage_is_listed_for_the_wheel():
 def test_the_root_holds_what_belongs_there():
     kept = call("git", "ls-files").stdout.splitlines()
     assert {path for path in kept if "/" not in path} == {
-        ".gitignore", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "README.md", "pyproject.toml",
+        ".gitignore", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in", "README.md", "pyproject.toml",
     }  # fmt: skip
     assert {path.partition("/")[0] for path in kept if "/" in path} == {
         ".ci", "benchmarks", "blocks", "diagrams", "docs", "fmus", "install", "notebooks", "tests",
