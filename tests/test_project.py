@@ -155,6 +155,17 @@ def test_the_built_wheel_imports_runs_and_holds_the_c_runtime(tmp_path):
         assert (site / "loopwright" / room / "py.typed").is_file()
 
 
+@pytest.mark.slow
+def test_an_installation_without_a_compiler_is_a_pure_wheel(tmp_path):
+    copy = tmp_path / "source"
+    assert call("git", "clone", "-q", str(ROOT), str(copy)).returncode == 0
+    command = (sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(tmp_path), str(copy))
+    done = call(*command, env={**os.environ, "LOOPWRIGHT_CC": "no-such-compiler"})
+    assert done.returncode == 0, done.stdout + done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    assert wheel.name.endswith("-py3-none-any.whl")
+
+
 def test_importing_changes_no_global_state():
     script = """
 import pickle, sys, warnings, numpy, casadi, matplotlib
