@@ -34,12 +34,12 @@ typedef struct {
 typedef struct {
     int64_t count;
     const bound_call *calls;
-} sequence;
+} call_sequence;
 
 typedef struct {
     uint64_t *words;
     int64_t count;
-    const sequence *sequences; /* without calls: Python's */
+    const call_sequence *sequences; /* without calls: Python's */
     int32_t commands, replies, ordered, watches;
     patience patience;
 } server;
@@ -67,7 +67,7 @@ static inline int make_call(const bound_call *c) {
 }
 
 /* Run a sequence up to the first call that fails; see `Child._bind_run`. */
-static inline void run_sequence(const sequence *s, uint64_t *words) {
+static inline void run_sequence(const call_sequence *s, uint64_t *words) {
     uint32_t worst = 0;
     uint64_t warned = 0;
     for (int64_t i = 0; i < s->count; i++) {

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from ...blocks.core import LoopwrightError
 from ...blocks.interrupts import INTERRUPTS
 from ...fmus.calls import ERROR, BoundCalls, ChildFace, ChildRequest, FmuInstance, QuietStep, RemoteStep, SharedValues
 from .functions import at
-from .libraries import load_compiled, read_sources
+from .runtime import load_runtime
 
 UNDER_WAY, REFUSED, TOLD = 3, 4, 5
 """Stages at which such an FMU is left to Python: its step has begun; no step has, as an input doesn't fit; Python has
@@ -24,11 +23,10 @@ _FEWEST = 4  # `wire.FEWEST`
 _IDLE, _POSTED, _ARRIVED = range(3)
 
 
-@lru_cache(maxsize=1)
 def compile_other_side() -> str | None:
     """Return the file of the library that makes the calls in the other process; None where it can't be compiled."""
     try:
-        return load_compiled(read_sources("newton.c", "remote.c", "child.c"))._name
+        return load_runtime()._name
     except LoopwrightError:
         return None
 

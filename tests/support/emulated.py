@@ -288,7 +288,7 @@ def emulate(patch, platform, folder):
 
     Its steps of FMUs are not for Windows, whose calls place numbers and integers in one order.
     """
-    processor, known, original_load = Processor(platform), {}, libraries.load_compiled
+    processor, known, native_runtime = Processor(platform), {}, runtime.load_runtime
 
     def load(source, flags=(), processor_of=""):
         if (source, flags) not in known:
@@ -306,6 +306,6 @@ def emulate(patch, platform, folder):
     patch.setattr(runtime, "installed_runtime", lambda: folder / "none")
     _replace(patch, runtime.load_runtime, lru_cache(runtime.load_runtime.__wrapped__))
     _replace(patch, libraries.load_compiled, load)
-    patch.setattr(remote, "load_compiled", original_load)  # code of other processes
+    patch.setattr(remote, "load_runtime", native_runtime)  # code of other processes
     patch.setattr(native_tick, "_Tick", function)
     return processor

@@ -53,7 +53,6 @@ def sources():
     """All C code that runs compile, by name."""
     found = {
         "runtime": runtime.runtime_source(),
-        "other process": libraries.read_sources("newton.c", "remote.c", "child.c"),
     }
     with pytest.MonkeyPatch.context() as patch:
         for grouped in (False, True):

@@ -1,6 +1,7 @@
 """FMUs in processes of their own under a loop in C: the bits and the words of interpreted runs. The zoo's is y' = u."""
 
 import os
+import re
 import signal
 
 import numpy as np
@@ -131,7 +132,8 @@ def test_a_fault_is_told_as_in_an_interpreted_run(folder, fault, fmi, beside):
         found.append(caught.value)
     one, two = found
     assert type(one) is type(two)
-    assert (str(one), one.block, one.t) == (str(two), two.block, two.t)
+    texts = [re.sub(r"has [\d.]+ of", "has … of", str(error)) for error in found]  # memory of the process, to the page
+    assert (texts[0], one.block, one.t) == (texts[1], two.block, two.t)
     assert getattr(one, "cause", None) is getattr(two, "cause", None)
     assert_same_bits(one.run, two.run)
     assert two.run.tier == "compiled"
