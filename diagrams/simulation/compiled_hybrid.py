@@ -401,7 +401,10 @@ def make_hybrid(
     native = plants_for_c(plants)
     reason = find_hybrid_obstacle(workspace.flat, continuous.solver.name)
     if reason is None and continuous.exchanged is not None:
-        reason = find_exchange_obstacle(continuous.exchanged.blocks)
+        blocks = continuous.exchanged.blocks
+        reason = find_exchange_obstacle(blocks)
+        if machine and any(getattr(block, "native_host", None) is not None for block in blocks.values()):
+            return None, ()  # Python sets traps of such a library back after every call, C after several
     reason = reason or find_obstacle_at_ticks(workspace.flat, plants, native, steps, coupled=coupled)
     if reason is None:
         try:

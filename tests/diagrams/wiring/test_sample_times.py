@@ -99,6 +99,7 @@ def exact(force, times):
     return np.array([(expm(A * t) @ (x0 - rest) + rest)[0] for t in times])
 
 
+@pytest.mark.one_tier
 @pytest.mark.python_loop  # it counts calls of a method
 def test_an_fmu_steps_where_a_subsystem_acts_and_not_at_the_base(cache, monkeypatch):
     plant = oscillator()
@@ -119,6 +120,8 @@ def test_an_fmu_steps_where_a_subsystem_acts_and_not_at_the_base(cache, monkeypa
     assert run["plant.position"] == pytest.approx(exact(3.0, run.t), abs=1e-9)
 
 
+@pytest.mark.one_tier
+@pytest.mark.python_loop
 def test_an_fmu_that_takes_steps_of_one_length_steps_at_the_base(cache, monkeypatch):
     plant = oscillator()
     monkeypatch.setattr(Fmu, "variable_step", property(lambda self: False))
