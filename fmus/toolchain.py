@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import platform
 import sys
+from pathlib import Path
 
 #: FMI 3.0 platform tuples (2.5.1.4) of the platforms to build for, and zig's name of each with the oldest system:
 #: glibc 2.17, macOS 11. On Windows the C library belongs to the system since version 10.
@@ -44,6 +45,13 @@ def flags(platform: str, *, zig: bool) -> tuple[str, ...]:
     windows = platform.endswith("windows")
     target = ("-target", TARGETS[platform], *_ZIG_FLAGS, *(() if windows else _ZIG_RUNTIME)) if zig else ()
     return (*target, *FLAGS, *(() if windows else ("-fPIC",)))
+
+
+def read_unit(folder: Path, name: str) -> str:
+    """Return a C source of a folder with the files that it includes from there in their places."""
+    own = '#include "'
+    lines = (folder / name).read_text(encoding="utf-8").splitlines()
+    return "\n".join(read_unit(folder, line[len(own) : -1]) if line.startswith(own) else line for line in lines)
 
 
 def runtime_name(source: str, platform: str) -> str:

@@ -83,7 +83,7 @@ def _build() -> str:
     shutil.rmtree(BUILT, ignore_errors=True)
     if found is None:
         return ""
-    (command, zig), source = found, read_unit("runtime.c")
+    (command, zig), source = found, tools["read_unit"](RUNTIME, "runtime.c")
     flags = (*tools["flags"](native, zig=zig), *tools["DIAGRAM_FLAGS"], *tools["RUNTIME_FLAGS"])
     name = tools["runtime_name"](source, native)
     with tempfile.TemporaryDirectory() as folder:
@@ -108,10 +108,3 @@ def _tag(native: str, *, zig: bool) -> str:
         release = "11_0" if zig else "_".join(platform.mac_ver()[0].split(".")[:2])
         return f"macosx_{release}_{'arm64' if arch == 'aarch64' else arch}"
     return f"manylinux_2_17_{arch}" if zig and system == "linux" else f"{system}_{arch}"
-
-
-def read_unit(name: str) -> str:
-    """Return a C source with the files that it includes from its own folder; `libraries.py` reads it alike."""
-    lines = (RUNTIME / name).read_text(encoding="utf-8").splitlines()
-    own = '#include "'
-    return "\n".join(read_unit(line[len(own) : -1]) if line.startswith(own) else line for line in lines)

@@ -116,7 +116,10 @@ class CalledFunction(CompiledFunction):
         def call(given: Any, wanted: Any, *_: Any) -> int:
             for i, address, size in inputs:
                 ctypes.memmove(address, given[i], size)
-            call_for_c(bound.call)
+            try:
+                call_for_c(bound.call)
+            except Exception:  # C can't raise it: Python evaluates this instant again, and says what it is
+                return 1
             for i, address, size in outputs:
                 ctypes.memmove(wanted[i], address, size)
             return 0

@@ -25,13 +25,6 @@ def read_sources(*names: str) -> str:
     return "\n".join(files(__package__).joinpath(name).read_text(encoding="utf-8") for name in names)
 
 
-def read_unit(name: str) -> str:
-    """Return a C source of this package with the files that it includes; `install/backend.py` reads it alike."""
-    own = '#include "'
-    lines = read_sources(name).splitlines()
-    return "\n".join(read_unit(line[len(own) : -1]) if line.startswith(own) else line for line in lines)
-
-
 @lru_cache(maxsize=64)
 def load_compiled(source: str, flags: tuple[str, ...] = (), known: str = "") -> ctypes.CDLL:
     """Return the library of a C source, which is compiled unless the cache has it.

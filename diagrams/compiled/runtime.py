@@ -6,14 +6,14 @@ import ctypes
 from functools import lru_cache
 from pathlib import Path
 
-from ...fmus.toolchain import RUNTIME_FLAGS, native_platform, runtime_name
-from .libraries import is_kept, load_compiled, read_unit
+from ...fmus.toolchain import RUNTIME_FLAGS, native_platform, read_unit, runtime_name
+from .libraries import is_kept, load_compiled
 
 
 @lru_cache(maxsize=1)
 def runtime_source() -> str:
     """Return the C text of the runtime library."""
-    return read_unit("runtime.c")
+    return read_unit(Path(__file__).parent, "runtime.c")
 
 
 def installed_runtime() -> Path:

@@ -173,7 +173,7 @@ def test_a_saved_state_tells_the_fmu_that_steps_may_be_taken_back_and_a_crash_be
 
 
 @pytest.mark.one_tier
-def test_long_runs_are_compiled_by_themselves(mass):
+def test_a_long_run_under_auto_is_that_of_the_matrix_exponential(mass):
     run = mass_loop(mass, True).simulate(4.0, record=["plant.position"], every=100, progress=False)
     assert run.tier in ("interpreted", "both")  # as fast as the machine is
     np.testing.assert_allclose(run["plant.position"], exact_loop(4001)[::100], rtol=0.0, atol=1e-6)

@@ -268,7 +268,7 @@ def test_a_run_to_disk_and_an_interrupt(files, tmp_path):
     np.testing.assert_allclose(run["plant.position"][:1000], exact_loop(1000), atol=1e-6)
 
 
-def test_long_runs_go_on_in_c_by_themselves(files):
+def test_a_long_run_under_auto_is_that_of_the_matrix_exponential(files):
     run = pi_loop(mass(files)).simulate(10.0, record=["plant.position"], every=100, progress=False)
     assert run.tier in ("interpreted", "both")  # as fast as the machine is
     np.testing.assert_allclose(run["plant.position"], exact_loop(10_001)[::100], atol=1e-7)

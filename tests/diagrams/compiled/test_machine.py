@@ -80,6 +80,23 @@ def test_a_function_of_matrices_is_called_in_python():
     np.testing.assert_allclose(evaluate(f, [1.5]), [25.0], rtol=1e-15)
 
 
+def test_an_error_within_such_a_function_is_no_result(monkeypatch):
+    x = ca.MX.sym("x")
+    table = ca.interpolant("table", "linear", [[0.0, 1.0, 2.0]], [0.0, 10.0, 40.0])
+    f = ca.Function("f", [x], [table(x)])
+
+    class Failing:
+        def call(self):
+            raise RuntimeError("no value")
+
+    monkeypatch.setattr("loopwright.diagrams.compiled.functions.bind_function", lambda *_: Failing())
+    made = np.array([7.0])
+    bound = Machine(load_runtime()).find(f).bind([np.array([1.5])], [made])
+    call = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4, ctypes.c_int)(bound.structure.evaluate)
+    assert call(bound.structure.arguments, bound.structure.results, None, None, 0) == 1
+    assert made[0] == 7.0
+
+
 def test_an_operation_that_it_does_not_have_is_refused():
     x = ca.SX.sym("x")
     f = ca.Function("f", [x], [ca.erfinv(x)])

@@ -42,7 +42,7 @@ def swapped(request, monkeypatch):
         def __init__(self, target, args, **_):
             self.start = lambda: target(*args)
 
-    make, look = background.BackgroundCode._load, background.BackgroundCode.look
+    look = background.BackgroundCode.look
 
     def counted(self, spent, rest):
         looks.append(spent)
@@ -52,7 +52,6 @@ def swapped(request, monkeypatch):
     monkeypatch.setattr(background, "Thread", Later)
     monkeypatch.setattr(background.BackgroundCode, "look", counted)
     monkeypatch.setattr(change_over, "_PATIENCE", -1.0)
-    assert make
     return looks
 
 
