@@ -3,21 +3,25 @@
 The experiments of Fig. 3, everything recorded. A tick is timed on a run that goes on, so that neither the start nor the
 compiler counts; each figure is the smallest of seven, the two forms take turns. The last column says whether all
 samples have the same bits. Below: a PI controller at 1 kHz around two lags in continuous time, with solvers that start
-anew at every tick, and its largest error against the exponential of a matrix.
+anew at every tick, and its largest error against the exponential of a matrix. Last: large diagrams, whose blocks are
+evaluated kind by kind, with one signal recorded, and the time until their first tick.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
+from typing import Any
 
 import numpy as np
 from scipy.linalg import expm
 
-from loopwright.blocks import TransferFunction, UnitDelay
+from loopwright.blocks import PID, Gain, Sine, Sum, TransferFunction, UnitDelay
 from loopwright.diagrams import Diagram, experiments, subsystem
 
 TICKS, TURNS, LAG_TURNS = 4000, 7, 5
+LARGE_TICKS = 400
 SOLVERS = ("rk4", "RK45", "auto", "Radau")
 
 
@@ -84,8 +88,64 @@ def measure_experiment(letter: str) -> tuple[list[float], list[float], bool]:
     return times[False], times[True], runs[False].data.tobytes() == runs[True].data.tobytes()
 
 
+def chain_of_gains(n: int) -> Diagram:
+    """Gains and delays in turn, at 100 Hz: runs of one block each, the least that can be done together."""
+
+    @subsystem(sample_time=0.01, name="box")
+    def box(signal):
+        for i in range(n):
+            kind = UnitDelay(initial_value=0.0, name=f"b{i}") if i % 2 else Gain(gain=1.0 - 1e-3 * i, name=f"b{i}")
+            signal = kind(signal)
+        return signal
+
+    return Diagram("chain", box(Sine(frequency=3.0, name="source")))
+
+
+def pid_loops(n: int) -> Diagram:
+    """Controllers of lags at 100 Hz, beside each other."""
+
+    @subsystem(sample_time=0.01, name="box")
+    def box(signal):
+        lags = [TransferFunction(numerator=1.0, denominator=[0.5 + 1e-3 * i, 1.0], name=f"lag{i}") for i in range(n)]
+        for i, lag in enumerate(lags):
+            lag(PID(kp=2.0, ki=1.0, kd=0.05, filter_time=0.1, name=f"pid{i}")(signal, lag.y))
+        return lags[0].y
+
+    return Diagram("loops", box(Sine(frequency=0.3, name="source")))
+
+
+def ring_of_lags(n: int) -> Diagram:
+    """Lags in continuous time, each driven by the difference of two others."""
+    lags = [TransferFunction(numerator=1.0, denominator=[1.0, 1.0], name=f"x{i}") for i in range(n)]
+    calls = []
+    for i, lag in enumerate(lags):
+        total = Sum(signs="+-", name=f"s{i}")(lags[(i + 1) % n].y, lags[(7 * i + 3) % n].y)
+        calls.append(lag(Gain(gain=0.3, name=f"g{i}")(total)))
+    return Diagram("ring", *calls)
+
+
+def measure_large(make: Callable[[int], Diagram], n: int, **options: Any) -> tuple[list[float], list[float]]:
+    """Return the times of ticks in s, and those until the first one, by the virtual machine and by generated code."""
+    ticks, starts = [], []
+    make(n).simulate(0.1, compile=True, progress=False, **options)  # the cache has the code
+    for form in (False, True):
+        diagram = make(n)
+        started = time.process_time()
+        with diagram.simulation(compile=form, **options) as simulation:
+            step = float(simulation.flat.base)
+            simulation.advance(step)
+            starts.append(time.process_time() - started)
+            found = []
+            for _ in range(TURNS):
+                started = time.process_time()
+                simulation.advance(LARGE_TICKS * step)
+                found.append((time.process_time() - started) / LARGE_TICKS)
+            ticks.append(min(found))
+    return ticks, starts
+
+
 def main() -> int:
-    """Print one row for each experiment, and one for each solver of a continuous plant; 1 if a bit differs."""
+    """Print rows for experiments, for solvers of a continuous plant, and for large diagrams; 1 if a bit differs."""
     print("experiment  interpreted, µs/tick   compiled, µs/tick   ratio   same bits")
     worst = 0
     for letter in experiments.EXPERIMENTS:
@@ -100,6 +160,18 @@ def main() -> int:
         print(
             f"{solver:10}  {interpreted:20.2f}  {compiled:18.2f}  {interpreted / compiled:6.0f}   {errors[0]:17.1e}  "
             f"{errors[1]:9.1e}"
+        )
+    print("\nlarge diagram            interpreted, µs/tick   compiled, µs/tick   ratio   first tick, s   compiled")
+    rk4 = {"step": 1e-3, "solver": "rk4", "record": ["x0"]}
+    for name, make, n, options in (
+        ("300 PID loops", pid_loops, 300, {"record": ["source"]}),
+        ("chain of 3000 blocks", chain_of_gains, 3000, {"record": ["source"]}),
+        ("600 lags, rk4", ring_of_lags, 600, rk4),
+    ):
+        (interpreted, compiled), (first, second) = measure_large(make, n, **options)
+        print(
+            f"{name:23}  {interpreted * 1e6:20.2f}  {compiled * 1e6:18.2f}  {interpreted / compiled:6.1f}  "
+            f"{first:14.2f}  {second:9.2f}"
         )
     return worst
 

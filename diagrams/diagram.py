@@ -7,11 +7,16 @@ sub-package when it is first called, so that a run does not pay for it.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any, ClassVar, Self, Unpack
 
-from .results import OperatingPoint
-from .varied_diagram import VariedDiagram
+from ..blocks.core import Block, OptionError, WiringError, check_name, explain_calls, without_collection
+from .coupling import Coupling, CouplingReport, report_coupling, to_coupling
+from .flat import FlatDiagram, WiredDiagram
+from .results import OperatingPoint, Run
+from .simulation import KeptKeywords, RunKeywords, RunOptions, Simulation, simulate
+from .wiring import Collector, Structure, SubsystemSettings, Wire
 
 if TYPE_CHECKING:
     from .contact import Contact
@@ -19,9 +24,15 @@ if TYPE_CHECKING:
     from .linearization import Linearization
     from .measure import FrequencyResponse
     from .report import Report
+    from .requirements import Requirements
+    from .studies import Sensitivities, WorstCase
+    from .sweeps import Sweep
+
+LOOPS = ("error", "solve")
 
 
-class Diagram(VariedDiagram):
+@explain_calls
+class Diagram:
     """A diagram: what its last calls need, found by walking the wires backwards.
 
     Building it checks everything: unwired inputs, double drives, shapes, units, names, algebraic loops.
@@ -53,6 +64,359 @@ class Diagram(VariedDiagram):
     [0.0, 1.414214, 2.0, 1.414214, 0.0]
     """
 
+    contact_port: ClassVar[str | None] = None
+    """Port at which an environment pushes unless a contact names another; known where the kind of diagram is."""
+    wired: WiredDiagram
+    """Its blocks and wires, checked and ordered, with its functions: what the sub-packages take as a diagram."""
+
+    @without_collection
+    def __init__(self, name: str, *roots: object, loops: str = "error"):
+        if not isinstance(name, str):
+            raise WiringError(
+                f'found {name!r} where the name is expected; write Diagram("name", …), the calls after the name.'
+            )
+        if not roots:
+            raise WiringError("a diagram needs at least one call, such as plant(motor_force=u).", block=name)
+        if not isinstance(loops, str) or loops not in LOOPS:
+            raise OptionError(
+                f"found loops={loops!r}; expected {' or '.join(map(repr, LOOPS))}.", block=name, port="loops"
+            )
+        self._hold(WiredDiagram(check_name(name), Collector(roots).structure(), loops, type(self)))
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        explain_calls(cls)
+
+    def _hold(self, wired: WiredDiagram) -> None:
+        self.__dict__["wired"] = wired
+        wired.show_as(self)
+
+    @classmethod
+    def of_wired(cls, wired: WiredDiagram) -> Self:
+        """Return the diagram that shows a wired one to users."""
+        diagram = cls.__new__(cls)
+        diagram._hold(wired)
+        return diagram
+
+    @classmethod
+    def _of(cls, name: str, structure: Structure, loops: str = "error") -> Self:
+        return cls.of_wired(WiredDiagram(name, structure, loops, cls))
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return type(self)._of, (self.name, self.structure, self.loops)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise AttributeError(f"a diagram is a value: {name!r} can't be set. Use replace(…), or build another one.")
+
+    def __repr__(self) -> str:
+        paths = [path for path in self.structure.subsystems if path]
+        return f"<diagram {self.name}: {len(self.blocks)} blocks{', in ' + ', '.join(paths) if paths else ''}>"
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.wired.name
+
+    @property
+    def loops(self) -> str:
+        """Treatment of algebraic loops: "error" or "solve"."""
+        return self.wired.loops
+
+    @property
+    def structure(self) -> Structure:
+        """Blocks, wires and subsystems as they were wired."""
+        return self.wired.structure
+
+    @property
+    def blocks(self) -> Mapping[str, Block]:
+        """Every block by its dotted path."""
+        return dict(self.structure.blocks)
+
+    @property
+    def subsystems(self) -> Mapping[str, SubsystemSettings]:
+        """Every subsystem by its dotted path; the diagram itself is ""."""
+        return dict(self.structure.subsystems)
+
+    @property
+    def wires(self) -> Mapping[tuple[str, str], Wire]:
+        """The source of every wired input, by (block path, input)."""
+        return dict(self.structure.wires)
+
+    @property
+    def names(self) -> Mapping[str, Wire]:
+        """Every named wire."""
+        return dict(self.structure.names)
+
+    @property
+    def is_continuous(self) -> bool:
+        """Whether the solver has work between ticks: continuous states, events, or a transport delay."""
+        return self.wired.is_continuous
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether a subsystem, or the diagram itself, has a sample time."""
+        return self.wired.has_clock
+
+    @property
+    def has_fmu(self) -> bool:
+        """Whether a block in it is stepped from outside, such as an FMU."""
+        return self.wired.has_fmu
+
+    def __getitem__(self, path: str) -> Block:
+        """Return the block at a path, or at the unique end of one."""
+        return self.wired[path]
+
+    # --- variants ----------------------------------------------------------------------------------------------------
+
+    def replace(self, changes: Mapping[str, object] | None = None, /, **more: object) -> Self:
+        """Return a variant: other blocks, parameters or sample times.
+
+        Parameters
+        ----------
+        changes : mapping, optional
+            By dotted path, or its unique end: a block (``"plant"``), a parameter
+            (``"controller.admittance_par.stiffness"``), an entry of an array, counted from 1
+            (``"motor.denominator[1]"``), a subsystem's ``sample_time``, ``method``, ``offset`` or
+            ``delay`` (``"controller.sample_time"``; None: that of its surroundings), a plant's start value
+            (``"plant.start.position"``, or ``"plant.position"`` where the block has no parameter of that name).
+        **more
+            Changes whose paths are identifiers, as keywords: ``replace(plant=Fmu("other.fmu"))``.
+
+        Raises
+        ------
+        UnknownNameError, ParameterError, WiringError
+            A name that isn't there, a value out of bounds, a block that doesn't fit the wires.
+        OptionError
+            Two names of one parameter, or of one block.
+
+        Notes
+        -----
+        Blocks are replaced first, then whole parameters, then parts of them, in whatever order they are given:
+        ``{"plant.mass": 3, "plant": Fmu("other.fmu")}`` gives the other FMU a mass of 3.
+        """
+        return self.of_wired(self.wired.replace(changes, **more))
+
+    def continuous(self) -> Self:
+        """Return the diagram with every sampled subsystem as its ideal: continuous, without sampling, hold or delay.
+
+        A projection then solves its equation at each evaluation, from the foot point of the last accepted step. A run
+        with an FMU still exchanges signals with it at multiples of ``step`` only, and holds its inputs between. The
+        linear model comes from the FMU's equations and has no such hold.
+
+        Raises
+        ------
+        SampleTimeError
+            A block that is defined at samples only, such as a `UnitDelay`.
+        """
+        return self.of_wired(self.wired.continuous())
+
+    def sampled(self, sample_time: float | Fraction, method: str = "exact") -> Self:
+        """Return the diagram with all its continuous blocks sampled.
+
+        Each block is discretized by itself, with its inputs held over a sample. So a plant drawn with `Integrator`
+        blocks becomes forward Euler between them, of first order, whatever the method. For a method to act on a plant
+        as a whole, write the plant as one block: a `StateSpace`, a `TransferFunction`, or a `Block` of your own.
+
+        Parameters
+        ----------
+        sample_time : float or Fraction
+            Sample time in s. Subsystems with a sample time of their own keep it.
+        method : {"exact", "forward", "semi_implicit", "trapezoidal"}
+            Discretization of the blocks that were continuous; see `loopwright.blocks.hold`. As inputs are held,
+            ``trapezoidal`` is not Tustin's method, python-control's ``c2d(…, "bilinear")``, which averages them too.
+
+        Raises
+        ------
+        SampleTimeError
+            A sample time that is not positive, or an unknown method.
+        """
+        return self.of_wired(self.wired.sampled(sample_time, method))
+
+    # --- runs --------------------------------------------------------------------------------------------------------
+
+    def flatten(self, step: float | Fraction | None = None) -> FlatDiagram:
+        """Return the diagram as one CasADi function of a tick.
+
+        Parameters
+        ----------
+        step : float or Fraction, optional
+            Seconds between two ticks, where no subsystem has a sample time (or to look between samples).
+        """
+        return self.wired.flatten(step)
+
+    def simulate(self, duration: float, *, progress: bool | None = None, **options: Unpack[RunKeywords]) -> Run:
+        """Run the diagram and return what it recorded: from t = 0, or from a saved state.
+
+        The page docs/architecture.md says what happens in which order.
+
+        Parameters
+        ----------
+        duration : float
+            Simulated time in s. One that is no multiple of the step between ticks ends with a sample between two of
+            them; such a run has no ``final_state``.
+        progress : bool, optional
+            Show a progress bar; by default on a terminal, and in a notebook where ipywidgets is installed.
+        **options
+            Options of the run by name: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step``, ``record``, ``every``,
+            ``states``, ``to``, ``overwrite``, ``start``, ``coupling``, ``start_exchange``, ``compile`` (whether C goes
+            from tick to tick) and ``fuse`` (faster; values differ by rounding). `RunOptions` says what each means,
+            and its default.
+
+        Returns
+        -------
+        Run
+            Every output at every sample.
+
+        Raises
+        ------
+        SimulationError
+            `PathDomainError`, `GuardError`, `NonFiniteError` or `FmuRuntimeError`, a solver that can't go on, events
+            that pile up, an algebraic loop without a solution; ``error.run`` holds what was recorded until then.
+        OptionError
+            A duration that is not positive, or no multiple of the step; an unknown option or solver, a tolerance out of
+            range.
+        """
+        return simulate(self.wired, duration, RunOptions.of(options, block=self.name), progress=progress)
+
+    def simulation(self, **options: Unpack[RunKeywords]) -> Simulation:
+        """Return a run in the making, to go on step by step, to save and to restore; see `Simulation`.
+
+        Parameters
+        ----------
+        **options
+            As for `simulate`; see `RunOptions`.
+
+        Raises
+        ------
+        OptionError
+            An unknown option or solver, a tolerance out of range.
+        """
+        return Simulation(self.wired, RunOptions.of(options, block=self.name))
+
+    def report_coupling(
+        self, coupling: str | Coupling = "jacobi", *, step: float | Fraction | None = None
+    ) -> CouplingReport:
+        """List the delay of every connection from and to an FMU; see docs/coupling.md.
+
+        Parameters
+        ----------
+        coupling : str or Coupling
+            As of `simulate`.
+        step : float or Fraction, optional
+            As of `simulate`; required where no subsystem has a sample time.
+
+        Returns
+        -------
+        CouplingReport
+            ``print`` shows it as a table.
+
+        Raises
+        ------
+        OptionError, SampleTimeError
+            An unknown coupling; no step where one is needed.
+        """
+        return report_coupling(self.wired.flatten(step), to_coupling(coupling, block=self.name))
+
+    def sweep(
+        self,
+        parameters: Mapping[str, Any] | None,
+        duration: float,
+        *,
+        samples: Any = "grid",
+        count: int | None = None,
+        seed: int = 0,
+        seeds: str | Iterable[str] = (),
+        signals: str | Iterable[str] = (),
+        reduce: Mapping[str, Callable[[Run], Any]] | None = None,
+        to: str | os.PathLike[str] | None = None,
+        overwrite: bool = False,
+        workers: int | None = None,
+        client: Any = None,
+        progress: bool | None = None,
+        lanes: bool | int = False,
+        **options: Unpack[KeptKeywords],
+    ) -> Sweep:
+        """Run the diagram with many values of its parameters, on every core; see docs/sweeps.md.
+
+        Without ``lanes`` each run is, to the last bit, that of ``diagram.replace(parameters).simulate(duration)`` with
+        the same options and ``compile=True``, whoever makes it, and however many workers there are. A run that fails
+        is kept as data, and harms no other.
+
+        Parameters
+        ----------
+        parameters : mapping or None
+            By dotted path, as `replace` takes them: values for a grid, ranges ``(low, high)`` or `Box` for a Latin
+            hypercube; None with a table.
+        duration : float
+            Simulated time of each run in s.
+        samples : {"grid", "latin"}, Samples, list of mapping, mapping of str to list, or DataFrame
+            Every combination of the values; ``count`` samples spread over the ranges; or a table of samples.
+        count : int, optional
+            Number of samples of a Latin hypercube.
+        seed : int
+            Seed of the sweep; each sample has one of its own, which depends on this one and its place alone.
+        seeds : list of str
+            Parameters that take the sample's seed, such as ``"noise.seed"``. Where a seed is fixed in a
+            block's equations, these runs are interpreted by default.
+        signals : list of str
+            Signals whose samples are kept.
+        reduce : mapping of str to callable, optional
+            Numbers of each run, by name: `final`, `maximum`, `minimum`, `mean`, `settling_time`, or a function that
+            takes a run and returns numbers.
+        to : path, optional
+            Folder for the results. A sweep that was cut off, or one with some samples more, runs what is missing.
+        overwrite : bool
+            Replace a sweep of another diagram, or with other options, that is stored there.
+        workers : int, optional
+            Number of threads, or processes; as many as cores without it.
+        client : distributed.Client, optional
+            A Dask cluster that runs the samples.
+        progress : bool, optional
+            Show a progress bar; see `simulate`.
+        lanes : bool or {2, 4, 8, 16}, optional
+            Make so many runs side by side in the lanes of the processor's vectors, 8 for True: some times as fast.
+            Their values then differ from those of single runs by rounding, and the sweep's messages say so. A motion
+            that magnifies small differences (a limit cycle, sticking) magnifies these, too; see docs/sweeps.md.
+            Every FMU must have been built by Loopwright on this machine, with steps of fixed length and without events;
+            runs that can't go so are made one after the other, which is told.
+        **options
+            Options of each run, as for `simulate`; ``compile=True`` is the default, but with ``seeds``.
+
+        Returns
+        -------
+        Sweep
+            ``sweep["name"]`` by name, ``sweep.dataset`` for xarray, ``sweep.failures``.
+
+        Raises
+        ------
+        UnknownNameError
+            A parameter or signal that isn't there.
+        OptionError
+            Samples, options or reductions that don't fit; a folder that holds something else.
+        """
+        from .sweeps import sweep
+
+        return sweep(
+            self.wired,
+            parameters,
+            duration,
+            samples=samples,
+            count=count,
+            seed=seed,
+            seeds=seeds,
+            signals=signals,
+            reduce=reduce,
+            to=to,
+            overwrite=overwrite,
+            workers=workers,
+            client=client,
+            progress=progress,
+            lanes=lanes,
+            options=options,
+        )
+
+    # --- linear models, margins and contact --------------------------------------------------------------------------
+
     def operating_point(
         self, t: float = 0.0, *, states: Mapping[str, Any] | None = None, **options: Any
     ) -> OperatingPoint:
@@ -77,8 +441,8 @@ class Diagram(VariedDiagram):
         from .linearization import point_from_states, run_to
 
         if not (states is None or (isinstance(states, dict) and not states)):
-            return point_from_states(self, t, states, options)
-        return run_to(self, t, options)
+            return point_from_states(self.wired, t, states, options)
+        return run_to(self.wired, t, options)
 
     def trim(
         self,
@@ -142,7 +506,7 @@ class Diagram(VariedDiagram):
         """
         from .linearization import trim
 
-        return trim(self, free, targets, rates=rates, fixed=fixed, at=at, tolerance=tolerance, **options)
+        return trim(self.wired, free, targets, rates=rates, fixed=fixed, at=at, tolerance=tolerance, **options)
 
     def linearize(
         self,
@@ -196,7 +560,7 @@ class Diagram(VariedDiagram):
         from .linearization import linearize
 
         options = {"plants": plants, "stairs": stairs, **options}
-        return linearize(self, point, inputs=inputs, outputs=outputs, openings=openings, **options)
+        return linearize(self.wired, point, inputs=inputs, outputs=outputs, openings=openings, **options)
 
     def linearize_batch(
         self, points: Iterable[Any] = (None,), variants: Iterable[Mapping[str, Any]] = ({},), **options: Any
@@ -224,123 +588,7 @@ class Diagram(VariedDiagram):
         """
         from .linearization import linearize_batch
 
-        return linearize_batch(self, points, variants, **options)
-
-    def contact(
-        self,
-        port: str | None = None,
-        *,
-        position: str | None = None,
-        velocity: str | None = None,
-        force: str | None = "force",
-        direction: Any = "perp",
-        at: Any = None,
-        **options: Any,
-    ) -> Contact:
-        """Return the contact of an environment with the plant: admittance, passivity and limits of coupled stability.
-
-        The plant is the block or FMU with the port; all the rest of the diagram is its controller.
-
-        Parameters
-        ----------
-        port : str, optional
-            Port at which the environment pushes; a diagram of Fig. 3 needs no name for it.
-        position, velocity : str, optional
-            Position and velocity there, in its axes; the outputs ``position`` and ``velocity`` of the port's block
-            without them.
-        force : str or None
-            Wire of the measured force on the robot; None if the controller does not measure it.
-        direction : {"perp", "par"} or vector
-            Direction of the environment: across or along the diagram's path, or a vector.
-        at : OperatingPoint, Snapshot or float, optional
-            Point at rest, as in `linearize`; the start without it. ``options`` are those of the run, and ``stairs``.
-
-        Raises
-        ------
-        UnknownNameError, ShapeError, OptionError, ParameterError
-            Ports that don't fit; a point not at rest; a plant without a model of its equations; a force behind states.
-        """
-        from .contact import PortNames, make_contact
-
-        return make_contact(self, PortNames(port, position, velocity, force), direction, at, options)
-
-    def report(
-        self,
-        path: str | os.PathLike[str] | None = None,
-        *,
-        pdf: bool = False,
-        json: bool = False,
-        paper: str = "A4",
-        **options: Any,
-    ) -> Report:
-        """Analyse the diagram for design, and write the report; see docs/reports.md.
-
-        Parameters
-        ----------
-        path : path, optional
-            File to write, ``.html``; without it nothing is written. A notebook shows the report.
-        pdf, json : bool
-            Write ``.pdf`` (which needs ``pip install 'loopwright[pdf]'``) and ``.json`` beside it, too.
-        paper : {"A4", "letter"}
-            Paper of the PDF. ``options`` are those of `analyse`, such as ``requirements``, ``at`` and ``loops``.
-
-        Returns
-        -------
-        Report
-            Its sections, and ``.numbers()`` by dotted path.
-
-        Raises
-        ------
-        OptionError, ConfirmationError
-            A path that does not end in ``.html``, a PDF without its library; a number that its confirmation refutes.
-        """
-        from .report import analyse, check_files, with_drawing, write_report
-
-        check_files(path, pdf=pdf, json=json, paper=paper)
-        made = with_drawing(analyse(self, _written=path is not None, **options), self)
-        write_report(made, path, pdf=pdf, json=json, paper=paper)
-        return made
-
-    def draw(
-        self,
-        path: str | os.PathLike[str] | None = None,
-        *,
-        subsystem: str = "",
-        closed: bool | Iterable[str] | None = None,
-    ) -> Drawing:
-        """Draw the diagram itself: blocks, subsystems with their rates, wires with their names, FMUs marked.
-
-        Signals run from left to right; feedback runs back below. Nothing but Python is needed.
-
-        Parameters
-        ----------
-        path : path, optional
-            File to write, ``.svg``.
-        subsystem : str
-            Path of the subsystem whose inside is drawn; the whole diagram without it.
-        closed : bool or list of str, optional
-            Subsystems that are drawn closed: all of them, or those of the list. Without it all are open, in a diagram
-            of more than 40 blocks closed.
-
-        Returns
-        -------
-        Drawing
-            A notebook shows it; ``.svg`` is its text.
-
-        Raises
-        ------
-        OptionError
-            No such subsystem, a file that is no ``.svg``, or a folder that isn't there.
-        """
-        from .drawing import Drawing, draw
-
-        drawing = Drawing(draw(self, subsystem=subsystem, closed=closed))
-        if path is not None:
-            drawing.save(path)
-        return drawing
-
-    def _repr_svg_(self) -> str:
-        return str(self.draw().svg)
+        return linearize_batch(self.wired, points, variants, **options)
 
     def frequency_response(
         self,
@@ -405,6 +653,260 @@ class Diagram(VariedDiagram):
         from .measure import frequency_response
 
         return frequency_response(
-            self, wire, frequencies, amplitude=amplitude, kind=kind, at=at, outputs=outputs, windows=windows,
-            agreement=agreement, confirm=confirm, **options,
-        )  # fmt: skip
+            self.wired,
+            wire,
+            frequencies,
+            amplitude=amplitude,
+            kind=kind,
+            at=at,
+            outputs=outputs,
+            windows=windows,
+            agreement=agreement,
+            confirm=confirm,
+            **options,
+        )
+
+    def contact(
+        self,
+        port: str | None = None,
+        *,
+        position: str | None = None,
+        velocity: str | None = None,
+        force: str | None = "force",
+        direction: Any = "perp",
+        at: Any = None,
+        **options: Any,
+    ) -> Contact:
+        """Return the contact of an environment with the plant: admittance, passivity and limits of coupled stability.
+
+        The plant is the block or FMU with the port; all the rest of the diagram is its controller.
+
+        Parameters
+        ----------
+        port : str, optional
+            Port at which the environment pushes; a diagram of Fig. 3 needs no name for it.
+        position, velocity : str, optional
+            Position and velocity there, in its axes; the outputs ``position`` and ``velocity`` of the port's block
+            without them.
+        force : str or None
+            Wire of the measured force on the robot; None if the controller does not measure it.
+        direction : {"perp", "par"} or vector
+            Direction of the environment: across or along the diagram's path, or a vector.
+        at : OperatingPoint, Snapshot or float, optional
+            Point at rest, as in `linearize`; the start without it. ``options`` are those of the run, and ``stairs``.
+
+        Raises
+        ------
+        UnknownNameError, ShapeError, OptionError, ParameterError
+            Ports that don't fit; a point not at rest; a plant without a model of its equations; a force behind states.
+        """
+        from .contact import PortNames, make_contact
+
+        return make_contact(self.wired, PortNames(port, position, velocity, force), direction, at, options)
+
+    def sensitivity(
+        self,
+        loop: str | Iterable[str],
+        parameters: str | Iterable[str] | None = None,
+        *,
+        at: Any = None,
+        delay: int = 0,
+        skew: float = 0.0,
+        **options: Any,
+    ) -> Sensitivities:
+        """Return the derivatives of a loop's margins by parameters of the diagram; see docs/worst_case.md.
+
+        They are exact derivatives of the linear model, hold and delay included: of its matrices by CasADi, of the
+        margins by implicit differentiation at their crossings and peaks. By an FMU's parameter they are differences,
+        with their error.
+
+        Parameters
+        ----------
+        loop : str or list of str
+            Wire that the loop is cut at, as of `Linearization.loop`. Of several wires, or one with several entries,
+            there is the disk margin alone.
+        parameters : list of str, optional
+            Paths, ``"controller.pid.kp"`` or ``"plant.mass"`` of an FMU. Without it, all numbers in the traced
+            equations that are not 0, and the parameters that the blocks of FMUs set.
+        at : OperatingPoint, Snapshot, float or callable, optional
+            Point, as in `linearize`. An equilibrium follows the parameter; a point that is not at rest keeps its
+            states. A function from a diagram to a point, ``lambda d: d.trim(…)``, is asked anew for changed parameters.
+        delay, skew
+            As of `margins`. ``options`` are those of `linearize`.
+
+        Returns
+        -------
+        Sensitivities
+            ``found["pid.kp", "phase_margin_deg"].per_percent``; ``found.of("ms")``; ``print``; ``found.plot("ms")``.
+
+        Raises
+        ------
+        UnknownNameError, ParameterError
+            A wire or parameter that isn't there; a parameter that is structure of the equations.
+        """
+        from .studies import find_sensitivities
+
+        return find_sensitivities(self.wired, loop, parameters, at=at, delay=delay, skew=skew, **options)
+
+    def worst_case(
+        self,
+        parameters: Mapping[str, Any] | None,
+        loop: str | Iterable[str] | None = None,
+        *,
+        quantity: str | Callable[[Any], Any] | None = None,
+        requirements: Requirements | None = None,
+        contact: Mapping[str, Any] | None = None,
+        samples: Any = "latin",
+        count: int | None = None,
+        seed: int = 0,
+        starts: int = 3,
+        steps: int = 15,
+        at: Any = None,
+        points: Sequence[Any] | None = None,
+        delay: int = 0,
+        progress: Callable[[str], None] | None = None,
+        **options: Any,
+    ) -> WorstCase:
+        """Find the worst case of a loop's margin, or of requirements, over ranges of parameters.
+
+        Samples of the ranges come first, then all corners (of up to 5 numbers), then searches downhill from the worst
+        of them, along the exact derivatives of the margins. A case that can't be analysed counts as the worst and
+        tells its reason; then come unstable loops, by their growth.
+
+        Parameters
+        ----------
+        parameters : mapping of str to (low, high) or Box
+            Ranges by path; values of each for a grid; None where ``samples`` is a table.
+        loop : str or list of str
+            Wire that the loop is cut at; with requirements several wires, each a loop of its own. Without them several
+            wires are one loop, cut at all at once, with a disk margin. Requirements need none where they name loops.
+        quantity : str or callable, optional
+            The number, ``"disk_margin"`` without it: one of those that `Requirements` can limit. Or a function from a
+            diagram to a number, the smaller, the worse, without a loop; its search takes differences.
+        requirements : Requirements, optional
+            In place of a number: the smallest distance to a limit, relative to the limit, is made worst.
+        contact : mapping, optional
+            In place of a loop: the contact whose limit of coupled stability is made worst, with arguments of `contact`
+            and of `Contact.stability_limit`: ``{"vary": "stiffness", "damping": 10.0}``. Its search takes differences.
+        samples, count, seed
+            As of `sweep`: ``count`` samples of a Latin hypercube (100), ``"grid"``, or a table.
+        starts, steps : int
+            Number of searches, 0 for samples alone, without corners, and the most steps of each.
+        at : OperatingPoint, Snapshot, float or callable, optional
+            Point of each case, as of `sensitivity`; ``points`` is a list of them, each of which every case is tried at.
+        delay : int
+            Whole samples of delay in series with sampled loops.
+        progress : callable, optional
+            Told a line for every case. ``options`` are those of `linearize`.
+
+        Returns
+        -------
+        WorstCase
+            ``found.diagram.simulate(…)`` runs the worst case, ``found.confirm()`` measures it; ``found.parameters``,
+            ``found.table()``, ``found.plot()``.
+
+        Raises
+        ------
+        OptionError, UnknownNameError
+            Ranges, numbers or loops that aren't there; a diagram that can't be analysed as it is.
+        """
+        from .studies import find_worst_case
+
+        return find_worst_case(
+            self.wired,
+            parameters,
+            loop,
+            quantity=quantity,
+            requirements=requirements,
+            contact=contact,
+            samples=samples,
+            count=count,
+            seed=seed,
+            starts=starts,
+            steps=steps,
+            at=at,
+            points=points,
+            delay=delay,
+            progress=progress,
+            **options,
+        )
+
+    # --- report and drawing ------------------------------------------------------------------------------------------
+
+    def report(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        pdf: bool = False,
+        json: bool = False,
+        paper: str = "A4",
+        **options: Any,
+    ) -> Report:
+        """Analyse the diagram for design, and write the report; see docs/reports.md.
+
+        Parameters
+        ----------
+        path : path, optional
+            File to write, ``.html``; without it nothing is written. A notebook shows the report.
+        pdf, json : bool
+            Write ``.pdf`` (which needs ``pip install 'loopwright[pdf]'``) and ``.json`` beside it, too.
+        paper : {"A4", "letter"}
+            Paper of the PDF. ``options`` are those of `analyse`, such as ``requirements``, ``at`` and ``loops``.
+
+        Returns
+        -------
+        Report
+            Its sections, and ``.numbers()`` by dotted path.
+
+        Raises
+        ------
+        OptionError, ConfirmationError
+            A path that does not end in ``.html``, a PDF without its library; a number that its confirmation refutes.
+        """
+        from .report import analyse, check_files, with_drawing, write_report
+
+        check_files(path, pdf=pdf, json=json, paper=paper)
+        made = with_drawing(analyse(self, _written=path is not None, **options), self.wired)
+        write_report(made, path, pdf=pdf, json=json, paper=paper)
+        return made
+
+    def draw(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        subsystem: str = "",
+        closed: bool | Iterable[str] | None = None,
+    ) -> Drawing:
+        """Draw the diagram itself: blocks, subsystems with their rates, wires with their names, FMUs marked.
+
+        Signals run from left to right; feedback runs back below. Nothing but Python is needed.
+
+        Parameters
+        ----------
+        path : path, optional
+            File to write, ``.svg``.
+        subsystem : str
+            Path of the subsystem whose inside is drawn; the whole diagram without it.
+        closed : bool or list of str, optional
+            Subsystems that are drawn closed: all of them, or those of the list. Without it all are open, in a diagram
+            of more than 40 blocks closed.
+
+        Returns
+        -------
+        Drawing
+            A notebook shows it; ``.svg`` is its text.
+
+        Raises
+        ------
+        OptionError
+            No such subsystem, a file that is no ``.svg``, or a folder that isn't there.
+        """
+        from .drawing import Drawing, draw
+
+        drawing = Drawing(draw(self.structure, self.name, subsystem=subsystem, closed=closed))
+        if path is not None:
+            drawing.save(path)
+        return drawing
+
+    def _repr_svg_(self) -> str:
+        return str(self.draw().svg)

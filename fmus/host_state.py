@@ -9,8 +9,7 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from functools import wraps
-from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
+from typing import Any
 
 _CONTROLS = {"x86_64": ((0, 2), (28, 32)), "aarch64": ((0, 4),)}
 """Bytes of C's ``fenv_t`` that hold rounding modes and traps, by the machine; glibc's layout."""
@@ -18,8 +17,6 @@ _FLAGS = 0x3F
 """Bits of the last of them on x86_64 that tell past exceptions, which are no modes."""
 FOLDER = threading.RLock()
 """Held while a library is loaded, which takes place in its own folder: relative paths then lead elsewhere."""
-P = ParamSpec("P")
-R = TypeVar("R")
 
 
 class _FloatingPoint:
@@ -121,25 +118,3 @@ class HostState:
         if change not in self._told:
             self._told.add(change)
             self._tell(f"the FMU has changed {change} of this process; it was set back")
-
-
-class _Host(Protocol):
-    """Instance whose calls are guarded."""
-
-    @property
-    def host(self) -> HostState:
-        """The state of this process before its call."""
-
-
-H = TypeVar("H", bound=_Host)
-
-
-def guard_host(method: Callable[Concatenate[H, P], R]) -> Callable[Concatenate[H, P], R]:
-    """Let a method of an instance leave this process's state as it was."""
-
-    @wraps(method)
-    def guarded(self: H, /, *arguments: P.args, **options: P.kwargs) -> R:
-        with self.host:
-            return method(self, *arguments, **options)
-
-    return guarded

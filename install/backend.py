@@ -23,7 +23,7 @@ from setuptools import build_meta
 from setuptools.build_meta import *  # noqa: F403 - the hooks that stay as they are
 
 ROOT = Path(__file__).resolve().parent.parent
-RUNTIME = ROOT / "diagrams" / "compiled"
+RUNTIME = ROOT / "fmus" / "runtime"
 BUILT = RUNTIME / "built"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 COMPILER = PROJECT["optional-dependencies"]["build"]

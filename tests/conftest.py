@@ -1,6 +1,7 @@
 """The quick part of products of cases (`support.drawn`), a cache for each worker, and runs that tests share."""
 
 import gc
+import importlib.util
 import os
 import sys
 from collections import defaultdict
@@ -159,8 +160,13 @@ def pytest_unconfigure(config):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def cache(tmp_path_factory):
-    """Folder of this worker's cache. The compiler's own, 50 MB that are the same for all, is shared by the workers."""
+def cache(tmp_path_factory, pytestconfig):
+    """Folder of this worker's cache. The compiler's own, 50 MB that are the same for all, is shared by the workers.
+
+    So are compiled libraries, which stay in pytest's cache from run to run (`support.kept_libraries`).
+    """
+    from support import kept_libraries
+
     folder = tmp_path_factory.mktemp("cache")
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if WORKER else base
@@ -169,6 +175,8 @@ def cache(tmp_path_factory):
         patch.setenv("ZIG_GLOBAL_CACHE_DIR", str(shared / "zig"))
         patch.setenv("ZIG_LOCAL_CACHE_DIR", str(shared / "zig"))
         patch.delenv("LOOPWRIGHT_CC", raising=False)
+        if hasattr(pytestconfig, "cache") and importlib.util.find_spec("ziglang") is not None:
+            kept_libraries.install(patch, pytestconfig.cache.mkdir("compiled"), shared / "zig")
         yield folder
 
 

@@ -142,7 +142,7 @@ def test_the_built_wheel_imports_runs_and_holds_the_c_runtime(tmp_path):
         "from loopwright.blocks import Constant, Integrator; "
         "d.Diagram('small', Integrator()(Constant(value=1.0))).report('small.html')"
     )
-    (runtime,) = (site / "loopwright" / "diagrams" / "compiled" / "built").iterdir()
+    (runtime,) = (site / "loopwright" / "fmus" / "runtime" / "built").iterdir()
     assert "none-any" not in wheel.name, runtime
     environment = {**os.environ, "PYTHONPATH": str(site), "LOOPWRIGHT_CACHE": str(tmp_path / "cache")}
     done = subprocess.run(
@@ -180,7 +180,7 @@ except ModuleNotFoundError as error:
 import loopwright.blocks, loopwright.fmus, loopwright.diagrams
 wave = loopwright.blocks.Sine(frequency=1.0)()
 loopwright.diagrams.Diagram("wave", wave).simulate(1.0, step=0.5, progress=False)
-needed = {"coupling", "diagram", "events", "exchange", "flat", "results", "simulation", "solvers", "varied_diagram", "wiring"}  # a run pays for nothing else
+needed = {"compiled", "coupling", "diagram", "events", "exchange", "flat", "results", "simulation", "solvers", "wiring"}  # a run pays for nothing else
 assert {m.split(".")[2] for m in sys.modules if m.startswith("loopwright.diagrams.")} == needed
 loopwright.diagrams.experiments.path_following().diagram.simulate(0.01, progress=False)
 late = [m for m in ("control", "matplotlib.pyplot", "scipy.integrate") if m in sys.modules]

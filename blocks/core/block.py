@@ -10,7 +10,15 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from .docstrings import port_section, with_section
-from .errors import DefinitionError, GuardError, WiringError, near
+from .errors import (
+    DefinitionError,
+    DoubleDriveError,
+    GuardError,
+    UnknownNameError,
+    UnwiredInputError,
+    WiringError,
+    near,
+)
 from .ports import Event, Input, Output, Port, State, check_port_names
 from .signals import (
     Call,
@@ -18,7 +26,6 @@ from .signals import (
     UnknownAttributeError,
     Wireable,
     as_signal,
-    bind,
     check_name,
     primary_outputs,
 )
@@ -231,7 +238,7 @@ class Block(Value, Wireable):
 
     def __call__(self, *args: Any, **kwargs: Any) -> Call:
         """Wire the block: signals by position in the order of the inputs, or by keyword."""
-        return Call(self, bind(self, args, kwargs))
+        return Call(self, _bind(self, args, kwargs))
 
     def named(self, *names: str) -> Call:
         """Name the wires of the outputs of a block without inputs; see `Call.named`."""
@@ -246,12 +253,12 @@ class Block(Value, Wireable):
         raise UnknownAttributeError(f"it has no output or parameter {name!r}. {near(name, known)}", block=self.label)
 
     def _signal(self) -> Signal:
-        if any(port.default is None for port in self.inputs.values()) or len(primary_outputs(self)) != 1:
+        if any(port.default is None for port in self.inputs.values()) or len(primary_outputs(self.outputs)) != 1:
             return as_signal_error(self)
-        return Signal(self, primary_outputs(self)[0])
+        return Signal(self, primary_outputs(self.outputs)[0])
 
     def __iter__(self) -> Iterator[Signal]:
-        names = primary_outputs(self)
+        names = primary_outputs(self.outputs)
         if len(names) < 2 or any(port.default is None for port in self.inputs.values()):
             return iter(self._signal())  # one signal, or none: the error says what to do
         return iter([Signal(self, name) for name in names])
@@ -307,9 +314,43 @@ def _is_kind(port: Port, attribute: str) -> bool:
     return isinstance(port, {"inputs": Input, "states": State, "events": Event}[attribute])
 
 
+def _bind(block: Block, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Signal]:
+    """Match the arguments of a call with the block's inputs.
+
+    Signals by position go to the inputs in their order, or, if they are as many as inputs without a default, to these.
+
+    Raises
+    ------
+    UnwiredInputError, DoubleDriveError, UnknownNameError, WiringError
+        For a required input left out, an input given twice, an unknown input, too many signals.
+    """
+    inputs, who = block.inputs, block.label
+    if len(args) > len(inputs):
+        raise WiringError(f"{len(args)} signals for {len(inputs)} inputs ({', '.join(inputs) or 'none'}).", block=who)
+    required = [name for name, port in inputs.items() if port.default is None and name not in kwargs]
+    # as many signals as inputs need are theirs, wherever inputs with a default stand
+    given = dict(zip(required if len(args) == len(required) else inputs, args, strict=False))
+    for name, value in kwargs.items():
+        if name not in inputs:
+            raise UnknownNameError(f"it has no input {name!r}. {near(name, inputs)}", block=who)
+        if name in given:
+            raise DoubleDriveError("it is driven twice in one call, by position and by keyword.", block=who, port=name)
+        given[name] = value
+    missing = [name for name, port in inputs.items() if name not in given and port.default is None]
+    if missing:
+        raise UnwiredInputError(
+            f"nothing is wired to {', '.join(repr(m) for m in missing)}; expected {block.label}"
+            f"({', '.join(f'{name}=…' for name, port in inputs.items() if port.default is None or name in given)})."
+            f"{block.advise_unwired(missing)}",
+            block=who,
+            port=missing[0],
+        )
+    return {name: as_signal(value, block=who, port=name) for name, value in given.items()}
+
+
 def as_signal_error(block: Block) -> Signal:
     """Raise the error of a block that is used as a signal and has inputs, or not exactly one output."""
-    outputs = ", ".join(primary_outputs(block)) or "none"
+    outputs = ", ".join(primary_outputs(block.outputs)) or "none"
     needed = [name for name, port in block.inputs.items() if port.default is None]
     if needed:
         raise WiringError(
@@ -317,7 +358,7 @@ def as_signal_error(block: Block) -> Signal:
             f"{block.label}({', '.join(f'{n}=…' for n in needed)}).",
             block=block.label,
         )
-    found, step = len(primary_outputs(block)), "Name one." if block.outputs else "Declare one."
+    found, step = len(primary_outputs(block.outputs)), "Name one." if block.outputs else "Declare one."
     raise WiringError(f"found {found} outputs ({outputs}); expected one, as a signal. {step}", block=block.label)
 
 

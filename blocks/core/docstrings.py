@@ -6,12 +6,12 @@ Both are made from the declarations of parameters and ports, so that no class re
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
-from .parameters import HasParameters, ParameterSpec
+from .parameters import ParameterSpec
 
 _NAME = ("name : str, optional", "Name in the diagram; without one the class name in snake case, numbered on repeats.")
 
@@ -19,9 +19,9 @@ _NAME = ("name : str, optional", "Name in the diagram; without one the class nam
 class ParameterSignature:
     """Signature shown for a value: a class shows its constructor's, a block its call's."""
 
-    def __get__(self, instance: Any, owner: type[HasParameters]) -> inspect.Signature:
+    def __get__(self, instance: Any, owner: Any) -> inspect.Signature:
         if instance is None:
-            return _constructor(owner)
+            return _constructor(owner.parameter_specs, owner._keywords)
         inputs = getattr(instance, "inputs", None)
         if inputs is None:
             raise AttributeError("__signature__")
@@ -34,15 +34,15 @@ class ParameterSignature:
         return inspect.Signature(parameters, __validate_parameters__=False)
 
 
-def _constructor(cls: type[HasParameters]) -> inspect.Signature:
+def _constructor(specs: Mapping[str, ParameterSpec], keywords: Iterable[str]) -> inspect.Signature:
     parameters = []
-    for name, spec in sorted(cls.parameter_specs.items(), key=lambda item: item[1].kw_only):
+    for name, spec in sorted(specs.items(), key=lambda item: item[1].kw_only):
         kind = inspect.Parameter.KEYWORD_ONLY if spec.kw_only else inspect.Parameter.POSITIONAL_OR_KEYWORD
         default = inspect.Parameter.empty if spec.required else spec.default
         parameters.append(inspect.Parameter(name, kind, default=default, annotation=spec.annotation))
     parameters += [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation="str | None")
-        for name in sorted(cls._keywords)
+        for name in sorted(keywords)
     ]
     return inspect.Signature(parameters, __validate_parameters__=False)
 
@@ -54,13 +54,10 @@ def with_section(text: str, title: str, entries: Iterable[tuple[str, str]]) -> s
     return text if not lines or header in text else f"{text}\n\n{header}" + "\n".join(lines)
 
 
-def parameter_section(cls: type[HasParameters]) -> list[tuple[str, str]]:
-    """Return an entry for each parameter of a class: type, unit, range and default, then the description."""
-    entries = [
-        (f"{name} : {', '.join(_describe_parameter(spec))}", spec.description)
-        for name, spec in cls.parameter_specs.items()
-    ]
-    return [*entries, _NAME] if "name" in cls._keywords else entries
+def parameter_section(specs: Mapping[str, ParameterSpec], keywords: Collection[str]) -> list[tuple[str, str]]:
+    """Return an entry for each parameter of a class: its type, unit, range and default, then the description."""
+    entries = [(f"{name} : {', '.join(_describe_parameter(spec))}", spec.description) for name, spec in specs.items()]
+    return [*entries, _NAME] if "name" in keywords else entries
 
 
 def _describe_parameter(spec: ParameterSpec) -> list[str]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from .explained_calls import explain_calls
 from .units import parse_unit
@@ -90,10 +89,3 @@ def parameter(
     if unit is not None:
         parse_unit(unit)
     return ParameterSpec(default, unit, description, above, minimum, maximum, shape, structural, kw_only, tunable)
-
-
-class HasParameters(Protocol):
-    """A class with declared parameters, as signatures and docstrings are made from them."""
-
-    parameter_specs: ClassVar[Mapping[str, ParameterSpec]]
-    _keywords: ClassVar[frozenset[str]]

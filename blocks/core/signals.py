@@ -6,19 +6,17 @@ one. Both can be wired on, indexed, unpacked, named, and used in ``+``, ``-`` an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from contextvars import ContextVar
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from .errors import (
-    DoubleDriveError,
     LoopwrightError,
     ShapeError,
     UnknownNameError,
-    UnwiredInputError,
     WiringError,
     near,
 )
@@ -29,16 +27,7 @@ from .numpy_guard import NoNumber
 B = TypeVar("B")
 
 
-class OperatorBlock(Protocol):
-    """A block that an operator makes; it is called with signals, or used as its own output."""
-
-    def __call__(self, *inputs: Any) -> Call:
-        """Wire the inputs."""
-
-    def _signal(self) -> Signal: ...
-
-
-_OPERATOR_BLOCKS: dict[str, Callable[..., OperatorBlock]] = {}
+_OPERATOR_BLOCKS: dict[str, Callable[..., Any]] = {}
 
 
 def register_operator_block(name: str) -> Callable[[type[B]], type[B]]:
@@ -53,25 +42,6 @@ def register_operator_block(name: str) -> Callable[[type[B]], type[B]]:
         return cls
 
     return register
-
-
-class WirableBlock(Protocol):
-    """The members of a block that wiring needs."""
-
-    @property
-    def label(self) -> str:
-        """Name for messages."""
-
-    @property
-    def inputs(self) -> Mapping[str, Any]:
-        """Input ports by name."""
-
-    @property
-    def outputs(self) -> Mapping[str, Any]:
-        """Output ports by name."""
-
-    def advise_unwired(self, ports: Collection[str]) -> str:
-        """Return what else gives values to inputs without a wire."""
 
 
 recorder: ContextVar[list[Any] | None] = ContextVar("loopwright_calls", default=None)
@@ -97,8 +67,8 @@ class Wireable(NoNumber):
         return _sum(other, self, "+-")
 
     def __neg__(self) -> Signal:
-        total = _OPERATOR_BLOCKS["sum"](signs="-")  # keeps the unit, which a gain would not
-        return with_hint(total, f"minus_{_operand(self, 'constant')}")(self)._signal()
+        # a sum keeps the unit, which a gain would not
+        return _operate("sum", f"minus_{_operand(self, 'constant')}", self, signs="-")
 
     def __mul__(self, other: Any) -> Signal:
         return _product(self, other)
@@ -107,7 +77,7 @@ class Wireable(NoNumber):
         return _product(self, other)
 
     def __rmatmul__(self, matrix: Any) -> Signal:
-        return with_hint(_OPERATOR_BLOCKS["gain"](gain=matrix), f"gain_of_{_operand(self, 'constant')}")(self)._signal()
+        return _operate("gain", f"gain_of_{_operand(self, 'constant')}", self, gain=matrix)
 
     def __truediv__(self, other: Any) -> Signal:
         if isinstance(other, Wireable):
@@ -221,7 +191,7 @@ class Call(Wired):
 
     def __init__(
         self,
-        block: WirableBlock,
+        block: Any,
         wires: dict[str, Signal],
         names: tuple[str | None, ...] = (),
         origin: Call | None = None,
@@ -236,7 +206,7 @@ class Call(Wired):
     @property
     def primary(self) -> list[str]:
         """Names of the outputs that the call unpacks into, without the secondary ones."""
-        return primary_outputs(self.block)
+        return primary_outputs(self.block.outputs)
 
     def named(self, *names: str) -> Call:
         """Name the wires of the outputs, in order (all of them)."""
@@ -283,9 +253,9 @@ class UnknownAttributeError(UnknownNameError, AttributeError):
     """An unknown output or parameter was read as an attribute."""
 
 
-def primary_outputs(block: WirableBlock) -> list[str]:
-    """Return the outputs that a call of ``block`` unpacks into."""
-    return [name for name, port in block.outputs.items() if not getattr(port, "secondary", False)]
+def primary_outputs(outputs: Mapping[str, Any]) -> list[str]:
+    """Return the outputs of a block, by name, that a call of it unpacks into."""
+    return [name for name, port in outputs.items() if not getattr(port, "secondary", False)]
 
 
 def check_name(name: Any) -> str:
@@ -312,47 +282,12 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
     if isinstance(value, Wireable):
         return value._signal()
     if isinstance(value, int | float | np.number | np.ndarray | list | tuple) and not isinstance(value, bool):
-        try:
-            return _OPERATOR_BLOCKS["constant"](value=value)._signal()
-        except ValueError:
-            pass
+        with suppress(ValueError):
+            constant: Signal = _OPERATOR_BLOCKS["constant"](value=value)._signal()
+            return constant
     raise WiringError(
         f"found {value!r}; expected a signal, a call, a block with one output, or numbers.", block=block, port=port
     )
-
-
-def bind(block: WirableBlock, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Signal]:
-    """Match the arguments of a call with the block's inputs.
-
-    Signals by position go to the inputs in their order, or, if they are as many as inputs without a default, to these.
-
-    Raises
-    ------
-    UnwiredInputError, DoubleDriveError, UnknownNameError, WiringError
-        For a required input left out, an input given twice, an unknown input, too many signals.
-    """
-    inputs, who = block.inputs, block.label
-    if len(args) > len(inputs):
-        raise WiringError(f"{len(args)} signals for {len(inputs)} inputs ({', '.join(inputs) or 'none'}).", block=who)
-    required = [name for name, port in inputs.items() if port.default is None and name not in kwargs]
-    # as many signals as inputs need are theirs, wherever inputs with a default stand
-    given = dict(zip(required if len(args) == len(required) else inputs, args, strict=False))
-    for name, value in kwargs.items():
-        if name not in inputs:
-            raise UnknownNameError(f"it has no input {name!r}. {near(name, inputs)}", block=who)
-        if name in given:
-            raise DoubleDriveError("it is driven twice in one call, by position and by keyword.", block=who, port=name)
-        given[name] = value
-    missing = [name for name, port in inputs.items() if name not in given and port.default is None]
-    if missing:
-        raise UnwiredInputError(
-            f"nothing is wired to {', '.join(repr(m) for m in missing)}; expected {block.label}"
-            f"({', '.join(f'{name}=…' for name, port in inputs.items() if port.default is None or name in given)})."
-            f"{block.advise_unwired(missing)}",
-            block=who,
-            port=missing[0],
-        )
-    return {name: as_signal(value, block=who, port=name) for name, value in given.items()}
 
 
 def _operand(value: Any, default: str) -> str:
@@ -365,25 +300,27 @@ def _operand(value: Any, default: str) -> str:
     return signal.source.label if len(outputs) == 1 else signal.port
 
 
-def with_hint(block: B, hint: str) -> B:
-    """Set the name of a block that an operator makes, numbered where it repeats, and return the block."""
-    object.__setattr__(block, "_hint", hint)
-    return block
+def _operate(kind: str, name: str, *operands: Any, **parameters: Any) -> Signal:
+    """Return the output of a block that an operator makes; its name is numbered where it repeats."""
+    block = _OPERATOR_BLOCKS[kind](**parameters)
+    object.__setattr__(block, "_hint", name)
+    signal: Signal = block(*operands)._signal()
+    return signal
 
 
 def _sum(left: Any, right: Any, signs: str) -> Signal:
     word = {"++": "plus", "+-": "minus"}[signs]
     name = f"{_operand(left, 'constant')}_{word}_{_operand(right, 'constant')}"
-    return with_hint(_OPERATOR_BLOCKS["sum"](signs=signs), name)(left, right)._signal()
+    return _operate("sum", name, left, right, signs=signs)
 
 
 def _product(left: Any, right: Any) -> Signal:
     if isinstance(right, Wireable):
         name = f"{_operand(left, 'constant')}_times_{_operand(right, 'constant')}"
-        return with_hint(_OPERATOR_BLOCKS["product"](), name)(left, right)._signal()
+        return _operate("product", name, left, right)
     if not isinstance(right, int | float | np.number | np.ndarray) or np.ndim(right) > 1:
         raise ShapeError(
             f"found a factor of shape {np.shape(right)}; expected a number, a vector or another signal. Apply a matrix "
             "as K @ signal."
         )
-    return with_hint(_OPERATOR_BLOCKS["gain"](gain=right), f"gain_of_{_operand(left, 'constant')}")(left)._signal()
+    return _operate("gain", f"gain_of_{_operand(left, 'constant')}", left, gain=right)

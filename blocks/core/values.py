@@ -55,7 +55,8 @@ class Value:
                 )
         cls.parameter_specs = specs
         written = cls.__dict__.get("__doc__") or f"{cls.__name__}."
-        cls.__doc__ = with_section(inspect.cleandoc(written), "Parameters", parameter_section(cls))
+        section = parameter_section(cls.parameter_specs, cls._keywords)
+        cls.__doc__ = with_section(inspect.cleandoc(written), "Parameters", section)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         cls = type(self)

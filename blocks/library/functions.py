@@ -95,9 +95,10 @@ class Function(Block):
         needed = [p for p in every if p.default is p.empty and p.kind is not p.VAR_KEYWORD]
         if not needed or any(p.kind in (p.VAR_POSITIONAL, p.KEYWORD_ONLY) for p in needed):
             raise self._refuse(
-                "arguments", f"the function {self.label}, whose number of arguments can't be found",
+                "arguments",
+                f"the function {self.label}, whose number of arguments can't be found",
                 "names for the inputs, such as arguments=('a', 'b')",
-            )  # fmt: skip
+            )
         return [p.name for p in needed]
 
     def _shapes(self, parameter: str, given: Any) -> dict[str, Shape | None]:

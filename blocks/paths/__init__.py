@@ -1,9 +1,8 @@
 """Planar paths: ellipse, circle, line, cubic spline, and the base of users' own paths."""
 
-from .path import UNLIMITED, Frame, Path
+from .path import UNLIMITED, Frame, Path, replace_unlimited
 from .shapes import Circle, Ellipse, Line
 from .spline import CubicSpline
-from .tables import replace_unlimited
 
 __all__ = [
     "UNLIMITED",

@@ -7,8 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from ..core import Array, ParameterError, parameter
-from .path import UNLIMITED, Path, check_order
-from .tables import as_positions
+from .path import UNLIMITED, Path, as_positions, check_order
 
 __all__ = ["Circle", "Ellipse", "Line"]
 

@@ -1,5 +1,6 @@
 """Equations of blocks as CasADi functions, and their discretization."""
 
+from .differences import differentiate, extrapolate
 from .discretization import check_method, find_hold, hold
 from .equations import initial_state, start_shapes, start_values
 from .numpy_check import GUARDS, NEXT, evaluate
@@ -22,7 +23,9 @@ __all__ = [
     "constants_of",
     "count_uses",
     "describe_outside",
+    "differentiate",
     "evaluate",
+    "extrapolate",
     "find_hold",
     "flat_column",
     "has_large_product",

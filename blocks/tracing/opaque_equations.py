@@ -14,10 +14,9 @@ import casadi as ca
 import numpy as np
 
 from ..core import Block, Layout, LoopwrightError, Shape, ShapeError, SimulationError, TraceError
+from .differences import differentiate
 from .equations import parts_of
 from .symbols import bundle, size, with_values, wrap
-
-_STEP = float(np.cbrt(np.finfo(float).eps))  # of a difference, relative: rounding changes it by 4e-11 of the value
 
 
 class Foreign:
@@ -219,17 +218,14 @@ class _Differences(_Foreign):
         middle = values[k]
         if not np.isfinite(middle):  # the sample time, in a continuous subsystem
             return [np.zeros(size(s)) for s in self.equation.results.values()]
-        step = _STEP * max(abs(middle), nominal)
 
-        def slope(step: float) -> list[np.ndarray]:
-            values[k] = high = middle + step
-            above = self.equation.at(point)
-            values[k] = low = middle - step
-            below = self.equation.at(point)
-            values[k] = middle
-            return [(a - b) / (high - low) for a, b in zip(above, below, strict=True)]
+        def move(to: float) -> list[np.ndarray]:
+            values[k] = to
+            return self.equation.at(point)
 
-        return [(4.0 * fine - coarse) / 3.0 for fine, coarse in zip(slope(step), slope(2.0 * step), strict=True)]
+        found = differentiate(move, middle, max(abs(middle), nominal))
+        values[k] = middle
+        return found
 
 
 def raise_failure(failures: list[BaseException], path: str) -> None:

@@ -258,8 +258,11 @@ def _summary_lines(s: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
     yield "SHA-256", s["sha256"]
     yield "FMI", s["fmi_version"]
     for kind, attributes in s["interfaces"].items():
-        flags = [name if value is True else f"{name} = {value}" for name, value in attributes.items()
-                 if value is not False and name != "modelIdentifier"]  # fmt: skip
+        flags = [
+            name if value is True else f"{name} = {value}"
+            for name, value in attributes.items()
+            if value is not False and name != "modelIdentifier"
+        ]
         yield "interface", INTERFACES[kind]
         for line in flags or ["no capability flags"]:
             yield "", f"  {line}"
@@ -303,8 +306,16 @@ def _print_variables(variables: Iterable[Mapping[str, Any]], *, everything: bool
         for v in chosen:
             causality = f"{v['causality']}, state" if v["state"] else v["causality"]
             shape = "×".join("?" if n is None else str(n) for n in v["shape"])
-            cells = (v["name"], v["type"], shape, causality, v["variability"] or "", v["unit"] or "",
-                     _start_text(v["start"]), v["description"])  # fmt: skip
+            cells = (
+                v["name"],
+                v["type"],
+                shape,
+                causality,
+                v["variability"] or "",
+                v["unit"] or "",
+                _start_text(v["start"]),
+                v["description"],
+            )
             table.add_row(*(Text(fit(cell, sys.stdout)) for cell in cells))
         Console(file=sys.stdout, width=None if sys.stdout.isatty() else _WIDTH, highlight=False).print(table)
     if hidden:

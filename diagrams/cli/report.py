@@ -134,9 +134,9 @@ def report_command(arguments: argparse.Namespace) -> int:
         out = arguments.out or (f"{diagram.name}.html" if arguments.diagram else "fig3.html")
         check_files(out, pdf=arguments.pdf, json=arguments.json)
         if searched is not None:
-            searched.check(diagram, asked)
+            searched.check(diagram.wired, asked)
         if touched is not None:
-            touched.check(diagram)
+            touched.check(diagram.wired)
         began = time.perf_counter()
         about = {name: text for name in ABOUT if (text := getattr(arguments, name)) is not None}
         try:
@@ -269,7 +269,7 @@ def _analyse(
         contacts=touched,
         _written=True,
     )
-    return with_drawing(made, diagram)
+    return with_drawing(made, diagram.wired)
 
 
 @contextlib.contextmanager

@@ -9,6 +9,7 @@ from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOp
 from .hybrid_code import (
     HybridCode,
     compile_hybrid,
+    find_code_obstacle,
     find_hybrid_obstacle,
     hybrid_sources,
     interpret_hybrid,
@@ -16,24 +17,27 @@ from .hybrid_code import (
 )
 from .kernels import Kernel
 from .libraries import load_compiled
+from .library_method import LIBRARY_METHODS, USES_SLOPE, Failure
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
 from .native_tick import bind_call
 from .remote import REFUSED, TOLD, UNDER_WAY, compile_other_side
 from .sources import Code
 from .staged import NativeExchange
-from .watch import RECENT, Fired, Watch
+from .watch import Fired, Pile, Watch
 
 __all__ = [
     "FIXED",
     "LARGEST",
-    "RECENT",
+    "LIBRARY_METHODS",
     "REFUSED",
     "TOLD",
     "UNDER_WAY",
+    "USES_SLOPE",
     "BackgroundCode",
     "Code",
     "CompiledHybrid",
     "CompiledLoop",
+    "Failure",
     "Fired",
     "FusedPlant",
     "HandedOver",
@@ -45,6 +49,7 @@ __all__ = [
     "NativeExchange",
     "NewtonOptions",
     "Outcome",
+    "Pile",
     "Reason",
     "Span",
     "TickCode",
@@ -54,6 +59,7 @@ __all__ = [
     "compile_hybrid",
     "compile_other_side",
     "compile_ticks",
+    "find_code_obstacle",
     "find_exchange_obstacle",
     "find_hybrid_obstacle",
     "find_obstacle",

@@ -10,38 +10,22 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 from ...blocks.core import CompilerError
-from ..flat import EXACT_LOOP, FlatDiagram, TickPattern, share_terms
-from .functions import CodeOfFunctions, CompiledFunction, GeneratedCode
+from ...fmus.runtime import read_sources
+from ..flat import EXACT_LOOP, FlatDiagram, TickPattern, TickProgram, share_terms
+from .functions import CodeOfFunctions, CompiledFunction, GeneratedCode, address_of
 from .generated_text import write_functions
-from .grouping import Tables, make_tables
-from .kernels import write_kernels
-from .libraries import load_compiled, read_sources
+from .grouped_functions import GroupedTick
+from .grouping import TickTables, make_tables
+from .kernels import BlockKinds, Kernels
+from .libraries import load_compiled
 from .reordered import put_in_order
+from .runtime import load_runtime
 from .sources import Sources
 from .staged_functions import Staged, StagedEquations
 
 LARGEST = 6_000
 """Operations of a function up to which it is compiled as a whole: the compiler's time grows faster than they do."""
 MASTER = "loopwright_run"
-
-
-@dataclass(frozen=True, eq=False)
-class GroupedTick:
-    """A tick as runs of equal blocks.
-
-    Attributes
-    ----------
-    tables : Tables
-        Where the values of each block stand.
-    functions : mapping
-        CasADi functions of the blocks that Python evaluates, by key.
-    address : int
-        Address of the C function that goes over the tables.
-    """
-
-    tables: Tables
-    functions: Mapping[int, Any]
-    address: int
 
 
 CompiledTick = CompiledFunction | GroupedTick | Staged
@@ -78,13 +62,8 @@ class TickCode:
     notes: tuple[str, ...] = ()
 
 
-_COMPILED: WeakKeyDictionary[FlatDiagram, TickCode] = WeakKeyDictionary()
-_INTERPRETED: WeakKeyDictionary[FlatDiagram, tuple[Sequence[frozenset[TickPattern]], Sources[TickCode]]]
-_INTERPRETED = WeakKeyDictionary()
-
-
 def find_obstacle(flat: FlatDiagram) -> str | None:
-    """Return why a diagram's ticks can't be compiled; None if they can."""
+    """Return why there can't be generated code of a diagram's ticks; None if there can."""
     if flat.loops.slices and any(flat.table.blocks[path].opaque for path in flat.checked.traced):
         return "it has an algebraic loop beside blocks that Python evaluates, and Newton's method runs in C alone"
     return None
@@ -105,9 +84,8 @@ def compile_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -
         If the cache can't be written.
     """
     flat = flat.origin  # other numbers change no code
-    if flat in _COMPILED and tuple(_COMPILED[flat].ticks) == tuple(acting):
-        return _COMPILED[flat]
-    return write_ticks(flat, acting).load()
+    code: TickCode | None = flat.made["ticks"].get("generated")
+    return code if code is not None and tuple(code.ticks) == tuple(acting) else write_ticks(flat, acting).load()
 
 
 def interpret_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickCode:
@@ -119,13 +97,12 @@ def interpret_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]])
         If there is only generated code of them, or the runtime library can't be had.
     """
     flat = flat.origin
-    known, sources = _INTERPRETED.get(flat, ((), None))
+    known, sources = flat.made["ticks"].get("interpreted", ((), None))
     if sources is None or [*known] != [*acting]:
-        if flat.by_block:
-            raise CompilerError("a diagram of many blocks is interpreted block by block, until there is code of it.")
         sources = write_ticks(flat, acting, straight=True)
-        _INTERPRETED[flat] = [*acting], sources
-    return sources.on_machine()
+        flat.made["ticks"]["interpreted"] = [*acting], sources
+    code: TickCode = sources.on_machine()
+    return code
 
 
 def write_ticks(
@@ -141,6 +118,7 @@ def write_ticks(
     if not loops:
         return replace(ticks, keep=partial(_keep, flat))
     exact = ticks.exact and all(len(flat.active_loops(clocks)) <= EXACT_LOOP for clocks in loops)
+    exact = exact and all(function.is_a("SXFunction") for function in loops.values())
 
     def make(libraries: Sequence[CodeOfFunctions]) -> TickCode:
         return replace(ticks.make(libraries[:-1]), exact=exact, loops=find_loops(loops, libraries[-1]))
@@ -151,7 +129,7 @@ def write_ticks(
 
 
 def _keep(flat: FlatDiagram, code: TickCode) -> None:
-    _COMPILED.setdefault(flat, code)
+    flat.made["ticks"].setdefault("generated", code)
 
 
 def loop_functions(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> dict[frozenset[TickPattern], Any]:
@@ -221,14 +199,35 @@ def _write_straight(
 
 def _write_grouped(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> Sources[TickCode]:
     programs = {clocks: flat.program_at(clocks) for clocks in acting}
-    kernels = write_kernels(flat, [tick.program for tick in programs.values()])
+    kinds = BlockKinds(flat, [tick.program for tick in programs.values()])
+    ticks = GroupedTicks(programs)
 
     def make(libraries: Sequence[CodeOfFunctions]) -> TickCode:
-        address, of_python = libraries[0].address("grouped"), kernels.of_python
-        ticks = {clocks: GroupedTick(make_tables(p, kernels.of), of_python, address) for clocks, p in programs.items()}
-        return TickCode(ticks, kernels.exact, libraries[0].library)
+        kernels = kinds.find(libraries[0])
+        return TickCode(ticks.find(kernels), kinds.exact or kernels.generated is None, libraries[0].library)
 
-    return Sources([lambda: kernels.source], make, kernels.operations, kernels.exact)
+    return Sources([lambda: kinds.source], make, kinds.operations, kinds.exact)
+
+
+class GroupedTicks:
+    """Ticks as runs of equal blocks, with tables that are made once for kernels.
+
+    Parameters
+    ----------
+    programs : mapping
+        The ticks, by the clocks that act.
+    """
+
+    def __init__(self, programs: Mapping[frozenset[TickPattern], TickProgram]):
+        self._programs = programs
+        self._tables: WeakKeyDictionary[Kernels, dict[frozenset[TickPattern], TickTables]] = WeakKeyDictionary()
+
+    def find(self, kernels: Kernels) -> dict[frozenset[TickPattern], GroupedTick]:
+        """Return the ticks with these kernels."""
+        if kernels not in self._tables:
+            self._tables[kernels] = {clocks: make_tables(p, kernels.of) for clocks, p in self._programs.items()}
+        address = address_of(load_runtime(), "loopwright_grouped_tick")
+        return {clocks: GroupedTick(tables, kernels, address) for clocks, tables in self._tables[kernels].items()}
 
 
 def master_source() -> str:

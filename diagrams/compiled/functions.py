@@ -32,6 +32,8 @@ class Bound:
     arguments: Sequence[np.ndarray]
     results: Sequence[np.ndarray]
     kept: list[Any]
+    failures: list[Exception] = field(default_factory=list)
+    """The last error of Python within a call that has failed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +111,7 @@ class CalledFunction(CompiledFunction):
         taken, made = (
             [np.zeros(size(i)) for i in range(n)] for size, n in ((f.numel_in, f.n_in()), (f.nnz_out, f.n_out()))
         )
-        bound = bind_function(f, taken, made)
+        bound, failures = bind_function(f, taken, made), list[Exception]()
         inputs = [(i, v.ctypes.data, v.nbytes) for i, v in enumerate(taken) if v.size]
         outputs = [(i, v.ctypes.data, v.nbytes) for i, v in enumerate(made) if v.size]
 
@@ -118,7 +120,8 @@ class CalledFunction(CompiledFunction):
                 ctypes.memmove(address, given[i], size)
             try:
                 call_for_c(bound.call)
-            except Exception:  # C can't raise it: Python evaluates this instant again, and says what it is
+            except Exception as error:  # C can't raise it: Python evaluates this instant again, and says what it is
+                failures[:] = [error]
                 return 1
             for i, address, size in outputs:
                 ctypes.memmove(wanted[i], address, size)
@@ -129,7 +132,7 @@ class CalledFunction(CompiledFunction):
         structure = TickStructure(
             ctypes.cast(function, ctypes.c_void_p).value, *map(ctypes.addressof, lists), None, None
         )
-        return Bound(structure, arguments, results, [taken, made, bound, function, lists])
+        return Bound(structure, arguments, results, [taken, made, bound, function, lists], failures)
 
 
 def call_for_c(call: Callable[[], None]) -> None:
@@ -173,14 +176,15 @@ class GeneratedCode(CodeOfFunctions):
 
 @dataclass(frozen=True, eq=False)
 class Machine(CodeOfFunctions):
-    """The virtual machine of a library; functions that are no scalar operations are evaluated by Python."""
+    """The virtual machine of a library; functions of other operations than its own are evaluated by Python."""
 
     def find(self, function: Any) -> CompiledFunction:
         """Return a function as a program, or as a call of Python."""
-        if not function.is_a("SXFunction"):
+        if function not in _PROGRAMS:
+            names, scalar = operation_names(self.library), function.is_a("SXFunction")
+            _PROGRAMS[function] = make_program(function, names) if scalar else None
+        if (program := _PROGRAMS[function]) is None:
             return CalledFunction(function, 0)
-        if (program := _PROGRAMS.get(function)) is None:
-            program = _PROGRAMS[function] = make_program(function, operation_names(self.library))
         return MachineFunction(function, address_of(self.library, "loopwright_machine"), program)
 
     def address(self, name: str) -> int:
@@ -188,7 +192,7 @@ class Machine(CodeOfFunctions):
         raise CompilerError(f"{name} needs generated code.")
 
 
-_PROGRAMS: WeakKeyDictionary[Any, Program] = WeakKeyDictionary()
+_PROGRAMS: WeakKeyDictionary[Any, Program | None] = WeakKeyDictionary()
 
 
 @lru_cache(maxsize=4)
@@ -216,4 +220,4 @@ def list_vectors(vectors: Sequence[np.ndarray], length: int) -> Any:
 
 def at(vector: np.ndarray) -> int | None:
     """Return the address of a vector; None without entries."""
-    return vector.ctypes.data if vector.size else None
+    return vector.__array_interface__["data"][0] if vector.size else None  # .ctypes.data takes four times as long

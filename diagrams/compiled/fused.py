@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from weakref import WeakKeyDictionary
 
 from ...blocks.core import CompilerError, FmuError
 from ...fmus.export import describe_processor, inline_model, own_functions, processor_flags, tune
@@ -78,9 +77,6 @@ def fuse(diagram: WiredDiagram) -> tuple[WiredDiagram, tuple[str, ...]]:
     return (diagram.replace(changes) if changes else diagram), tuple(messages)
 
 
-_FUSED: WeakKeyDictionary[FlatDiagram, dict[tuple[FusedPlant, ...], TickCode]] = WeakKeyDictionary()
-
-
 def compile_fused(
     flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], plants: Mapping[str, FusedPlant]
 ) -> TickCode:
@@ -99,7 +95,7 @@ def compile_fused(
         If the cache can't be written.
     """
     flat, key = flat.origin, tuple(plants.values())
-    known = _FUSED.setdefault(flat, {})
+    known: dict[tuple[FusedPlant, ...], TickCode] = flat.made["fused ticks"]
     if key not in known or tuple(known[key].ticks) != tuple(acting):
         known[key] = _compile(flat, acting, plants)
     return known[key]

@@ -18,7 +18,7 @@ PYTHON = -1
 
 @dataclass(frozen=True, eq=False)
 class PythonCall:
-    """A block that Python evaluates in a tick.
+    """A block that Python evaluates.
 
     Attributes
     ----------
@@ -34,15 +34,32 @@ class PythonCall:
 
 
 @dataclass(frozen=True, eq=False)
-class Tables:
-    """A tick as tables for grouped code.
+class BlockCalls:
+    """The calls of blocks in a function, as runs of equal blocks.
 
     Attributes
     ----------
     runs : ndarray of int32, shape (n, 3)
         Kernel, number of blocks, and where their rows begin.
     rows : ndarray of int32
-        Where the values stand, block by block.
+        Where the values are, block by block.
+    python : sequence of PythonCall
+        The blocks that Python evaluates; their rows are their places in it.
+    """
+
+    runs: np.ndarray
+    rows: np.ndarray
+    python: Sequence[PythonCall]
+
+
+@dataclass(frozen=True, eq=False)
+class TickTables:
+    """A tick as tables for kernels.
+
+    Attributes
+    ----------
+    calls : BlockCalls
+        The blocks.
     memory : ndarray
         v with its constants.
     next : int
@@ -55,12 +72,9 @@ class Tables:
         Whether the log ends with the residual of algebraic loops.
     unread : ndarray of int32
         Entries of the log that may be no finite numbers, ascending.
-    python : sequence of PythonCall
-        The blocks that Python evaluates.
     """
 
-    runs: np.ndarray
-    rows: np.ndarray
+    calls: BlockCalls
     memory: np.ndarray
     next: int
     inputs: np.ndarray
@@ -70,11 +84,10 @@ class Tables:
     log: int
     residual: bool
     unread: np.ndarray
-    python: Sequence[PythonCall]
 
 
 @without_collection
-def make_tables(tick: TickProgram, kernels: Mapping[int | str, Kernel]) -> Tables:
+def make_tables(tick: TickProgram, kernels: Mapping[int | str, Kernel]) -> TickTables:
     """Return the tables of a tick.
 
     Parameters
@@ -94,9 +107,9 @@ def make_tables(tick: TickProgram, kernels: Mapping[int | str, Kernel]) -> Table
         return np.ascontiguousarray(places[np.array(ids, dtype=np.int64)], dtype=np.int32)
 
     around, taken = tick.mismatch or (range(0), range(0))
-    return Tables(
-        runs=np.array(runs, dtype=np.int32).reshape(-1, 3),
-        rows=np.concatenate([np.array(rows, dtype=np.int32), copies.ravel()]),
+    every = np.concatenate([np.array(rows, dtype=np.int32), copies.ravel()])
+    return TickTables(
+        calls=BlockCalls(np.array(runs, dtype=np.int32).reshape(-1, 3), every, python),
         memory=memory,
         next=first,
         inputs=where(tick.z),
@@ -106,30 +119,29 @@ def make_tables(tick: TickProgram, kernels: Mapping[int | str, Kernel]) -> Table
         log=len(tick.log),
         residual=tick.mismatch is not None,
         unread=np.ascontiguousarray(tick.unread, dtype=np.int32),
-        python=python,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class PartTables:
-    """A function between ticks as tables for grouped code.
+    """A function between ticks as tables for kernels.
 
     Attributes
     ----------
-    runs, rows, memory, python
-        See `Tables`.
+    calls : BlockCalls
+        The blocks.
+    memory : ndarray
+        v with its constants.
     where : ndarray of int32
         Where the results stand in v, one after the other.
     lengths : tuple of int
         Entries of each result.
     """
 
-    runs: np.ndarray
-    rows: np.ndarray
+    calls: BlockCalls
     memory: np.ndarray
     where: np.ndarray
     lengths: tuple[int, ...]
-    python: Sequence[PythonCall]
 
 
 @without_collection
@@ -153,12 +165,10 @@ def make_part_tables(part: PartProgram, kernels: Mapping[int | str, Kernel]) -> 
     p_first = program.p.ids.start if isinstance(program.p.ids, range) else 0
     runs, rows, python = _write_runs(program, part.operations, kernels, places, p_first)
     return PartTables(
-        runs=np.array(runs, dtype=np.int32).reshape(-1, 3),
-        rows=np.array(rows, dtype=np.int32),
+        calls=BlockCalls(np.array(runs, dtype=np.int32).reshape(-1, 3), np.array(rows, dtype=np.int32), python),
         memory=memory,
         where=places[[value for ids in part.results for value in ids]].astype(np.int32),
         lengths=tuple(map(len, part.results)),
-        python=python,
     )
 
 
@@ -209,9 +219,11 @@ def _place(tick: TickProgram) -> tuple[np.ndarray, np.ndarray, int]:
     wanted[log[::-1]] = 1 + np.arange(len(log))[::-1]
     for column in program.columns:
         size, place = len(column), int(wanted[column.start])
-        if place < 0 or column.start in program.constants or (
-            size > 1 and not np.array_equal(wanted[column.start : column.stop], np.arange(place, place + size))
-        ):  # fmt: skip
+        if (
+            place < 0
+            or column.start in program.constants
+            or (size > 1 and not np.array_equal(wanted[column.start : column.stop], np.arange(place, place + size)))
+        ):
             place, end = end, end + size
         places[column.start : column.stop] = np.arange(place, place + size) if size > 1 else place
     memory = np.zeros(end + 1)

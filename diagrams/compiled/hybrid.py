@@ -11,19 +11,24 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..flat import NONE, FlatDiagram, TickPattern
-from .bound import BoundFunction, address
+from .delays import NativeDelays, PastInputs
+from .differences import Differences
+from .functions import at
 from .hybrid_code import Between, HybridCode
 from .hybrid_structures import HybridStructure, MethodStructure, ProblemStructure, SpanStructure
+from .library_method import LIBRARY_METHODS, USES_SLOPE, Failure, LibraryMethod
 from .loop import CompiledLoop, NewtonOptions, NewtonStructure, OutcomeStructure
 from .radau import radau_numbers
 from .runtime import load_runtime
 from .staged import NativeExchange
 from .staged_functions import Staged, StagedSlopes
-from .watch import Fired, Watch
+from .watch import Fired, Pile, Watch
 
 FIXED = ("euler", "heun", "rk4")
 _KINDS = {"euler": 0, "heun": 1, "rk4": 2, "RK23": 3, "RK45": 3, "DOP853": 4, "Radau": 5}
+_KINDS |= dict.fromkeys(LIBRARY_METHODS, 6)
 _SECONDS = 0.05  # of a call, about, after which Ctrl-C has its turn
+_LIBRARY_STEP = 200_000  # ns that a library takes for a step, about
 _UNKNOWN = 20  # steps of the first call beside FMUs that may take any time
 
 
@@ -31,7 +36,7 @@ class HybridReason(IntEnum):
     """Reasons for which the loop returns: those of `Reason`, and more."""
 
     DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED, SUSPENDED, ASK_BETWEEN, ASK_TICK, ENDED, LOOK = range(11)
-    ASK_REST, ASK_SETTLE, ASK_FIRE, OUTSIDE_FAILED = range(11, 15)
+    ASK_REST, ASK_SETTLE, ASK_FIRE, OUTSIDE_FAILED, PILED_UP = range(11, 16)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +46,7 @@ class MethodOptions:
     Attributes
     ----------
     name : str
-        Its name: "euler", "heun", "rk4", "RK23", "RK45", "DOP853" or "Radau".
+        Its name: "euler", "heun", "rk4", "RK23", "RK45", "DOP853", "Radau", or one of `LIBRARY_METHODS`.
     rtol : float
         Relative tolerance.
     atol : ndarray, shape (n,)
@@ -129,6 +134,9 @@ class CompiledHybrid:
     accepts : {0, 1, 2}
         Whether blocks are to be evaluated after every step (1): they remember something, have guards, may fail, or FMUs
         read them; or after every one that ends between ticks (2).
+    delays : PastInputs, optional
+        The memory of transport delays, where there are some; their inputs are kept within ``tolerances``, relative and
+        absolute.
     held : pair of ndarray
         Inputs of FMUs as they are now, and as they are held from a tick to the next one; one array where nothing
         changes them between ticks.
@@ -150,11 +158,13 @@ class CompiledHybrid:
         held: tuple[np.ndarray, np.ndarray],
         loops: NewtonOptions | None = None,
         exchange: NativeExchange | None = None,
+        delays: PastInputs | None = None,
+        tolerances: tuple[float, float] = (0.0, 0.0),
     ):
         self.ticks, self._kept = loop, list[Any]([code, arguments, x_next])
         self.kinds: Mapping[frozenset[TickPattern], int] = loop.kinds
         n, width, (_, x, w, p) = flat.continuous.size, flat.width, arguments
-        trial = [np.zeros(1), x.copy(), w, p]
+        trial = [np.zeros(1), x.copy(), w if delays is None else w.copy(), p]
         where = self._own(flat.continuous.astype(np.int64))
         slope = code.between.get("slope")
         slopes = np.zeros(0 if slope is None else n * n if loops else len(slope.pattern[0]))
@@ -177,11 +187,17 @@ class CompiledHybrid:
             x=self._own(trial[1]),
             slopes=self._own(slopes),
         )
+        self._delays: NativeDelays | None = None
+        if delays is not None:
+            driven = np.zeros(flat.plant_inputs.total)
+            bound = self._bind(code.between["driven"], trial, [driven])
+            self._delays = NativeDelays(delays, bound, driven, w, trial[2], tolerances)
+            hybrid.p.delays = self._delays.address
         results = [slopes]
         if loops is not None:
             m = len(loops.where)
             self._solver = loop.bind_loops(code.ticks, NONE, trial, loops)
-            hybrid.p.loops, hybrid.p.here = ctypes.addressof(self._solver), address(x)
+            hybrid.p.loops, hybrid.p.here = ctypes.addressof(self._solver), at(x)
             hybrid.solved = self._own(np.zeros(m))
             if not isinstance(slope, StagedSlopes):
                 through = np.zeros(2 * n * m)
@@ -197,6 +213,13 @@ class CompiledHybrid:
         of = ctypes.addressof(hybrid) + HybridStructure.p.offset
         self.methods = [self._method(options, n, of, code.steps.get(options.name)) for options in methods]
         self._names = [options.name for options in methods]
+        self._libraries = {
+            i: LibraryMethod(one.name, one.rtol, one.atol, one.longest, flat.continuous_labels, hybrid.p, method)
+            for i, (one, method) in enumerate(zip(methods, self.methods, strict=True))
+            if one.name in LIBRARY_METHODS
+        }
+        if self._libraries:
+            loop.calls_python = True
         for i, method in enumerate(self.methods):
             hybrid.methods[i] = ctypes.addressof(method)
         hybrid.before = self._own(np.zeros(width))
@@ -229,6 +252,8 @@ class CompiledHybrid:
         """Forget the run before: methods have no step in mind, and no sign of stiffness has been seen."""
         for structure, content in self._fresh:
             ctypes.memmove(ctypes.addressof(structure), content, len(content))
+        for library in self._libraries.values():
+            library.begin_anew()
 
     def _zeros(self, n: int) -> np.ndarray:
         self._kept.append(np.zeros(n))
@@ -236,7 +261,7 @@ class CompiledHybrid:
 
     def _own(self, values: np.ndarray) -> int | None:
         self._kept.append(values)
-        return address(values)
+        return at(values)
 
     def _bind(
         self,
@@ -250,7 +275,12 @@ class CompiledHybrid:
         if self._exchange is not None and isinstance(function, StagedSlopes):
             assert typical is not None
             return self._exchange.bind_slopes(function, arguments, results, typical, self._solver)
-        bound = BoundFunction(function, arguments, results, typical)
+        assert not isinstance(function, Staged | StagedSlopes)
+        if isinstance(function, Differences):
+            assert typical is not None
+            bound = function.bind(arguments, results, typical)
+        else:
+            bound = function.bind(arguments, results)
         self._kept.append(bound)
         return bound.structure
 
@@ -300,11 +330,28 @@ class CompiledHybrid:
         """Begin an interval at a tick, or at any instant between two, that the run has reached."""
         self._hybrid.inside, self._hybrid.t = 0, t
 
-    def hand_over_recent(self, times: Sequence[float]) -> None:
-        """Take over the times in s at which events have fired last."""
-        if self.watch is not None:
-            self.watch.set_recent(times)
-            self._hybrid.w.fired_times = len(times)
+    @property
+    def fired_times(self) -> int:
+        """Number of instants at which events have fired."""
+        return int(self._hybrid.w.fired_times)
+
+    @fired_times.setter
+    def fired_times(self, count: int) -> None:
+        self._hybrid.w.fired_times = count
+
+    @property
+    def sliding(self) -> tuple[bool, bool]:
+        """Whether events of a fixed step wait for its end, and whether one has fired there; see `Sliding`."""
+        return bool(self._hybrid.w.sliding), bool(self._hybrid.w.switched)
+
+    @sliding.setter
+    def sliding(self, state: tuple[bool, bool]) -> None:
+        self._hybrid.w.sliding, self._hybrid.w.switched = state
+
+    @property
+    def pile(self) -> tuple[Pile, int, int]:
+        """How events have piled up, the event that is to blame, and how many times in a row."""
+        return Pile(self._hybrid.w.pile), int(self._hybrid.w.culprit), int(self._hybrid.w.piled)
 
     def take_fired(self) -> list[Fired]:
         """Return the events that have fired since the last call."""
@@ -328,8 +375,10 @@ class CompiledHybrid:
 
     def set_tolerances(self, methods: Sequence[MethodOptions]) -> None:
         """Take other absolute tolerances of the methods."""
-        for vector, options in zip(self._tolerances, methods, strict=True):
+        for i, (vector, options) in enumerate(zip(self._tolerances, methods, strict=True)):
             vector[:] = options.atol
+            if i in self._libraries:
+                self._libraries[i].set_absolute_tolerance(options.atol)
 
     def limit_budget(self, spent: float) -> None:
         """Let calls take fewer steps if one has taken long, in s; FMUs may take any time for an evaluation."""
@@ -337,6 +386,10 @@ class CompiledHybrid:
             self._hybrid.budget = max(1, int(self._hybrid.budget * _SECONDS / spent))
         elif spent < 0.5 * _SECONDS:
             self._hybrid.budget = min(2 * self._hybrid.budget, self._largest_budget)
+
+    def take_failure(self) -> Failure | None:
+        """Return why a method of another library could not take the last step; None if nothing failed."""
+        return next((failure for one in self._libraries.values() if (failure := one.take_failure())), None)
 
     @property
     def active(self) -> int:
@@ -383,19 +436,23 @@ class CompiledHybrid:
         """
         given = SpanStructure(
             count=len(span.widths),
-            times=address(span.times),
-            widths=address(span.widths),
-            kinds=address(span.kinds),
-            lands=address(span.lands),
+            times=at(span.times),
+            widths=at(span.widths),
+            kinds=at(span.kinds),
+            lands=at(span.lands),
             beyond=span.beyond,
             edges=len(span.edges),
-            edge=address(span.edges),
-            late=address(span.late),
+            edge=at(span.edges),
+            late=at(span.late),
             room=len(rows),
         )
-        at, found = ctypes.byref, self._outcome
+        found = self._outcome
+        if self._delays is not None:
+            self._delays.hand_over(self._hybrid.t)
         with self._guard():
-            self._run(at(self._hybrid), at(given), ctypes.c_void_p(address(rows)), at(found))
+            self._run(ctypes.byref(self._hybrid), ctypes.byref(given), ctypes.c_void_p(at(rows)), ctypes.byref(found))
+        if self._delays is not None:
+            self._delays.take_back()
         return HybridOutcome(
             found.ticks, found.rows, HybridReason(found.reason), found.plant, found.stage, found.status, self._hybrid.t
         )
@@ -403,5 +460,7 @@ class CompiledHybrid:
 
 def _budget(flow: int, methods: Sequence[MethodOptions], n: int) -> int:
     """Return the steps of a call: an operation takes about 1 ns, and so does one of the factors of a Jacobian."""
-    step = 100 + 15 * flow + (4 * n**3 if any(m.name == "Radau" for m in methods) else 0)
+    step = 100 + 15 * flow + (4 * n**3 if any(m.name in USES_SLOPE for m in methods) else 0)
+    if any(m.name in LIBRARY_METHODS for m in methods):
+        step += _LIBRARY_STEP
     return max(10, int(_SECONDS * 1e9 / step))

@@ -11,22 +11,23 @@ from weakref import WeakKeyDictionary
 
 import casadi as ca
 
-from ...blocks.core import CompilerError
 from ...fmus.export import describe_processor, processor_flags
-from ..flat import NONE, FlatDiagram, OpaqueStage, Schedule, TickPattern, share_terms
+from ..flat import NONE, FlatDiagram, OpaqueStage, PartProgram, Schedule, TickPattern, share_terms
 from .code import (
-    GroupedTick,
+    GroupedTicks,
     TickCode,
     check_size,
     find_loops,
     loop_functions,
     write_loops,
 )
-from .functions import CodeOfFunctions, CompiledFunction, GeneratedCode, MachineFunction
+from .differences import Columns, Differences, find_columns
+from .functions import CodeOfFunctions, CompiledFunction, GeneratedCode, MachineFunction, address_of
 from .generated_text import write_functions
-from .grouped_parts import Differences, GroupedPart, find_differences
-from .grouping import make_part_tables, make_tables
-from .kernels import write_kernels
+from .grouped_functions import GroupedFunction, GroupedPart
+from .grouping import PartTables, make_part_tables
+from .kernels import BlockKinds, Kernels
+from .runtime import load_runtime
 from .small_steps import STEPS, write_steps
 from .sources import Sources
 from .staged_functions import Staged, StagedEquations, StagedSlopes
@@ -34,11 +35,6 @@ from .step_outputs import may_fail_at_steps
 
 FUSING = ("-finline-functions", "-freciprocal-math", "-fno-tree-vectorize", "-fno-tree-slp-vectorize")
 """Flags of fused code: a parameter's inverse is computed once; vectors of few values cost more than they save."""
-_GROUPED = ("grouped", "grouped_part", "grouped_differences")
-
-EMBEDDED = ("euler", "heun", "rk4", "RK23", "RK45", "DOP853", "Radau", "auto")
-"""Solvers that there are in C."""
-
 
 Between = CompiledFunction | GroupedPart | Differences | Staged | StagedSlopes
 """A function between ticks that was compiled."""
@@ -77,41 +73,40 @@ class HybridCode:
 
 def _hand_over(function: Any, to: Any) -> None:
     match function:
-        case MachineFunction():
+        case MachineFunction() | GroupedFunction():
             function.hand_over(to)
         case Staged():
             for one, other in zip(function.functions, to.functions, strict=True):
                 _hand_over(one, other)
         case StagedEquations():
             _hand_over(function.mismatch, to.mismatch)
-        case StagedSlopes():
+        case StagedSlopes() | Differences():
             pass  # its rates are those between ticks
 
 
-_COMPILED: WeakKeyDictionary[FlatDiagram, dict[tuple[Any, ...], HybridCode]] = WeakKeyDictionary()
-_KNOWN: WeakKeyDictionary[FlatDiagram, dict[tuple[Any, ...], Sources[HybridCode]]] = WeakKeyDictionary()
-
-
-def find_hybrid_obstacle(flat: FlatDiagram, solver: str) -> str | None:
-    """Return why a diagram with continuous states can't go from tick to tick in C; None if it can.
-
-    Parameters
-    ----------
-    solver : str
-        Name of the solver.
-    """
-    if solver not in EMBEDDED:
-        return f"there is no solver={solver!r} in C; there are {', '.join(EMBEDDED[:-1])} and {EMBEDDED[-1]}"
+def find_hybrid_obstacle(flat: FlatDiagram) -> str | None:
+    """Return why a diagram with continuous states can't go from tick to tick in C; None if it can."""
     blocks = flat.table.blocks
-    delayed = sorted({path for name in flat.plant_inputs.slices if blocks[path := flat.ports[name][0]].transport})
-    if delayed:
-        return f"the transport delay {delayed[0]!r} keeps its past in Python"
+    delayed = sorted(path for path in blocks if blocks[path].transport and path not in flat.checked.traced)
+    if delayed and flat.outside:
+        return f"the transport delay {delayed[0]!r} is beside the FMU {flat.outside[0]!r} in model exchange"
+    return None
+
+
+def find_code_obstacle(flat: FlatDiagram) -> str | None:
+    """Return why there can't be generated code of a diagram with continuous states; None if there can."""
+    blocks = flat.table.blocks
     opaque = sorted(path for path in flat.checked.traced if blocks[path].opaque and path not in flat.outside)
     if opaque and flat.outside:
         return f"Python evaluates the block {opaque[0]!r} beside the FMU {flat.outside[0]!r} in model exchange"
     if opaque and flat.loops.slices:
         return f"it has an algebraic loop beside the block {opaque[0]!r}, which Python evaluates"
     return None
+
+
+def has_delays(flat: FlatDiagram) -> bool:
+    """Whether there is a transport delay in continuous time."""
+    return any(block.transport and path not in flat.checked.traced for path, block in flat.table.blocks.items())
 
 
 def compile_hybrid(
@@ -136,7 +131,7 @@ def compile_hybrid(
         If the cache can't be written.
     """
     kinds = (NONE, *(clocks for clocks in acting if clocks))
-    known = _COMPILED.setdefault(flat.origin, {})
+    known: dict[tuple[Any, ...], HybridCode] = flat.made["generated code between ticks"]
     if (kinds, stiff, fuse) not in known:
         more = ((*processor_flags(), *FUSING), describe_processor()) if fuse else ()
         known[kinds, stiff, fuse] = hybrid_sources(flat, acting, stiff=stiff).load(*more)
@@ -151,15 +146,13 @@ def interpret_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]
     CompilerError
         If there is only generated code of them, or the runtime library can't be had.
     """
-    if flat.by_block and not flat.active_loops(NONE) and not flat.outside:
-        raise CompilerError("a diagram of many blocks is interpreted block by block, until there is code of it.")
     return hybrid_sources(flat, acting, stiff=stiff).on_machine()
 
 
 def hybrid_sources(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, stiff: bool) -> Sources[HybridCode]:
     """Return the functions of a diagram with continuous states; the same ones for the next run. See `write_hybrid`."""
     key = (NONE, *(clocks for clocks in acting if clocks)), stiff
-    known = _KNOWN.setdefault(flat.origin, {})
+    known: dict[tuple[Any, ...], Sources[HybridCode]] = flat.made["functions between ticks"]
     if key not in known:
         known[key] = write_hybrid(flat.origin, acting, stiff=stiff)
     return known[key]
@@ -201,12 +194,16 @@ def _write_straight(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], 
         others["slope"] = flat.jacobian_with_loops.fast if looped else _sparse_slope(flat)
     if flat.events:
         others |= {"indicators": flat.indicators.last.fast, "jump": flat.jump.last.fast}
+    if has_delays(flat):
+        others["driven"] = flat.driven.last.fast
     others = {name: share_terms(function, name) for name, function in others.items()}
     functions = [*ticks.values(), *others.values()]
 
     @cache
     def steps() -> str:
-        return "" if flat.active_loops(NONE) else write_steps(flat.flow.last.fast, flat.continuous.tolist())
+        if flat.active_loops(NONE) or has_delays(flat):  # there is more to a trial than the rates
+            return ""
+        return write_steps(flat.flow.last.fast, flat.continuous.tolist())
 
     def write() -> str:
         for function in functions:
@@ -261,27 +258,37 @@ def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *,
 
 def _write_grouped(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> Sources[HybridCode]:
     programs = {clocks: flat.program_at(clocks) for clocks in kinds}
-    names = ("flow", "indicators", "jump") if flat.events else ("flow",)
+    names = ["flow", *(("indicators", "jump") if flat.events else ()), *(("driven",) if has_delays(flat) else ())]
     parts = {name: flat.part_program(name) for name in names}
     every = [tick.program for tick in programs.values()] + [part.program for part in parts.values()]
-    kernels = write_kernels(flat, every)
+    blocks, ticks = BlockKinds(flat, every), GroupedTicks(programs)
+    tables: WeakKeyDictionary[Kernels, dict[str, PartTables]] = WeakKeyDictionary()
+    counts = {name: _count_operations(part) for name, part in parts.items()}
+
+    @cache
+    def columns() -> Columns:
+        return find_columns(parts["flow"], flat.continuous)
 
     def make(libraries: Sequence[CodeOfFunctions]) -> HybridCode:
-        library = libraries[0].library
-        tick, part, differences = (libraries[0].address(name) for name in _GROUPED)
-        ticks = {c: GroupedTick(make_tables(p, kernels.of), kernels.of_python, tick) for c, p in programs.items()}
-        between: dict[str, Between] = {}
-        for name, program in parts.items():
-            of = program.program.functions
-            count = sum(of[op.kernel].n_instructions() for op in program.operations if op.kernel in of)
-            between[name] = GroupedPart(make_part_tables(program, kernels.of), kernels.of_python, count, part)
+        kernels, runtime = blocks.find(libraries[0]), load_runtime()
+        if kernels not in tables:
+            tables[kernels] = {name: make_part_tables(part, kernels.of) for name, part in parts.items()}
+        address = address_of(runtime, "loopwright_grouped_part")
+        found = {name: GroupedPart(of, kernels, address, counts[name]) for name, of in tables[kernels].items()}
+        between: dict[str, Between] = {**found}
         if stiff:
-            rates = between["flow"]
-            assert isinstance(rates, GroupedPart)
-            between["slope"] = find_differences(parts["flow"], flat.continuous, rates, differences)
-        return HybridCode(TickCode(ticks, exact=False, library=library), between)
+            address = address_of(runtime, "loopwright_grouped_differences")
+            between["slope"] = Differences(found["flow"], columns(), address)
+        exact = blocks.exact or kernels.generated is None
+        return HybridCode(TickCode(ticks.find(kernels), exact, libraries[0].library), between)
 
-    return Sources([lambda: kernels.source], make)
+    return Sources([lambda: blocks.source], make, blocks.operations, blocks.exact)
+
+
+def _count_operations(part: PartProgram) -> int:
+    """Return the operations of one evaluation."""
+    of = part.program.functions
+    return sum(of[op.kernel].n_instructions() for op in part.operations if op.kernel in of)
 
 
 def _sparse_slope(flat: FlatDiagram) -> Any:

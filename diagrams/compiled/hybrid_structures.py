@@ -23,9 +23,26 @@ class ProblemStructure(ctypes.Structure):
     _fields_ = [
         *_fields(_INT, "n width"), ("where", _AT), ("flow", TickStructure), ("slope", TickStructure),
         *_fields(_AT, "t x slopes"), ("entries", _INT), *_fields(_AT, "row column"),
-        *_fields(_REAL, "stop edge left at late"), *_fields(_AT, "loops here by_loops"),
+        *_fields(_REAL, "stop edge left at late"), *_fields(_AT, "loops here by_loops delays"),
         *_fields(_INT, "rates jacobians"),
     ]  # fmt: skip
+
+
+class DelaysStructure(ctypes.Structure):
+    """Transport delays, as C knows them."""
+
+    _fields_ = [
+        *_fields(_INT, "n distinct"),
+        *_fields(_AT, "tau different input output size start node weight"),
+        *_fields(_INT, "inputs outputs"),
+        *_fields(_AT, "here trial"),
+        ("driven", TickStructure),
+        *_fields(_AT, "z found"),
+        *_fields(_REAL, "rtol atol"),
+        *_fields(_AT, "pieces edges kept_edges"),
+        *_fields(_INT, "count capacity noted room kept_count kept_noted smoothed"),
+        ("middle", _REAL),
+    ]
 
 
 class MethodStructure(ctypes.Structure):
@@ -43,7 +60,8 @@ class MethodStructure(ctypes.Structure):
         *_fields(_AT, "x x_old f y g K D J lu lu_complex Z W F error scale pivots pivots_complex"),
         *_fields(_REAL, "h_of_lu h_before error_before tolerance"),
         *_fields(ctypes.c_int32, "has_lu has_slope slope_is_new predicts"),
-        ("step", _AT),
+        *_fields(_AT, "step library"),
+        ("begins", ctypes.c_int32),
     ]
 
 
@@ -52,8 +70,8 @@ class HybridStructure(ctypes.Structure):
 
     _fields_ = [
         ("l", LoopStructure), ("p", ProblemStructure), ("w", WatchStructure), ("methods", _AT * 2),
-        *_fields(_INT, "active automatic accepts between budget inside begun stepped"), *_fields(_REAL, "t to"),
-        *_fields(_INT, "found hits misses easy"), ("before", _AT), ("outputs", _INT),
+        *_fields(_INT, "active automatic accepts between budget inside begun stepped"),
+        *_fields(_REAL, "t to counts_as"), *_fields(_INT, "found hits misses easy"), ("before", _AT), ("outputs", _INT),
         *_fields(_AT, "taken taken_first taken_states"), ("switched", _INT), ("solved", _AT), ("looked_at", _REAL),
         *_fields(_AT, "z held"), ("inputs", _INT), ("planned", _REAL), ("o", _AT),
         ("jump", _REAL), ("acted", _INT), ("looked", _REAL),

@@ -8,7 +8,6 @@ import os
 import re
 from contextlib import suppress
 from functools import lru_cache
-from importlib.resources import files
 from pathlib import Path
 
 from ...blocks.core import CompilerError, replace_file
@@ -18,11 +17,6 @@ from ...fmus.toolchain import DIAGRAM_FLAGS, SUFFIXES
 
 _OURS = re.compile(r"[0-9a-f]{40}\.(size|so|dll|dylib)")
 """Names of what stands in the folder of compiled diagrams; other files there are the user's."""
-
-
-def read_sources(*names: str) -> str:
-    """Return C sources of this package, one behind the other."""
-    return "\n".join(files(__package__).joinpath(name).read_text(encoding="utf-8") for name in names)
 
 
 @lru_cache(maxsize=64)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,9 +15,9 @@ from ...blocks.interrupts import INTERRUPTS
 from ...fmus.calls import NEAR, FmuInstance, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
 from ..flat import TRUE, TickPattern
-from .code import CompiledTick, GroupedTick, TickCode
+from .code import CompiledTick, TickCode
 from .functions import TickStructure, at
-from .native_tick import bind_native
+from .grouped_functions import GroupedTick
 from .remote import RemotePlants
 from .runtime import load_runtime
 from .staged_functions import Staged, StagedEquations
@@ -113,8 +113,7 @@ class NewtonOptions:
     halvings: int
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """Where and why the loop has returned.
 
     Attributes
@@ -199,7 +198,7 @@ class CompiledLoop:
         self._remotes = [self._remote, *([] if exchange is None else [exchange.remote])]
         self._kept: list[Any] = [code, arguments, results, plants, columns, exchange]
         self._exchange = exchange
-        self._calls_python = any(isinstance(t, GroupedTick) and len(t.tables.python) > 0 for t in code.ticks.values())
+        self.calls_python = any(isinstance(t, GroupedTick) and t.calls_python for t in code.ticks.values())
         self._watched: list[tuple[HostState, ctypes.c_bool]] = [] if exchange is None else [*exchange.watched]
         t, x, _, _ = arguments
         x_next, _, log, ok = results
@@ -230,6 +229,7 @@ class CompiledLoop:
         self._outcome = OutcomeStructure()
         self._run = code.master or load_runtime()["loopwright_run"]
         self._run.restype = None
+        self._run.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 5]
 
     def _array(self, values: np.ndarray) -> int | None:
         self._kept.append(values)
@@ -253,7 +253,7 @@ class CompiledLoop:
             if isinstance(tick, Staged):
                 return self._exchange.bind(tick, arguments, results)
             return self._exchange.bind_equations(tick, arguments, results)
-        bound = bind_native(tick, arguments, results)
+        bound = tick.bind(arguments, results)
         self._kept.append(bound)
         return bound.structure
 
@@ -332,7 +332,7 @@ class CompiledLoop:
         """
         if self._watched or any(r.address for r in self._remotes):
             return self._guard()
-        return INTERRUPTS.kept() if self._calls_python else nullcontext()
+        return INTERRUPTS.kept() if self.calls_python else nullcontext()
 
     @contextmanager
     def _guard(self) -> Iterator[None]:
@@ -341,7 +341,7 @@ class CompiledLoop:
                 stack.enter_context(host)
             for remote in self._remotes:
                 stack.enter_context(remote.guard())
-            if self._calls_python or any(r.address for r in self._remotes):
+            if self.calls_python or any(r.address for r in self._remotes):
                 stack.enter_context(INTERRUPTS.kept())
             yield
         for host, changed in self._watched:
@@ -373,10 +373,13 @@ class CompiledLoop:
         """
         with self.guard():
             self._run(
-                ctypes.byref(self.structure),
-                ctypes.c_int64(len(widths)),
-                *(ctypes.c_void_p(at(vector)) for vector in (times, widths, kinds, rows)),
-                ctypes.byref(self._outcome),
+                ctypes.addressof(self.structure),
+                len(widths),
+                at(times),
+                at(widths),
+                at(kinds),
+                at(rows),
+                ctypes.addressof(self._outcome),
             )
         found = self._outcome
         return Outcome(found.ticks, found.rows, Reason(found.reason), found.plant, found.stage, found.status)

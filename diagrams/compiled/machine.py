@@ -11,13 +11,23 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import CompilerError
-
 _INPUT, _OUTPUT = 0, 1
 
 
 class _ProgramStructure(ctypes.Structure):
     _fields_ = [("runs", ctypes.c_int64), *((name, ctypes.c_void_p) for name in ("code", "generated", "iw", "w"))]
+
+
+class BlockProgramStructure(ctypes.Structure):
+    """A block's function as C knows it; see `machine.c`."""
+
+    _fields_ = [
+        ("runs", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("code", "values")),
+        *((name, ctypes.c_int32) for name in ("width", "row")),
+        ("columns", ctypes.c_void_p),
+        ("arguments", ctypes.c_int32),
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +53,44 @@ class Program:
         return _ProgramStructure(self.runs, self.code.ctypes.data), self.start.copy()
 
 
-def make_program(function: Any, names: Sequence[str]) -> Program:
-    """Return a CasADi function of scalar operations as a program.
+@dataclass(frozen=True, eq=False)
+class BlockProgram:
+    """A block's function as a program for several blocks at a time.
+
+    Attributes
+    ----------
+    program : Program
+        The program; each value has ``width`` places.
+    width : int
+        Blocks at a time.
+    columns : ndarray of int32
+        Of each argument, then of each result: its entry of a block's row in the table; -1 for none.
+    arguments : int
+        Number of arguments; the last one is the parameters.
+    """
+
+    program: Program
+    width: int
+    columns: np.ndarray
+    arguments: int
+
+    def bind(self) -> tuple[BlockProgramStructure, np.ndarray]:
+        """Return it as C knows it, and memory for one use of it at a time; valid as long as both live."""
+        values, row = self.program.start.copy(), int(self.columns.max(initial=-1)) + 1
+        structure = BlockProgramStructure(
+            self.program.runs,
+            self.program.code.ctypes.data,
+            values.ctypes.data,
+            self.width,
+            row,
+            self.columns.ctypes.data,
+            self.arguments,
+        )
+        return structure, values
+
+
+def make_program(function: Any, names: Sequence[str], width: int = 1) -> Program | None:
+    """Return a CasADi function of scalar operations as a program; None if it has one that the machine doesn't have.
 
     Every operation writes to a place that nothing else is written to. So operations may be done in any order in which
     the operands come first; those of one kind are done together where that is possible.
@@ -55,11 +101,8 @@ def make_program(function: Any, names: Sequence[str]) -> Program:
         A function of scalar operations.
     names : sequence of str
         Names of the machine's operations, by their codes.
-
-    Raises
-    ------
-    CompilerError
-        If it has an operation that the machine does not have.
+    width : int, default 1
+        Places of each value.
     """
     codes = {getattr(ca, f"OP_{name}"): code for code, name in enumerate(names)}
     place: dict[int, int] = {}  # of the last value that was written to a place of CasADi's memory
@@ -75,7 +118,7 @@ def make_program(function: Any, names: Sequence[str]) -> Program:
             made.append(-1)
             continue
         if op not in codes:
-            raise CompilerError(f"a function has CasADi's operation {op}, which the virtual machine does not have.")
+            return None
         code = codes[op]
         if code == _OUTPUT:
             rows.append(((code, written[0]), (place[given[0]], written[1])))
@@ -91,9 +134,11 @@ def make_program(function: Any, names: Sequence[str]) -> Program:
     code_of: list[int] = []
     for kind, members in runs:
         code_of += [kind[0], len(members), *kind[1:]]
+        transfers = kind[0] in (_INPUT, _OUTPUT)  # the second number is an entry of a vector
         for i in members:
-            code_of += rows[i][1]
-    return Program(len(runs), np.array(code_of, dtype=np.int32), np.array(start or [0.0]))
+            first, *others = rows[i][1]
+            code_of += [width * first, *(others if transfers else [width * place for place in others])]
+    return Program(len(runs), np.array(code_of, dtype=np.int32), np.repeat(start or [0.0], width))
 
 
 def _sort(

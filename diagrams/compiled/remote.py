@@ -102,10 +102,20 @@ class RemotePlants:
         behind = quiet.slopes if quiet.line is None else quiet.line[2 + sloped.size :]
         slopes = None if behind is None else at(behind)
         made = _Quiet(
-            at(quiet.until), watched.size, sloped.size, at(quiet.vector), at(watched), at(sloped), at(quiet.taken),
-            at(quiet.last), line, slopes, quiet.event or None, quiet.changed or None,
+            at(quiet.until),
+            watched.size,
+            sloped.size,
+            at(quiet.vector),
+            at(watched),
+            at(sloped),
+            at(quiet.taken),
+            at(quiet.last),
+            line,
+            slopes,
+            quiet.event or None,
+            quiet.changed or None,
             None if quiet.added is None else at(quiet.added),
-        )  # fmt: skip
+        )
         self._kept += [quiet, watched, sloped, made]
         return ctypes.addressof(made)
 

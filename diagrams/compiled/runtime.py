@@ -1,27 +1,13 @@
-"""The runtime library: the loops over ticks and time, their methods and events, and the virtual machine."""
+"""The runtime library, loaded: the loops over ticks and time, their methods and events, and the virtual machine."""
 
 from __future__ import annotations
 
 import ctypes
 from functools import lru_cache
-from pathlib import Path
 
-from ...fmus.toolchain import RUNTIME_FLAGS, native_platform, read_unit, runtime_name
+from ...fmus.runtime import installed_runtime, runtime_source
+from ...fmus.toolchain import RUNTIME_FLAGS
 from .libraries import is_kept, load_compiled
-
-
-@lru_cache(maxsize=1)
-def runtime_source() -> str:
-    """Return the C text of the runtime library."""
-    return read_unit(Path(__file__).parent, "runtime.c")
-
-
-def installed_runtime() -> Path:
-    """Return the file of the runtime library that was compiled when the package was installed; it may not be there.
-
-    Its name holds the hash of the source: after a change of a checkout there is none.
-    """
-    return Path(__file__).parent / "built" / runtime_name(runtime_source(), native_platform())
 
 
 @lru_cache(maxsize=1)

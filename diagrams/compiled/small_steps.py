@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from ...fmus.runtime import read_sources
 from ..flat import share_terms
 from .generated_text import write_functions
-from .libraries import read_sources
 
 STEPS = {"rk4": "step_rk4", "RK23": "step_rk23", "RK45": "step_rk45"}
 """Names of the C functions, by method."""
@@ -58,5 +58,6 @@ def _write_embedded(name: str, method: Any) -> str:
         f"    static const double {letter}[] = {{{', '.join(map(float.hex, map(float, values)))}}};\n"
         for letter, values in tables.items()
     ]
-    call = f"    return step_embedded(m, {stages}, A, B, C, E, {float(method.error_estimator_order)});\n"
+    numbers = f"{stages}, A, B, C, E, NULL, {float(method.error_estimator_order)}"
+    call = f"    return step_small(m, &(lw_tableau){{{numbers}}});\n"
     return f"\nVISIBLE int {STEPS[name]}(method *m) {{\n" + "".join(texts) + call + "}\n"

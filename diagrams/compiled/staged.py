@@ -12,8 +12,8 @@ from ...blocks.core import EvaluationVectors, Wanted
 from ...fmus.calls import BoundCalls, NativeAction, NativeLook
 from ...fmus.host_state import HostState
 from ..flat import JUMP, OpaqueStage
+from .differences import color_columns
 from .functions import TickStructure, address_of, at, list_vectors
-from .grouped_parts import color_columns
 from .loop import NewtonStructure
 from .remote import WAIT, LateReplies, RemotePlants
 from .staged_functions import Staged, StagedEquations, StagedSlopes
@@ -28,9 +28,14 @@ def _fields(kind: Any, names: str) -> list[tuple[str, Any]]:
 
 class _Action(ctypes.Structure):
     _fields_ = [
-        *_fields(_INT, "kind count"), ("function", _AT), ("arguments", ctypes.c_uint64 * 8),
-        *_fields(_AT, "vector index buffer"), ("type", _INT), *_fields(_REAL, "low high"), ("warned_at", _AT),
-    ]  # fmt: skip
+        *_fields(_INT, "kind count"),
+        ("function", _AT),
+        ("arguments", ctypes.c_uint64 * 8),
+        *_fields(_AT, "vector index buffer"),
+        ("type", _INT),
+        *_fields(_REAL, "low high"),
+        ("warned_at", _AT),
+    ]
 
 
 class _Sequence(ctypes.Structure):
@@ -39,27 +44,44 @@ class _Sequence(ctypes.Structure):
 
 class _Exchanged(ctypes.Structure):
     _fields_ = [
-        ("of", _AT), *_fields(_INT, "place states inputs events first"),
+        ("of", _AT),
+        *_fields(_INT, "place states inputs events first"),
         *_fields(_Sequence, "complete enter update leave"),
-        *_fields(_AT, "again terminate nominals defined wants ends time"), *_fields(_INT, "width again_where"),
-        *_fields(_AT, "u least relative low high discrete"), ("next_time", _REAL),
-        *_fields(_INT, "asks ended in_event"), ("end", _REAL), *_fields(_INT, "other_nominals acted"),
+        *_fields(_AT, "again terminate nominals defined wants ends time"),
+        *_fields(_INT, "width again_where"),
+        *_fields(_AT, "u least relative low high discrete"),
+        ("next_time", _REAL),
+        *_fields(_INT, "asks ended in_event"),
+        ("end", _REAL),
+        *_fields(_INT, "other_nominals acted"),
         *_fields(_AT, "changed far"),
-    ]  # fmt: skip
+    ]
 
 
 class _Outside(ctypes.Structure):
     _fields_ = [
-        ("count", _INT), ("each", _AT), ("jump", TickStructure), *_fields(_INT, "look lost failed plant"),
-        ("action", _AT), *_fields(_INT, "call status"), ("at", _REAL), ("log", _AT),
-        *_fields(_INT, "logged capacity warned"), ("apart", _AT), ("wait", WAIT),
-    ]  # fmt: skip
+        ("count", _INT),
+        ("each", _AT),
+        ("jump", TickStructure),
+        *_fields(_INT, "look lost failed plant"),
+        ("action", _AT),
+        *_fields(_INT, "call status"),
+        ("at", _REAL),
+        ("log", _AT),
+        *_fields(_INT, "logged capacity warned"),
+        ("apart", _AT),
+        ("wait", WAIT),
+    ]
 
 
 class _Stage(ctypes.Structure):
     _fields_ = [
-        ("f", TickStructure), ("fmu", _AT), ("calls", _Sequence), *_fields(_AT, "t x u into"), ("made", _INT),
-    ]  # fmt: skip
+        ("f", TickStructure),
+        ("fmu", _AT),
+        ("calls", _Sequence),
+        *_fields(_AT, "t x u into"),
+        ("made", _INT),
+    ]
 
 
 class _Schedule(ctypes.Structure):
@@ -68,9 +90,10 @@ class _Schedule(ctypes.Structure):
 
 class _Slopes(ctypes.Structure):
     _fields_ = [
-        *_fields(_AT, "rates loops x dx before step values typical"), *_fields(_INT, "n colors"),
+        *_fields(_AT, "rates loops x dx before step values typical"),
+        *_fields(_INT, "n colors"),
         *_fields(_AT, "where first columns rows_first rows"),
-    ]  # fmt: skip
+    ]
 
 
 class NativeBlock(Protocol):

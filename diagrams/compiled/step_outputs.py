@@ -12,16 +12,38 @@ import numpy as np
 from ..flat import NONE, FlatDiagram
 
 _ANY = {
-    ca.OP_POW, ca.OP_EXP, ca.OP_EXPM1, ca.OP_LOG, ca.OP_LOG1P, ca.OP_SQRT, ca.OP_INV, ca.OP_ASIN, ca.OP_ACOS,
-    ca.OP_SINH, ca.OP_COSH, ca.OP_ACOSH, ca.OP_ATANH, ca.OP_ERFINV,
-}  # fmt: skip
+    ca.OP_POW,
+    ca.OP_EXP,
+    ca.OP_EXPM1,
+    ca.OP_LOG,
+    ca.OP_LOG1P,
+    ca.OP_SQRT,
+    ca.OP_INV,
+    ca.OP_ASIN,
+    ca.OP_ACOS,
+    ca.OP_SINH,
+    ca.OP_COSH,
+    ca.OP_ACOSH,
+    ca.OP_ATANH,
+    ca.OP_ERFINV,
+}
 """Operations that may make a value that is not finite of finite ones that move."""
 _SECOND = {ca.OP_DIV, ca.OP_FMOD, ca.OP_REMAINDER}  # only where what they divide by moves
 _UNKNOWN = {ca.OP_CALL, ca.OP_SOLVE, ca.OP_CONSTPOW} | _ANY | _SECOND
 _CARRYING = {
-    ca.OP_ADD, ca.OP_SUB, ca.OP_MUL, ca.OP_NEG, ca.OP_SQ, ca.OP_TWICE, ca.OP_FABS, ca.OP_SQRT, ca.OP_LOG, ca.OP_SIN,
-    ca.OP_COS, ca.OP_TAN,
-}  # fmt: skip
+    ca.OP_ADD,
+    ca.OP_SUB,
+    ca.OP_MUL,
+    ca.OP_NEG,
+    ca.OP_SQ,
+    ca.OP_TWICE,
+    ca.OP_FABS,
+    ca.OP_SQRT,
+    ca.OP_LOG,
+    ca.OP_SIN,
+    ca.OP_COS,
+    ca.OP_TAN,
+}
 """Operations whose result is not finite wherever one of their arguments is not."""
 _AS_ONE = (ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT)
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..flat import FlatDiagram
-from .bound import BoundFunction, address
-from .functions import TickStructure
+from .differences import Differences
+from .functions import TickStructure, at
 from .hybrid_code import Between
 from .staged import NativeExchange
-from .staged_functions import Staged
+from .staged_functions import Staged, StagedSlopes
 
 _LOGGED = 2**22  # bytes of what has fired in a call
 _INSTANTS = 1100  # of a step that are looked at together, at most
@@ -25,7 +26,7 @@ def _fields(kind: Any, names: str) -> list[tuple[str, Any]]:
     return [(name, kind) for name in names.split()]
 
 
-_BY_C, _BY_PYTHON, _BY_FMU = range(3)  # who lets an event fire
+_BY_C, _BY_FMU = range(2)  # who lets an event fire
 
 
 class WatchStructure(ctypes.Structure):
@@ -35,11 +36,19 @@ class WatchStructure(ctypes.Structure):
         ("m", _INT), ("indicators", TickStructure), ("jump", TickStructure),
         *_fields(_AT, "z open fired rising falling hysteretic asks hysteresis own own_first"),
         *_fields(_REAL, "spacing finest step"), ("state_size", _INT), ("state", _AT),
-        *_fields(_AT, "domain low high slack size rounding largest counts latest fresh recent"), ("fired_times", _INT),
+        *_fields(_AT, "domain low high slack size rounding largest counts latest fresh"),
+        *_fields(_AT, "side stuck briefs brief_at recent recent_fired"), ("fired_times", _INT),
         ("kept", _AT), *_fields(_INT, "kept_times kept_log"), ("log", _AT), *_fields(_INT, "logged capacity"),
         *_fields(_AT, "times seen gates domains x x_before now strict values motion later fires following located"),
-        ("landed", _AT),
+        *_fields(_AT, "gate inside inside_first start"), *_fields(_INT, "sliding switched"), ("slid", _AT),
+        *_fields(_INT, "pile culprit piled"),
     ]  # fmt: skip
+
+
+class Pile(IntEnum):
+    """How events pile up so that a run can't go on; see `loopwright.diagrams.events`."""
+
+    IN_CONTACT, ZENO, CHATTERS, ENDLESS = range(4)
 
 
 class Fired(NamedTuple):
@@ -112,28 +121,27 @@ class Watch:
             self.structure.indicators = exchange.bind(indicators, trial, [z, opened])
         self.fired = fired
         """Which events fire in a jump, from 0 to 1."""
-        subsystems = flat.table.subsystems
         flags = {
             "rising": [e.direction != "falling" for e in events],
             "falling": [e.direction != "rising" for e in events],
             "hysteretic": [e.hysteresis > 0.0 for e in events],
-            "asks": [
-                _BY_FMU
-                if e.path in flat.outside
-                else _BY_PYTHON
-                if e.subsystem and subsystems[e.path].when == "reset"
-                else _BY_C
-                for e in events
-            ],
+            "asks": [_BY_FMU if e.path in flat.outside else _BY_C for e in events],
         }
         for name, values in flags.items():
             self._put(name, np.array(values, dtype=np.uint8))
         self._put("hysteresis", np.array([e.hysteresis for e in events]))
         self._put("own", np.concatenate([np.zeros(0), *own]).astype(np.int64))
         self._put("own_first", np.cumsum([0, *map(len, own)]).astype(np.int64))
+        self._put_resets(flat)
         self._make_state(m)
-        self._recent = np.zeros(RECENT)
-        self._put("recent", self._recent)
+        self.start, self._slid = np.zeros(m), np.full(m, np.nan)
+        """Domains where the run has begun, to which those inside a subsystem go back that is reset."""
+        self._put("start", self.start)
+        self._put("slid", self._slid)
+        self.recent = np.zeros(RECENT), np.zeros((RECENT, m), dtype=np.uint8)
+        """Rings of the times in s at which any event has fired last, and which did; see `EventLimits`."""
+        self._put("recent", self.recent[0])
+        self._put("recent_fired", self.recent[1])
         row = 2 + 2 * self._width
         self._log = np.zeros((max(200, _LOGGED // (8 * row)), row))
         self._put("log", self._log)
@@ -145,28 +153,43 @@ class Watch:
         for name in ("now", "strict", "values", "later"):
             self._put(name, np.zeros(m))
         self._put("motion", np.zeros(6 * m))
-        for name in ("fires", "following"):
-            self._put(name, np.zeros(m, dtype=np.uint8))
+        self.fires = np.zeros(m, dtype=np.uint8)
+        """Which events fire at the instant that C has come to."""
+        self._put("fires", self.fires)
+        self._put("following", np.zeros(m, dtype=np.uint8))
         self.located = np.zeros(m, dtype=np.uint8)
         """Which events fire at an instant that was found in a step, where C has left that to Python."""
         self._put("located", self.located)
-        self._landed = np.zeros(m)
-        self._put("landed", self._landed)
 
     def _put(self, name: str, vector: np.ndarray) -> None:
         self._kept.append(vector)
-        setattr(self.structure, name, address(vector))
+        setattr(self.structure, name, at(vector))
+
+    def _put_resets(self, flat: FlatDiagram) -> None:
+        """Tell C the events that reset a subsystem: its gate among the states, and the events inside it."""
+        gates, inside = np.full(self._m, -1, dtype=np.int64), list[list[int]]()
+        for i, event in enumerate(flat.events):
+            inside.append([])
+            if event.subsystem and flat.table.subsystems[event.path].when == "reset":
+                gates[i] = flat.gates.slices[event.path].start
+                own = (j for j, e in enumerate(flat.events) if e.path.startswith(f"{event.path}.") and not e.subsystem)
+                inside[i].extend(own)
+        self._put("gate", gates)
+        self._put("inside", np.array([j for own in inside for j in own] + [0], dtype=np.int64))
+        self._put("inside_first", np.cumsum([0, *map(len, inside)]).astype(np.int64))
 
     def _bind(
         self, name: str, function: Between, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
     ) -> None:
-        bound = BoundFunction(function, arguments, results)
+        assert not isinstance(function, Differences | Staged | StagedSlopes)
+        bound = function.bind(arguments, results)
         self._kept.append(bound)
         setattr(self.structure, name, bound.structure)
 
     def _make_state(self, m: int) -> None:
         """Lay out what C goes back to where an event is left to Python: one vector, of parts."""
         sizes = dict.fromkeys(["domain", "low", "high", "slack", "size", "rounding", "largest", "counts"], m)
+        sizes |= dict.fromkeys(["side", "stuck", "briefs", "brief_at"], m)
         sizes |= {"latest": _LATEST * m, "fresh": 1}
         state = np.zeros(sum(sizes.values()))
         self._put("state", state)
@@ -176,11 +199,13 @@ class Watch:
         first = 0
         for name, size in sizes.items():
             part = self._parts[name] = state[first : first + size]
-            setattr(self.structure, name, address(part))
+            setattr(self.structure, name, at(part))
             first += size
         parts = self._parts
         self.domain, self.low, self.high, self.slack = (parts[name] for name in ("domain", "low", "high", "slack"))
         self.size, self.rounding, self.largest = (parts[name] for name in ("size", "rounding", "largest"))
+        self.rest = [parts[name] for name in ("side", "stuck", "briefs", "brief_at")]
+        """A rest in contact: see `EventLimits`."""
 
     @property
     def fresh(self) -> bool:
@@ -204,16 +229,11 @@ class Watch:
             rows[i, : len(own)] = own
             self._parts["counts"][i] = len(own)
 
-    def take_landed(self) -> list[tuple[int, int]]:
-        """Return the indicators that jumps have left in contact since the last call, and the sides they come from."""
-        found = [(int(i), int(self._landed[i])) for i in np.flatnonzero(self._landed)]
-        self._landed[:] = 0.0
-        return found
-
-    def set_recent(self, times: Sequence[float]) -> None:
-        """Take over the times in s at which any event has fired last."""
-        self._recent[: len(times)] = times
-        self.structure.fired_times = len(times)
+    def take_slid(self) -> list[tuple[float, int]]:
+        """Return the events that have begun to slide since the last call, and when, in s."""
+        found = [(float(self._slid[i]), int(i)) for i in np.flatnonzero(~np.isnan(self._slid))]
+        self._slid[:] = np.nan
+        return sorted(found)
 
     def take(self, structure: WatchStructure) -> list[Fired]:
         """Return what has fired since the last call, from the structure that C has changed."""

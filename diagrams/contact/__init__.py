@@ -4,7 +4,7 @@ from .admittance import ContactAdmittance, compute_admittance
 from .confirmation import ContactConfirmation, ContactTrial, TrialMethod, try_limit
 from .contact import SIDES, Contact, find_sign, make_contact
 from .environment import UNITS, check_environment
-from .loop import close_loop, controller_rows, hold_inputs, join_environment
+from .loop import close_loop, controller_rows, join_environment
 from .measured_force import Tool
 from .moored_plant import hold_sources
 from .parts import restrict
@@ -48,7 +48,6 @@ __all__ = [
     "find_limit",
     "find_poles",
     "find_sign",
-    "hold_inputs",
     "hold_sources",
     "join_environment",
     "make_contact",

@@ -161,9 +161,12 @@ def attach_environment(
     shape = np.shape(mooring.anchor)
     d = np.asarray(mooring.direction).reshape(shape)
     common: dict[str, Any] = {
-        "direction": d if shape else float(d), "anchor": mooring.anchor if shape else float(mooring.anchor),
-        "stiffness": mooring.stiffness, "damping": mooring.damping, "mass": mooring.mass,
-    }  # fmt: skip
+        "direction": d if shape else float(d),
+        "anchor": mooring.anchor if shape else float(mooring.anchor),
+        "stiffness": mooring.stiffness,
+        "damping": mooring.damping,
+        "mass": mooring.mass,
+    }
     push = table.wires.get((path, ports.force), None)
     if push is None:
         push = _add(table, Constant(value=_idle(block, ports.force, shape), name=f"{name}_push"), "y")
@@ -258,8 +261,9 @@ def _mobility(model: PlantEquations, ports: Ports) -> np.ndarray:
 def _find_feedthrough(diagram: WiredDiagram, path: str, model: PlantEquations) -> Iterable[str]:
     """Return the outputs of a plant that its inputs act on at once, and that something reads."""
     used = {wire.port for wire in diagram.scheduled.wires.values() if wire.block == path}
-    return [port for port in diagram.blocks[path].outputs if port in used
-            and np.any(model.D[model.outputs.entries([port])])]  # fmt: skip
+    return [
+        port for port in diagram.blocks[path].outputs if port in used and np.any(model.D[model.outputs.entries([port])])
+    ]
 
 
 def _find_acceleration(table: Structure, ports: Ports, model: PlantEquations) -> Wire:

@@ -18,6 +18,7 @@ import numpy as np
 from ...blocks.core import ConfirmationError, OptionError, explain_calls, near
 from ...fmus.running import Fmu
 from ..linearization import PlantEquations, copy_point, find_signal, linearize, linearize_plant
+from ..simulation import RunOptions, simulate
 from .attached_environment import attach_environment
 from .environment import read_positive
 from .moored_plant import Mooring, hold_sources, library_class, moored_diagram
@@ -63,7 +64,7 @@ class TriedContact(Protocol):
     """A contact, as its limits are tried."""
 
     @property
-    def diagram(self) -> WiredDiagram:
+    def wired(self) -> WiredDiagram:
         """Its diagram."""
 
     @property
@@ -103,7 +104,7 @@ class TriedContact(Protocol):
 
 
 @dataclass
-class Trials:
+class LimitTrials:
     """Runs beside a limit, and predictions for them.
 
     Attributes
@@ -122,7 +123,7 @@ class Trials:
     _known: dict[float, np.ndarray] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, contact: TriedContact, limit: ContactLimit, method: TrialMethod | str | None) -> Trials:
+    def of(cls, contact: TriedContact, limit: ContactLimit, method: TrialMethod | str | None) -> LimitTrials:
         """Return the trials of a contact's limit.
 
         Raises
@@ -133,9 +134,9 @@ class Trials:
         chosen = _choose(contact, limit, method)
         model = None
         if chosen is not TrialMethod.INSIDE:
-            model = linearize_plant(contact.diagram, contact.point, contact.plant)
-        made = cls(contact, limit, chosen, hold_sources(contact.diagram, contact.point.values), model)
-        stepped = contact.diagram.blocks[contact.plant].stepped and contact.sample_time > 0.0
+            model = linearize_plant(contact.wired, contact.point, contact.plant)
+        made = cls(contact, limit, chosen, hold_sources(contact.wired, contact.point.values), model)
+        stepped = contact.wired.blocks[contact.plant].stepped and contact.sample_time > 0.0
         open_choice = method is None and chosen is TrialMethod.SOLVER and stepped
         if open_choice and made._diagram(limit.value, 0.0).loops == "solve":
             made.method = TrialMethod.HELD  # the FMU does not list its dependencies: each evaluation would be a loop
@@ -209,15 +210,15 @@ class Trials:
         """Return times, the velocity along the mode's direction, and the largest speed."""
         contact = self.contact
         step = contact.shortest or STEP
-        made: Any = self._diagram(value, push)
-        options: dict[str, Any] = {} if made.has_clock else {"step": step}
+        made = self._diagram(value, push)
+        name = f"{contact.plant}.{contact.ports.velocity}"
+        options: dict[str, Any] = {"record": [name], "states": False, **({} if made.has_clock else {"step": step})}
         if self.method is TrialMethod.SOLVER:
             options |= {"rtol": RTOL, "atol": PRECISE * push}
         t0 = contact.point.t if self._is_away else 0.0
         if self._is_away:
             options["start"] = self._start(made)
-        name = f"{contact.plant}.{contact.ports.velocity}"
-        run = made.simulate(duration + 4 * step, progress=False, record=[name], states=False, **options)
+        run = simulate(made, duration + 4 * step, RunOptions.of(options, block=made.name), progress=False)
         t = np.asarray(run.t) - t0
         count = np.round(t / step)
         ticks = np.flatnonzero(np.abs(t / step - count) <= ON_TICK)
@@ -233,7 +234,7 @@ class Trials:
 
     def _start(self, made: WiredDiagram) -> OperatingPoint | None:
         """Return the operating point of a diagram with an environment; None for the start."""
-        return copy_point(self.contact.diagram, self.contact.point, made) if self._is_away else None
+        return copy_point(self.contact.wired, self.contact.point, made) if self._is_away else None
 
     def _diagram(self, value: float, push: float) -> WiredDiagram:
         """Return the diagram with the environment."""
@@ -246,10 +247,13 @@ class Trials:
         step = contact.sample_time or STEP
         begin = contact.point.t if self._is_away else 0.0
         mooring = Mooring(
-            d, np.asarray(contact.point.values[f"{contact.plant}.{contact.ports.position}"], dtype=float),
+            d,
+            np.asarray(contact.point.values[f"{contact.plant}.{contact.ports.position}"], dtype=float),
             **{name: float(v) for name, v in environment.items()},
-            kick=push / (mobility * step), kick_time=begin + step, kick_start=begin,
-        )  # fmt: skip
+            kick=push / (mobility * step),
+            kick_time=begin + step,
+            kick_start=begin,
+        )
         source = find_signal(still.flatten_like(contact.point), contact.entry) if contact.entry else None
         if self.method is TrialMethod.INSIDE:
             ports = (contact.ports.force, contact.ports.position, contact.ports.velocity)
@@ -275,7 +279,7 @@ class Trials:
 
 def _choose(contact: TriedContact, limit: ContactLimit, method: TrialMethod | str | None) -> TrialMethod:
     """Return the place of the environment: the one that is asked for, or the first that is possible."""
-    block = contact.diagram.blocks[contact.plant]
+    block = contact.wired.blocks[contact.plant]
     has_mass = limit.vary == "mass" or limit.environment.get("mass", 0.0) > 0.0
     equations = not block.stepped or (isinstance(block, Fmu) and block.description.model_exchange is not None)
     possible = []
@@ -411,7 +415,7 @@ def confirm_limit(
 ) -> ContactConfirmation:
     """Run a contact's diagram at 0.97 and at 1.03 of a limit; see `Contact.confirm`."""
     push = _check(contact, limit, push)
-    trials = Trials.of(contact, limit, method)
+    trials = LimitTrials.of(contact, limit, method)
     tried = trials.find_own_limit()
     values = [factor * tried for factor in FACTORS]
     predicted = [trials.find_mode(value) for value in values]
@@ -529,7 +533,7 @@ def _check(contact: TriedContact, limit: ContactLimit, push: float) -> float:
     return read_positive(push, "push", "velocity in m/s")
 
 
-def _others_decay(trials: Trials, value: float, window: float) -> float:
+def _others_decay(trials: LimitTrials, value: float, window: float) -> float:
     """Return the time in s until modes of about the frequency of the limit's have decayed beside it."""
     mode, rates = trials.find_mode(value), trials.find_rates(value)
     near = np.abs(np.abs(rates.imag) - abs(mode.imag)) < 8 * 2 * math.pi / window

@@ -81,7 +81,7 @@ class Contact:
         Kinks, stairs and flat slopes that the linear model leaves out.
     """
 
-    diagram: WiredDiagram
+    wired: WiredDiagram
     plant: str
     direction: np.ndarray
     side: str
@@ -100,7 +100,12 @@ class Contact:
             f"T = {self.sample_time:g} s" if self.sample_time else "continuous",
         )
         then = ".stability_limit(), .admittance(omega), .passivity()"
-        return brief(f"contact of {self.diagram.name!r}", *facts, then=then)
+        return brief(f"contact of {self.wired.name!r}", *facts, then=then)
+
+    @property
+    def diagram(self) -> Any:
+        """The `Diagram` of the contact."""
+        return self.wired.facade
 
     @property
     def sample_time(self) -> float:

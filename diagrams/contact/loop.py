@@ -32,6 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...blocks.core import Array
+from ..frequency import advance_held, hold_inputs
 from .environment import check_environment
 from .parts import ContactParts, StateMatrices
 
@@ -113,17 +114,6 @@ def controller_rows(parts: ContactParts, joined: Joined) -> Rows:
     return Rows(stack(yx, fx), stack(y_last, f_last), stack(y_now, f_now), stack(yF, fF))
 
 
-def hold_inputs(joined: Joined, T: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the matrices over one sample with held inputs u."""
-    from scipy.linalg import expm
-
-    n, many = joined.B.shape[-2:]
-    whole = np.zeros((*joined.A.shape[:-2], n + many, n + many))
-    whole[..., :n, :n], whole[..., :n, n:] = joined.A, joined.B
-    whole = np.asarray(expm(whole * T))
-    return whole[..., :n, :n], whole[..., :n, n:]
-
-
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
     """The coupled loop: s⁺ (or ds/dt) = A s + g F at the ticks, with the plant's state first.
@@ -151,9 +141,9 @@ def close_loop(parts: ContactParts, joined: Joined) -> ClosedLoop:
     """Return the loop of joined plant and controller."""
     rows = controller_rows(parts, joined)
     if not parts.ticks:
-        held = hold_inputs(joined, parts.sample_time) if parts.sample_time else None
+        held = hold_inputs(joined.A, joined.B, parts.sample_time) if parts.sample_time else None
         return _close_tick(parts, joined, rows, parts.controller, held)
-    holds = {T: hold_inputs(joined, T) for T in {tick.duration for tick in parts.ticks}}
+    holds = {T: hold_inputs(joined.A, joined.B, T) for T in {tick.duration for tick in parts.ticks}}
     steps = tuple(_close_tick(parts, joined, rows, tick.matrices, holds[tick.duration]) for tick in parts.ticks)
     A = steps[0].A
     for step in steps[1:]:
@@ -211,7 +201,7 @@ def split_modes(parts: ContactParts, direction: np.ndarray, loop: ClosedLoop, us
     a spring, by the velocity if it has a damper, and by the acceleration if it has a mass. A tool's mass feels all
     directions, and acts at the ticks.
     """
-    from scipy.linalg import expm, matrix_balance
+    from scipy.linalg import matrix_balance
 
     T, A = parts.sample_time, loop.A
     n, nf = len(parts.plant.A), len(direction)
@@ -222,8 +212,7 @@ def split_modes(parts: ContactParts, direction: np.ndarray, loop: ClosedLoop, us
     for axis in axes.T[:, :, None]:
         free = join_environment(parts, axis[:, 0])
         at_ticks.append(close_loop(parts, free._replace(G=0.0 * free.G)).every_step)
-    held = np.zeros((n + 1, n + 1))
-    held[:n, :n], held[:n, n:] = loop.joined.A, parts.force @ d
+    push = parts.force @ d
 
     def row(by_x: np.ndarray, by_u: np.ndarray) -> np.ndarray:
         made = np.zeros((len(by_x), size))
@@ -246,7 +235,7 @@ def split_modes(parts: ContactParts, direction: np.ndarray, loop: ClosedLoop, us
     until = np.eye(size)
     for k, (step, tick) in enumerate(zip(loop.every_step, parts.controllers, strict=True)):
         along = np.zeros((size, 1))
-        along[:n] = np.asarray(expm(held * tick.duration))[:n, n:] if T else held[:n, n:]
+        along[:n] = hold_inputs(loop.joined.A, push, tick.duration)[1] if T else push
         now = [one[k].at_tick for one in at_ticks]
         pushes = np.hstack([step.A @ pushes if k else pushes, *now, along])
         felt = np.vstack([felt, *(r @ until for r in rows)])
@@ -353,18 +342,13 @@ def find_frequency(parts: ContactParts, loop: ClosedLoop, rate: complex, state: 
 
 def _follow(parts: ContactParts, loop: ClosedLoop, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times over the period, their weights, and the velocities of the contact at them."""
-    from scipy.linalg import expm
-
-    joined = loop.joined
-    n, many = joined.B.shape
-    whole = np.zeros((n + many, n + many))
-    whole[:n, :n], whole[:n, n:] = joined.A, joined.B
+    joined, n = loop.joined, len(parts.plant.A)
     times, weights, velocities, begin = [], [], [], 0.0
     for step, tick in zip(loop.every_step, parts.controllers, strict=True):
         count = math.ceil(SAMPLES * tick.duration / parts.shortest)
         h = tick.duration / count
-        here = expm(whole * 0.5 * h) @ np.concatenate([state[:n], step.inputs[0] @ state])
-        further = expm(whole * h)
+        here = advance_held(joined.A, joined.B, 0.5 * h) @ np.concatenate([state[:n], step.inputs[0] @ state])
+        further = advance_held(joined.A, joined.B, h)
         for i in range(count):
             times.append(begin + (i + 0.5) * h)
             weights.append(h)

@@ -95,8 +95,11 @@ def find_sensor(flat: FlatDiagram, path: str) -> str | None:
     for _ in flat.table.blocks:
         if isinstance(flat.table.blocks[path], ForceSensor):
             return path
-        sources = [wire.block for port in flat.table.blocks[path].inputs
-                   if (wire := flat.table.wires.get((path, port))) is not None]  # fmt: skip
+        sources = [
+            wire.block
+            for port in flat.table.blocks[path].inputs
+            if (wire := flat.table.wires.get((path, port))) is not None
+        ]
         if len(sources) != 1:
             return None
         path = sources[0]
@@ -234,17 +237,25 @@ def find_tool(
     blocks = flat.table.blocks
     path = find_sensor(flat, signal.port[0])
     if path is None:
-        to_plant = {p for (b, _), wire in flat.table.wires.items() if b == ports.plant
-                    for p in find_upstream(flat, wire.block, ports.plant)}  # fmt: skip
+        to_plant = {
+            p
+            for (b, _), wire in flat.table.wires.items()
+            if b == ports.plant
+            for p in find_upstream(flat, wire.block, ports.plant)
+        }
         ahead = find_upstream(flat, signal.port[0], ports.plant)
         found = sorted(
-            p for p, block in blocks.items() if isinstance(block, ForceSensor)
+            p
+            for p, block in blocks.items()
+            if isinstance(block, ForceSensor)
             and (p in ahead or (p in to_plant and entry.port[0] in find_upstream(flat, p, ports.plant)))
-        )  # fmt: skip
+        )
         if len(found) > 1:
             names = ", ".join(map(repr, found))
-            return Tool(problem=f"found the force sensors {names} on the ways of {signal.name!r}; expected one, to "
-                        f"tell whose tool it is. {_advise(found[0])}")  # fmt: skip
+            return Tool(
+                problem=f"found the force sensors {names} on the ways of {signal.name!r}; expected one, to "
+                f"tell whose tool it is. {_advise(found[0])}"
+            )
         path = found[0] if found else None
     if path is None:
         return Tool()

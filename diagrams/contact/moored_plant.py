@@ -207,8 +207,9 @@ def moored_diagram(
     else:
         values = {name: getattr(block, name) for name in cls.parameter_specs}
         made: Any = moor(cls, *ports)
-        table.blocks[plant] = made(**{k: v for k, v in values.items() if v is not None}, **mooring.parameters(),
-                                   name=block.label)  # fmt: skip
+        table.blocks[plant] = made(
+            **{k: v for k, v in values.items() if v is not None}, **mooring.parameters(), name=block.label
+        )
     set_tool(table, tool)
     if measured is not None:
         source = measured.port

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from ...blocks.core import (
     ShapeError,
 )
 from ...fmus.running import Derivation
+from ..frequency import FourMatrices
 from ..linearization import (
     BlockFinding,
     Linearization,
@@ -47,9 +48,6 @@ if TYPE_CHECKING:
     from ..results import OperatingPoint
 
 
-Four: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-
-
 class StateMatrices(NamedTuple):
     """State-space matrices; axes in front of the last two are those of a batch."""
 
@@ -68,7 +66,7 @@ class ControllerTick(NamedTuple):
 
 def hold_signals(
     models: Sequence[TickModel],
-    cut: Callable[[Four], StateMatrices],
+    cut: Callable[[FourMatrices], StateMatrices],
     shown: int,
     felt_wire: int | None,
     *,
@@ -115,8 +113,10 @@ def _hold(
     on_h = K.D @ now
     if keep:
         on_s, on_h = np.hstack([np.zeros((many, n + len(held))), np.eye(many)]), np.zeros((many, entries))
-    rows_s = [np.hstack([K.A, K.B @ last, np.zeros((n, kept))]),
-              np.hstack([np.zeros((len(held), n)), last[held], np.zeros((len(held), kept))])]  # fmt: skip
+    rows_s = [
+        np.hstack([K.A, K.B @ last, np.zeros((n, kept))]),
+        np.hstack([np.zeros((len(held), n)), last[held], np.zeros((len(held), kept))]),
+    ]
     rows_h = [K.B @ now, now[held]]
     if has_kept:
         rows_s.append(on_s)
@@ -235,11 +235,9 @@ def take_apart(
     felt = [] if signal is None else list(signal.entries)
     pushed, position, velocity = _find_entries(m, ports, measured, len(felt))
     wired, rows = m.inputs.entries(wires), m.outputs.entries(seen)
-    own = [] if not inside or signal is None else [
-        rows.index(m.outputs.slices[signal.port[1]].start + i) for i in felt
-    ]  # fmt: skip
+    own = [] if not inside or signal is None else [rows.index(m.outputs.slices[signal.port[1]].start + i) for i in felt]
 
-    def cut(matrices: Four, states: Sequence[str]) -> StateMatrices:
+    def cut(matrices: FourMatrices, states: Sequence[str]) -> StateMatrices:
         K = _cut_controller(matrices, states, path, wires, flat, signal if entry is signal else None)
         if signal is None:
             return StateMatrices(K.A, _widen(K.B, len(pushed)), K.C, _widen(K.D, len(pushed)))
@@ -340,9 +338,13 @@ def _collect_findings(model: Linearization, path: str) -> tuple[Finding, ...]:
 
 
 def _cut_controller(
-    matrices: Four, states: Sequence[str], path: str, wires: Mapping[str, Source], flat: FlatDiagram,
+    matrices: FourMatrices,
+    states: Sequence[str],
+    path: str,
+    wires: Mapping[str, Source],
+    flat: FlatDiagram,
     signal: Tap | None,
-) -> StateMatrices:  # fmt: skip
+) -> StateMatrices:
     """Return the matrices from the plant's outputs and the measured force to its inputs, without the plant's states."""
     A, B, C, D = matrices
     own = [_is_of(path, name) for name in states]

@@ -36,8 +36,8 @@ from enum import StrEnum
 import numpy as np
 
 from ...blocks.core import Array, Finding, brief, explain_calls, on_one_thread
-from ..frequency import refine_sign_change
-from .loop import close_loop, controller_rows, hold_inputs, join_environment
+from ..frequency import hold_inputs, refine_sign_change
+from .loop import close_loop, controller_rows, join_environment
 from .parts import ContactParts, StateMatrices
 
 ALIASES = 16
@@ -171,7 +171,7 @@ class _Aliases:
         self.K = StateMatrices(K.A, K.B[:, : self.many], K.C, K.D[:, : self.many])
         self.felt = (K.B[:, self.many :] @ direction, K.D[:, self.many :] @ direction)
         self.shown = (parts.force_shown @ direction[:, None])[:, 0]
-        self.held = hold_inputs(self.joined, self.T)
+        self.held = hold_inputs(self.joined.A, self.joined.B, self.T)
         self.modes = self._find_modes()
 
     def judge(self) -> PortPassivity:
@@ -193,8 +193,12 @@ class _Aliases:
         found = [(float(np.min(margins)), float(grid[np.argmin(margins)]))]
         for i in lowest[np.argsort(margins[lowest])][:MINIMA]:
             a, b = grid[max(i - 1, 0)], grid[min(i + 1, len(grid) - 1)]
-            best = minimize_scalar(lambda w: float(self.margins(np.array([w]))[0]), bounds=(a, b), method="bounded",
-                                   options={"xatol": 1e-6 * b})  # fmt: skip
+            best = minimize_scalar(
+                lambda w: float(self.margins(np.array([w]))[0]),
+                bounds=(a, b),
+                method="bounded",
+                options={"xatol": 1e-6 * b},
+            )
             found.append((float(best.fun), float(best.x)))
         margin, w = min(found)
         return PortPassivity(margin > -PRECISE, PassivityReason.COMPUTED, margin, w, PRECISE)

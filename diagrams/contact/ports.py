@@ -126,8 +126,13 @@ def check_command(flat: FlatDiagram, ports: Ports, signal: Tap, wires: Mapping[s
 
 def force_wire_error(flat: FlatDiagram, ports: Ports, signal: Tap) -> OptionError:
     """Return the error of a measured force that leads on to the force port: the environment's force would act twice."""
-    readers = sorted({f"{path}.{port}" for (path, port), wire in flat.table.wires.items()
-                      if (wire.block, wire.port) == signal.port and path != ports.plant})  # fmt: skip
+    readers = sorted(
+        {
+            f"{path}.{port}"
+            for (path, port), wire in flat.table.wires.items()
+            if (wire.block, wire.port) == signal.port and path != ports.plant
+        }
+    )
     return OptionError(
         f"found {signal.name!r}, which leads on to {ports.plant}.{ports.force}, and is read by {', '.join(readers)}; "
         "expected a wire that acts on the controller alone. Put a Gain(gain=1, name='cell') on the wire to those of "

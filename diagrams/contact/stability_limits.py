@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -82,23 +82,12 @@ class FoundLimit(NamedTuple):
     confirmed_by: str
 
 
-class _Limit(Protocol):
-    @property
-    def value(self) -> float: ...
-    @property
-    def unit(self) -> str: ...
-    @property
-    def frequency(self) -> float: ...
-    @property
-    def environment(self) -> dict[str, float]: ...
-
-
-def describe_limit(name: str, limit: _Limit) -> str:
+def describe_limit(name: str, value: float, unit: str, frequency: float, environment: Mapping[str, float]) -> str:
     """Return the short text of a limit of a property."""
-    held = ", ".join(f"{name} {value:g}" for name, value in limit.environment.items())
+    held = ", ".join(f"{held} {value:g}" for held, value in environment.items())
     facts = (
-        f"{name} {limit.value:.6g} {limit.unit}",
-        f"at {limit.frequency:.4g} rad/s" if limit.frequency == limit.frequency else "",
+        f"{name} {value:.6g} {unit}",
+        f"at {frequency:.4g} rad/s" if frequency == frequency else "",
         held and f"with {held}",
     )
     return brief("limit of coupled stability", *facts, then=".value, .frequency, .confirmed_by")
@@ -349,7 +338,7 @@ class ContactLimit:
     second_look: float = math.nan
 
     def __repr__(self) -> str:
-        return describe_limit(self.vary, self)
+        return describe_limit(self.vary, self.value, self.unit, self.frequency, self.environment)
 
     @property
     def number(self) -> Number:

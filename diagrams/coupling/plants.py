@@ -17,7 +17,10 @@ NEAR = 1e-9
 
 
 class Plant(Protocol):
-    """A stepped block in a run, as its ``instantiate`` yields it: `bind`, `exchange`, `begin`, then each `step`."""
+    """A stepped block in a run, as its ``instantiate`` yields it: `bind`, `exchange`, `begin`, then each `step`.
+
+    A protocol: instances of FMUs come from the room `fmus`, which this sub-package doesn't know, others from users.
+    """
 
     @property
     def messages(self) -> Sequence[str]:
@@ -59,7 +62,7 @@ class Plant(Protocol):
 
 
 class Stepped(Protocol):
-    """A block whose class says ``stepped = True``."""
+    """A block whose class says ``stepped = True``: an `Fmu`, or one that a user has written."""
 
     def instantiate(
         self, wired: Sequence[str], stop_time: float | None, *, start_time: float

@@ -14,7 +14,10 @@ def never(t: float) -> bool:
 
 
 class Rest(Protocol):
-    """The blocks in continuous time between two ticks; they take part in a communication step."""
+    """The blocks in continuous time between two ticks; they take part in a communication step.
+
+    A protocol: the loop over time, above this sub-package, gives them to a coupling scheme.
+    """
 
     sample: Sample
     """Records the instant at which a stop condition ends the run."""

@@ -18,7 +18,7 @@ class Border(Enum):
     """Signals leave the subsystem there."""
 
 
-class Place(NamedTuple):
+class PinPlace(NamedTuple):
     """An end of a wire inside a subsystem: at a block, at an inner subsystem, or at the subsystem's own border.
 
     Attributes
@@ -37,7 +37,7 @@ class Place(NamedTuple):
         return self.path if self.border is None else f"{self.border.value} of {self.path}: {pin.maker} {pin.port}"
 
 
-PlacedPin = tuple[Place, Pin]
+PlacedPin = tuple[PinPlace, Pin]
 
 
 class Nets:
@@ -71,7 +71,7 @@ class Nets:
         for path, wire in table.controls.items():
             self._thread(wire, path.rpartition(".")[0], path, Pin(wire.port, wire.block, control=True))
         for block, port in self.names:
-            self.of[table.subsystem_of[block]].setdefault((Place(block), Pin(port)), [])
+            self.of[table.subsystem_of[block]].setdefault((PinPlace(block), Pin(port)), [])
             _add(self.outs, block, Pin(port))
 
     def name_of(self, path: str, pin: Pin) -> str:
@@ -79,13 +79,13 @@ class Nets:
         block = path if path in self.table.blocks else pin.maker
         return ", ".join(self.names.get((block, pin.port), []))
 
-    def label_at(self, place: Place, pin: Pin, sinks: list[PlacedPin]) -> str:
+    def label_at(self, place: PinPlace, pin: Pin, sinks: list[PlacedPin]) -> str:
         """Return the text at a wire's source: its name; empty where the wire only leaves the subsystem."""
         if place.border is Border.INPUTS or (sinks and all(end.border is Border.OUTPUTS for end, _ in sinks)):
             return ""
         return self.name_of(place.path, pin)
 
-    def is_part(self, place: Place, pin: Pin) -> bool:
+    def is_part(self, place: PinPlace, pin: Pin) -> bool:
         """Whether only a part of the wire's signal goes into this end."""
         return place.border is None and (place.path, pin) in self.parts
 
@@ -93,17 +93,17 @@ class Nets:
         """Lead a wire from its block across borders to a consumer in a subsystem."""
         crossing = Pin(wire.port, wire.block)
         here = self.table.subsystem_of[wire.block]
-        end = (Place(wire.block), Pin(wire.port))
+        end = (PinPlace(wire.block), Pin(wire.port))
         _add(self.outs, wire.block, end[1])
         while not (here == subsystem or not here or subsystem.startswith(here + ".")):
-            self._join(here, end, (Place(here, Border.OUTPUTS), crossing))
+            self._join(here, end, (PinPlace(here, Border.OUTPUTS), crossing))
             _add(self.outs, here, crossing)
-            end, here = (Place(here), crossing), here.rpartition(".")[0]
+            end, here = (PinPlace(here), crossing), here.rpartition(".")[0]
         for inner in _subsystems_between(here, subsystem):
-            self._join(here, end, (Place(inner), crossing))
+            self._join(here, end, (PinPlace(inner), crossing))
             _add(self.ins, inner, crossing)
-            end, here = (Place(inner, Border.INPUTS), crossing), inner
-        self._join(here, end, (Place(item), pin))
+            end, here = (PinPlace(inner, Border.INPUTS), crossing), inner
+        self._join(here, end, (PinPlace(item), pin))
         _add(self.ins, item, pin)
         if wire.index is not None:
             self.parts[item, pin] = wire.part

@@ -8,9 +8,9 @@ from html import escape
 from pathlib import Path
 
 from ...blocks.core import OptionError, Sum, accepts, check_file, explain_calls, kinds, near, write_text
-from ..wiring import CheckedDiagram, Structure, stepped_blocks
+from ..wiring import Structure, stepped_blocks
 from .layout import Net, arrange
-from .nets import Border, Nets, Place
+from .nets import Border, Nets, PinPlace
 from .order import Node, Pin
 from .shapes import BORDER, GREY, INK, NAME, PLANT, WIRE, line, rect, seconds, text_at, width
 
@@ -58,13 +58,15 @@ class Drawing:
 
 
 @accepts(subsystem=kinds.text, closed=kinds.either(kinds.flag, kinds.names))
-def draw(diagram: CheckedDiagram, *, subsystem: str = "", closed: bool | Iterable[str] | None = None) -> str:
+def draw(table: Structure, name: str, *, subsystem: str = "", closed: bool | Iterable[str] | None = None) -> str:
     """Return the drawing of a diagram, or of the inside of one of its subsystems, as SVG.
 
     Parameters
     ----------
-    diagram : CheckedDiagram
-        The diagram.
+    table : Structure
+        The diagram's blocks and wires.
+    name : str
+        The diagram's name.
     subsystem : str
         Path of the subsystem whose inside is drawn; the whole diagram without it.
     closed : bool or list of str, optional
@@ -75,14 +77,13 @@ def draw(diagram: CheckedDiagram, *, subsystem: str = "", closed: bool | Iterabl
     OptionError
         If a path stands for no subsystem.
     """
-    table = diagram.structure
     paths = [path for path in table.subsystems if path]
-    shut = _find_closed(table, subsystem, closed, diagram=diagram.name)
+    shut = _find_closed(table, subsystem, closed, diagram=name)
     if subsystem not in table.subsystems:
         raise OptionError(
-            f"there is no subsystem {subsystem!r}. {near(subsystem, paths)}", block=diagram.name, port="subsystem"
+            f"there is no subsystem {subsystem!r}. {near(subsystem, paths)}", block=name, port="subsystem"
         )
-    return _Picture(table, shut - {subsystem}).page(subsystem, subsystem or diagram.name)
+    return _Picture(table, shut - {subsystem}).page(subsystem, subsystem or name)
 
 
 def _find_closed(table: Structure, subsystem: str, closed: bool | Iterable[str] | None, *, diagram: str) -> set[str]:
@@ -163,7 +164,7 @@ class _Picture:
             nodes[-1].plant = self._has_plant(path)
         borders = []
         if subsystem:
-            entering, leaving = Place(subsystem, Border.INPUTS), Place(subsystem, Border.OUTPUTS)
+            entering, leaving = PinPlace(subsystem, Border.INPUTS), PinPlace(subsystem, Border.OUTPUTS)
             borders = [
                 Node(entering.key(n), 0, 0, {}, {n: 0.0}, -1) for n in self.nets.ins.get(subsystem, []) if not n.control
             ]

@@ -364,13 +364,17 @@ class Domains:
     def count(self, t: float, x: np.ndarray, fired: np.ndarray) -> None:
         """Note that events fired; raise if they pile up: chattering, Zeno behaviour, or a rest in contact."""
         self.search.fresh = True
+        self.limits.count(t, fired, lambda: self._change(t, x))
 
-        def change() -> tuple[float, np.ndarray]:
-            h = self.spacing
-            z, _ = self._many(np.array([t, t]), np.array([x, x + h * self._rates(t, x)]))
-            return h, np.abs(z[1] - z[0])
+    def chatters(self, t: float, x: np.ndarray) -> SimulationError:
+        """Return the error of events that chatter at t, in s, and the continuous states x."""
+        return self.limits.chatters(t, *self._change(t, x))
 
-        self.limits.count(t, fired, change)
+    def _change(self, t: float, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return a time in s, and by how much the indicators change in it."""
+        h = self.spacing
+        z, _ = self._many(np.array([t, t]), np.array([x, x + h * self._rates(t, x)]))
+        return h, np.abs(z[1] - z[0])
 
     def too_many(self, t: float, fired: np.ndarray) -> SimulationError:
         """Return the error of events that fire each other at one instant for ever."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from ...blocks.core import SimulationError
 from ..flat import FlatEvent
 
-_CHATTER, _SPAN = 500, 1e-8  # so many events within so many seconds (relative to 1 + |t|)
+CHATTER, _SPAN = 500, 1e-8  # so many events within so many seconds (relative to 1 + |t|)
 _ZENO, _SHRUNK = 8, 1e-6  # intervals that shrink from one to the next, down to this part of the largest one
 _RESOLVED = 1e3  # ulps of the time, above which intervals are no matter of rounding
 _SLIDES = 10  # events in a row, by which a fixed step knows a sliding mode
@@ -28,7 +28,9 @@ class EventLimits:
         self.events = events
         self._times = [deque[float](maxlen=_ZENO + 1) for _ in events]
         self._largest = np.zeros(len(events))
-        self._recent = deque[tuple[float, tuple[int, ...]]](maxlen=_CHATTER)
+        self._instants = 0
+        self._recent = np.zeros(CHATTER), np.zeros((CHATTER, len(events)), dtype=np.uint8)
+        """Rings of the times in s at which any event has fired last, and which did; ``_instants`` were written."""
         self._side = np.zeros(len(events), dtype=int)
         """The side from which each indicator on the border is held: 1, −1; 0 for none."""
         self._stuck = np.zeros(len(events), dtype=int)
@@ -73,7 +75,7 @@ class EventLimits:
         in_a_row = self._brief_at[i] <= t <= self._brief_at[i] + _APART * spacing
         self._briefs[i], self._brief_at[i] = (self._briefs[i] + 1 if in_a_row else 1), t
         if self._briefs[i] >= _BRIEFS:
-            raise self._rests(t, i, int(self._briefs[i]))
+            raise self.rests_in_contact(t, i, int(self._briefs[i]))
 
     # --- counts ------------------------------------------------------------------------------------------------------
 
@@ -92,17 +94,23 @@ class EventLimits:
         """
         for i in np.flatnonzero(fired):
             if self._stuck[i] >= _RESTS:
-                raise self._rests(t, int(i), _RESTS)
+                raise self.rests_in_contact(t, int(i), _RESTS)
             times = self._times[i]
             if times:
                 self._largest[i] = max(self._largest[i], t - times[-1])
             times.append(t)
             self._look_for_zeno(int(i))
-        self._recent.append((t, tuple(np.flatnonzero(fired).tolist())))
-        if len(self._recent) == _CHATTER and t - self._recent[0][0] < _SPAN * (1.0 + abs(t)):
-            raise self._chatters(t, *change())
+        times_ring, which = self._recent
+        times_ring[self._instants % CHATTER], which[self._instants % CHATTER] = t, fired
+        self._instants += 1
+        if self._instants >= CHATTER and t - self._first_of_recent() < _SPAN * (1.0 + abs(t)):
+            raise self.chatters(t, *change())
 
-    def _rests(self, t: float, i: int, times: int) -> SimulationError:
+    def _first_of_recent(self) -> float:
+        return float(self._recent[0][self._instants % CHATTER])
+
+    def rests_in_contact(self, t: float, i: int, times: int) -> SimulationError:
+        """Return the error of event ``i``, which has led back into contact so many times in a row."""
         event = self.events[i]
         return SimulationError(
             f"the event {event.name!r} rests in contact: its jump leaves its indicator at zero, and the motion leads "
@@ -115,21 +123,23 @@ class EventLimits:
 
     def slides(self, span: float) -> FlatEvent | None:
         """Return the event of which a few have just fired within so many seconds; None where that is not so."""
-        latest = list(self._recent)[-_SLIDES:]
-        if len(latest) < _SLIDES or latest[-1][0] - latest[0][0] > span or self._stuck.any():
+        times, n = self._recent[0], self._instants
+        if n < _SLIDES or times[(n - 1) % CHATTER] - times[(n - _SLIDES) % CHATTER] > span or self._stuck.any():
             return None
-        return self._most_of(latest)
+        return self._most_of(_SLIDES)
 
-    def _most_of(self, latest: Iterable[tuple[float, tuple[int, ...]]]) -> FlatEvent:
-        return self.events[int(np.argmax(np.bincount([i for _, together in latest for i in together])))]
+    def _most_of(self, instants: int) -> FlatEvent:
+        rows = [k % CHATTER for k in range(self._instants - instants, self._instants)]
+        return self.events[int(np.argmax(self._recent[1][rows].sum(axis=0, dtype=int)))]
 
-    def _chatters(self, t: float, h: float, change: np.ndarray) -> SimulationError:
-        event = self._most_of(self._recent)
+    def chatters(self, t: float, h: float, change: np.ndarray) -> SimulationError:
+        """Return the error of events that chatter, whose indicators change by so much in a time of h, in s."""
+        event = self._most_of(CHATTER)
         size = float(change[list(self.events).index(event)])
         told = f"of {size:.1g} it would switch about every {2.0 * h:.2g} s" if 0.0 < size < np.inf else "it would go on"
         return SimulationError(
-            f"the event {event.name!r} chatters: {_CHATTER} times events fired within "
-            f"{t - self._recent[0][0]:.2g} s, so the run would not go on. "
+            f"the event {event.name!r} chatters: {CHATTER} times events fired within "
+            f"{t - self._first_of_recent():.2g} s, so the run would not go on. "
             "What it switches drives the indicator back across zero at once (a sliding mode). Declare a hysteresis; "
             f"with one {told}. In a block of your own that is Event(hysteresis=…), in a Relay its off_point below its "
             "on_point, which takes the place of a Compare, too. Or take a fixed step: solver='rk4'.",
@@ -146,16 +156,22 @@ class EventLimits:
             return
         r = float((intervals[-1] / intervals[0]) ** (1.0 / (len(intervals) - 1)))
         if r < 0.9999 and np.all(intervals[1:] < 1.5 * intervals[:-1]):  # by one ratio, but for what the solver adds
-            event, t = self.events[i], times[-1]
-            limit = t + intervals[-1] * r / (1.0 - r)
-            raise SimulationError(
-                f"the event {event.name!r} shows Zeno behaviour: it fires at intervals that shrink by {r:.4g} each "
-                f"time, the last one {intervals[-1]:.2g} s, and would fire infinitely often before t = {limit:.9g} s. "
-                "Give the model a state of rest: let its jump stop the motion below a small speed, or end the run "
-                "before.",
-                block=event.path,
-                t=t,
-            )
+            raise self.shows_zeno(i)
+
+    def shows_zeno(self, i: int) -> SimulationError:
+        """Return the error of event ``i``, which fires at intervals that shrink by one ratio."""
+        event, times = self.events[i], self._times[i]
+        t, intervals = times[-1], np.diff(np.array(times))
+        r = float((intervals[-1] / intervals[0]) ** (1.0 / (len(intervals) - 1)))
+        limit = t + intervals[-1] * r / (1.0 - r)
+        return SimulationError(
+            f"the event {event.name!r} shows Zeno behaviour: it fires at intervals that shrink by {r:.4g} each "
+            f"time, the last one {intervals[-1]:.2g} s, and would fire infinitely often before t = {limit:.9g} s. "
+            "Give the model a state of rest: let its jump stop the motion below a small speed, or end the run "
+            "before.",
+            block=event.path,
+            t=t,
+        )
 
     def endless(self, t: float, fired: np.ndarray, rounds: int) -> SimulationError:
         """Return the error of events that fire each other at one instant for ever."""
@@ -173,13 +189,13 @@ class EventLimits:
         """Return what is needed to go on from here."""
         times = [list(d) for d in self._times]
         rest = self._side.copy(), self._stuck.copy(), self._briefs.copy(), self._brief_at.copy()
-        return times, self._largest.copy(), list(self._recent), rest
+        return times, self._largest.copy(), (self._instants, *(ring.copy() for ring in self._recent)), rest
 
     def restore(self, saved: Any) -> None:
         """Go back to what `save` returned."""
-        times, largest, recent, rest = saved
+        times, largest, (self._instants, *rings), rest = saved
+        self._recent = rings[0].copy(), rings[1].copy()
         self._largest = largest.copy()
         self._side, self._stuck, self._briefs, self._brief_at = (part.copy() for part in rest)
         self.holds = bool(self._side.any())
         self._times = [deque(d, maxlen=_ZENO + 1) for d in times]
-        self._recent = deque(recent, maxlen=_CHATTER)

@@ -6,7 +6,6 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
-from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -19,7 +18,6 @@ SIZES = (8, 16, 32, 64)
 """Instants in one call; results of those beyond the ones asked for are left."""
 _MOST_SCANNED = 16
 """Most events that are scanned over a step in one call."""
-_MADE: WeakKeyDictionary[FlatDiagram, dict[tuple[int, int], tuple[Any, Any]]] = WeakKeyDictionary()
 
 
 class Instant(Protocol):
@@ -63,7 +61,7 @@ class ManyInstants:
     def __init__(self, flat: FlatDiagram, at: Instant, time_at: Callable[[float], float]):
         self._function, self._x, self._w, self._p = flat.indicators.last.fast, at.x, at.w, at.p
         self._time_at, where = time_at, flat.continuous
-        self._made = _MADE.setdefault(flat.origin, {})
+        self._made: dict[tuple[int, int], tuple[Any, Any]] = flat.made["indicators of several instants"]
         together = where.size > 0 and where[-1] - where[0] == where.size - 1
         self._where: slice | np.ndarray = slice(int(where[0]), int(where[-1]) + 1) if together else where
         self._states, self._events = where.size, self._function.numel_out(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ..flat import FlatEvent
 from .domains import Domains
 
 _PART = 1e-9  # of a step, within which a few events in a row are a sliding mode
@@ -34,6 +35,10 @@ class Sliding:
         if event is None:
             return ()
         self.active = True
+        return self.tell(event, t)
+
+    def tell(self, event: FlatEvent, t: float) -> tuple[str, ...]:
+        """Return what is to be told of an event that waits for the ends of steps from t on, in s; once for each."""
         name = f"{event.path}.{event.name}"
         if name in self._told:
             return ()

@@ -25,7 +25,8 @@ Values = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
 class ExchangedBlock(Protocol):
     """A block whose equations a run evaluates; see `loopwright.fmus.calls.ExchangeInstance`.
 
-    States and inputs are flat, in the order of the block's.
+    States and inputs are flat, in the order of the block's. A protocol: the instances come from the room `fmus`, which
+    this sub-package doesn't know, or from users.
     """
 
     is_trial: bool
@@ -108,7 +109,7 @@ class ExchangedBlock(Protocol):
 
 
 class Exchangeable(Protocol):
-    """A block whose class says ``evaluated_outside``."""
+    """A block whose class says ``evaluated_outside``: an `Fmu`, or one that a user has written."""
 
     def exchange(self, wired: Sequence[str], *, start_time: float) -> AbstractContextManager[ExchangedBlock]:
         """Load it for a run; see `loopwright.blocks.Block`."""
@@ -183,7 +184,7 @@ class ExchangeEvaluator:
         return wanted
 
     def bind(self, names: tuple[str, ...], vectors: EvaluationVectors, *, again: bool) -> Callable[[], None]:
-        """Return `evaluate` bound to vectors; see `loopwright.diagrams.flat.stages.BindingEvaluator`."""
+        """Return `evaluate` bound to vectors; see `loopwright.diagrams.flat.stages.Evaluator.bind`."""
         if names == (JUMP,):
             t, x, u, into = vectors
 

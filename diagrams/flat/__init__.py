@@ -3,7 +3,7 @@
 from ...blocks.core import Layout
 from .announced import Announcer, Times, announcers
 from .clock_sets import is_exact, kinds_of
-from .clocks import EVERY, NONE, ClockSets, TickPattern, bits_of, ticks_after
+from .clocks import EVERY, NONE, ClockSets, TickPattern, ticks_after
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator, sort_names
 from .fast_functions import share_terms
 from .flat_diagram import EXACT_LOOP, FlatDiagram
@@ -57,7 +57,6 @@ __all__ = [
     "WiredDiagram",
     "announcers",
     "bind_function",
-    "bits_of",
     "evaluate",
     "evaluate_apart",
     "indicators_of",

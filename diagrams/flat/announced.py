@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping
-from typing import Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -18,13 +17,6 @@ from ...blocks.core import Block, Constant, Gain, Sum, move_earlier, right_of
 from ...blocks.library import Clock
 from ...blocks.tracing import Line, size, switching_times
 from .flat_diagram import FlatDiagram
-
-
-class Announcer(Protocol):
-    """Whatever knows the next instant at which a block is not smooth in time."""
-
-    def next_instant(self, t: float) -> float:
-        """Return the first one after t, in s; infinity if there is none."""
 
 
 class Times:
@@ -47,6 +39,9 @@ class Times:
         i = bisect_right(self._from, t)
         return self.times[i] if i < len(self.times) else math.inf
 
+
+Announcer = Block | Times
+"""Source of instants at which a block is not smooth in time: the block itself, or instants known from the start."""
 
 _KNOWN: WeakKeyDictionary[FlatDiagram, list[tuple[str, Announcer]]] = WeakKeyDictionary()
 

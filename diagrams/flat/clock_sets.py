@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import lru_cache
+
 import numpy as np
 
-from .clocks import TickPattern, bits_of
+from .clocks import TickPattern
 from .layout import FlatLayout
 
 _EXACT = 2**53  # up to which every integer is a float64
-_MOST_TICKS = 2**20
+_MOST_TICKS, _MOST_SETS = 2**20, 256
+_AT_ONCE = 32  # clocks whose bits are looked at together
 
 
 def is_exact(flat: FlatLayout, last: int) -> bool:
@@ -17,10 +21,20 @@ def is_exact(flat: FlatLayout, last: int) -> bool:
 
 
 def kinds_of(flat: FlatLayout, *, every: bool) -> list[frozenset[TickPattern]]:
-    """Return the sets of clocks that act together at some tick, as far as they are found in the first million."""
-    clocks = flat.distinct
-    period = int(np.lcm.reduce([1, *(clock.every for clock in clocks)]))
+    """Return the sets of clocks that act together at some of the first million ticks; of very many the commonest."""
+    return [acting for acting in _sets_of(flat.distinct) if acting or every or not flat.distinct]
+
+
+@lru_cache(maxsize=64)
+def _sets_of(clocks: Sequence[TickPattern]) -> list[frozenset[TickPattern]]:
+    period = int(np.lcm.reduce([1, *(clock.every for clock in clocks)], dtype=object))
     ticks = np.arange(min(max((clock.offset for clock in clocks), default=0) + period + 1, _MOST_TICKS))
-    masks = np.unique(bits_of(clocks, ticks)).tolist()
-    found = [frozenset(c for i, c in enumerate(clocks) if mask >> i & 1) for mask in masks]
-    return [acting for acting in found if acting or every or not clocks]
+    group = np.zeros(len(ticks), dtype=np.int64)  # ticks at which the same clocks act, from the last clock on
+    for end in range(len(clocks), 0, -_AT_ONCE):
+        bits = group << _AT_ONCE
+        for i, clock in enumerate(clocks[max(0, end - _AT_ONCE) : end]):
+            bits |= clock.among(ticks).astype(np.int64) << i
+        group = np.unique(bits, return_inverse=True)[1]
+    _, first, count = np.unique(group, return_index=True, return_counts=True)
+    commonest = np.sort(np.argsort(-count, kind="stable")[:_MOST_SETS])
+    return [frozenset(c for c in clocks if c.acts(k)) for k in ticks[first[commonest]].tolist()]

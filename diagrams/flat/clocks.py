@@ -71,31 +71,38 @@ def in_order(clocks: frozenset[TickPattern] | set[TickPattern]) -> tuple[TickPat
 class ClockSets:
     """Numbers of sets of clocks that act together.
 
+    The sets are a tree that branches at each clock: to sets in which it acts, and to those in which it doesn't. So
+    there may be any number of clocks.
+
     Parameters
     ----------
     clocks : sequence of TickPattern
-        All clocks; at most some 20.
+        All clocks.
     sets : mapping of frozenset of TickPattern to int
-        The number of each set.
-    other : int
-        Number of all other sets.
+        The number of each set, from 0 on; all others have the number -1.
     """
 
-    def __init__(self, clocks: Sequence[TickPattern], sets: Mapping[frozenset[TickPattern], int], other: int = -1):
+    def __init__(self, clocks: Sequence[TickPattern], sets: Mapping[frozenset[TickPattern], int]):
         self._clocks = tuple(clocks)
-        self._numbers = np.full(1 << len(self._clocks), other, dtype=np.int32)
+        self._branches: list[np.ndarray] = []
+        nodes: dict[tuple[bool, ...], int] = {(): 0}  # of each level, by whether the clocks so far act
+        for i in range(len(self._clocks)):
+            following: dict[tuple[bool, ...], int] = {}
+            for acting in sets:
+                following.setdefault(tuple(c in acting for c in self._clocks[: i + 1]), len(following))
+            branches = np.full((len(nodes) + 1, 2), len(following), dtype=np.int32)  # the last node leads to no set
+            for path, node in following.items():
+                branches[nodes[path[:-1]], int(path[-1])] = node
+            self._branches.append(branches)
+            nodes = following
+        self._numbers = np.full(len(nodes) + 1, -1, dtype=np.int32)
         for acting, number in sets.items():
-            self._numbers[sum(1 << i for i, clock in enumerate(self._clocks) if clock in acting)] = number
+            self._numbers[nodes[tuple(c in acting for c in self._clocks)]] = number
 
     def at(self, ticks: np.ndarray) -> np.ndarray:
         """Return the number of the set that acts at each of some ticks."""
-        found: np.ndarray = self._numbers[bits_of(self._clocks, ticks)]
+        node = np.zeros(len(ticks), dtype=np.int32)
+        for clock, branches in zip(self._clocks, self._branches, strict=True):
+            node = branches[node, clock.among(ticks).view(np.int8)]
+        found: np.ndarray = self._numbers[node]
         return found
-
-
-def bits_of(clocks: Sequence[TickPattern], ticks: np.ndarray) -> np.ndarray:
-    """Return which clocks act at each of some ticks, one bit a clock."""
-    bits = np.zeros(len(ticks), dtype=np.int64)
-    for i, clock in enumerate(clocks):
-        bits |= clock.among(ticks).astype(np.int64) << i
-    return bits

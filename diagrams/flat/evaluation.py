@@ -23,7 +23,7 @@ from .logic import choose, is_true, logic_and, logic_not, logic_or, to_number
 from .program import Cells
 
 INDICATORS, JUMP = "indicators", "jump"
-"""Names of the equations of a block's events, beside its outputs, `NEXT` and `GUARDS`."""
+"""Names of the equations of a block's events, next to its outputs, `NEXT` and `GUARDS`."""
 
 Apart = Callable[["Instant", str, tuple[str, ...], Any, Sequence[Any]], list[Any]]
 """Evaluates a block from outside: called with the instant, the block's path, the names of the equations that are
@@ -53,7 +53,7 @@ def evaluate(
     Parameters
     ----------
     layout : FlatLayout
-        Where everything stands.
+        Places of everything in the vectors.
     functions : BlockFunctions
         The functions of the blocks.
     acting : frozenset of TickPattern
@@ -345,7 +345,7 @@ class Instant:
         return state
 
     def _resets(self, subsystem: str) -> bool:
-        """Whether states may start anew at this instant because a subsystem, not by an event, is enabled."""
+        """Whether states may be reset at this instant because a subsystem, not by an event, is enabled."""
         settings = self.layout.table.subsystems[subsystem]
         return settings.when == "reset" and (subsystem, "enable") not in self._events and self._acts(subsystem)
 

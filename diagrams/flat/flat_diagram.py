@@ -1,6 +1,6 @@
 """A flattened diagram: its layout with its functions, each traced once, when it is first asked for.
 
-From the bottom up: `layout` says where everything stands, `evaluate` evaluates all blocks at an instant, `functions`
+From the bottom up: `layout` says where everything is, `evaluate` evaluates all blocks at an instant, `functions`
 makes schedules of it (`stages`), and the `FlatDiagram` keeps them. They are what is run, differentiated and compiled.
 Nothing in it changes but these caches: a run has its own vectors, of parameters too.
 """
@@ -8,6 +8,7 @@ Nothing in it changes but these caches: a run has its own vectors, of parameters
 from __future__ import annotations
 
 import copy
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -135,7 +136,7 @@ class FlatDiagram(FlatLayout):
         return WeakValueDictionary()
 
     def part_program(self, name: str) -> PartProgram:
-        """Return "flow", "indicators" or "jump" as calls of block functions, for grouped code."""
+        """Return "flow", "indicators", "jump" or "driven" as calls of block functions, for grouped code."""
         if name == "flow":  # the blocks are gone through once for the tick at which no clock acts, and for this
             tick = self.program_at(NONE)
             assert tick.rates is not None
@@ -240,6 +241,15 @@ class FlatDiagram(FlatLayout):
     @_shared
     def _kept(self) -> dict[Any, Any]:
         return {}
+
+    @_shared
+    def made(self) -> defaultdict[str, dict[Any, Any]]:
+        """Return what others have made of its functions to run them, by kind and by their own keys.
+
+        It stands here, and not in tables of theirs with weak keys: what is made often refers to the diagram, which such
+        a table would then keep for ever.
+        """
+        return defaultdict(dict)
 
     def pack(self, path: str, block: Block) -> np.ndarray:
         """Return the entries of p of a block if it had the parameters of another one, of equal structure."""

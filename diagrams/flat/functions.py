@@ -74,8 +74,10 @@ def trace_tick(
         if keep is not None:
             keep((symbols, rates(instant)))
         found = {"x_next": next_x(instant), "z": plant_inputs(instant), "log": log(instant)}
-        counted = {**found, "log": _without(found["log"], layout.unread_entries)}
-        sizes = (ca.norm_1(counted[name]) for name in ("log", "x_next", "z") if counted[name].numel())
+        counted = [_without(found["log"], layout.unread_entries), found["x_next"], found["z"]]
+        if instant.mismatch:  # a block in a loop may fail: its own value isn't recorded, and the residual hides NaN
+            counted.append(loop_mismatch(instant))
+        sizes = (ca.norm_1(column) for column in counted if column.numel())
         ok = sum(sizes, ca.MX(0.0)) <= LARGEST  # false for any NaN or infinity
         if instant.guards:
             ok = ca.logic_and(ok, ca.mmin(ca.vertcat(*instant.guards) > 0))
@@ -237,7 +239,7 @@ def _let_fire(instant: Instant) -> None:
 
 @without_collection
 def trace_part_program(layout: FlatLayout, functions: BlockFunctions, name: str) -> PartProgram:
-    """Return "indicators" or "jump" as a program; a jump takes which events fire as a further argument."""
+    """Return "indicators", "jump" or "driven" as a program; a jump takes which events fire as a further argument."""
     fires = name == "jump"
     sizes = (layout.width, layout.plant_outputs.total, layout.parameters.total)
     program = Program(sizes, len(layout.events) if fires else 0)
@@ -245,6 +247,8 @@ def trace_part_program(layout: FlatLayout, functions: BlockFunctions, name: str)
     instant = evaluate(layout, functions, NONE, program.t, program.x, program.w, program.p, fired=fired)
     if name == "indicators":
         return PartProgram.of(program, *map(program.join, indicators_of(instant)))
+    if name == "driven":
+        return PartProgram.of(program, plant_inputs(instant))
     _let_fire(instant)
     return PartProgram.of(program, program.join([next_x(instant)]))
 

@@ -1,8 +1,8 @@
-"""The layout of a flattened diagram: where everything stands in its vectors, and when it acts. Pure data.
+"""The layout of a flattened diagram: the place of everything in its vectors, and when it acts. Pure data.
 
 A flattened diagram has five vectors: ``x``, the states of all blocks and whatever else is kept from one instant to the
 next; ``w``, the outputs of what is stepped from outside (FMUs, transport delays); ``z``, its inputs; ``p``, the
-parameters; and ``log``, all outputs. A `FlatLayout` says where each thing stands in them, holds their start values, and
+parameters; and ``log``, all outputs. A `FlatLayout` says where each thing is in them, holds their start values, and
 lists the clocks, the events and the order of evaluation. It knows no CasADi and can be pickled: what runs the diagram
 in another process, or in compiled code, needs this and the functions.
 """
@@ -25,7 +25,7 @@ from .plant_ticks import find_plant_ticks, takes_any_step
 
 @dataclass(frozen=True, repr=False)
 class StateLayout(Layout):
-    """Where the states of blocks stand: by the block's path, and within a block by the state's name.
+    """Where the states of blocks are: by the block's path, and within a block by the state's name.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class FlatEvent:
 @explain_calls
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FlatLayout:
-    """Where everything of a flattened diagram stands, and when it acts.
+    """Where everything of a flattened diagram is, and when it acts.
 
     Attributes
     ----------
@@ -84,12 +84,12 @@ class FlatLayout:
     clocks : dict
         For every subsystem that is sampled: at which ticks it acts.
     states : StateLayout
-        Where the states of the blocks stand in x: by block, and by state.
+        Where the states of the blocks are in x: by block, and by state.
     held, gates, starts, loops : Layout
-        Where the other parts of x stand: outputs that are held, what enabled and triggered subsystems remember of
+        Where the other parts of x are: outputs that are held, what enabled and triggered subsystems remember of
         their control, start values of states that are reset, the last solution of algebraic loops.
     plant_outputs, plant_inputs, parameters, log : Layout
-        Where things stand in w, z, p and log.
+        Where things are in w, z, p and log.
     continuous : ndarray of int
         The entries of x that are integrated.
     events : tuple of FlatEvent
@@ -134,7 +134,7 @@ class FlatLayout:
 
     @cached_property
     def unread(self) -> dict[str, slice]:
-        """Where outputs of FMUs that nothing reads stand in the log, by dotted path: these alone may be no numbers.
+        """Where outputs of FMUs that nothing reads are in the log, by dotted path: these alone may be no numbers.
 
         Readers are wires and what enables or triggers subsystems; a name of a wire, and the record, are none.
         """

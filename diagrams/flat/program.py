@@ -16,7 +16,8 @@ import numpy as np
 Ids = range | tuple[int, ...]
 
 COPY, TRUE_OF, AND, OR, NOT, CHOOSE, LESS = "copy", "is_true", "and", "or", "not", "choose", "less_true"
-"""Operations on single values, beside the calls of block functions."""
+"""Operations on single values, next to the calls of block functions."""
+_NOTHING = range(0)
 
 
 class Cells:
@@ -44,7 +45,8 @@ class Operation:
     kernel : int or str
         Key of the function in `Program.functions`, or one of the operations on single values.
     arguments, results : tuple of range
-        The values that it takes and makes, one range for each column; those of an argument may be empty.
+        The values that it takes and makes, one range for each column; those of an argument may be empty. The first
+        argument is the time, the last one the parameters; operations on single values have neither.
     """
 
     kernel: int | str
@@ -67,7 +69,7 @@ class Program:
     constants : dict
         Numbers by the value that holds them.
     columns : list of range
-        Values that stand one behind the other.
+        Consecutive values.
     """
 
     widths: tuple[int, int, int]
@@ -123,8 +125,8 @@ class Program:
         ids = [self.ids(column) for column in columns]
         made = self._make(max(map(len, ids)))
         for i, result in enumerate(made):
-            given = tuple(self._one(part[i if len(part) > 1 else 0]) for part in ids)
-            self.operations.append(Operation(name, given, (self._one(result),)))
+            given = [self._one(part[i if len(part) > 1 else 0]) for part in ids]
+            self.operations.append(Operation(name, (_NOTHING, *given, _NOTHING), (self._one(result),)))
         return Cells(self, made)
 
     @staticmethod
@@ -132,7 +134,7 @@ class Program:
         return range(value, value + 1)
 
     def _together(self, ids: Ids) -> range:
-        """Return values that stand one behind the other: these, or copies of them."""
+        """Return these values, or copies of them, as consecutive ones."""
         if isinstance(ids, range):
             return ids
         copied = self.apply(COPY, Cells(self, ids)).ids
@@ -145,7 +147,7 @@ class Program:
 
 
 def as_ids(values: Iterable[int]) -> Ids:
-    """Return values as a range where they stand one behind the other."""
+    """Return values as a range where they are consecutive."""
     found = tuple(values)
     first = found[0] if found else 0
     whole = range(first, first + len(found))

@@ -5,17 +5,17 @@ evaluated from outside, by a library in C or by Python. Such a block splits the 
 
     traced stage       one CasADi function of (t, x, w, p, c): everything between two blocks that are evaluated from
                        outside. It writes a part of c, the last one the results.
-    opaque stage       one block, called with its states and inputs, which stand in c; it writes its outputs, or the
+    opaque stage       one block, called with its states and inputs, which are in c; it writes its outputs, or the
                        rates of its states, into c.
 
-The vector ``c`` carries what later stages need. A block whose outputs do not depend on an input stands in two stages:
+The vector ``c`` carries what later stages need. A block whose outputs do not depend on an input is in two stages:
 its outputs come first, its rates when the input is known, as in the order of evaluation.
 
 A `Schedule` without an opaque stage has exactly one stage, and that is an ordinary CasADi function: every diagram of
 traced blocks is evaluated in this way. The total derivative of a schedule is the chain rule over its stages
 (`loopwright.diagrams.flat.total_derivative`).
 
-Two uses stand on this:
+Two uses build on this:
 
 - *Model exchange.* The outputs and rates of such an FMU depend on the state that a solver tries, so that it is
   evaluated within the flow, the outputs and the indicators. Its instance is an `Evaluator`: fmi3SetTime,
@@ -34,7 +34,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
@@ -45,7 +45,10 @@ from .fast_functions import share_terms, speed_up
 
 
 class Evaluator(Protocol):
-    """Evaluates a block from outside of the traced functions; its parameters are its own."""
+    """Evaluates a block from outside of the traced functions; its parameters are its own.
+
+    A protocol: evaluators in runs and in linear models belong to sub-packages above this one.
+    """
 
     def evaluate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Return the equations that are wanted, one after the other, flat.
@@ -70,13 +73,8 @@ class Evaluator(Protocol):
         """
         ...
 
-
-@runtime_checkable
-class BindingEvaluator(Protocol):
-    """Evaluator that can be bound to vectors, so that a call costs no copies."""
-
     def bind(self, names: tuple[str, ...], vectors: EvaluationVectors, *, again: bool) -> Callable[[], None]:
-        """Return the call that reads and writes these vectors as `Evaluator.evaluate` does arguments and result.
+        """Return the call that reads and writes these vectors as `evaluate` does its arguments and its result.
 
         Parameters
         ----------
@@ -99,7 +97,7 @@ class TracedStage:
     name : str
         Name of its function.
     arguments : tuple of MX
-        Symbols of the schedule's arguments; behind them that of c, where something is carried.
+        Symbols of the schedule's arguments; behind them that of c, where there is something to pass on.
     results : tuple of MX
         Expressions of these: of the part of c that it makes; of the last stage the schedule's results.
     function : casadi.Function
@@ -140,7 +138,7 @@ class OpaqueStage:
     names : tuple of str
         The equations that are wanted of it; see `Evaluator.evaluate`.
     states, inputs : slice
-        Where its states and inputs stand in c.
+        Where its states and inputs are in c.
     makes : slice
         Which part of c it makes.
     has_parameters : bool
@@ -196,7 +194,7 @@ class Schedule:
     stages : tuple of TracedStage and OpaqueStage
         In the order in which they are evaluated.
     width : int
-        Number of entries of c, which is carried from stage to stage.
+        Number of entries of c, which is passed from stage to stage.
     """
 
     name: str
@@ -263,7 +261,7 @@ class Schedule:
         Parameters
         ----------
         arguments : sequence of ndarray
-            The vectors from which it is evaluated; what stands in them at the time of the call counts.
+            The vectors from which it is evaluated; their values at the time of the call count.
         results : sequence of ndarray, optional
             The vectors into which it is evaluated; new ones without them.
         evaluators : mapping, optional
@@ -276,7 +274,8 @@ class Schedule:
         for stage in self.stages:
             if isinstance(stage, OpaqueStage):
                 evaluator = stage.evaluator(evaluators or {})
-                calls.append(_call_of(stage, evaluator, arguments[0], c, again=stage.path in paths))
+                bound = evaluator.bind(stage.names, stage.vectors(arguments[0], c), again=stage.path in paths)
+                calls.append(bound)
                 paths.add(stage.path)
             else:
                 into = results if stage is self.last else [c[stage.makes]]
@@ -321,7 +320,7 @@ class Bound:
     call : callable
         Evaluates it: from the vectors that it is bound to, into ``outputs``.
     outputs : list of ndarray
-        One for each result; matrices stand in columns, one after the other.
+        One for each result; matrices column by column.
     """
 
     def __init__(self, call: Callable[[], None], outputs: list[np.ndarray], kept: Any = None):
@@ -374,14 +373,6 @@ def _depends(stage: TracedStage, i: int, k: int, of_c: np.ndarray) -> np.ndarray
 
     found = pattern(k)
     return found if not len(of_c) else found | (pattern(len(stage.arguments) - 1) @ of_c)
-
-
-def _call_of(
-    stage: OpaqueStage, evaluator: Evaluator, t: np.ndarray, c: np.ndarray, *, again: bool
-) -> Callable[[], None]:
-    if isinstance(evaluator, BindingEvaluator):
-        return evaluator.bind(stage.names, stage.vectors(t, c), again=again)
-    return lambda: stage.run(evaluator, t, c)
 
 
 def _one_after_the_other(calls: Sequence[Callable[[], None]]) -> Callable[[], None]:

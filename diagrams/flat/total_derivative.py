@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from ...blocks.core import Layout, ParameterError
+from ...blocks.tracing import differentiate, extrapolate
 from .fast_functions import speed_up
 from .stages import Bound, Evaluator, Evaluators, OpaqueStage, Schedule, TracedStage, bind_function, call_function
 
 By = tuple[str, Sequence[int] | None]
 """An argument of a schedule, and the entries by which it is differentiated; None for all."""
 
-_STEP = float(np.cbrt(np.finfo(float).eps))  # of a difference; the same as of blocks in users' own Python
+_FORWARD = 0.1 * float(np.cbrt(np.finfo(float).eps))
+"""Step of a forward difference by time, relative to it."""
 ALONG = 2.0**-11
 """Step of a difference of fourth order, relative to 1 + the size of what moves."""
 
@@ -182,7 +184,7 @@ class Derivative:
 
         near, far = difference(ALONG), difference(2.0 * ALONG)
         error = max((float(np.max(np.abs(a - b), initial=0.0)) for a, b in zip(near, far, strict=True)), default=0.0)
-        return values, [(4.0 * a - b) / 3.0 for a, b in zip(near, far, strict=True)], error
+        return values, [extrapolate(a, b) for a, b in zip(near, far, strict=True)], error
 
     def bind(
         self,
@@ -205,7 +207,7 @@ class Derivative:
 
 
 def size_of_motion(value: np.ndarray, slope: np.ndarray) -> float:
-    """Return the largest slope, relative to 1 + the size of the value; entries that stand may be no numbers."""
+    """Return the largest slope, relative to 1 + the size of the value; entries that do not move may be no numbers."""
     moves = slope != 0.0
     return float(np.max(np.abs(slope[moves]) / (1.0 + np.abs(value[moves])), initial=0.0))
 
@@ -217,7 +219,7 @@ def _slope(expression: Any, symbol: Any, entries: Sequence[int] | None) -> Any:
 
 def _forward_by_time(stage: OpaqueStage, evaluator: Evaluator, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Return the derivative of a block by time, by forward differences of third order: an event may lie just before."""
-    h = 0.1 * _STEP * max(abs(t), 1.0)
+    h = _FORWARD * max(abs(t), 1.0)
     f = [np.array(evaluator.evaluate(stage.names, t + k * h, x, u)) for k in range(4)]
     return ((-11.0 * f[0] + 18.0 * f[1] - 9.0 * f[2] + 2.0 * f[3]) / (6.0 * h))[:, None]
 
@@ -226,15 +228,10 @@ def _differences(stage: OpaqueStage, evaluator: Evaluator, t: float, x: np.ndarr
     """Return the derivative of a block by (t, x, u), by central differences of fourth order."""
     at = np.concatenate([[t], x, u])
 
-    def evaluate(v: np.ndarray) -> np.ndarray:
-        return np.array(evaluator.evaluate(stage.names, float(v[0]), v[1 : 1 + x.size], v[1 + x.size :]))
+    def evaluate(i: int, to: float) -> list[np.ndarray]:
+        v = at.copy()
+        v[i] = to
+        return [np.array(evaluator.evaluate(stage.names, float(v[0]), v[1 : 1 + x.size], v[1 + x.size :]))]
 
-    columns = []
-    for i, middle in enumerate(at):
-        slopes = []
-        for step in (_STEP * max(abs(middle), 1.0), 2.0 * _STEP * max(abs(middle), 1.0)):
-            high, low = at.copy(), at.copy()
-            high[i], low[i] = middle + step, middle - step
-            slopes.append((evaluate(high) - evaluate(low)) / (high[i] - low[i]))
-        columns.append((4.0 * slopes[0] - slopes[1]) / 3.0)
+    columns = [differentiate(partial(evaluate, i), v, max(abs(v), 1.0))[0] for i, v in enumerate(at.tolist())]
     return np.array(columns).T

@@ -19,7 +19,7 @@ from .realization import Realization
 from .sampled_design import SampledDesign, sampled_gains, sampled_poles
 from .scan_refine_confirm import first_largest, order_key, refine_sign_change
 from .sensitivities import GangOfFour, complementary, gang_of_four, sensitivity
-from .state_space import read_matrices
+from .state_space import FourMatrices, advance_held, hold_inputs, read_matrices
 
 if TYPE_CHECKING:
     from .loop_transfer import LoopTransfer as LoopTransfer
@@ -37,6 +37,7 @@ __all__ = [
     "Comparison",
     "Confirmation",
     "DiskMargin",
+    "FourMatrices",
     "GainCrossover",
     "GangOfFour",
     "Interval",
@@ -49,6 +50,7 @@ __all__ = [
     "PhaseCrossover",
     "Realization",
     "SampledDesign",
+    "advance_held",
     "compare_margins",
     "compare_with_control",
     "complementary",
@@ -59,6 +61,7 @@ __all__ = [
     "find_hidden_unstable",
     "first_largest",
     "gang_of_four",
+    "hold_inputs",
     "loop_at",
     "loop_class",
     "margin_slopes",

@@ -10,7 +10,7 @@ from ...blocks.core import ParameterError, accepts, kinds
 from .number import Number, carries_findings
 from .scan_refine_confirm import find_first_limit, number_of_limit
 from .sensitivities import invert_loop
-from .state_space import Matrices, make_state_space, read_matrices
+from .state_space import Matrices, hold_inputs, make_state_space, read_matrices
 
 if TYPE_CHECKING:
     from control import StateSpace
@@ -44,8 +44,6 @@ def delayed_hold(plant: LinearSystem, sample_time: float, delay: float = 0.0) ->
 
 
 def _delay_hold(P: Matrices, sample_time: float, delay: float) -> Matrices:
-    from scipy.linalg import expm
-
     if P.dt != 0 or np.any(P.D):
         raise ParameterError(
             f"found dt={P.dt} and D={P.D.tolist()}; expected a continuous plant without direct feedthrough. Leave "
@@ -61,14 +59,9 @@ def _delay_hold(P: Matrices, sample_time: float, delay: float) -> Matrices:
     n, m = P.states, P.inputs
     samples = int(np.floor(delay / sample_time * (1 + 1e-14)))
     fraction = max(0.0, delay - samples * sample_time)
-
-    def hold_over(t: float) -> tuple[np.ndarray, np.ndarray]:
-        both = np.asarray(expm(np.block([[P.A, P.B], [np.zeros((m, n + m))]]) * t))
-        return both[:n, :n], both[:n, n:]
-
-    Phi, _ = hold_over(sample_time)
-    rest, new = hold_over(sample_time - fraction)
-    old = rest @ hold_over(fraction)[1]
+    Phi, _ = hold_inputs(P.A, P.B, sample_time)
+    rest, new = hold_inputs(P.A, P.B, sample_time - fraction)
+    old = rest @ hold_inputs(P.A, P.B, fraction)[1]
     kept = samples + (fraction > 0)  # commands underway: u[k − 1], u[k − 2], …
     none = np.zeros((P.outputs, m))
     if not kept:

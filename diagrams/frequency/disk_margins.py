@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, brief, explain_calls, kinds
-from .loop_scan import Scan
+from .loop_scan import LoopScan
 from .margin_analysis import EIGENVALUES
 from .number import Confirmation, Number, carries_findings
 from .poles_and_zeros import Features
@@ -301,7 +301,7 @@ def _confirm_destabilizing(r: Realization, delta: np.ndarray, skew: float) -> Co
 def _find_largest(r: Realization, skew: float, matrix: Callable[[float], np.ndarray]) -> float:
     """Return the frequency in rad/s at which the structured singular value's bound is largest."""
     if len(r.D) == 1:
-        return Scan(r).find_peak((1 + skew) / 2, -(1 - skew) / 2).omega
+        return LoopScan(r).find_peak((1 + skew) / 2, -(1 - skew) / 2).omega
 
     def bound(omega: float) -> float:
         return mu_bound(matrix(omega), polish=False)

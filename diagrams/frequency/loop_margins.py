@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, explain_calls, kinds, on_one_thread
-from .loop_scan import Crossing, Peak, Scan
+from .loop_scan import Crossing, LoopScan, Peak
 from .margin_analysis import EIGENVALUES, MarginFinder, StabilityMargins
 from .number import Confirmation, Number, carries_findings
 from .nyquist import count_encirclements, winding_number
 from .poles_and_zeros import Features, find_hidden_unstable
-from .realization import Realization
+from .realization import ROUNDOFF, Realization
 from .scan_refine_confirm import confirm_no_limit, number_of_limit
 from .sensitivity_peaks import confirm_peak, find_level_frequencies
 
@@ -183,7 +183,7 @@ class _LoopMarginFinder(MarginFinder[Margins]):
 
     def __init__(self, r: Realization, skew: float):
         super().__init__(r)
-        self.skew, self.scan = skew, Scan(r)
+        self.skew, self.scan = skew, LoopScan(r)
         self.gain, self.phase = self.scan.find_gain_crossovers(), self.scan.find_phase_crossovers()
 
     def find_numbers(self) -> dict[str, Number]:
@@ -378,7 +378,7 @@ class _LoopMarginFinder(MarginFinder[Margins]):
 
 def find_disk_frequency(r: Realization, skew: float = 0.0) -> float:
     """Return the frequency in rad/s at which |S + (σ − 1)/2| is largest: that of the disk margin."""
-    return float(Scan(r).find_peak((1 + skew) / 2, -(1 - skew) / 2).omega)
+    return float(LoopScan(r).find_peak((1 + skew) / 2, -(1 - skew) / 2).omega)
 
 
 def _missing_phase(c: Crossing) -> float:
@@ -394,9 +394,14 @@ def _confirm_crossing(r: Realization, c: Crossing, factor: complex, name: str) -
         where = "1 + D vanishes with this factor: a closed-loop pole passes through infinity"
     else:
         p = complex(r.point(np.array(1j * c.omega)))
-        distance = np.min(np.abs(r.eigenvalues(factor) - p), initial=np.inf)
+        closed = r.closed_matrix(factor)
+        distance = np.min(np.abs(np.linalg.eigvals(closed) - p), initial=np.inf)
         ok = distance <= 1e-5 * abs(p) + 1e-7 * r.scale
         where = "a closed-loop eigenvalue that lies there with this factor"
+        if not ok:  # a large factor leaves few digits of an eigenvalue: is p one of a matrix within rounding of this?
+            apart = np.linalg.svd(p * np.eye(r.order) - closed, compute_uv=False).min(initial=np.inf)
+            ok = apart <= r.order * ROUNDOFF * float(np.linalg.norm(closed))
+            where += ", as far as rounding lets it be seen"
     if not ok:
         raise ConfirmationError(
             f"found a crossing at {c.omega:.12g} rad/s, but no closed-loop eigenvalue there with the factor "

@@ -46,7 +46,7 @@ class Peak:
     omega: float
 
 
-class Scan:
+class LoopScan:
     """Frequency response of a loop with one channel, sampled once; crossings and peaks are refined from the samples."""
 
     def __init__(self, r: Realization):
@@ -140,7 +140,10 @@ class Scan:
         for omega, (L, dL) in zip(self.segments, self.samples, strict=True):
             with np.errstate(all="ignore"):
                 h, slope = function(L, dL)
+            searched = 0
             for k in range(len(omega) - 1):
+                if k < searched:
+                    continue
                 span = (float(omega[k]), float(omega[k + 1]))
                 left, right = h[k], h[k + 1]
                 if not (np.isfinite(left) and np.isfinite(right)):
@@ -148,7 +151,12 @@ class Scan:
                 turns = left * slope[k] < 0 and right * slope[k + 1] > 0
                 if left * right > 0 and not turns:
                     continue
-                if max(abs(left), abs(right)) <= self._find_rounding(omega[k : k + 2], L[k : k + 2]):
+                if max(abs(left), abs(right)) <= float(np.max(self._find_rounding(omega[k : k + 2], L[k : k + 2]))):
+                    before, behind = self._leave_rounding(omega, L, h, k)
+                    searched = len(omega) if behind is None else behind
+                    if before is not None and behind is not None and h[before] * h[behind] < 0:
+                        span = float(omega[before]), float(omega[behind])  # both samples are too close to the root
+                        found.append(self._polish(lambda w: self._evaluate(function, w, 0), span))
                     continue
                 if left == 0.0:
                     found.append(span[0])
@@ -161,12 +169,19 @@ class Scan:
                         found.append(self._polish(lambda w: self._evaluate(function, w, 0), (turn, span[1])))
         return found
 
-    def _find_rounding(self, omega: np.ndarray, L: np.ndarray) -> float:
-        """Return a bound of the relative rounding error of L at frequencies, at least that of a constant.
+    def _find_rounding(self, omega: np.ndarray, L: np.ndarray) -> np.ndarray:
+        """Return bounds of the relative rounding error of L at frequencies, at least that of a constant.
 
         Beside a pole on the axis it turns the phase, and a crossing that is less than it isn't there.
         """
-        return max(1e-11, float(np.max(self.r.rounding(1j * omega) / np.abs(L))))
+        return np.asarray(np.maximum(1e-11, self.r.rounding(1j * omega) / np.abs(L)))
+
+    def _leave_rounding(self, omega: np.ndarray, L: np.ndarray, h: np.ndarray, k: int) -> tuple[int | None, int | None]:
+        """Return the nearest samples up to k and behind it that are more than rounding, where there are such."""
+        with np.errstate(all="ignore"):
+            shows = ~(np.abs(h) <= self._find_rounding(omega, L))
+        before, behind = np.flatnonzero(shows[: k + 1]), k + 1 + np.flatnonzero(shows[k + 1 :])
+        return (int(before[-1]) if before.size else None), (int(behind[0]) if behind.size else None)
 
     def _evaluate(self, function: Function, omega: float, which: int) -> float:
         """Return the value (0) or the slope (1) of a function."""

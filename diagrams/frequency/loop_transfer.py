@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from control import StateSpace, feedback
@@ -25,16 +25,6 @@ BELOW = 1 - 1e-6
 """Part of π/T up to which a sampled loop is drawn."""
 FAR = 8.0
 """Largest part of the plane that a Nyquist plot shows: the real and imaginary part up to this."""
-
-
-class Model(Protocol):
-    """The linear model that a loop was made from."""
-
-    def sensitivity(self, *wires: str) -> StateSpace:
-        """Return S at wires."""
-
-    def complementary(self, *wires: str) -> StateSpace:
-        """Return T = 1 − S at wires."""
 
 
 @explain_calls
@@ -59,7 +49,7 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
         Effects that limit it; see `Linearization.loop`.
     """
 
-    linearization: Model | None = None
+    linearization: Any = None
     wires: tuple[str, ...] = ()
     inexactness: float = 0.0
 

@@ -18,12 +18,11 @@ from .disk_margins import mimo_disk_margin, mu_bound
 from .loop_margins import Margins, find_disk_frequency, margins
 from .number import Number
 from .realization import Realization
-from .state_space import read_matrices
+from .state_space import FourMatrices, read_matrices
 
 if TYPE_CHECKING:
     from .state_space import LinearSystem
 
-Four = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 KINK = 1e-6
 """Relative difference of two candidates of a margin below which it has a kink."""
 NEAR_POLE = 1e-13
@@ -46,7 +45,12 @@ class MarginSlope:
 
 @on_one_thread
 def margin_slopes(
-    loop: LinearSystem, changes: Sequence[Four], *, delay: int = 0, skew: float = 0.0, found: Margins | None = None
+    loop: LinearSystem,
+    changes: Sequence[FourMatrices],
+    *,
+    delay: int = 0,
+    skew: float = 0.0,
+    found: Margins | None = None,
 ) -> dict[str, MarginSlope]:
     """Return the margins of a loop by name, with their derivatives along changes (dA, dB, dC, dD) of its matrices.
 
@@ -70,7 +74,7 @@ def margin_slopes(
 class _Response:
     """L of a loop at a frequency, with its derivatives by the frequency and along the changes."""
 
-    def __init__(self, matrices: Four, changes: Sequence[Four], dt: float, delay: int):
+    def __init__(self, matrices: FourMatrices, changes: Sequence[FourMatrices], dt: float, delay: int):
         self.matrices, self.changes, self.dt, self.delay = matrices, changes, dt, delay
 
     @cached_property

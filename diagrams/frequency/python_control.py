@@ -11,7 +11,7 @@ import numpy as np
 
 from ...blocks.core import ConfirmationError, ParameterError, accepts, explain_calls, kinds, on_one_thread
 from .loop_margins import Margins, margins
-from .loop_scan import Scan
+from .loop_scan import LoopScan
 from .realization import Realization
 from .scan_refine_confirm import confirm_limit, pick_test_values
 
@@ -170,7 +170,7 @@ class _Judge:
     """Verdicts between two values of one loop."""
 
     def __init__(self, r: Realization, ours: Margins):
-        self.r, self.ours, self.scan = r, ours, Scan(r)
+        self.r, self.ours, self.scan = r, ours, LoopScan(r)
 
     def compare(self, name: str, mine: float, theirs: float, function: str, reason: str) -> Comparison:
         same = mine == theirs or abs(mine - theirs) <= SAME * abs(mine)

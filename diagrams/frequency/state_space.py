@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
     LinearSystem: TypeAlias = StateSpace | TransferFunction
 
+FourMatrices: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""A, B, C and D."""
+
 
 class Matrices(NamedTuple):
     """State space ẋ = A x + B u, y = C x + D u, or x⁺ = A x + B u of a sampled system.
@@ -44,6 +47,23 @@ class Matrices(NamedTuple):
     def outputs(self) -> int:
         """Number of outputs."""
         return len(self.D)
+
+
+def advance_held(A: np.ndarray, B: np.ndarray, T: float) -> np.ndarray:
+    """Return the matrix that leads (x, u) of ẋ = A x + B u over the time T with u held; axes in front are a batch's."""
+    from scipy.linalg import expm
+
+    n, m = B.shape[-2:]
+    both = np.zeros((*A.shape[:-2], n + m, n + m), dtype=np.result_type(A, B))
+    both[..., :n, :n], both[..., :n, n:] = A, B
+    return np.asarray(expm(both * T))
+
+
+def hold_inputs(A: np.ndarray, B: np.ndarray, T: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return Ad and Bd of x(t + T) = Ad x + Bd u for ẋ = A x + B u with u held; axes in front are a batch's."""
+    n = A.shape[-1]
+    whole = advance_held(A, B, T)
+    return whole[..., :n, :n], whole[..., :n, n:]
 
 
 def read_matrices(system: LinearSystem) -> Matrices:

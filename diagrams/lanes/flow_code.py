@@ -8,38 +8,42 @@ from string import Template
 from typing import Any
 
 from ...blocks.core import left_of
+from .methods import write_methods
 from .scalar_calls import ScalarFunctions
 
 METHODS: Mapping[str, str] = {
-    "euler": "EACH_RATE next[where[i]] = x[where[i]] + h * k1[i];",
-    "heun": """
-    RATES(to, EACH_RATE stage[where[i]] = x[where[i]] + h * k1[i], k2)
-    EACH_RATE next[where[i]] = x[where[i]] + (0.5 * h) * (k1[i] + k2[i]);""",
-    "rk4": """
-    RATES(middle, EACH_RATE stage[where[i]] = x[where[i]] + (0.5 * h) * k1[i], k2)
-    RATES(middle, EACH_RATE stage[where[i]] = x[where[i]] + (0.5 * h) * k2[i], k3)
-    RATES(to, EACH_RATE stage[where[i]] = x[where[i]] + h * k3[i], k4)
-    EACH_RATE next[where[i]] = x[where[i]] + (h / 6.0) * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i]);""",
+    "euler": "$n, h, now, k1, now",
+    "heun": "&e, $n, h, to, now, k1, k2, stage, now",
+    "rk4": "&e, $n, from, h, to, now, k1, k2, k3, k4, stage, now",
 }
-"""Methods of fixed step, as in compiled/methods.c."""
+"""Methods of fixed step in fmus/runtime/fixed_step.c, with their arguments in `_TEXT`."""
 
-_TEXT = Template("""
+_RATES = Template("""
+typedef struct { const vec *x, *w, *p, *kept; } states;
+
+/* The rates of the continuous states y, which are among all states. */
+INLINE int flow_rate(const states *e, double at, const vec *y, vec *f) {
+    static const int where[] = {$where};
+    vec t[1] = {splat(at)}, all[N_X];
+    memcpy(all, e->x, sizeof all);
+    for (int i = 0; i < $n; i++) all[where[i]] = y[i];
+    flow(t, all, e->w, e->p, e->kept, f);
+    return 0;
+}
+""")
+_STEP = Template("""
 /* A step of the continuous states from tick to tick. Its end is seen from the left, as in problem.c: a source that
    jumps there still has its value from before. */
 static inline void step_states(double from, double end, vec *x, const vec *w, const vec *p, const vec *kept) {
     static const int where[] = {$where};
-    vec k1[$n], k2[$n], k3[$n], k4[$n], stage[N_X], next[N_X], t[1];
-    const double h = end - from;
-    const vec first = splat(from), middle = splat(from + 0.5 * h);
-    const vec to = splat(fmax(from, end - $left * fabs(end)));
-#define EACH_RATE for (int i = 0; i < $n; i++)
-#define RATES(at, set, into) set; t[0] = at; flow(t, stage, w, p, kept, into);
-    (void)k2, (void)k3, (void)k4, (void)to, (void)middle;
-    memcpy(stage, x, sizeof stage);
-    memcpy(next, x, sizeof next);
-    RATES(first, , k1)
-    $method
-    memcpy(x, next, sizeof next);
+    const states e = {x, w, p, kept};
+    vec k1[$n], k2[$n], k3[$n], k4[$n], stage[$n], now[$n];
+    const double h = end - from, to = fmax(from, end - $left * fabs(end));
+    (void)k2, (void)k3, (void)k4, (void)stage, (void)to;
+    for (int i = 0; i < $n; i++) now[i] = x[where[i]];
+    flow_rate(&e, from, now, k1);
+    flow_lw_$method($arguments);
+    for (int i = 0; i < $n; i++) x[where[i]] = now[i];
 }
 """)
 
@@ -72,8 +76,11 @@ def write_flow(source: FlowSource, scalars: ScalarFunctions) -> tuple[str, int]:
         For an operation that has no form over vectors.
     """
     code = scalars.write_calls("flow", source.rates, ("t", "x", "w", "p"), {3})
-    where = ", ".join(map(str, source.where))
-    step = _TEXT.substitute(
-        where=where, n=len(source.where), method=METHODS[source.method], left=(1.0 - left_of(1.0)).hex()
+    sizes = {"where": ", ".join(map(str, source.where)), "n": str(len(source.where))}
+    step = _STEP.substitute(
+        sizes,
+        method=source.method,
+        arguments=Template(METHODS[source.method]).substitute(sizes),
+        left=(1.0 - left_of(1.0)).hex(),
     )
-    return code.text + step, code.kept
+    return code.text + _RATES.substitute(sizes) + write_methods("flow", "const states") + step, code.kept

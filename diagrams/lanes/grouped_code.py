@@ -94,7 +94,7 @@ class GroupedCode:
 
     def _add_single(self, name: str, value: str) -> None:
         given = len(set(re.findall(r"\b[abc](?=\[)", value)))
-        kernel = Kernel(len(self._known), (*((False, k) for k in range(given)), (True, 0)))
+        kernel = Kernel(len(self._known), (*((False, 1 + k) for k in range(given)), (True, 0)))
         self._known[name] = self._of[name] = kernel
         arguments = ", ".join(f"*{'abc'[k]} = v + o[{k}]" for k in range(given))
         self._texts.append(
@@ -134,16 +134,28 @@ class GroupedCode:
         found = make_tables(tick, self._of)
         places = np.flatnonzero((found.memory != 0.0) | np.signbit(found.memory))
         lists: Mapping[str, np.ndarray] = {
-            "runs": found.runs.ravel(), "rows": found.rows, "inputs": found.inputs, "guards": found.guards,
-            "made": found.made, "taken": found.taken, "places": places,
-        }  # fmt: skip
+            "runs": found.calls.runs.ravel(),
+            "rows": found.calls.rows,
+            "inputs": found.inputs,
+            "guards": found.guards,
+            "made": found.made,
+            "taken": found.taken,
+            "places": places,
+        }
         tables = [f"static const int32_t {name}_{key}[] = {{{_list(values)}}};" for key, values in lists.items()]
         tables.append(f"static const double {name}_numbers[] = {{{_list(found.memory[places])}}};")
         text = _TICK.format(
-            name=name, tables="\n".join(tables), count=found.memory.size, constants=len(places), runs=len(found.runs),
-            log=found.log, next=found.next, guards=found.guards.size, loops=found.made.size,
+            name=name,
+            tables="\n".join(tables),
+            count=found.memory.size,
+            constants=len(places),
+            runs=len(found.calls.runs),
+            log=found.log,
+            next=found.next,
+            guards=found.guards.size,
+            loops=found.made.size,
             residual=int(found.residual),
-        )  # fmt: skip
+        )
         return VectorCode(text, found.memory.size)
 
 

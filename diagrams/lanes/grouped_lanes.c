@@ -1,7 +1,7 @@
 /* A tick of many blocks over vectors: runs of equal blocks, each one loop over a table that says where their values stand.
 
    v holds the time, then the log (outputs of plants, outputs of blocks, states before the tick), then whatever else a
-   tick needs, as in compiled/grouped.c. Above this text stand the kernels and their table. */
+   tick needs, as in fmus/runtime/grouped.c. Above this text stand the kernels and their table. */
 
 #include <float.h>
 
@@ -36,7 +36,9 @@ static void go_over_groups(const lane_group *g, const vec *t, const vec *x, cons
     if (g->residual) {
         vec apart = splat(0.0), largest = splat(0.0);
         for (int32_t i = 0; i < g->n_loops; i++) {
-            apart = vec_fmax(apart, vec_fabs(v[g->made[i]] - v[g->taken[i]]));
+            const vec mismatch = vec_fabs(v[g->made[i]] - v[g->taken[i]]);
+            size += mismatch; /* a maximum hides NaN */
+            apart = vec_fmax(apart, mismatch);
             largest = vec_fmax(largest, vec_fabs(v[g->taken[i]]));
         }
         log[g->log] = apart / (1.0 + largest);

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from threading import Lock
 from typing import Any
-from weakref import WeakKeyDictionary
 
 from ...blocks.core import CompilerError, FmuError
 from ...fmus import Fmu
@@ -203,7 +202,6 @@ class LaneStarts:
     sizes: list[int]
 
 
-_COMPILED: WeakKeyDictionary[FlatDiagram, dict[Any, LaneCode]] = WeakKeyDictionary()
 _COMPILING = Lock()
 
 
@@ -238,7 +236,7 @@ def compile_lanes(
         If its runs can't go side by side, or there is no compiler.
     """
     with _COMPILING:
-        known = _COMPILED.setdefault(flat.origin, {})
+        known: dict[Any, LaneCode] = flat.made["lanes"]
         key = count, tuple(acting), method, None if start is None else start.key
         if key not in known:
             known[key] = _compile(flat.origin, acting, count, start, method, loops or {})
@@ -266,9 +264,12 @@ def _compile(
             loops[i] = LoopSource(_check_size(equations.fast), newton[clocks])
     plants = {path: _plant(flat, path) for path in flat.plant_ticks}
     sizes = LaneSizes(
-        flat.width, flat.plant_outputs.total, flat.plant_inputs.total, flat.parameters.total,
+        flat.width,
+        flat.plant_outputs.total,
+        flat.plant_inputs.total,
+        flat.parameters.total,
         flat.log.total + flat.width + bool(flat.loops.slices),
-    )  # fmt: skip
+    )
     flow = None
     if flat.continuous.size:
         rates = _check_size(flat.flow.last.fast)

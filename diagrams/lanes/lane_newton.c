@@ -1,4 +1,4 @@
-/* Newton's method over vectors, as in compiled/newton.c: small systems are solved lane by lane. */
+/* Newton's method over vectors, as in fmus/runtime/newton.c: small systems are solved lane by lane. */
 
 OWN vec largest_of(const vec *values, int n) {
     vec found = splat(0.0);

@@ -15,6 +15,7 @@ from ...fmus import Fmu
 from ...fmus.archive import FmuVariable
 from ...fmus.calls import FmuInstance
 from ...fmus.export import WrittenEquations, read_equations
+from .methods import write_methods
 from .no_lanes import NoLanesError
 from .vector_code import write_vectors
 
@@ -34,22 +35,19 @@ static void ${name}_begin($name *self, const vec *from) {
     ${name}_outputs_prepare(self->p, self->outputs);
 }
 
-/* A step of the explicit Runge-Kutta method of order 4, as in runtime/integrators.c. */
+INLINE int ${name}_rate(const $name *self, double at, const vec *x, vec *f) {
+    const vec t[1] = {splat(at)};
+    ${name}_rates(t, x, self->u, self->p, self->rates, f);
+    return 0;
+}
+
+$methods
+/* A step of the integrator of the FMU, as in export/runtime/integrators.c. */
 INLINE void ${name}_rk4(const $name *self, double now, double h, vec *x) {
-    vec k1[AT_LEAST_1($n_k)], k2[AT_LEAST_1($n_k)], k3[AT_LEAST_1($n_k)], k4[AT_LEAST_1($n_k)];
-    vec stage[AT_LEAST_1($n_x)], t[1];
+    vec k1[AT_LEAST_1($n_k)], k2[AT_LEAST_1($n_k)], k3[AT_LEAST_1($n_k)], k4[AT_LEAST_1($n_k)], stage[AT_LEAST_1($n_x)];
     memcpy(stage, x, sizeof stage);
-    t[0] = splat(now);
-    ${name}_rates(t, x, self->u, self->p, self->rates, k1);
-    for (int i = 0; i < $n_k; i++) stage[i] = x[i] + h / 2.0 * k1[i];
-    t[0] = splat(now + h / 2.0);
-    ${name}_rates(t, stage, self->u, self->p, self->rates, k2);
-    for (int i = 0; i < $n_k; i++) stage[i] = x[i] + h / 2.0 * k2[i];
-    ${name}_rates(t, stage, self->u, self->p, self->rates, k3);
-    for (int i = 0; i < $n_k; i++) stage[i] = x[i] + h * k3[i];
-    t[0] = splat(now + h);
-    ${name}_rates(t, stage, self->u, self->p, self->rates, k4);
-    for (int i = 0; i < $n_k; i++) x[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);
+    ${name}_rate(self, now, x, k1);
+    ${name}_lw_rk4(self, $n_k, now, h, now + h, x, k1, k2, k3, k4, stage, x);
 }
 
 static inline void ${name}_step($name *self, double now, double h, int64_t n, const vec *z, vec *w) {
@@ -122,12 +120,18 @@ class LanePlant:
         outputs = write_vectors(f"{name}_outputs", self.output, _ARGUMENTS, {3})
         of: Mapping[str, str] = {"x": "self->x", "u": "self->u", "y": "y"}
         return f"{rates.text}\n{outputs.text}" + _TEXT.substitute(
-            name=name, n_p=self.derivative.numel_in(3), n_u=self.derivative.numel_in(2),
-            n_x=self.derivative.numel_in(1), n_k=self.derivative.numel_out(0), n_y=self.output.numel_out(0),
-            kept_rates=rates.kept, kept_outputs=outputs.kept,
+            name=name,
+            n_p=self.derivative.numel_in(3),
+            n_u=self.derivative.numel_in(2),
+            n_x=self.derivative.numel_in(1),
+            n_k=self.derivative.numel_out(0),
+            n_y=self.output.numel_out(0),
+            kept_rates=rates.kept,
+            kept_outputs=outputs.kept,
+            methods=write_methods(name, f"const {name}"),
             inputs=" ".join(f"self->u[{i}] = z[{j}];" for i, j in self.inputs),
             outputs=" ".join(f"w[{i}] = {of[kind]}[{j}];" for i, kind, j in self.outputs),
-        )  # fmt: skip
+        )
 
     def read(self, plant: FmuInstance) -> tuple[np.ndarray, float]:
         """Return the numbers of an FMU at the start of a run, and the longest step of its integrator in s.

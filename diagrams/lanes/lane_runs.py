@@ -145,10 +145,21 @@ class LaneRuns:
         numbers = vectors.p, vectors.x, vectors.w, vectors.z, vectors.plants, self._last
         p, x, w, z, plant, last = (vector.ctypes.data for vector in numbers)
         self._structure = _structure(width)(
-            every=every, skip=every - 1, columns=self._columns.size, stops=self._stops.size,
-            column=self._columns.ctypes.data, stop=self._stops.ctypes.data, p=p, x=x, w=w, z=z, plant=plant,
-            steps=self._steps.ctypes.data, last=last, room=self._room.ctypes.data,
-        )  # fmt: skip
+            every=every,
+            skip=every - 1,
+            columns=self._columns.size,
+            stops=self._stops.size,
+            column=self._columns.ctypes.data,
+            stop=self._stops.ctypes.data,
+            p=p,
+            x=x,
+            w=w,
+            z=z,
+            plant=plant,
+            steps=self._steps.ctypes.data,
+            last=last,
+            room=self._room.ctypes.data,
+        )
         self._structure.alive[:] = [-1] * count + [0] * (width - count)
 
     @property

@@ -91,8 +91,13 @@ def write_loops(name: str, source: LoopSource, arguments: Sequence[str], scalars
     code = scalars.write_calls(f"{name}_equations", columns, arguments, {3})
     n = len(options.where)
     text = _TEXT.substitute(
-        name=name, n=n, where=", ".join(map(str, options.where)), iterations=options.iterations,
-        halvings=options.halvings, rounding=options.rounding.hex(), tolerance=options.tolerance.hex(),
+        name=name,
+        n=n,
+        where=", ".join(map(str, options.where)),
+        iterations=options.iterations,
+        halvings=options.halvings,
+        rounding=options.rounding.hex(),
+        tolerance=options.tolerance.hex(),
         singular=options.singular.hex(),
-    )  # fmt: skip
+    )
     return f"{code.text}\n{text}", code.kept

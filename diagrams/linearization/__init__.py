@@ -1,6 +1,7 @@
 """Linear models, operating points and trim."""
 
-from .derivatives import Tap, find_signal
+from .block_slopes import linearize_block
+from .derivatives import Tap, find_signal, moves_between_ticks
 from .findings import (
     BlockFinding,
     CoarseValues,
@@ -18,10 +19,10 @@ from .findings import (
 )
 from .kinks import find_kinks_between
 from .linear_model import Linearization, linearize, linearize_batch
-from .loops_over_a_period import ticks_between_renewals, ticks_to_renewal
 from .operating_points import PointLike, capture, check_options, copy_point, operating_point, run_to
+from .over_a_period import TickModel, model_ticks, ticks_between_renewals, ticks_to_renewal
 from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop, loop_of_variant
-from .plant_equations import PlantEquations, TickModel, linearize_plant, model_ticks, moves_between_ticks
+from .plant_models import PlantEquations, linearize_plant
 from .trim_search import point_from_states, trim
 
 __all__ = [
@@ -53,6 +54,7 @@ __all__ = [
     "find_signal",
     "linearize",
     "linearize_batch",
+    "linearize_block",
     "linearize_plant",
     "loop_of_variant",
     "model_ticks",

@@ -12,13 +12,29 @@ import numpy as np
 
 from ...blocks.core import Block, Layout
 from ...blocks.tracing import NEXT, Traced, has_large_product, size
+from ...fmus.running import Derivation, DerivativeMethod, FmuLinearization
 
 BRANCHES = frozenset(
     {
-        ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR, ca.OP_IF_ELSE_ZERO, ca.OP_FLOOR,
-        ca.OP_CEIL, ca.OP_FABS, ca.OP_SIGN, ca.OP_FMIN, ca.OP_FMAX, ca.OP_FMOD, ca.OP_REMAINDER, ca.OP_COPYSIGN,
+        ca.OP_LT,
+        ca.OP_LE,
+        ca.OP_EQ,
+        ca.OP_NE,
+        ca.OP_NOT,
+        ca.OP_AND,
+        ca.OP_OR,
+        ca.OP_IF_ELSE_ZERO,
+        ca.OP_FLOOR,
+        ca.OP_CEIL,
+        ca.OP_FABS,
+        ca.OP_SIGN,
+        ca.OP_FMIN,
+        ca.OP_FMAX,
+        ca.OP_FMOD,
+        ca.OP_REMAINDER,
+        ca.OP_COPYSIGN,
     }
-)  # fmt: skip
+)
 """CasADi's operations that are not smooth."""
 ROUNDINGS = frozenset({ca.OP_FLOOR, ca.OP_CEIL})
 """Those of them that make stairs."""
@@ -248,3 +264,27 @@ def slopes_of(trace: Traced) -> BlockSlopes:
     if trace not in _KNOWN:
         _KNOWN[trace] = BlockSlopes(trace)
     return _KNOWN[trace]
+
+
+def linearize_block(block: Block, trace: Traced, t: float, x: np.ndarray, u: np.ndarray) -> FmuLinearization:
+    """Return the linear model of a block's equations in continuous time at a point, exact; as that of an FMU."""
+    values, J = slopes_of(trace).slopes(t, np.concatenate([x, u]), trace.pack(block, np.inf))
+    m, n = len(values) - x.size, x.size  # the outputs come first
+    states, inputs, outputs = (tuple(Layout.of(ports).labels) for ports in (trace.states, trace.inputs, trace.outputs))
+    return FmuLinearization(
+        A=J[m:, :n],
+        B=J[m:, n:],
+        C=J[:m, :n],
+        D=J[:m, n:],
+        states=states,
+        inputs=inputs,
+        outputs=outputs,
+        t=t,
+        h=None,
+        x0=x,
+        u0=u,
+        f=values[m:],
+        y0=values[:m],
+        derivation=Derivation(DerivativeMethod.TRACED),
+        uncertainty=np.zeros(J.shape),
+    )

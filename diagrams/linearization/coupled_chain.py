@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...blocks.core import OptionError, left_of
-from ..coupling import Links
+from ..coupling import Links, Scheme, tells_slopes
 from ..flat import NONE, FlatDiagram
+from ..results import OperatingPoint
 from .derivatives import LocalDerivatives
 from .plant_models import PlantModel, join_matrices
 
@@ -187,3 +188,39 @@ class CoupledChain:
                 port="coupling",
                 t=step.t,
             )
+
+
+def coupling_at(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) -> CoupledChain | None:
+    """Return the steps of the coupling of the run at a point; None where inputs are held from a step's beginning.
+
+    The default coupling holds them. Where every input comes from sampled subsystems, every scheme does.
+
+    Raises
+    ------
+    OptionError
+        If the run takes adaptive communication steps, or tells an FMU slopes.
+    """
+    for path, inputs in Links(flat).inputs.items():
+        if inputs.stop > inputs.start and tells_slopes(flat.table.blocks[path]):
+            raise OptionError(
+                "found input_derivatives among its options: its inputs are ramps over a communication step; expected "
+                "held inputs, which a linear model over communication steps has. Linearize the diagram with "
+                f"replace({{{path!r}: …}}), the FMU without this option.",
+                block=path,
+                port="stepping",
+            )
+    links = Links(flat)
+    found = [path for path in links.paths if links.moving[links.inputs[path]].any()]
+    if not at.coupling or not (found or links.felt.any()):
+        return None
+    if at.coupling not in [scheme.value for scheme in Scheme]:
+        raise OptionError(
+            f"found an operating point of a run with coupling {at.coupling!r}, in which the length of a communication "
+            "step depends on the motion; expected steps from tick to tick, which a linear model over communication "
+            "steps follows. Linearize at a point of a run without error=, or, without sampled subsystems, in "
+            "continuous time: linearize(t) without step=, which all couplings approach with shorter steps.",
+            block=(found or [*links.paths])[0],
+            port="coupling",
+        )
+    one_by_one = at.coupling == Scheme.GAUSS_SEIDEL
+    return CoupledChain(flat, local, links, (at.coupling_order or links.order(())) if one_by_one else ())

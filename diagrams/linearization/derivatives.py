@@ -1,17 +1,23 @@
-"""Derivatives of a diagram's functions at an instant, with injected signals and cut wires."""
+"""Derivatives of a diagram's functions at an instant, with injected signals and cut wires.
+
+Along a direction of the parameters a number and its slope travel together, as one complex number: the imaginary part is
+the slope, times a factor so small that its square vanishes. Sums, products, solutions of linear systems and matrix
+exponentials of such numbers have the slopes of their results as imaginary parts, to rounding. So the linear models over
+a period, and their slopes along a parameter, are made by the same functions.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar, cast
 
 import casadi as ca
 import numpy as np
 
 from ...blocks.core import Layout, NonFiniteError, UnknownNameError, elements, near
-from ...blocks.tracing import size
+from ...blocks.tracing import extrapolate, size
 from ..flat import (
     NONE,
     Apart,
@@ -21,22 +27,31 @@ from ..flat import (
     Instant,
     Schedule,
     TickPattern,
+    WiredDiagram,
     evaluate,
     loop_mismatch,
     next_x,
     plant_inputs,
     rates,
+    size_of_motion,
     trace_schedule,
 )
 from ..results import OperatingPoint, resolve
 from ..simulation import Workspace
 from ..wiring import Wire, index_of, join, split_entry
+from .exchanged import evaluators_at
 from .mean_stairs import NO_STAIRS, Stairs
-from .plant_models import PlantModel, model_equations, model_step
+from .plant_models import EQUILIBRIUM, PlantModel, model_equations, model_step
 
 T = TypeVar("T")
 SLOPE = 2.0**-140
 """Factor of the slopes that imaginary parts carry: so small that its square vanishes beside any value."""
+STEP = 2.0**-9
+"""Step of a difference of fourth order between models of an FMU, relative to 1 + the size of what moves."""
+ROUNDING = 1e-13
+"""Change of an FMU's states and inputs by a change of the parameter as large as itself that is rounding alone."""
+STILL = 1e3 * EQUILIBRIUM
+"""Largest slope of an FMU's rates at which it stays at rest."""
 _RESULTS, _ARGUMENTS = ("x", "z", "y", "dx", "v", "r"), ("x", "w", "d", "e")
 Numbers: TypeAlias = dict[str | tuple[str, str], np.ndarray]
 """Values by name, ``found["z"]``, and derivatives by name and argument, ``found["z", "w"]``."""
@@ -98,8 +113,20 @@ def find_signal(flat: FlatDiagram, name: str) -> Tap:
     return Tap(name, (wire.block, wire.port), tuple(np.ravel(part).tolist()), flat_labels, entry)
 
 
+def join_slope(value: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Return numbers that carry slopes."""
+    return np.asarray(value + 1j * SLOPE * np.asarray(slope))
+
+
+def slope_of(numbers: np.ndarray) -> np.ndarray:
+    """Return the slopes that numbers carry."""
+    return np.asarray(np.imag(numbers) / SLOPE)
+
+
 class LocalDerivatives:
     """Exact derivatives of a diagram's functions at a tick and between ticks.
+
+    With a ``direction`` of the parameters they carry their slopes along it, as do the operating points that they take.
 
     Parameters
     ----------
@@ -116,6 +143,15 @@ class LocalDerivatives:
         Evaluators of opaque stages; see `Schedule`.
     stairs : Stairs
         Stairs that are replaced by their mean slopes.
+
+    Attributes
+    ----------
+    direction : ndarray or None
+        Direction of the diagram's vector of parameters p.
+    scale : float
+        Size of the parameter.
+    error : float
+        Largest estimated error of a slope that is made of differences; 0 if all are exact.
     """
 
     def __init__(
@@ -135,8 +171,12 @@ class LocalDerivatives:
         for s in openings:
             self.cut.setdefault(s.port, set()).update(s.entries)
         self.evaluators = evaluators
+        self.direction: np.ndarray | None = None
+        self.scale, self.error = 1.0, 0.0
         self._schedules: dict[frozenset[TickPattern], Schedule] = {}
         self._derivatives: dict[frozenset[TickPattern], Derivative] = {}
+        self._closed_slopes: dict[frozenset[TickPattern], Derivative] = {}
+        self._plants: dict[tuple[Any, ...], PlantModel] = {}
         taps = [tuple((tap.port, tap.entries) for tap in group) for group in (inputs, outputs, openings)]
         self._taps: tuple[Any, ...] = tuple(taps)
         self._workspace = Workspace(flat, evaluators) if flat.loops.slices else None
@@ -201,20 +241,34 @@ class LocalDerivatives:
         return ca.vertcat(*columns) if columns else ca.MX(0, 1)
 
     def _trace_closed(self, acting: frozenset[TickPattern]) -> Schedule:
-        """Return ``(t, x, w, p) -> c``, the values of the cut ports in the closed diagram."""
+        """Return ``(t, x, w, p) -> (c, r)`` of the closed diagram.
+
+        c are the values of the cut ports, r is the mismatch of the algebraic loops.
+        """
 
         def make() -> Schedule:
             flat, symbols = self.flat, self.flat.symbols()
 
             def results(apart: Apart) -> Mapping[str, Any]:
                 instant = evaluate(flat, flat.blocks, acting, **symbols, apart=apart)
-                return {"c": ca.vertcat(*(ca.densify(ca.MX(instant.values[port])) for port in self.cut))}
+                columns = [ca.densify(ca.MX(instant.values[port])) for port in self.cut]
+                return {"c": ca.vertcat(*columns) if columns else ca.MX(0, 1), "r": loop_mismatch(instant)}
 
             return trace_schedule("closed", symbols, results)
 
         if acting not in self._schedules:
             self._schedules[acting] = self._kept("closed", acting, make)
         return self._schedules[acting]
+
+    def _differentiate_closed(self, acting: frozenset[TickPattern]) -> Derivative:
+        """Return the function of `_trace_closed` and its derivative by x."""
+
+        def make() -> Derivative:
+            return Derivative(self._trace_closed(acting), [("x", None)])
+
+        if acting not in self._closed_slopes:
+            self._closed_slopes[acting] = self._kept("closed slopes", acting, make)
+        return self._closed_slopes[acting]
 
     def _trace_derivative(self, acting: frozenset[TickPattern]) -> Derivative:
         """Return values and derivatives by (x, w, d) at an instant; ``NONE`` is one between ticks."""
@@ -226,9 +280,14 @@ class LocalDerivatives:
 
             def results(apart: Apart) -> Mapping[str, Any]:
                 instant = evaluate(
-                    flat, flat.blocks, acting, **symbols, taps=self._make_taps(d, c), apart=apart,
+                    flat,
+                    flat.blocks,
+                    acting,
+                    **symbols,
+                    taps=self._make_taps(d, c),
+                    apart=apart,
                     visit=lambda here, path, inputs, made: self.stairs.add(here, path, made, e),
-                )  # fmt: skip
+                )
                 found = {"x_next": next_x(instant), "z": plant_inputs(instant), "y": self._read_outputs(instant)}
                 return {**found, "dx": rates(instant), "v": self.stairs.read(instant), "r": loop_mismatch(instant)}
 
@@ -238,18 +297,6 @@ class LocalDerivatives:
         if acting not in self._derivatives:
             self._derivatives[acting] = self._kept("parts", acting, make)
         return self._derivatives[acting]
-
-    def model_step(self, at: OperatingPoint, path: str, z: np.ndarray, h: float, way: str | None) -> PlantModel:
-        """Return the linear model of one communication step of an FMU; see `plant_models.model_step`."""
-        return model_step(self.flat, at, path, z, h, way)
-
-    def model_equations(self, at: OperatingPoint, way: str | None) -> list[PlantModel]:
-        """Return the linear models of the equations of all FMUs; see `plant_models.model_equations`."""
-        return model_equations(self.flat, at, way)
-
-    def parts(self, change: np.ndarray, state: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return the pairs of a change and a state that both are small where nothing moves."""
-        return [(change, state)]
 
     def _solve_loops(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return x with the algebraic loops solved at an instant."""
@@ -266,13 +313,42 @@ class LocalDerivatives:
         NonFiniteError
             If a derivative is not finite, such as that of a square root at zero.
         """
-        flat = self.flat
+        if self.direction is not None:
+            return self._differentiate_along(self.direction, acting, t, x, w)
         x = self._solve_loops(acting, t, x, w)
-        at = t, x, w, flat.p
+        at = t, x, w, self.flat.p
         c = self._trace_closed(acting)(*at, evaluators=self.evaluators)[0] if self.cut else np.zeros(0)
         zeros = np.zeros(self.n_inputs), np.zeros(self.stairs.e.total)
         numbers = self._trace_derivative(acting)(*at, *zeros, c, evaluators=self.evaluators)
         return self._eliminate_loops(numbers, acting, t)
+
+    def _differentiate_along(
+        self, direction: np.ndarray, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray
+    ) -> Numbers:
+        """Return the numbers of `differentiate` with their slopes: x and w move with the parameters."""
+        flat, dx, dw = self.flat, slope_of(x), slope_of(w)
+        x, w = self._solve_loops(acting, t, np.real(x).copy(), np.real(w).copy()), np.real(w).copy()
+        at, still = [np.array([t]), x, w, flat.p], np.zeros(1)
+        c = dc = np.zeros(0)
+        if self.cut or flat.loops.slices:
+            closed, loops = self._differentiate_closed(acting), flat.active_loops(acting)
+
+            def follow() -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+                values, slopes, error = closed.along(at, [still, dx, dw, direction], self.evaluators)
+                self.error = max(self.error, error)
+                return values, slopes
+
+            (c, r, _, by_x), (dc, dr, *_) = follow()
+            if r.size:  # the loops' solutions move, too
+                dx[loops] -= np.linalg.solve(by_x[:, loops], dr)
+                (c, *_), (dc, *_) = follow()
+        zeros = [np.zeros(self.n_inputs), np.zeros(self.stairs.e.total)]
+        values, slopes, error = self._trace_derivative(acting).along(
+            [*at, *zeros, c], [still, dx, dw, direction, *zeros, dc], self.evaluators
+        )
+        self.error = max(self.error, error)
+        both = [join_slope(v, s) for v, s in zip(values, slopes, strict=True)]
+        return self._eliminate_loops(both, acting, t)
 
     def _eliminate_loops(self, numbers: Sequence[np.ndarray], acting: frozenset[TickPattern], t: float) -> Numbers:
         """Return values and derivatives by name, without algebraic loops and the stairs that are replaced.
@@ -295,6 +371,112 @@ class LocalDerivatives:
         self.stairs.close(found, names[:4], arguments[:3])
         return found
 
+    def parts(self, change: np.ndarray, state: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the pairs of a change and a state that both are small where nothing moves, slopes included."""
+        if self.direction is None:
+            return [(change, state)]
+        return [(np.real(change), np.real(state)), (slope_of(change), slope_of(state))]
+
+    # --- FMUs --------------------------------------------------------------------------------------------------------
+
+    def model_step(self, at: OperatingPoint, path: str, z: np.ndarray, h: float, way: str | None) -> PlantModel:
+        """Return the linear model of one communication step of an FMU; see `plant_models.model_step`."""
+        if self.direction is None:
+            return model_step(self.flat, at, path, z, h, way)
+        middle = self._model_step_once(at, path, np.real(z), h, way)
+
+        def follow(way: str) -> PlantModel:
+            def model(point: OperatingPoint, inputs: np.ndarray) -> PlantModel:
+                return model_step(self.flat, point, path, inputs, h, way)
+
+            return self._follow(middle, at, z, path, model)
+
+        if middle.identified or not middle.derivation.held:
+            return follow("identified" if middle.identified else "step")
+        made = follow("equations")
+        moves = np.max(np.abs(slope_of(made.f - made.x0)), initial=0.0) > STILL
+        return follow("step") if moves else made
+
+    def _model_step_once(self, at: OperatingPoint, path: str, z: np.ndarray, h: float, way: str | None) -> PlantModel:
+        """Return the linear model of a step without slopes; one that is known from another direction is taken."""
+        still = _without_slopes(at)
+        point = still.plants[path]
+        numbers = [np.ravel(v) for kind in ("state", "inputs") for v in point[kind].values()]
+        kept = tuple(v.tobytes() if v.dtype.kind != "O" else tuple(v) for v in numbers)
+        key = (path, h, way, point["t"], z.tobytes(), still.w.tobytes(), kept)
+        if key not in self._plants:
+            self._plants[key] = model_step(self.flat, still, path, z, h, way)
+        return self._plants[key]
+
+    def model_equations(self, at: OperatingPoint, way: str | None) -> list[PlantModel]:
+        """Return the linear models of the equations of all FMUs; see `plant_models.model_equations`."""
+        if self.direction is None:
+            return model_equations(self.flat, at, way)
+        found = model_equations(self.flat, _without_slopes(at), way)
+
+        def follow(place: int) -> PlantModel:
+            def model(point: OperatingPoint, z: np.ndarray) -> PlantModel:
+                return model_equations(self.flat, replace(point, z=z), way)[place]
+
+            return self._follow(found[place], at, at.z, found[place].path, model)
+
+        return [follow(place) for place in range(len(found))]
+
+    def _follow(
+        self,
+        middle: PlantModel,
+        at: OperatingPoint,
+        z: np.ndarray,
+        path: str,
+        model: Callable[[OperatingPoint, np.ndarray], PlantModel],
+    ) -> PlantModel:
+        """Return an FMU's model with its slopes, by differences along those of its states and inputs."""
+        point = at.plants[path]
+        moving = [*point["state"].values(), *point["inputs"].values(), z[middle.inputs], at.z[middle.inputs]]
+        moving.append(at.w[middle.outputs])
+        size = max((size_of_motion(np.asarray(v), slope_of(v)) for v in moving), default=0.0)
+        if size * self.scale <= ROUNDING:
+            return middle
+
+        def shift(s: float) -> PlantModel:
+            return model(_moved(at, s / size), np.real(z) + s / size * slope_of(z))
+
+        pairs = [(shift(s), shift(-s)) for s in (STEP, 2.0 * STEP)]
+
+        def slope(value: Any, ends: Sequence[tuple[Any, Any]]) -> Any:
+            if isinstance(value, Mapping):
+                return {key: slope(value[key], [(a[key], b[key]) for a, b in ends]) for key in value if key != "t"}
+            if isinstance(value, str) or np.asarray(value).dtype.kind not in "fc":
+                return value
+            near, far = (
+                (np.asarray(a) - np.asarray(b)) * (size / (2.0 * s))
+                for (a, b), s in zip(ends, (STEP, 2.0 * STEP), strict=True)
+            )
+            self.error = max(self.error, float(np.max(np.abs(near - far), initial=0.0)))
+            return join_slope(np.asarray(value), extrapolate(near, far))
+
+        made = {
+            name: slope(getattr(middle, name), [(getattr(a, name), getattr(b, name)) for a, b in pairs])
+            for name in ("A", "B", "C", "D", "x0", "f", "y_next", "next")
+        }
+        return replace(middle, **{**made, "next": {**middle.next, **made["next"]}})
+
+
+def _moved(at: OperatingPoint, s: float) -> OperatingPoint:
+    """Return an operating point that has moved by ``s`` along its slopes."""
+
+    def move(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {key: move(inner) for key, inner in value.items()}
+        return np.real(value) + s * slope_of(value) if np.iscomplexobj(value) else value
+
+    x, w, z = (move(v) for v in (at.x, at.w, at.z))
+    return replace(at, x=x, w=w, z=z, plants=cast("dict[str, Any]", move(at.plants)))
+
+
+def _without_slopes(at: OperatingPoint) -> OperatingPoint:
+    return _moved(at, 0.0)
+
 
 def _check_finite(derivatives: Iterable[np.ndarray], t: float) -> None:
     """Refuse an instant at which a derivative is not finite, such as that of a square root at zero."""
@@ -305,3 +487,33 @@ def _check_finite(derivatives: Iterable[np.ndarray], t: float) -> None:
                 "at another instant, or take a block that is smooth there.",
                 t=t,
             )
+
+
+# --- signals that change between ticks -------------------------------------------------------------------------------
+
+
+def find_moving(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) -> tuple[str, ...]:
+    """Return the names of injected signals that change between ticks and that continuous blocks use there."""
+    if not flat.continuous.size:
+        return ()
+    by_d = local.differentiate(NONE, at.t, at.x, at.w)["dx", "d"]
+    injected = zip(local.inputs, local.injected, strict=True)
+    return tuple(signal.name for signal, where in injected if np.any(by_d[:, where]) and is_moving(flat, signal))
+
+
+def is_moving(flat: FlatDiagram, signal: Tap) -> bool:
+    """Whether a signal follows continuous states between two ticks."""
+    return bool(flat.output(signal.port).depends("y", "x")[:, flat.continuous].any())
+
+
+def moves_between_ticks(diagram: WiredDiagram, at: OperatingPoint, outputs: list[str], inputs: list[str]) -> str:
+    """Return the name of a signal around a plant that changes between the ticks of a sampled diagram, or "".
+
+    These are outputs of the plant that other continuous blocks follow between the ticks, and inputs of the plant that
+    are not held.
+    """
+    flat = diagram.flatten_like(at)
+    signals, sources = ([find_signal(flat, name) for name in names] for names in (outputs, inputs))
+    local = LocalDerivatives(flat, signals, [], signals, evaluators_at(flat, at))
+    names = [*find_moving(flat, local, at), *(s.name for s in sources if is_moving(flat, s))]
+    return names[0] if names else ""

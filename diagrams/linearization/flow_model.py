@@ -4,31 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TypeAlias
 
 import numpy as np
 
 from ...blocks.core import Finding, OptionError, left_of
 from ...fmus.running import Derivation
 from ..flat import NONE, FlatDiagram, WiredDiagram, announcers
+from ..frequency import FourMatrices, hold_inputs
 from ..results import OperatingPoint
 from ..simulation import late_progress
 from .derivatives import LocalDerivatives
 from .exchanged import noise_of
-from .plant_models import join_matrices, states_of
+from .plant_models import EQUILIBRIUM, join_matrices, states_of
 
-EQUILIBRIUM = 1e-9
-"""Largest residual of an equilibrium."""
 STAGES = (1.0, 0.6, 0.2816, 0.857, 0.0526, 0.3333, 0.6513, 0.1184, 0.25, 0.3077, 0.0789)
 """Instants within a step at which DOP853 asks for rates, as parts of the step; the end comes first."""
-Four: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass
 class Model:
     """Matrices A, B, C, D of a linear model, with its states and findings; see `Linearization`."""
 
-    matrices: Four
+    matrices: FourMatrices
     dt: float
     states: list[str]
     affine: np.ndarray
@@ -40,7 +37,7 @@ class Model:
 
 def differentiate_flow(
     flat: FlatDiagram, local: LocalDerivatives, t: float, x1: np.ndarray, w: np.ndarray, h: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> FourMatrices:
     """Return the derivatives of x after the time h by x before it, by w and by d, and x after the time h.
 
     Only continuous states change. At an equilibrium, and everywhere where the flow is linear, the derivative is a
@@ -50,8 +47,6 @@ def differentiate_flow(
     An FMU in model exchange may depend on time without saying so. At an equilibrium it is asked at the instants at
     which DOP853 would ask it; where rates and derivatives are the same bits at all of them, they stay.
     """
-    from scipy.linalg import expm
-
     xc = flat.continuous
     nc, nx, nw, m = len(xc), flat.width, len(w), local.n_inputs
     many = nx + nw + m
@@ -77,14 +72,10 @@ def differentiate_flow(
         return all(np.array_equal(J, F) and np.array_equal(f, f0) for J, f in asked)
 
     if rests and (not local.varies or stays()):
-        big = np.zeros((nc + many, nc + many), dtype=F.dtype)
-        big[:nc] = F
-        whole = np.asarray(expm(big * h))[:nc]
+        whole = np.hstack(hold_inputs(F[:, :nc], F[:, nc:], h))
         final[xc] = start + f0 * h
     elif local.is_linear:
-        big = np.zeros((nc + many + 1, nc + many + 1), dtype=F.dtype)
-        big[:nc] = np.hstack([F, f0[:, None]])
-        whole = np.asarray(expm(big * h))[:nc]
+        whole = np.hstack(hold_inputs(F[:, :nc], np.hstack([F[:, nc:], f0[:, None]]), h))
         whole, final[xc] = whole[:, :-1], start + whole[:, -1]
     else:
         from scipy.integrate import solve_ivp

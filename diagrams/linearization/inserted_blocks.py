@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -31,13 +30,12 @@ from .findings import BlockFinding, CutFromTracking, InertConsumer
 from .kinks import read_arguments, read_log
 from .signal_paths import Node, SignalPaths
 
-D = TypeVar("D", bound=WiredDiagram)
 Port = tuple[str, str]
 
 
 def split_inputs(
-    diagram: D, point: OperatingPoint, names: Iterable[str]
-) -> tuple[D, OperatingPoint, Mapping[str, str]]:
+    diagram: WiredDiagram, point: OperatingPoint, names: Iterable[str]
+) -> tuple[WiredDiagram, OperatingPoint, Mapping[str, str]]:
     """Return the diagram with a block ahead of every input among the names, its operating point, and the blocks' ports.
 
     Names of wires and outputs are left out: an input has what no signal is called. An injection at a block's port
@@ -87,8 +85,13 @@ def _find_inputs(diagram: WiredDiagram, name: object) -> list[Port]:
 
 
 def insert_ahead(
-    diagram: D, flat: FlatDiagram, point: OperatingPoint, inputs: Sequence[Port], source: Port, entries: Sequence[int]
-) -> tuple[D, OperatingPoint, str]:
+    diagram: WiredDiagram,
+    flat: FlatDiagram,
+    point: OperatingPoint,
+    inputs: Sequence[Port],
+    source: Port,
+    entries: Sequence[int],
+) -> tuple[WiredDiagram, OperatingPoint, str]:
     """Return the diagram with a block ahead of inputs of one source, its operating point, and the block's port.
 
     Parameters
@@ -139,8 +142,8 @@ def _carry_point(
 
 
 def split_consumers(
-    diagram: D, point: OperatingPoint, wires: Sequence[str], to: Iterable[str]
-) -> tuple[D, OperatingPoint, str]:
+    diagram: WiredDiagram, point: OperatingPoint, wires: Sequence[str], to: Iterable[str]
+) -> tuple[WiredDiagram, OperatingPoint, str]:
     """Return the diagram with a block ahead of some consumers of a wire, its operating point, and the block's port.
 
     The block passes the signal on.

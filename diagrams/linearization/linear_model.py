@@ -22,34 +22,31 @@ from ...blocks.core import (
     LoopwrightError,
     NonFiniteError,
     OptionError,
+    WiringError,
     accepts,
     brief,
+    check_argument,
     count_of,
     explain_calls,
     kinds,
 )
 from ...fmus.running import Derivation, DerivativeMethod
-from ..flat import NONE, TickPattern, WiredDiagram
+from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
 from ..frequency import loop_class
 from ..results import OperatingPoint
 from ..wiring import exact_time
-from .checks import as_list, check_loop, check_opening, refuse_transport_delays, replace_stairs
-from .derivatives import LocalDerivatives, find_signal
+from .derivatives import LocalDerivatives, Tap, find_moving, find_signal
 from .exchanged import derivations_at, evaluators_at, findings_on
 from .findings import EntryTaken
-from .flow_model import EQUILIBRIUM, Model, model_continuous, relative_error
+from .flow_model import Model, model_continuous, relative_error
 from .inserted_blocks import find_cut_findings, name_inputs, split_consumers, split_inputs
 from .kinks import find_kinks
-from .loops_over_a_period import (
-    advance_point,
-    confirm_loop,
-    find_slower_clocks,
-    model_loop,
-    ticks_to_renewal,
-)
+from .mean_stairs import replace_stairs
 from .operating_points import PointLike, check_options, operating_point
-from .over_a_period import model_period, period_of
+from .over_a_period import begin_loop, confirm_loop, model_loop, model_period
+from .plant_models import EQUILIBRIUM
 from .signal_paths import SignalPaths
+from .tick_chain import period_of
 
 if TYPE_CHECKING:
     from control import StateSpace
@@ -101,7 +98,7 @@ class Linearization:
         Treatment of stairs that was asked for; the loops of this model use it too.
     """
 
-    diagram: WiredDiagram
+    wired: WiredDiagram = field(repr=False)
     A: np.ndarray = field(repr=False)
     B: np.ndarray = field(repr=False)
     C: np.ndarray = field(repr=False)
@@ -124,7 +121,12 @@ class Linearization:
 
     def __repr__(self) -> str:
         facts = f"T = {self.dt:g} s" if self.dt else "continuous", count_of(len(self.states), "state")
-        return brief(f"linear model of {self.diagram.name!r}", *facts, then="model.loop('wire'), .A, .findings")
+        return brief(f"linear model of {self.wired.name!r}", *facts, then="model.loop('wire'), .A, .findings")
+
+    @property
+    def diagram(self) -> Any:
+        """The `Diagram` of the model."""
+        return self.wired.facade
 
     @property
     def how(self) -> dict[str, str]:
@@ -145,7 +147,7 @@ class Linearization:
         OptionError
             If the model has no inputs or no outputs.
         """
-        return self._state_space(self.C, self.D, self.diagram.name)
+        return self._state_space(self.C, self.D, self.wired.name)
 
     def _state_space(self, C: np.ndarray, D: np.ndarray, name: str, kind: type[StateSpace] | None = None) -> Any:
         from control import StateSpace
@@ -154,7 +156,7 @@ class Linearization:
             raise OptionError(
                 f"found {len(self.inputs)} inputs and {len(self.outputs)} outputs; expected at least one of each. Name "
                 "them: linearize(…, inputs=…, outputs=…), or take a loop, .loop(…).",
-                block=self.diagram.name,
+                block=self.wired.name,
             )
         # python-control refuses dots in names
         names = {
@@ -173,7 +175,7 @@ class Linearization:
     @cached_property
     def findings_on_loops(self) -> tuple[Finding, ...]:
         """Those of the findings that limit numbers about all loops together, such as the poles."""
-        flat = self.diagram.flatten_like(self.point)
+        flat = self.wired.flatten_like(self.point)
         return SignalPaths(flat, [find_signal(flat, wire).port for wire in self.openings]).on_loops(self.findings)
 
     @property
@@ -236,8 +238,8 @@ class Linearization:
         if slow not in ("closed", "open"):
             raise OptionError(f"found slow={slow!r}; expected 'closed' or 'open'. Choose one of them.", port="slow")
         if to:
-            diagram, point, port = split_consumers(self.diagram, self.point, wires, as_list(to))
-            return replace(self, diagram=diagram, point=point).loop(port, lifted=lifted, slow=slow)
+            diagram, point, port = split_consumers(self.wired, self.point, wires, _as_list(to))
+            return replace(self, wired=diagram, point=point).loop(port, lifted=lifted, slow=slow)
         cut = self._make_at(wires, openings=wires, loop="lifted" if lifted else "one", slow=slow)
         made: LoopTransfer = cut._state_space(-cut.C, -cut.D, f"L({', '.join(wires)})", loop_class())
         made.linearization, made.wires = self, wires
@@ -265,26 +267,21 @@ class Linearization:
         if not wires:
             raise OptionError(
                 "found no name of a wire; expected one. Name it: .loop('v_perp').",
-                block=self.diagram.name,
+                block=self.wired.name,
                 port="wires",
             )
-        flat = self.diagram.flatten_like(self.point)
-        at, shift, frozen = self.point, 0, NONE
+        flat = self.wired.flatten_like(self.point)
         ports = [find_signal(flat, w).port for w in wires]
-        if slow == "open":
-            frozen = find_slower_clocks(flat, ports, self.diagram.name)
-        if self.dt and period_of(flat) > 1:
-            shift = ticks_to_renewal(flat, ports, at.tick)
-            at = advance_point(flat, at, self.plants, shift)
+        at, frozen = begin_loop(flat, self.point, ports, self.plants, slow, self.wired.name, moves=bool(self.dt))
         how: dict[str, Any] = {"plants": self.plants, "step": self.step, "stairs": self.stairs}
         how |= {"frozen": frozen, "findings": self.findings}
-        made = _linearize(self.diagram, at, wires, wires, openings, loop=loop, **how)
+        made = _linearize(self.wired, at, wires, wires, openings, loop=loop, **how)
         if loop:
-            own = not shift and not self.openings and not frozen
-            closed = self if own else _linearize(self.diagram, at, (), (), (), **how)
+            own = at is self.point and not self.openings and not frozen
+            closed = self if own else _linearize(self.wired, at, (), (), (), **how)
             known = 0.0 if math.isnan(made.uncertainty) else made.uncertainty
             cut = Model((made.A, made.B, made.C, made.D), made.dt, [], made.affine, uncertainty=known)
-            confirm_loop(cut, closed.A, wires, self.diagram.name)
+            confirm_loop(cut, closed.A, wires, self.wired.name)
         return made
 
 
@@ -304,7 +301,7 @@ def linearize(
     at = operating_point(diagram, point, options)
     _refuse_lost(diagram, at)
     diagram = diagram.replace(at.parameters) if at.parameters else diagram  # parameters that a trim has found
-    given = [as_list(names) for names in (inputs, outputs, openings)]
+    given = [_as_list(names) for names in (inputs, outputs, openings)]
     diagram, at, ports = split_inputs(diagram, at, itertools.chain(*given))
     places = [[ports.get(name, name) for name in names] for names in given]
     made = _linearize(diagram, at, *places, plants=plants, stairs=stairs, step=options.get("step"))
@@ -349,19 +346,19 @@ def _linearize(
         )
     if step is not None and not at.asked:
         at = replace(at, asked=True)
-    names = [as_list(n) for n in (inputs, outputs, openings)]
+    names = [_as_list(n) for n in (inputs, outputs, openings)]
     flat = diagram.flatten_like(at)
     at.check_fits(flat, diagram.name)
-    refuse_transport_delays(flat)
+    _refuse_transport_delays(flat)
     found = [[find_signal(flat, n) for n in group] for group in names]
     for signal in found[2]:
-        check_opening(flat, signal)
+        _check_opening(flat, signal)
     means = replace_stairs(diagram, flat, at, stairs)
     channels = list[str]()
     local = LocalDerivatives(flat, found[0], found[1], found[2], evaluators_at(flat, at), means)
     if diagram.has_clock or (diagram.has_fmu and step is not None):
         if loop:
-            check_loop(flat, local, at)
+            _check_loop(flat, local, at)
         if loop and period_of(flat) > 1:
             model, channels = model_loop(flat, local, at, plants, lifted=loop == "lifted", frozen=frozen)
         else:
@@ -424,3 +421,46 @@ def linearize_batch(
             error.add(f" (with {changes}, at {point!r})")
             raise
     return made
+
+
+# --- checks ----------------------------------------------------------------------------------------------------------
+
+
+def _as_list(given: str | Iterable[str]) -> list[str]:
+    """Return a name, or several, as a list."""
+    check_argument(given, kinds.names, "inputs, outputs and openings", "linearize")
+    return [given] if isinstance(given, str) else list(given)
+
+
+def _check_loop(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) -> None:
+    """Refuse the loop of a wire that changes between ticks and acts there."""
+    moving = find_moving(flat, local, at)
+    if moving:
+        raise OptionError(
+            f"{moving[0]!r} changes between ticks, and blocks in continuous time use it there; expected a loop that is "
+            "closed at ticks. Take the loop at a sampled signal, or that of diagram.continuous().",
+            block=local.inputs[0].port[0],
+            port=local.inputs[0].port[1],
+        )
+
+
+def _refuse_transport_delays(flat: FlatDiagram) -> None:
+    """Refuse a diagram with transport delays in continuous time."""
+    for path in sorted(flat.table.blocks):
+        if flat.table.blocks[path].transport and path not in flat.checked.traced:
+            raise WiringError(
+                "found a transport delay in continuous time, which has no finite linear model; expected none. Put it "
+                "into a sampled subsystem, where it is a delay of whole samples, or take PadeDelay(delay=…, order=…).",
+                block=path,
+            )
+
+
+def _check_opening(flat: FlatDiagram, signal: Tap) -> None:
+    """Refuse to cut a port without consumers."""
+    if signal.port in {(w.block, w.port) for w in flat.table.wires.values()}:
+        return
+    raise WiringError(
+        f"found nothing wired to it; expected a wire to cut at {signal.name!r}. Name a wire that closes a loop.",
+        block=signal.port[0],
+        port=signal.port[1],
+    )

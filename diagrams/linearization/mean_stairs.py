@@ -14,9 +14,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import Finding, Layout
+from ...blocks.core import Finding, Layout, OptionError
 from ...blocks.tracing import NEXT
-from ..flat import FlatDiagram, Instant
+from ..flat import FlatDiagram, Instant, WiredDiagram
 from ..results import OperatingPoint
 from .block_slopes import BlockSlopes, slopes_of
 from .findings import MeanSlope, StepsOnly
@@ -170,3 +170,16 @@ def _means(f: Any, arguments: Sequence[Any]) -> list[Any]:
 
 NO_STAIRS = Stairs()
 """No stairs are replaced."""
+
+
+def replace_stairs(diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, stairs: str | None) -> Stairs:
+    """Return the stairs that are replaced by their mean slopes."""
+    if stairs is None:
+        return NO_STAIRS
+    if not isinstance(stairs, str) or stairs != "gain":
+        raise OptionError(
+            f'found stairs={stairs!r}; expected "gain", which takes stairs as their mean slope, or None. Choose one.',
+            block=diagram.name,
+            port="stairs",
+        )
+    return Stairs.of(flat, at)

@@ -63,7 +63,7 @@ def capture(simulation: Simulation, how: PointOrigin = PointOrigin.RUN) -> Opera
         coupling=simulation.coupling,
         coupling_order=simulation.coupling_order,
         exchanged={path: block.operating_point() for path, block in view.exchanged.items()},
-        units=units_of(simulation.diagram.blocks, (*view.plants, *view.exchanged)),
+        units=units_of(simulation.wired.blocks, (*view.plants, *view.exchanged)),
     )
     return with_residual(flat, point, view.x_next)
 
@@ -152,7 +152,7 @@ def _top_paths(diagram: WiredDiagram) -> set[str]:
 
 def _check_found_again(diagram: WiredDiagram, given: Snapshot, found: OperatingPoint) -> None:
     """Refuse an instant that a repeated run does not reach again: the first run was restored from a saved state."""
-    if getattr(given.run, "diagram", None) is not diagram or given.state.shape != found.x.shape:
+    if getattr(getattr(given.run, "diagram", None), "wired", None) is not diagram or given.state.shape != found.x.shape:
         return
     off = float(np.max(np.abs(found.x - given.state) / (1.0 + np.abs(found.x)), initial=0.0))
     if not off <= AGAIN:
@@ -291,10 +291,19 @@ def copy_point(diagram: WiredDiagram, point: OperatingPoint, other: WiredDiagram
     for path in exchanged.keys() & states.keys():
         _copy_state(flat.states.of_block[path], states[path], x)
     return replace(
-        guess, t=point.t, tick=int(tick), x=x, w=w, z=z, plants=plants, exchanged=exchanged,
+        guess,
+        t=point.t,
+        tick=int(tick),
+        x=x,
+        w=w,
+        z=z,
+        plants=plants,
+        exchanged=exchanged,
         values={**guess.values, **{name: v for name, v in point.values.items() if name in guess.values}},
-        residual=point.residual, largest=point.largest, how=point.how,
-    )  # fmt: skip
+        residual=point.residual,
+        largest=point.largest,
+        how=point.how,
+    )
 
 
 def _copy(values: np.ndarray, old: Layout, new: Layout, into: np.ndarray) -> None:

@@ -1,47 +1,106 @@
-"""Discrete linear models of a diagram: over one base period, or over the least common period of several rates.
+"""Linear models over a period of ticks, from the models of its ticks (`tick_chain`).
 
-The state of a discrete model is that of all blocks and FMUs just before a tick, the signals that subsystems hold, and
-the inputs of FMUs that still act on their outputs: the outputs of a co-simulation FMU are those at the end of its last
-step. A tick contributes the derivative of the tick's function, the time to the next tick that of the flow, and an FMU
-that of its step. The operating point moves along: every tick of a period is linearized at the states of that tick.
+The period is the base period or, with several rates, the least common period of all clocks. Three models are made:
+
+- *over the period* (`model_period`): injected signals are held over the whole period, and measured at its beginning;
+- *of a loop* (`model_loop`). A signal that is held over the whole period cuts a wire's loop only if the wire is renewed
+  once in the period, at its beginning: the period of a loop begins at a tick at which the wire's source acts. A signal
+  of its own is injected at every tick. Ticks between which the wire stays the same make one channel; a channel that
+  nothing on the loop uses is left out. A wire that is renewed once has one channel, and L. A wire that is renewed N
+  times has a periodic loop: no L at one rate, but a lifted L of N × N, with a channel for each renewal;
+- *of each tick* (`model_ticks`), for an environment at the plant, which moves between them.
+
+The loop of a fast wire with the slow loops open needs no lifting: the clocks slower than the wire's are frozen, and the
+period is that of the others.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from ...blocks.core import Finding, Layout
-from ...fmus.running import Derivation
-from ..flat import NONE, FlatDiagram, TickPattern
+from ...blocks.core import ConfirmationError, Finding, OptionError, PeriodicLoopError
+from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
+from ..frequency import FourMatrices
 from ..results import OperatingPoint
-from .checks import check_coupling
-from .coupled_chain import CoupledChain, Step
-from .derivatives import SLOPE, LocalDerivatives, Numbers
-from .exchanged import noise_of
-from .findings import EventWithinPeriod, MemoryActs, UnusualStart
-from .flow_model import EQUILIBRIUM, Four, Model, differentiate_flow
-from .plant_models import (
-    PlantModel,
-    check_way,
-    fmu_at,
-    inputs_before,
-    join_matrices,
-    plant_paths,
-    states_of,
-)
+from .derivatives import LocalDerivatives, Tap, find_signal
+from .exchanged import evaluators_at
+from .findings import MemoryActs
+from .flow_model import Model
+from .mean_stairs import replace_stairs
+from .plant_models import EQUILIBRIUM
+from .tick_chain import Chain, period_of
 
-SAME = 1e-12
-"""Largest difference of values that are the same, relative to 1 + their size."""
+SAME_ROWS = 1e-12
+"""Relative difference up to which a wire counts as unchanged from one tick to the next."""
+SAME_POLES = 1e-6
+"""Relative difference up to which two characteristic polynomials count as the same."""
 
 
-def period_of(flat: FlatDiagram, frozen: frozenset[TickPattern] = NONE) -> int:
-    """Return the least common period of all clocks and FMUs that are not frozen, in ticks of the base."""
-    plants = {clock for clocks in flat.plant_ticks.values() for clock in clocks}
-    return math.lcm(*(clock.every for clock in {*flat.distinct} | plants if clock not in frozen))
+def lift(steps: Sequence[FourMatrices], *, each_tick: bool) -> FourMatrices:
+    """Return the matrices over all ticks of a period, from those of each tick.
+
+    With ``each_tick`` the inputs and outputs of all ticks follow one another. Else an input is held over the
+    whole period, and the outputs are those of the first tick.
+    """
+    n, m = steps[0][1].shape
+    X, U = np.eye(n), np.zeros((n, m * len(steps) if each_tick else m), dtype=steps[0][1].dtype)
+    C, D = [], []
+    for k, (M, N, Cy, Dy) in enumerate(steps):
+        own = slice(k * m, (k + 1) * m) if each_tick else slice(0, m)
+        if each_tick or not k:
+            by_d = Cy @ U
+            by_d[:, own] += Dy
+            C.append(Cy @ X)
+            D.append(by_d)
+        X, U = M @ X, M @ U
+        U[:, own] += N
+    return X, U, np.vstack(C), np.vstack(D)
+
+
+def own_states(flat: FlatDiagram, chain: Chain) -> set[int]:
+    """Return the numbers of the states of blocks and FMUs that are states of the model.
+
+    Modes that only events change, states from which a block in continuous time only starts a search, and states of
+    frozen clocks are not.
+    """
+    table = flat.table
+
+    def acts(path: str) -> bool:
+        subsystem = table.subsystem_of[path]
+        return table.is_sampled(subsystem) and flat.clocks.get(subsystem) not in chain.frozen
+
+    sampled = flat.states.entries(path for path in flat.states.slices if acts(path))
+    return {*flat.continuous.tolist(), *sampled, *range(flat.width, flat.width + chain.n_p)}
+
+
+def find_needed(steps: Sequence[FourMatrices], own: set[int]) -> list[int]:
+    """Return the numbers of the own states, and of those of the other entries that act on anything in a step.
+
+    The other entries are signals held since a tick and solutions of loops; many are only recorded. One that stays
+    constant, whatever the others do, is a mode.
+    """
+    one = np.eye(len(steps[0][0]))
+    acts = np.any([A != 0.0 for A, *_ in steps], axis=0) & (one == 0.0)  # on others
+    shown = np.any([np.any(C, axis=0) for _, _, C, _ in steps], axis=0)
+    changed = np.any([one != A for A, *_ in steps], axis=0)
+    driven = np.any([np.any(B, axis=1) for _, B, *_ in steps], axis=0)
+    keep = np.ones(len(one), dtype=bool)
+    free = np.array([j not in own for j in range(len(one))], dtype=bool)
+    while True:
+        silent = ~acts[keep].any(axis=0) & ~shown
+        constant = ~changed[:, keep].any(axis=1) & ~driven
+        gone = keep & free & (silent | constant)
+        if not gone.any():
+            return np.flatnonzero(keep).tolist()
+        keep &= ~gone
+
+
+def _restrict(four: FourMatrices, keep: list[int]) -> FourMatrices:
+    A, B, C, D = four
+    return A[np.ix_(keep, keep)], B[keep], C[:, keep], D
 
 
 def model_period(
@@ -57,15 +116,14 @@ def model_period(
     period = period_of(flat, frozen)
     chain = Chain(flat, local, at, way, period, frozen)
     chain.go_on()
-    A, B = chain.M, chain.N
+    whole = lift(chain.steps, each_tick=False)
     names = chain.labels
-    keep = find_needed(A, chain.C, own_states(flat, frozen), set(range(flat.width, flat.width + chain.n_p)))
-    memory, findings = _find_memory(flat, A, names)
+    keep = find_needed([whole], own_states(flat, chain))
+    memory, findings = _find_memory(flat, whole[0], names)
     findings += chain.findings(at.tick + period) if with_findings else []
-    A, B, C = A[np.ix_(keep, keep)], B[keep], chain.C[:, keep]
     labels = [names[i] for i in keep]
     return Model(
-        (A, B, C, chain.D),
+        _restrict(whole, keep),
         float(flat.base * period),
         labels,
         chain.affine()[keep],
@@ -74,288 +132,6 @@ def model_period(
         tuple(m for m in memory if m in labels),
         tuple(findings),
     )
-
-
-def ticks_of_period(flat: FlatDiagram, first: int, period: int) -> Iterator[tuple[int, int]]:
-    """Yield the ticks of a period, each with the next one.
-
-    They are the first one, and those at which a clock acts or an FMU steps.
-    """
-    ticks = [k for k in range(first, first + period) if k == first or any(c.acts(k) for c in flat.visited)]
-    yield from zip(ticks, [*ticks[1:], first + period], strict=True)
-
-
-class Chain:
-    """Linear models of the ticks of a period, one after the other.
-
-    M and N lead from the state just before the first tick, and from the injected signals, to the state just before the
-    tick that is reached. C and D lead to the signals that are measured at the first tick. ``steps`` holds the four
-    matrices of each tick. Clocks that are ``frozen`` do not act: their subsystems hold outputs and states.
-
-    An FMU goes from one of its communication points to the next, with the inputs of the first one. Between them its
-    outputs are held: where an FMU has fewer of them than there are ticks, these outputs are states, too.
-    """
-
-    def __init__(
-        self,
-        flat: FlatDiagram,
-        local: LocalDerivatives,
-        at: OperatingPoint,
-        way: str | None,
-        count: int,
-        frozen: frozenset[TickPattern] = NONE,
-    ):
-        check_way(way)
-        self._coupled: CoupledChain | None = check_coupling(flat, local, at)
-        self.flat, self.local, self.way, self.frozen = flat, local, way, frozen
-        self.first = self.here = at
-        self.ticks = list(ticks_of_period(flat, at.tick, count))
-        self._end = at.tick + count
-        self.paths = plant_paths(flat)
-        self._until = dict.fromkeys(self.paths, at.tick)
-        self._holds = any(not self._steps_at(path, k) for path in self.paths for k, _ in self.ticks[1:])
-        self._straight = [] if self._coupled is None else np.flatnonzero(self._coupled.straight).tolist()
-        if self._coupled is not None:
-            self._coupled.check_ticks(self._holds or any(not self._steps_at(path, at.tick) for path in self.paths))
-            self._holds = bool(self._straight)
-        self._models: dict[str, PlantModel] = {}
-        self.derivations: dict[str, Derivation] = {}
-        self.uncertainty, self.n_p = 0.0, 0
-        self._known_plants: dict[str, tuple[float, np.ndarray, np.ndarray, PlantModel]] = {}
-        self._known_flow: tuple[float, np.ndarray, np.ndarray, Four] | None = None
-        self._begun = False
-        self.steps: list[Four] = []
-        self._fired: list[Finding] = []
-        self._first_tick: Numbers = {}
-
-    @property
-    def models(self) -> list[PlantModel]:
-        """Models of the FMUs' present steps."""
-        return [self._models[path] for path in self.paths]
-
-    def _steps_at(self, path: str, k: int) -> bool:
-        return any(clock.acts(k) for clock in self.flat.plant_ticks[path] if clock not in self.frozen)
-
-    def go_on(self) -> None:
-        """Go through all ticks."""
-        for k, following in self.ticks:
-            self.go(k, following)
-
-    def go(self, k: int, following: int) -> None:
-        """Go from tick ``k`` to the next one."""
-        flat, here, h = self.flat, self.here, float(self.flat.base * (following - k))
-        tick = self.local.differentiate(flat.acting(k) - self.frozen, here.t, here.x, here.w)
-        mid_step = [path for path in self.paths if self._until[path] != k]
-        held = self._begin_steps(k, tick["z"])
-        kept = [*self._straight, *(i for path in mid_step for i in self._models[path].outputs)]
-        models = self.models
-        Ap, Bp, Cp, Dp = (join_matrices(flat, models, which) for which in "ABCD")
-        nx, nz, n_p, nw = flat.width, flat.plant_inputs.total, len(Ap), flat.plant_outputs.total
-        n = nx + n_p + nz + (nw if self._holds else 0)
-        W = np.zeros((nw, n), dtype=Cp.dtype)  # the FMUs' outputs before the tick
-        W[:, nx : nx + n_p], W[:, nx + n_p : nx + n_p + nz] = Cp, Dp
-        W[kept] = 0.0
-        W[kept, [nx + n_p + nz + i for i in kept]] = 1.0
-
-        def eliminate_w(quantity: str) -> tuple[np.ndarray, np.ndarray]:
-            by_state = tick[quantity, "w"] @ W
-            by_state[:, :nx] += tick[quantity, "x"]
-            return by_state, tick[quantity, "d"]
-
-        x_of, x_by_d = eliminate_w("x")
-        z_of, z_by_d = eliminate_w("z")
-        for path in held:  # the inputs that it has already
-            mine = self._models[path].inputs
-            z_of[mine], z_by_d[mine] = 0.0, 0.0
-            z_of[mine, [nx + n_p + i for i in mine]] = 1.0
-        x1 = tick["x"]
-        if flat.continuous.size:
-            E, Ew, Ed, x1 = self._differentiate_flow(x1, h)
-            x_of, x_by_d = E @ x_of + Ew @ W, E @ x_by_d + Ed
-        else:
-            Ew = np.zeros((nx, nw), dtype=W.dtype)
-        P, P_by_d = Bp @ z_of, Bp @ z_by_d
-        P[:, nx : nx + n_p] += Ap
-        W_next, states = W, Layout.of({m.path: (len(m.A),) for m in models})
-        for path in self.paths:
-            if self._until[path] != following:  # it is on its way
-                rows = states.entries([path])
-                P[rows], P_by_d[rows] = 0.0, 0.0
-                P[rows, [nx + i for i in rows]] = 1.0
-        W_by_d = np.zeros((nw, x_by_d.shape[1]), dtype=W.dtype)
-        if self._coupled is not None:
-            before = np.zeros((n_p, n + x_by_d.shape[1]), dtype=P.dtype)
-            before[:, nx : nx + n_p] = np.eye(n_p)
-            x_all, z_all, w_all = (np.hstack(pair) for pair in ((x_of, x_by_d), (z_of, z_by_d), (W, W_by_d)))
-            end = self._end_time(following)
-            step = Step(x_all, z_all, w_all, before, here.t, end, x1, here.w, tick["z"], dict(states.slices))
-            self._models |= self._coupled.go(step, lambda path, z: self._model_plant(path, z, h), Ew)
-            (x_of, x_by_d), (P, P_by_d), (z_of, z_by_d), (W_next, W_by_d) = (
-                (part[:, :n], part[:, n:]) for part in (step.x, step.p, step.z, step.w)
-            )
-        M, N = np.vstack([x_of, P, z_of]), np.vstack([x_by_d, P_by_d, z_by_d])
-        if self._holds:
-            M, N = np.vstack([M, W_next]), np.vstack([N, W_by_d])
-        self.steps.append((M, N, *eliminate_w("y")))
-        if not self._begun:
-            (self.M, self.N, self.C, self.D), self.n_p = self.steps[0], n_p
-            self._begun, self._first_tick = True, tick
-        else:
-            self.M, self.N = M @ self.M, M @ self.N + N
-        self._move(following, h, x1, tick["z"])
-
-    def _begin_steps(self, k: int, z: np.ndarray) -> list[str]:
-        """Begin the steps of the FMUs that stand at a tick; return those that keep the inputs that they hold."""
-        held = []
-        for path in self.paths:
-            own = self._steps_at(path, k)
-            if not own:
-                held.append(path)
-            if self._until[path] == k:
-                ends = (clock.after(k) for clock in self.flat.plant_ticks[path] if clock not in self.frozen)
-                self._until[path] = min([*ends, self._end])
-                h = float(self.flat.base * (self._until[path] - k))
-                self._models[path] = self._model_plant(path, z if own else inputs_before(self.flat, self.here), h)
-        return held
-
-    def _model_plant(self, path: str, z: np.ndarray, h: float) -> PlantModel:
-        """Return the model of an FMU's step; at rest, that of the last one is used again."""
-        before, known = inputs_before(self.flat, self.here), self._known_plants.get(path)
-        if known is not None and known[0] == h and _are_same(known[1], z) and _are_same(known[2], before):
-            return replace(known[3], next={**known[3].next, "t": self.here.plants[path]["t"] + h})
-        model = self.local.model_step(self.here, path, z, h, self.way)
-        self.derivations[path] = model.derivation
-        self.uncertainty = max(self.uncertainty, model.uncertainty)
-        if _are_same(model.f, model.x0):  # at rest: the same inputs give the same model
-            self._known_plants[path] = (h, z, before, model)
-        return model
-
-    def _differentiate_flow(self, x1: np.ndarray, h: float) -> Four:
-        """Return `differentiate_flow` from here on; at rest, that of the last tick is used again."""
-        here, known = self.here, self._known_flow
-        if known is not None and known[0] == h and _are_same(known[1], x1) and _are_same(known[2], here.w):
-            return known[3]
-        found = differentiate_flow(self.flat, self.local, here.t, x1, here.w, h)
-        if not self.local.varies and _are_same(found[3], x1):
-            self._known_flow = (h, x1, here.w, found)
-        self._note_events(found[3], h)
-        return found
-
-    def _note_events(self, x_end: np.ndarray, h: float) -> None:
-        """Add a finding for each event whose indicator changes its sign over the flow."""
-        flat, here = self.flat, self.here
-        if not flat.events:
-            return
-        evaluators = self.local.evaluators
-        (g0, _), (g1, opened) = (
-            flat.indicators(t, np.real(x), np.real(here.w), flat.p, evaluators=evaluators)
-            for t, x in ((here.t, here.x), (here.t + h, x_end))
-        )
-        for event, a, b, now in zip(flat.events, g0 > 0, g1 > 0, opened > 0.5, strict=True):
-            if a != b and now:
-                self._fired.append(EventWithinPeriod(event.path, event.name, here.t))
-
-    def _end_time(self, k: int) -> float:
-        return self.first.t + float((k - self.first.tick) * self.flat.base)
-
-    def _move(self, k: int, h: float, x: np.ndarray, z: np.ndarray) -> None:
-        """Move the operating point to tick k."""
-        kind = np.result_type(self.here.w, *(m.y_next for m in self.models))
-        w, plants = self.here.w.astype(kind), dict(self.here.plants)
-        for m in self.models:
-            if self._until[m.path] == k:
-                w[m.outputs] = m.y_next
-                plants[m.path] = m.next
-        self.here = replace(self.here, t=self._end_time(k), tick=k, x=x, w=w, z=z, plants=plants)
-
-    @property
-    def labels(self) -> list[str]:
-        """Names of the model's states: of blocks, of FMUs, and of the inputs and outputs that FMUs hold."""
-        ports = self.flat.plant_inputs.labels + (self.flat.plant_outputs.labels if self._holds else [])
-        held = [f"held({label})" for label in ports]
-        return self.flat.labels + states_of(self.models) + held
-
-    def affine(self) -> np.ndarray:
-        """Return the change of the states over the period at the operating point itself."""
-        last, first = self.here, self.first
-        inputs = [inputs_before(self.flat, point) for point in (first, last)]
-        states = [_plant_states(self.flat, point, self.models) for point in (first, last)]
-        outputs = [last.w - first.w] if self._holds else []
-        return np.concatenate([last.x - first.x, states[1] - states[0], inputs[1] - inputs[0], *outputs])
-
-    def findings(self, last: int) -> list[Finding]:
-        """Return the events within the period, and a start whose tick is unlike the tick ``last``."""
-        findings = list(dict.fromkeys(self._fired))
-        if self.first.tick == 0 and np.max(np.abs(self.affine()), initial=0.0) <= EQUILIBRIUM:
-            later = self.local.differentiate(
-                self.flat.acting(last) - self.frozen, self.here.t, self.here.x, self.here.w
-            )
-            pairs = [(self._first_tick[e, a], later[e, a]) for e in "xzy" for a in "xwd"]
-            same = max(1e-9, 10.0 * noise_of(self.local.evaluators)[0])
-            if any(np.max(np.abs(a - b), initial=0.0) > same * (1 + np.max(np.abs(b), initial=0.0)) for a, b in pairs):
-                findings.append(UnusualStart())
-        return findings
-
-
-def _plant_states(flat: FlatDiagram, point: OperatingPoint, models: Sequence[PlantModel]) -> np.ndarray:
-    parts = [np.zeros(0)]
-    for m in models:
-        if m.identified:  # the states of an identified model are zero at rest
-            parts.append(np.zeros(len(m.A)))
-            continue
-        state = point.plants[m.path]["state"]
-        parts += [np.ravel(state[name]) for name in fmu_at(flat, m.path).description.states]
-    return np.concatenate(parts)
-
-
-def _are_same(a: np.ndarray, b: np.ndarray) -> bool:
-    if np.iscomplexobj(a) or np.iscomplexobj(b):  # values with slopes
-        return _are_same(np.real(a), np.real(b)) and _are_same(np.imag(a) / SLOPE, np.imag(b) / SLOPE)
-    return bool(np.all(np.abs(a - b) <= SAME * (1.0 + np.abs(a))))
-
-
-# --- states of the model ---------------------------------------------------------------------------------------------
-
-
-def own_states(flat: FlatDiagram, frozen: frozenset[TickPattern] = NONE) -> set[int]:
-    """Return the numbers of the states of blocks that are states of the model.
-
-    Modes that only events change, states from which a block in continuous time only starts a search, and states of
-    frozen clocks are not.
-    """
-    table = flat.table
-
-    def acts(path: str) -> bool:
-        subsystem = table.subsystem_of[path]
-        return table.is_sampled(subsystem) and flat.clocks.get(subsystem) not in frozen
-
-    sampled = flat.states.entries(path for path in flat.states.slices if acts(path))
-    return {*flat.continuous.tolist(), *sampled}
-
-
-def find_needed(A: np.ndarray, C: np.ndarray, own: set[int], plants: set[int]) -> list[int]:
-    """Return the numbers of the states of blocks and FMUs, and of the other entries that act on anything.
-
-    The other entries are signals held since a tick and solutions of loops; many are only recorded.
-    """
-    keep = list(range(len(A)))
-    while True:
-        gone = [
-            j
-            for j in keep
-            if j not in own | plants and not np.any(A[np.ix_([i for i in keep if i != j], [j])]) and not np.any(C[:, j])
-        ]
-        gone += [j for j in keep if j not in own | plants and j not in gone and _is_constant(A, keep, j)]
-        if not gone:
-            return keep
-        keep = [j for j in keep if j not in gone]
-
-
-def _is_constant(A: np.ndarray, keep: list[int], j: int) -> bool:
-    """Whether a state stays constant, whatever the others do: a mode."""
-    row = A[j, keep].copy()
-    row[keep.index(j)] -= 1.0
-    return not np.any(row)
 
 
 def _find_memory(flat: FlatDiagram, A: np.ndarray, names: list[str]) -> tuple[list[str], list[Finding]]:
@@ -370,3 +146,318 @@ def _find_memory(flat: FlatDiagram, A: np.ndarray, names: list[str]) -> tuple[li
         else:
             findings.append(MemoryActs(path, float(np.max(np.abs(A[:, where])))))
     return found, findings
+
+
+# --- loops -----------------------------------------------------------------------------------------------------------
+
+
+def ticks_to_renewal(flat: FlatDiagram, ports: Iterable[tuple[str, str]], tick: int) -> int:
+    """Return the number of ticks after ``tick`` until the wires are renewed; 0 if they are not renewed together.
+
+    A wire is renewed at the ticks of the clock behind its source. A wire that follows continuous states or an FMU is
+    renewed at the ticks of the clock of its readers.
+    """
+    clock = _find_one_clock(flat, list(ports))
+    return 0 if clock is None or clock.acts(tick) else clock.after(tick) - tick
+
+
+def ticks_between_renewals(flat: FlatDiagram, ports: Iterable[tuple[str, str]]) -> int | None:
+    """Return the number of ticks from one renewal of the wires to the next; None if they are not renewed together."""
+    clock = _find_one_clock(flat, list(ports))
+    return None if clock is None else clock.every
+
+
+def find_slower_clocks(flat: FlatDiagram, ports: Iterable[tuple[str, str]], name: str) -> frozenset[TickPattern]:
+    """Return the clocks that are slower than the wires: than the fastest clock behind their sources, or their readers.
+
+    Raises
+    ------
+    OptionError
+        If no sampled subsystem makes or reads a wire.
+    """
+    ports = list(ports)
+    for reading in (False, True):
+        found = [_find_clocks(flat, port, reading=reading) for port in ports]
+        if all(found):
+            every = min(clock.every for clocks in found for clock in clocks or ())
+            return frozenset(clock for clock in flat.distinct if clock.every > every)
+    raise OptionError(
+        f"found no sampled subsystem that makes or reads {', '.join('.'.join(port) for port in ports)} alone; expected "
+        "one, whose rate tells the slower loops. Take the loop at a wire of a sampled subsystem.",
+        block=name,
+        port="slow",
+    )
+
+
+def _find_one_clock(flat: FlatDiagram, ports: Sequence[tuple[str, str]]) -> TickPattern | None:
+    """Return the one clock behind the sources of all wires, or else that of all their readers; None without one."""
+    for reading in (False, True):
+        found: set[TickPattern] | None = set()
+        for port in ports:
+            clocks = _find_clocks(flat, port, reading=reading)
+            found = None if clocks is None or found is None else found | clocks
+        if found is not None and len(found) == 1:
+            return next(iter(found))
+    return None
+
+
+def _find_clocks(flat: FlatDiagram, port: tuple[str, str], *, reading: bool) -> set[TickPattern] | None:
+    """Return the clocks behind a port, or with ``reading`` those of its readers.
+
+    Blocks in continuous time without states are passed through; with states, or an FMU, the result is None.
+    """
+    table = flat.table
+    found: set[TickPattern] = set()
+    todo, seen = [port[0]] if not reading else _readers(flat, port), set[str]()
+    while todo:
+        path = todo.pop()
+        if path in seen:
+            continue
+        seen.add(path)
+        subsystem = table.subsystem_of[path]
+        if table.is_sampled(subsystem) and subsystem in flat.clocks:
+            found.add(flat.clocks[subsystem])
+            continue
+        where = flat.states.slices.get(path)
+        if path not in flat.checked.traced or (where is not None and where.stop > where.start):
+            return None
+        if reading:
+            todo += [block for (block, _), w in table.wires.items() if w.block == path]
+        else:
+            todo += [w.block for (block, _), w in table.wires.items() if block == path]
+    return found
+
+
+def _readers(flat: FlatDiagram, port: tuple[str, str]) -> list[str]:
+    return [block for (block, _), w in flat.table.wires.items() if (w.block, w.port) == port]
+
+
+def begin_loop(
+    flat: FlatDiagram,
+    at: OperatingPoint,
+    ports: Sequence[tuple[str, str]],
+    way: str | None,
+    slow: str,
+    name: str,
+    closed: LocalDerivatives | None = None,
+    *,
+    moves: bool = True,
+) -> tuple[OperatingPoint, frozenset[TickPattern]]:
+    """Return the point at which the period of a loop begins, and the clocks that are frozen in it.
+
+    Wires are renewed at that point. ``closed`` are the derivatives with nothing cut, ``moves`` says whether the model
+    has ticks. With ``slow="open"`` the clocks slower than the wires' are frozen.
+    """
+    frozen = find_slower_clocks(flat, ports, name) if slow == "open" else NONE
+    count = ticks_to_renewal(flat, ports, at.tick) if moves and period_of(flat) > 1 else 0
+    if not count:
+        return at, frozen
+    chain = Chain(flat, closed or LocalDerivatives(flat, (), (), (), evaluators_at(flat, at)), at, way, count)
+    chain.go_on()
+    return chain.here, frozen
+
+
+def model_loop(
+    flat: FlatDiagram,
+    local: LocalDerivatives,
+    at: OperatingPoint,
+    way: str | None,
+    *,
+    lifted: bool,
+    frozen: frozenset[TickPattern] = NONE,
+) -> tuple[Model, list[str]]:
+    """Return the model from the injected to the returning signals at the same wires, and the names of its channels.
+
+    Raises
+    ------
+    PeriodicLoopError
+        If a wire is renewed, and used, several times in the period, unless ``lifted``.
+    """
+    period, m = period_of(flat, frozen), local.n_inputs
+    chain = Chain(flat, local, at, way, period, frozen)
+    chain.go_on()
+    whole = lift(chain.steps, each_tick=True)
+    keep = find_needed([whole], own_states(flat, chain))
+    names, labels = chain.labels, [e for s in local.inputs for e in s.labels]
+    A, B, C, D = _restrict(whole, keep)
+    groups = _find_channels(A, B, C, D, m)
+    many = [e for e in range(m) if len(groups[e]) > 1]
+    if many and not lifted:
+        signal = next(s for s in local.inputs if labels[many[0]] in s.labels)
+        raise _make_error(signal, len(groups[many[0]]), float(flat.base * period))
+    if many:  # all renewals, so that a delay of one is a shift by one channel
+        renewals = _find_renewals(flat, local.inputs, [k for k, _ in chain.ticks])
+        groups = [renewals if renewals and len(group) > 1 else group for group in groups]
+    chosen = [(e, j, group) for e in range(m) for j, group in enumerate(groups[e])]
+    into = np.zeros((B.shape[1], len(chosen)))
+    for column, (e, _, group) in enumerate(chosen):
+        into[[k * m + e for k in group], column] = 1.0
+    rows = [group[0] * m + e for e, _, group in chosen]
+    model = Model(
+        (A, B @ into, C[rows], D[rows] @ into),
+        float(flat.base * period),
+        [names[i] for i in keep],
+        chain.affine()[keep],
+        chain.derivations,
+        chain.uncertainty,
+    )
+    return model, [f"{labels[e]}@{j}" if len(groups[e]) > 1 else labels[e] for e, j, _ in chosen]
+
+
+def _make_error(signal: Tap, count: int, period: float) -> PeriodicLoopError:
+    return PeriodicLoopError(
+        f"{signal.name!r} is renewed {count} times in the model's period of {period:g} s; expected once: its loop is "
+        f"periodic and has no L at one rate. Take loop({signal.name!r}, slow='open') for the loop at its own rate, "
+        "with slower subsystems holding; with all loops closed take "
+        f"periodic_margins(loop({signal.name!r}, lifted=True)).",
+        block=signal.port[0],
+        port=signal.port[1],
+    )
+
+
+def _find_renewals(flat: FlatDiagram, signals: Sequence[Tap], ticks: Sequence[int]) -> list[list[int]]:
+    """Return the groups of places in ``ticks`` between the renewals of the wires; empty if no one clock renews them."""
+    clock = _find_one_clock(flat, [signal.port for signal in signals])
+    if clock is None or not clock.acts(ticks[0]):
+        return []
+    groups: list[list[int]] = []
+    for place, k in enumerate(ticks):
+        if clock.acts(k):
+            groups.append([place])
+        else:
+            groups[-1].append(place)
+    return groups
+
+
+def _find_channels(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, m: int) -> list[list[list[int]]]:
+    """Return the channels of each entry: groups of ticks between which it stays the same, if they act on an output."""
+    count = len(C) // m if m else 0
+    seen = np.any(C, axis=0)
+    while True:  # states on which an output depends
+        more = seen | np.any(A[seen], axis=0)
+        if np.array_equal(more, seen):
+            break
+        seen = more
+    acts = np.any(B[seen], axis=0) | np.any(D, axis=0)
+    both, found = np.hstack([C, D]), []
+    for e in range(m):
+        groups: list[list[int]] = []
+        for k in range(count):
+            row = both[k * m + e]
+            before = both[(k - 1) * m + e]
+            if k and np.max(np.abs(row - before), initial=0.0) <= SAME_ROWS * np.max(np.abs(row), initial=0.0):
+                groups[-1].append(k)
+            else:
+                groups.append([k])
+        used = [group for group in groups if any(acts[k * m + e] for k in group)]
+        found.append(used or groups[:1])
+    return found
+
+
+def confirm_loop(cut: Model, A: np.ndarray, wires: tuple[str, ...], name: str) -> None:
+    """Compare the poles of the closed loop with those of the diagram.
+
+    Raises
+    ------
+    ConfirmationError
+        If they differ.
+    """
+    Ac, B, C, D = cut.matrices
+    back = np.eye(len(D)) - D
+    if len(D) and not np.linalg.cond(back) < 1e12:
+        return  # the closed loop has no unique solution, which its margins say
+    closed = Ac + B @ np.linalg.solve(back, C) if len(D) else Ac
+    size = [float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) for a in (closed, A, 0.1 * Ac)]
+    radius = 1.5 * max(size) or 1.0  # the open loop counts too: the poles of a deadbeat loop are rounding alone
+    worst = 0.0
+    for angle in (0.3, 1.1, 2.0):  # det(I − A/z) does not count states at zero, such as values held for later
+        z = radius * np.exp(1j * angle)
+        (s1, l1), (s2, l2) = (np.linalg.slogdet(np.eye(len(a)) - a / z) for a in (closed, A))
+        worst = max(worst, float(abs(s1 / s2 * np.exp(l1 - l2) - 1.0)))
+    if not worst <= SAME_POLES + 100 * cut.uncertainty / radius:
+        raise ConfirmationError(
+            f"the loop at {', '.join(map(repr, wires))}, closed, has the poles of another system than the diagram: "
+            f"found characteristic polynomials that differ by {worst:.3g} of their size; expected the same. The "
+            "margins of this loop are not those of the diagram. Cut another wire.",
+            block=name,
+        )
+
+
+# --- each tick -------------------------------------------------------------------------------------------------------
+
+
+class TickModel(NamedTuple):
+    """Model of the rest of a diagram from one tick to the next, with the plant's outputs injected.
+
+    The matrices lead from the states just before the tick and the injected signals to those before the next one, and
+    to the signals that are measured at the tick.
+
+    Attributes
+    ----------
+    matrices : tuple of ndarray
+        A, B, C and D.
+    duration : float
+        Time to the next tick in s.
+    steps : bool
+        Whether the plant exchanges signals at the tick: always, if it is no FMU.
+    renews : tuple of bool
+        Whether each injected wire is renewed at the tick, by the clock of its block; wires of continuous blocks and
+        FMUs always are.
+    """
+
+    matrices: FourMatrices
+    duration: float
+    steps: bool
+    renews: tuple[bool, ...]
+
+
+def model_ticks(
+    diagram: WiredDiagram,
+    at: OperatingPoint,
+    path: str,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    openings: Sequence[str],
+    stairs: str | None = None,
+) -> tuple[tuple[TickModel, ...], list[str]]:
+    """Return the models of all ticks of a sampled diagram's period, and the names of their states.
+
+    Parameters
+    ----------
+    diagram : Diagram
+        Sampled diagram.
+    at : OperatingPoint
+        Instant at whose tick the period begins.
+    path : str
+        Path of the plant.
+    inputs, outputs, openings : sequence of str
+        Wires at which signals are injected and measured, and wires that are cut.
+    stairs : str, optional
+        Treatment of stairs, as `linearize` takes it.
+    """
+    flat = diagram.flatten_like(at)
+    injected, measured, cut = ([find_signal(flat, name) for name in names] for names in (inputs, outputs, openings))
+    means = replace_stairs(diagram, flat, at, stairs)
+    local = LocalDerivatives(flat, injected, measured, cut, evaluators_at(flat, at), means)
+    chain = Chain(flat, local, at, None, period_of(flat))
+    chain.go_on()
+    keep = find_needed(chain.steps, own_states(flat, chain))
+    clocks = [_clock_of(flat, tap) for tap in injected]
+    mine = flat.plant_ticks.get(path)
+    found = tuple(
+        TickModel(
+            _restrict(four, keep),
+            float(flat.base * (following - k)),
+            mine is None or any(clock.acts(k) for clock in mine),
+            tuple(clock is None or clock.acts(k) for clock in clocks),
+        )
+        for (k, following), four in zip(chain.ticks, chain.steps, strict=True)
+    )
+    labels = chain.labels
+    return found, [labels[i] for i in keep]
+
+
+def _clock_of(flat: FlatDiagram, tap: Tap) -> TickPattern | None:
+    """Return the clock of the subsystem that a wire comes from; None of one in continuous time."""
+    subsystem = flat.table.subsystem_of.get(tap.port[0], "")
+    return flat.clocks.get(subsystem) if flat.table.is_sampled(subsystem) else None

@@ -1,7 +1,7 @@
 """Slopes of a loop's linear model: derivatives of its A, B, C, D by parameters of the diagram.
 
 A parameter of traced equations is a symbol in them: CasADi differentiates the Jacobians once more, along the parameter,
-and hold, delay and the time between ticks carry the slopes on (`derivatives_along`). An FMU's parameter is none: the
+and hold, delay and the time between ticks carry the slopes on (`derivatives`). An FMU's parameter is none: the
 linear models of diagrams with changed start values are differenced, with an estimate of the error.
 """
 
@@ -10,22 +10,23 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from ...blocks.core import LoopwrightError, ParameterError
-from ..flat import NONE, FlatDiagram, WiredDiagram
+from ..flat import FlatDiagram, WiredDiagram
+from ..frequency import FourMatrices
 from ..results import OperatingPoint
 from ..wiring import join
-from .checks import replace_stairs
-from .derivatives import LocalDerivatives, find_signal
-from .derivatives_along import DerivativesAlong, join_slope, once_for_model, slope_of
+from .derivatives import LocalDerivatives, find_signal, join_slope, slope_of
 from .exchanged import evaluators_at
-from .flow_model import EQUILIBRIUM, Four, Model, model_continuous
+from .flow_model import Model, model_continuous
 from .linear_model import Linearization
-from .loops_over_a_period import advance_point, find_slower_clocks, model_loop, ticks_to_renewal
-from .over_a_period import Chain, model_period, period_of
-from .plant_models import join_matrices, plant_layout
+from .mean_stairs import replace_stairs
+from .over_a_period import begin_loop, lift, model_loop, model_period
+from .plant_models import EQUILIBRIUM, join_matrices, plant_layout
+from .tick_chain import Chain, period_of
 from .trim_request import Free, difference, free_parameters, locate, read_value, split_array, spread_nodes
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ LOST = 1e-6
 """Largest remainder, relative to 1 + the size of the change, with which an equilibrium follows a parameter."""
 PointFinder = Callable[[WiredDiagram], OperatingPoint]
 """Function from a diagram to its operating point."""
+_RESTS: WeakKeyDictionary[Linearization, dict[tuple[bytes, bytes], OperatingPoint | None]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +62,9 @@ class LoopSlope:
 
     parameter: str
     value: float
-    matrices: Four
-    slopes: Four
-    errors: Four
+    matrices: FourMatrices
+    slopes: FourMatrices
+    errors: FourMatrices
     rest_lost: bool = False
 
     @property
@@ -108,9 +110,9 @@ def differentiate_loop(
     cut = _Cut(model, tuple(wires), slow)
     found = []
     for name in dict.fromkeys(parameters):
-        whole, entry = split_array(model.diagram, name)
+        whole, entry = split_array(model.wired, name)
         try:
-            (free,), diagram = free_parameters(model.diagram, {whole: None})
+            (free,), diagram = free_parameters(model.wired, {whole: None})
             kind = _StartValues if free.where is None else _Traced
             found += kind(cut, free, diagram, find).slopes(free.find_entries(entry))
         except LoopwrightError as error:
@@ -146,7 +148,7 @@ def loop_of_variant(
     return System(*_loop_matrices(made), made.dt, remove_useless_states=False), rests
 
 
-def _loop_matrices(made: Model) -> Four:
+def _loop_matrices(made: Model) -> FourMatrices:
     A, B, C, D = made.matrices
     n, m = len(A), len(D)
     return A, B.reshape(n, m), -C.reshape(m, n), -D
@@ -164,12 +166,10 @@ def _model_at(
     """Return the model of a cut loop; ``closed`` are the derivatives with nothing cut."""
     if not model.dt:
         return model_continuous(diagram, flat, local, at, model.plants)
-    ports, frozen = [tap.port for tap in local.inputs], NONE
-    if slow == "open":
-        frozen = find_slower_clocks(flat, ports, diagram.name)
+    ports = [tap.port for tap in local.inputs]
+    at, frozen = begin_loop(flat, at, ports, model.plants, slow, diagram.name, closed)
     if period_of(flat) == 1:
         return model_period(flat, local, at, model.plants, frozen, with_findings=False)
-    at = advance_point(flat, at, model.plants, ticks_to_renewal(flat, ports, at.tick), closed)
     return model_loop(flat, local, at, model.plants, lifted=False, frozen=frozen)[0]
 
 
@@ -178,28 +178,37 @@ class _Cut:
 
     def __init__(self, model: Linearization, wires: tuple[str, ...], slow: Literal["closed", "open"]):
         self.model, self.wires, self.slow = model, wires, slow
-        self.flat = model.diagram.flatten_like(model.point)
-        self._known: dict[int, tuple[FlatDiagram, OperatingPoint, DerivativesAlong, DerivativesAlong]] = {}
+        self.flat = model.wired.flatten_like(model.point)
+        self._known: dict[int, tuple[FlatDiagram, OperatingPoint, LocalDerivatives, LocalDerivatives]] = {}
 
-    def derivatives(self, flat: FlatDiagram, diagram: WiredDiagram) -> tuple[DerivativesAlong, DerivativesAlong]:
+    def derivatives(self, flat: FlatDiagram, diagram: WiredDiagram) -> tuple[LocalDerivatives, LocalDerivatives]:
         """Return the derivatives with the loop cut, and with all closed; their traces are kept."""
         key, at = id(flat), self.model.point
         if key not in self._known:
             taps = [find_signal(flat, w) for w in self.wires]
             outside, means = evaluators_at(flat, at), replace_stairs(diagram, flat, at, self.model.stairs)
-            made = [DerivativesAlong(flat, t, t, t, outside, means) for t in (taps, [])]
+            made = [LocalDerivatives(flat, t, t, t, outside, means) for t in (taps, [])]
             self._known[key] = (flat, at, made[0], made[1])
         return self._known[key][2:]
 
-    def loop(self, flat: FlatDiagram, diagram: WiredDiagram, at: OperatingPoint, direction: np.ndarray) -> Four:
+    def loop(self, flat: FlatDiagram, diagram: WiredDiagram, at: OperatingPoint, direction: np.ndarray) -> FourMatrices:
         """Return A, B, C, D of L with slopes along a direction of the parameters, at a point with slopes."""
         local, closed = self.derivatives(flat, diagram)
         local.direction = closed.direction = direction
         return _loop_matrices(_model_at(self.model, flat, diagram, at, local, closed, self.slow))
 
-    @once_for_model
     def rest(self, flat: FlatDiagram, diagram: WiredDiagram, direction: np.ndarray) -> OperatingPoint | None:
         """Return the point with the slopes of the equilibrium that follows a parameter; None if none follows.
+
+        It is kept as long as the model lives: it follows a parameter alike for all loops.
+        """
+        known, key = _RESTS.setdefault(self.model, {}), (flat.p.tobytes(), direction.tobytes())
+        if key not in known:
+            known[key] = self._find_rest(flat, diagram, direction)
+        return known[key]
+
+    def _find_rest(self, flat: FlatDiagram, diagram: WiredDiagram, direction: np.ndarray) -> OperatingPoint | None:
+        """Return the point of `rest`.
 
         The equations are x = f(x, p) over a period, so that (1 − ∂f/∂x) x′ = ∂f/∂p. The smallest solution is taken:
         states that nothing determines, as those of an integrator at rest, stay.
@@ -220,7 +229,7 @@ class _Cut:
             return replace(at, x=join_slope(at.x, x))
         chain = Chain(flat, closed, start, model.plants, period_of(flat))
         chain.go_on()
-        M = np.real(chain.M)
+        M = np.real(lift(chain.steps, each_tick=False)[0])
         moved = _smallest(M - np.eye(len(M)), -slope_of(chain.affine()))
         if moved is None:
             return None
@@ -319,22 +328,24 @@ class _StartValues:
     def slopes(self, entries: Sequence[tuple[int, str]]) -> list[LoopSlope]:
         free, model = self.free, self.cut.model
         found, value = [], free.start
-        middle = self._loop(model.diagram, model.point)[0]
+        middle = self._loop(model.wired, model.point)[0]
         for i, name in entries:
-            changed = _Changed.of(free, value, i, model.diagram)
+            changed = _Changed.of(free, value, i, model.wired)
             made = [self._loop(d, model.point if self.find is None else self.find(d)) for d in changed.diagrams]
             if any([np.shape(M) for M in four] != [np.shape(M) for M in middle] for four, _ in made):
                 raise ParameterError(
                     "found a value that changes the number of states of the loop; expected the same states. Try "
-                    "values with diagram.replace(…), one after the other.", block=free.path, port=name,
-                )  # fmt: skip
+                    "values with diagram.replace(…), one after the other.",
+                    block=free.path,
+                    port=name,
+                )
             both = [changed.slope(M, [four[k] for four, _ in made]) for k, M in enumerate(middle)]
             (A, B, C, D), (eA, eB, eC, eD) = zip(*both, strict=True)
             lost = model.is_equilibrium and not all(rests for _, rests in made)
             found.append(LoopSlope(name, float(value[i]), middle, (A, B, C, D), (eA, eB, eC, eD), lost))
         return found
 
-    def _loop(self, diagram: WiredDiagram, at: OperatingPoint) -> tuple[Four, bool]:
+    def _loop(self, diagram: WiredDiagram, at: OperatingPoint) -> tuple[FourMatrices, bool]:
         """Return A, B, C, D of the loop of a diagram, and whether its point is an equilibrium."""
         L, rests = loop_of_variant(self.cut.model, self.cut.wires, diagram, at, slow=self.cut.slow)
         return (L.A, L.B, L.C, L.D), rests
@@ -348,11 +359,11 @@ class _Traced:
         model = cut.model
         _, keys = free.path, free.keys
         self.value = np.ravel(
-            np.asarray(read_value(model.diagram.structure.blocks[free.path], keys, free.path), dtype=float)
+            np.asarray(read_value(model.wired.structure.blocks[free.path], keys, free.path), dtype=float)
         )
         self.shape = free.shape
         if np.array_equal(self.value, free.start):  # no zero, which a trace takes for structure
-            self.diagram, self.flat = model.diagram, cut.flat
+            self.diagram, self.flat = model.wired, cut.flat
             free.where, free.pack = None, None
             locate(free, self.diagram, self.flat)
         else:
@@ -362,12 +373,12 @@ class _Traced:
             assert free.where is not None
             p[free.where] = free.pack_value(self.value)
             self.flat = replace(flat, p=p)
-            model.point.check_fits(self.flat, model.diagram.name)
+            model.point.check_fits(self.flat, model.wired.name)
 
     def slopes(self, entries: Sequence[tuple[int, str]]) -> list[LoopSlope]:
         free, cut = self.free, self.cut
         found = []
-        packed, error = free.slope_with_error(self.value)
+        packed, error = free.slope(self.value)
         for i, name in entries:
             direction = np.zeros(self.flat.p.size)
             direction[free.where] = packed[:, i]
@@ -379,8 +390,10 @@ class _Traced:
             if not all(np.isfinite(np.concatenate([np.ravel(M) for M in four]))):
                 raise ParameterError(
                     f"found a derivative that is not finite at the value {self.value[i]:g}; expected a smooth "
-                    "dependence. Take another value, with diagram.replace(…).", block=free.path, port=name,
-                )  # fmt: skip
+                    "dependence. Take another value, with diagram.replace(…).",
+                    block=free.path,
+                    port=name,
+                )
             (A, B, C, D), (dA, dB, dC, dD) = map(np.real, four), map(slope_of, four)
             worst = max(local.error, closed.error, own, float(error[i]))
             eA, eB, eC, eD = (worst * (slope != 0.0) for slope in (dA, dB, dC, dD))
@@ -392,7 +405,7 @@ class _Traced:
         at = self.cut.model.point
         still = replace(at, x=join_slope(at.x, np.zeros(at.x.size)))
         if self.find is not None:
-            changed = _Changed.of(self.free, self.value, i, self.cut.model.diagram)
+            changed = _Changed.of(self.free, self.value, i, self.cut.model.wired)
             return (*_with_differences(at, [self.find(d) for d in changed.diagrams], changed), False)
         if self.cut.model.is_equilibrium:
             moved = self.cut.rest(self.flat, self.diagram, direction)

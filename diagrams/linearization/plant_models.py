@@ -1,19 +1,25 @@
-"""Linear models of the FMUs of a diagram: of their equations or of their steps, as their descriptions allow."""
+"""Linear models of the FMUs of a diagram: of their equations or of their steps, as their descriptions allow.
+
+`linearize_plant` gives that of one plant's equations, which may be a block, too.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
-from ...blocks.core import Block, FmuError, Layout, LoopwrightError, OptionError
+from ...blocks.core import Block, FmuError, Layout, LoopwrightError, OptionError, ParameterError
 from ...fmus.platform import is_built_here
 from ...fmus.running import Derivation, FmuLinearization, linearize_fmu, step_gap
-from ..flat import FlatDiagram, StateLayout
+from ..flat import FlatDiagram, StateLayout, WiredDiagram
+from ..frequency import hold_inputs
 from ..results import OperatingPoint
 from ..wiring import join, stepped_blocks
+from .block_slopes import linearize_block
+from .exchanged import linearize_exchanged
 from .identification import identify_step
 
 if TYPE_CHECKING:
@@ -24,7 +30,7 @@ WAYS = ("equations", "step", "identified")
 SOLVED, COARSE = 1e-9, 1e-5
 """Distances of an FMU's step from its equations: up to which they are one, and beyond which the step is the model."""
 EQUILIBRIUM = 1e-9
-"""Largest rate of a state in 1/s, relative to 1 + its size, of an FMU at rest."""
+"""Largest residual of an equilibrium: of a rate in 1/s, or a change over a step, relative to 1 + its state's size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +178,22 @@ def model_equations(flat: FlatDiagram, at: OperatingPoint, way: str | None) -> l
         z, w, wired = plant_entries(flat, path)
         m = linearize_equations(flat, at, path, at.z)
         B, D, names = m.B[:, wired], m.D[:, wired], _prefix_names(path, m.states)
-        models.append(PlantModel(path, m.A, B, m.C, D, m.x0, m.f, names, z, w, m.derivation, _largest_error(m)))
+        models.append(
+            PlantModel(
+                path=path,
+                A=m.A,
+                B=B,
+                C=m.C,
+                D=D,
+                x0=m.x0,
+                f=m.f,
+                states=names,
+                inputs=z,
+                outputs=w,
+                derivation=m.derivation,
+                uncertainty=_largest_error(m),
+            )
+        )
     return models
 
 
@@ -255,9 +276,22 @@ def model_step(
         "inputs": _inputs(flat, at, path, z),
     }
     return PlantModel(
-        path, m.A, m.B[:, wired], C, D[:, wired], m.x0, m.f, names, mine, w, derivation, _largest_error(m), m.y0,
-        following, after=after,
-    )  # fmt: skip
+        path=path,
+        A=m.A,
+        B=m.B[:, wired],
+        C=C,
+        D=D[:, wired],
+        x0=m.x0,
+        f=m.f,
+        states=names,
+        inputs=mine,
+        outputs=w,
+        derivation=derivation,
+        uncertainty=_largest_error(m),
+        y_next=m.y0,
+        next=following,
+        after=after,
+    )
 
 
 def _identify_model(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray, h: float) -> PlantModel:
@@ -267,9 +301,22 @@ def _identify_model(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndar
     n, rest, names = len(m.A), {**now, "t": now["t"] + h}, _prefix_names(path, m.states)
     D = np.zeros((len(w), len(wired)))
     return PlantModel(
-        path, m.A, m.B[:, wired], m.C, D, np.zeros(n), np.zeros(n), names, mine, w, m.derivation, m.uncertainty, m.y0,
-        rest, True,
-    )  # fmt: skip
+        path=path,
+        A=m.A,
+        B=m.B[:, wired],
+        C=m.C,
+        D=D,
+        x0=np.zeros(n),
+        f=np.zeros(n),
+        states=names,
+        inputs=mine,
+        outputs=w,
+        derivation=m.derivation,
+        uncertainty=m.uncertainty,
+        y_next=m.y0,
+        next=rest,
+        identified=True,
+    )
 
 
 def _is_at_rest(m: FmuLinearization) -> bool:
@@ -290,16 +337,10 @@ class _HeldStep:
 
 
 def _hold_inputs(m: FmuLinearization, h: float) -> _HeldStep:
-    """Return the model of a step with held inputs: the matrix exponential of [[A, B, f], [0, 0, 0]]."""
-    from scipy.linalg import expm
-
-    n, k = m.B.shape
-    big = np.zeros((n + k + 1, n + k + 1))
-    big[:n] = np.hstack([m.A, m.B, m.f[:, None]])
-    whole = np.asarray(expm(big * h))[:n]
-    change = whole[:, -1]
-    A, B, f, y = whole[:, :n], whole[:, n:-1], m.x0 + change, m.y0 + m.C @ change
-    return _HeldStep(A, B, m.x0, f, y, m.states, m.uncertainty * h)
+    """Return the model of a step with held inputs; the rates f at the point act like a further input."""
+    A, forced = hold_inputs(m.A, np.hstack([m.B, m.f[:, None]]), h)
+    change = forced[:, -1]
+    return _HeldStep(A, forced[:, :-1], m.x0, m.x0 + change, m.y0 + m.C @ change, m.states, m.uncertainty * h)
 
 
 def _hold_at_rest(
@@ -346,9 +387,13 @@ def _hold_in_motion(
 
 
 def _outputs_before(
-    flat: FlatDiagram, at: OperatingPoint, path: str, equations: FmuLinearization | None, step: FmuLinearization,
+    flat: FlatDiagram,
+    at: OperatingPoint,
+    path: str,
+    equations: FmuLinearization | None,
+    step: FmuLinearization,
     z: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives of the outputs at the beginning of a step, by the states and by the inputs until then."""
     if equations is not None:
         before = inputs_before(flat, at)
@@ -390,3 +435,82 @@ def _prefix_names(path: str, states: Sequence[str]) -> tuple[str, ...]:
 def _largest_error(m: FmuLinearization | _HeldStep) -> float:
     """Return the largest error that is known; entries with a NaN have none."""
     return float(np.max(m.uncertainty, initial=0.0, where=np.isfinite(m.uncertainty)))
+
+
+# --- one plant, of its equations -------------------------------------------------------------------------------------
+
+
+class PlantEquations(NamedTuple):
+    """Linear model of a plant's equations, dx/dt = f + A x + B u and y = C x + D u, about an operating point.
+
+    ``inputs`` and ``outputs`` lay out u and y by ports, ``states`` names the entries of x, and ``error`` bounds the
+    errors of the entries of [[A, B], [C, D]]; it is an estimate where they are differences.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    f: np.ndarray
+    x0: np.ndarray
+    states: tuple[str, ...]
+    inputs: Layout
+    outputs: Layout
+    derivation: Derivation
+    error: np.ndarray
+
+
+def linearize_plant(diagram: WiredDiagram, at: OperatingPoint, path: str) -> PlantEquations:
+    """Return the linear model of the equations of one block or FMU of a diagram.
+
+    Parameters
+    ----------
+    diagram : Diagram
+        Diagram with the plant.
+    at : OperatingPoint
+        Instant of the diagram.
+    path : str
+        Path of the plant.
+
+    Raises
+    ------
+    FmuError
+        If the FMU gives no model of its equations.
+    ParameterError
+        If the block has no equations in continuous time.
+    """
+    flat, block = diagram.flatten_like(at), diagram.blocks[path]
+    trace = flat.checked.traced.get(path)
+    if block.evaluated_outside:
+        m = linearize_exchanged(flat, at, path)
+    elif block.stepped:
+        m = linearize_equations(flat, at, path, at.z)
+    else:
+        m = _linearize_block(diagram, flat, at, path)
+    if trace is None:  # an FMU that is stepped declares all shapes
+        shapes = [{port: spec.shape or () for port, spec in ports.items()} for ports in (block.inputs, block.outputs)]
+    else:
+        shapes = [dict(trace.inputs), dict(trace.outputs)]
+    inputs, outputs = map(Layout.of, shapes)
+    names = tuple(f"{path}.{name}" for name in m.states)
+    return PlantEquations(m.A, m.B, m.C, m.D, m.f, m.x0, names, inputs, outputs, m.derivation, m.uncertainty)
+
+
+def _linearize_block(diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, path: str) -> FmuLinearization:
+    """Return the linear model of a block with the states and inputs of a point."""
+    block, trace = diagram.blocks[path], diagram.checked.traced[path]
+    where = flat.states.slices.get(path, slice(0, 0))
+    if trace.foreign is not None or trace.advance != "derivative" or where.stop == where.start:
+        raise ParameterError(
+            f"found {type(block).__name__}, whose equations have no derivatives in continuous time; expected a plant "
+            "with a linear model. Give an FMU, or a block with a derivative.",
+            block=path,
+        )
+    parts = [np.zeros(0)]
+    for port in trace.inputs:
+        wire = diagram.structure.wires.get((path, port))
+        value = block.inputs[port].default if wire is None else at.values[join(wire.block, wire.port)]
+        value = np.asarray(0.0 if value is None else value, dtype=float)
+        value = value if wire is None or wire.index is None else value[wire.index]
+        parts.append(np.broadcast_to(value, trace.inputs[port]).ravel())
+    return linearize_block(block, trace, at.t, at.x[where], np.concatenate(parts))

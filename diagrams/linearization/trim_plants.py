@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -12,7 +12,7 @@ from ...blocks.core import FmuError, SimulationError, elements
 from ...fmus.running import FmuLinearization, linearize_fmu
 from ..flat import Evaluators, FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
-from ..wiring import join
+from ..wiring import change_parameter, join
 from .exchanged import evaluators_at, load_evaluators
 from .identification import WATCHED, output_drift
 from .plant_models import plant_entries, plant_layout
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 RELATIVE_STEP = 1e-5
-"""Step of a difference by a free parameter, relative to its size."""
+"""Step of a difference by a free parameter, relative to its size or that of its first value."""
 
 
 @dataclass(eq=False)
@@ -120,8 +120,6 @@ class Plants:
 
     def change_blocks(self, free: list[Free], q: list[np.ndarray]) -> dict[str, Fmu]:
         """Return the FMUs with free parameters, with these values of them, by path."""
-        from ..wiring import change_parameter
-
         found: dict[str, Fmu] = {}
         for f, value in zip(free, q, strict=True):
             if f.path in self.blocks:
@@ -130,22 +128,29 @@ class Plants:
 
     def evaluate(self, xp: np.ndarray, z: np.ndarray, free: list[Free], q: list[np.ndarray]) -> PlantValues:
         """Evaluate all FMUs; the derivatives by their parameters are differences."""
-        flat, n, many = self.flat, self.total, sum(f.start.size for f in free)
+        flat, n = self.flat, self.total
         nw, nz = flat.plant_outputs.total, flat.plant_inputs.total
-        v = PlantValues(
-            np.zeros(n), np.zeros(nw), np.zeros((n, n)), np.zeros((n, nz)), np.zeros((nw, n)), np.zeros((nw, nz)),
-            np.zeros((n, many)), np.zeros((nw, many)),
-        )  # fmt: skip
+        f, y = np.zeros(n), np.zeros(nw)
+        A, B, C, D = np.zeros((n, n)), np.zeros((n, nz)), np.zeros((nw, n)), np.zeros((nw, nz))
         changed = self.change_blocks(free, q)
-        for path in self.blocks:
-            self._fill_one(v, path, changed.get(path, self.blocks[path]), xp, z)
-        column = 0
-        for i, f in enumerate(free):
-            for j in range(f.start.size):
-                if f.path in self.blocks:
-                    self._fill_parameter_column(v, column, f, xp, z, free, q, i, j)
-                column += 1
-        return v
+        for path, own in self.own.items():
+            m, f[own] = self._evaluate_one(path, changed.get(path, self.blocks[path]), xp, z)
+            mine, w, wired = plant_entries(flat, path)
+            y[w] = m.y0
+            A[own, own] = m.A - np.eye(len(m.A)) if self.by_step[path] else m.A
+            B[own, mine] = m.B[:, wired]
+            C[w, own] = m.C
+            D[np.ix_(w, mine)] = m.D[:, wired]
+
+        def evaluate(i: int, beside: list[np.ndarray]) -> list[np.ndarray]:
+            path, rates, outputs = free[i].path, np.zeros(n), np.zeros(nw)
+            m, rates[self.own[path]] = self._evaluate_one(path, self.change_blocks(free, beside)[path], xp, z)
+            outputs[plant_entries(flat, path)[1]] = m.y0
+            return [rates, outputs]
+
+        chosen = [i for i, parameter in enumerate(free) if parameter.path in self.blocks]
+        f_by_q, y_by_q = differentiate_by(free, q, chosen, (n, nw), evaluate)
+        return PlantValues(f, y, A, B, C, D, f_by_q, y_by_q)
 
     def _evaluate_one(
         self, path: str, block: Fmu, xp: np.ndarray, z: np.ndarray
@@ -153,32 +158,6 @@ class Plants:
         """Return an FMU's linear model, and f: rates, or changes over a step."""
         m = self._linearize(block, self.point(path, block, xp, z), step=self.by_step[path])
         return m, m.f - m.x0 if self.by_step[path] else m.f
-
-    def _fill_one(self, v: PlantValues, path: str, block: Fmu, xp: np.ndarray, z: np.ndarray) -> None:
-        """Write the values of one FMU into v."""
-        m, f = self._evaluate_one(path, block, xp, z)
-        own, (mine, w, wired) = self.own[path], plant_entries(self.flat, path)
-        v.f[own], v.y[w] = f, m.y0
-        v.A[own, own] = m.A - np.eye(len(f)) if self.by_step[path] else m.A
-        v.B[own, mine] = m.B[:, wired]
-        v.C[w, own] = m.C
-        v.D[np.ix_(w, mine)] = m.D[:, wired]
-
-    def _fill_parameter_column(
-        self, v: PlantValues, column: int, f: Free, xp: np.ndarray, z: np.ndarray,
-        free: list[Free], q: list[np.ndarray], i: int, j: int,
-    ) -> None:  # fmt: skip
-        """Write the derivatives by entry j of the i-th free parameter into a column of v."""
-        d = 1e-5 * max(1.0, abs(float(q[i][j])))
-        found = []
-        sides, width = f.find_sides(q[i], j, d)
-        for value in sides if width else ():  # a parameter with one value only stays
-            beside = [*q[:i], value, *q[i + 1 :]]
-            m, rates = self._evaluate_one(f.path, self.change_blocks(free, beside)[f.path], xp, z)
-            found.append((rates, m.y0))
-        if width:
-            v.f_by_q[self.own[f.path], column] = (found[0][0] - found[1][0]) / width
-            v.y_by_q[plant_entries(self.flat, f.path)[1], column] = (found[0][1] - found[1][1]) / width
 
 
 class ExchangedPlants:
@@ -225,17 +204,44 @@ class ExchangedPlants:
         evaluate : callable
             Function from evaluators to the vectors.
         """
-        columns = [np.zeros((v.size, sum(value.size for value in q))) for v in values]
-        first = np.cumsum([0, *(value.size for value in q)])
-        for i in self.mine:
-            for j in range(q[i].size):
-                beside, width = self.free[i].find_sides(q[i], j, RELATIVE_STEP * (abs(float(q[i][j])) or 1.0))
-                if width:  # a parameter with one value only stays
-                    ends = (evaluate(self.evaluators([*q[:i], value, *q[i + 1 :]])) for value in beside)
-                    high, low = ([np.ravel(v).copy() for v in values] for values in ends)
-                    for column, above, below in zip(columns, high, low, strict=True):
-                        column[:, first[i] + j] = (above - below) / width
-        return columns
+        sizes = [v.size for v in values]
+        return differentiate_by(self.free, q, self.mine, sizes, lambda _, beside: evaluate(self.evaluators(beside)))
+
+
+def differentiate_by(
+    free: Sequence[Free],
+    q: Sequence[np.ndarray],
+    chosen: Iterable[int],
+    sizes: Sequence[int],
+    evaluate: Callable[[int, list[np.ndarray]], Sequence[np.ndarray]],
+) -> list[np.ndarray]:
+    """Return the derivatives of vectors by all free parameters: central differences by those that are chosen, or zeros.
+
+    Parameters
+    ----------
+    free : sequence of Free
+        The parameters.
+    q : sequence of ndarray
+        Their values.
+    chosen : iterable of int
+        Numbers of those that the vectors may follow.
+    sizes : sequence of int
+        Sizes of the vectors.
+    evaluate : callable
+        Function from the number of a parameter and the values with another one of it to the vectors.
+    """
+    columns = [np.zeros((size, sum(value.size for value in q))) for size in sizes]
+    first = np.cumsum([0, *(value.size for value in q)])
+    for i in chosen:
+        for j in range(q[i].size):
+            size = max(abs(float(q[i][j])), abs(float(free[i].start[j])) or 1.0)  # a search may come by 0
+            sides, width = free[i].find_sides(q[i], j, RELATIVE_STEP * size)
+            if width:  # a parameter with one value only stays
+                ends = (evaluate(i, [*q[:i], value, *q[i + 1 :]]) for value in sides)
+                high, low = ([np.ravel(v).copy() for v in values] for values in ends)
+                for column, above, below in zip(columns, high, low, strict=True):
+                    column[:, first[i] + j] = (above - below) / width
+    return columns
 
 
 def check_drift(drift: Mapping[str, float], tolerance: float, name: str, t: float) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from ...blocks.core import Block, OptionError, ParameterError, UnknownNameError, Value, elements, near
-from ...blocks.tracing import traced_parameters
+from ...blocks.tracing import extrapolate, traced_parameters
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, PointOrigin
 from ..wiring import change_parameter, find_place, index_of, split_entry
@@ -103,26 +103,19 @@ class Free:
         assert self.pack is not None
         return self.pack(self.change_block(value))
 
-    def slope(self, value: np.ndarray) -> np.ndarray:
-        """Return the derivative of `pack_value` by differences; it is exact if the numbers are the parameters."""
-        columns = []
-        for i in range(value.size):
-            d = 2.0**-17 * max(1.0, 2.0 ** np.round(np.log2(abs(value[i]) or 1.0)))
-            up, down = value.copy(), value.copy()
-            up[i], down[i] = value[i] + d, value[i] - d
-            change = (self.pack_value(up) - self.pack_value(down)) / (up[i] - down[i])
-            columns.append(np.where(np.isnan(change), 0.0, change))  # NaN stands for no sample time
-        return np.array(columns).T
-
-    def slope_with_error(self, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def slope(self, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the derivative of `pack_value` by differences of fourth order, and each column's error.
 
-        The error is 0 where the numbers are the parameters themselves.
+        The error is 0 where the numbers are the parameters themselves. An entry with one value only stays.
         """
         columns, errors = [], []
         for i, middle in enumerate(value):
             size = 2.0**-10 * 2.0 ** np.round(np.log2(abs(middle) or 1.0))
             h, nodes = spread_nodes(middle, size, self.low[i], self.high[i])
+            if not h:
+                columns.append(np.zeros(self.pack_value(value).size))
+                errors.append(0.0)
+                continue
             found = []
             for place in (0.0, *nodes):
                 moved = value.copy()
@@ -157,7 +150,7 @@ def difference(values: Sequence[Any], h: float, nodes: tuple[float, ...]) -> tup
     else:
         near = (4.0 * f[1] - 3.0 * f[0] - f[2]) / (2.0 * s * h)
         far = (4.0 * f[2] - 3.0 * f[0] - f[3]) / (4.0 * s * h)
-    slope, error = (4.0 * near - far) / 3.0, np.abs(near - far)
+    slope, error = extrapolate(near, far), np.abs(near - far)
     whole = np.round(slope)
     exact = (np.abs(slope - whole) <= WHOLE) & (error <= WHOLE)
     return np.where(exact, whole, slope), np.where(exact, 0.0, error)

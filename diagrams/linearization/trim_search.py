@@ -16,7 +16,16 @@ from typing import Any, TypeAlias
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import Layout, OptionError, SimulationError, accepts, check_argument, elements, kinds
+from ...blocks.core import (
+    Layout,
+    NonFiniteError,
+    OptionError,
+    SimulationError,
+    accepts,
+    check_argument,
+    elements,
+    kinds,
+)
 from ..flat import (
     Apart,
     Derivative,
@@ -32,7 +41,6 @@ from ..flat import (
 )
 from ..frequency import first_largest
 from ..results import FreeDirection, OperatingPoint, PointOrigin
-from .checks import check_slopes
 from .exchanged import evaluators_at
 from .operating_points import PointLike, operating_point, with_residual
 from .trim_plants import ExchangedPlants, Plants, check_drift
@@ -170,7 +178,7 @@ class _Equations:
         for f, value, columns in zip(self.parameters, q, self.free_q.slices.values(), strict=True):
             if f.where is not None:
                 p[f.where] = f.pack_value(value)
-                by_q[f.where, columns] = f.slope(value)
+                by_q[f.where, columns] = f.slope(value)[0]
         numbers = self.function(self.at.t, x, w, p, evaluators=self.exchanged.evaluators(q))
         values, rest = numbers[:5], numbers[5:]
         moved = self.exchanged.differentiate(q, values, lambda e: self.function(self.at.t, x, w, p, evaluators=e)[:5])
@@ -236,7 +244,7 @@ def solve(equations: _Equations) -> np.ndarray:
     found = least_squares(
         lambda v: equations.residual_at(fill_in(v))[0],
         begin,
-        jac=lambda v: check_slopes(equations.residual_at(fill_in(v))[1][:, moves]),
+        jac=lambda v: _check_finite(equations.residual_at(fill_in(v))[1][:, moves]),
         bounds=(low[moves], high[moves]),
         x_scale="jac",
         ftol=1e-15,
@@ -256,6 +264,16 @@ def solve(equations: _Equations) -> np.ndarray:
             break
         best = trial
     return best
+
+
+def _check_finite(slopes: np.ndarray) -> np.ndarray:
+    """Return the derivatives of a trim's equations; refuse those that are not finite, as that of a root at 0."""
+    if not np.isfinite(slopes).all():
+        raise NonFiniteError(
+            "trim: found a derivative of the diagram's equations that is not finite; expected finite numbers, and a "
+            "root has none at 0. Begin elsewhere: at= another time, or with other initial states."
+        )
+    return slopes
 
 
 def find_free_directions(equations: _Equations, unknown: np.ndarray) -> tuple[FreeDirection, ...]:
@@ -326,9 +344,11 @@ def trim(
         )
     targets, rates = ({} if given is None else given for given in (targets, rates))
     for name, given, kind in (
-        ("targets", targets, kinds.mapping), ("rates", rates, kinds.mapping), ("fixed", fixed, kinds.names),
+        ("targets", targets, kinds.mapping),
+        ("rates", rates, kinds.mapping),
+        ("fixed", fixed, kinds.names),
         ("tolerance", tolerance, kinds.number),
-    ):  # fmt: skip
+    ):
         check_argument(given, kind, name, diagram.name)
     asked: dict[str, Any] = dict(free) if isinstance(free, Mapping) else dict.fromkeys(() if free is None else free)
     guess = operating_point(diagram, at, options)
@@ -360,9 +380,15 @@ def point_from_states(
 
 
 def _solve_trim(
-    base: WiredDiagram, diagram: WiredDiagram, flat: FlatDiagram, guess: OperatingPoint,
-    parameters: list[Free], target: Target, tolerance: float, how: PointOrigin,
-) -> OperatingPoint:  # fmt: skip
+    base: WiredDiagram,
+    diagram: WiredDiagram,
+    flat: FlatDiagram,
+    guess: OperatingPoint,
+    parameters: list[Free],
+    target: Target,
+    tolerance: float,
+    how: PointOrigin,
+) -> OperatingPoint:
     equations = _Equations(base, flat, guess, parameters, target)
     unknown = solve(equations)
     left = equations.scale_residual(unknown)
@@ -389,9 +415,19 @@ def _solve_trim(
     drift = equations.plants.drift(plants, changed) if how is PointOrigin.TRIM else {}
     check_drift(drift, tolerance, diagram.name, guess.t)
     residuals = dict(sorted((residuals | drift).items(), key=lambda r: -r[1]))
-    point = _complete_point(final, guess, x, w, plants, {
-        "parameters": {**guess.parameters, **values}, "residuals": residuals, "how": how, "free": free,
-    })  # fmt: skip
+    point = _complete_point(
+        final,
+        guess,
+        x,
+        w,
+        plants,
+        {
+            "parameters": {**guess.parameters, **values},
+            "residuals": residuals,
+            "how": how,
+            "free": free,
+        },
+    )
     most = max(drift, key=drift.__getitem__, default="")
     return replace(point, residual=drift[most], largest=most) if most and drift[most] > point.residual else point
 

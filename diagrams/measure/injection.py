@@ -102,8 +102,12 @@ def inject_signal(
     for path, subsystem in table.subsystems.items():
         table.subsystems[path] = replace(subsystem, delay=0)  # the delays have become blocks
     block, port = signal.port
-    consumers = [(group, key) for group in (table.wires, table.controls) for key, w in group.items()
-                 if (w.block, w.port) == (block, port)]  # fmt: skip
+    consumers = [
+        (group, key)
+        for group in (table.wires, table.controls)
+        for key, w in group.items()
+        if (w.block, w.port) == (block, port)
+    ]
     if not consumers:
         raise WiringError(
             f"found nothing wired to it; expected a consumer for the test signal at {signal.name!r}. Name a wire of a "
@@ -117,9 +121,16 @@ def inject_signal(
     shape = diagram.checked.shapes[signal.port]
     ones = np.ones(lines)
     table.blocks[source] = Excitation(
-        direction=np.ones(shape) if shape else 1.0, amplitude=ones, frequency=ones, sweep=ones, phase=ones,
-        start_time=NEVER, ramp=1.0, period=1.0, name="signal",
-    )  # fmt: skip
+        direction=np.ones(shape) if shape else 1.0,
+        amplitude=ones,
+        frequency=ones,
+        sweep=ones,
+        phase=ones,
+        start_time=NEVER,
+        ramp=1.0,
+        period=1.0,
+        name="signal",
+    )
     table.subsystems[frame_path] = SubsystemSettings(frame_path, None, "exact", outputs=("y",))
     if held is not None:
         table.subsystems[frame_path] = replace(table.subsystems[frame_path], sample_time=held[0], offset=held[1])
@@ -159,9 +170,14 @@ class InjectionRun:
     """
 
     def __init__(
-        self, diagram: WiredDiagram, made: InjectedDiagram, signal: Tap, outputs: Iterable[Tap],
-        point: OperatingPoint | None, options: Mapping[str, Any],
-    ):  # fmt: skip
+        self,
+        diagram: WiredDiagram,
+        made: InjectedDiagram,
+        signal: Tap,
+        outputs: Iterable[Tap],
+        point: OperatingPoint | None,
+        options: Mapping[str, Any],
+    ):
         self.made, self.signal, self.outputs = made, signal, list(outputs)
         ports = [signal.port, *(o.port for o in self.outputs)]
         record = sorted({f"{b}.{p}" for b, p in ports} | {f"{made.sum}.y", f"{made.source}.y"})
@@ -197,10 +213,15 @@ class InjectionRun:
         direction[entry] = 1.0
         shape = np.shape(block.direction)
         changed = block.replace(
-            direction=direction.reshape(shape) if shape else float(direction[0]), amplitude=waveform.amplitude,
-            frequency=waveform.frequency, sweep=waveform.sweep, phase=waveform.phase, start_time=self.t - ahead,
-            ramp=ramp, period=waveform.period,
-        )  # fmt: skip
+            direction=direction.reshape(shape) if shape else float(direction[0]),
+            amplitude=waveform.amplitude,
+            frequency=waveform.frequency,
+            sweep=waveform.sweep,
+            phase=waveform.phase,
+            start_time=self.t - ahead,
+            ramp=ramp,
+            period=waveform.period,
+        )
         self.simulation.set_parameters(path, changed)
 
     def step(self, size: float, entry: int) -> None:

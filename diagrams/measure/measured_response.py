@@ -96,7 +96,7 @@ class FrequencyResponse:
         signal to a window after its end, relative to 1 + its size.
     """
 
-    diagram: WiredDiagram = field(repr=False)
+    wired: WiredDiagram = field(repr=False)
     wire: str
     kind: str
     amplitude: float
@@ -123,6 +123,11 @@ class FrequencyResponse:
             f"{int(self.settled.sum())} settled",
         )
         return brief(f"measured frequency response at {self.wire!r}", *facts, then=".L, .S, .T, measured_margins(…)")
+
+    @property
+    def diagram(self) -> Any:
+        """The `Diagram` that was measured."""
+        return self.wired.facade
 
     @property
     def S(self) -> FrequencyResponseData:  # noqa: N802
@@ -158,7 +163,7 @@ class FrequencyResponse:
         if not self.outputs:
             raise OptionError(
                 "found no measured outputs; expected some. Name them: frequency_response(…, outputs=[…]).",
-                block=self.diagram.name,
+                block=self.wired.name,
             )
         return self._data(self.y, self.outputs, "response")
 
@@ -168,7 +173,7 @@ class FrequencyResponse:
                 f"found that {self.wire!r} changes between two samples of {self.dt:g} s; expected a signal that is "
                 "constant between them, as the test signal is: −v/u is no loop. Take S or T, or a wire that is "
                 "renewed once in this time.",
-                block=self.diagram.name,
+                block=self.wired.name,
                 port="wire",
             )
 
@@ -218,7 +223,7 @@ class FrequencyResponse:
             raise OptionError(
                 f"found a linear model with the sample time {dt:g} s; expected that of the measurement, {self.dt:g} s. "
                 "Linearize the same diagram, with the same step.",
-                block=self.diagram.name,
+                block=self.wired.name,
             )
         measured = {"L": self._loop(), "S": self.u, "T": -self.v}[of]
         s = np.exp(1j * self.omega * self.dt) if self.dt else 1j * self.omega
@@ -234,10 +239,19 @@ class FrequencyResponse:
 
 
 def frequency_response(
-    diagram: WiredDiagram, wire: str, frequencies: ArrayLike, *, amplitude: float, kind: str = "sine",
-    at: PointLike = 0.0, outputs: str | Iterable[str] = (), windows: int = 40, agreement: float = 1e-6,
-    confirm: bool = True, **options: Any,
-) -> FrequencyResponse:  # fmt: skip
+    diagram: WiredDiagram,
+    wire: str,
+    frequencies: ArrayLike,
+    *,
+    amplitude: float,
+    kind: str = "sine",
+    at: PointLike = 0.0,
+    outputs: str | Iterable[str] = (),
+    windows: int = 40,
+    agreement: float = 1e-6,
+    confirm: bool = True,
+    **options: Any,
+) -> FrequencyResponse:
     """Measure a frequency response; see `Diagram.frequency_response`."""
     omega = _check_request(diagram, frequencies, amplitude, kind, windows)
     chosen, point, t0 = _find_beginning(diagram, at, dict(options))
@@ -295,10 +309,24 @@ def frequency_response(
     found.refute_moved()
     labels = tuple(e for o in measured for e in o.labels)
     return FrequencyResponse(
-        variant, wire, kind, float(amplitude), lines, dt if discrete else 0.0, found.v, found.u, found.y,
-        found.uncertainty, found.distortion, found.windows, found.settled, found.moved,
-        not discrete or (found.held and not _changes_between_ticks(flat, signal.port)), signal.labels, labels,
-    )  # fmt: skip
+        variant,
+        wire,
+        kind,
+        float(amplitude),
+        lines,
+        dt if discrete else 0.0,
+        found.v,
+        found.u,
+        found.y,
+        found.uncertainty,
+        found.distortion,
+        found.windows,
+        found.settled,
+        found.moved,
+        not discrete or (found.held and not _changes_between_ticks(flat, signal.port)),
+        signal.labels,
+        labels,
+    )
 
 
 def _check_request(

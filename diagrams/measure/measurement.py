@@ -151,9 +151,16 @@ def _find_noise(phasors: np.ndarray) -> np.ndarray:
 
 
 def measure_part(
-    run: InjectionRun, part: Part, entry: int, j: int, every: int, windows: int, agreement: float,
-    found: Measurement, i: int,
-) -> None:  # fmt: skip
+    run: InjectionRun,
+    part: Part,
+    entry: int,
+    j: int,
+    every: int,
+    windows: int,
+    agreement: float,
+    found: Measurement,
+    i: int,
+) -> None:
     """Play part i of the test signal at one entry until two windows agree; write the last one's phasors to ``found``.
 
     Where the distance of windows is noise, which falls no further, the mean of the windows since then is written.

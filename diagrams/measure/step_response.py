@@ -17,6 +17,7 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError, OptionError, SimulationError, brief, explain_calls
 from ..flat import FlatDiagram, WiredDiagram
+from ..frequency import advance_held
 from ..linearization import (
     Linearization,
     PointLike,
@@ -289,10 +290,25 @@ def step_response(
         renewed = ticks_between_renewals(flat, [tap.port]) if sampled and not _follows_states(flat, tap.port) else None
         columns += [renewed is not None and renewed % every == 0 and not wait] * len(tap.labels)
     return StepResponse(
-        wire, float(size), t, d, change[:, 0], labels, change[:, 1:], rest[0, 1:], float(rest[0, 0]),
-        moved, float(period), is_held,
-        prediction, final, later, between, np.array(columns), flat.hybrid,
-    )  # fmt: skip
+        wire,
+        float(size),
+        t,
+        d,
+        change[:, 0],
+        labels,
+        change[:, 1:],
+        rest[0, 1:],
+        float(rest[0, 0]),
+        moved,
+        float(period),
+        is_held,
+        prediction,
+        final,
+        later,
+        between,
+        np.array(columns),
+        flat.hybrid,
+    )
 
 
 def predict(model: Linearization, d: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -333,12 +349,10 @@ def predict(model: Linearization, d: np.ndarray, t: np.ndarray) -> tuple[np.ndar
 
 def _advance_by(model: Linearization, h: float) -> np.ndarray:
     """Return the matrix that takes (x, d) of a linear model h seconds further with d held, or by its sample time."""
-    from scipy.linalg import expm
-
     A, B, n = model.A, model.B[:, :1], len(model.A)
     if model.dt:
         return np.block([[A, B], [np.zeros((1, n)), np.ones((1, 1))]])
-    return np.asarray(expm(np.block([[A, B], [np.zeros((1, n + 1))]]) * h))
+    return advance_held(A, B, h)
 
 
 def _find_extremes(model: Linearization, one: np.ndarray, z: np.ndarray, h: float) -> np.ndarray:

@@ -123,9 +123,7 @@ class AdmittanceLoop(Value):
     findings: tuple[Finding, ...] = parameter(default=(), description="kinks and stairs that its numbers carry")
 
     @classmethod
-    def of(
-        cls, diagram: WiredDiagram, side: str = "perp", *, point: OperatingPoint | None = None, **changes: Any
-    ) -> Self:
+    def of(cls, diagram: Diagram, side: str = "perp", *, point: OperatingPoint | None = None, **changes: Any) -> Self:
         """Return the loop of a diagram that `fig3` has made, with the diagram's parameters.
 
         The linear model of the diagram's own plant, at the point and velocity of the loop, is compared with M and C. A
@@ -153,6 +151,7 @@ class AdmittanceLoop(Value):
             states, a stiffness, or another mass or friction slope than the model. ``AdmittanceLoop(path, model, …)``
             makes a loop of parameters without a diagram.
         """
+        wired = diagram.wired
         names = (*(f"{kind}_{s}" for kind in ("admittance", "pid") for s in SIDES),)
         linearization = cast(FeedbackLinearization, diagram["controller.feedback_linearization"])
         sensor, controller = cast(ForceSensor, diagram["sensors.force_sensor"]), diagram.subsystems["controller"]
@@ -166,14 +165,14 @@ class AdmittanceLoop(Value):
             "model": linearization.model,
             "sample_time": float(controller.sample_time),
             "method": controller.method,
-            "delay": delay_of(diagram),
+            "delay": delay_of(wired),
             "tool_mass": sensor.tool_mass,
         }
-        check_wires(diagram)
-        loop = cls(**{**found, "findings": find_kinks(diagram, point), "side": side, **changes})
+        check_wires(wired)
+        loop = cls(**{**found, "findings": find_kinks(wired, point), "side": side, **changes})
         check_plant(
-            diagram,
-            plant_path(diagram),
+            wired,
+            plant_path(wired),
             loop.true_plant,
             rate=loop.rate,
             frame=loop.frame,
@@ -339,14 +338,14 @@ def _contact_of(loop: AdmittanceLoop) -> Contact:
     return replace(made, parts=parts, direction=axis[axes], side=loop.side, filter=loop.admittance, scale=loop.scale)
 
 
-def _perfect_diagram(loop: AdmittanceLoop) -> Diagram:
+def _perfect_diagram(loop: AdmittanceLoop) -> WiredDiagram:
     a, q = loop.admittance, loop.scale
     mass, damping, stiffness = a.mass / q + loop.tool_mass, float(a.effective_damping) / q, a.stiffness / q
     plant = PerfectRobot(mass=mass, damping=damping, stiffness=stiffness, name="plant")
-    return Diagram("compliance", plant(external_force=Constant(value=0.0, unit="N", name="free_space")))
+    return Diagram("compliance", plant(external_force=Constant(value=0.0, unit="N", name="free_space"))).wired
 
 
-def _diagram_at_rest(loop: AdmittanceLoop) -> Diagram:
+def _diagram_at_rest(loop: AdmittanceLoop) -> WiredDiagram:
     """Return Fig. 3 with the parameters of a loop, around robots that are linear at rest."""
     path, place = _path_like(loop)
     robot, model = (_robot_of(motion, path, place) for motion in loop.both_motions)
@@ -355,7 +354,7 @@ def _diagram_at_rest(loop: AdmittanceLoop) -> Diagram:
     channels = [Channel(r, _unlimited(loop.filters[side])) for r, side in zip(references, SIDES, strict=True)]
     rig = Rig(tool_mass=loop.tool_mass, sample_time=loop.sample_time, admittance_method=loop.method)
     # the acceleration is that under the new motor force here, so that it is one with the measured force
-    made = Diagram("compliance", wire(plant, path, *channels, model=model, rig=rig), loops="solve")
+    made = Diagram("compliance", wire(plant, path, *channels, model=model, rig=rig), loops="solve").wired
     changes: dict[str, Any] = {
         f"controller.pid_{side}": pid.replace(name=f"pid_{side}") for side, pid in loop.pids.items()
     }
@@ -388,7 +387,7 @@ def _unlimited(admittance: AdmittanceFilter) -> AdmittanceFilter:
     return admittance.replace(velocity_limit=None, acceleration_limit=None)
 
 
-def _with_gain(diagram: Diagram, block: str, port: str, gain: Any) -> Diagram:
+def _with_gain(diagram: WiredDiagram, block: str, port: str, gain: Any) -> WiredDiagram:
     """Return a diagram with a gain on the wire to an input."""
     table, name = diagram.structure.copy(), f"{port}_share_of_{block.rpartition('.')[2]}"
     subsystem = table.subsystem_of[block]

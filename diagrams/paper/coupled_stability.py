@@ -165,7 +165,7 @@ class StabilityLimit:
     findings: tuple[Finding, ...] = ()
 
     def __repr__(self) -> str:
-        return describe_limit(self.over, self)
+        return describe_limit(self.over, self.value, self.unit, self.frequency, self.environment)
 
     @property
     def number(self) -> Number:

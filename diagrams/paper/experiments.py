@@ -108,7 +108,7 @@ class Experiment:
             As in `Diagram.simulate`.
         """
         self._refuse_own(options)
-        return simulate(self.diagram, self.duration, RunOptions.of(options, block=self.letter), progress=progress)
+        return simulate(self.diagram.wired, self.duration, RunOptions.of(options, block=self.letter), progress=progress)
 
     def sweep(self, parameters: Mapping[str, Any] | None, **options: Any) -> Sweep:
         """Run it to its end with many values of parameters; see `Diagram.sweep`.

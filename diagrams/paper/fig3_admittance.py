@@ -147,12 +147,17 @@ def _reduced_side(case: Fig3Case, loops: ReducedLoops, side: str) -> Section:
     signs = ({**facts, **_reduced_sign(v)} for facts, v in variants)
     environment, held = _held(loop.admittance)
     masses = (
-        {**facts, "name": contacts.LIMITS[vary], "mass": contacts.WORDS[vary], "limit": found.number,
-         "again": contacts.stable_again(found.restabilizes, found.unit) or "no"}
+        {
+            **facts,
+            "name": contacts.LIMITS[vary],
+            "mass": contacts.WORDS[vary],
+            "limit": found.number,
+            "again": contacts.stable_again(found.restabilizes, found.unit) or "no",
+        }
         for facts, v in variants
         for vary in ("mass", "tool_mass")
         if (found := stability_limit(v, vary, **environment))
-    )  # fmt: skip
+    )
     tables = (SIGN.fill(signs), *_reduced_stiffness(loops, side, titles), MASSES.fill(masses, held=held))
     text = (*TEXTS.paragraphs("asked", loop=loop), passivity(loop).caveat)
     plots = _reduced_admittances(loops, side, titles, case.looks), _stability_map(loops, side, titles, case.looks)
@@ -172,17 +177,19 @@ def _reduced_stiffness(loops: ReducedLoops, side: str, titles: Mapping[str, str]
             variant = implementation + kind.suffix
             for b in contacts.DAMPINGS:
                 found = loops.limit(side, key, implementation, b)
-                rows.append({
-                    "variant": titles.get(variant, variant),
-                    "key": implementation,
-                    "prefix": kind.prefix,
-                    "suffix": kind.suffix,
-                    "damping": b,
-                    "limit": found.number,
-                    "rule": Number(found.rule_of_thumb, "N/m", 0.0, "closed form (d + b_e)/T_d"),
-                    "frequency": contacts.frequency_number(found.frequency, found.confirmed_by, found.findings),
-                    "again": contacts.stable_again(found.restabilizes, found.unit) or "no",
-                })  # fmt: skip
+                rows.append(
+                    {
+                        "variant": titles.get(variant, variant),
+                        "key": implementation,
+                        "prefix": kind.prefix,
+                        "suffix": kind.suffix,
+                        "damping": b,
+                        "limit": found.number,
+                        "rule": Number(found.rule_of_thumb, "N/m", 0.0, "closed form (d + b_e)/T_d"),
+                        "frequency": contacts.frequency_number(found.frequency, found.confirmed_by, found.findings),
+                        "again": contacts.stable_again(found.restabilizes, found.unit) or "no",
+                    }
+                )
         yield STIFFNESS.fill(rows, kind=f", {kind.title}")
 
 

@@ -13,7 +13,7 @@ from ..diagram import Diagram
 from .wires import IDEAL, Channel, Rig, wire
 
 if TYPE_CHECKING:
-    from ..report import MakesSections
+    from ..report import ReportKind
 
 
 class Fig3Diagram(Diagram):
@@ -26,13 +26,13 @@ class Fig3Diagram(Diagram):
     contact_port: ClassVar[str | None] = "plant.external_force"
 
     @property
-    def report_kind(self) -> MakesSections:
+    def report_kind(self) -> ReportKind[Any]:
         """The report of Fig. 3, as long as the error dynamics and the feedback linearization are in the diagram."""
         from ..report import ANY_DIAGRAM  # a run has no need of the report
         from .fig3_case import has_parts
         from .fig3_report import FIG3
 
-        return FIG3 if has_parts(self) else ANY_DIAGRAM
+        return FIG3 if has_parts(self.wired) else ANY_DIAGRAM
 
 
 @explain_calls

@@ -90,7 +90,7 @@ def limits_tried(case: Fig3Case) -> Section:
 def _tried(
     loop: AdmittanceLoop, limit: Number, damping: float, path: str
 ) -> Iterator[tuple[str, Number, ContactTrial]]:
-    contact = make_contact(_gantry_diagram(loop), PortNames("plant.external_force"), loop.side, None, {})
+    contact = make_contact(_gantry_diagram(loop).wired, PortNames("plant.external_force"), loop.side, None, {})
     found = contact.stability_limit("stiffness", damping=damping)
     if not abs(found.value - limit.value) <= SAME * limit.value:
         raise ConfirmationError(

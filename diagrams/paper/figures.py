@@ -210,11 +210,11 @@ def _draw_error(ax: Axes, run: Run, label: str, error: np.ndarray) -> None:
     if len(error) > 1 and abs(error[0]) > 100.0 * np.median(np.abs(error)) and abs(error[0]) > 1e-4:
         magnitude = np.maximum(np.abs(error), 1e-12)
         factor, prefix = _prefix(float(magnitude.max()))
-        ax.plot(run.t, magnitude * factor, marker=marker_of(run), **_ACTUAL)
+        ax.plot(run.t, magnitude * factor, marker=marker_of(run.t), **_ACTUAL)
         ax.set_yscale("log")
         ax.set_ylim(max(magnitude.min(), 1e-8) * factor, 3.0 * magnitude.max() * factor)
         ax.set_ylabel(f"$|{label}|$ [{prefix}m]")
-        limit_time(ax, run)
+        limit_time(ax, run.t)
     else:
         _draw(ax, run, f"${label}$", "m", [(error, _ACTUAL)])
 
@@ -237,9 +237,9 @@ def _draw(
     largest = max((float(np.max(np.abs(values))) for values, _ in lines if len(values)), default=0.0)
     factor, prefix = _prefix(largest) if unit == "m" else (1.0, "")
     for values, look in lines:
-        ax.plot(run.t, values * factor, marker=marker_of(run), **look)
+        ax.plot(run.t, values * factor, marker=marker_of(run.t), **look)
     ax.set_ylabel(f"{label} [{prefix}{unit}]")
     ax.margins(y=0.08)
     if largest < floor:
         ax.set_ylim(-floor, floor)
-    limit_time(ax, run)
+    limit_time(ax, run.t)

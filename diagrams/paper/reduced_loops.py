@@ -68,11 +68,11 @@ class ReducedLoops:
         at: dict[str, Any] = {**OPTIONS[Implementation.SAMPLED], "point": point}
         at |= {"eta": eta % period if period else eta, "xi": xi}
         if smooth is None or plant is None:
-            return cls({side: AdmittanceLoop.of(base, side, plant=plant, **at) for side in SIDES}, {})
+            return cls({side: AdmittanceLoop.of(base.facade, side, plant=plant, **at) for side in SIDES}, {})
         bare = plant.replace(**NO_FRICTION)
         return cls(
-            {side: AdmittanceLoop.of(smooth, side, plant=bare, **at) for side in SIDES},
-            {side: AdmittanceLoop.of(base, side, plant=plant, **at) for side in SIDES},
+            {side: AdmittanceLoop.of(smooth.facade, side, plant=bare, **at) for side in SIDES},
+            {side: AdmittanceLoop.of(base.facade, side, plant=plant, **at) for side in SIDES},
         )
 
     def suffixed(self, side: str) -> dict[str, AdmittanceLoop]:

@@ -26,9 +26,9 @@ from ..contact import (
     compute_admittance,
     controller_rows,
     find_sign,
-    hold_inputs,
     join_environment,
 )
+from ..frequency import hold_inputs
 from .compliance_loop import AdmittanceLoop
 from .coupled_stability import ROBOT
 
@@ -88,7 +88,7 @@ def rendered_system(loop: AdmittanceLoop) -> StateSpace:
             B, C = B / loop.scale, C * loop.scale
     else:
         rows, K = controller_rows(parts, joined), parts.controller
-        by_u, by_force = (hold_inputs(joined._replace(B=M), T)[1] for M in (joined.B, joined.G))
+        by_u, by_force = (hold_inputs(joined.A, M, T)[1] for M in (joined.B, joined.G))
 
         def drive(shown: np.ndarray) -> np.ndarray:
             u = K.D @ shown

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
 import numpy as np
 
 from ...blocks import PlanarModel
-from ...blocks.core import Array, LoopwrightError, ParameterError
+from ...blocks.core import Array, Layout, LoopwrightError, ParameterError
 from ...blocks.path_following import PlanarSlopes, planar_slopes
-from ...fmus.running import Derivation, DerivativeMethod, FmuLinearization
-from ..linearization import operating_point
+from ...fmus.running import FmuLinearization
+from ..linearization import linearize_block, operating_point
 
 if TYPE_CHECKING:
     from ...fmus.running import Fmu
@@ -158,8 +158,6 @@ def _make_linearizer(diagram: WiredDiagram, path: str, point: OperatingPoint | N
 
 def _make_traced_linearizer(diagram: WiredDiagram, path: str, point: OperatingPoint | None) -> Linearizer:
     """Return the linearizer of a block with equations, by algorithmic differentiation."""
-    import casadi as ca
-
     block, trace = diagram.blocks[path], diagram.checked.traced[path]
     if trace.foreign is not None or trace.advance not in ("derivative", "none"):
         raise ParameterError(
@@ -169,29 +167,12 @@ def _make_traced_linearizer(diagram: WiredDiagram, path: str, point: OperatingPo
         )
     point = operating_point(diagram, None, {}) if point is None else point
     t, here = point.t, point.x[diagram.flatten_like(point).states.slices[path]]
-    names = [tuple(_elements(ports)) for ports in (trace.states, trace.inputs, trace.outputs)]
-    x, ports = ca.MX.sym("x", len(names[0])), [ca.MX.sym(n, int(np.prod(s))) for n, s in trace.inputs.items()]
-    results = trace.function(t, x, *ports, trace.pack(block, np.inf))
-    outputs, rates = results[: len(trace.outputs)], results[len(trace.outputs)]
-    u, values = ca.vertcat(*ports), ca.vertcat(rates, *outputs)
-    function = ca.Function("linear", [x, u], [ca.jacobian(values, ca.vertcat(x, u)), values])
+    many = Layout.of(trace.inputs).total
 
-    def linearize(at: np.ndarray | None, inputs: np.ndarray | None) -> FmuLinearization:
-        x0 = here if at is None else at
-        u0 = np.zeros(len(names[1])) if inputs is None else inputs
-        J, y = (np.array(v.full()) for v in function(x0, u0))
-        n, y = len(x0), y[:, 0]
-        exact = np.zeros(J.shape)
-        return FmuLinearization(
-            J[:n, :n], J[:n, n:], J[n:, :n], J[n:, n:], names[0], names[1], names[2], t, None,
-            x0=x0, u0=u0, f=y[:n], y0=y[n:], derivation=Derivation(DerivativeMethod.TRACED), uncertainty=exact,
-        )  # fmt: skip
+    def linearize(x: np.ndarray | None, u: np.ndarray | None) -> FmuLinearization:
+        return linearize_block(block, trace, t, here if x is None else x, np.zeros(many) if u is None else u)
 
     return linearize
-
-
-def _elements(ports: Mapping[str, tuple[int, ...]]) -> list[str]:
-    return [f"{name}[{i + 1}]" for name, shape in ports.items() for i in range(int(np.prod(shape)))]
 
 
 def _entries(names: tuple[str, ...], port: str) -> list[int]:

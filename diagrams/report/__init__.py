@@ -29,7 +29,7 @@ from .pages import (
     read_definitions,
     write_report,
 )
-from .parts import MakesSections, ReportKind, ReportPart
+from .parts import ReportKind, ReportPart
 from .points import point_of
 from .sections.loops import DISK_NUMBERS, disk_numbers, disk_range
 from .sections.not_modelled import LIMITS_TITLE
@@ -61,7 +61,6 @@ __all__ = [
     "Case",
     "Implementation",
     "InjectionPlan",
-    "MakesSections",
     "Plot",
     "Report",
     "ReportKind",

@@ -18,7 +18,7 @@ from .case import Case, ReportedExperiment
 from .content_hash import content_hash
 from .figures import AxisUnits
 from .pages import DEFINITIONS, Report
-from .parts import HasReportKind, MakesSections, ReportKind, ReportPart
+from .parts import ReportKind, ReportPart
 from .points import STEP
 from .review import review
 from .sections.contacts import contact_sections, contacts_on_first_page, read_contacts
@@ -64,8 +64,11 @@ def check_workers(given: int | None, written: bool) -> int:
 
 def _reported(value: Any) -> str:
     """Kind of all that is reported: diagrams, and experiments."""
-    good = isinstance(value, WiredDiagram) or isinstance(getattr(value, "diagram", None), WiredDiagram)
-    return "" if good else "a Diagram, or an experiment"
+    return "" if _is_diagram(value) or _is_diagram(getattr(value, "diagram", None)) else "a Diagram, or an experiment"
+
+
+def _is_diagram(value: Any) -> bool:
+    return isinstance(getattr(value, "wired", None), WiredDiagram)
 
 
 @accepts(
@@ -83,7 +86,7 @@ def _reported(value: Any) -> str:
 @on_one_thread
 @offer_elsewhere(**{name: f"about={{'{name}': …}}" for name in _HEADING})
 def analyse(
-    diagram: WiredDiagram | ReportedExperiment,
+    diagram: Any,
     *,
     at: Any = None,
     point: Any = None,
@@ -172,27 +175,28 @@ def analyse(
             "found at and point, two names of one option; expected one of them. Give at=… alone.", port="at"
         )
     point = point if at is None else at
-    if not isinstance(diagram, WiredDiagram):
+    if not _is_diagram(diagram):
         experiment, diagram = diagram, diagram.diagram
-    kind: MakesSections = diagram.report_kind if isinstance(diagram, HasReportKind) else ANY_DIAGRAM
+    kind: ReportKind[Any] = getattr(diagram, "report_kind", ANY_DIAGRAM)
+    wired: WiredDiagram = diagram.wired
     kind.check_keys(only or ())
     wires = None if loops is None else tuple([loops] if isinstance(loops, str) else loops)
     for wire in (*(wires or ()), *(measured or ())):
-        find_signal(diagram.flatten(None if diagram.has_clock else STEP), wire)
+        find_signal(wired.flatten(None if wired.has_clock else STEP), wire)
     tell = progress or (lambda key: None)
     file = None if isinstance(requirements, Requirements | None) else TomlFile.read(requirements, "requirements")
     asked = requirements if isinstance(requirements, Requirements | None) else read_requirements(file or requirements)
-    touched = read_contacts(diagram, contacts, file, asked)
+    touched = read_contacts(wired, contacts, file, asked)
     if asked is None and touched is not None and touched.limits:
         asked = Requirements(stable=False)  # a robot that yields to a force may drift, and has a pole on the limit
-    task = read_task(diagram, worst_case, file, asked)
+    task = read_task(wired, worst_case, file, asked)
     axes, names = AxisUnits(decibels, hertz), tuple(measured or ())
     how: dict[str, Any] = {"workers": check_workers(workers, _written), "drawn": _written}
-    case, sections = kind.sections(diagram, point, experiment, wires, only, tell, stairs, asked, axes, names, **how)
+    case, sections = kind.sections(wired, point, experiment, wires, only, tell, stairs, asked, axes, names, **how)
     loops_measured = read_measured(case, measured) if measured else ()
     if loops_measured:
         sections = (*sections, measured_loops(case, loops_measured))
-    searched = None if task is None else find_reported(diagram, task, asked, point, stairs, tell, case.loop_wires())
+    searched = None if task is None else find_reported(wired, task, asked, point, stairs, tell, case.loop_wires())
     if searched is not None:
         sections = (*sections, worst_case_of(searched))
     if touched is not None and touched.contacts:
@@ -203,17 +207,17 @@ def analyse(
     if only is None or asked is not None:
         more = [] if touched is None or not touched.contacts else [contacts_on_first_page(touched)]
         sections = (summary(case, reviewed, made, searched, more), *sections)
-    name = diagram.name if experiment is None else f"Experiment {experiment.letter}: {diagram.name}"
+    name = wired.name if experiment is None else f"Experiment {experiment.letter}: {wired.name}"
     lines = {str(key): str(text) for key, text in (about or {}).items()}
     title = lines.pop("title", f"Design report: {name}")
     meta: dict[str, Any] = {
-        "diagram": diagram.name,
+        "diagram": wired.name,
         **lines,
-        "revision": content_hash(diagram),
+        "revision": content_hash(wired),
         "made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
         "versions": versions(),
         "variants": {key: v.title if not v.problem else f"left out: {v.problem}" for key, v in case.variants.items()},
         "definitions": dict(kind.definitions),
-        "fmus": {path: b.description.digest for path, b in diagram.blocks.items() if isinstance(b, Fmu)},
+        "fmus": {path: b.description.digest for path, b in wired.blocks.items() if isinstance(b, Fmu)},
     }
     return Report(title, sections, meta, reviewed)

@@ -31,15 +31,15 @@ the solver asks a block that is evaluated from outside, as an FMU in model excha
 
 
 class ReportedExperiment(Protocol):
-    """An experiment, as a report's heading names it."""
+    """An experiment, as a report's heading names it; a protocol, as the report knows no paper."""
 
     @property
     def letter(self) -> str:
         """Its letter."""
 
     @property
-    def diagram(self) -> WiredDiagram:
-        """Its diagram."""
+    def diagram(self) -> Any:
+        """Its `Diagram`."""
 
 
 class Basis(NamedTuple):

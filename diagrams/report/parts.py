@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
-from typing import Any, Generic, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, Generic, TypeVar, cast
 
 from ...blocks.core import OptionError
 from ..flat import WiredDiagram
@@ -53,44 +53,6 @@ class ReportPart(Generic[C_contra]):
     key: str
     make: Callable[[C_contra], Section | None]
     applies: Callable[[C_contra], bool] = always
-
-
-class MakesSections(Protocol):
-    """A kind of report, as `analyse` uses it."""
-
-    @property
-    def definitions(self) -> Mapping[str, str]:
-        """Definitions of the terms in the paths of numbers."""
-
-    def check_keys(self, keys: Iterable[str]) -> None:
-        """Refuse keys of sections that it doesn't have."""
-
-    def sections(
-        self,
-        diagram: WiredDiagram,
-        point: Any,
-        experiment: ReportedExperiment | None,
-        wires: tuple[str, ...] | None,
-        only: Iterable[str] | None,
-        tell: Callable[[str], None],
-        stairs: str | None = None,
-        requirements: Requirements | None = None,
-        axes: AxisUnits = RADIANS,
-        measured: Collection[str] = (),
-        *,
-        workers: int = 1,
-        drawn: bool = False,
-    ) -> tuple[Case, tuple[Section, ...]]:
-        """Return the case of a diagram, and its sections."""
-
-
-@runtime_checkable
-class HasReportKind(Protocol):
-    """A diagram that says itself which kind of report it gets."""
-
-    @property
-    def report_kind(self) -> MakesSections:
-        """The kind of report."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +117,7 @@ class ReportKind(Generic[C]):
         with contextlib.ExitStack() as stack:
             second: SecondProcess[tuple[Section | None, tuple[str, ...]]] | None = None
             if workers > 1 and long:
-                second = stack.enter_context(SecondProcess(task, diagram.name))
+                second = stack.enter_context(SecondProcess(task.make, diagram.name))
             case = task.make_case(experiment)
 
             def make(key: str) -> tuple[Section | None, tuple[str, ...]]:

@@ -21,8 +21,7 @@ from ..requirements import (
     judge,
     judge_interval,
 )
-from ..studies import Case as StudyCase
-from ..studies import CaseState
+from ..studies import CaseState, StudyCase
 from .case import Case
 from .points import STEP
 from .sections.contacts import ReportedContacts

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from ..wiring import CheckedDiagram, find_cyclic_parts
+from ..flat import WiredDiagram
+from ..wiring import find_cyclic_parts
 
 MOST = 4
 """Wires at which loops are looked at where none has a name."""
 
 
-def wires_on_loops(diagram: CheckedDiagram, wires: Sequence[str] | None = None) -> dict[str, str]:
+def wires_on_loops(diagram: WiredDiagram, wires: Sequence[str] | None = None) -> dict[str, str]:
     """Return the wires at which loops are looked at, by their keys in a report.
 
     Without a choice these are all that have names and lie on loops; where none has a name, the inputs of FMUs on loops,
@@ -37,7 +38,7 @@ def wires_on_loops(diagram: CheckedDiagram, wires: Sequence[str] | None = None) 
     return {(e if ends.count(e) == 1 else _key(n)): n for e, n in zip(ends, names, strict=True)}
 
 
-def blocks_on_loops(diagram: CheckedDiagram) -> set[str]:
+def blocks_on_loops(diagram: WiredDiagram) -> set[str]:
     """Return the blocks that lie on a cycle of wires."""
     table = diagram.structure
     pairs = [(w.block, block) for (block, _), w in table.wires.items()]

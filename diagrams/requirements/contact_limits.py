@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ...blocks.core import OptionError, near
-from .limits import Limit, Sense, make_limit
+from .number_limits import Limit, Sense, make_limit
 
 CONTACT_SENSES: Mapping[str, Sense] = MappingProxyType(
     {"stiffness": Sense.LEAST, "damping": Sense.LEAST, "mass": Sense.LEAST, "tool_mass": Sense.LEAST}
@@ -49,8 +49,11 @@ class ContactLimits:
             if name not in CONTACT_SENSES and name != WITH:
                 hint = near(str(name), [*CONTACT_SENSES, WITH])
                 raise OptionError(f"a contact has no limit of {name!r}. {hint}", port=f"{port}.{name}")
-        limits = {name: make_limit(name, value, CONTACT_SENSES[name], f"{port}.{name}")
-                  for name, value in given.items() if name != WITH}  # fmt: skip
+        limits = {
+            name: make_limit(name, value, CONTACT_SENSES[name], f"{port}.{name}")
+            for name, value in given.items()
+            if name != WITH
+        }
         if not limits:
             raise OptionError(f"found no limit; expected some of {', '.join(CONTACT_SENSES)}. Give one.", port=port)
         self.limits: Mapping[str, Limit] = MappingProxyType(limits)

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from ...blocks.core import LoopwrightError, OptionError, UnknownNameError, brief, explain_calls, near
 from .contact_limits import ContactLimits, read_contacts
-from .limits import SENSES, STEP_SENSES, Limit, make_limit
+from .number_limits import SENSES, STEP_SENSES, Limit, make_limit
 
 PLACES = ("input", "output", "size", "length")
 """Entries of a step's requirement that are no limits."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from ...blocks.core import brief, explain_calls
 from ..frequency import Number
-from .limits import Limit, Reason, Verdict
+from .number_limits import Limit, Reason, Verdict
 
 
 @dataclass(frozen=True)

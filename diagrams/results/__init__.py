@@ -21,10 +21,9 @@ from .plots import (
 )
 from .recorder import Recorder, select
 from .recording import Recording
-from .run import Run
+from .run import Run, Snapshot
 from .saved_state import RunState, check_fits, layout_of, not_open_error
 from .signal_names import Places, entries, resolve
-from .snapshot import Snapshot
 from .stored import Occurrence, Stopped
 from .texts import TextSignal
 

@@ -107,7 +107,7 @@ class OperatingPoint:
     unjudged: tuple[str, ...] = ()
     how: PointOrigin = PointOrigin.RUN
     exchanged: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    """Time, states and inputs of each FMU in model exchange by path; its continuous states stand in x, too."""
+    """Time, states and inputs of each FMU in model exchange by path; its continuous states are in x, too."""
     values: Mapping[str, Any] = field(default_factory=dict, repr=False)
     """Every signal at the tick by its path."""
     layout: StateLayout = field(default=(), repr=False)

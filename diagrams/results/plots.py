@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -17,12 +17,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from .recorded_signals import RecordedSignals
-
 # Okabe and Ito's palette, which colour-blind readers tell apart
 BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
 GREY, STONE, DARK = "#A6A6A6", "#6E6E6E", "#333333"
-"""Helping lines; curves and texts that stand back; texts."""
+"""Helping lines; curves and texts in the background; texts."""
 
 WIDTH = 170 / 25.4
 """Width of a figure in inches: the text of an A4 page."""
@@ -155,92 +153,51 @@ def save(figure: Figure, stem: Path) -> tuple[Path, Path]:
 
 
 LONG = 21
-"""Letters of a name with its unit that fit beside the axes of one signal; a longer one stands above them."""
+"""Letters of a name with its unit that fit next to the axes of one signal; a longer one is written above them."""
 
 
-def named_signals(run: RecordedSignals, names: Iterable[object]) -> list[str]:
-    """Return names of signals that are given one by one or in lists; without any, those of all named wires.
+class DrawnSignal(NamedTuple):
+    """A signal to draw: its name, its samples (N, …), and the unit of each entry."""
 
-    Raises
-    ------
-    OptionError
-        If no name is given and no wire has one, or for anything but names.
-    """
-    found: list[str] = []
-    for name in names:
-        several = name if isinstance(name, list | tuple | set | np.ndarray) else [name]
-        for one in several:
-            if not isinstance(one, str):
-                raise OptionError(
-                    f'found {one!r} to draw; expected the name of a signal, as in run.plot("eta"). Name the wire with '
-                    '.named("…"), or give the path of the port.'
-                )
-            found.append(str(one))
-    if found:
-        return found
-    wires = [name for name in run.names if name in run.wires]
-    if not wires:
-        some = ", ".join(map(repr, run.names[:6]))
-        raise OptionError(f"found no signal to draw, and no wire has a name; expected names, such as {some}.")
-    return wires
+    name: str
+    values: np.ndarray
+    units: Sequence[str]
 
 
-def plot_signals(run: RecordedSignals, names: Sequence[str], axes: Sequence[Axes] | None = None) -> Figure:
-    """Draw signals over time, one below the other; a vector's entries share an axis.
-
-    Parameters
-    ----------
-    run : Run
-        The run.
-    names : sequence of str
-        Signals, by the names that ``run[name]`` takes.
-    axes : sequence of matplotlib axes, optional
-        Axes to draw into, one for each name.
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    OptionError
-        If there is no name, or another number of axes.
-    UnknownNameError
-        For a name that was not recorded.
-    """
-    if not names:
+def plot_signals(t: np.ndarray, signals: Sequence[DrawnSignal], axes: Sequence[Axes] | None = None) -> Figure:
+    """Draw signals over time, one below the other; see `Run.plot`."""
+    if not signals:
         raise OptionError('found no signal to draw; expected names, such as run.plot("eta", "xi").')
-    signals = [
-        (name, run[name].reshape(len(run.t), _size(run, name)), run[name].ndim > 1, _units(run, name)) for name in names
-    ]
+    signals = [one._replace(units=[print_unit(unit) for unit in one.units]) for one in signals]
     with style():
         if axes is None:
             figure = new_figure(
-                0.5 + 1.35 * len(names) + 0.2 * sum(_is_long(name, units) for name, *_, units in signals)
+                0.5 + 1.35 * len(signals) + 0.2 * sum(_is_long(name, units) for name, _, units in signals)
             )
-            axes = list(figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0])
+            axes = list(figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0])
         rows: list[Axes] = list(np.ravel(np.asarray(axes, dtype=object)))
-        if len(rows) != len(names):
+        if len(rows) != len(signals):
             raise OptionError(
-                f"found {len(rows)} axes for {len(names)} signals; expected one for each. Make as many, or give none."
+                f"found {len(rows)} axes for {len(signals)} signals; expected one for each. Make as many, or give none."
             )
-        for ax, (name, values, vector, units) in zip(rows, signals, strict=True):
-            long = _is_long(name, units)
-            for i, column in enumerate(values.T):
+        for ax, (name, values, units) in zip(rows, signals, strict=True):
+            long, vector = _is_long(name, units), values.ndim > 1
+            columns = values.reshape(len(values), int(np.prod(values.shape[1:])))
+            for i, column in enumerate(columns.T):
                 unit = f" [{units[i]}]" if vector and len(set(units)) > 1 and units[i] else ""
                 entry = f"{'' if long else name}[{i + 1}]{unit}"
-                ax.plot(run.t, column, marker=marker_of(run), label=entry if vector else name)
+                ax.plot(t, column, marker=marker_of(t), label=entry if vector else name)
             common = _common(units)
-            if long:  # beside the axes it would run into its neighbours
+            if long:  # next to the axes it would run into its neighbours
                 ax.set_title(name, loc="left", fontsize="medium")
                 ax.set_ylabel(common)
             else:
                 ax.set_ylabel(f"{name} {common}".rstrip())
             if vector:
-                ax.legend(loc="best", ncols=min(values.shape[1], 3))
+                ax.legend(loc="best", ncols=min(columns.shape[1], 3))
         rows[-1].set_xlabel("t [s]")
         for ax in rows:
-            limit_time(ax, run)
+            limit_time(ax, t)
         top: Any = rows[0].figure  # a figure, or a part of one
         result: Figure = top
         result.align_ylabels()
@@ -257,28 +214,16 @@ def _is_long(name: str, units: Sequence[str]) -> bool:
     return len(f"{name} {_common(units)}") > LONG
 
 
-def _size(run: RecordedSignals, name: str) -> int:
-    """Return the number of entries of a signal."""
-    return int(np.prod(run[name].shape[1:]))
+def marker_of(t: np.ndarray) -> str:
+    """Return the marker of a line over times: a single sample is a dot."""
+    return "." if len(t) == 1 else ""
 
 
-def _units(run: RecordedSignals, name: str) -> list[str]:
-    """Return the unit of every entry, as readers see it."""
-    unit = run.unit(name)
-    units = unit if isinstance(unit, tuple) else [unit or ""] * _size(run, name)
-    return [print_unit(u) for u in units]
-
-
-def marker_of(run: RecordedSignals) -> str:
-    """Return the marker of a line: a single sample is a dot."""
-    return "." if len(run.t) == 1 else ""
-
-
-def limit_time(ax: Axes, run: RecordedSignals) -> None:
-    """Let the time axis span the run."""
+def limit_time(ax: Axes, t: np.ndarray) -> None:
+    """Let the time axis span the times of a run."""
     from matplotlib.ticker import MaxNLocator
 
     ax.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 5, 10]))
-    if len(run.t) > 1:
-        margin = 0.015 * float(run.t[-1] - run.t[0])  # the border of the axes must not hide the first tick
-        ax.set_xlim(float(run.t[0]) - margin, float(run.t[-1]) + margin)
+    if len(t) > 1:
+        margin = 0.015 * float(t[-1] - t[0])  # the border of the axes must not hide the first tick
+        ax.set_xlim(float(t[0]) - margin, float(t[-1]) + margin)

@@ -1,4 +1,4 @@
-"""The recorder: takes samples into memory, or to disk while the run goes on."""
+"""The recorder: takes samples into memory, or to disk during the run."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ class Recorder:
         return self._skip
 
     def room(self, t: float) -> np.ndarray:
-        """Return rows to be written from outside, shape (n, 1 + entries), n > 0: time, then values; see `took`.
+        """Return rows that the caller writes, shape (n, 1 + entries), n > 0: time, then values; see `took`.
 
         Parameters
         ----------

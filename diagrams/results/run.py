@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -10,11 +10,20 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import Layout, OptionError, PortUnit, UnknownNameError, explain_calls, kinds
-from ..wiring import CheckedDiagram, Wire, split_entry
-from .short_text import describe_run
+from ...blocks.core import (
+    Layout,
+    OptionError,
+    PortUnit,
+    UnknownNameError,
+    brief,
+    check_argument,
+    count_of,
+    enumerate_some,
+    explain_calls,
+    kinds,
+)
+from ..wiring import Wire, index_of, split_entry
 from .signal_names import Place, Places, entries, place_of, resolve
-from .snapshot import Snapshot
 from .stored import Occurrence, PathLike, Stopped, header, prepare, read, write
 from .texts import TextSignal
 
@@ -25,6 +34,37 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
     from .saved_state import RunState
+
+
+_MESSAGES = 3
+"""Messages that the short text of a run shows; the others are counted."""
+
+
+@explain_calls
+@dataclass(frozen=True)
+class Snapshot:
+    """All signals and states at one recorded instant."""
+
+    t: float
+    tick: int
+    """The sample's number in the run, from 0: the tick, where every tick was recorded."""
+    values: dict[str, Any]
+    state: np.ndarray
+    """The state vector x of the flattened diagram."""
+    names: dict[str, Wire]
+    """The named wires: two of one short name differ in their source."""
+    run: Run | None = field(default=None, repr=False, compare=False)
+    """The run that it comes from."""
+
+    def __repr__(self) -> str:
+        of = f" of {self.run.diagram_name!r}" if self.run is not None and self.run.diagram_name else ""
+        facts = count_of(len(self.values), "signal"), count_of(self.state.size, "state")
+        return brief(f"instant t = {self.t:.9g} s{of}", *facts, then="instant['name'], diagram.linearize(instant)")
+
+    def __getitem__(self, name: str) -> Any:
+        full, entry = split_entry(resolve(name, self.names, self.values), self.values)
+        value = self.values[full]
+        return value[index_of(entry, value.shape, full)] if entry else value
 
 
 @explain_calls
@@ -74,7 +114,7 @@ class Run:
     layout: Layout = field(repr=False)
     wires: dict[str, Wire] = field(repr=False)
     units: dict[str, PortUnit] = field(repr=False)
-    diagram: CheckedDiagram | None = field(repr=False)
+    diagram: Any = field(repr=False)
     elapsed: float = float("nan")
     tier: str = "interpreted"
     messages: tuple[str, ...] = ()
@@ -96,7 +136,23 @@ class Run:
         if not self.diagram_name:
             object.__setattr__(self, "diagram_name", getattr(self.diagram, "name", ""))
 
-    __repr__ = describe_run
+    def __repr__(self) -> str:
+        t = self.t
+        span = f" from {t[0]:.9g} to {t[-1]:.9g} s" if len(t) else ""
+        names = self.names
+        wires = [name for name in self.wires if name in names]
+        first = (wires or names or ["name"])[0]
+        facts = (
+            count_of(len(t), "sample") + span,
+            count_of(len(names), "signal") + (f" (named: {enumerate_some(wires)})" if wires else ""),
+            self.tier,
+            f"stopped at {self.stopped.t:.9g} s by {self.stopped.block}" if self.stopped is not None else "",
+            count_of(len(self.events), "event") if self.events else "",
+            count_of(len(self.messages), "message") if self.messages else "",
+        )
+        head = brief(f"run of {self.diagram_name!r}", *facts, then=f"run[{first!r}], run.plot({first!r}), run.at(t)")
+        more = len(self.messages) - _MESSAGES
+        return "\n".join([head, *self.messages[:_MESSAGES], *([f"and {more} more: run.messages"] if more > 0 else [])])
 
     @classmethod
     def open(cls, path: PathLike) -> Run:
@@ -148,7 +204,7 @@ class Run:
         path : path
             Folder to make; its files are those of ``simulate(…, to=path)``.
         overwrite : bool
-            Whether a run that stands there may be replaced.
+            Whether a run in that folder may be replaced.
 
         Raises
         ------
@@ -307,9 +363,30 @@ class Run:
         UnknownNameError
             For a name that was not recorded.
         """
-        from .plots import named_signals, plot_signals
+        from .plots import DrawnSignal, plot_signals
 
-        return plot_signals(self, named_signals(self, names), axes)
+        drawn = [DrawnSignal(name, self[name], self._units(name)) for name in self._names_to_draw(names)]
+        return plot_signals(self.t, drawn, axes)
+
+    def _names_to_draw(self, names: Iterable[object]) -> list[str]:
+        """Return names that are given one by one or in lists; without any, those of all named wires."""
+        found: list[str] = []
+        for name in names:
+            several = name if isinstance(name, list | tuple | set | np.ndarray) else [name]
+            for one in several:
+                if not isinstance(one, str):
+                    raise OptionError(
+                        f'found {one!r} to draw; expected the name of a signal, as in run.plot("eta"). Name the wire '
+                        'with .named("…"), or give the path of the port.'
+                    )
+                found.append(str(one))
+        if found:
+            return found
+        wires = [name for name in self.names if name in self.wires]
+        if not wires:
+            some = ", ".join(map(repr, self.names[:6]))
+            raise OptionError(f"found no signal to draw, and no wire has a name; expected names, such as {some}.")
+        return wires
 
     # --- for other tools: all named wires (where none has a name, all ports) if no signal is given -------------------
 
@@ -332,7 +409,7 @@ class Run:
         """
         from .exports import to_csv
 
-        to_csv(self, path, names)
+        to_csv(path, self.t, dict(self._columns(names)))
 
     def to_pandas(self, *names: str) -> DataFrame:
         """Return signals as a pandas DataFrame with the times (s) as index ``t``; columns are named as in `to_csv`.
@@ -348,7 +425,7 @@ class Run:
         """
         from .exports import to_pandas
 
-        return to_pandas(self, names)
+        return to_pandas(self.t, dict(self._columns(names)), self._units_of_columns(names))
 
     def to_xarray(self, *names: str) -> Dataset:
         """Return signals as an xarray Dataset over ``t`` (s).
@@ -366,7 +443,8 @@ class Run:
         """
         from .exports import to_xarray
 
-        return to_xarray(self, names)
+        signals = {name: self[name] for name in self._names_to_export(names)}
+        return to_xarray(self.t, signals, {name: self._units(name) for name in signals}, self.diagram_name)
 
     def to_parquet(self, path: PathLike, *names: str) -> None:
         """Write ``t`` (s) and signals as a Parquet file; columns are named as in `to_csv`.
@@ -382,7 +460,10 @@ class Run:
         """
         from .exports import to_parquet
 
-        to_parquet(self, path, names)
+        def read(samples: slice) -> Iterator[np.ndarray]:
+            return (values for _, values in self._columns(names, samples))
+
+        to_parquet(path, self.t, read, self._units_of_columns(names), self.diagram_name)
 
     def to_mat(self, path: PathLike, *names: str) -> None:
         """Write ``t`` (s) and signals as a MATLAB file (version 5), a column vector or an N-by-n matrix each.
@@ -402,4 +483,40 @@ class Run:
         """
         from .exports import to_mat
 
-        to_mat(self, path, names)
+        signals = {name: self[name] for name in self._names_to_export(names)}
+        units = {name: self._units(name) if self.unit(name) else None for name in signals}
+        to_mat(path, self.t, signals, units, self.diagram_name)
+
+    def _names_to_export(self, names: Iterable[str]) -> list[str]:
+        """Return signals, each once: those given, else all named wires, else all ports."""
+        names = list(names)
+        for name in names:
+            check_argument(name, kinds.text, "names", self.diagram_name)
+        every = self.names
+        wires = [n for n in every if n in self.wires]
+        return list(dict.fromkeys(names or wires or every))
+
+    def _columns(self, names: Iterable[str], samples: slice = slice(None)) -> Iterator[tuple[str, np.ndarray]]:
+        """Yield the name and the values of each column; entries of a vector are counted from 1."""
+        from .exports import column_labels, flatten_samples
+
+        for name in self._names_to_export(names):
+            values = self.part(name, samples)
+            for label, column in zip(column_labels(name, values.shape[1:]), flatten_samples(values).T, strict=True):
+                yield label, np.ascontiguousarray(column)
+
+    def _units_of_columns(self, names: Iterable[str]) -> dict[str, str]:
+        """Return the unit of each column, "" where it is not declared."""
+        from .exports import column_labels
+
+        units: dict[str, str] = {}
+        for name in self._names_to_export(names):
+            units |= zip(column_labels(name, self._place(name)[0]), self._units(name), strict=True)
+        return units
+
+    def _units(self, name: str) -> list[str]:
+        """Return the unit of each entry of a signal, "" where it is not declared."""
+        size, unit = int(np.prod(self._place(name)[0])), self.unit(name)
+        if not isinstance(unit, tuple):
+            return [unit or ""] * size
+        return list(unit) if len(unit) == size else [", ".join(unit)] * size

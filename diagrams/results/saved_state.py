@@ -1,4 +1,4 @@
-"""The complete state of a run at a tick, from which a run can go on, in another process too."""
+"""The complete state of a run at a tick, from which a run can continue, in another process too."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ StateLayout = tuple[tuple[tuple[str, object], ...], ...]
 class RunState:
     """The complete state of a run at a tick: of all blocks and FMUs, of outputs that are held, and of the solver.
 
-    It can be pickled. `Diagram.simulate` goes on from it with ``start=``. The diagram may be a variant with other
+    It can be pickled. `Diagram.simulate` continues from it with ``start=``. The diagram may be a variant with other
     parameters (a branch), with the same blocks and states.
 
     Attributes

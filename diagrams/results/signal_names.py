@@ -22,7 +22,7 @@ Places = dict[str, Place]
 
 
 def place_of(columns: np.ndarray) -> Place:
-    """Return the place of a signal whose entries stand in some columns, in its shape."""
+    """Return the place of a signal whose entries are in some columns, in its shape."""
     flat = columns.ravel()
     together = flat.size and np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size))
     return columns.shape, slice(int(flat[0]), int(flat[0]) + flat.size) if together else flat

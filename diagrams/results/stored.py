@@ -89,7 +89,7 @@ class SignalEntry(TypedDict):
 
 
 class WireEntry(TypedDict):
-    """A named wire in a header; a slice stands as ``{"slice": [start, stop, step]}``."""
+    """A named wire in a header; a slice is written as ``{"slice": [start, stop, step]}``."""
 
     block: str
     port: str
@@ -201,7 +201,7 @@ def prepare(folder: Path, overwrite: bool) -> None:
     Raises
     ------
     OptionError
-        If something stands there that may not be replaced.
+        If something there may not be replaced.
     """
     place = os.fspath(folder)
     with explain_disk_errors(f"the run can't be kept in {place!r}", place, OTHER_PATH, OptionError):
@@ -220,7 +220,7 @@ def prepare(folder: Path, overwrite: bool) -> None:
 def create(folder: Path, head: Mapping[str, object]) -> tuple[FileIO, TextIO]:
     """Write the header, and return the open files for rows and events.
 
-    Files of an earlier run are removed, not emptied, so a reader that has them open goes on reading the earlier run.
+    Files of an earlier run are removed, not emptied, so a reader that has them open still reads the earlier run.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name in (HEADER, END, EVENTS, ROWS):

@@ -1,4 +1,4 @@
-"""The second process itself: it reads a task from its standard input, and answers with parts of the result."""
+"""The second process itself: it reads a function from its standard input, and answers with parts of the result."""
 
 from __future__ import annotations
 
@@ -8,17 +8,12 @@ import pickle
 import signal
 import sys
 from collections.abc import Callable
-from typing import Protocol
 
 from ...blocks.core import on_one_thread
 from ..sweeps import receive, send
 
-
-class Task(Protocol):
-    """Makes parts of a result, each by its key, in any process alike."""
-
-    def make(self, key: str, tell: Callable[[str], None]) -> object:
-        """Return the part of a key; ``tell`` is told what is being done."""
+Make = Callable[[str, Callable[[str], None]], object]
+"""``make(key, tell)``: return the part of a key, the same in any process; ``tell`` gets what is being done, as text."""
 
 
 @on_one_thread
@@ -37,12 +32,12 @@ def main() -> None:
     with contextlib.suppress(EOFError, BrokenPipeError):
         sys.path[:] = receive(orders)
         data = receive(orders)
-        task: Task | None = None
+        make: Make | None = None
         while True:
             key = receive(orders)
             try:
-                task = pickle.loads(data) if task is None else task
-                made = pickle.dumps(task.make(key, lambda text: send(answers, ("told", text))), protocol=5)
+                make = pickle.loads(data) if make is None else make
+                made = pickle.dumps(make(key, lambda text: send(answers, ("told", text))), protocol=5)
             except BrokenPipeError:
                 return
             except Exception:

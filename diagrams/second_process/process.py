@@ -16,7 +16,7 @@ from typing import Any, Generic, TypeVar
 from ...blocks.core import LoopwrightError
 from ...fmus.child_processes import ProcessGroup, find_python
 from ..sweeps import receive, send, to_bytes
-from .child import Task
+from .child import Make
 
 T = TypeVar("T")
 _PROGRAM = "from loopwright.diagrams.second_process.child import main; main()"
@@ -37,13 +37,13 @@ class SecondProcess(Generic[T]):
 
     Parameters
     ----------
-    task : Task
-        Makes the parts there; it travels as bytes.
+    make : callable
+        Makes the parts there, see `Make`; it is pickled.
     name : str
         Name of the diagram, for errors.
     """
 
-    def __init__(self, task: Task, name: str):
+    def __init__(self, make: Make, name: str):
         self._process: subprocess.Popen[bytes] | None = None
         self._told: SimpleQueue[str] = SimpleQueue()
         self._lock, self._over = threading.Lock(), False
@@ -51,7 +51,7 @@ class SecondProcess(Generic[T]):
         self._left: deque[str] = deque()
         self._thread: threading.Thread | None = None
         try:
-            data = to_bytes(task, name)
+            data = to_bytes(make, name)
             program = [find_python(), "-c", _PROGRAM]
             self._group = ProcessGroup()
             try:

@@ -4,12 +4,12 @@ from .algebraic_loops import newton_options
 from .diagnosis import START_SETTLED
 from .engine import Engine
 from .held_inputs import note_held_inputs
-from .initialize import find_initial_state, find_start_values, values_from_left
+from .initialize import find_initial_state, values_from_left
 from .progress import Interrupted, late_progress, progress_bar
 from .run_options import START_EXCHANGES, KeptKeywords, RunKeywords, RunOptions, default_step, refuse_rest, ticks_in
-from .simulated_diagram import SimulatedDiagram
 from .simulation import Simulation, simulate
 from .start_at_point import apply_point, copy_states
+from .start_values import Port, StartFunctions, StartValues, trace_start
 from .stops import StopConditions
 from .view import SimulationView
 from .workspace import Workspace
@@ -20,18 +20,19 @@ __all__ = [
     "Engine",
     "Interrupted",
     "KeptKeywords",
+    "Port",
     "RunKeywords",
     "RunOptions",
-    "SimulatedDiagram",
     "Simulation",
     "SimulationView",
+    "StartFunctions",
+    "StartValues",
     "StopConditions",
     "Workspace",
     "apply_point",
     "copy_states",
     "default_step",
     "find_initial_state",
-    "find_start_values",
     "late_progress",
     "newton_options",
     "note_held_inputs",
@@ -39,5 +40,6 @@ __all__ = [
     "refuse_rest",
     "simulate",
     "ticks_in",
+    "trace_start",
     "values_from_left",
 ]

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from itertools import groupby
 
 import numpy as np
 
+from ...blocks.core import SimulationError
 from ...fmus.calls import FmuInstance
 from ..compiled import (
-    RECENT,
+    LIBRARY_METHODS,
     REFUSED,
     TOLD,
     UNDER_WAY,
@@ -22,6 +22,7 @@ from ..compiled import (
     HybridCode,
     MethodOptions,
     NativeExchange,
+    Pile,
     TickCode,
     Watch,
     compile_other_side,
@@ -30,8 +31,8 @@ from ..coupling import Plant, PlantSteps, end_all, runs_apart, step_all
 from ..events import Domains
 from ..exchange import INPUT_EVENT
 from ..flat import NONE, TickPattern
-from ..results import Occurrence, Recorder
-from ..solvers import AutoSolver
+from ..results import Recorder
+from ..solvers import SUNDIALS, AutoSolver
 from .algebraic_loops import newton_options
 from .continuous import Continuous
 from .solver_setup import has_guards, next_instant, remembers
@@ -90,6 +91,8 @@ def bind_hybrid(
         held=(workspace.z, steps.inputs),
         loops=newton_options(flat, NONE) if flat.active_loops(NONE) else None,
         exchange=native,
+        delays=continuous.delays,
+        tolerances=continuous.resolution,
     )  # fmt: skip
     return loop, handed
 
@@ -98,30 +101,48 @@ def _tell_jump(continuous: Continuous, t: float, path: str, before: np.ndarray, 
     continuous.tell_outside(t, path, INPUT_EVENT, before, after)
 
 
-def name_methods(methods: Sequence[MethodOptions]) -> str:
-    """Return the methods in words."""
-    return ", and where it is stiff ".join(f"{_METHODS[m.name]} ({m.name})" for m in methods)
+def describe_methods(methods: Sequence[MethodOptions], solver: str) -> str:
+    """Return in words which methods integrate for a solver of a name, and where."""
+    if solver in LIBRARY_METHODS:
+        library = "SUNDIALS" if solver in SUNDIALS else "SciPy"
+        return f"{library} takes steps of {solver}, and the rest of the run is C"
+    names = ", and where it is stiff ".join(f"{_METHODS[m.name]} ({m.name})" for m in methods)
+    return f"{names} runs in C as solver={solver!r}"
 
 
-def hand_over_domains(domains: Domains, watch: Watch) -> list[float]:
-    """Let C go on with the domains; return the times in s at which events have fired last."""
-    (domain, _, low, high, slack), (size, rounding), watch.fresh, limits = domains.save()
-    watch.latest, watch.largest[:], recent, _ = limits
+def hand_over_domains(domains: Domains, loop: CompiledHybrid, watch: Watch) -> None:
+    """Let C go on with the domains, and with the times at which events have fired last."""
+    (domain, watch.start[:], low, high, slack), (size, rounding), watch.fresh, limits = domains.save()
+    watch.latest, watch.largest[:], (loop.fired_times, *recent), rest = limits
     watch.domain[:], watch.low[:], watch.high[:], watch.slack[:] = domain, low, high, slack
     watch.size[:], watch.rounding[:] = size, rounding
-    return [t for t, _ in recent]
+    parts: list[np.ndarray] = [*watch.recent, *watch.rest]
+    for part, values in zip(parts, [*recent, *rest], strict=True):
+        part[:] = values
 
 
-def take_back_domains(domains: Domains, watch: Watch, fired: Sequence[Fired]) -> None:
-    """Let Python go on with the domains from C, where some events have fired since they were handed over."""
-    (_, first, *_), _, _, (_, _, recent, rest) = domains.save()
-    groups = groupby(fired, key=lambda one: one.t)
-    recent = [*recent, *((t, tuple(one.event for one in group)) for t, group in groups)][-RECENT:]
-    states = watch.domain.astype(int), first, watch.low, watch.high, watch.slack
-    limits = watch.latest, np.array(watch.largest), recent, rest
+def take_back_domains(domains: Domains, loop: CompiledHybrid, watch: Watch) -> None:
+    """Let Python go on with the domains from C."""
+    side, stuck, briefs, brief_at = watch.rest
+    rest = side.astype(int), stuck.astype(int), briefs.astype(int), brief_at
+    states = watch.domain.astype(int), watch.start.astype(int), watch.low, watch.high, watch.slack
+    limits = watch.latest, np.array(watch.largest), (loop.fired_times, *watch.recent), rest
     domains.restore((states, (watch.size, watch.rounding), watch.fresh, limits))
-    for event, side in watch.take_landed():
-        domains.limits.note_contact(event, side)
+
+
+def pile_up(continuous: Continuous, loop: CompiledHybrid, t: float) -> SimulationError:
+    """Return the error of events that pile up at t in s, where C has come to; the domains have been taken back."""
+    assert continuous.domains is not None
+    assert loop.watch is not None
+    limits, (pile, event, times) = continuous.domains.limits, loop.pile
+    if pile is Pile.IN_CONTACT:
+        return limits.rests_in_contact(t, event, times)
+    if pile is Pile.ZENO:
+        return limits.shows_zeno(event)
+    if pile is Pile.CHATTERS:
+        continuous.enter(t)
+        return continuous.domains.chatters(t, continuous.workspace.here.x[continuous.where])
+    return limits.endless(t, loop.watch.fires, times)
 
 
 def methods_of(continuous: Continuous) -> list[MethodOptions]:
@@ -187,9 +208,9 @@ def plants_for_c(plants: Mapping[str, Plant]) -> dict[str, FmuInstance]:
     return {path: plant for path, plant in plants.items() if isinstance(plant, FmuInstance)}
 
 
-def prepare(plants: Mapping[str, FmuInstance]) -> Callable[[], object]:
+def prepare(plants: Iterable[FmuInstance]) -> Callable[[], object]:
     """Return a function that compiles what the steps of plants need beside the code of a diagram."""
-    apart = any(map(runs_apart, plants.values()))
+    apart = any(map(runs_apart, plants))
     return compile_other_side if apart else lambda: None
 
 
@@ -260,19 +281,10 @@ def changes_method(workspace: Workspace, continuous: Continuous, t: float, h: fl
     return found
 
 
-def is_held(continuous: Continuous) -> bool:
-    """Whether an indicator is held in contact, or events wait for the end of a fixed step: Python goes on then."""
-    return continuous.sliding.active or (continuous.domains is not None and continuous.domains.limits.holds)
-
-
 def tell_fired(continuous: Continuous, fired: Sequence[Fired]) -> None:
     """Tell events that have fired in C."""
-    flat = continuous.flat
     for one in fired:
-        event = flat.events[one.event]
-        of = None if event.subsystem else flat.states.of_block[event.path]
-        before, after = ({} if of is None else of.split(x) for x in (one.before, one.after))
-        continuous.on_event(Occurrence(one.t, event.path, event.name, before, after))
+        continuous.tell_event(one.t, one.event, one.before, one.after)
 
 
 # --- blocks that are evaluated from outside -------------------------------------------------------------------------

@@ -12,35 +12,36 @@ import numpy as np
 from ...blocks.core import CompilerError, LoopwrightError, SimulationError
 from ...fmus.calls import FmuInstance
 from ..compiled import (
+    USES_SLOPE,
     BackgroundCode,
     CompiledHybrid,
-    Fired,
     HandedOver,
     HybridCode,
     HybridOutcome,
     HybridReason,
     Span,
     compile_hybrid,
+    find_code_obstacle,
     find_exchange_obstacle,
     find_hybrid_obstacle,
     hybrid_sources,
     interpret_hybrid,
 )
 from ..coupling import Plant, PlantSteps
-from ..flat import EVERY, ClockSets, is_exact, kinds_of, ticks_after
+from ..flat import EVERY, ClockSets, FlatDiagram, is_exact, kinds_of, ticks_after
 from ..results import Recorder
 from .compiled_hand_over import (
     active_method,
     bind_hybrid,
     changes_method,
+    describe_methods,
     end_steps,
     end_tick,
     find_edges,
     hand_over_domains,
-    is_held,
     let_act,
     methods_of,
-    name_methods,
+    pile_up,
     planned_steps,
     plants_for_c,
     prepare,
@@ -54,13 +55,12 @@ from .compiled_ticks import (
     WISHED,
     LaterCode,
     find_obstacle_at_ticks,
-    tell_failure_once,
+    tell_missing_once,
 )
 from .continuous import Continuous
+from .diagnosis import forget_trials
 from .ticks import take_tick
 from .workspace import Workspace
-
-_KEPT = 5000  # events of which the limits may ask
 
 
 class HybridTicks:
@@ -107,13 +107,8 @@ class HybridTicks:
         self._workspace, self._continuous, self._plants, self._steps = workspace, continuous, plants, steps
         self._stops = stops
         self._methods = methods_of(continuous)
-        self._stiff = any(method.name == "Radau" for method in self._methods)
-        self._acting = kinds_of(flat, every=every)
-        self._code = (
-            interpret_hybrid(flat, self._acting, stiff=self._stiff)
-            if machine
-            else compile_hybrid(flat, self._acting, stiff=self._stiff, fuse=fuse)
-        )
+        self._acting, self._stiff = kinds_of(flat, every=every), is_stiff(continuous)
+        self._code = find_code(flat, continuous, every=every, machine=machine, fuse=fuse)
         self._clocks = flat.visited if plants else flat.distinct
         self._sampled = every or not self._clocks or EVERY in self._clocks
         lands = continuous.fixed or bool(plants) or continuous.lands
@@ -121,15 +116,7 @@ class HybridTicks:
         self._loop: CompiledHybrid | None = None
         self._recorder: Recorder | None = None
         self._chunk = FIRST
-        self.start: float | None = None
-        """Time in s after a tick that interpreted steps have come to, if C begins there."""
-        self._fired: list[Fired] = []
         self._handed: HandedOver | None = None
-
-    @property
-    def solver(self) -> str:
-        """The methods in words."""
-        return name_methods(self._methods)
 
     def reaches(self, last: int) -> bool:
         """Whether times up to a tick are quotients of integers that a float64 holds."""
@@ -141,10 +128,10 @@ class HybridTicks:
         if self._loop is not None:
             self._loop.take_steps(code.steps)
 
-    def make_later(self) -> LaterCode[HybridCode] | None:
+    def make_later(self) -> LaterCode[HybridCode]:
         """Return generated code of these functions that is made while they are interpreted."""
         write = partial(hybrid_sources, self._flat, self._acting, stiff=self._stiff)
-        return LaterCode(BackgroundCode(self._flat, write, prepare(self._plants)))
+        return LaterCode(BackgroundCode(self._flat, write, prepare(self._plants.values())))
 
     # --- going on ----------------------------------------------------------------------------------------------------
 
@@ -166,11 +153,8 @@ class HybridTicks:
         """
         loop = self._bind(recorder)
         if k == 0:  # of a run before nothing is left
-            self._fired = []
             loop.begin_anew()
-        t, self.start = self._time_of(k) if self.start is None else self.start, None
-        while self._sampled and self._time_of(k + 1) <= t:
-            k += 1
+        t = self._time_of(k)
         self._hand_over(loop, t)
         try:
             return self._run(loop, k, t, last, recorder, arrived, progress)
@@ -192,7 +176,9 @@ class HybridTicks:
             rows = recorder.room(t)
             loop.skip = recorder.skip
             started = perf_counter()
-            if is_held(self._continuous):
+            kinds = self._kinds.at(rest)
+            known = int(np.append(np.flatnonzero(kinds < 0), len(kinds))[0])
+            if not known:  # sets of clocks that are too rare to have code of their own
                 following = int(rest[0])
                 asked = HybridOutcome(0, 0, HybridReason.ASK_BETWEEN, 0, 0, 0, t)
                 ended = self._take_interval(loop, k, following, last, asked, recorder)
@@ -202,13 +188,15 @@ class HybridTicks:
                 if arrived(k):
                     return None
                 continue
-            span, lands = self._span(k, rest, last, t)
+            span, lands = self._span(k, rest[:known], kinds, last, t)
             found = loop.run(span, rows)
             recorder.took(found.rows, loop.skip)
             self._tell(loop)
+            if loop.ticks.calls_python:
+                forget_trials(self._flat)  # an interrupt of a block of Python is raised
             t = found.t
+            loop.limit_budget(perf_counter() - started)
             if self._handed is not None:
-                loop.limit_budget(perf_counter() - started)
                 self._handed.tell()
                 if self._handed.has_news():
                     self._take_back(loop)
@@ -221,8 +209,14 @@ class HybridTicks:
                 over = landed.size and arrived(int(done[landed[-1]]), in_step)
                 if over and found.reason is not HybridReason.ENDED:
                     return None
+            failure = loop.take_failure()
+            if failure is not None and found.reason is not HybridReason.OUTSIDE_FAILED:
+                raise self._continuous.explain_failure(failure)
             if found.reason is HybridReason.ENDED:
                 return t
+            if found.reason is HybridReason.PILED_UP:
+                self._take_back(loop)
+                raise pile_up(self._continuous, loop, t)
             if found.reason is HybridReason.LOOK:
                 self._take_back(loop)
                 if changes_method(self._workspace, self._continuous, t, loop.looked_at()):
@@ -246,14 +240,16 @@ class HybridTicks:
         base = self._flat.base
         return k * base.numerator / base.denominator
 
-    def _span(self, k: int, ticks: np.ndarray, last: int, t: float) -> tuple[Span, np.ndarray]:
-        """Return the ticks of a call, from tick ``k`` on, where the states have come to t; and which are landed on."""
+    def _span(self, k: int, ticks: np.ndarray, kinds: np.ndarray, last: int, t: float) -> tuple[Span, np.ndarray]:
+        """Return the ticks of a call, from tick ``k`` on, where the states have come to t; and which are landed on.
+
+        ``kinds`` are the sets of clocks that act at them.
+        """
         base = self._flat.base
         edges = find_edges(self._continuous, t, self._time_of(int(ticks[-1])))
         while edges is None:
             ticks = ticks[: max(1, len(ticks) // 2)]
             edges = find_edges(self._continuous, t, self._time_of(int(ticks[-1])), limited=len(ticks) > 1)
-        kinds = self._kinds.at(ticks)
         lands = np.ones(len(ticks), dtype=np.uint8)
         if not self._lands:
             lands[:] = ticks == last
@@ -263,6 +259,7 @@ class HybridTicks:
         beyond = min([*(clock.after(end) for clock in self._clocks), last]) if not lands[-1] else end
         ends = np.concatenate([[k], ticks])
         n, d = base.numerator, base.denominator
+        kinds = kinds[: len(ticks)]
         return Span(ends * n / d, np.diff(ends) * n / d, kinds, lands, self._time_of(beyond), *edges), lands
 
     # --- by Python ---------------------------------------------------------------------------------------------------
@@ -328,7 +325,7 @@ class HybridTicks:
                 self._stops, self._methods,
             )  # fmt: skip
             self._recorder = recorder
-            self._kinds = ClockSets(self._flat.distinct, self._loop.kinds, other=0)
+            self._kinds = ClockSets(self._flat.distinct, self._loop.kinds)
         return self._loop
 
     def _hand_over(self, loop: CompiledHybrid, t: float) -> None:
@@ -341,7 +338,8 @@ class HybridTicks:
         loop.active = active_method(self._continuous, self._methods)
         if loop.watch is not None:
             assert self._continuous.domains is not None
-            loop.hand_over_recent(hand_over_domains(self._continuous.domains, loop.watch))
+            hand_over_domains(self._continuous.domains, loop, loop.watch)
+            loop.sliding = self._continuous.sliding.save()
 
     def _take_back(self, loop: CompiledHybrid) -> None:
         """Let Python go on from where C has come to."""
@@ -350,14 +348,29 @@ class HybridTicks:
             self._continuous.follow()
         if loop.watch is not None:
             assert self._continuous.domains is not None
-            take_back_domains(self._continuous.domains, loop.watch, self._fired)
-            self._fired = []
+            take_back_domains(self._continuous.domains, loop, loop.watch)
+            self._continuous.sliding.restore(loop.sliding)
 
     def _tell(self, loop: CompiledHybrid) -> None:
         """Tell the events that have fired."""
-        fired = loop.take_fired()
-        self._fired = [*self._fired, *fired][-_KEPT:]
-        tell_fired(self._continuous, fired)
+        tell_fired(self._continuous, loop.take_fired())
+        for t, event in () if loop.watch is None else loop.watch.take_slid():
+            self._workspace.messages += self._continuous.sliding.tell(self._flat.events[event], t)
+
+
+def find_code(
+    flat: FlatDiagram, continuous: Continuous, *, every: bool, machine: bool, fuse: bool = False
+) -> HybridCode:
+    """Return the functions of a run for the virtual machine, or compiled; see `HybridTicks`."""
+    acting, stiff = kinds_of(flat, every=every), is_stiff(continuous)
+    if machine:
+        return interpret_hybrid(flat, acting, stiff=stiff)
+    return compile_hybrid(flat, acting, stiff=stiff, fuse=fuse)
+
+
+def is_stiff(continuous: Continuous) -> bool:
+    """Whether the solver needs the derivative of the rates."""
+    return any(method.name in USES_SLOPE for method in methods_of(continuous))
 
 
 _ASKING = frozenset(
@@ -383,7 +396,6 @@ def make_hybrid(
     *,
     every: bool,
     coupled: bool,
-    asked: bool = True,
     machine: bool = False,
     fuse: bool = False,
 ) -> tuple[HybridTicks | None, tuple[str, ...]]:
@@ -393,27 +405,23 @@ def make_hybrid(
     ----------
     coupled : bool
         Whether another coupling than "jacobi" is asked for.
-    asked : bool
-        Whether the user asks for C, by ``compile=True``; else a compiler that fails is told once, and nothing else.
+    machine : bool, default False
+        Let the virtual machine evaluate the functions; then nothing is said but that the library can't be had.
     fuse : bool, default False
         Compile them for the processor of this machine.
     """
     native = plants_for_c(plants)
-    reason = find_hybrid_obstacle(workspace.flat, continuous.solver.name)
+    flat = workspace.flat
+    reason = find_hybrid_obstacle(flat) or (None if machine else find_code_obstacle(flat))
     if reason is None and continuous.exchanged is not None:
-        blocks = continuous.exchanged.blocks
-        reason = find_exchange_obstacle(blocks)
-        if machine and any(getattr(block, "native_host", None) is not None for block in blocks.values()):
-            return None, ()  # Python sets traps of such a library back after every call, C after several
+        reason = find_exchange_obstacle(continuous.exchanged.blocks)
     reason = reason or find_obstacle_at_ticks(workspace.flat, plants, native, steps, coupled=coupled)
     if reason is None:
         try:
             found = HybridTicks(workspace, continuous, native, steps, stops, every=every, machine=machine, fuse=fuse)
         except (LoopwrightError, OSError) as error:
             if machine:
-                return None, ()
-            if not asked:
-                return None, tell_failure_once(error)
+                return None, tell_missing_once(error)
             if not isinstance(error, CompilerError):
                 raise
             reason = str(error)
@@ -421,14 +429,14 @@ def make_hybrid(
             if machine:
                 return found, ()
             told = (
-                f"Compiled: {found.solver} runs in C as solver={continuous.solver.name!r}, by the same rules as "
+                f"Compiled: {describe_methods(methods_of(continuous), continuous.solver.name)}, by the same rules as "
                 "interpreted; values differ from those of an interpreted run by rounding and within the tolerances."
             )
             fused = (
                 "Fused: ticks and rates are compiled for this processor; values differ by rounding, which some motions "
                 "magnify."
             )
-            return found, (*((told,) if continuous.where.size and asked else ()), *((fused,) if fuse else ()))
-    if not asked:
+            return found, (*((told,) if continuous.where.size else ()), *((fused,) if fuse else ()))
+    if machine:
         return None, ()
     return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Generic
 
 import numpy as np
 
-from ...blocks.core import CompilerError, SimulationError
+from ...blocks.core import CompilerError, LoopwrightError, SimulationError
 from ...fmus.calls import FmuInstance
 from ..compiled import (
     BackgroundCode,
@@ -41,11 +42,9 @@ FIRST, LARGEST_CHUNK = 64, 2**15
 """Ticks of a chunk: the first one, and at most, so that lists of them stay in the processor's cache."""
 WISHED = 0.05
 """Seconds that a chunk takes, half or double; Ctrl-C and the progress bar have their turn after it."""
-_WINDOW = 2**14
-"""Ticks whose times are computed at a time, at most."""
+_WINDOW, _FEW = 2**14, 16
+"""Ticks whose times are computed at a time, at most; so many are computed without arrays, whose set-up takes longer."""
 _RK4 = 1  # the integrator of exported FMUs that is compiled into a fused loop
-CLOCKS = 16
-"""Clocks up to which sets of them are numbered by their bits."""
 _SIGNS = (
     "Compiled: it has tables or large matrix products, in which signs of zeros may differ from those of an interpreted "
     "run."
@@ -61,11 +60,11 @@ class _Window:
     """Some ticks after tick ``before``: the time of that and of each in s, their lengths in s, and their kinds."""
 
     before: int
-    ticks: np.ndarray
+    ticks: Sequence[int] | np.ndarray
     times: np.ndarray
     widths: np.ndarray
     kinds: np.ndarray
-    unknown: np.ndarray
+    unknown: Sequence[int] | np.ndarray
     """Places of the ticks at which clocks act together for which there is no code."""
 
     def known(self, start: int, stop: int) -> int:
@@ -113,7 +112,8 @@ class CompiledTicks:
         self._code = compile_ticks(flat, kinds_of(flat, every=every)) if code is None else code
         self._loop: CompiledLoop | None = None
         self._recorder: Recorder | None = None
-        self._kinds = ClockSets(flat.distinct, {clocks: kind for kind, clocks in enumerate(self._code.ticks)})
+        self._numbers = {clocks: kind for kind, clocks in enumerate(self._code.ticks)}
+        self._kinds = ClockSets(flat.distinct, self._numbers)
         self._chunk = FIRST
         self._first: _Window | None = None
         self._last = 0
@@ -133,6 +133,11 @@ class CompiledTicks:
     def hand_over(self, code: TickCode) -> None:
         """Let generated code of the same ticks go on; C must not run meanwhile."""
         self._code, self._loop = code, None
+
+    def make_later(self) -> LaterCode[TickCode]:
+        """Return generated code of these ticks that is made while they are interpreted."""
+        write = partial(write_ticks, self._flat.origin, [*self._code.ticks])
+        return LaterCode(BackgroundCode(self._flat, write, prepare(self._plants)))
 
     def run(
         self,
@@ -202,9 +207,17 @@ class CompiledTicks:
             k = int(window.ticks[-1])
 
     def _window(self, k: int, last: int) -> _Window:
-        base, visited = self._flat.base, (EVERY,) if self._every else self._flat.visited
-        ticks = ticks_after(visited, k, last, _WINDOW)
-        n, d, ends = base.numerator, base.denominator, np.concatenate([[k], ticks])
+        flat, base = self._flat, self._flat.base
+        n, d = base.numerator, base.denominator
+        if last - k <= _FEW:
+            few = [*flat.ticks(k, last, every=self._every)]
+            numbers = [self._numbers.get(flat.acting(tick), -1) for tick in few]
+            widths = [(b - a) * n / d for a, b in pairwise([k, *few])]
+            missing = [i for i, number in enumerate(numbers) if number < 0]
+            times = [tick * n / d for tick in (k, *few)]
+            return _Window(k, few, np.array(times), np.array(widths), np.array(numbers, dtype=np.int32), missing)
+        ticks = ticks_after((EVERY,) if self._every else flat.visited, k, last, _WINDOW)
+        ends = np.concatenate([[k], ticks])
         kinds = self._kinds.at(ticks)
         unknown = np.flatnonzero(kinds < 0)
         return _Window(k, ticks, ends * n / d, np.diff(ends) * n / d, kinds, unknown)
@@ -236,23 +249,28 @@ class CompiledTicks:
         recorder.row(t, workspace.log)
 
 
-def bind_evaluations(workspace: Workspace, *, every: bool) -> dict[frozenset[TickPattern], Callable[[], None]]:
+def bind_evaluations(
+    workspace: Workspace, find_code: Callable[[], TickCode]
+) -> dict[frozenset[TickPattern], Callable[[], None]]:
     """Return the evaluations of ticks in C, with the bits of interpreted ones; empty where they can't be had.
 
-    The functions of a large diagram take seconds to trace as a whole, and its grouped code needs none of them.
+    The functions of a large diagram take seconds to trace as a whole, and calls of its blocks need none of them.
+
+    Parameters
+    ----------
+    find_code : callable
+        Returns the code of ticks.
     """
     flat, here = workspace.flat, workspace.here
-    if find_obstacle(flat) or len(flat.distinct) > CLOCKS or flat.loops.slices:
+    if flat.loops.slices or flat.outside:
         return {}
     try:
-        code = compile_ticks(flat, kinds_of(flat, every=every))
-    except CompilerError:  # told by `make_compiled`
-        return {}
-    if not code.exact:
+        code = find_code()
+    except LoopwrightError:  # as `make_compiled` says
         return {}
     results = [workspace.x_next, workspace.z, workspace.log, workspace.ok]
     vectors = [here.t, here.x, here.w, here.p]
-    return {clocks: bind_call(tick, vectors, results) for clocks, tick in code.ticks.items()}
+    return {clocks: bind_call(tick, vectors, results) for clocks, tick in code.ticks.items()} if code.exact else {}
 
 
 def make_compiled(
@@ -280,16 +298,19 @@ def make_compiled(
         Compile ticks and plants of our own together, for the processor of this machine.
     """
     native = plants_for_c(plants)
-    reason = find_obstacle(workspace.flat) or find_obstacle_at_ticks(
-        workspace.flat, plants, native, steps, coupled=coupled
-    )
+    reason = None if machine else find_obstacle(workspace.flat)
+    reason = reason or find_obstacle_at_ticks(workspace.flat, plants, native, steps, coupled=coupled)
     if reason is None:
         try:
             acting = kinds_of(workspace.flat, every=every)
             code = _fuse(workspace.flat, native, every=every) if fuse else None
             code = interpret_ticks(workspace.flat, acting) if machine else code
             found = CompiledTicks(workspace, native, stops, every=every, code=code)
-        except CompilerError as error:
+        except (LoopwrightError, OSError) as error:
+            if machine:
+                return None, tell_missing_once(error)
+            if not isinstance(error, CompilerError):
+                raise
             reason = str(error)
         else:
             return found, () if machine else found.messages
@@ -344,22 +365,21 @@ _TOLD: list[Exception] = []  # the failure that this process has told
 
 def tell_failure_once(failure: Exception) -> tuple[str, ...]:
     """Return a message that there is no compiler, or one that fails; once in a process."""
+    return _tell_once(
+        failure, "Interpreted, though the run is long enough for C: {}. compile=False asks for no compiler."
+    )
+
+
+def tell_missing_once(failure: Exception) -> tuple[str, ...]:
+    """Return a message that the loop in C can't be had; once in a process."""
+    return _tell_once(failure, "Interpreted by Python's own loop, which takes several times as long as C's: {}.")
+
+
+def _tell_once(failure: Exception, text: str) -> tuple[str, ...]:
     if _TOLD:
         return ()
     _TOLD.append(failure)
-    reason = str(failure).rstrip(".")
-    return (f"Interpreted, though the run is long enough for C: {reason}. compile=False asks for no compiler.",)
-
-
-def make_later(
-    workspace: Workspace, plants: Mapping[str, Plant], *, steps: PlantSteps, every: bool
-) -> LaterCode[TickCode] | None:
-    """Return the code of ticks that is made beside them; None where they can't go in C. See `make_compiled`."""
-    flat, native = workspace.flat, plants_for_c(plants)
-    if find_obstacle(flat) or find_obstacle_at_ticks(flat, plants, native, steps, coupled=False):
-        return None
-    write = partial(write_ticks, flat.origin, kinds_of(flat, every=every))
-    return LaterCode(BackgroundCode(flat, write, prepare(native)))
+    return (text.format(str(failure).rstrip(".")),)
 
 
 def find_obstacle_at_ticks(
@@ -371,8 +391,6 @@ def find_obstacle_at_ticks(
     coupled: bool,
 ) -> str | None:
     """Return why the clocks and the plants of a run can't be gone over in C; None if they can."""
-    if len(flat.distinct) > CLOCKS:
-        return f"it has {len(flat.distinct)} different clocks, and at most {CLOCKS} are compiled"
     if coupled:
         return "coupling= asks for another one than 'jacobi', whose steps Python takes"
     if not steps.regular:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,8 +30,13 @@ from .transport_delays import delays_of, keep_step
 from .trials import Trials
 from .workspace import Workspace
 
-_ULPS = 4
-"""An event within so many ulps of a tick belongs to the tick."""
+if TYPE_CHECKING:
+    from ..compiled import Failure
+
+_ULPS = 16
+"""An event within so many ulps of a tick or of a sample belongs to it."""
+_AT_ONCE = 1e-6
+"""Part of the time between two samples within which an indicator has come back at once."""
 _NO_EVENTS = np.zeros(0, dtype=bool)
 NOTHING: frozenset[Any] = frozenset()
 TIGHT, ONE_STEP = 1e-9, ("auto", "RK23", "RK45", "DOP853", "Radau")
@@ -75,7 +80,7 @@ class Continuous(Trials, Memory):
         self.where = flat.continuous
         self._edge, self._left, self._sources_edge = math.inf, math.inf, math.inf
         self._beyond, self._nothing = None, np.zeros(self.where.size)
-        self._resolution = rtol, atol
+        self.resolution = rtol, atol
         self._loops = flat.active_loops(NOTHING)
         self._opaque = any(flat.table.blocks[path].opaque for path in flat.checked.traced)
         self.delays = delays_of(flat)
@@ -93,9 +98,6 @@ class Continuous(Trials, Memory):
             max_step=longest,
         )
         self.fixed = self.solver.fixed
-        self.watch: Callable[[float, bool], bool] | None = None
-        """Told the end of every step, and whether events fire there; returns whether the run is to pause there."""
-        self.paused: float | None = None
         self.sliding = Sliding(float(flat.base) if self.fixed else None)
         self.lands = rtol < TIGHT and self.solver.name in ONE_STEP
         """Whether the solver lands on every sample: the dense output is of lower order than the step."""
@@ -133,6 +135,8 @@ class Continuous(Trials, Memory):
         self._announced = NextInstants(self.sources)
         self.late = find_late(self.sources)
         """Instants at which sources are seen at a time just after."""
+        self._crossed: dict[int, float] = {}
+        """When indicators of FMUs have crossed zero last, in s."""
         self._fresh = self.save()
 
     # --- the instant that is reached ---------------------------------------------------------------------------------
@@ -196,6 +200,8 @@ class Continuous(Trials, Memory):
                 return True
         self.fire(t, fired)
         self.sliding.switched = True
+        if ahead:
+            self._fire_ahead(t)
         return True
 
     def _changed(self, t: float) -> np.ndarray:
@@ -220,7 +226,7 @@ class Continuous(Trials, Memory):
             nominals = self.exchanged.nominals()
             if not np.array_equal(nominals, self._nominals):
                 self._nominals = nominals
-                self.solver.set_absolute_tolerance(absolute_tolerances(self.flat, self._resolution[1], nominals))
+                self.solver.set_absolute_tolerance(absolute_tolerances(self.flat, self.resolution[1], nominals))
 
     def _end_events(self, t: float) -> None:
         if self.delays is not None:
@@ -258,7 +264,7 @@ class Continuous(Trials, Memory):
             else:
                 self.outside.fire(t, fired)
             for i in np.flatnonzero(fired):
-                self._tell(t, self.flat.events[int(i)], before)
+                self.tell_event(t, int(i), before, workspace.here.x)
                 self._reset_domains(self.flat.events[int(i)])
             self._synchronize()
             domains.count(t, workspace.here.x[self.where], fired)
@@ -279,10 +285,19 @@ class Continuous(Trials, Memory):
             assert self.domains is not None
             self.domains.reset(event.path)
 
-    def _tell(self, t: float, event: Any, before: np.ndarray) -> None:
-        states = [
-            {} if event.subsystem else state_values(self.flat, event.path, x) for x in (before, self.workspace.here.x)
-        ]
+    def tell_event(self, t: float, i: int, before: np.ndarray, after: np.ndarray) -> None:
+        """Tell that event ``i`` has fired at t in s, with all states before and after it.
+
+        An FMU hears of every crossing of its indicators. One that comes back at once over the zero beyond which the
+        last event was located, and that changes no state, is no event of the run.
+        """
+        event = self.flat.events[i]
+        states = [{} if event.subsystem else state_values(self.flat, event.path, x) for x in (before, after)]
+        if event.path in self.flat.outside and self.domains is not None:
+            last, self._crossed[i] = self._crossed.get(i, -math.inf), t
+            same = all(np.array_equal(value, states[1][name]) for name, value in states[0].items())
+            if same and 0.0 <= t - last <= _AT_ONCE * self.domains.spacing:
+                return
         self.on_event(Occurrence(t, event.path, event.name, *states))
 
     # --- from tick to tick -------------------------------------------------------------------------------------------
@@ -300,7 +315,7 @@ class Continuous(Trials, Memory):
         Returns
         -------
         float or None
-            Time at which a stop condition has ended the run, or `watch` has it ``paused``.
+            Time at which a stop condition has ended the run.
         """
         workspace = self.workspace
         self.sliding.begin_step()
@@ -314,8 +329,8 @@ class Continuous(Trials, Memory):
                 self.delays.look_from(0.5 * (t + edge))
             self._synchronize()
             self._explained(self.solver.restart, t, workspace.here.x[self.where], edge)
-            found, wanted, paused = None, False, False
-            while found is None and not (wanted or paused) and t < edge:
+            found, wanted = None, False
+            while found is None and not wanted and t < edge:
                 step: AcceptedStep = self._explained(self.solver.step)
                 self.tell_changes(workspace)
                 if self.domains is not None and not self.sliding.active:
@@ -325,27 +340,33 @@ class Continuous(Trials, Memory):
                         found = end, found[1]
                 t = step.t if found is None else found[0]
                 while pending < t or (pending == t < edge and found is None):
+                    if found is not None and t - pending <= _ULPS * math.ulp(pending):
+                        break  # the event belongs to the sample, which is taken after it
                     self._put(pending, step.interpolate(pending))
+                    workspace.here.t[0] = pending  # within rounding before a discontinuity it sees that from the right
                     workspace.evaluate()
                     if self._record(pending, sample):
                         return pending
                     pending = next(times, math.inf)
                 if self.delays is not None and t > step.t_old:
-                    keep_step(self.delays, step.t_old, t, step.interpolate, self._inputs_of_delays, self._resolution)
+                    keep_step(self.delays, step.t_old, t, step.interpolate, self._inputs_of_delays, self.resolution)
                 self._put(t, step.x if found is None else step.interpolate(t))
                 if found is not None:  # the loops as the indicators saw them, to the last bit
                     workspace.here.x[self._loops] = solved
                 if self._accepts or t < end or found is not None:
                     self.accept()
                 wanted = self.outside is not None and self.outside.complete_step()
-                paused = self.watch is not None and self.watch(t, found is not None) and t < end
             happened = found is not None or wanted
             if t == end and not (happened or self.delays or self.flat.plant_outputs.total):
                 self._looked = end if is_before(end, self._sources_edge) else math.nan
             if found is None and wanted:
                 self.settle(t)
             if found is not None:
-                self.fire(t, found[1])
+                at, t = t, min(t, pending)
+                self.fire(t, found[1], at)
+                if at > t:
+                    workspace.here.t[0] = t
+                    self._synchronize()
                 workspace.messages += self.sliding.look(self.domains, t)
             if t == edge and self.delays is not None:
                 self.delays.note_reached(t, from_source=not is_before(t, self._sources_edge))
@@ -359,9 +380,6 @@ class Continuous(Trials, Memory):
                 pending = next(times, math.inf)
             elif happened and self._stops_at(t, sample):
                 return t
-            if paused:
-                self.paused = t
-                return t
         return None
 
     def _explained(self, call: Callable[..., Any], *arguments: Any) -> Any:
@@ -370,6 +388,13 @@ class Continuous(Trials, Memory):
         except SimulationError as error:
             found = self._explain(error)
             raise found from found.__cause__
+
+    def explain_failure(self, failure: Failure) -> BaseException:
+        """Return the error behind that of a solver which C has asked for a step."""
+        if not isinstance(failure.error, SimulationError):
+            return failure.error
+        self._edge, self._left, self._beyond = failure.edge, failure.left, failure.beyond
+        return self._explain(failure.error)
 
     def _explain(self, error: SimulationError) -> SimulationError:
         """Return the error behind that of the solver: what an opaque block raised, or who made a trial not finite."""

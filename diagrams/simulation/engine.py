@@ -13,16 +13,17 @@ from ...blocks.core import Block, SimulationError, UnknownNameError, near
 from ...fmus.calls import FmuInstance
 from ..coupling import CoupledSteps, Links, Plant, PlantSteps, load_plants, refuse_exchanged, to_coupling
 from ..exchange import ExchangedBlock, ExchangedBlocks
-from ..flat import FlatDiagram
+from ..flat import FlatDiagram, kinds_of
 from ..results import Occurrence, OperatingPoint, Recorder, Stopped, TextSignal
 from ..solvers import solver_name
-from .change_over import ChangeOver, HybridChange
+from .change_over import ChangeOver
 from .continuous import Continuous
 from .continuous_part import ContinuousPart
 from .diagnosis import opaque_failure
-from .initialize import initialize
+from .initialize import find_start_values, initialize
 from .run_options import RunOptions, check_compile, check_start_exchange
 from .start_at_point import start_at, take_over
+from .start_values import choose_start_values
 from .stops import StopConditions
 from .ticks import Progress, Row, end_between_ticks, run_hybrid, run_ticks, take_tick
 from .view import Position, SimulationView
@@ -31,9 +32,7 @@ from .workspace import Workspace
 if TYPE_CHECKING:
     from ..compiled import TickCode
     from .compiled_hybrid import HybridTicks
-    from .compiled_ticks import CompiledTicks, LaterCode
-
-_FEW = 100  # sampled ticks that Python goes through unless compile=True: C takes some 50 µs to begin
+    from .compiled_ticks import CompiledTicks
 
 
 class Engine:
@@ -73,7 +72,7 @@ class Engine:
         self._stops = StopConditions(flat, self.workspace.log, self._find_asking)
         self._passes_on = check_start_exchange(options.start_exchange)
         self._compile, self._fuse = check_compile(options.compile, fuse=options.fuse), options.fuse
-        self._changed = self._due = False  # whether code has taken over within the run, or does so at the next tick
+        self._changed = False  # whether generated code has taken over within the run
         self._compiled: CompiledTicks | HybridTicks | None = None
         self._generated = self._asked_machine = False  # whether it is generated code; whether the machine can be had
         self.messages: tuple[str, ...] = ()
@@ -97,10 +96,7 @@ class Engine:
             flat, self.plants, self.workspace.z, self.workspace.here.w, self.position.time_of,
             every_tick=self.every_tick, coupled=is_coupled,
         )  # fmt: skip
-        self._change_over = ChangeOver(self.position, self._make_later)
-        part = self.continuous if self._compile == "auto" and not is_coupled else None
-        parts = self.position, self.plants, self._make_hybrid, self.every_tick
-        self._hybrid = None if part is None else HybridChange(part, *parts)
+        self._change_over = ChangeOver(self.position)
         if is_coupled:
             refuse_exchanged(self.coupling, {path: flat.table.blocks[path] for path in flat.outside})
             self.coupled = CoupledSteps(
@@ -129,16 +125,29 @@ class Engine:
     def initialize(self) -> None:
         """Find values of everything at t = 0; the plants are then ready to be stepped."""
         self.steps.bind()
-        if self._compile is True and self.continuous is None and (self.flat.by_block or not self._fuse):
+        large, sampled = self.flat.by_block, self.continuous is None
+        plain = sampled and large if self._fuse else sampled or large
+        if (plain and self._compile is True) or (large and self.may_use_machine(self._compile)):
             from .compiled_ticks import bind_evaluations
 
-            self.workspace.native = bind_evaluations(self.workspace, every=self.every_tick)
-        self._find_start(None)
+            self.workspace.native = bind_evaluations(self.workspace, self._find_tick_code)
+        self._find_start(choose_start_values(self.workspace))
         if self._compile is True:
             self._compiled = self._make_compiled()
             self._generated = self._compiled is not None
 
-    def _find_start(self, set_start: Callable[[Workspace], None] | None) -> None:
+    def _find_tick_code(self) -> TickCode:
+        """Return the code of the ticks, for an evaluation of one."""
+        from ..compiled import compile_ticks, interpret_ticks
+        from .compiled_hybrid import find_code
+
+        machine = self._compile is not True
+        if self.continuous is not None:
+            return find_code(self.flat, self.continuous, every=self.every_tick, machine=machine).ticks
+        acting = kinds_of(self.flat, every=self.every_tick)
+        return interpret_ticks(self.flat, acting) if machine else compile_ticks(self.flat, acting)
+
+    def _find_start(self, set_start: Callable[[Workspace], None]) -> None:
         delays = None if self.continuous is None else self.continuous.delays
         take_inputs = self.steps.take_inputs
         initialize(self.workspace, self.plants, delays, take_inputs, self.exchanged, self._passes_on, set_start)
@@ -181,16 +190,12 @@ class Engine:
         """
         self.workspace.begin_anew(flat)
         self.position.restore(0, None)
-        if self._hybrid is not None:
-            self._hybrid.begin_anew()
-            if not self._asked_machine:
-                self._compiled, self._generated = None, False
         if self.continuous is not None:
             self.continuous.begin_anew(flat)
         for plant in self.plants.values():
             assert isinstance(plant, FmuInstance)
             plant.read(0.0)
-        self._find_start(set_start)
+        self._find_start(set_start or find_start_values)
 
     def _make_compiled(self, *, machine: bool = False) -> CompiledTicks | HybridTicks | None:
         """Return the ticks in C; None, with a message, where they can't be had."""
@@ -211,8 +216,7 @@ class Engine:
         assert self.continuous is not None
         ticks, message = make_hybrid(
             self.workspace, self.continuous, self.plants, self.steps, self._stops.entries, every=self.every_tick,
-            coupled=self.coupled is not None, asked=self._compile is True, machine=machine,
-            fuse=self._fuse,
+            coupled=self.coupled is not None, machine=machine, fuse=self._fuse,
         )  # fmt: skip
         self.messages += message
         return ticks
@@ -247,42 +251,23 @@ class Engine:
         workspace, plants, position, row = self.workspace, self.plants, self.position, recorder.row
         self.is_ahead = False
         try:
-            few = self._compile is not True and self.continuous is None and last - position.tick < _FEW
-            if self._compiled is None and not few and not self._asked_machine and self.may_use_machine(self._compile):
+            if self._compiled is None and not self._asked_machine and self.may_use_machine(self._compile):
                 self._asked_machine = True
                 self._compiled = self._make_compiled(machine=True)
-            if self._hybrid is not None and self._compiled is None and self._hybrid.is_due(last):
-                self._compiled, self._generated = self._hybrid.ticks, True
-            if self._compiled is not None and not few and self._compiled.reaches(last):
+            if self._compiled is not None and self._compiled.reaches(last):
                 self._go_in_c(last, recorder, progress)
-                return
-            if self.continuous is None:
-                auto = self._compile == "auto" and self._compiled is None and not few
+            elif self.continuous is None:
                 run_ticks(
                     workspace, plants, self.steps, self.coupled, position.tick, last, every=self.every_tick, row=row,
-                    arrived=self._arrive,
-                    progress=self._change_over.watch(last, progress, self._note_due) if auto else progress,
+                    arrived=self._arrive, progress=progress,
                 )  # fmt: skip
-                self._due = False
-                self.messages += self._change_over.tell_failure()
-                if auto and (code := self._change_over.code) is not None:
-                    self._compiled, self._changed, self._generated = self._ticks_of(code), True, True
-                    if position.stopped is None and position.tick < last:
-                        self.go(last, recorder, progress)
-                return
-            change = self._hybrid if self._compiled is None else None
-            self.continuous.watch = None if change is None else change.watch(last, self._note_due)
-            ended = run_hybrid(
-                workspace, self.continuous, plants, self.steps, self.coupled, position, last,
-                every=self.every_tick, row=row, arrived=self._arrive, progress=progress,
-            )  # fmt: skip
-            start, self.continuous.paused, self._due = self.continuous.paused, None, False
-            if ended is not None and start is None:
-                position.stopped = self._stops.met_at(ended)
-            elif change is not None and change.ticks is not None and position.stopped is None:
-                self._compiled, change.ticks.start = change.ticks, start
-                self._changed = self._generated = True
-                self._go_in_c(last, recorder, progress)
+            else:
+                ended = run_hybrid(
+                    workspace, self.continuous, plants, self.steps, self.coupled, position, last,
+                    every=self.every_tick, row=row, arrived=self._arrive, progress=progress,
+                )  # fmt: skip
+                if ended is not None:
+                    position.stopped = self._stops.met_at(ended)
         except SimulationError as error:
             if not self._end_within_step(error):
                 culprit = self.blame(error)
@@ -291,7 +276,7 @@ class Engine:
     def _go_in_c(self, last: int, recorder: Recorder, progress: Progress) -> None:
         assert self._compiled is not None
         if self._compile == "auto" and not self._generated:
-            progress = self._change_over.watch(last, progress, self._hand_over)
+            progress = self._change_over.watch(last, progress, self._compiled.make_later, self._hand_over)
         ended = self._compiled.run(self.position.tick, last, recorder, arrived=self._arrive, progress=progress)
         self.messages += self._change_over.tell_failure()
         if ended is not None:
@@ -302,24 +287,6 @@ class Engine:
         assert self._compiled is not None
         self._compiled.hand_over(self._change_over.code)
         self._changed = self._generated = True
-
-    def _make_later(self) -> LaterCode[Any] | None:
-        """Return the code that is generated while the run is interpreted; None where it can't be had."""
-        from .compiled_hybrid import HybridTicks
-        from .compiled_ticks import make_later
-
-        if isinstance(self._compiled, HybridTicks):
-            return self._compiled.make_later()
-        if self.continuous is not None or not self.coupling.is_plain:
-            return None
-        return make_later(self.workspace, self.plants, steps=self.steps, every=self.every_tick)
-
-    def _ticks_of(self, code: TickCode) -> CompiledTicks:
-        from .compiled_hand_over import plants_for_c
-        from .compiled_ticks import CompiledTicks
-
-        native = plants_for_c(self.plants)
-        return CompiledTicks(self.workspace, native, self._stops.entries, every=self.every_tick, code=code)
 
     def end_between_ticks(self, end: float, row: Row, progress: Progress) -> None:
         """Go on from a tick to the end of the run, before the next tick, and record it; see `go`."""
@@ -347,10 +314,6 @@ class Engine:
                 del changes[:-1]
         return found
 
-    def _note_due(self) -> None:
-        """Let interpreted ticks end at the next one: C takes over."""
-        self._due = self._can_stop = True
-
     def _arrive(self, k: int, steps_on: bool = False) -> bool:
         """Take note of a tick that was recorded; return whether it ends the run, in whose next step plants may be."""
         self.position.tick = k
@@ -361,7 +324,7 @@ class Engine:
         if position.stopped is None and self._stops.is_met():
             position.stopped = self._stops.met_at(position.t)
             self._note_end(position.t, position.t)
-        return position.stopped is not None or self._due
+        return position.stopped is not None
 
     # --- ends that FMUs ask for ---------------------------------------------------------------------------------------
 

@@ -40,8 +40,8 @@ def initialize(
     delays: Delays | None,
     take_inputs: Callable[[], None],
     exchanged: ExchangedBlocks,
-    passes_on: str = "agree",
-    set_start: Callable[[Workspace], None] | None = None,
+    passes_on: str,
+    set_start: Callable[[Workspace], None],
 ) -> None:
     """Find values of everything at t = 0.
 
@@ -55,9 +55,8 @@ def initialize(
 
     ``take_inputs`` lets the plants see the inputs z. ``passes_on`` is the exchange of values with them: "agree" until
     their inputs stay, "once", or "none", where the inputs of FMUs keep their start values. ``set_start`` computes the
-    initial states and first held outputs from the values at hand; `find_start_values` by default.
+    initial states and first held outputs from the values at hand, as `find_start_values` does.
     """
-    set_start = set_start or find_start_values
     workspace.here.t[0] = 0.0
     if delays is not None:
         delays.outputs_at(0.0, workspace.here.w)
@@ -303,6 +302,8 @@ def _hold_first_outputs(workspace: Workspace) -> None:
     flat, x = workspace.flat, workspace.here.x
     if not flat.held.slices and not flat.gates.slices:
         return
+    if (solve := workspace.loop_solver(frozenset(flat.distinct), workspace.here)) is not None:
+        solve()  # those of subsystems that don't act at t = 0, too
     done = _evaluate(workspace)
     before = _evaluate(workspace, taps=values_from_left(workspace)) if flat.gates.slices else done
     for name, column in done.held.items():

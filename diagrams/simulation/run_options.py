@@ -133,10 +133,9 @@ class RunOptions:
         need; a virtual machine evaluates the diagram's functions unless there is generated code of them, to the same
         bits. "auto": a run begins with the machine; a compiler works beside it if the run is long enough, and its code
         takes over. False: no code is generated, and no compiler is started. True: code is generated before the first
-        tick. That needs a compiler (the extra ``build``), and a diagram without transport delays at FMUs; between ticks
-        one of the solvers "auto", "RK23", "RK45", "DOP853", "Radau" and those of fixed step. Where one of these fails,
-        the run is interpreted, and ``run.messages`` says why. ``run.tier`` says what was done. Diagrams of more than
-        2000 operations a tick are interpreted by Python until there is code of them.
+        tick. That needs a compiler (the extra ``build``), and that C has all that the run needs. Where one of these
+        fails, the run is interpreted, and ``run.messages`` says why. ``run.tier`` says what was done. Diagrams of more
+        than 2000 operations a tick are interpreted by Python until there is code of them.
     fuse : bool
         Compile the ticks, the loop over them and the equations of FMUs that Loopwright has built on this machine
         together, for its processor, with products and sums fused (FMA): faster, and values differ by rounding, as

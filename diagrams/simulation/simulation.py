@@ -68,7 +68,7 @@ class Simulation:
             if not diagram.is_continuous and not diagram.has_base:
                 step = step or self._point.base
         diagram, fused = options.apply_fuse(diagram)
-        self.diagram = diagram
+        self.wired = diagram
         saved = None if isinstance(start, OperatingPoint) else start
         base = default_step(diagram, step, duration, options.solver, saved)
         self.recipe = options.with_step(base).recipe
@@ -102,7 +102,12 @@ class Simulation:
         self._recorder = self._new_recorder()
 
     def __repr__(self) -> str:
-        return describe_simulation(self.diagram.name, self.view, is_open=self._open)
+        return describe_simulation(self.wired.name, self.view, is_open=self._open)
+
+    @property
+    def diagram(self) -> Any:
+        """The `Diagram` that it runs."""
+        return self.wired.facade
 
     def _new_recorder(self) -> Recorder:
         every_tick = self._engine.every_tick
@@ -110,7 +115,7 @@ class Simulation:
 
     def __enter__(self) -> Simulation:
         if self._open is not None:
-            raise not_open_error(self._open, self.diagram.name)
+            raise not_open_error(self._open, self.wired.name)
         try:
             self._open = True
             self._load()
@@ -204,16 +209,16 @@ class Simulation:
             only; a run that has not begun, or has ended.
         """
         if not self._open:
-            raise not_open_error(self._open, self.diagram.name)
+            raise not_open_error(self._open, self.wired.name)
         position = self._engine.position
-        count, rest = ticks_in(duration, self.flat.base, self.diagram.name)
+        count, rest = ticks_in(duration, self.flat.base, self.wired.name)
         if rest:
-            refuse_rest(self.flat, count, duration, self.diagram.name)
+            refuse_rest(self.flat, count, duration, self.wired.name)
         if position.end is not None:
             raise OptionError(
                 f"the run has ended at t = {position.end:g} s, between two ticks, and can't go on from "
                 f"there. Let it go on in multiples of {float(self.flat.base):g} s, and end between them only at last.",
-                block=self.diagram.name,
+                block=self.wired.name,
                 port="duration",
             )
         last = position.tick + count
@@ -285,7 +290,7 @@ class Simulation:
             If a value is not finite there, or a guard fails.
         """
         if not self._open:
-            raise not_open_error(self._open, self.diagram.name)
+            raise not_open_error(self._open, self.wired.name)
         self._engine.take_over(x, of)
 
     # --- its record --------------------------------------------------------------------------------------------------
@@ -366,7 +371,7 @@ class Simulation:
             If the run has not begun, or has ended and its FMUs are freed, or has ended between two ticks.
         """
         if not self._begun or (self._engine.has_plants and not self._open):
-            raise not_open_error(self._open, self.diagram.name)
+            raise not_open_error(self._open, self.wired.name)
         return save_state(self._engine)
 
     def restore(self, state: RunState) -> None:
@@ -379,8 +384,8 @@ class Simulation:
             ended.
         """
         if not self._open:
-            raise not_open_error(self._open, self.diagram.name)
-        check_fits(state, self.flat, self.diagram.name)
+            raise not_open_error(self._open, self.wired.name)
+        check_fits(state, self.flat, self.wired.name)
         restore_state(self._engine, state)
         self._engine.take_texts()
         self._elapsed, self._begun = 0.0, True

@@ -187,11 +187,9 @@ def end_between_ticks(
         steps.end_at(end, position.tick)
     if continuous is not None:
         take_tick(workspace, continuous, plants, end, NONE)
-    else:  # everything is held but for what has been stepped
+    else:
         workspace.here.t[0] = end
-        flat = workspace.flat
-        for name, where in flat.plant_outputs.slices.items():
-            workspace.log[flat.log.slices[name]] = workspace.here.w[where]
+        workspace.evaluate_with_held()
     row(end, workspace.log)
     return None
 
@@ -217,8 +215,8 @@ def take_tick(
         workspace.tick(acting)
         return
     continuous.enter(now)
-    if acting:
-        continuous.settle(now, ahead=True)  # subsystems see the instant after its own events
+    if acting or continuous.domains is not None:
+        continuous.settle(now, ahead=True)  # subsystems and the record see the instant after its own events
     workspace.tick(acting)
     continuous.enter(now)
     if (acting or plants) and continuous.delays is not None:

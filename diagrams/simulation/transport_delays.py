@@ -11,7 +11,6 @@ some of them the solver need not land there any more.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from typing import Any
 
@@ -25,6 +24,8 @@ _NODES = 9
 _BETWEEN = (0.0211, 0.2671, 0.5837, 0.9113)  # where the polynomial is compared with the input, parts of a step
 _DEEPEST = 10  # a step is halved so often at most
 _ROUNDING = 1e-13
+_ROOM = 2048  # pieces and discontinuities that there is memory for, at first
+_STEP = 1100  # of them, that one step may make: halved _DEEPEST times, it has 1024 parts
 _SMOOTH = 8  # a discontinuity in the derivative of this order is none to a solver
 
 
@@ -41,6 +42,19 @@ class Delays:
         Output of each until its delay has passed; None takes the first input.
     smoothed : bool
         Whether a state stands between any output and any input of a delay.
+    total : int, optional
+        Number of entries of z.
+
+    Attributes
+    ----------
+    pieces : ndarray, shape (m, 2 + 9 total)
+        Past inputs, of which the first ``count`` rows are known: begin and end of a step or of a part of it in s, then
+        z at its nodes. A loop in C reads and writes the same memory.
+    edges : ndarray, shape (k, 2)
+        Discontinuities that come out, of which the first ``noted`` rows are known: time in s, and the order of the
+        derivative that jumps.
+    start : ndarray, shape (total,)
+        What comes out until a delay has passed, at the entries of its input.
     """
 
     def __init__(
@@ -51,18 +65,22 @@ class Delays:
         starts: list[np.ndarray | None],
         *,
         smoothed: bool = True,
+        total: int | None = None,
     ):
-        self.taus, self.inputs, self.outputs, self.starts = taus, inputs, outputs, starts
+        self.taus, self.inputs, self.outputs = taus, inputs, outputs
+        total = max((where.stop for where in inputs), default=0) if total is None else total
         self._from_input = [start is None for start in starts]
+        self.start = np.zeros(total)
+        for where, start in zip(inputs, starts, strict=True):
+            if start is not None:
+                self.start[where] = start
         self.shortest = min(taus, default=math.inf)
         angles = np.pi * np.arange(_NODES) / (_NODES - 1)
         self.nodes = 0.5 * (1.0 - np.cos(angles))
         self.weights = (-1.0) ** np.arange(_NODES)
         self.weights[[0, -1]] *= 0.5
-        self._from: list[float] = []
-        self._to: list[float] = []
-        self._samples: list[np.ndarray] = []
-        self._edges: list[tuple[float, int]] = []
+        self.pieces, self.count = np.empty((_ROOM, 2 + _NODES * total)), 0
+        self.edges, self.noted = np.empty((_ROOM, 2)), 0
         self.smoothed = smoothed
         self._middle = 0.0  # an instant within the segment that is being solved
 
@@ -70,7 +88,7 @@ class Delays:
         """Take the inputs at the start where there is no initial value, and put them out."""
         for i, where in enumerate(self.inputs):
             if self._from_input[i]:
-                self.starts[i] = z[where].copy()
+                self.start[where] = z[where]
         self.outputs_at(0.0, w)
 
     def look_from(self, t: float) -> None:
@@ -85,58 +103,82 @@ class Delays:
 
     def keep(self, t_old: float, t: float, samples: np.ndarray) -> None:
         """Keep a step: the vector z at each of `sample_times`."""
-        self._from.append(t_old)
-        self._to.append(t)
-        self._samples.append(samples)
-        old = t - max(self.taus) - 1e-9 * (1.0 + abs(t))
-        drop = bisect_right(self._to, old) - 1
-        if drop > 1000:  # no delay reaches them any more
-            del self._from[:drop], self._to[:drop], self._samples[:drop]
+        self.make_room(t)
+        self.pieces[self.count, :2] = t_old, t
+        self.pieces[self.count, 2:] = np.ravel(samples)
+        self.count += 1
+
+    def make_room(self, t: float) -> None:
+        """Forget inputs that no delay reaches any more at a time in s; make room for a step of a loop in C."""
+        edges = max(_STEP, 20 * len(self.taus))
+        if self.count + _STEP > len(self.pieces):
+            old = t - max(self.taus) - 1e-9 * (1.0 + abs(t))
+            drop = max(0, int(self.pieces[: self.count, 1].searchsorted(old, side="right")) - 1)
+            kept = self.pieces[drop : self.count]
+            if 2 * len(kept) + _STEP > len(self.pieces):
+                self.pieces = np.empty((2 * len(self.pieces), self.pieces.shape[1]))
+            self.pieces[: len(kept)], self.count = kept.copy(), len(kept)
+        if self.noted + edges > len(self.edges):
+            self.edges = np.concatenate([self.edges, np.empty((len(self.edges) + edges, 2))])
 
     def note_edge(self, t: float, order: int = 0) -> None:
         """Note a discontinuity of the inputs, or of their derivative of some order; one instant is noted once."""
         for tau in sorted(set(self.taus)):
-            i = bisect_left(self._edges, (t + tau, -1))
-            near = [k for k in (i - 1, i) if 0 <= k < len(self._edges) and _same(self._edges[k][0], t + tau)]
+            edges = self.edges[: self.noted]
+            i = int(edges[:, 0].searchsorted(t + tau))
+            near = [k for k in (i - 1, i) if 0 <= k < self.noted and _same(edges[k, 0], t + tau)]
             if near:
-                self._edges[near[0]] = (self._edges[near[0]][0], min(self._edges[near[0]][1], order))
+                edges[near[0], 1] = min(edges[near[0], 1], order)
             else:
-                self._edges.insert(i, (t + tau, order))
+                self.make_room(t)
+                self.edges[i + 1 : self.noted + 1] = self.edges[i : self.noted].copy()
+                self.edges[i], self.noted = (t + tau, order), self.noted + 1
+
+    def _pass_edges(self, t: float) -> float:
+        """Forget the discontinuities up to ``t``; return the least order among them."""
+        passed, order = 0, math.inf
+        while passed < self.noted and not is_before(t, float(self.edges[passed, 0])):
+            order = min(order, float(self.edges[passed, 1]))
+            passed += 1
+        if passed:
+            self.edges[: self.noted - passed] = self.edges[passed : self.noted].copy()
+            self.noted -= passed
+        return order
 
     def next_edge(self, t: float) -> float:
         """Return the next time after ``t`` at which a discontinuity comes out."""
-        while self._edges and not is_before(t, self._edges[0][0]):
-            self._edges.pop(0)
-        return self._edges[0][0] if self._edges else math.inf
+        self._pass_edges(t)
+        return float(self.edges[0, 0]) if self.noted else math.inf
 
     def note_reached(self, t: float, *, from_source: bool) -> None:
         """Note a discontinuity at ``t``, of a source or out of a delay: it goes into the delays."""
-        order = 0 if from_source else math.inf
-        while self._edges and not is_before(t, self._edges[0][0]):
-            order = min(order, self._edges.pop(0)[1] + self.smoothed)
+        order = min(0 if from_source else math.inf, self._pass_edges(t) + self.smoothed)
         if order < _SMOOTH:
             self.note_edge(t, int(order))
 
     def outputs_at(self, t: float, w: np.ndarray) -> None:
         """Write the outputs at a time into w."""
-        for tau, into, where, start in zip(self.taus, self.outputs, self.inputs, self.starts, strict=True):
-            w[into] = self._value(t - tau, self._middle - tau, where, start)
+        for tau, into, where in zip(self.taus, self.outputs, self.inputs, strict=True):
+            w[into] = self._value(t - tau, self._middle - tau, where)
 
-    def _value(self, s: float, inside: float, where: slice, start: Any) -> Any:
+    def _value(self, s: float, inside: float, where: slice) -> Any:
         nudged = s + 1e-9 * (inside - s)
-        i = bisect_right(self._from, nudged) - 1
+        i = int(self.pieces[: self.count, 0].searchsorted(nudged, side="right")) - 1
         if i < 0:
-            return 0.0 if start is None else start
-        a, b = self._from[i], self._to[i]
-        return barycentric(self, (s - a) / (b - a), self._samples[i][:, where])
+            return self.start[where]
+        a, b = self.pieces[i, :2]
+        return barycentric(self, (s - a) / (b - a), self.pieces[i, 2:].reshape(_NODES, -1)[:, where])
 
     def save(self) -> Any:
         """Return the memory with which a run goes on from here."""
-        return list(self._from), list(self._to), list(self._samples), list(self._edges), list(self.starts)
+        return self.pieces[: self.count].copy(), self.edges[: self.noted].copy(), self.start.copy()
 
     def restore(self, saved: Any) -> None:
         """Go back to the memory that `save` returned."""
-        self._from, self._to, self._samples, self._edges, self.starts = (list(part) for part in saved)
+        pieces, edges, self.start[:] = saved
+        self.count, self.noted = len(pieces), len(edges)
+        self.pieces = np.concatenate([pieces, np.empty((_ROOM, pieces.shape[1]))])
+        self.edges = np.concatenate([edges, np.empty((_ROOM, 2))])
 
 
 def keep_step(
@@ -210,4 +252,5 @@ def delays_of(flat: FlatDiagram) -> Delays | None:
     into, out = (np.concatenate([np.arange(s.start, s.stop) for s in part]) for part in (inputs, outputs))
     straight = bool(np.any(flat.driven.depends("z", "w")[np.ix_(into, out)]))  # from a delay into another, or itself
     smoothed = not (flat.loops.slices or straight)
-    return Delays([b.delay for b in blocks], inputs, outputs, starts, smoothed=smoothed)
+    total = flat.plant_inputs.total
+    return Delays([b.delay for b in blocks], inputs, outputs, starts, smoothed=smoothed, total=total)

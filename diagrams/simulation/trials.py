@@ -23,7 +23,6 @@ class Trials:
     where: np.ndarray
     """The entries of x that are integrated."""
     delays: Delays | None
-    _edge: float
     """Next discontinuity in time, infinite without one."""
     _left: float
     """Last time before it."""
@@ -45,7 +44,8 @@ class Trials:
         return self.workspace.flow()
 
     def _time(self, t: float) -> float:
-        t = self._left if t >= self._edge else self.late.get(t, t)
+        t = min(t, self._left)  # a step may end a rounding error before the edge
+        t = self.late.get(t, t)
         if self.delays is not None:
             self.delays.outputs_at(t, self.workspace.trial.w)
         if self._loops:  # whatever was tried in between: Newton's method starts from the last accepted solution
@@ -105,7 +105,7 @@ class Trials:
 
     def _put(self, t: float, x: np.ndarray) -> None:
         here = self.workspace.here
-        here.t[0] = self._left if t >= self._edge else t
+        here.t[0] = min(t, self._left)
         here.x[self.where] = x
         if self.delays is not None:
             self.delays.outputs_at(here.t[0], here.w)

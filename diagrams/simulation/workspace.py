@@ -9,7 +9,18 @@ import numpy as np
 
 from ...blocks.core import Block, ParameterError
 from ...blocks.tracing import is_traced_by
-from ..flat import NONE, Bound, Derivative, Evaluators, FlatDiagram, Schedule, TickPattern, Vectors
+from ..flat import (
+    NONE,
+    Bound,
+    Derivative,
+    Evaluators,
+    FlatDiagram,
+    Schedule,
+    TickPattern,
+    Vectors,
+    evaluate,
+    evaluate_apart,
+)
 from .algebraic_loops import LoopSolver
 from .diagnosis import failure
 
@@ -134,6 +145,20 @@ class Workspace:
             solve = self.loop_solver(acting, self.here)
             self._evaluations[acting] = call if solve is None else _one_after_the_other(solve, call)
         return self._evaluations[acting]
+
+    def evaluate_with_held(self) -> None:
+        """Evaluate the outputs at ``here``, between two ticks of a diagram without states in continuous time, into log.
+
+        Sampled blocks put out what they did at the last tick. With algebraic loops in continuous time all blocks do.
+        """
+        flat, here = self.flat, self.here
+        found: dict[str, Any] = {name: here.w[where] for name, where in flat.plant_outputs.slices.items()}
+        if not flat.active_loops(NONE):
+            kept, apart = self.log[: flat.log.total].copy(), evaluate_apart(self.evaluators)
+            instant = evaluate(flat, flat.blocks, NONE, here.t[0], here.x, here.w, here.p, apart=apart, kept=kept)
+            found |= {name: instant.values[flat.ports[name]] for name in flat.log.slices if name not in found}
+        for name, column in found.items():
+            self.log[flat.log.slices[name]] = np.ravel(np.array(column))
 
     def bind_jump(self) -> Callable[[np.ndarray], None]:
         """Return the call that lets events fire at ``here`` and takes over the states after them.

@@ -1,10 +1,11 @@
 """Solvers of fixed and variable step behind one interface."""
 
-from .base import AcceptedStep, Polynomial, Problem, Solver, solver_name
+from .base import SUNDIALS, AcceptedStep, Polynomial, Problem, Solver, solver_name
 from .choose import make_solver
 from .scipy_methods import AutoSolver
 
 __all__ = [
+    "SUNDIALS",
     "AcceptedStep",
     "AutoSolver",
     "Polynomial",

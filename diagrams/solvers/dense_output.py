@@ -110,10 +110,11 @@ def from_nordsieck(dense: Any, t_old: float, x_old: np.ndarray) -> FromStart:
 def from_differences(dense: Any, t_old: float, x_old: np.ndarray) -> FromStart:
     """Return the dense output of SciPy's BDF: Newton's polynomial through backward differences, about the start."""
     h, q = dense.t - t_old, len(dense.denom)
-    coefficients, product = np.zeros((q, len(x_old))), np.array([1.0])
-    for j in range(q):  # one more factor, a + b u, in each term
-        product = np.convolve(product, [(t_old - dense.t_shift[j]) / dense.denom[j], h / dense.denom[j]])
-        coefficients[: j + 1] += np.outer(product[1:], dense.D[j + 1])
+    coefficients, product = np.zeros((q, len(x_old))), [1.0]
+    starts, widths = ((t_old - dense.t_shift) / dense.denom).tolist(), (h / dense.denom).tolist()
+    for j, (a, b) in enumerate(zip(starts, widths, strict=True)):  # one more factor, a + b u, in each term
+        product = [a * c + b * before for c, before in zip([*product, 0.0], [0.0, *product], strict=True)]
+        coefficients[: j + 1] += np.multiply.outer(product[1:], dense.D[j + 1])
     return FromStart(t_old, x_old, h, coefficients)
 
 

@@ -1,6 +1,6 @@
 """Studies of a design's margins over its parameters: sensitivities, worst cases."""
 
-from .cases import Case, CaseOrigin, CaseState, Goal
+from .cases import CaseOrigin, CaseState, Goal, StudyCase
 from .confirmation import ConfirmationKind, RunConfirmation, confirm_parameter, confirm_sensitivity
 from .contact_task import ContactTask
 from .sensitivity import Sensitivities, Sensitivity, find_sensitivities, sensitivities_of
@@ -8,7 +8,6 @@ from .worst_case import WorstCase, find_worst_case
 from .worst_case_task import WorstCaseTask
 
 __all__ = [
-    "Case",
     "CaseOrigin",
     "CaseState",
     "ConfirmationKind",
@@ -17,6 +16,7 @@ __all__ = [
     "RunConfirmation",
     "Sensitivities",
     "Sensitivity",
+    "StudyCase",
     "WorstCase",
     "WorstCaseTask",
     "confirm_parameter",

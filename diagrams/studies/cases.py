@@ -40,7 +40,7 @@ class CaseOrigin(StrEnum):
 
 
 @dataclass(frozen=True)
-class Case:
+class StudyCase:
     """One choice of parameters at one operating point, with its numbers.
 
     Attributes
@@ -125,7 +125,7 @@ class Goal:
         return (1.0 if value - limit.low < limit.high - value else -1.0) / (max(ends) or 1.0)
 
 
-def describe(case: Case) -> str:
+def describe(case: StudyCase) -> str:
     """Return one line about a case."""
     if case.state is CaseState.FAILED:
         return f"failed: {case.reason}"

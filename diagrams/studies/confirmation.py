@@ -28,7 +28,7 @@ from .numbers import numbers_of
 from .parameters import changed_entry
 
 if TYPE_CHECKING:
-    from .cases import Case
+    from .cases import StudyCase
     from .sensitivity import Sensitivities, Sensitivity
 
 AGREEMENT = 1e-3
@@ -101,7 +101,9 @@ class RunConfirmation:
         return f"{'confirmed' if self.agrees else 'NOT confirmed'} by {self.trial}"
 
 
-def confirm_case(diagram: WiredDiagram, case: Case, at: Any, amplitude: float | None, delay: int) -> RunConfirmation:
+def confirm_case(
+    diagram: WiredDiagram, case: StudyCase, at: Any, amplitude: float | None, delay: int
+) -> RunConfirmation:
     """Return the confirmation of a case by a run of the diagram with its parameters.
 
     Raises
@@ -112,14 +114,16 @@ def confirm_case(diagram: WiredDiagram, case: Case, at: Any, amplitude: float | 
     if not case.loop or delay:
         raise OptionError(
             "found a case without a loop that a run has, as it failed, or has a delay in series; expected one with "
-            "delay=0 that was analysed. Look at its reason.", block=diagram.name,
-        )  # fmt: skip
+            "delay=0 that was analysed. Look at its reason.",
+            block=diagram.name,
+        )
     if len(case.loop) > 1 and case.quantity:
         raise OptionError(
             f"found a loop cut at {len(case.loop)} wires at once; expected one wire, at which a run can be tested. "
-            "Simulate found.diagram.", block=diagram.name,
-        )  # fmt: skip
-    point = at(diagram) if callable(at) else at
+            "Simulate found.diagram.",
+            block=diagram.name,
+        )
+    point = at(diagram.facade) if callable(at) else at
     model = linearize(diagram, point)
     still = hold_sources(diagram, model.point.values)  # references that move would move the point
     if still is not diagram:
@@ -131,12 +135,12 @@ def confirm_case(diagram: WiredDiagram, case: Case, at: Any, amplitude: float | 
 
 
 def _size_at(model: Linearization, wire: str) -> float:
-    source = model.diagram.names.get(wire.partition("[")[0])
+    source = model.wired.names.get(wire.partition("[")[0])
     path = wire if source is None else f"{source.block}.{source.port}"
     return AMPLITUDE * (1.0 + float(np.max(np.abs(model.point.values.get(path, 0.0)), initial=0.0)))
 
 
-def _measure_margin(diagram: WiredDiagram, model: Linearization, case: Case, amplitude: float) -> RunConfirmation:
+def _measure_margin(diagram: WiredDiagram, model: Linearization, case: StudyCase, amplitude: float) -> RunConfirmation:
     """Measure L at the frequency that decides a margin, and read the margin from it."""
     L, wire = model.loop(*case.loop), case.loop[0]
     omega = _deciding_frequency(L, case.quantity, case.value, diagram.name)
@@ -187,8 +191,9 @@ def _inside(omega: float, L: Any, name: str) -> float:
     if not 0 < omega < math.inf:
         raise OptionError(
             f"found a margin that is decided at {omega} rad/s; expected a frequency at which a sine can be added. Take "
-            "another number, such as quantity='disk_margin'.", block=name,
-        )  # fmt: skip
+            "another number, such as quantity='disk_margin'.",
+            block=name,
+        )
     return min(omega, top)
 
 
@@ -222,8 +227,8 @@ def _read_margin(L: np.ndarray, quantity: str, omega: float) -> float:
 
 def _find_unstable_wire(model: Linearization, wires: tuple[str, ...]) -> str:
     """Return an entry of a wire whose own loop has the unstable poles: those of another loop are hidden in a loop."""
-    flat = model.diagram.flatten_like(model.point)
-    for name in (*wires, *model.diagram.names):
+    flat = model.wired.flatten_like(model.point)
+    for name in (*wires, *model.wired.names):
         for label in find_signal(flat, name).labels:
             try:
                 r = Realization.of(model.loop(label))
@@ -235,7 +240,7 @@ def _find_unstable_wire(model: Linearization, wires: tuple[str, ...]) -> str:
 
 
 def _measure_growth(
-    diagram: WiredDiagram, model: Linearization, case: Case, amplitude: float | None
+    diagram: WiredDiagram, model: Linearization, case: StudyCase, amplitude: float | None
 ) -> RunConfirmation:
     """Add a small step to the wire, and measure how the signal grows over time constants of the unstable pole."""
     wire, dt = _find_unstable_wire(model, case.loop), model.dt
@@ -301,7 +306,7 @@ def confirm_parameter(
     h = STEP * (abs(rows[0].value) or 1.0)
 
     def numbers(change: float) -> dict[str, Number]:
-        diagram = model.diagram.replace(changed_entry(model.diagram, parameter, rows[0].value + change))
+        diagram = model.wired.replace(changed_entry(model.wired, parameter, rows[0].value + change))
         L, rests = loop_of_variant(model, found.wires, diagram, model.point)
         if model.is_equilibrium and not rests and not rows[0].rest_lost:
             point = trim(diagram, None, None, rates=None, fixed=(), at=model.point, tolerance=1e-9)
@@ -329,7 +334,7 @@ def confirm_parameter(
                 f"found {row.slope.value:.9g} as the derivative of {row.quantity} by {parameter}, but differences of "
                 f"the margin give {other:.9g}; expected the same to {AGREEMENT:g}. Look at the crossings near it: the "
                 "margin may have a kink there.",
-                block=model.diagram.name,
+                block=model.wired.name,
             )
         how = Confirmation(row.slope.confirmed_by).and_by(
             f"differences of the margin of the changed diagram give {other:.6g}",

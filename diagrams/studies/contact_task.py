@@ -102,7 +102,7 @@ class ContactTask:
             As `check`.
         """
         for name, given in self.places.items():
-            if name in self._made and self._made[name].diagram is diagram:
+            if name in self._made and self._made[name].wired is diagram:
                 continue
             options = {key: given[key] for key in ("stairs",) if key in given}
             try:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -21,19 +21,6 @@ OF_CONTACT = (*PortNames._fields, "direction")
 """Arguments of `Diagram.contact`."""
 OF_LIMIT = ("vary", "low", "high", "per_decade", "stiffness", "damping", "mass", "tool_mass")
 """Arguments of `Contact.stability_limit`."""
-
-
-class Measure(Protocol):
-    """A number of a diagram at an operating point: the smaller, the worse."""
-
-    name: str
-    place: str
-
-    def __call__(self, diagram: WiredDiagram, at: Any) -> Number:
-        """Return the number."""
-
-    def confirm(self, diagram: WiredDiagram, at: Any) -> RunConfirmation:
-        """Return its confirmation by a run."""
 
 
 class ContactMeasure:
@@ -58,8 +45,10 @@ class ContactMeasure:
         if not isinstance(given, Mapping):
             raise OptionError(
                 f"found {given!r}; expected arguments of a contact and its limit, such as {{'vary': 'stiffness', "
-                "'damping': 10.0}. Give a mapping.", block=diagram.name, port="contact",
-            )  # fmt: skip
+                "'damping': 10.0}. Give a mapping.",
+                block=diagram.name,
+                port="contact",
+            )
         for key in given:
             if key not in OF_CONTACT and key not in OF_LIMIT:
                 hint = near(str(key), [*OF_CONTACT, *OF_LIMIT])
@@ -118,7 +107,7 @@ class FunctionMeasure:
             If it is no number, or the function fails.
         """
         try:
-            found = self._function(diagram)
+            found = self._function(diagram.facade)
         except LoopwrightError:
             raise
         except Exception as error:
@@ -139,5 +128,10 @@ class FunctionMeasure:
         """Refuse: nothing is known about a run that shows the number."""
         raise OptionError(
             f"found {self.name!r}, a function of your own; expected a margin or a contact's limit, which a run can "
-            "show. Simulate found.diagram.", block=self.place,
-        )  # fmt: skip
+            "show. Simulate found.diagram.",
+            block=self.place,
+        )
+
+
+Measure = ContactMeasure | FunctionMeasure
+"""A number of a diagram at an operating point: the smaller, the worse."""

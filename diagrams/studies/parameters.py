@@ -143,8 +143,9 @@ def changed_entry(diagram: WiredDiagram, parameter: str, value: float) -> dict[s
     except (ValueError, IndexError):
         raise OptionError(
             f"found {parameter!r}; expected an entry of an array of shape {whole.shape}, counted from 1, such as "
-            f"'{name}[1]'.", block=diagram.name,
-        ) from None  # fmt: skip
+            f"'{name}[1]'.",
+            block=diagram.name,
+        ) from None
     return {name: whole}
 
 

@@ -16,7 +16,7 @@ from ..frequency import Number, Realization, find_hidden_unstable, margin_slopes
 from ..linearization import Linearization, differentiate_loop, linearize, loop_of_variant, operating_point
 from ..results import OperatingPoint
 from ..sweeps import Box
-from .cases import Case, CaseOrigin, CaseState, Goal, describe
+from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe
 from .measures import Measure
 from .numbers import numbers_of
 
@@ -53,7 +53,7 @@ class Study:
     ):
         self.diagram, self.goal, self.boxes, self.points = diagram, goal, boxes, points
         self.delay, self.options, self.tell, self.measure = delay, options, tell, measure
-        self.cases: list[Case] = []
+        self.cases: list[StudyCase] = []
         self.names = [(name, i) for name, box in boxes.items() for i in range(box.size)]
         self.smooth = {name for name in boxes if not _is_start_value(diagram, name)}
         self._bases: dict[int, Linearization] = {}
@@ -63,7 +63,7 @@ class Study:
 
     # --- cases --------------------------------------------------------------------------------------------------------
 
-    def run(self, parameters: Mapping[str, Any], origin: CaseOrigin) -> list[Case]:
+    def run(self, parameters: Mapping[str, Any], origin: CaseOrigin) -> list[StudyCase]:
         """Return the cases of some parameters at all points."""
         made = []
         for place in range(len(self.points)):
@@ -74,12 +74,12 @@ class Study:
         self.tell(f"{origin.value} {len(self.cases)}: {describe(worst)}")
         return made
 
-    def _analyse(self, parameters: Mapping[str, Any], place: int, origin: CaseOrigin) -> Case:
-        start = Case(len(self.cases), origin, dict(parameters), place, CaseState.FAILED, FAILED)
+    def _analyse(self, parameters: Mapping[str, Any], place: int, origin: CaseOrigin) -> StudyCase:
+        start = StudyCase(len(self.cases), origin, dict(parameters), place, CaseState.FAILED, FAILED)
         try:
             diagram = self.diagram.replace(parameters) if parameters else self.diagram
             point = self.points[place]
-            asked = point(diagram) if callable(point) else point
+            asked = point(diagram.facade) if callable(point) else point
             if self.measure is not None:
                 return self._take(start, self.measure, self.measure(diagram, asked))
             if not parameters:
@@ -105,7 +105,7 @@ class Study:
             self.has_no_loop = True
             raise
 
-    def _take(self, case: Case, measure: Measure, number: Number) -> Case:
+    def _take(self, case: StudyCase, measure: Measure, number: Number) -> StudyCase:
         """Return a case with a number that is no loop's."""
         place, name = (measure.place,), measure.name
         if math.isnan(number.value):
@@ -115,7 +115,7 @@ class Study:
             case, state=CaseState.STABLE, goodness=goodness, loop=place, quantity=name, numbers={place: {name: number}}
         )
 
-    def with_findings(self, case: Case) -> Case:
+    def with_findings(self, case: StudyCase) -> StudyCase:
         """Return a stable case with its numbers made anew by the whole linear model, which tells what it leaves out.
 
         The numbers of many cases come from their loops' matrices alone, without the model's checks and findings.
@@ -132,12 +132,12 @@ class Study:
 
     def _judge(
         self,
-        case: Case,
+        case: StudyCase,
         base: Linearization,
         diagram: WiredDiagram,
         at: OperatingPoint,
         loops: Mapping[tuple[str, ...], Any],
-    ) -> Case:
+    ) -> StudyCase:
         """Return a case with its numbers and its goodness; ``loops`` are those that are known."""
         numbers: dict[tuple[str, ...], dict[str, Number]] = {}
         worst: tuple[float, tuple[str, ...], str] = (math.inf, (), "")
@@ -163,9 +163,13 @@ class Study:
                     worst = (goodness, wires, quantity)
         if unstable:
             return replace(
-                case, state=CaseState.UNSTABLE, goodness=UNSTABLE - max(growth, 0.0), loop=unstable, growth=growth,
+                case,
+                state=CaseState.UNSTABLE,
+                goodness=UNSTABLE - max(growth, 0.0),
+                loop=unstable,
+                growth=growth,
                 numbers=numbers,
-            )  # fmt: skip
+            )
         if not worst[1]:
             asked = ", ".join(dict.fromkeys(name for limits in self.goal.loops.values() for name in limits))
             there = ", ".join(dict.fromkeys(name for found in numbers.values() for name in found)) or "none"
@@ -247,16 +251,20 @@ class Study:
 
         try:
             minimize(
-                evaluate, fractions, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * fractions.size,
+                evaluate,
+                fractions,
+                jac=True,
+                method="L-BFGS-B",
+                bounds=[(0.0, 1.0)] * fractions.size,
                 options={"maxiter": steps, "maxfun": 2 * steps},
-            )  # fmt: skip
+            )
         except _LostError:
             return
         if ends and len(self.names) > MOST_CORNERS:
             corner = np.where(ends[-1] > 0.0, 0.0, 1.0)
             self.run(self.parameters_at(np.where(ends[-1] == 0.0, fractions, corner)), CaseOrigin.CORNER)
 
-    def gradient(self, case: Case, fractions: np.ndarray) -> np.ndarray:
+    def gradient(self, case: StudyCase, fractions: np.ndarray) -> np.ndarray:
         """Return the derivative of a case's goodness by the fractions, exact where the parameters are traced.
 
         A number that is no loop's has differences alone.
@@ -267,7 +275,7 @@ class Study:
         model, found = linearize(diagram, at, **self.options), np.zeros(fractions.size)
         L = model.loop(*case.loop)
         point = self.points[case.point]
-        find = point if callable(point) else None
+        find = (lambda d: point(d.facade)) if callable(point) else None  # users' functions take a Diagram
         names = [name for name in self.boxes if name in self.smooth]
         made = differentiate_loop(model, case.loop, names, find=find, left_out={})
         slopes: list[LoopSlope | None] = []
@@ -286,7 +294,7 @@ class Study:
                 found[i] = self._difference(case, fractions, i)
         return found
 
-    def _difference(self, case: Case, fractions: np.ndarray, i: int) -> float:
+    def _difference(self, case: StudyCase, fractions: np.ndarray, i: int) -> float:
         side = -1.0 if fractions[i] > 0.5 else 1.0
         moved = fractions.copy()
         moved[i] += side * DIFFERENCE

@@ -15,7 +15,6 @@ from ..flat import WiredDiagram
 from ..frequency import MarginSlope, Number, margin_slopes, order_key
 from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize
 from ..results import BLUE, DARK, VERMILION, OperatingPoint, new_figure, style
-from ..wiring import find_parameter
 from .parameters import check_parameters, list_parameters, unit_of
 
 if TYPE_CHECKING:
@@ -27,7 +26,6 @@ PEAK_ERROR = 1e-6
 """Relative error of the slope of a disk margin of several channels, whose frequency is searched for."""
 BY_DERIVATIVE = "exact derivative of the linear model"
 BY_DIFFERENCES = "differences of linear models with changed start values"
-Four = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @explain_calls
@@ -151,7 +149,7 @@ class Sensitivities(Sequence[Sensitivity]):
         full = [n for n in names if n == name or n.endswith(f".{name}")]
         if len(full) != 1 and self.model is not None:  # other short names, as those of FMUs' start values
             with suppress(LoopwrightError):
-                full = [n for n in names if n == find_parameter(self.model.diagram, name)]
+                full = [n for n in names if n == self.model.wired.find_parameter(name)]
         if len(full) != 1:
             raise UnknownNameError(f"found no sensitivity to {name!r}. {near(str(name), names)}")
         for row in self.rows:
@@ -237,7 +235,13 @@ def find_sensitivities(
 ) -> Sensitivities:
     """Return the derivatives of a loop's margins by parameters; see `Diagram.sensitivity`."""
     wires = (loop,) if isinstance(loop, str) else tuple(loop)
-    find: PointFinder | None = at if callable(at) and not isinstance(at, OperatingPoint) else None
+    find: PointFinder | None = None
+    if callable(at) and not isinstance(at, OperatingPoint):
+
+        def find(variant: WiredDiagram) -> OperatingPoint:
+            found: OperatingPoint = at(variant.facade)
+            return found
+
     point = find(diagram) if find is not None else at
     model = linearize(diagram, point, plants=plants, stairs=stairs, **options)
     return sensitivities_of(model, wires, parameters, find=find, delay=delay, skew=skew)
@@ -253,13 +257,13 @@ def sensitivities_of(
     skew: float = 0.0,
 ) -> Sensitivities:
     """Return the derivatives of the margins of a linear model's loop by parameters of its diagram."""
-    diagram = model.diagram
+    diagram = model.wired
     left_out: dict[str, str] = {}
     if parameters is None:
         names, left_out = list_parameters(diagram)
     else:
         given = [parameters] if isinstance(parameters, str) else list(parameters)
-        names = list(dict.fromkeys(find_parameter(diagram, name) for name in given))
+        names = list(dict.fromkeys(diagram.find_parameter(name) for name in given))
         check_parameters(diagram, names, "a sensitivity")
     L = model.loop(*wires)
     refused = left_out if parameters is None else None

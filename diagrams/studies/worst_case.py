@@ -18,7 +18,7 @@ from ..flat import WiredDiagram
 from ..frequency import order_key
 from ..requirements import Requirements
 from ..sweeps import Box, Samples, read_samples
-from .cases import Case, CaseOrigin, CaseState, Goal, describe, make_goal
+from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe, make_goal
 from .confirmation import RunConfirmation, confirm_case
 from .measures import ContactMeasure, FunctionMeasure, Measure
 from .parameters import check_parameters
@@ -38,11 +38,11 @@ class WorstCase:
 
     Attributes
     ----------
-    worst : Case
+    worst : StudyCase
         The worst of all cases.
-    nominal : tuple of Case
+    nominal : tuple of StudyCase
         The diagram as it is, at each operating point.
-    cases : tuple of Case
+    cases : tuple of StudyCase
         All cases in the order in which they were computed.
     boxes : mapping of str to Box
         The ranges; empty where the samples were a table.
@@ -58,12 +58,12 @@ class WorstCase:
         The number, where it is no loop's.
     """
 
-    worst: Case
-    nominal: tuple[Case, ...]
-    cases: tuple[Case, ...] = field(repr=False)
+    worst: StudyCase
+    nominal: tuple[StudyCase, ...]
+    cases: tuple[StudyCase, ...] = field(repr=False)
     boxes: Mapping[str, Box] = field(repr=False)
     goal: Goal = field(repr=False)
-    base: WiredDiagram = field(repr=False)
+    wired: WiredDiagram = field(repr=False)
     points: tuple[Any, ...] = field(repr=False)
     options: Mapping[str, Any] = field(default_factory=dict, repr=False)
     measure: Measure | None = field(default=None, repr=False)
@@ -83,25 +83,34 @@ class WorstCase:
     @property
     def diagram(self) -> Any:
         """The diagram with the parameters of the worst case, ready to be simulated."""
-        return self.base.replace(self.worst.parameters) if self.worst.parameters else self.base
+        return self._worst_wired.facade
 
     @property
-    def unstable(self) -> tuple[Case, ...]:
+    def base(self) -> Any:
+        """The `Diagram` as it is."""
+        return self.wired.facade
+
+    @property
+    def _worst_wired(self) -> WiredDiagram:
+        return self.wired.replace(self.worst.parameters) if self.worst.parameters else self.wired
+
+    @property
+    def unstable(self) -> tuple[StudyCase, ...]:
         """The cases with an unstable loop."""
         return tuple(case for case in self.cases if case.state is CaseState.UNSTABLE)
 
     @property
-    def failures(self) -> tuple[Case, ...]:
+    def failures(self) -> tuple[StudyCase, ...]:
         """The cases that could not be analysed; each tells its reason."""
         return tuple(case for case in self.cases if case.state is CaseState.FAILED)
 
     @property
-    def worst_analysed(self) -> Case:
+    def worst_analysed(self) -> StudyCase:
         """The worst of the cases that could be analysed."""
         return min((c for c in self.cases if c.state is not CaseState.FAILED), key=lambda c: (c.goodness, c.index))
 
     @property
-    def worst_sample(self) -> Case:
+    def worst_sample(self) -> StudyCase:
         """The worst of the samples, from which the search went on."""
         mine = [case for case in self.cases if case.origin is CaseOrigin.SAMPLE]
         return min(mine, key=lambda case: case.goodness)
@@ -129,12 +138,15 @@ class WorstCase:
         if self.worst.state is CaseState.FAILED:
             raise OptionError(
                 f"found a worst case that failed: {self.worst.reason} Expected one that was analysed: look at "
-                "worst_analysed.", block=self.base.name,
-            )  # fmt: skip
+                "worst_analysed.",
+                block=self.wired.name,
+            )
         if self.measure is not None:
-            point, diagram = self.points[self.worst.point], self.diagram
-            return self.measure.confirm(diagram, point(diagram) if callable(point) else point)
-        return confirm_case(self.diagram, self.worst, self.points[self.worst.point], amplitude, self.options["delay"])
+            point, diagram = self.points[self.worst.point], self._worst_wired
+            return self.measure.confirm(diagram, point(diagram.facade) if callable(point) else point)
+        return confirm_case(
+            self._worst_wired, self.worst, self.points[self.worst.point], amplitude, self.options["delay"]
+        )
 
     def __str__(self) -> str:
         w, n = self.worst, min(self.nominal, key=lambda case: case.goodness)

@@ -11,7 +11,7 @@ import numpy as np
 from ...blocks.core import OptionError, accepts, kinds, near, with_unit
 from ..results import BLUE, DARK, GREEN, PURPLE, VERMILION, legend_above, new_figure, style
 from ..sweeps import Box
-from .cases import Case, CaseOrigin, CaseState, Goal
+from .cases import CaseOrigin, CaseState, Goal, StudyCase
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,7 +19,11 @@ if TYPE_CHECKING:
 
 @accepts("plot", parameters=kinds.names)
 def plot_cases(
-    cases: Sequence[Case], worst: Case, goal: Goal, boxes: Mapping[str, Box], parameters: Sequence[str] | None = None
+    cases: Sequence[StudyCase],
+    worst: StudyCase,
+    goal: Goal,
+    boxes: Mapping[str, Box],
+    parameters: Sequence[str] | None = None,
 ) -> Figure:
     """Return a scatter of the number over each parameter; see `WorstCase.plot`."""
     every = [name for name, value in worst.parameters.items() if isinstance(value, float | int)]
@@ -76,7 +80,7 @@ def plot_cases(
     return figure
 
 
-def _drawn(worst: Case, goal: Goal) -> tuple[tuple[str, ...], str]:
+def _drawn(worst: StudyCase, goal: Goal) -> tuple[tuple[str, ...], str]:
     """Return the loop and the number that are drawn: those of the worst case, or else the first."""
     if worst.quantity:
         return worst.loop, worst.quantity

@@ -12,7 +12,6 @@ from ..flat import WiredDiagram
 from ..linearization import find_signal
 from ..requirements import Limit, Requirements, TomlFile
 from ..sweeps import Box, read_samples
-from ..wiring import find_parameter
 from .cases import Goal, make_goal
 from .measures import ContactMeasure
 from .parameters import check_parameters
@@ -120,7 +119,7 @@ class WorstCaseTask:
         samples = self.options.get("samples", "latin")
         for name, values in self.ranges.items():
             with _Placed(self.file, f"{TABLE}.ranges.{name}"):
-                check_parameters(diagram, [find_parameter(diagram, name)], "a worst case", blocks=True)
+                check_parameters(diagram, [diagram.find_parameter(name)], "a worst case", blocks=True)
                 if samples == "latin" and not (
                     isinstance(values, Box) or (isinstance(values, list) and len(values) == 2)
                 ):
@@ -170,9 +169,15 @@ class WorstCaseTask:
         quantity, limits = self._asked(diagram, requirements)
         with _Placed(self.file, TABLE):
             return find_worst_case(
-                diagram, self.ranges or None, self.loops or None, quantity=quantity, requirements=limits,
-                progress=progress, **given, **options,
-            )  # fmt: skip
+                diagram,
+                self.ranges or None,
+                self.loops or None,
+                quantity=quantity,
+                requirements=limits,
+                progress=progress,
+                **given,
+                **options,
+            )
 
     def _asked(
         self, diagram: WiredDiagram, requirements: Requirements | None

@@ -13,26 +13,25 @@ import numpy as np
 from ...blocks.core import SimulationError
 from ...fmus.calls import FmuInstance
 from ..coupling import note_loops, note_steps
-from ..flat import EVERY, FlatDiagram, renumber
+from ..flat import EVERY, FlatDiagram, WiredDiagram, renumber
 from ..results import Occurrence, Places, Recorder, Recording, Run, Stopped
-from ..simulation import Engine, RunOptions, SimulatedDiagram, default_step, note_held_inputs, refuse_rest, ticks_in
-from .start_values import StartValues
+from ..simulation import Engine, RunOptions, StartValues, default_step, note_held_inputs, refuse_rest, ticks_in
 from .variation import Numbers
 
 LOADING = threading.Lock()
 """Held while FMUs are loaded, and begun for the first time: loading changes what the whole process shares."""
 
-Tell = Callable[[float], None]
+Progress = Callable[[float], None]
 
 
 class BoundRun:
-    """Runs of a diagram over one duration, one after the other, each with numbers of its own.
+    """Runs of a diagram over one duration, one after the other, each with its own numbers.
 
     It is used in a ``with`` statement, which loads the FMUs and frees them.
 
     Parameters
     ----------
-    diagram : SimulatedDiagram
+    diagram : WiredDiagram
         The diagram.
     duration : float
         Simulated time of each run in s.
@@ -40,7 +39,7 @@ class BoundRun:
         Options of the runs; they begin at t = 0, and are recorded in memory.
     """
 
-    def __init__(self, diagram: SimulatedDiagram, duration: float, options: RunOptions):
+    def __init__(self, diagram: WiredDiagram, duration: float, options: RunOptions):
         self._name = diagram.name
         run, fused = options.apply_fuse(diagram)
         base = default_step(run, options.step, duration, options.solver)
@@ -108,7 +107,7 @@ class BoundRun:
                 return f"{path} takes more calls than one for a step, and is loaded for each of them"
         return f"Python's solver goes between their ticks ({' '.join(engine.messages) or 'compile=True'})"
 
-    def fits(self, numbers: Numbers[Any]) -> bool:
+    def fits(self, numbers: Numbers) -> bool:
         """Whether a run with the numbers of a sample can follow: the solver has the same tolerances and step limits."""
         continuous = self.engine.continuous
         return continuous is None or continuous.fits(self.flat.table.blocks, numbers.blocks)
@@ -128,15 +127,15 @@ class BoundRun:
         """Whether an FMU of it has failed for good, so that it can't be reset."""
         return any(isinstance(p, FmuInstance) and p.fatal for p in self.engine.plants.values())
 
-    def run(self, numbers: Numbers[Any], tell: Tell) -> Run:
+    def run(self, numbers: Numbers, progress: Progress) -> Run:
         """Run with the numbers of a sample.
 
         Parameters
         ----------
         numbers : Numbers
             Numbers of the diagram.
-        tell : callable
-            Told the time in s now and then; what it raises ends the run.
+        progress : callable
+            Called with the time in s now and then; an exception that it raises ends the run.
 
         Raises
         ------
@@ -150,9 +149,9 @@ class BoundRun:
             engine.take_first_tick(None, recorder.row)
             if engine.position.stopped is None:
                 if self.count:
-                    engine.go(self.count, recorder, tell)
+                    engine.go(self.count, recorder, progress)
                 if self._end is not None and engine.position.stopped is None:
-                    engine.end_between_ticks(self._end, recorder.row, tell)
+                    engine.end_between_ticks(self._end, recorder.row, progress)
         except SimulationError as error:
             culprit = engine.blame(error).at(t=engine.position.t)
             raise culprit.keep(self._take_record(started)) from culprit.__cause__
@@ -163,7 +162,7 @@ class BoundRun:
             recorder.last(engine.position.t, engine.workspace.log)
         return self._take_record(started)
 
-    def begin(self, numbers: Numbers[Any]) -> None:
+    def begin(self, numbers: Numbers) -> None:
         """Go back to t = 0 with the numbers of a sample: the engine's workspace holds them, and its plants are begun.
 
         Raises
@@ -206,7 +205,7 @@ class BoundRun:
         started : float
             Reading of the clock at its start.
         messages : sequence of str
-            What was told in it.
+            Messages of the run.
         residual : ndarray or None
             Largest residual of the algebraic loops, by sample.
         """
@@ -234,14 +233,14 @@ class BoundRun:
         self.recorder.event(event)
 
     def _forget_messages(self) -> None:
-        """Let FMUs forget what they have told in runs before: a run's messages, and its error, quote its own."""
+        """Let FMUs forget the messages of earlier runs: a run's messages, and its error, quote its own."""
         for path, plant in self.engine.plants.items():
             if isinstance(plant, FmuInstance):
                 plant.log.begin_anew()
                 self._told[path] = len(plant.messages)
 
     def take_messages(self) -> tuple[str, ...]:
-        """Return what a run's start and the FMUs have told since the last run."""
+        """Return the messages of the start and of FMUs since the last run."""
         found = [*self.engine.workspace.messages]
         for path, plant in self.engine.plants.items():
             texts = plant.messages

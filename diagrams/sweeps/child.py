@@ -40,7 +40,7 @@ def receive(file: BinaryIO) -> Any:
 
 def main() -> None:
     """Answer samples until the standard input ends; what anybody prints goes to the standard error."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that has started it tells when it ends
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent process decides when it ends
     if hasattr(signal, "SIGTTOU"):  # it is no foreground process, and may write to any terminal all the same
         signal.signal(signal.SIGTTOU, signal.SIG_IGN)
     answers = os.fdopen(os.dup(1), "wb")
@@ -55,17 +55,21 @@ def main() -> None:
         send(answers, error_text(error))
         return
     from ...blocks.core import one_thread
+    from ...fmus.child_processes import end_all
     from .workers import make_worker
 
-    with one_thread(), make_worker(plan) as worker:
-        send(answers, "")
-        while True:
-            try:
-                sample = receive(orders)
-            except EOFError:
-                return
-            for outcome in worker.run_all([sample]):
-                send(answers, outcome)
+    try:
+        with one_thread(), make_worker(plan) as worker:
+            send(answers, "")
+            while True:
+                try:
+                    sample = receive(orders)
+                except EOFError:
+                    return
+                for outcome in worker.run_all([sample]):
+                    send(answers, outcome)
+    finally:
+        end_all()
 
 
 def error_text(error: BaseException) -> str:

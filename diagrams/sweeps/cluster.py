@@ -15,8 +15,8 @@ from typing import Any
 from ...blocks.core import OptionError, one_thread, replace_file
 from ...fmus import Fmu
 from ...fmus.platform import cache_folder, explain_cache_errors, is_built_here, record_build
-from ..simulation import SimulatedDiagram
-from .outcome import WORKER_ENDED, Failure, Outcome
+from ..flat import WiredDiagram
+from .outcome import WORKER_ENDED, Failure, SampleOutcome
 from .plan import Plan, Worker
 from .processes import to_bytes
 from .samples import Sample
@@ -24,10 +24,10 @@ from .workers import make_worker
 
 _CHUNKS = 8
 """Chunks of samples for each thread of the cluster."""
-_MOST = 64
-"""Most samples of a chunk."""
+_LARGEST_CHUNK = 64
+"""Samples of a chunk at most."""
 
-Made = tuple[Callable[..., SimulatedDiagram], tuple[Any, ...]]
+Made = tuple[Callable[..., WiredDiagram], tuple[Any, ...]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Parcel:
     Attributes
     ----------
     plan : Plan
-        The sweep; its diagram is made anew where it arrives.
+        The sweep; its diagram is built again where it arrives.
     made : tuple
         Function and arguments that make the diagram.
     files : mapping of str to str
@@ -147,7 +147,7 @@ def release(key: str) -> None:
 # --- here ------------------------------------------------------------------------------------------------------------
 
 
-def run_on_cluster(plan: Plan, samples: Sequence[Sample], client: Any) -> Generator[Outcome, None, None]:
+def run_on_cluster(plan: Plan, samples: Sequence[Sample], client: Any) -> Generator[SampleOutcome, None, None]:
     """Yield the outcomes of samples, in the order in which they are ready.
 
     A worker that ends gives its samples to others. A sample with which workers end again and again is a failure.
@@ -187,7 +187,7 @@ def run_on_cluster(plan: Plan, samples: Sequence[Sample], client: Any) -> Genera
     key = hashlib.sha256(parcel).hexdigest()[:24]
     packed = client.submit(deliver, parcel, key=f"loopwright-sweep-{key}")
     files = [client.submit(deliver, data, key=f"loopwright-fmu-{digest}") for digest, data in contents.items()]
-    size = max(1, min(_MOST, len(samples) // (_CHUNKS * threads)))
+    size = max(1, min(_LARGEST_CHUNK, len(samples) // (_CHUNKS * threads)))
     size = -(-size // plan.lanes) * plan.lanes  # no vector is broken up
 
     def submit(some: Sequence[Sample]) -> Any:
@@ -226,10 +226,10 @@ def _has_ended(error: BaseException) -> bool:
     return isinstance(error, KilledWorker)
 
 
-def _lost(sample: Sample) -> Outcome:
+def _lost(sample: Sample) -> SampleOutcome:
     values = ", ".join(f"{name!r}: {value!r}" for name, value in sample.parameters.items())
     text = (
         "the workers of the cluster that ran this sample ended, several times. Run it alone: "
         f"diagram.replace({{{values}}}).simulate(…)."
     )
-    return Outcome(sample.index, failure=Failure(sample.index, WORKER_ENDED, text))
+    return SampleOutcome(sample.index, failure=Failure(sample.index, WORKER_ENDED, text))

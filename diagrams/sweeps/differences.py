@@ -1,11 +1,11 @@
-"""Differences between two sweeps, told by their parts."""
+"""Differences between two sweeps, by their parts."""
 
 from __future__ import annotations
 
 from .revision import DIGEST, Parts
 
 _SHOWN = 5
-"""Differences that are told; the others are counted."""
+"""Differences that the message lists; the others are counted."""
 _KINDS = {
     "sweep": "the {}",
     "parameter": "the parameter {}",
@@ -19,9 +19,9 @@ _KINDS = {
     "control": "the condition of {}",
     "name": "the signal {!r}",
 }
-"""Kinds of parts in words, those first that tell most."""
+"""Kinds of parts in words, the most telling first."""
 _VALUES = ("sweep", "parameter", "setting", "option")
-"""Kinds whose parts are values, which are told."""
+"""Kinds whose parts are values, which the message shows."""
 
 
 def describe_differences(old: Parts, new: Parts) -> str:
@@ -38,22 +38,25 @@ def describe_differences(old: Parts, new: Parts) -> str:
         for name in {**new.get(kind, {}), **old.get(kind, {})}
         if old.get(kind, {}).get(name) != new.get(kind, {}).get(name)
     ]
-    single = [name for name in [*old.get("block", {}), *new.get("block", {})]
-              if not (name in old.get("block", {}) and name in new.get("block", {}))]  # fmt: skip
+    single = [
+        name
+        for name in [*old.get("block", {}), *new.get("block", {})]
+        if not (name in old.get("block", {}) and name in new.get("block", {}))
+    ]
     changed = [name for kind, name in differ if kind in ("block", "parameter", "content")]
 
     def follows(kind: str, name: str) -> bool:
-        """Whether a difference only follows from another one that is told."""
+        """Whether a difference only follows from another one that is listed."""
         if kind == "equations":
             return any(path == name or path.startswith(name + ".") for path in changed)
         if kind == "content":
             return name in single
         return kind in ("parameter", "wire") and any(name.startswith(path + ".") for path in single)
 
-    told = [part for part in differ if not follows(*part)]
-    words = [_describe(*part, old, new) for part in told[:_SHOWN]]
-    if len(told) > _SHOWN:
-        words.append(f"{len(told) - _SHOWN} more")
+    listed = [part for part in differ if not follows(*part)]
+    words = [_describe(*part, old, new) for part in listed[:_SHOWN]]
+    if len(listed) > _SHOWN:
+        words.append(f"{len(listed) - _SHOWN} more")
     return ", ".join(words[:-1]) + (" and " if words[1:] else "") + words[-1] if words else ""
 
 

@@ -17,8 +17,8 @@ from ..flat import EVERY, Announcer, ClockSets, FlatDiagram, TickPattern, is_exa
 from ..lanes import LaneCode, LaneEnd, LaneRuns, LaneStart, LaneVectors, NoLanesError, compile_lanes, make_room
 from ..results import Run, Stopped, machine_memory
 from ..simulation import START_EXCHANGES, StopConditions, newton_options
-from .bound_run import BoundRun, Tell
-from .outcome import Outcome
+from .bound_run import BoundRun, Progress
+from .outcome import SampleOutcome
 from .plan import Plan, Worker
 from .samples import Sample
 from .variation import Numbers
@@ -66,28 +66,28 @@ class LaneWorker(Worker):
             self._lanes(numbers, bound)
         return True
 
-    def run_all(self, samples: Iterable[Sample], tell: Tell = lambda t: None) -> Iterator[Outcome]:
+    def run_all(self, samples: Iterable[Sample], progress: Progress = lambda t: None) -> Iterator[SampleOutcome]:
         """Yield the outcomes of some samples; see `run`."""
-        alike: dict[Any, list[tuple[Sample, Numbers[Any]]]] = {}
+        alike: dict[Any, list[tuple[Sample, Numbers]]] = {}
         for sample in samples:
             try:
                 numbers = self._variation.find(self.plan.parameters_of(sample))
             except LoopwrightError:  # its run says what it is
-                yield self.run(sample, tell)
+                yield self.run(sample, progress)
                 continue
             alike.setdefault(numbers.key, []).append((sample, numbers))
         for group in alike.values():
             for k in range(0, len(group), self.width):
-                yield from self._run_alike(group[k : k + self.width], tell)
+                yield from self._run_alike(group[k : k + self.width], progress)
 
-    def _run_alike(self, group: Sequence[tuple[Sample, Numbers[Any]]], tell: Tell) -> Iterator[Outcome]:
+    def _run_alike(self, group: Sequence[tuple[Sample, Numbers]], progress: Progress) -> Iterator[SampleOutcome]:
         """Yield the outcomes of samples that share their functions."""
         numbers = group[0][1]
         bound = self._bind(numbers) if self._repeats else None
         found = self._alone if bound is None else self._lanes(numbers, bound)
         if bound is None or isinstance(found, str):
             for sample, _ in group:
-                yield _note(self.run(sample, tell), f"Not side by side in vector lanes: {found}.")
+                yield _note(self.run(sample, progress), f"Not side by side in vector lanes: {found}.")
             return
         started = perf_counter()
         alone, left = list[tuple[Sample, str | None]](), list[Sample]()
@@ -110,19 +110,19 @@ class LaneWorker(Worker):
             ([sample for sample, _ in runs], found.gather([start for _, start in runs])) for runs in ready.values()
         ]
         for samples, vectors in together:
-            for sample, run in zip(samples, found.run(vectors, tell, started), strict=True):
+            for sample, run in zip(samples, found.run(vectors, progress, started), strict=True):
                 if run is None:
                     left.append(sample)
                 else:
                     yield self._judge(sample, partial(_itself, run))
         for sample, note in alone:
-            outcome = self.run(sample, tell)
+            outcome = self.run(sample, progress)
             yield outcome if note is None else _note(outcome, note)
         for sample in left:
-            outcome = self.run(sample, tell)
+            outcome = self.run(sample, progress)
             yield outcome if outcome.failure is not None else _note(outcome, LEFT)
 
-    def _lanes(self, numbers: Numbers[Any], bound: BoundRun) -> _Lanes | str:
+    def _lanes(self, numbers: Numbers, bound: BoundRun) -> _Lanes | str:
         """Return the lanes of bound runs, or why there are none."""
         found = self._found.get(numbers.key)
         if isinstance(found, str) or (found is not None and found.bound is bound):
@@ -144,8 +144,8 @@ class _Lanes:
     def __init__(self, bound: BoundRun, count: int, method: str, *, agrees: bool):
         self.bound, engine, flat = bound, bound.engine, bound.flat
         if not bound.is_compiled:
-            told = next(iter(engine.messages), "compile=True was not asked for")
-            raise NoLanesError(f"they don't go from tick to tick in C ({told.rstrip('.')})")
+            reason = next(iter(engine.messages), "compile=True was not asked for")
+            raise NoLanesError(f"they don't go from tick to tick in C ({reason.rstrip('.')})")
         if bound.ends_between_ticks or not is_exact(flat, bound.count):
             raise NoLanesError("their duration is no whole number of ticks, or of too many")
         acting = kinds_of(flat, every=engine.every_tick)
@@ -176,13 +176,13 @@ class _Lanes:
         self._stops = StopConditions(flat, engine.workspace.log, str)
         self._start: VectorStart | None = None
         if search is not None and self._code.starts is not None:
-            with suppress(NoLanesError):  # of the FMUs' own numbers; each start says it of its own
+            with suppress(NoLanesError):  # of the FMUs' own numbers; each start raises its own
                 start = VectorStart(search, self._code, self._columns, self._stops.entries)
                 for path, step in start.steps.items():
                     self._refuse_fine(path, step)
                 self._start = start
 
-    def start_together(self, group: Sequence[Numbers[Any]]) -> tuple[LaneVectors | None, list[int]]:
+    def start_together(self, group: Sequence[Numbers]) -> tuple[LaneVectors | None, list[int]]:
         """Return runs at their first tick, and which of a group these are; the others are started one by one."""
         if self._start is None or not len(self._ticks):
             return None, []
@@ -192,7 +192,7 @@ class _Lanes:
         """Return the vectors of runs that were started one by one."""
         return LaneVectors.of(self._code, starts)
 
-    def start(self, numbers: Numbers[Any]) -> LaneStart | None:
+    def start(self, numbers: Numbers) -> LaneStart | None:
         """Return a run's numbers at its first tick; None if it ends there.
 
         Raises
@@ -236,7 +236,7 @@ class _Lanes:
         if self._widths.max() > _MOST_SUBSTEPS * step:
             raise NoLanesError(f"{path} integrates with {step:g} s, more than {_MOST_SUBSTEPS} substeps in a tick")
 
-    def run(self, vectors: LaneVectors, tell: Tell, started: float) -> Iterator[Run | None]:
+    def run(self, vectors: LaneVectors, progress: Progress, started: float) -> Iterator[Run | None]:
         """Yield the runs; None for one that has failed."""
         bound, n = self.bound, len(self._columns)
         runs = LaneRuns(
@@ -256,9 +256,9 @@ class _Lanes:
             elif took > 2 * _WISHED:
                 self._span = max(1, self._span // 2)
             k = end
-            tell(float(self._times[k]))
-        for told, parts, end_of in zip(vectors.messages, kept, runs.ends(), strict=True):
-            yield None if end_of.failed else self._make_run(parts, end_of, started, (*told, DIFFER))
+            progress(float(self._times[k]))
+        for messages, parts, end_of in zip(vectors.messages, kept, runs.ends(), strict=True):
+            yield None if end_of.failed else self._make_run(parts, end_of, started, (*messages, DIFFER))
 
     def _make_run(self, parts: Sequence[np.ndarray], end: LaneEnd, started: float, messages: Sequence[str]) -> Run:
         """Return a run from its rows, of which those after its end are left out."""
@@ -285,5 +285,5 @@ def _itself(run: Run) -> Run:
     return run
 
 
-def _note(outcome: Outcome, text: str) -> Outcome:
+def _note(outcome: SampleOutcome, text: str) -> SampleOutcome:
     return replace(outcome, messages=(*outcome.messages, text))

@@ -41,11 +41,11 @@ class Failure:
 
 
 WORKER_ENDED = "WorkerEnded"
-"""Kind of a failure: the process that ran the sample has ended. It is run again when the sweep goes on."""
+"""Kind of a failure: the process that ran the sample has ended. It is run again when the sweep continues."""
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class SampleOutcome:
     """The outcome of a sample.
 
     Attributes

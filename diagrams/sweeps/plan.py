@@ -15,10 +15,11 @@ from ...blocks.core import Layout, LoopwrightError, SimulationError
 from ...fmus import Fmu
 from ...fmus.isolation import find_limits
 from ...fmus.platform import is_built_here
+from ..flat import WiredDiagram
 from ..results import Run
-from ..simulation import RunOptions, SimulatedDiagram, simulate
-from .bound_run import BoundRun, Tell
-from .outcome import Outcome, describe_failure
+from ..simulation import RunOptions, simulate
+from .bound_run import BoundRun, Progress
+from .outcome import SampleOutcome, describe_failure
 from .reductions import Reduction
 from .samples import Sample, seed_of
 from .variation import Numbers, Variation
@@ -33,7 +34,7 @@ class Plan:
 
     Attributes
     ----------
-    diagram : SimulatedDiagram
+    diagram : WiredDiagram
         The diagram.
     duration : float
         Simulated time of each run in s.
@@ -49,7 +50,7 @@ class Plan:
         Runs that go side by side in the lanes of a vector; 1 for one after the other.
     """
 
-    diagram: SimulatedDiagram
+    diagram: WiredDiagram
     duration: float
     options: Mapping[str, Any]
     signals: tuple[str, ...] = ()
@@ -113,12 +114,12 @@ class Worker:
 
     def __init__(self, plan: Plan):
         self.plan, self._options = plan, plan.run_options
-        self._variation: Variation[Any] = Variation(plan.diagram)
+        self._variation = Variation(plan.diagram)
         self._bound: OrderedDict[Any, BoundRun] = OrderedDict()
         self._known_units: tuple[Layout, dict[str, str]] | None = None
         self._repeats = self._options.start is None and plan.runs_in_threads
         self._alone = "" if self._repeats else plan.obstacle
-        """Why each run needs a set-up of its own, as a clause, where it does."""
+        """Why each run needs its own set-up, as a clause, where it does."""
 
     def __enter__(self) -> Worker:
         return self
@@ -135,28 +136,28 @@ class Worker:
         """Whether a sample's run goes from tick to tick in C; it is prepared, and not run."""
         try:
             bound = self._bind(self._variation.find(self.plan.parameters_of(sample))) if self._repeats else None
-        except LoopwrightError:  # of this sample; its run will tell
+        except LoopwrightError:  # of this sample; its run will raise it
             return False
         return bound is not None and bound.is_compiled
 
-    def run_all(self, samples: Iterable[Sample], tell: Tell = lambda t: None) -> Iterator[Outcome]:
+    def run_all(self, samples: Iterable[Sample], progress: Progress = lambda t: None) -> Iterator[SampleOutcome]:
         """Yield the outcomes of some samples; see `run`."""
         for sample in samples:
-            yield self.run(sample, tell)
+            yield self.run(sample, progress)
 
-    def run(self, sample: Sample, tell: Tell = lambda t: None) -> Outcome:
+    def run(self, sample: Sample, progress: Progress = lambda t: None) -> SampleOutcome:
         """Run a sample; a run that fails is an outcome, too.
 
         Parameters
         ----------
         sample : Sample
             The sample.
-        tell : callable
-            Told the simulated time in s now and then; what it raises ends the run.
+        progress : callable
+            Called with the simulated time in s now and then; an exception that it raises ends the run.
         """
-        return self._judge(sample, lambda: self._simulate(self.plan.parameters_of(sample), tell))
+        return self._judge(sample, lambda: self._simulate(self.plan.parameters_of(sample), progress))
 
-    def _judge(self, sample: Sample, make: Callable[[], Run]) -> Outcome:
+    def _judge(self, sample: Sample, make: Callable[[], Run]) -> SampleOutcome:
         """Return the outcome of a sample whose run is made here, whether it fails or not."""
         try:
             return self._outcome(sample, make())
@@ -164,28 +165,28 @@ class Worker:
             failure = describe_failure(sample.index, error)
             run = error.run if isinstance(error, SimulationError) else None
             if run is None or not len(run.t):
-                return Outcome(sample.index, failure=failure, end=failure.t)
+                return SampleOutcome(sample.index, failure=failure, end=failure.t)
             t = run.t.copy() if self.plan.signals else None
-            return Outcome(
+            return SampleOutcome(
                 sample.index, {}, t, self._signals(run), failure.t, "", failure, self._units(run), run.messages
             )
 
     # --- its runs ----------------------------------------------------------------------------------------------------
 
-    def _simulate(self, parameters: Mapping[str, Any], tell: Tell) -> Run:
+    def _simulate(self, parameters: Mapping[str, Any], progress: Progress) -> Run:
         numbers = self._variation.find(parameters)
         bound = self._bind(numbers) if self._repeats else None
         if bound is None or not bound.fits(numbers):
             return simulate(numbers.make_diagram(), self.plan.duration, self._options, progress=False)
         try:
-            return bound.run(numbers, tell)
+            return bound.run(numbers, progress)
         finally:
             if bound.is_broken:
                 del self._bound[numbers.key]
                 bound.__exit__(None, None, None)
 
-    def _bind(self, numbers: Numbers[Any]) -> BoundRun | None:
-        """Return the bound runs of a diagram; None where each run needs a set-up of its own."""
+    def _bind(self, numbers: Numbers) -> BoundRun | None:
+        """Return the bound runs of a diagram; None where each run needs its own set-up."""
         if numbers.key not in self._bound:
             bound = BoundRun(numbers.diagram, self.plan.duration, self._options)
             try:
@@ -206,11 +207,11 @@ class Worker:
 
     # --- their outcomes ----------------------------------------------------------------------------------------------
 
-    def _outcome(self, sample: Sample, run: Run) -> Outcome:
+    def _outcome(self, sample: Sample, run: Run) -> SampleOutcome:
         numbers = {name: self._reduce(name, function, run) for name, function in self.plan.reductions.items()}
         t = run.t.copy() if self.plan.signals else None
         stopped = "" if run.stopped is None else run.stopped.block
-        return Outcome(
+        return SampleOutcome(
             sample.index,
             numbers,
             t,

@@ -1,4 +1,4 @@
-"""Samples of a sweep in processes of their own: for runs that Python interprets, and for FMUs of other tools."""
+"""Samples of a sweep in separate processes: for runs that Python interprets, and for FMUs of other tools."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from typing import Any, BinaryIO
 from ...blocks.core import OptionError
 from ...fmus.child_processes import ProcessGroup, find_python
 from .child import receive, send
-from .desk import Desk
-from .outcome import WORKER_ENDED, Failure, Outcome
+from .outcome import WORKER_ENDED, Failure, SampleOutcome
 from .plan import Plan
+from .sample_queue import SampleQueue
 from .samples import Sample
 
 _PROGRAM = "from loopwright.diagrams.sweeps.child import main; main()"
 _LEAVING = 10.0  # s in which a process that has nothing more to do ends by itself
 
 
-def run_in_processes(plan: Plan, samples: Iterable[Sample], count: int) -> Generator[Outcome, None, None]:
+def run_in_processes(plan: Plan, samples: Iterable[Sample], count: int) -> Generator[SampleOutcome, None, None]:
     """Yield the outcomes of samples, in the order in which they are ready.
 
-    A process that ends in a run, such as by a crash, makes a failure of that sample alone; another one goes on.
+    A process that ends in a run, such as by a crash, makes only that sample a failure; another process continues.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def run_in_processes(plan: Plan, samples: Iterable[Sample], count: int) -> Gener
             for process in processes:
                 process.end()
 
-        yield from Desk(samples).serve([process.work for process in processes], end)
+        yield from SampleQueue(samples).serve([process.work for process in processes], end)
 
 
 def to_bytes(plan: object, name: str) -> bytes:
@@ -93,31 +93,31 @@ def _not_sent(name: str, error: object) -> OptionError:
 
 
 class _Process:
-    """A worker process; it is started when it is needed first, and anew after its end."""
+    """A worker process; it is started when first needed, and again after its end."""
 
     def __init__(self, data: bytes, group: ProcessGroup):
         self._data, self._group = data, group
         self._process: subprocess.Popen[bytes] | None = None
         self._lock, self._over = threading.Lock(), False
 
-    def work(self, desk: Desk) -> None:
-        """Run the samples of a desk until there are none; then the process ends by itself, and so its FMUs do."""
-        while taken := desk.take():
-            desk.put(self.run(taken[0]))
+    def work(self, queue: SampleQueue) -> None:
+        """Run samples of the queue until there are none; then the process ends by itself, and so its FMUs do."""
+        while taken := queue.take():
+            queue.put(self.run(taken[0]))
         process = self._process
         if process is not None:
             with suppress(OSError, subprocess.TimeoutExpired):
                 _pipe(process.stdin).close()
                 process.wait(_LEAVING)
 
-    def run(self, sample: Sample) -> Outcome:
+    def run(self, sample: Sample) -> SampleOutcome:
         """Return the outcome of a sample; where the process ends, that is its failure."""
         try:
             process = self._begin()
             send(_pipe(process.stdin), sample)
-            found: Outcome = receive(_pipe(process.stdout))
+            found: SampleOutcome = receive(_pipe(process.stdout))
         except (EOFError, OSError):
-            return Outcome(sample.index, failure=Failure(sample.index, WORKER_ENDED, self._describe_end(sample)))
+            return SampleOutcome(sample.index, failure=Failure(sample.index, WORKER_ENDED, self._describe_end(sample)))
         return found
 
     def _begin(self) -> subprocess.Popen[bytes]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core import OptionError, UnknownNameError, accepts, explain_calls, kinds, near
-from .outcome import Failure, Outcome
+from .outcome import Failure, SampleOutcome
 from .samples import Samples
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class Sweep:
     """
 
     samples: Samples
-    outcomes: Sequence[Outcome | None] = field(repr=False)
+    outcomes: Sequence[SampleOutcome | None] = field(repr=False)
     diagram_name: str
     elapsed: float = float("nan")
     reused: int = 0
@@ -158,7 +158,7 @@ class Sweep:
         """One xarray data set: the dimensions of a grid are its parameters; else there is one, ``sample``.
 
         Its variables are the reductions, the signals, over ``t`` (s), the variables ``failed``, ``end_time`` (s) and
-        ``failure``, the message. Entries of vectors count from 1. Where runs have times of their own, samples run over
+        ``failure``, the message. Entries of vectors count from 1. Where runs have their own times, samples run over
         ``step``, and ``t`` is a variable.
 
         Raises
@@ -187,8 +187,10 @@ class Sweep:
             ["" if o is None or o.failure is None else str(o.failure.message) for o in self.outcomes], dtype=object
         )
         about: list[tuple[str, np.ndarray, dict[str, str]]] = [
-            ("failed", self.failed, {}), ("end_time", self.end, {"units": "s"}), ("failure", text, {}),
-        ]  # fmt: skip
+            ("failed", self.failed, {}),
+            ("end_time", self.end, {"units": "s"}),
+            ("failure", text, {}),
+        ]
         for name, values, attributes in about:
             variables[name] = (dims, values.reshape(samples.shape), attributes)
         inner: tuple[str, ...] = ()

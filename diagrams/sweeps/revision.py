@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core import OptionError, Value
-from ..simulation import SimulatedDiagram
+from ..flat import WiredDiagram
 from .plan import Plan
 from .reductions import Reduction
 from .samples import Sample
@@ -70,7 +70,7 @@ def key_of(sample: Sample, *, seeded: bool) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def _of_diagram(diagram: SimulatedDiagram) -> dict[str, dict[str, str]]:
+def _of_diagram(diagram: WiredDiagram) -> dict[str, dict[str, str]]:
     table = diagram.scheduled
     blocks, parameters, contents, settings = (dict[str, str]() for _ in range(4))
     for path, block in table.blocks.items():
@@ -93,7 +93,7 @@ def _of_diagram(diagram: SimulatedDiagram) -> dict[str, dict[str, str]]:
     }
 
 
-def _equations_of(diagram: SimulatedDiagram) -> dict[str, str]:
+def _equations_of(diagram: WiredDiagram) -> dict[str, str]:
     found, seen = dict[str, str](), dict[int, str]()
     for path, trace in diagram.checked.traced.items():
         block, own = diagram.scheduled.blocks[path], list[str]()

@@ -1,4 +1,4 @@
-"""Samples of parameters: grids, Latin hypercubes and tables, each sample with a seed of its own."""
+"""Samples of parameters: grids, Latin hypercubes and tables, each sample with its own seed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Block, OptionError, brief, enumerate_some, explain_calls, near
-from ..wiring import CheckedDiagram, find_parameter
+from ..flat import WiredDiagram
 
 KINDS = ("grid", "latin")
 _SCALES = ("linear", "log")
@@ -64,7 +64,7 @@ class Box:
         Raises
         ------
         OptionError
-            For anything else; ``name`` tells whose it is.
+            For anything else; ``name`` says whose it is.
         """
         if isinstance(value, cls):
             return value
@@ -109,7 +109,7 @@ class Sample:
     parameters : mapping
         Values by the names of the sweep, as `Diagram.replace` takes them.
     seed : int
-        Seed of its own: it depends on the sweep's seed and the place alone, not on who runs it, or when.
+        Its own seed: it depends on the sweep's seed and the place alone, not on who runs it, or when.
     """
 
     index: int
@@ -168,7 +168,7 @@ class Samples(Sequence[Sample]):
         """Number of samples along each axis of a grid; one number where it is no grid."""
         return (len(self),) if self.axes is None else tuple(len(values) for values in self.axes.values())
 
-    def resolve(self, diagram: CheckedDiagram) -> Samples:
+    def resolve(self, diagram: WiredDiagram) -> Samples:
         """Return the samples with the full path of each parameter in a diagram.
 
         Raises
@@ -180,7 +180,7 @@ class Samples(Sequence[Sample]):
         """
         full: dict[str, str] = {}
         for name in self.names:
-            path = find_parameter(diagram, name)
+            path = diagram.find_parameter(name)
             if path in full:
                 raise OptionError(
                     f"found two names of one parameter, {full[path]!r} and {name!r}; give it once.",
@@ -298,7 +298,7 @@ def table(rows: Any, *, seed: int = 0) -> Samples:
 
 
 def read_samples(
-    diagram: CheckedDiagram, parameters: Any, samples: Any = "grid", *, count: int | None = None, seed: int = 0
+    diagram: WiredDiagram, parameters: Any, samples: Any = "grid", *, count: int | None = None, seed: int = 0
 ) -> Samples:
     """Return the samples of a sweep of a diagram, with the full paths of their parameters.
 
@@ -316,7 +316,7 @@ def read_samples(
     Raises
     ------
     OptionError
-        For a kind that is unknown, parameters beside a table, and what `grid`, `latin` and `table` refuse.
+        For a kind that is unknown, parameters next to a table, and what `grid`, `latin` and `table` refuse.
     UnknownNameError
         For a name that isn't in the diagram.
     """

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...blocks.core import OptionError, explain_disk_errors, replace_file, write_text
 from .differences import describe_differences
-from .outcome import WORKER_ENDED, Failure, Outcome
+from .outcome import WORKER_ENDED, Failure, SampleOutcome
 from .revision import Parts, digest_of
 
 HEAD = "sweep.json"
@@ -34,12 +34,12 @@ class Store:
     about : mapping
         Facts for people who look into the folder.
     overwrite : bool
-        Replace a sweep of another revision that stands there.
+        Replace a sweep of another revision in the folder.
 
     Raises
     ------
     OptionError
-        If something else stands there.
+        If the folder holds something else.
     """
 
     def __init__(self, folder: Path, parts: Parts, about: dict[str, Any], *, overwrite: bool = False):
@@ -48,7 +48,7 @@ class Store:
         with explain_disk_errors(f"the sweep can't be kept in {str(folder)!r}", folder, step, OptionError, **own):
             self.folder = folder.absolute()  # loading an FMU changes the working folder for a moment
             self._open(parts, about, overwrite=overwrite)
-        self._waiting: list[tuple[str, Outcome]] = []
+        self._waiting: list[tuple[str, SampleOutcome]] = []
         self._last = monotonic()
 
     def _open(self, parts: Parts, about: dict[str, Any], *, overwrite: bool) -> None:
@@ -85,11 +85,11 @@ class Store:
             )
 
     def _remove(self) -> None:
-        """Remove the sweep, and nothing else that stands in its folder."""
+        """Remove the sweep, and nothing else in its folder."""
         for path in (*self.folder.glob("part-*.npz"), self.folder / HEAD):
             path.unlink()
 
-    def read(self) -> dict[str, Outcome]:
+    def read(self) -> dict[str, SampleOutcome]:
         """Return the outcomes that are there, by the keys of their samples; unfinished parts don't count.
 
         Raises
@@ -97,12 +97,12 @@ class Store:
         OptionError
             If a part can't be read.
         """
-        found: dict[str, Outcome] = {}
+        found: dict[str, SampleOutcome] = {}
         for path in sorted(self.folder.glob("part-*.npz")):
             found.update(_read_part(path))
         return found
 
-    def add(self, key: str, outcome: Outcome) -> None:
+    def add(self, key: str, outcome: SampleOutcome) -> None:
         """Keep an outcome; it is on disk within about a second, or after `flush`."""
         if outcome.failure is None or outcome.failure.kind != WORKER_ENDED:
             self._waiting.append((key, outcome))
@@ -128,7 +128,7 @@ def _tell(found: Mapping[str, Any], parts: Parts) -> str:
     return describe_differences(known, parts) or "its head, which was changed by hand"
 
 
-def _write_part(path: Path, outcomes: Iterable[tuple[str, Outcome]]) -> None:
+def _write_part(path: Path, outcomes: Iterable[tuple[str, SampleOutcome]]) -> None:
     heads, arrays = [], dict[str, np.ndarray]()
     for place, (key, outcome) in enumerate(outcomes):
         failure = None if outcome.failure is None else vars(outcome.failure)
@@ -155,13 +155,13 @@ def _write_part(path: Path, outcomes: Iterable[tuple[str, Outcome]]) -> None:
         save(fresh, **arrays)
 
 
-def _read_part(path: Path) -> dict[str, Outcome]:
-    found: dict[str, Outcome] = {}
+def _read_part(path: Path) -> dict[str, SampleOutcome]:
+    found: dict[str, SampleOutcome] = {}
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as part:
             for place, head in enumerate(json.loads(part["heads"].tobytes())):
                 failure = head["failure"]
-                found[head["key"]] = Outcome(
+                found[head["key"]] = SampleOutcome(
                     -1,
                     {name: part[f"{place}.n{k}"] for k, name in enumerate(head["numbers"])},
                     part[f"{place}.t"] if head["has_t"] else None,

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import OptionError, accepts, kinds, one_thread
-from ..flat import FlatDiagram
+from ..flat import FlatDiagram, WiredDiagram
 from ..results import Run, entries, machine_memory, resolve, select
-from ..simulation import RunOptions, SimulatedDiagram, Simulation, progress_bar
-from ..wiring import find_parameter
-from .outcome import Outcome
+from ..simulation import RunOptions, Simulation, progress_bar
+from .outcome import SampleOutcome
 from .plan import Plan
 from .processes import run_in_processes
 from .reductions import Reduction, check_reductions
@@ -56,7 +55,7 @@ class InterruptedSweep(KeyboardInterrupt):
 
 @accepts(duration=kinds.number, signals=kinds.names, seeds=kinds.names, progress=kinds.flag)
 def sweep(
-    diagram: SimulatedDiagram,
+    diagram: WiredDiagram,
     parameters: Mapping[str, Any] | None,
     duration: float,
     *,
@@ -81,13 +80,13 @@ def sweep(
     plan = make_plan(diagram, duration, signals, reduce, seeds, options, count=len(found), lanes=lanes)
     _check_names(plan, found.names)
     count_workers = _check_workers(workers)
-    store, known = None, dict[str, Outcome]()
+    store, known = None, dict[str, SampleOutcome]()
     if to is not None:
         if not isinstance(to, str | os.PathLike) or "\0" in str(to):
             raise OptionError(f"found {to!r}; expected the path of a folder. Give one.", block=name, port="to")
         store = Store(Path(to), parts_of(plan), {"diagram": name, "duration": plan.duration}, overwrite=overwrite)
         known = store.read()
-    outcomes: list[Outcome | None] = [None] * len(found)
+    outcomes: list[SampleOutcome | None] = [None] * len(found)
     reused = 0
 
     def result() -> Sweep:
@@ -119,7 +118,7 @@ def sweep(
 
 
 def make_plan(
-    diagram: SimulatedDiagram,
+    diagram: WiredDiagram,
     duration: float,
     signals: str | Iterable[str],
     reduce: Mapping[str, Callable[[Run], Any]] | None,
@@ -150,10 +149,10 @@ def make_plan(
             "kept, or reduce={'end': final('y')}, numbers of each run.",
             block=name,
         )
-    paths = [find_parameter(diagram, path) for path in ((seeds,) if isinstance(seeds, str) else seeds)]
+    paths = [diagram.find_parameter(path) for path in ((seeds,) if isinstance(seeds, str) else seeds)]
     if isinstance(record := options.get("record"), Iterable) and not isinstance(record, str):
         options = {**options, "record": tuple(record)}  # for each of the runs
-    compiled = all(is_number(diagram, path) for path in paths)  # else each sample would be compiled anew
+    compiled = all(is_number(diagram, path) for path in paths)  # else each sample would be compiled again
     plan = Plan(
         diagram, duration, {"compile": compiled, **options}, chosen, reductions, tuple(paths), _check_lanes(lanes)
     )
@@ -187,7 +186,7 @@ def _check_recorded(plan: Plan, flat: FlatDiagram, needed: Iterable[str]) -> Non
         )
 
 
-def _run(plan: Plan, samples: Sequence[Sample], workers: int, client: Any) -> Generator[Outcome, None, None]:
+def _run(plan: Plan, samples: Sequence[Sample], workers: int, client: Any) -> Generator[SampleOutcome, None, None]:
     """Yield the outcomes of samples where they are run best: here, in threads, in processes or on a cluster."""
     if not samples:
         return
@@ -269,5 +268,5 @@ def _check_room(plan: Plan, flat: FlatDiagram, count: int) -> None:
 
 @contextmanager
 def _bar(name: str, total: int, show: bool | None) -> Iterator[Callable[[int], None]]:
-    with progress_bar(name, 0, total, show, "{task.completed:.0f} of {task.total:.0f} samples") as tell:
-        yield tell
+    with progress_bar(name, 0, total, show, "{task.completed:.0f} of {task.total:.0f} samples") as advance:
+        yield advance

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Generator, Iterable
 from functools import partial
 
-from .desk import Desk
-from .outcome import Outcome
+from .outcome import SampleOutcome
 from .plan import Plan, Worker
+from .sample_queue import SampleQueue
 from .samples import Sample
 from .workers import make_worker
 
@@ -16,7 +16,9 @@ class Halt(BaseException):
     """Ends the run of a thread whose sweep is over."""
 
 
-def run_in_threads(plan: Plan, samples: Iterable[Sample], count: int, worker: Worker) -> Generator[Outcome, None, None]:
+def run_in_threads(
+    plan: Plan, samples: Iterable[Sample], count: int, worker: Worker
+) -> Generator[SampleOutcome, None, None]:
     """Yield the outcomes of samples, in the order in which they are ready.
 
     Where the caller stops, such as after Ctrl-C, the runs at hand end within a chunk of ticks.
@@ -33,17 +35,17 @@ def run_in_threads(plan: Plan, samples: Iterable[Sample], count: int, worker: Wo
         The worker of the first thread, which has been set up; each of the others makes its own.
     """
 
-    def work(worker: Worker, desk: Desk) -> None:
-        def tell(t: float) -> None:
-            if desk.is_closed:
+    def work(worker: Worker, queue: SampleQueue) -> None:
+        def progress(t: float) -> None:
+            if queue.is_closed:
                 raise Halt
 
-        while taken := desk.take(worker.width):
-            for outcome in worker.run_all(taken, tell):
-                desk.put(outcome)
+        while taken := queue.take(worker.width):
+            for outcome in worker.run_all(taken, progress):
+                queue.put(outcome)
 
-    def make_and_work(desk: Desk) -> None:
+    def make_and_work(queue: SampleQueue) -> None:
         with make_worker(plan) as own:
-            work(own, desk)
+            work(own, queue)
 
-    yield from Desk(samples).serve([partial(work, worker), *[make_and_work] * (count - 1)])
+    yield from SampleQueue(samples).serve([partial(work, worker), *[make_and_work] * (count - 1)])

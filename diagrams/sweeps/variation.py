@@ -5,22 +5,21 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from ...blocks.core import Block, LoopwrightError, identity
 from ...blocks.tracing import has_structure
 from ...fmus import Fmu
 from ...fmus.archive import FmuDescription
-from ..simulation import SimulatedDiagram
+from ..flat import WiredDiagram
 from ..wiring import change_parameters, split_entry, split_path
 
-D = TypeVar("D", bound=SimulatedDiagram)
 _KEPT = 8
 """Diagrams of other structure that are kept at a time."""
 
 
 @dataclass(frozen=True, eq=False)
-class Numbers(Generic[D]):
+class Numbers:
     """A sample as numbers of a diagram.
 
     Attributes
@@ -35,12 +34,12 @@ class Numbers(Generic[D]):
         Start values of FMUs, checked, by the block's path and the FMU's names.
     """
 
-    diagram: D
+    diagram: WiredDiagram
     key: Any
     blocks: Mapping[str, Block] = field(default_factory=dict)
     starts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
-    def make_diagram(self) -> D:
+    def make_diagram(self) -> WiredDiagram:
         """Return the diagram with these numbers; it shares the functions of `diagram`."""
         plants = {path: self._start_with(path, values) for path, values in self.starts.items()}
         return self.diagram.renumbered({**self.blocks, **plants}) if self.blocks or plants else self.diagram
@@ -51,7 +50,7 @@ class Numbers(Generic[D]):
         return block.replace(start={**block.start, **values})
 
 
-class Variation(Generic[D]):
+class Variation:
     """Finds the numbers of samples.
 
     Parameters
@@ -60,14 +59,14 @@ class Variation(Generic[D]):
         The diagram that is varied.
     """
 
-    def __init__(self, diagram: D):
+    def __init__(self, diagram: WiredDiagram):
         self._diagram = diagram
-        self._others: OrderedDict[Any, D] = OrderedDict()
+        self._others: OrderedDict[Any, WiredDiagram] = OrderedDict()
         self._places: dict[str, tuple[str, list[str]] | None] = {}
         self._free: dict[str, list[str]] = {}
         self._descriptions: dict[str, FmuDescription] = {}
 
-    def find(self, parameters: Mapping[str, Any]) -> Numbers[D]:
+    def find(self, parameters: Mapping[str, Any]) -> Numbers:
         """Return the numbers of a sample.
 
         Raises
@@ -168,7 +167,7 @@ def _has_elements(block: Fmu, name: str) -> bool:
     return any(about.elements[given][0] == name for given in block.start if given in about.elements)
 
 
-def is_number(diagram: SimulatedDiagram, path: str) -> bool:
+def is_number(diagram: WiredDiagram, path: str) -> bool:
     """Whether a parameter of a block changes numbers of a run alone, though it is no float, such as a noise's seed."""
     place = Variation(diagram).place(path)
     return place is not None and place[1][0] in type(diagram.scheduled.blocks[place[0]]).computed_from

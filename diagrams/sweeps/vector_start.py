@@ -11,9 +11,16 @@ from ...blocks.core import Block, LoopwrightError
 from ...fmus.calls import FmuInstance
 from ..flat import TRUE, FlatDiagram, write_numbers
 from ..lanes import LaneCode, LaneVectors, StartSource, make_room
-from ..simulation import START_SETTLED, find_initial_state, values_from_left
+from ..simulation import (
+    START_SETTLED,
+    Port,
+    StartFunctions,
+    StartValues,
+    find_initial_state,
+    trace_start,
+    values_from_left,
+)
 from .bound_run import LOADING, BoundRun
-from .start_values import Port, StartFunctions, StartValues, trace_start
 from .variation import Numbers
 
 _PASSES = 30
@@ -122,19 +129,19 @@ class VectorStart:
         self._base = np.concatenate([np.zeros(0), *numbers_of])
         left = [np.ravel(search.left[port]) for port in self._functions.places]
         sizes = code.sizes
-        self._left = make_room(sum(v.size for v in left), n)
-        self._left[:] = np.concatenate([np.zeros(0), *left])[:, None]
+        self._left = make_room(self._functions.width, n)
+        self._left[:] = np.concatenate([*left, [0.0]])[:, None]
         self._next, self._log, self._ok = make_room(sizes.x, n), make_room(sizes.log, n), make_room(1, n)
         self._room = make_room(code.room.start, n)
         self._values = [make_room(size, n) for size in code.starts.sizes] if code.starts is not None else []
         self._initial: dict[str, dict[bytes, np.ndarray]] = {path: {} for path in self._functions.inputs}
 
-    def fits(self, numbers: Numbers[Any]) -> bool:
+    def fits(self, numbers: Numbers) -> bool:
         """Whether a run's numbers can be set over vectors."""
         known = all(name in self._places.get(path, {}) for path, values in numbers.starts.items() for name in values)
         return known and not (numbers.blocks.keys() & self._sources)
 
-    def find(self, group: Sequence[Numbers[Any]]) -> tuple[LaneVectors | None, list[int]]:
+    def find(self, group: Sequence[Numbers]) -> tuple[LaneVectors | None, list[int]]:
         """Return runs at their first tick, and which of a group these are; the others are started one by one.
 
         Parameters
@@ -153,7 +160,7 @@ class VectorStart:
             places = [i for i, is_good in zip(places, good, strict=True) if is_good]
         return None, []
 
-    def _fill(self, vectors: LaneVectors, group: Sequence[Numbers[Any]]) -> np.ndarray:
+    def _fill(self, vectors: LaneVectors, group: Sequence[Numbers]) -> np.ndarray:
         """Set all numbers with which runs begin; return for which ones that could be done."""
         flat, good = self._flat, np.ones(len(group), dtype=bool)
         vectors.p[:], vectors.x[:] = flat.p[:, None], flat.x0[:, None]
@@ -170,7 +177,7 @@ class VectorStart:
         vectors.fill()
         return good
 
-    def _settle(self, vectors: LaneVectors, group: Sequence[Numbers[Any]]) -> np.ndarray:
+    def _settle(self, vectors: LaneVectors, group: Sequence[Numbers]) -> np.ndarray:
         """Go through the first tick, with inputs and outputs of the FMUs that agree; return for which that went."""
         calls, count = self._calls, len(group)
         assert calls is not None
@@ -221,7 +228,7 @@ class VectorStart:
             good &= ~(self._log[self._stops] > TRUE).any(axis=0)
         return good
 
-    def _set_start(self, vectors: LaneVectors, group: Sequence[Numbers[Any]]) -> np.ndarray:
+    def _set_start(self, vectors: LaneVectors, group: Sequence[Numbers]) -> np.ndarray:
         """Compute initial states, first held outputs and gates, as `StartValues.set` does."""
         flat, calls, functions = self._flat, self._calls, self._functions
         assert calls is not None
@@ -254,7 +261,7 @@ class VectorStart:
                 x[where] = (found[i] > TRUE).astype(float)
         return good
 
-    def _start_of(self, path: str, k: int, values: np.ndarray, numbers: Numbers[Any]) -> np.ndarray:
+    def _start_of(self, path: str, k: int, values: np.ndarray, numbers: Numbers) -> np.ndarray:
         """Return the initial state of a block from its inputs."""
         known, key, block = self._initial[path], values.tobytes(), numbers.blocks.get(path)
         if block is None and key in known:

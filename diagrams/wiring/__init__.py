@@ -1,20 +1,20 @@
 """Structure of a diagram: blocks, wires, subsystems, checks and the order of evaluation."""
 
-from .check import Checked
-from .checked_diagram import CheckedDiagram, find_parameter
+from .check import Checked, check
 from .collector import Collector
 from .cycles import find_cyclic_parts
+from .delay_blocks import add_delay_blocks
 from .entry_names import index_of, split_entry
 from .entry_order import OrderStep
 from .order import Order, find_orders
-from .parameter_names import find_place, split_path
+from .parameter_names import find_name, find_path, find_place, split_path
 from .structure import Structure, SubsystemSettings, Wire, join, stepped_blocks
 from .subsystems import Subsystem, exact_time, subsystem
-from .variants import change_parameter, change_parameters
+from .units import add_unit_conversions
+from .variants import apply_changes, change_parameter, change_parameters
 
 __all__ = [
     "Checked",
-    "CheckedDiagram",
     "Collector",
     "Order",
     "OrderStep",
@@ -22,12 +22,17 @@ __all__ = [
     "Subsystem",
     "SubsystemSettings",
     "Wire",
+    "add_delay_blocks",
+    "add_unit_conversions",
+    "apply_changes",
     "change_parameter",
     "change_parameters",
+    "check",
     "exact_time",
     "find_cyclic_parts",
+    "find_name",
     "find_orders",
-    "find_parameter",
+    "find_path",
     "find_place",
     "index_of",
     "join",

@@ -72,7 +72,7 @@ def part_shape(shape: Shape, wire: Wire, consumer: str, port: str) -> Shape:
 
 
 def _check_ports(table: Structure) -> None:
-    inputs = {path: block.inputs for path, block in table.blocks.items()}  # each access makes them anew
+    inputs = {path: block.inputs for path, block in table.blocks.items()}  # each access makes them again
     for (consumer, port), wire in table.wires.items():
         outputs = table.blocks[wire.block].outputs
         if wire.port not in outputs:

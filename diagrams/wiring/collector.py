@@ -35,7 +35,9 @@ _Consumer = Call | SubsystemCall | _Inside | _Root | None
 
 
 class Collector:
-    """Walks from the roots against the wires, then gives every block its path; blocks are told apart by identity.
+    """Walks from the roots against the wires, then gives every block its path.
+
+    Two blocks are the same node only if they are one object.
 
     Parameters
     ----------
@@ -144,7 +146,7 @@ class Collector:
         return table
 
     def _find_subsystem(self, key: int, places: _Places) -> str:
-        """Return the path of the subsystem in which a block stands: where it is called, else around all its users."""
+        """Return the path of the subsystem in which a block is: where it is called, else around all its users."""
         block, call = self.blocks[key], self.calls.get(key)
         if call is not None:
             return places.of(call) or ""
@@ -217,7 +219,7 @@ class _Places:
         return self.path(consumer.call) if isinstance(consumer, _Inside) else self._outside(consumer)
 
     def place_blocks(self, blocks: dict[int, Block], subsystems: dict[int, str]) -> dict[int, str]:
-        """Return the paths of blocks that stand in these subsystems, all by identity; given names come first."""
+        """Return the paths of blocks in these subsystems, all by identity; given names come first."""
         self._given = {join(subsystems[key], block.name) for key, block in blocks.items() if block.name}
         named, others = ([key for key, block in blocks.items() if bool(block.name) is has] for has in (True, False))
         return {key: self._take(subsystems[key], blocks[key].name, blocks[key].label) for key in (*named, *others)}

@@ -16,7 +16,7 @@ from .structure import Structure, Wire, join
 def add_delay_blocks(table: Structure) -> Structure:
     """Return the structure with a delay block for every output that leaves a subsystem with a computational delay.
 
-    The block stands inside the subsystem, acts at its ticks, and is called ``delay_`` and the output's name, numbered
+    The block is inside the subsystem, acts at its ticks, and is called ``delay_`` and the output's name, numbered
     where two outputs share a name. Blocks inside the subsystem still read the output without delay. A wire that is
     named inside and leaves the subsystem is the one that its consumers outside get: with the delay.
     """

@@ -76,7 +76,7 @@ class Structure:
     blocks : dict
         Every block by its path.
     subsystem_of : dict
-        Path of the subsystem that a block stands in, by the block's path.
+        Path of the subsystem that a block is in, by the block's path.
     subsystems : dict
         Settings of every subsystem by its path, the diagram's own under "".
     wires : dict

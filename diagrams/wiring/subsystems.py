@@ -1,4 +1,4 @@
-"""Subsystems: functions of signals that stand in a diagram like blocks."""
+"""Subsystems: functions of signals that are used in a diagram like blocks."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class SubsystemKeywords(TypedDict, total=False):
 
 @explain_calls
 class Subsystem:
-    """A function of signals that stands in a diagram like a block; made by `subsystem`, called like a block."""
+    """A function of signals that is used in a diagram like a block; made by `subsystem`, called like a block."""
 
     def __init__(
         self,
@@ -338,7 +338,7 @@ def subsystem(
         first ticks the first computed value leaves it.
     enabled : {"held", "reset"}, optional
         Gives the subsystem one more input, ``enable``. It acts only while that is true (above 0.5), and holds its
-        outputs and states else; with "reset" the states start anew when it is enabled again. With a sample time the
+        outputs and states else; with "reset" the states start again when it is enabled again. With a sample time the
         input counts at its own ticks, and subsystems of other rates inside go by the last of them.
     triggered : {"rising", "falling", "both"}, optional
         Gives the subsystem one more input, ``trigger``. It acts only at the instants at which that becomes true

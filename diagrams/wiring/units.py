@@ -35,13 +35,13 @@ def follow_units(table: Structure, converted: Mapping[Port, Unit]) -> dict[Port,
             wire = table.wires.get((path, like)) if like and not hasattr(port, "start") else None
             if wire is not None and (path, name) not in units:
                 followers.setdefault((wire.block, wire.port), []).append(((path, name), (path, str(like)), wire))
-    told = list(units)
-    while told:
-        for output, end, wire in followers.get(told.pop(), ()):
+    waiting = list(units)
+    while waiting:
+        for output, end, wire in followers.get(waiting.pop(), ()):
             unit = converted.get(end) or _part_unit(units, wire)
             if unit is not None:
                 units[output] = unit
-                told.append(output)
+                waiting.append(output)
     return units
 
 
@@ -55,7 +55,7 @@ def check_units(table: Structure) -> dict[Port, Unit]:
     """
     units = follow_units(table, {})
     for path, block in sorted(table.blocks.items()):
-        beside: tuple[Wire, Unit] | None = None
+        first: tuple[Wire, Unit] | None = None
         for name, spec in block.inputs.items():
             wire = table.wires.get((path, name))
             unit = None if wire is None else _part_unit(units, wire)
@@ -63,9 +63,9 @@ def check_units(table: Structure) -> dict[Port, Unit]:
                 continue
             expected, relation = spec.unit, "expected"
             if block.same_units:
-                if beside is None:
-                    beside = (wire, unit)
-                expected, relation = beside[1], f"{beside[0]} beside it is"
+                if first is None:
+                    first = (wire, unit)
+                expected, relation = first[1], f"{first[0]} beside it is"
             a, b = next(_mismatches(unit, expected), ("", ""))
             if a:
                 ends = (block, table.blocks[wire.block])
@@ -83,8 +83,9 @@ def check_units(table: Structure) -> dict[Port, Unit]:
 def add_unit_conversions(table: Structure) -> Structure:
     """Return the structure with a `UnitConversion` in each wire between two units where one of its blocks converts.
 
-    The block stands beside the consumer, and is called ``convert_`` and the names of the consumer and its input. A
-    block whose inputs are all in one unit, such as a sum, takes that of the first input whose source does not convert.
+    The block is in the subsystem of the consumer. It is called ``convert_`` and the names of the consumer and its
+    input. A block whose inputs are all in one unit, such as a sum, takes that of the first input whose source does not
+    convert.
     """
     if not any(block.converts_units for block in table.blocks.values()):
         return table

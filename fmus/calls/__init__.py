@@ -1,13 +1,15 @@
 """FMI calls into a library that is loaded in this process."""
 
-from .bound_calls import BoundCalls, Call, ChildFace, ChildRequest, bind_functions, exported_name, list_prototypes
-from .evaluated_exchange import is_smooth
+from .bound_calls import BoundCalls, Call, ChildFace, ChildRequest
 from .exchange_instance import ExchangeInstance
 from .fmi_calls import ERROR, WARNING, FmiCalls, Log
 from .fmu_block import FmuBlock
 from .instance import FmuInstance
+from .library_functions import bind_functions, exported_name, list_prototypes
 from .loaded_library import CALLS, LoadedFmu, MakeCalls
-from .native_step import NativeAction, NativeLook, NativeStep, QuietStep, RemoteStep, SharedValues
+from .model_structure import is_smooth
+from .native_actions import NativeAction, NativeLook
+from .native_step import NativeStep, QuietStep, RemoteStep, SharedValues
 from .saved_state import FmuState
 from .step_failures import NEAR
 from .step_options import StepOptions, StepTime, check_offered

@@ -4,27 +4,37 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from functools import cached_property, partial
+from itertools import pairwise
 
 import numpy as np
 
-from ...blocks.core import EvaluationVectors, FmuRuntimeError, SimulationError, Wanted
+from ...blocks.core import EvaluationVectors, FmuError, FmuRuntimeError, Layout, Wanted
+from ..archive import ExchangeInfo, FmuVariable
 from ..host_state import HostState
-from .bound_calls import DISCARD, WARNING, BoundCalls, Call, EventUpdate
-from .evaluated_exchange import EvaluatedExchange
-from .evaluation import Evaluation, call_actions
+from .bound_calls import DISCARD, ERROR, FATAL, WARNING, BoundCalls, Call
+from .evaluation import DirectEvaluation, Evaluation, Vector, call_actions
+from .event_calls import EventUpdate
+from .fmi_calls import MOST_ROUNDS
 from .fmu_block import FmuBlock, check_next_time
 from .loaded_library import MakeCalls
-from .native_step import ActionKind, NativeAction, NativeLook, copy_action, transfer_actions
-from .texts import Text, TextRecord
+from .model_structure import check_structure, is_smooth
+from .native_actions import ActionKind, NativeAction, NativeLook, copy_action, transfer_actions
+from .running_fmu import RunningFmu
+from .saved_state import StateFormat
 from .transfer import Transfer, UnfitError
 
-ROUNDS = 100
-"""Rounds of an event iteration."""
+_NOTHING = nullcontext()
 _SAME = 1e-12  # relative change of a continuous input that is no jump
+_UPDATING = "the event iteration"
+_READING = {"get_states": "reading the continuous states", "nominals": "reading the nominal values of the states"}
+_FORMAT = StateFormat(b"lw-fmu-x", "dd", "state of an FMU in model exchange", "those of a run with the same interface")
+"""State in model exchange: its time and the time of the next time event, in s; all inputs go before the FMU's bytes."""
 
 
-class ExchangeInstance(EvaluatedExchange):
+class ExchangeInstance(RunningFmu):
     """Loaded FMU whose continuous states a solver integrates.
 
     After `begin` it is in Continuous-Time Mode. There `evaluation` sets time, states and continuous inputs and gets
@@ -35,6 +45,8 @@ class ExchangeInstance(EvaluatedExchange):
 
     Attributes
     ----------
+    about : ExchangeInfo
+        Model exchange as the FMU's description states it.
     next_time : float
         Time of its next time event in s, infinite without one.
     nominals : ndarray
@@ -42,28 +54,38 @@ class ExchangeInstance(EvaluatedExchange):
     """
 
     def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):
-        super().__init__(block, wired, make_calls=make_calls)
+        super().__init__(block, wired, model_exchange=True, make_calls=make_calls)
+        assert block.exchange_info is not None
+        self.about: ExchangeInfo = block.exchange_info
+        self._ports = dict(block.input_variables)
+        self._places = Layout.of({port: v.shape for port, v in self._ports.items()}).slices
+        self._smooth = {port: v for port, v in self.inputs.items() if is_smooth(v)}
         n = self.about.state_count
-        self._kept = self._allocate(n)
+        order = self.description.state_order
+        self._order = np.array(order if len(order) == n else range(n), dtype=int)
+        self._time = self.fmi.variable(ctypes.c_double)
+        self._x, self._dx, self._kept = (self._allocate(n) for _ in range(3))
+        self._indicators = self._allocate(len(self.about.indicators))
+        self._evaluations: dict[Wanted, Evaluation] = {}
+        self._is_own = self.fmi.in_process and self.is_built_here
+        self._guarded = self.fmi.in_process and not self._is_own
+        self._is_placed = False
+        """Whether a bound evaluation has just set time and states."""
+        self._discarded = ""
+        self._u = np.zeros(0)
+        """Values of all inputs at the last instant that was reached."""
         self.next_time, self.nominals, self._has_odd_nominals = math.inf, np.ones(n), False
-        self.ends_run = False
-        """Whether the FMU has asked to end the simulation (terminateSimulation)."""
-        self._texts = TextRecord(self.fmi, block.text_variables)
         self._events = self.fmi.event_calls()
         self._event: Evaluation | None = None
         self._completion: Evaluation | None = None
         self._bound: dict[tuple[str, int], BoundCalls] = {}
         self._all_inputs: Transfer | None = None
         self._final = True
-        self._limited = any(np.isfinite(side).any() for v in self._wired.values() for side in v.limits)
-        self.is_trial = False
-        """Whether a step may be taken back; an input out of its range is then kept in `refused`, and no error yet."""
-        self.refused: SimulationError | None = None
-        """Error of an input that was out of its range in a trial step."""
+        self._limited = any(np.isfinite(side).any() for v in self.inputs.values() for side in v.limits)
         width = sum(v.size for v in self._ports.values())
         self._least, self._relative = np.full(width, math.inf), np.zeros(width)
         """Least change of each input that is a jump, by itself and relative to the input; infinite without a wire."""
-        for port, variable in self._wired.items():
+        for port, variable in self.inputs.items():
             smooth = _SAME if port in self._smooth else 0.0
             self._least[self._places[port]] = smooth * variable.nominals.ravel()
             self._relative[self._places[port]] = smooth
@@ -73,36 +95,222 @@ class ExchangeInstance(EvaluatedExchange):
         """Time that was set last, in s."""
         return self._time.value if self._running else self._began
 
+    def _allocate(self, n: int) -> np.ndarray:
+        return self.fmi.allocate(n, ctypes.c_double)
+
+    # ---- evaluations ----
+
+    def evaluation(self, wanted: Wanted) -> Callable[[float, np.ndarray, np.ndarray], np.ndarray]:
+        """Return the call ``(t, x, u) -> values`` that gets outputs, then derivatives, then indicators.
+
+        The result is one array, written anew by each call: NaN where the FMU can't compute it there (discard).
+        """
+        found = self._evaluation(wanted)
+
+        def evaluate(t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+            return self._run(found, t, x, u)
+
+        return evaluate
+
+    def _evaluation(self, wanted: Wanted) -> Evaluation:
+        if wanted not in self._evaluations:
+            self._evaluations[wanted] = self._bind(wanted)
+        return self._evaluations[wanted]
+
+    def _bind(self, wanted: Wanted, then: tuple[tuple[Call, str], ...] = (), *, all_inputs: bool = False) -> Evaluation:
+        outputs = {port: self.block.output_variables[port] for port in wanted.outputs}
+        every = wanted.indicators or bool(then) or all_inputs
+        used = {port: v for port, v in self._smooth.items() if every or self._is_needed(port, wanted)}
+        index = [np.arange(self._places[p].start, self._places[p].stop) for p in used]
+        inputs = self._allocate(sum(v.size for v in used.values()))
+        got = self._allocate(sum(v.size for v in outputs.values()))
+        return Evaluation(
+            self.fmi,
+            time=self._time,
+            states=Vector("set_states", self._x),
+            inputs=Transfer(self.fmi, "Set", used, inputs),
+            index=np.concatenate([np.zeros(0, dtype=int), *index]),
+            outputs=Transfer(self.fmi, "Get", outputs, got),
+            derivatives=Vector("derivatives", self._dx),
+            rates=wanted.rates,
+            indicators=Vector("indicators", self._indicators) if wanted.indicators else None,
+            then=then,
+            asked_first=None if self.is_built_here or (then and wanted == Wanted()) else self._asked_first,
+        )
+
+    @cached_property
+    def _asked_first(self) -> Transfer:
+        """Transfer of one variable that is computed, if there is one: to read it lets the FMU compute all of them."""
+        about = self.description
+        states, rates = (list(map(about.find, names)) for names in (about.states, about.states.values()))
+        given = {v.keys for v in states}
+        computed = [
+            v for v in about.variables.values() if v.causality == "output" and is_smooth(v) and v.keys not in given
+        ]
+        read = {v.name: v for v in sorted(computed or rates or states, key=lambda v: v.size)[:1]}
+        return Transfer(self.fmi, "Get", read, self._allocate(sum(v.size for v in read.values())))
+
+    def bound_evaluation(self, wanted: Wanted, vectors: EvaluationVectors, *, again: bool) -> Callable[[], None]:
+        """Return the call that reads and writes these vectors as `evaluation` does its arguments and its result.
+
+        An FMU that Loopwright has built reads and writes these vectors itself. With ``again`` another such call always
+        comes right before it, at the same t and x, which need not be set anew.
+        """
+        plain = self.evaluation(wanted)
+        t, x, u, into = vectors
+
+        def copy() -> None:
+            into[:] = plain(t[0], x, u)
+
+        made = self._bind_direct(wanted, vectors, again=False)
+        if made is None:
+            return copy
+        short = self._bind_direct(wanted, vectors, again=True) if again else None
+
+        def call() -> None:
+            if not self._running:
+                copy()
+                return
+            direct = made if short is None or not self._is_placed else short
+            status, place = direct.run()
+            self._is_placed = status <= WARNING
+            if status:
+                self._x[:] = x
+                self._judge_evaluation(
+                    status, direct.warned if status <= WARNING else [direct.actions[place]], t[0], into
+                )
+
+        return call
+
+    def _bind_direct(self, wanted: Wanted, vectors: EvaluationVectors, *, again: bool) -> DirectEvaluation | None:
+        """Return an evaluation on vectors of the caller's; None where values have to be copied or converted."""
+        outputs = [self.block.output_variables[port] for port in wanted.outputs]
+        used = [port for port in self._places if port in self._smooth]
+        inputs = [port for port in used if wanted.indicators or self._is_needed(port, wanted)]
+        variables = [*outputs, *(self._ports[port] for port in inputs)]
+        places = [self._places[port] for port in inputs]
+        adjoining = all(a.stop == b.start for a, b in pairwise(places))
+        sorted_states = np.array_equal(self._order, np.arange(self._order.size))
+        if not (self._is_own and sorted_states and adjoining and all(v.type == "Float64" for v in variables)):
+            return None
+        return DirectEvaluation(
+            self.fmi,
+            time=self._time,
+            vectors=vectors._replace(u=vectors.u[places[0].start : places[-1].stop] if places else vectors.u[:0]),
+            inputs=[r for port in inputs for r in self._ports[port].references],
+            outputs=[r for v in outputs for r in v.references],
+            rates=wanted.rates,
+            indicators=len(self.about.indicators) if wanted.indicators else 0,
+            again=again,
+        )
+
+    def _is_needed(self, port: str, wanted: Wanted) -> bool:
+        """Whether outputs or rates that are wanted may depend on an input."""
+        unknown = [self.block.output_variables[name] for name in wanted.outputs]
+        if wanted.rates:
+            unknown += [self.description.find(name) for name in self.description.states.values()]
+            if not self.description.states:
+                return True
+        return any(self.about.pattern(of, self._ports[port]).any() for of in unknown)
+
+    def _run(self, made: Evaluation, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        self._x[:] = x[self._order]
+        try:
+            with self.host if self._guarded else _NOTHING:
+                status, action = made.run(t, u, running=self._running)
+        except UnfitError as error:
+            raise self.refuse(error, t) from None
+        if status:
+            self._judge_evaluation(status, [action] if action else made.warned, t, made.result)
+        if status <= WARNING and made.rates is not None:
+            made.result[made.rates_at][self._order] = self._dx
+        return made.result
+
+    def _judge_evaluation(self, status: int, actions: Sequence[str], t: float, into: np.ndarray) -> None:
+        """Note a warning; write NaN where the FMU can't compute a result; raise the error of a status that is worse."""
+        if status <= WARNING:
+            for action in actions:
+                self.log.warn(action, self.fmi.status_name(status), t)
+            return
+        if status != DISCARD:
+            raise self.report(actions[-1], status, t)
+        self._discarded = f"{actions[-1]} at t = {t:.9g} s{self._quote_messages().rstrip('.')}"
+        into[:] = math.nan
+
+    @property
+    def discarded(self) -> str:
+        """The last evaluation that the FMU could not compute; empty if there is none."""
+        return self._discarded
+
+    def slopes(self, ports: Sequence[str], *, rates: bool, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
+        """Return the derivative of an `evaluation` by (x, u); None if the FMU computes no directional derivatives.
+
+        Those of local variables may not be asked for (FMI 2.0, 2.1.9; FMI 3.0, 2.2.11). Those of states are known; some
+        FMUs say that they are zero.
+        """
+        about = self.description
+        if not self.about.has_derivatives or (self._x.size and not about.states):
+            return None
+        outputs = [self.block.output_variables[port] for port in ports]
+        states = [about.find_state(v) for v in outputs]
+        asked = [
+            v.type == "Float64" and state is None and about.has_slopes(v)
+            for v, state in zip(outputs, states, strict=True)
+        ]
+        if any(
+            v.type == "Float64" and not a and name is None for v, a, name in zip(outputs, asked, states, strict=True)
+        ):
+            return None
+        self.evaluation(Wanted(tuple(ports), rates))(t, x, u)
+        unknown = [*outputs, *(about.find(name) for name in about.states.values() if rates)]
+        asked += [True] * (len(unknown) - len(asked))
+        smooth = [v for v, is_asked in zip(unknown, asked, strict=True) if is_asked]
+        parts = (np.full(v.size, is_asked) for v, is_asked in zip(unknown, asked, strict=True))
+        rows = np.concatenate([np.zeros(0, dtype=bool), *parts])
+        J = np.zeros((rows.size, x.size + u.size))
+        first, where = 0, about.layout(about.states).slices
+        for v, name in zip(outputs, states, strict=True):
+            if name is not None:
+                J[first : first + v.size, where[name]] = np.eye(v.size)
+            first += v.size
+        column = 0
+        known = [(about.find(name), True) for name in about.states]
+        known += [(v, port in self._smooth and v.type == "Float64") for port, v in self._ports.items()]
+        references = [r for v in smooth for r in v.references]
+        count = sum(v.size for v in smooth)
+        for variable, moves in known:
+            for k in range(variable.size):
+                if moves and count:
+                    refs, seed = seeds(variable, k)
+                    purpose = f"the directional derivative by {variable.name}"
+                    J[rows, column] = self.call(purpose, self.fmi.directional_derivative, references, refs, seed, count)
+                column += 1
+        return J
+
     # ---- the start ----
 
     def exchange(self, u: np.ndarray) -> np.ndarray:
         """In Initialization Mode: set the inputs, and return the continuous states that follow."""
         self._u = u.copy()
-        status = self._fill(u, self._began).set() if self._wired else 0
-        self._check("setting the inputs", status, self._began)
+        status = self._fill(u, self._began).set() if self.inputs else 0
+        self.judge("setting the inputs", status, self._began)
         return self._get("get_states")
 
     def begin_exchange(self) -> np.ndarray:
         """Leave Initialization Mode, settle the events at the start, and return the continuous states."""
         if self._limited:
-            self._check_limits(self._fill(self._u, self._began), self._began)
+            self.check_limits(self._fill(self._u, self._began), self._began)
         self.begin()
         self._time.value = self._began
-        x = self._iterate(self._began, self._events.first())
+        x = self._iterate(self._began, self.fmi.initialized)
         self.nominals = self._read_nominals()
-        for text in self.call("reading its texts", self._texts.go_back, self._began):
-            self.add_note(text)
-        self._check_structure(self._began, x, self._u)
+        self.begin_texts(self._began)
+
+        def evaluation(wanted: Wanted) -> Callable[[float, np.ndarray, np.ndarray], np.ndarray]:
+            return partial(self._run, self._bind(wanted, all_inputs=True))
+
+        check_structure(self, self.about, self._places, evaluation, self._began, x, self._u)
         return x
-
-    @property
-    def texts(self) -> Mapping[str, list[tuple[float, Text]]]:
-        """Texts and binary data by port: each value with the time in s from which on it held."""
-        return self._texts.values
-
-    def _note_texts(self, t: float) -> None:
-        if self._texts.variables:
-            self.call("reading its texts", self._texts.note, t)
 
     def _read_nominals(self) -> np.ndarray:
         """Return the states' nominal values; 1 stands in for a value that is 0 or no number."""
@@ -121,7 +329,7 @@ class ExchangeInstance(EvaluatedExchange):
         made = np.zeros(self._x.size)
         bound = self._bind_reading(quantity, *then)
         if bound.calls:
-            self._check(_READING[quantity], bound.run(), self.t)
+            self.judge(_READING[quantity], bound.run(), self.t)
         if made.size:
             made[self._order] = self._kept
         return made
@@ -140,16 +348,16 @@ class ExchangeInstance(EvaluatedExchange):
     def _fill(self, u: np.ndarray, t: float) -> Transfer:
         """Return the transfer of all wired inputs, discrete ones too, with their values."""
         if self._all_inputs is None:
-            vector = self._allocate(sum(v.size for v in self._wired.values()))
-            self._all_inputs = Transfer(self.fmi, "Set", self._wired, vector)
+            vector = self._allocate(sum(v.size for v in self.inputs.values()))
+            self._all_inputs = Transfer(self.fmi, "Set", self.inputs, vector)
         inputs = self._all_inputs
-        if self._wired:
-            inputs.vector[:] = np.concatenate([u[self._places[port]] for port in self._wired])
+        if self.inputs:
+            inputs.vector[:] = np.concatenate([u[self._places[port]] for port in self.inputs])
         try:
             for group in inputs.groups:
                 group.check_and_fill(inputs.vector)
         except UnfitError as error:
-            raise self._unfit(error, t) from None
+            raise self.refuse(error, t) from None
         return inputs
 
     # ---- events ----
@@ -162,12 +370,12 @@ class ExchangeInstance(EvaluatedExchange):
     def handle_event(self, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Go through Event Mode at an instant, and return the continuous states after it."""
         inputs = self._fill(u, t)
-        self._check_limits(inputs, t)
+        self.check_limits(inputs, t)
         event = self._event_evaluation(inputs)
         self._u, self._discarded = u.copy(), ""
         self._run(event, t, x, u)
         self._check_computed(t)
-        return self._iterate(t, self._events.updated())
+        return self._iterate(t, self._events.answers.updated())
 
     def _event_evaluation(self, inputs: Transfer) -> Evaluation:
         """Return the calls that go into Event Mode, with all inputs, for a first round."""
@@ -186,20 +394,10 @@ class ExchangeInstance(EvaluatedExchange):
             self._completion = self._bind(Wanted(), ((self._events.complete, "completing a step"),))
         return self._completion
 
-    def _check_limits(self, inputs: Transfer, t: float) -> None:
-        """Refuse inputs out of the range that the FMU states, in a trial step only if it is accepted."""
-        try:
-            inputs.check_limits()
-        except UnfitError as error:
-            refused = self._unfit(error, t)
-            if not self.is_trial:
-                raise refused from None
-            self.refused = self.refused or refused
-
     def _check_computed(self, t: float) -> None:
         """Refuse an instant that the solver has reached, and that the FMU can't compute."""
         if self._discarded:
-            raise self._error(f"{self._discarded}, where the solver has arrived:", DISCARD, t)
+            raise self.report(f"{self._discarded}, where the solver has arrived:", DISCARD, t)
 
     def _bind_update(self) -> BoundCalls:
         key = ("update", 1)
@@ -207,20 +405,13 @@ class ExchangeInstance(EvaluatedExchange):
             self._bound[key] = self.fmi.bind([self._events.update])
         return self._bound[key]
 
-    def _check(self, action: str, status: int, t: float) -> None:
-        """Note a warning, once for each action; raise the error of a status that is worse."""
-        if not 0 <= status <= WARNING:
-            raise self._error(action, status, t)
-        if status:
-            self.log.warn(action, self.fmi.status_name(status), t)
-
     def _iterate(self, t: float, made: EventUpdate | None = None) -> np.ndarray:
         """Update the discrete states until they settle, and return to Continuous-Time Mode."""
         calls, nominals = self._events, False
-        for _ in range(ROUNDS):
+        for _ in range(MOST_ROUNDS):
             if made is None:
-                self._check(_UPDATING, self._bind_update().run(), t)
-                made = calls.updated()
+                self.judge(_UPDATING, self._bind_update().run(), t)
+                made = calls.answers.updated()
             nominals |= made.nominals_changed
             if made.terminate:
                 self._note_end(t, "in Event Mode")
@@ -234,12 +425,12 @@ class ExchangeInstance(EvaluatedExchange):
         x = self._get("get_states", *([] if calls.leave is None else [calls.leave]))
         if nominals:
             self.nominals = self._read_nominals()
-        self._note_texts(t)
+        self.note_texts(t)
         return x
 
     def _unsettled(self, t: float) -> FmuRuntimeError:
         return FmuRuntimeError(
-            f"its discrete states don't settle at t = {t:.9g} s: after {ROUNDS} rounds of the event iteration it "
+            f"its discrete states don't settle at t = {t:.9g} s: after {MOST_ROUNDS} rounds of the event iteration it "
             f"still asks for another one{self._quote_messages()} Report it to its makers, or change the inputs there.",
             block=self.block.label,
             t=t,
@@ -248,24 +439,24 @@ class ExchangeInstance(EvaluatedExchange):
     def accept(self, t: float, x: np.ndarray, u: np.ndarray) -> bool:
         """Note an instant that the solver has reached; return whether the FMU wants an event there (step event)."""
         if self._limited:
-            self._check_limits(self._fill(u, t), t)
-        discrete = [port for port in self._wired if port not in self._smooth]
+            self.check_limits(self._fill(u, t), t)
+        discrete = [port for port in self.inputs if port not in self._smooth]
         kept = {port: self._u[self._places[port]].copy() for port in discrete}
         self._u, self._discarded = u.copy(), ""
         changed = False
         for port, values in kept.items():  # they are taken over by an event alone
             changed |= not np.array_equal(values, u[self._places[port]])
             self._u[self._places[port]] = values
-        if self._texts.variables:
+        if self.record.variables:
             self.evaluation(Wanted())(t, x, u)
-            self._note_texts(t)
+            self.note_texts(t)
         if not self.about.completes_steps:
             return changed
         completion = self._step_evaluation()
         self._events.final.value = self._final
         self._run(completion, t, x, u)
         self._check_computed(t)
-        wants, terminate = self._events.completed()
+        wants, terminate = self._events.answers.completed()
         if terminate:
             self._note_end(t, "after a step of the solver")
         return wants or changed
@@ -276,13 +467,86 @@ class ExchangeInstance(EvaluatedExchange):
             self.ends_run = True
             self.add_note(f"it asks to end the simulation at t = {t:.9g} s, {place} (terminateSimulation)")
 
+    # ---- saved states ----
+
+    @property
+    def can_serialize(self) -> bool:
+        """Whether its state can be turned into bytes."""
+        return self.about.can_serialize
+
+    def serialize(self) -> bytes:
+        """Return its complete state.
+
+        Raises
+        ------
+        FmuError
+            If the FMU can't serialize its state (`can_serialize`).
+        FmuRuntimeError
+            If the FMU's function fails.
+        """
+        self._check_can()
+        self._final = False
+        handle = self.call("saving its state", self.fmi.save_state)
+        try:
+            data = self.call("serializing its state", self.fmi.serialize_state, handle)
+        finally:
+            self.free_state(handle)
+        data = self._u.astype("<f8").tobytes() + bytes(data)
+        return _FORMAT.pack(self.description.digest, self.t, self.next_time, data=data)
+
+    def restore_bytes(self, data: bytes) -> None:
+        """Go to a state that `serialize` has returned.
+
+        Raises
+        ------
+        FmuError
+            If the bytes are no state of this FMU in model exchange on this platform.
+        FmuRuntimeError
+            If the FMU's function fails.
+        """
+        self._check_can()
+        n = 8 * sum(v.size for v in self._ports.values())
+        (t, next_time), rest = _FORMAT.unpack(data, self.description.digest, self.block.label, least=n)
+        u, rest = np.frombuffer(rest[:n], "<f8").copy(), rest[n:]
+        handle = self.call("reading a serialized state", self.fmi.deserialize_state, rest)
+        try:
+            self.call("restoring its state", self.fmi.set_state, handle)
+        finally:
+            self.free_state(handle)
+        self.failed, self._running, self._final, self.ends_run = False, True, False, False
+        self._u, self.next_time, self._time.value = u, next_time, t
+
+    def _check_can(self) -> None:
+        if self.can_serialize:
+            return
+        flag = self.description.state_flags[1 if self.about.can_save else 0]
+        raise FmuError(
+            f"its state can't be turned into bytes: {flag} is false for model exchange in the FMU's description. "
+            "Export it with that capability, or run again from the start.",
+            block=self.block.label,
+        )
+
+    # ---- errors ----
+
+    def report(self, action: str, status: int, t: float) -> FmuRuntimeError:
+        """Return the error of an action that has failed with a status."""
+        self.failed, self.fatal = status >= ERROR, status >= FATAL
+        u = ", ".join(f"{port} = {self._u[self._places[port]].tolist()}" for port in self.inputs)
+        return FmuRuntimeError(
+            f"{action} failed with {self.fmi.status_name(status)} at t = {t:.9g} s{self._quote_messages()} Its states "
+            f"were {self._x.tolist()}, its inputs at the last step {u or 'none'}. Look at the last samples of "
+            "error.run, or check its inputs and start values.",
+            block=self.block.label,
+            t=t,
+        )
+
     # ---- for a loop in C ----
 
     def find_native_obstacle(self) -> str | None:
         """Return why a loop in C can't evaluate it; None if it can."""
         if not self.fmi.in_process and self._bind_update().request is None:
             return "runs in a process of its own, for which C can't wait on this system"
-        if self._texts.variables:
+        if self.record.variables:
             return "has outputs of texts, which are recorded at each step"
         return None
 
@@ -294,17 +558,16 @@ class ExchangeInstance(EvaluatedExchange):
         """Return `accept` and `handle_event` as actions of C, at what stands in t, x and u; states are written."""
         inputs, take = self._fill(self._u, self.t), ActionKind.TAKE
         u, without_result = vectors.u, vectors._replace(into=np.zeros(0))
-        index = np.concatenate([np.zeros(0, int), *(np.arange(s.start, s.stop) for s in map(self._place, self._wired))])
+        index = np.concatenate([np.zeros(0, int), *(np.arange(s.start, s.stop) for s in map(self._place, self.inputs))])
         enter = [*transfer_actions(inputs, u, index, take)]
         enter += self._event_evaluation(inputs).native(without_result, self._order)
         complete = self._step_evaluation().native(without_result, self._order) if self.about.completes_steps else []
         calls = self._events
-        assert calls.answers is not None
         states = self._bind_reading("get_states", *([] if calls.leave is None else [calls.leave]))
         leave = call_actions(states, [_READING["get_states"]] * len(states.calls))
         low, high, discrete = np.full(u.size, -math.inf), np.full(u.size, math.inf), np.zeros(u.size, dtype=bool)
-        low[index], high[index] = inputs.bounds
-        for port in self._wired:
+        low[index], high[index] = inputs.limits
+        for port in self.inputs:
             discrete[self._places[port]] = port not in self._smooth
         return NativeLook(
             complete,
@@ -355,13 +618,16 @@ class ExchangeInstance(EvaluatedExchange):
     def judge_native(self, action: str, status: int, t: float) -> None:
         """Raise the error of a call of C that has failed; without a status, of an event that has no end or no time."""
         if not status:
-            check_next_time(self.block, self._events.updated().next_time, t)
+            check_next_time(self.block, self._events.answers.updated().next_time, t)
             raise self._unsettled(t)
         if status != DISCARD:
-            raise self._error(action, status, t)
-        self._judge(status, [action], t, np.zeros(0))
+            raise self.report(action, status, t)
+        self._judge_evaluation(status, [action], t, np.zeros(0))
         self._check_computed(t)
 
 
-_UPDATING = "the event iteration"
-_READING = {"get_states": "reading the continuous states", "nominals": "reading the nominal values of the states"}
+def seeds(variable: FmuVariable, k: int) -> tuple[list[int], list[float]]:
+    """Return value references and seeds that move one element of a variable."""
+    if len(variable.references) == variable.size:
+        return [variable.references[k]], [1.0]
+    return list(variable.references), np.eye(variable.size)[k].tolist()

@@ -1,39 +1,69 @@
-"""The face that both versions of FMI show to an instance: what differs between them is behind it."""
+"""Functions of an FMU's library for one instance, for all versions of FMI.
+
+What differs between versions in names and in the shapes of arguments stands in a table, `FmiVersion`; what an instance
+has to be told otherwise, in the class of a version.
+"""
 
 from __future__ import annotations
 
 import ctypes
+import math
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
 from ...blocks.core import FmuProcessError
-from .bound_calls import (
-    DISCARD,
-    ERROR,
-    FATAL,
-    PENDING,
-    STATUS,
-    WARNING,
-    BoundCalls,
-    Call,
-    EventCalls,
-    EventUpdate,
-    allow_missing,
-    exported_name,
-)
+from .bound_calls import DISCARD, ERROR, FATAL, PENDING, STATUS, WARNING, BoundCalls, Call
+from .event_calls import EventCalls, EventUpdate
+from .library_functions import allow_missing, exported_name
+from .printf import Logger, format_message
 
 __all__ = ["DISCARD", "ERROR", "FATAL", "PENDING", "STATUS", "WARNING", "FmiCalls"]
 
+_LONGEST_WAIT = 0.01
+"""Longest time in s between two looks at a step that is pending."""
+_STEP_STATUS, _LAST_SUCCESSFUL_TIME, _TERMINATED = 0, 2, 3
+"""What a step is asked for: fmi2DoStepStatus, fmi2LastSuccessfulTime, fmi2Terminated, and the same of FMI 1.0."""
 MOST_ROUNDS = 100
 """Rounds of an event iteration before an error."""
 Log = Callable[[int, str], None]
 """Takes the status and the text of a message."""
 C = TypeVar("C")
+
+
+def call_error_type() -> type[Exception]:
+    """Return FMPy's class of errors of functions that fail."""
+    from fmpy.fmi1 import FMICallException
+
+    return FMICallException  # type: ignore[no-any-return]
+
+
+def call_error(function: str, status: int) -> Exception:
+    """Return FMPy's error of a function that has failed."""
+    error: Any = call_error_type()
+    return error(function=function, status=ctypes.c_int(status).value)  # type: ignore[no-any-return]
+
+
+def make_callbacks(prefix: str, log: Log) -> tuple[Any, Any]:
+    """Return the callbacks of an instance before FMI 3.0, and its logger, to be kept; memory is the C library's."""
+    import fmpy
+
+    def message(environment: Any, name: Any, status: int, category: Any, text: bytes | None, *arguments: Any) -> None:
+        if status:  # the others are not kept
+            log(status, format_message(text or b"", arguments))
+
+    module, logger = import_module(f"fmpy.{prefix}"), Logger(message)
+    callbacks = getattr(module, f"{prefix}CallbackFunctions")()
+    callbacks.logger = ctypes.cast(logger, getattr(module, f"{prefix}CallbackLoggerTYPE"))
+    callbacks.allocateMemory = getattr(module, f"{prefix}CallbackAllocateMemoryTYPE")(fmpy.calloc)
+    callbacks.freeMemory = getattr(module, f"{prefix}CallbackFreeMemoryTYPE")(fmpy.free)
+    return callbacks, logger
 
 
 @dataclass(frozen=True)
@@ -43,6 +73,41 @@ class TypeCalls:
     suffix: str
     """End of the functions' names, such as ``Float64``."""
     ctype: type[Any]
+
+
+@dataclass(frozen=True)
+class FmiVersion:
+    """Names of functions in a version of FMI, and shapes of their arguments."""
+
+    number: int
+    types: Mapping[str, TypeCalls]
+    """Functions by type, as FMI 3.0 names types."""
+    exchange: Mapping[str, str]
+    """Ends of the names of the functions of model exchange that each evaluation calls."""
+    required: tuple[str, ...]
+    """Ends of the names of functions without which an FMU can't run."""
+    final: type[Any]
+    """C type of the argument noSetFMUStatePriorToCurrentPoint of a step; in FMI 1.0 it says that a step is new."""
+    has_sizes: bool = False
+    """Whether functions of values take their number as the last argument."""
+    reports_step: bool = False
+    """Whether a step reports events, its end and early return; else it may be pending, and is asked for its end."""
+    states: str = "FMUstate"
+    """End of the names of the functions of saved states."""
+    update: str = ""
+    """FMPy's method that takes a round of the event iteration in Event Mode."""
+    required_of_models: tuple[str, ...] | None = None
+    """The required functions in model exchange, where they are others."""
+
+    @property
+    def prefix(self) -> str:
+        """Prefix of the names of functions and statuses: ``fmi2``, say."""
+        return f"fmi{self.number}"
+
+    def kind(self, *, model_exchange: bool) -> Any:
+        """Return FMPy's class for the functions of a library."""
+        module = import_module(f"fmpy.{self.prefix}")
+        return getattr(module, f"FMU{self.number}{'Model' if model_exchange else 'Slave'}")
 
 
 @dataclass
@@ -70,17 +135,26 @@ class FmiCalls(ABC):
         FMPy's object for the library.
     """
 
-    prefix: ClassVar[str]  # of the names of functions and statuses: ``fmi2``, say
-    types: ClassVar[dict[str, TypeCalls]]
-    """Functions by type, as FMI 3.0 names types."""
+    table: ClassVar[FmiVersion]
     fmu: Any
     freeing = "FreeInstance"  # end of the name of the function that frees an instance
     patience: float = 60.0
     """Longest time in s for which a step may be pending."""
 
-    @abstractmethod
     def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
         """Load a library, of an FMU that is unpacked into a folder; a name is given to the instance."""
+        table, self.is_model = self.table, model_exchange
+        self.prefix, self.types = table.prefix, table.types
+        required = (table.required_of_models if model_exchange else None) or table.required
+        self.fmu = self._open(
+            table.kind(model_exchange=model_exchange),
+            required,
+            guid=token,
+            modelIdentifier=library.stem,
+            unzipDirectory=str(folder),
+            instanceName=name,
+            libraryPath=str(library),
+        )
 
     def _open(self, kind: Any, required: tuple[str, ...], **arguments: Any) -> Any:
         """Return an object of FMPy's class, with its library loaded; see `allow_missing`."""
@@ -107,14 +181,14 @@ class FmiCalls(ABC):
 
     # ---- the life of an instance ----
 
+    initialized: EventUpdate | None = None
+    """What the initialization says of events in model exchange, in FMI 1.0."""
     event_mode_used = False
     """Whether the FMU is told that its events are handled in Event Mode; set it before `instantiate`."""
     early_return_allowed = False
     """Whether the FMU is told that it may end a step early; set it before `instantiate`."""
     intermediate_inputs: tuple[int, ...] = ()
     """Value references of inputs that are set within a step (FMI 3.0, 4.2.2); set them before `instantiate`."""
-    intermediate_status: int = 0
-    """Worst status of setting them."""
 
     def version(self) -> str:
         """Return the version of FMI that the library states; empty if it states none."""
@@ -178,7 +252,8 @@ class FmiCalls(ABC):
 
     def get(self, type_: str, references: Sequence[int], size: int) -> list[Any]:
         """Return the values of variables of one type."""
-        return self._get(self.types[type_].suffix, list(references), size)
+        sizes = (size,) if self.table.has_sizes else ()
+        return list(getattr(self.fmu, f"get{self.types[type_].suffix}")(list(references), *sizes))
 
     def set(self, type_: str, references: Sequence[int], values: Sequence[Any]) -> None:
         """Set the values of variables of one type."""
@@ -205,8 +280,8 @@ class FmiCalls(ABC):
     def _call_with_values(self, name: str, references: Sequence[int], size: int, values: Any) -> None:
         """Call a function of FMPy's object that takes references and values."""
         kept = (ctypes.c_uint * len(references))(*references)
-        length = (size,) if self.prefix == "fmi3" else ()
-        getattr(self.fmu, f"{self.prefix}{name}")(self.fmu.component, kept, len(references), values, *length)
+        sizes = (size,) if self.table.has_sizes else ()
+        getattr(self.fmu, f"{self.prefix}{name}")(self.fmu.component, kept, len(references), values, *sizes)
 
     def enter_configuration_mode(self) -> None:
         """Enter Configuration Mode, in which structural parameters are set (FMI 3.0, 2.3.4)."""
@@ -216,17 +291,14 @@ class FmiCalls(ABC):
         """Leave Configuration Mode."""
         self.fmu.exitConfigurationMode()
 
-    @abstractmethod
-    def _get(self, suffix: str, references: list[int], size: int) -> list[Any]:
-        """Return values by the function with this suffix."""
-
     def value_function(self, verb: str, type_: str) -> Callable[..., int]:
         """Return the C function that gets or sets values of a type; it takes `value_arguments`."""
-        return self._function(f"{self.prefix}{verb}{self.types[type_].suffix}")
+        return self.function(f"{verb}{self.types[type_].suffix}")
 
-    @abstractmethod
     def value_arguments(self, references: Any, count: int, address: int, size: int) -> tuple[Any, ...]:
         """Return the arguments of a `value_function`: a C array of references, and the address of the values."""
+        sizes = (ctypes.c_size_t(size),) if self.table.has_sizes else ()
+        return self.instance_argument, references, ctypes.c_size_t(count), ctypes.c_void_p(address), *sizes
 
     def exported(self, name: str) -> str:
         """Return the name that the library gives to a function."""
@@ -235,19 +307,24 @@ class FmiCalls(ABC):
     text_watch: Callable[..., int] | None = None
     """Function for bound calls that notes whether texts have changed; None in this process, where they are read."""
 
-    def slope_line(self, references: Sequence[int], n: int) -> np.ndarray | None:
-        """Return where inputs' lines within a step stand in memory; None where `set_input_slopes` calls a function."""
-        return None
+    def slopes_call(self, references: Sequence[int], slopes: np.ndarray) -> Call:
+        """Return the call that tells the slopes of inputs within a step, which stand in an array; not in FMI 3.0."""
+        n, kept = slopes.size, (ctypes.c_uint * len(references))(*references)
+        values = (ctypes.c_int * n)(*[1] * n), ctypes.c_void_p(slopes.ctypes.data)
+        return self.function("SetRealInputDerivatives"), (self.instance_argument, kept, ctypes.c_size_t(n), *values)
+
+    def slope_line(self, references: Sequence[int], n: int) -> np.ndarray:
+        """Return start, status, values and slopes of n inputs, which FMI 3.0 sets from there within a step (4.2.2)."""
+        raise NotImplementedError
 
     def function(self, name: str) -> Callable[..., int]:
-        """Return a C function by its name without prefix, for bound calls."""
-        return self._function(f"{self.prefix}{name}")
-
-    def _function(self, name: str) -> Callable[..., int]:
-        """Return a C function without declared arguments, which takes those that are made for it.
+        """Return a C function by its name without prefix, for bound calls: it takes arguments that are made for it.
 
         Its status is unsigned, so that a negative one, which the standard doesn't have, is no success.
         """
+        name = f"{self.prefix}{name}"
+        if name in self.fmu.missing_functions:  # what stands in for it returns an error
+            return getattr(self.fmu.dll, self.exported(name))  # type: ignore[no-any-return]
         function = self.fmu.dll[self.exported(name)]
         function.restype = ctypes.c_uint
         if self._after is not None:
@@ -265,34 +342,98 @@ class FmiCalls(ABC):
     # ---- steps ----
 
     @property
-    @abstractmethod
     def final(self) -> Any:
         """The flag noSetFMUStatePriorToCurrentPoint, as a C value that can be changed."""
+        value = self.variable(self.table.final)
+        value.value = True
+        return value
 
-    @abstractmethod
     def step_call(self, now: ctypes.c_double, width: ctypes.c_double, final: Any) -> StepCall:
-        """Return the function that takes a step from ``now`` over ``width``, both in s."""
+        """Return the function that takes a step from ``now`` over ``width``, both in s (FMI 3.0, 4.2.1)."""
+        flags = self.variable(ctypes.c_bool * 4)  # event, terminate, early return, and one that is never set
+        reached, at = self.variable(ctypes.c_double), ctypes.addressof(flags)
+        reached.value = math.nan
+        reports = (*(ctypes.c_void_p(at + i) for i in range(3)), ctypes.byref(reached))
+        arguments = self.instance_argument, now, width, final, *(reports if self.table.reports_step else ())
+        any_flag = ctypes.c_uint32.from_buffer(flags)
+        return StepCall(self.function("DoStep"), arguments, any_flag, flags, reached)
 
-    @abstractmethod
     def end_step(self, status: int) -> tuple[int, bool]:
         """Return the status with which a step has ended, and whether the FMU asks to end the simulation.
 
-        It waits for a step that is pending.
+        In FMI 3.0 flags ask for the end, and no step is ever pending. Before, one that is pending is waited for, up to
+        `patience`; a discarded one is asked whether it is the end (FMI 1.0, 3.4; FMI 2.0, 4.2.2 and 4.2.3). An FMU of
+        FMI 1.0.0 doesn't know that question, and others may not answer it.
         """
-
-    @abstractmethod
-    def do_step(self, t: float, h: float, final: bool) -> bool:
-        """Take a step from t over h, both in s; return whether it ended early or asks to end the simulation."""
+        if self.table.reports_step:
+            return status, False
+        wait, end = 1e-5, time.monotonic() + self.patience
+        while status == PENDING and time.monotonic() < end:
+            time.sleep(wait)
+            wait = min(2 * wait, _LONGEST_WAIT)
+            status = int(self._ask_step("getStatus", _STEP_STATUS))
+        if status != DISCARD:
+            return status, False
+        try:
+            return status, self._ask_step("getBooleanStatus", _TERMINATED) not in (False, b"\0")
+        except call_error_type():
+            return status, False
 
     def time_after_discard(self, t: float, h: float) -> float | None:
-        """Return the time in s at which the FMU stands after a step from t over h was discarded; None if unknown."""
-        return t
+        """Return the time in s at which the FMU stands after a step from t over h was discarded; None if unknown.
 
-    def set_input_slopes(
-        self, t: float, references: Sequence[int], inputs: Sequence[float], slopes: Sequence[float]
-    ) -> None:
-        """Let real inputs go on from their elements' values at t, in s, with slopes within the step from there."""
-        self.fmu.setRealInputDerivatives(list(references), [1] * len(references), list(slopes))
+        In FMI 3.0 it is where it was; before, it says so by lastSuccessfulTime (FMI 1.0, 3.6; FMI 2.0, 4.2.3).
+        """
+        if self.table.reports_step:
+            return t
+        try:
+            found = float(self._ask_step("getRealStatus", _LAST_SUCCESSFUL_TIME))
+        except call_error_type():
+            return None
+        return min(max(found, t), t + h) if t - 1e-9 * h <= found <= t + h * (1.0 + 1e-9) else None
+
+    def _ask_step(self, question: str, kind: int) -> Any:
+        """Return the answer to one of FMPy's questions on the last step; those of FMI 1.0 are C values."""
+        found = getattr(self.fmu, question)(kind)
+        return getattr(found, "value", found)
+
+    def do_step(self, t: float, h: float, final: bool) -> bool:
+        """Take a step from t over h, both in s, by itself, with its events, if any.
+
+        Returns
+        -------
+        bool
+            Whether it ended early or asks to end the simulation.
+        """
+        now, width, flag, call = self._bare_step
+        end, flag.value = t + h, final
+        for _ in range(MOST_ROUNDS):
+            now.value, width.value, call.any_flag.value = t, h, 0
+            status, ends = self.end_step(call.function(*call.arguments))
+            if ends:
+                return True
+            if status > WARNING:
+                raise call_error(f"{self.prefix}DoStep", status)
+            event, terminate, early, _ = call.flags
+            if event and self.event_mode_used and not terminate:
+                self.enter_event_mode()
+                self.settle_events()
+            if terminate or not early or not self.early_return_allowed:
+                return bool(terminate or early)
+            t, h = call.reached.value, end - call.reached.value
+            if h <= 1e-9 * (end - t + h):
+                return False
+        return True
+
+    @property
+    def _bare_step(self) -> tuple[ctypes.c_double, ctypes.c_double, Any, StepCall]:
+        """Time, length and flag of a step, and its call; made once for an instance."""
+        if self._made_step is None or self._made_step[0] != self.fmu.component:
+            now, width, flag = self.variable(ctypes.c_double), self.variable(ctypes.c_double), self.final
+            self._made_step = self.fmu.component, (now, width, flag, self.step_call(now, width, flag))
+        return self._made_step[1]
+
+    _made_step: tuple[Any, tuple[ctypes.c_double, ctypes.c_double, Any, StepCall]] | None = None
 
     def enter_step_mode(self) -> None:
         """Go back from Event Mode to Step Mode (FMI 3.0, 4.2.1)."""
@@ -307,7 +448,7 @@ class FmiCalls(ABC):
             If it does not end.
         """
         for _ in range(MOST_ROUNDS):
-            if not self.update_discrete_states():
+            if not self.update_events().again:
                 self.enter_step_mode()
                 return
         raise RuntimeError(f"the events don't settle in {MOST_ROUNDS} rounds")
@@ -324,6 +465,10 @@ class FmiCalls(ABC):
         return list(zip(intervals, qualifiers, strict=True))
 
     # ---- saved states and derivatives ----
+
+    def save_call(self, handle: ctypes.c_void_p) -> Call:
+        """Return the call that saves the state into a handle, in the memory that the handle has from before, if any."""
+        return self.function(f"Get{self.table.states}"), (self.instance_argument, ctypes.byref(handle))
 
     def save_state(self) -> Any:
         """Return the handle of a copy of the instance's memory."""
@@ -345,43 +490,38 @@ class FmiCalls(ABC):
         """Return the handle of a state that was made from bytes."""
         return self.fmu.deserializeFMUState(data)
 
-    @abstractmethod
     def directional_derivative(
         self, unknowns: Sequence[int], knowns: Sequence[int], seed: Sequence[float], size: int
     ) -> list[float]:
-        """Return the change of unknowns by a change of knowns, by their references."""
+        """Return the change of unknowns by one of knowns, by their references (FMI 2.0, 2.1.9; FMI 3.0, 2.2.11)."""
+        sizes = (size,) if self.table.has_sizes else ()
+        return list(self.fmu.getDirectionalDerivative(list(unknowns), list(knowns), list(seed), *sizes))
 
     # ---- model exchange ----
-
-    exchange_names: ClassVar[dict[str, str]]
-    """Ends of the names of the functions of model exchange that each evaluation calls."""
 
     def exchange_function(self, name: str) -> Callable[..., int]:
         """Return the C function "set_time", which takes the instance and a time, or one of vectors of float64.
 
         These take instance, address and length: "set_states", "get_states", "derivatives", "indicators", "nominals".
         """
-        return self._function(f"{self.prefix}{self.exchange_names[name]}")
+        return self.function(self.table.exchange[name])
 
     @property
     def instance_argument(self) -> ctypes.c_void_p:
         """The instance, as an argument of C functions."""
         return ctypes.c_void_p(self.fmu.component)
 
-    @abstractmethod
-    def update_discrete_states(self) -> bool:
-        """Take a round of the event iteration; return whether another one is needed."""
-
-    @abstractmethod
     def update_events(self) -> EventUpdate:
-        """Take a round of the event iteration, and return what it says."""
+        """Take a round of the event iteration, and return what it says (FMI 2.0, 3.2.2; FMI 3.0, 2.3.5)."""
+        again, terminate, nominals, _, defined, t = getattr(self.fmu, self.table.update)()
+        return EventUpdate(bool(again), bool(terminate), bool(nominals), t if defined else math.inf)
 
     def event_calls(self) -> EventCalls:
         """Return the functions of events in model exchange, with memory of their own."""
         raise NotImplementedError
 
     def _mode_call(self, name: str) -> Call:
-        return self._function(f"{self.prefix}{name}"), (self.instance_argument,)
+        return self.function(name), (self.instance_argument,)
 
     def enter_event_mode(self) -> None:
         """Enter Event Mode."""
@@ -397,7 +537,7 @@ class FmiCalls(ABC):
 
     def state_derivatives(self, n: int) -> np.ndarray:
         """Return the derivatives of the n continuous states, in the FMU's order."""
-        made, name = (ctypes.c_double * n)(), self.exchange_names["derivatives"]
+        made, name = (ctypes.c_double * n)(), self.table.exchange["derivatives"]
         getattr(self.fmu, name[0].lower() + name[1:])(made, n)
         return np.array(made)
 

@@ -20,7 +20,7 @@ from ...blocks.core import (
     near,
 )
 from ..archive import FmuFault, FmuVariable, inexact, unpack
-from ..host_state import FOLDER, HostState, guard_host
+from ..host_state import FOLDER, HostState
 from ..platform import is_built_here
 from .evaluation import order_questions
 from .fmi1 import Fmi1Calls
@@ -29,10 +29,9 @@ from .fmi3 import Fmi3Calls
 from .fmi_calls import FATAL, FmiCalls
 from .fmu_block import FmuBlock
 from .message_log import MessageLog, clean_text, describe_end
-from .shared_steps import SharedReading
 from .step_options import choose_modes
 from .texts import is_readable, list_limits, read_text, waits_for_initialization, write_text
-from .transfer import BoundStart, is_kept
+from .transfer import BoundReading, BoundStart, is_kept
 
 CALLS: dict[str, type[FmiCalls]] = {"1": Fmi1Calls, "2": Fmi2Calls, "3": Fmi3Calls}
 """Functions by the major version of FMI."""
@@ -72,7 +71,7 @@ class LoadedFmu:
                     library=files / (description.model_exchange_binary if model_exchange else description.binary),
                     model_exchange=model_exchange,
                 )
-                self._fmu, self.fmi.lose, self._reading = self.fmi.fmu, self.lose, SharedReading(self.fmi)
+                self._fmu, self.fmi.lose, self._reading = self.fmi.fmu, self.lose, BoundReading(self.fmi)
                 if self.fmi.in_process and not self.is_built_here:
                     self.fmi.settle_by(self.host.settle)
                 self._check_version()
@@ -151,7 +150,6 @@ class LoadedFmu:
 
     # ---- initialization ----
 
-    @guard_host
     def initialize(
         self, stop_time: float | None, *, start_time: float = 0.0, values: Mapping[str, np.ndarray] | None = None
     ) -> None:
@@ -167,25 +165,26 @@ class LoadedFmu:
         values : mapping of str to array, optional
             Further start values, by the FMU's names; they override the block's.
         """
-        self._began, self._start = start_time, None
-        given = self._given = {**self.block.start, **(values or {})}
-        try:
-            self._configure(given)
-            tolerance, stop = self.block.stepping.tolerance, self.block.stepping.stop_time
-            stop_time = stop if stop_time is None else stop_time
-            self.fmi.set_up(start_time, stop_time, tolerance)
-            in_mode = {n: v for n, v in given.items() if waits_for_initialization(self.description, n)}
-            early = {n: v for n, v in given.items() if n not in (*self.description.structural, *in_mode)}
-            self.set_values(early)
-            self.fmi.enter_initialization_mode(start_time, stop_time, tolerance)
-            self.set_values(in_mode)
-            lost = self._find_lost(given)
-            if lost:  # some tools' FMUs drop parameters that are set before this mode
-                self.set_values(lost)
-                lost = self._find_lost(lost)
-        except Exception as error:
-            raise self._initialization_error(error) from error
-        self._refuse_lost(lost, "")
+        with self.host:
+            self._began, self._start = start_time, None
+            given = self._given = {**self.block.start, **(values or {})}
+            try:
+                self._configure(given)
+                tolerance, stop = self.block.stepping.tolerance, self.block.stepping.stop_time
+                stop_time = stop if stop_time is None else stop_time
+                self.fmi.set_up(start_time, stop_time, tolerance)
+                in_mode = {n: v for n, v in given.items() if waits_for_initialization(self.description, n)}
+                early = {n: v for n, v in given.items() if n not in (*self.description.structural, *in_mode)}
+                self.set_values(early)
+                self.fmi.enter_initialization_mode(start_time, stop_time, tolerance)
+                self.set_values(in_mode)
+                lost = self._find_lost(given)
+                if lost:  # some tools' FMUs drop parameters that are set before this mode
+                    self.set_values(lost)
+                    lost = self._find_lost(lost)
+            except Exception as error:
+                raise self._initialization_error(error) from error
+            self._refuse_lost(lost, "")
 
     def _refuse_lost(self, lost: Mapping[str, Any], moment: str) -> None:
         for name, value in lost.items():
@@ -244,7 +243,7 @@ class LoadedFmu:
             self.call("resetting it", self.fmi.reset)
         else:
             self.call("making it anew", self.fmi.renew, self.log.take, self._running and not self.failed)
-            self._reading = SharedReading(self.fmi)
+            self._reading = BoundReading(self.fmi)
         self.failed = self._running = False
 
     def begin(self) -> None:
@@ -412,24 +411,24 @@ class LoadedFmu:
 
     # ---- the end ----
 
-    @guard_host
     def close(self) -> None:
         """Terminate and free the instance; what fails then is noted, as the run is complete."""
         if not self._open:
             return
         self._open = False
         _OPEN.discard(self)
-        try:
-            if self.fatal:  # nothing may be called any more, not even to free it (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3)
-                return
-            if self._running and not self.failed:
-                self._end_by(self.fmi.terminate)
-            if not self.fatal:
-                self._end_by(self.fmi.free_instance)
-        finally:
-            if lines := self.fmi.read_printed():
-                self.add_note(f"it printed, in its own process: {clean_text(' / '.join(lines))}")
-            self.fmi.end()
+        with self.host:
+            try:
+                if self.fatal:  # nothing may be called any more, not even to free it (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3)
+                    return
+                if self._running and not self.failed:
+                    self._end_by(self.fmi.terminate)
+                if not self.fatal:
+                    self._end_by(self.fmi.free_instance)
+            finally:
+                if lines := self.fmi.read_printed():
+                    self.add_note(f"it printed, in its own process: {clean_text(' / '.join(lines))}")
+                self.fmi.end()
 
     def _end_by(self, function: Callable[[], None]) -> None:
         try:

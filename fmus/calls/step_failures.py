@@ -1,23 +1,19 @@
-"""Failures of a communication step: their errors, and steps that are taken again in parts."""
+"""Failures of a communication step: what is wrong with its inputs, its end and its outputs, and their errors."""
 
 from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ...blocks.core import FmuRuntimeError
-from ..archive import FmuVariable
-from .fmi_calls import DISCARD, ERROR, FATAL, PENDING, WARNING, StepCall
-from .loaded_library import LoadedFmu
-from .native_step import RemoteStep
-from .shared_steps import QuietSteps, SharedSteps
-from .stepped_instance import SteppedInstance
-from .stepping import CarefulSteps
-from .texts import TextRecord, TextWatch
-from .transfer import OutOfRangeError, Transfer, UnfitError
+from ...blocks.core import FmuProcessError, FmuRuntimeError
+from .fmi_calls import DISCARD, ERROR, FATAL, PENDING, StepCall
+from .fmu_block import FmuBlock
+from .loaded_library import MakeCalls
+from .saved_state import FmuState, SavingFmu
+from .transfer import Transfer, UnfitError
 
 NEAR = 1e-6
 """Distance from the end of a step, in steps, within which a time is that end."""
@@ -25,81 +21,62 @@ ROUNDED = 1e-9
 """Part of a step within which two times are one."""
 
 
-class StepFailures(LoadedFmu):
-    """Part of an instance that judges its steps."""
+class StepFailures(SavingFmu):
+    """Instance that judges its steps.
 
-    step: Callable[[float, float], None]
-    """Set the inputs, take a step from a time over a length, both in s, and get the outputs."""
+    Attributes
+    ----------
+    now, width : ctypes.c_double
+        Start and length of the step in s, as the arguments of the FMU's function.
+    is_stepping : bool
+        Whether a step is under way.
+    on_end : callable or None
+        Told when the FMU asks to end the simulation at the end of its step; without it the request is an error.
+    """
 
-    _inputs: dict[str, FmuVariable]
-    _vector: np.ndarray
-    _now: ctypes.c_double
-    _width: ctypes.c_double
-    _call: StepCall | None = None
-    _shared: SharedSteps | None = None
-    _quiet: QuietSteps | None = None
-    _careful: CarefulSteps | None = None
-    _watch: TextWatch | None = None
-    _texts: TextRecord
     is_stepping = False
-    _has_retried = _has_been_off = False
-    ends_run = False
-    """Whether the FMU has asked to end the simulation."""
-    is_trial = False
-    """Whether a step may be taken back; an input out of its range is then kept in `refused`, and no error yet."""
-    refused: FmuRuntimeError | None = None
-    """Error of an input that was out of its range in a trial step; `restore` takes it back."""
     on_end: Callable[[], None] | None = None
-    """Told when the FMU asks to end the simulation at the end of its step; without it the request is an error."""
+    _has_retried = _has_been_off = False
+
+    def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):
+        super().__init__(block, wired, make_calls=make_calls)
+        self.vector = np.zeros(0)
+        """Values of all inputs."""
+        self.now, self.width = self.fmi.variable(ctypes.c_double), self.fmi.variable(ctypes.c_double)
 
     @property
-    def now(self) -> ctypes.c_double:
-        """Start of the step in s, as the argument of the FMU's function."""
-        return self._now
-
-    @property
-    def width(self) -> ctypes.c_double:
-        """Length of the step in s, as the argument of the FMU's function."""
-        return self._width
+    def t(self) -> float:
+        """Time of the instance in s."""
+        return self.now.value + self.width.value if self._running else self._began
 
     def reset(self) -> None:
         """Return to the state before the initialization; see `LoadedFmu.reset`."""
         super().reset()
         self.ends_run, self.refused = False, None
 
+    def lose(self, error: FmuProcessError) -> FmuProcessError:
+        """Note that the process of the FMU has ended, in a step at its start."""
+        if self.is_stepping:
+            self.width.value = 0.0
+        return super().lose(error)
+
+    def go_back(self, state: FmuState) -> None:
+        """Set the FMU back to a state, without its outputs; for steps that are taken again."""
+        self.ends_run = False
+        super().go_back(state)
+
     def set_span(self, t: float, h: float) -> None:
         """Set start and length of the next step in s."""
-        self._now.value, self._width.value = t, h
+        self.now.value, self.width.value = t, h
 
-    def refuse_input(self, error: UnfitError, t: float) -> FmuRuntimeError:
-        """Return the error of an input that doesn't fit."""
-        action, block = ("Limit", "Saturation") if isinstance(error, OutOfRangeError) else ("Convert", "Quantizer")
-        return self._unfit(error, t, f"{action} the signal before this input, with {block}, say.")
-
-    def check_limits(self, inputs: Transfer, t: float) -> None:
-        """Refuse inputs out of the range that the FMU states, in a trial step only if it is accepted."""
+    def set_inputs(self, inputs: Transfer, t: float) -> None:
+        """Set inputs at a time in s."""
+        self.check_limits(inputs, t)
         try:
-            inputs.check_limits()
+            status = inputs.set()
         except UnfitError as error:
-            refused = self.refuse_input(error, t)
-            if not self.is_trial:
-                raise refused from None
-            self.refused = self.refused or refused
-
-    def judge(self, action: str, status: int, t: float) -> None:
-        """Note a warning, once for each action; raise the error of a status that is worse."""
-        if status > WARNING:
-            raise self.report(action, status, t)
-        if status:
-            self.log.warn(action, self.fmi.status_name(status), t)
-
-    def refuse_output(self, error: UnfitError, t: float) -> FmuRuntimeError:
-        """Return the error of an output that doesn't fit."""
-        self.failed = True
-        return self._unfit(error, t, "Leave this output out, by ports=.")
-
-    def _unfit(self, error: UnfitError, t: float, advice: str) -> FmuRuntimeError:
-        return FmuRuntimeError(f"{error.reason}. {advice}", block=self.block.label, port=error.port, t=t)
+            raise self.refuse(error, t) from None
+        self.judge("setting the inputs", status, t)
 
     # ---- failures of a step (FMI 2.0, 2.1.3 and 4.2.2; FMI 3.0, 2.2.3 and 4.2.1) ----
 
@@ -110,35 +87,20 @@ class StepFailures(LoadedFmu):
     def report(self, action: str, status: int, t: float, advice: str = "") -> FmuRuntimeError:
         """Return the error of an action that has failed with a status."""
         if self.ends_run:  # an FMU that has ended need not give its outputs any more
-            return self.termination(self._now.value, self._width.value, t)
+            return self.termination(self.now.value, self.width.value, t)
         self._mark_failure(status)
         return FmuRuntimeError(
             f"{action} failed with {self.fmi.status_name(status)}{self._quote_messages()} The inputs "
-            f"({', '.join(v.name for v in self._inputs.values())}) were {self._vector.tolist()}. "
+            f"({', '.join(v.name for v in self.inputs.values())}) were {self.vector.tolist()}. "
             f"{advice or 'Look at the last samples of error.run, or take a smaller step.'}"
             f"{self.fmi.describe_memory()}",
             block=self.block.label,
             t=t,
         )
 
-    def end_step(self, status: int, t: float, h: float) -> None:
-        """Wait for the end of a step that is pending, and raise the error of one that has failed."""
-        if status == WARNING:
-            self.judge("a step", status, t)
-            return
-        status, ends = self.fmi.end_step(status)
-        if ends:
-            reached = self.fmi.time_after_discard(t, h)
-            self.take_end(t, h, t if reached is None else reached)
-            return
-        again = status == DISCARD and self._call is not None and not self.block.stepping.rollback
-        if again and self._call is not None and retry_discarded(self, self._call, t, h):
-            return
-        if status > 1:
-            raise self._step_error(status, t, h)
-
-    def _step_error(self, status: int, t: float, h: float) -> FmuRuntimeError:
-        self._width.value = 0.0  # the instance stays where it was
+    def step_error(self, status: int, t: float, h: float) -> FmuRuntimeError:
+        """Return the error of a step from t over h, both in s, that has failed with a status."""
+        self.width.value = 0.0  # the instance stays where it was
         action = f"the step from t = {t:.9g} s by {h:g} s"
         if status == PENDING:
             action = f"{action} was still pending after {self.fmi.patience:g} s: it"
@@ -186,7 +148,7 @@ class StepFailures(LoadedFmu):
 
     def termination(self, t: float, h: float, reached: float) -> FmuRuntimeError:
         """Return the error of an FMU that asks to end the simulation at a time in a step from t over h, all in s."""
-        self._now.value, self._width.value = reached, 0.0  # the instance stays there
+        self.now.value, self.width.value = reached, 0.0  # the instance stays there
         error = FmuRuntimeError(
             f"the FMU asks to end the simulation (terminateSimulation) at {reached:.9g} s, in the step from "
             f"t = {t:.9g} s by {h:g} s{self._quote_messages()} End before, or look up the reason in the FMU's "
@@ -232,61 +194,6 @@ class StepFailures(LoadedFmu):
                 f"{where}; its outputs are taken as those of {t + h:.9g} s. {advice}"
             )
 
-    def judge_native(self, stage: int, status: int, t: float, h: float) -> None:
-        """Judge a step in C from t over h, both in s, that was out of the ordinary: raise its error, or accept it.
-
-        It is one of a library in this process; for others see `finish_remote`.
-
-        Parameters
-        ----------
-        stage : {0, 1, 2}
-            What was done last: setting the inputs, the step, reading the outputs.
-        status : int
-            Status of that.
-        """
-        assert self._call is not None
-        if stage == 0 and status == WARNING:  # nothing is lost by setting the inputs once more
-            self.step(t, h)
-            return
-        if stage != 1 and status > WARNING:
-            raise self.report("setting the inputs" if stage == 0 else "reading the outputs", status, t)
-        if stage == 1 and status > WARNING:
-            self.end_step(status, t, h)
-        elif stage == 1:
-            self.judge("a step", status, t)
-        self.check_flags(self._call, t, h)
-
-    @property
-    def remote(self) -> RemoteStep | None:
-        """Its step in another process as C asks for it; None in this one, and where Python has to take each step."""
-        steps = self._quiet or self._shared
-        return None if steps is None else steps.remote
-
-    def finish_remote(self, t: float, h: float) -> None:
-        """End a step from t over h, both in s, that C has begun in another process, and get the outputs."""
-        if self._quiet is not None:
-            self._step_marked(self._quiet.finish, t, h)
-        else:
-            assert self._shared is not None
-            self._shared.take_over(t, h)
-            self._shared.finish()
-        if self._texts.variables:
-            self._note_texts(t + h)
-
-    def _note_texts(self, t: float) -> None:
-        each = self._careful is not None and self._shared is None
-        if each or self._watch is None or self._watch.take():
-            self.call("reading its texts", self._texts.note, t)
-            if self._watch is not None:
-                self._watch.take()
-
-    def _step_marked(self, step: Callable[[float, float], None], t: float, h: float) -> None:
-        self.is_stepping = True
-        step(t, h)
-        self.is_stepping = False
-        if self._quiet is not None:
-            self._quiet.renew()
-
     def note_retry(self, t: float, h: float, count: int) -> None:
         """Keep the message of the first step that was discarded."""
         if not self._has_retried:
@@ -295,52 +202,3 @@ class StepFailures(LoadedFmu):
                 f"t = {t:.9g} s: the FMU discarded a step of {h:g} s; it was taken in {count} parts, and so are later "
                 "ones that it discards"
             )
-
-
-def retry_discarded(instance: SteppedInstance, call: StepCall, t: float, h: float) -> bool:
-    """Take a step that was discarded in smaller ones; return whether that has worked.
-
-    In FMI 3.0 the FMU is where it was before (4.2.1); in FMI 2.0 it is where its lastSuccessfulTime says (4.2.2), and
-    where it says nothing, the step is not taken again.
-
-    Parameters
-    ----------
-    instance : SteppedInstance
-        The instance.
-    call : StepCall
-        The FMU's step.
-    t, h : float
-        Start and length of the step in s.
-    """
-    options, about = instance.block.stepping, instance.description
-    smallest = h * 0.5**options.retries
-    if not options.retries or not about.variable_step:
-        return False
-    end, now, part, count = t + h, t, h, 0
-    status = DISCARD
-    while True:
-        if status == DISCARD:
-            known = instance.fmi.time_after_discard(now, part)
-            if known is None or part <= smallest * (1.0 + ROUNDED):
-                return False
-            now = min(max(known, now), end)
-            part = min(0.5 * part, end - now)
-        elif status > 1:
-            return False
-        else:
-            now, count = now + part, count + 1
-        if end - now <= ROUNDED * smallest:
-            break
-        part = min(part, end - now)
-        instance.set_span(now, part)
-        status, ends = instance.fmi.end_step(call.function(*call.arguments))
-        if ends or (status > 1 and status != DISCARD):
-            instance.end_step(status, now, part)
-            status = 0
-        elif status <= 1 and call.any_flag.value:
-            instance.check_flags(call, now, part)
-        if status <= 1:
-            instance.check_end(t, h, now + part)
-    instance.set_span(t, h)
-    instance.note_retry(t, h, count)
-    return True

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import dataclass
+from enum import Enum, Flag, auto
 from fractions import Fraction
-
-import numpy as np
+from functools import reduce
+from operator import or_
 
 from ...blocks.core import ParameterError, explain_calls
 from ..archive import FmuDescription
@@ -143,21 +143,40 @@ def check_offered(options: object, about: FmuDescription, label: str) -> None:
             )
 
 
-def uses_event_mode(about: FmuDescription, options: StepOptions) -> bool:
-    """Whether an FMU's events are handled in Event Mode."""
+class StepParts(Flag):
+    """What belongs to a step of an FMU beside setting its inputs, stepping, and getting its outputs."""
+
+    EVENTS = auto()
+    """Event Mode before it, within it and at its end: discrete inputs, clocks, time events (FMI 3.0, 4.2.1)."""
+    EARLY_RETURN = auto()
+    """It may end early; the rest follows at once (FMI 3.0, 4.2.1)."""
+    SLOPES = auto()
+    """Real inputs go on with their slopes within it (FMI 2.0, 4.2.1; FMI 3.0, 4.2.2)."""
+    ROLLBACK = auto()
+    """The state before it is saved, from which it is taken again where it is discarded (FMI 2.0, 4.2.2)."""
+    ADDED_TIME = auto()
+    """It begins at the sum of the lengths of those before it, see `StepTime.ADDED`."""
+
+
+def parts_of_step(about: FmuDescription, options: StepOptions) -> StepParts:
+    """Return what belongs to the steps of an FMU."""
     clocks = any(v.type_is_clock for v in about.other.values())
-    return about.has_event_mode and (clocks if options.event_mode is None else options.event_mode)
-
-
-def allows_early_return(about: FmuDescription, options: StepOptions) -> bool:
-    """Whether an FMU of FMI 3.0 may end a step early."""
-    return uses_event_mode(about, options) if options.early_return is None else options.early_return
+    events = about.has_event_mode and (clocks if options.event_mode is None else options.event_mode)
+    chosen = {
+        StepParts.EVENTS: events,
+        StepParts.EARLY_RETURN: events if options.early_return is None else options.early_return,
+        StepParts.SLOPES: options.input_derivatives,
+        StepParts.ROLLBACK: options.rollback,
+        StepParts.ADDED_TIME: options.time is StepTime.ADDED,
+    }
+    return reduce(or_, (part for part, belongs in chosen.items() if belongs), StepParts(0))
 
 
 def choose_modes(fmi: FmiCalls, about: FmuDescription, options: StepOptions) -> None:
     """Tell the calls of co-simulation of FMI 3.0, before `FmiCalls.instantiate`, how the FMU is stepped."""
-    fmi.event_mode_used = uses_event_mode(about, options)
-    fmi.early_return_allowed = allows_early_return(about, options)
+    parts = parts_of_step(about, options)
+    fmi.event_mode_used = StepParts.EVENTS in parts
+    fmi.early_return_allowed = StepParts.EARLY_RETURN in parts
     if options.input_derivatives and about.fmi.startswith("3"):
         inputs = about.of("input").values()
         fmi.intermediate_inputs = tuple(
@@ -167,26 +186,3 @@ def choose_modes(fmi: FmiCalls, about: FmuDescription, options: StepOptions) -> 
 
 def _slopes_flag(about: FmuDescription) -> str:
     return "providesIntermediateUpdate" if about.fmi.startswith("3") else "canInterpolateInputs"
-
-
-def adds_alone(about: FmuDescription, options: StepOptions) -> bool:
-    """Whether the times at which steps begin are added up, and steps are but for that setting, stepping and getting."""
-    return options.time is StepTime.ADDED and not needs_care(about, replace(options, time=StepTime.MULTIPLIED))
-
-
-def add_step(added: np.ndarray, t: float, h: float) -> float:
-    """Return where a step of h begins whose times are added up, and add it; t where it is the first one. In s."""
-    start = t if math.isnan(added[0]) else float(added[0])
-    added[0] = start + h
-    return start
-
-
-def needs_care(about: FmuDescription, options: StepOptions) -> bool:
-    """Whether an FMU's steps are more than setting, stepping and getting."""
-    return (
-        uses_event_mode(about, options)
-        or allows_early_return(about, options)
-        or options.input_derivatives
-        or options.rollback
-        or options.time is StepTime.ADDED
-    )

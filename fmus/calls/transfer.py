@@ -1,21 +1,22 @@
-"""Values of ports between a flat vector of float64 and an FMU's functions for each type; start values in two calls."""
+"""Values between flat vectors of float64 and an FMU's functions for each type, by calls that are bound once."""
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ...blocks.core import Layout
 from ..archive import FmuDescription, FmuVariable, inexact
-from .bound_calls import Call
+from .bound_calls import BoundCalls, Call
 from .fmi_calls import WARNING, FmiCalls
 from .texts import waits_for_initialization
 
 _ROUNDED = 1e-12
-
+_MOST_LISTS = 50
+"""Lists of variables whose calls are kept; others are read type by type."""
 
 EXACT, SINGLE = 1e-12, 1e-6
 """Relative distances up to which a value is kept, of double precision and of variables in single precision."""
@@ -48,6 +49,8 @@ class Transfer:
         Variables by port.
     vector : array
         Values of all ports, one after the other.
+    chosen : collection of str, optional
+        Those of the ports whose values are transferred; None for all.
 
     Attributes
     ----------
@@ -55,18 +58,26 @@ class Transfer:
         Least and greatest value of each entry of the vector; infinite without one.
     """
 
-    def __init__(self, fmi: FmiCalls, verb: str, ports: dict[str, FmuVariable], vector: np.ndarray):
+    def __init__(
+        self,
+        fmi: FmiCalls,
+        verb: str,
+        ports: Mapping[str, FmuVariable],
+        vector: np.ndarray,
+        chosen: Collection[str] | None = None,
+    ):
         self.groups: list[TypeGroup] = []
         self.vector = vector
         places = Layout.of({port: v.shape for port, v in ports.items()}).slices
-        for type_ in dict.fromkeys(v.type for v in ports.values()):
-            chosen = {port: v for port, v in ports.items() if v.type == type_}
-            self.groups.append(TypeGroup(fmi, verb, type_, chosen, {p: places[p] for p in chosen}, vector))
+        mine = {port: v for port, v in ports.items() if chosen is None or port in chosen}
+        for type_ in dict.fromkeys(v.type for v in mine.values()):
+            alike = {port: v for port, v in mine.items() if v.type == type_}
+            self.groups.append(TypeGroup(fmi, verb, type_, alike, {p: places[p] for p in alike}, vector))
         self.is_plain = all(group.direct for group in self.groups)
-        self._ports, self._places = ports, places
-        low, high = (
-            np.concatenate([np.zeros(0), *(np.ravel(v.limits[side]) for v in ports.values())]) for side in (0, 1)
-        )
+        self._ports, self._places = mine, {port: places[port] for port in mine}
+        low, high = np.full(vector.size, -np.inf), np.full(vector.size, np.inf)
+        for port, v in mine.items():
+            low[places[port]], high[places[port]] = (np.ravel(side) for side in v.limits)
         self._bounded = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
         # A signal at its bound that was converted from another unit may be off by a rounding.
         self.limits = low - _ROUNDED * np.abs(low), high + _ROUNDED * np.abs(high)
@@ -84,8 +95,8 @@ class Transfer:
 
     @property
     def views(self) -> list[tuple[memoryview, memoryview]]:
-        """Memory of the vector, and of the values of each call."""
-        return [(self.vector.data, group.buffer.data) for group in self.groups if group.size]
+        """Memory of the vector, and of the values of each call that are not the vector's own."""
+        return [(self.vector.data, group.buffer.data) for group in self.groups if group.size and not group.direct]
 
     @property
     def calls(self) -> list[Call]:
@@ -96,13 +107,6 @@ class Transfer:
     def has_limits(self) -> bool:
         """Whether a port has a smallest or largest value."""
         return self._bounded.size > 0
-
-    @property
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of each value of the vector, infinite without one."""
-        low, high = np.full(self.vector.size, -np.inf), np.full(self.vector.size, np.inf)
-        low[self._bounded], high[self._bounded] = self._low, self._high
-        return low, high
 
     def check_limits(self) -> None:
         """Refuse values out of the ranges that the FMU's description states.
@@ -262,18 +266,15 @@ class TypeGroup:
         return np.split(self.buffer[: self.size], ends)
 
 
-class PartTransfer:
-    """Some of the inputs, in a vector of their own."""
+class WatchedInputs:
+    """Some of the inputs, with the values that were taken last."""
 
-    def __init__(self, fmi: FmiCalls, ports: Mapping[str, FmuVariable], vector: np.ndarray, chosen: list[str]):
+    def __init__(self, fmi: FmiCalls, ports: Mapping[str, FmuVariable], vector: np.ndarray, chosen: Sequence[str]):
         places = Layout.of({port: v.shape for port, v in ports.items()}).slices
-        where = [np.arange(places[port].start, places[port].stop) for port in chosen]
-        self.ports = {port: ports[port] for port in chosen}
-        self.places = Layout.of({port: v.shape for port, v in self.ports.items()}).slices
-        self.index = np.concatenate(where) if where else np.zeros(0, dtype=int)
+        self.index = np.concatenate([np.zeros(0, dtype=int), *(np.r_[places[port]] for port in chosen)])
         self.source = vector
         self.values = np.array(vector[self.index])
-        self.transfer = Transfer(fmi, "Set", self.ports, self.values)
+        self.transfer = Transfer(fmi, "Set", ports, vector, chosen)
 
     @property
     def differs(self) -> bool:
@@ -281,10 +282,9 @@ class PartTransfer:
         return not np.array_equal(self.source[self.index], self.values)
 
     def take(self) -> bool:
-        """Copy the values of the diagram; return whether they have changed."""
-        fresh = self.source[self.index]
-        changed = not np.array_equal(fresh, self.values)
-        self.values[:] = fresh  # a zero may have got another sign
+        """Note the values of the diagram; return whether they have changed."""
+        changed = self.differs
+        self.values[:] = self.source[self.index]  # a zero may have got another sign
         return changed
 
 
@@ -347,3 +347,37 @@ class BoundStart:
             return True
         function, arguments = transfer.plain_call
         return not function(*arguments)
+
+
+class BoundReading:
+    """Calls that read lists of variables, bound when a list is read for the second time."""
+
+    def __init__(self, fmi: FmiCalls):
+        self.fmi = fmi
+        self._seen: set[tuple[str, ...]] = set()
+        self._lists: dict[tuple[str, ...], tuple[BoundCalls, list[np.ndarray]]] = {}
+
+    def read(self, groups: Sequence[Sequence[FmuVariable]]) -> list[np.ndarray]:
+        """Return the values of each group of variables of one type; nothing in process, or where a call fails."""
+        key = tuple(v.name for group in groups for v in group)
+        if self.fmi.in_process or not key:
+            return []
+        if key not in self._lists:
+            if key not in self._seen or len(self._lists) >= _MOST_LISTS:
+                self._seen.add(key)
+                return []
+            self._lists[key] = self._bind(groups)
+        bound, values = self._lists[key]
+        return [np.array(v) for v in values] if 0 <= bound.run() <= WARNING else []
+
+    def _bind(self, groups: Sequence[Sequence[FmuVariable]]) -> tuple[BoundCalls, list[np.ndarray]]:
+        calls, values = [], []
+        for group in groups:
+            type_, size = group[0].type, sum(v.size for v in group)
+            references = [r for v in group for r in v.references]
+            kept = (ctypes.c_uint * len(references))(*references)
+            buffer = self.fmi.allocate(size, self.fmi.types[type_].ctype)
+            arguments = self.fmi.value_arguments(kept, len(references), buffer.ctypes.data, size)
+            calls.append((self.fmi.value_function("Get", type_), arguments))
+            values.append(buffer)
+        return self.fmi.bind(calls), values

@@ -2,10 +2,11 @@
 
 from .folders import folder_in, make_temporary_folder, remove_folder, temporary_folder
 from .group import ProcessGroup, run_in_group
-from .keeper import find_python
+from .keeper import end_all, find_python
 
 __all__ = [
     "ProcessGroup",
+    "end_all",
     "find_python",
     "folder_in",
     "make_temporary_folder",

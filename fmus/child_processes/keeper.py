@@ -20,6 +20,7 @@ from ...blocks.core import LoopwrightError
 
 _SCRIPT = str(Path(__file__).with_name("keeper_process.py"))
 POSIX = os.name == "posix"
+_LONGEST_END = 10.0  # s that a keeper may take to end all and itself
 
 
 def find_python() -> str:
@@ -107,6 +108,11 @@ class Keeper:
                 with suppress(OSError):
                     pipe.close()
 
+    def wait(self, seconds: float) -> None:
+        """Wait at most so many seconds for a keeper whose pipes are closed: it ends by itself."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(seconds)
+
     def disown(self) -> None:
         """Leave the keeper to the process that this one is a fork of."""
         self.close()
@@ -185,6 +191,18 @@ def release_folder(folder: str | os.PathLike[str]) -> None:
     with _LOCKS[0]:
         for keeper in [keeper for keeper in _KEEPERS if path in keeper.kept]:
             _release(keeper, "removed", path)
+
+
+def end_all() -> None:
+    """End all groups and remove all folders that are kept, as the end of this process does; then none is left.
+
+    A process that is about to end calls it, so that whoever waits for its end finds nothing of it.
+    """
+    with _LOCKS[0]:
+        while _KEEPERS:
+            keeper = _KEEPERS.pop()
+            keeper.close()
+            keeper.wait(_LONGEST_END)
 
 
 def _forget() -> None:

@@ -1,7 +1,8 @@
 """C code of a model: CasADi writes the equations, this module the tables around them.
 
-The generated ``model.c`` is the only file to compile: it includes the runtime (``runtime/``), so that the compiler
-inlines the equations into the integrator.
+The generated ``model.c`` is the only file to compile: it includes the runtime (``runtime/``, and the files of
+`loopwright.fmus.runtime` that runs of diagrams use, too), so that the compiler inlines the equations into the
+integrator.
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ from typing import Any, Literal
 import casadi as ca
 
 from ...blocks.core import DefinitionError, lay_out, rate_of
+from ..runtime import read_sources
 from .elementary_tables import prepare_functions, restore_functions
 from .model import DIRECTIONS, INTEGRATORS, ModelSpec, Variable
 
 Kind = Literal["time", "fixed", "tunable", "input", "state", "discrete", "derivative", "output", "indicator"]
+_SHARED = ("linear.c", "fixed_step.c", "embedded.c", "crossings.c")  # of loopwright.fmus.runtime
 _COMMON = ("model.h", "elementary.c", "core.c", "integrators.c", "events.c", "stepping.c")
 RUNTIME = {3: (*_COMMON, "fmi3.c", "fmi3_events.c", "fmi3_refused.c"), 2: (*_COMMON, "fmi2.c", "fmi2_refused.c")}
 _ORDER = {3: "FMI 3.0, 2.3, 3.2 and 4.2", 2: "FMI 2.0, 3.2.3 and 4.2.4"}
@@ -341,4 +344,5 @@ def generate(spec: ModelSpec, token: str, fmi: int = 3) -> tuple[str, bool]:
 def runtime(fmi: int = 3) -> dict[str, str]:
     """Return the text of the C runtime's files for a version of FMI, by name."""
     folder = resources.files(__package__) / "runtime"
-    return {name: (folder / name).read_text(encoding="utf-8") for name in RUNTIME[fmi]}
+    own = {name: (folder / name).read_text(encoding="utf-8") for name in RUNTIME[fmi]}
+    return own | {name: f"{read_sources(name)}\n" for name in _SHARED}

@@ -6,6 +6,7 @@ import ctypes
 import json
 import mmap
 import os
+import select
 import struct
 import subprocess
 import sys
@@ -23,7 +24,6 @@ from ..child_processes import ProcessGroup, find_python, make_temporary_folder, 
 from . import wire
 from .endings import copy_files, count_cores, read_end
 from .output import ChildOutput
-from .pipes import is_readable, make_poll
 from .wire import CAUSE, CHILD_SLEEPS, DATA, MAIL, MESSAGES, PARENT_SLEEPS, PLACE, REPLY, REQUEST, SEQUENCE, STATUS
 
 _START = (
@@ -112,7 +112,7 @@ class ChildProcess:
             )
         commands, replies = self._process.stdin, self._process.stdout
         self._in, self._out = (pipe.fileno() for pipe in (commands, replies) if pipe is not None)
-        self._poll = make_poll(self._out)
+        self._poll = _make_poll(self._out)
         self.alive = True
 
     @property
@@ -256,7 +256,7 @@ class ChildProcess:
         wire.order_memory()
         arrived = wire.ORDERED  # else the byte in the pipe says that the reply is written
         while words[REPLY] != number or not arrived:
-            if is_readable(self._poll, self._out, _LOOK):
+            if _is_readable(self._poll, self._out, _LOOK):
                 arrived = True
                 if not os.read(self._out, 4096) and words[REPLY] != number:
                     self._fail(self._place_name(sequence))
@@ -385,3 +385,31 @@ class ChildProcess:
         self.told, self.lose = lambda status, text: None, lambda error: error
         self._output.begin_again()
         self.words[MESSAGES] = 0
+
+
+def _make_poll(pipe: int) -> Any:
+    """Return the system's object that waits for a pipe; None where there is none."""
+    if not hasattr(select, "poll"):
+        return None
+    poll = select.poll()
+    poll.register(pipe, select.POLLIN)
+    return poll
+
+
+def _is_readable(poll: Any, pipe: int, seconds: float) -> bool:
+    """Wait for some seconds at most, and return whether there is a byte in the pipe, or the pipe is closed."""
+    if poll is not None:
+        return bool(poll.poll(seconds * 1000))
+    import _winapi  # not tried
+    import msvcrt
+
+    handle, end = msvcrt.get_osfhandle(pipe), time.monotonic() + seconds  # type: ignore[attr-defined]
+    while True:
+        try:
+            if _winapi.PeekNamedPipe(handle, 0)[0]:  # type: ignore[attr-defined]
+                return True
+        except OSError:
+            return True  # closed: reading says so
+        if time.monotonic() >= end:
+            return False
+        time.sleep(0.0005)

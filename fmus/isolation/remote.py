@@ -5,12 +5,13 @@ from __future__ import annotations
 import ctypes
 from collections import deque
 from collections.abc import Callable, Sequence
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuError
+from ...blocks.core import FmuError, FmuProcessError
 from ..calls import (
     CALLS,
     ERROR,
@@ -24,13 +25,12 @@ from ..calls import (
     exported_name,
     list_prototypes,
 )
+from . import wire
 from .endings import describe_memory
 from .library import RemoteLibrary, describe_call, seconds_for
 from .limits import Isolation
 from .pool import give_back
 from .process import ChildProcess
-from .round_trip import bind_round_trip
-from .wire import WATCH_TEXTS
 
 
 class RemoteBoundCalls(BoundCalls):
@@ -48,7 +48,7 @@ class RemoteBoundCalls(BoundCalls):
             max((seconds_for(name, limits) for name in names), default=limits.step_time)
         )
         self._sequence = process.bind(described, blobs, limits.step_time)
-        self._run = bind_round_trip(process, self._sequence, self._seconds, self._note)
+        self._run = _bind_round_trip(process, self._sequence, self._seconds, self._note)
 
     def run(self) -> int:
         """Run them and return the status; see `BoundCalls`."""
@@ -83,10 +83,65 @@ class RemoteBoundCalls(BoundCalls):
         return status
 
 
+def _bind_round_trip(
+    process: ChildProcess, sequence: int, seconds: float, note_failure: Callable[[int], int]
+) -> Callable[[], int]:
+    """Return a function that lets a child run a bound sequence, waits for it, and returns the status.
+
+    It does what `ChildProcess.post` and `ChildProcess.finish` do one after the other, with everything looked up before:
+    a lookup costs a twentieth of the whole.
+
+    Parameters
+    ----------
+    process : ChildProcess
+        The child.
+    sequence : int
+        Number of the sequence.
+    seconds : float
+        Longest time of it in s.
+    note_failure : callable
+        Called with a status that is not 0, a warning too; returns it.
+    """
+    words, patience, number_at = process.words, process.patience, wire.REPLY
+    read, take, give = words.__getitem__, wire.ORDER.acquire, wire.ORDER.release
+    request, chosen, sleeps = wire.REQUEST, wire.SEQUENCE, wire.CHILD_SLEEPS
+    messages, status_at, fewest, ordered = wire.MESSAGES, wire.STATUS, wire.FEWEST, wire.ORDERED
+
+    def run() -> int:
+        if not process.alive:
+            process.post(sequence)  # it raises the error
+        words[chosen] = sequence
+        process.number = number = process.number + 1
+        words[request] = number
+        if take(False):  # the write above is seen before the read below is done
+            give()
+        if words[sleeps] or not ordered:
+            process.wake(sequence)
+        try:
+            for _ in repeat(None, patience.looks):
+                if read(number_at) == number:
+                    patience.pause = fewest
+                    break
+            else:
+                patience.slept()
+                process.sleep(sequence, number, seconds)
+        except FmuProcessError:
+            raise
+        except BaseException:  # an interrupt: the reply is still to come
+            process.give_up()
+            raise
+        if words[messages]:
+            process.fetch_messages()
+        status = words[status_at]
+        return note_failure(status) if status else 0
+
+    return run
+
+
 class RemoteWatch:
     """The child's own function among bound calls that notes whether texts have changed; it is bound, never called."""
 
-    name = WATCH_TEXTS
+    name = wire.WATCH_TEXTS
 
     def __call__(self, *arguments: object) -> int:
         """Refuse."""
@@ -100,8 +155,6 @@ class RemoteCalls(FmiCalls):
     text_watch = staticmethod(RemoteWatch())
     process: ChildProcess
     limits: Isolation
-    _line: np.ndarray | None = None
-    """Inputs that go on along lines within a step, in the shared memory; see `Child.do_follow`."""
 
     def _open(self, kind: Any, required: tuple[str, ...], **arguments: Any) -> Any:
         """Return an object of FMPy's class whose library is in the child."""
@@ -129,12 +182,13 @@ class RemoteCalls(FmiCalls):
 
         return type(kind.__name__, (kind,), {"__init__": initialize, "freeLibrary": unload})(**arguments)
 
-    def _function(self, name: str) -> Callable[..., int]:
-        return self.fmu.dll[self.exported(name)]  # type: ignore[no-any-return]
+    def function(self, name: str) -> Callable[..., int]:
+        """Return a C function of the child by its name without prefix."""
+        return self.fmu.dll[self.exported(f"{self.prefix}{name}")]  # type: ignore[no-any-return]
 
     def instantiate(self, log: Log) -> None:
         """Make the instance; its messages go to ``log``."""
-        self.process.told, self.process.lose, self._line = log, self.lose, None
+        self.process.told, self.process.lose = log, self.lose
         super().instantiate(log)  # type: ignore[safe-super]
         if self.process.find(self.fmu.component) is not None:  # an address there that is shared memory here
             raise FmuError("its instance has an address that can't be told from shared memory; run it again.")
@@ -181,36 +235,11 @@ class RemoteCalls(FmiCalls):
         if status > WARNING:
             raise FMICallException("fmi3SetBinary", status)
 
-    def set_input_slopes(
-        self, t: float, references: Sequence[int], inputs: Sequence[float], slopes: Sequence[float]
-    ) -> None:
-        """Tell the slopes of inputs; in FMI 3.0 the child sets them when the FMU asks for that within a step."""
-        line = self.slope_line(references, len(inputs))
-        if line is None:
-            super().set_input_slopes(t, references, inputs, slopes)
-        else:
-            line[0], line[2:] = t, [*inputs, *slopes]
-
-    def slope_line(self, references: Sequence[int], n: int) -> np.ndarray | None:
-        """Return start, status, values and slopes of inputs within a step, as the child reads them in FMI 3.0."""
-        if self._line is None and self.prefix == "fmi3":
-            self._line = self.allocate(2 + 2 * n, ctypes.c_double)
-            place = self.process.find(self._line.ctypes.data)
-            self.process.request(
-                "follow", place, list(references), n, self.fmu.component, call="fmi3SetFloat64",
-                seconds=self.limits.step_time,
-            )  # fmt: skip
-        return self._line
-
-    @property
-    def intermediate_status(self) -> int:
-        """Worst status of setting inputs within a step."""
-        return 0 if self._line is None else int(self._line[1])
-
-    @intermediate_status.setter
-    def intermediate_status(self, value: int) -> None:
-        if self._line is not None:
-            self._line[1] = value
+    def _follow(self, line: np.ndarray, references: Sequence[int], n: int) -> None:
+        """Let the child set inputs from a line when the FMU asks for that; see `Fmi3Calls.slope_line`."""
+        place, component = self.process.find(line.ctypes.data), self.fmu.component
+        seconds = self.limits.step_time
+        self.process.request("follow", place, list(references), n, component, call="fmi3SetFloat64", seconds=seconds)
 
     def read_printed(self) -> list[str]:
         """Return the last lines that the FMU has written to its standard output in this process's hold of it."""
@@ -227,7 +256,7 @@ class RemoteCalls(FmiCalls):
     def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
         self._path, self._unloaded = library, False
         self._freed: deque[Any] = deque()
-        super().__init__(name=name, token=token, folder=folder, library=library, model_exchange=model_exchange)  # type: ignore[safe-super]
+        super().__init__(name=name, token=token, folder=folder, library=library, model_exchange=model_exchange)
 
 
 def make_remote_calls(version: str, process: ChildProcess, limits: Isolation, **arguments: Any) -> FmiCalls:

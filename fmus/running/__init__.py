@@ -1,10 +1,10 @@
 """The block `Fmu` and its linear model."""
 
 from .derivation import Derivation, DerivativeMethod
-from .exchange import check_exchange_slopes, find_exchange_slopes
 from .fmu import Fmu
 from .fmu_point import FmuLinearization
 from .known_models import linearize_fmu, step_gap
+from .linearization import check_exchange_slopes, find_exchange_slopes
 from .replacement import suggest_names
 from .restored_point import RestoredPoint
 

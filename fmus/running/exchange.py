@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import Array, Event, FmuError, FmuFileError, Layout, ParameterError, State
+from ...blocks.core import Array, Event, FmuError, FmuFileError, ParameterError, State
 from ...blocks.tracing import NEXT
 from ..archive import ExchangeInfo, FmuDescription, FmuVariable
 from ..calls import ExchangeInstance, StepOptions, is_smooth
 from ..isolation import open_fmu
 from ..platform import is_built_here
-from .differences import Column, Differences, differentiate
 from .port_members import PortMembers
-from .slope_check import SlopeCheck, check_slopes
 
 INTERFACES = ("co_simulation", "model_exchange")
 """Interfaces of an FMU, as the parameter ``interface`` names them."""
 DEPENDENCIES = ("declared", "all")
 """Dependencies in model exchange, as the parameter ``dependencies`` names them."""
-EQUATIONS = 1e-5
-"""Relative distance of differences of equations."""
 UNNAMED = "continuous_states"
 """Name of the state of an FMU whose continuous states are no variables."""
 
@@ -201,73 +197,3 @@ def dependence(block: ExchangeMembers, equation: str, rates: str) -> dict[str, n
 
 def _stack(parts: list[np.ndarray], rows: int, columns: int) -> np.ndarray:
     return np.vstack(parts) if parts else np.ones((rows, columns), dtype=bool)
-
-
-def find_exchange_slopes(
-    block: ExchangeMembers,
-    wired: Sequence[str],
-    values: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    x: np.ndarray,
-    u: np.ndarray,
-) -> Differences:
-    """Return the derivative of values by (x, u) of model exchange, by differences.
-
-    Parameters
-    ----------
-    wired : sequence of str
-        Inputs that are moved; others, and those without derivatives, have zero columns.
-    values : callable
-        ``values(x, u)``: flat, at states and inputs.
-    """
-    about, places = block.description, Layout.of({p: v.shape for p, v in block.input_variables.items()}).slices
-    moved = {port: v for port, v in block.input_variables.items() if port in wired and is_smooth(v)}
-    parts = [(v, x, where) for v, where in _states_in(block)]
-    parts += [(v, u, places[port]) for port, v in moved.items()]
-    base = values(x, u)
-    many = x.size + u.size
-    made = Differences(np.zeros((base.size, 0)), np.zeros((base.size, 0)), np.zeros(0), base).place([], many)
-    for variable, vector, where in parts:
-        column = Column(about, [variable.name], vector[where], EQUATIONS)
-
-        def evaluate(name: str, moved: np.ndarray, vector: np.ndarray = vector, where: slice = where) -> np.ndarray:
-            changed = vector.copy()
-            changed[where] = moved
-            return values(changed, u) if vector is x else values(x, changed)
-
-        first = where.start if vector is x else x.size + where.start
-        made += differentiate(column, base, evaluate).place([*range(first, first + variable.size)], many)
-    return made
-
-
-def _states_in(block: ExchangeMembers) -> Iterator[tuple[FmuVariable, slice]]:
-    """Yield the variables of the continuous states, and where they stand among these."""
-    about = block.description
-    layout = about.layout(about.states).slices
-    yield from ((about.find(name), layout[name]) for name in about.states)
-
-
-def check_exchange_slopes(
-    block: ExchangeMembers,
-    wired: Sequence[str],
-    values: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    x: np.ndarray,
-    u: np.ndarray,
-    J: np.ndarray,
-) -> SlopeCheck:
-    """Return the FMU's own derivatives ``J`` of values by (x, u), held against differences; see `check_slopes`.
-
-    Parameters are those of `find_exchange_slopes`.
-    """
-    places = Layout.of({p: v.shape for p, v in block.input_variables.items()}).slices
-    n = x.size
-    nominals, low, high = np.ones(n + u.size), np.full(n + u.size, -np.inf), np.full(n + u.size, np.inf)
-    moved = np.arange(n + u.size) < n
-    parts = list(_states_in(block))
-    for port, v in block.input_variables.items():
-        where = slice(n + places[port].start, n + places[port].stop)
-        moved[where] = port in wired and is_smooth(v)
-        parts.append((v, where))
-    for v, where in parts:
-        nominals[where] = np.ravel(v.nominals)
-        low[where], high[where] = (np.ravel(side) for side in v.limits)
-    return check_slopes(J, lambda at: values(at[:n], at[n:]), np.concatenate([x, u]), nominals, (low, high), moved)

@@ -22,10 +22,9 @@ from ..calls import FmuInstance, StepOptions, check_offered
 from ..isolation import Isolation, check_isolation, open_fmu
 from .exchange import DEPENDENCIES, ExchangeMembers, choose_interface
 from .fmu_point import FmuLinearization
-from .linearization import linear_model
+from .linearization import STEP, linear_model, step_difference
 from .replacement import check_replacement
 from .start_values import check_start, check_value, read_sized
-from .step_model import STEP, step_difference
 
 
 class Fmu(ExchangeMembers):

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from ...blocks.core import FmuError, Layout, ParameterError, UnknownNameError, brief, elements, explain_calls, near
-from ..archive import FmuDescription
 from ..calls import FmuBlock, LoadedFmu, is_kept
 from ..isolation import open_fmu
 from .derivation import Derivation
-from .start_values import check_state
+from .start_values import check_state, check_value
 
 
 @explain_calls
@@ -62,17 +61,10 @@ class FmuLinearization:
         return str(self.derivation)
 
 
-class LinearizableFmu(FmuBlock, Protocol):
-    """Members of an FMU's block that its linear model needs."""
-
-    def start_value(self, description: FmuDescription, name: str, value: Any) -> Any:
-        """Return a start value in the variable's shape, after checking it."""
-
-
 class FmuPoint:
     """An operating point, as values of the FMU's variables."""
 
-    def __init__(self, block: LinearizableFmu, t: float, state: Any, inputs: Any):
+    def __init__(self, block: FmuBlock, t: float, state: Any, inputs: Any):
         self.block, self.about, self.t = block, block.description, float(t)
         about = self.about
         self.states = list(about.states)
@@ -93,7 +85,7 @@ class FmuPoint:
         self.given = {
             n: check_state(about.find(n), v, block.label)
             if n in about.states and about.find(n).start is None
-            else block.start_value(about, n, v)
+            else check_value(about, n, v, block.label)
             for n, v in {**given_state, **given_inputs}.items()
         }
 
@@ -151,9 +143,20 @@ class FmuPoint:
         n = x.size
         inputs, outputs = (self.elements(names, ports=True) for names in (self.inputs, self.outputs))
         return FmuLinearization(
-            J[:n, :n], J[:n, n:], J[n:, :n], J[n:, n:], self.elements(self.states), inputs, outputs, self.t,
-            x0=x, u0=u, f=values[:n], y0=values[n:], **more,
-        )  # fmt: skip
+            A=J[:n, :n],
+            B=J[:n, n:],
+            C=J[n:, :n],
+            D=J[n:, n:],
+            states=self.elements(self.states),
+            inputs=inputs,
+            outputs=outputs,
+            t=self.t,
+            x0=x,
+            u0=u,
+            f=values[:n],
+            y0=values[n:],
+            **more,
+        )
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import numpy as np
 from ...blocks.core import identity
 from .fmu import Fmu
 from .fmu_point import FmuLinearization
-from .step_model import find_step_gap
+from .linearization import find_step_gap
 
 MOST = 512
 """Models that are kept at a time."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from ...blocks.core import LoopwrightError
+from ...blocks.tracing import extrapolate
 from .derivation import Derivation, DerivativeMethod
 
 SAME = 1e-10
@@ -202,7 +203,7 @@ class _Checker:
         between = np.zeros(gap.shape, bool)
         if both:
             one, two, four = ((ends[k] - ends[-k]) / (2 * k * length) for k in (1, 2, 4))
-            fine, coarse = (4 * one - two) / 3, (4 * two - four) / 3
+            fine, coarse = extrapolate(one, two), extrapolate(two, four)
             middle, middle_error = (16 * fine - coarse) / 15, 0.5 * np.abs(fine - coarse) + rounding
             (up, up_error), (down, down_error) = sides
             kink = np.abs(up - down) > 10.0 * (up_error + down_error)

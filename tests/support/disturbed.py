@@ -16,9 +16,9 @@ same matrices one by one, as its entries have come out of other sums.
 from __future__ import annotations
 
 import functools
-import hashlib
 import importlib
 import sys
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -110,9 +110,16 @@ HOLDERS = ("loopwright", "control", "scipy.signal", "numpy.lib", "numpy.polynomi
 """Modules that may hold such a function by its own name."""
 
 
+AT_ONCE = 1 << 15
+"""Entries of a stack that are disturbed together: all that is computed of them stays in the processor's cache."""
+
+MOST_READ = 1000
+"""Entries of an argument of which its disturbance depends: equal arguments have equal ones."""
+
+
 def _norm_sizes(sizes: np.ndarray) -> np.ndarray:
-    """Return the norm of each matrix, or vector."""
-    axes = tuple(range(-min(sizes.ndim, 2), 0))
+    """Return the norm of each matrix, or vector; the last axis is that of the stack."""
+    axes = tuple(range(sizes.ndim - 1))
     return np.asarray(np.sqrt(np.mean(sizes**2, axis=axes, keepdims=True)))
 
 
@@ -121,28 +128,65 @@ def _scaled_sizes(sizes: np.ndarray) -> np.ndarray:
 
     LAPACK balances a matrix before it looks for eigenvalues, and elimination works with columns and rows: a disturbance
     by the norm alone would shake small entries beside large ones as no machine does. An entry of a square matrix stays
-    0 where all its powers have 0, as sums of products leave it so.
+    0 where all its powers have 0, as sums of products leave it so. The last axis is that of the stack.
     """
-    if sizes.ndim == 1:
+    if sizes.ndim == 2:  # vectors
         return sizes
-    if sizes.shape[-1] != sizes.shape[-2]:
+    if sizes.shape[0] != sizes.shape[1]:
         return np.asarray(np.where(sizes > 0.0, _least_sizes(sizes), 0.0))
-    largest = sizes.reshape(-1, *sizes.shape[-2:]).max(axis=0, initial=0.0)
+    largest = sizes.max(axis=2)
     connected = (largest > 0.0).astype(float)
-    for _ in range(int(sizes.shape[-1]).bit_length()):
+    for _ in range(int(sizes.shape[0]).bit_length()):
         connected = ((connected + connected @ connected) > 0.0).astype(float)
-    with np.errstate(all="ignore"):  # SciPy casts the factors to whole numbers, for which they may be too large
-        _, (scale, _) = _BALANCE(largest, permute=False, separate=True)  # one balance for a stack: each takes too long
-        balanced = _least_sizes(sizes / scale[:, None] * scale) * scale[:, None] / scale
-    return np.asarray(connected * np.fmin(_least_sizes(sizes), balanced))
+    found = _least_sizes(sizes)
+    scale = _BALANCE(largest, scale=1, permute=0)[3]  # one balance for a stack: each takes too long
+    if (scale != scale[0]).any():
+        factors = (scale / scale[:, None])[:, :, None]
+        with np.errstate(all="ignore"):  # factors may be as large as numbers get
+            balanced = _least_sizes(sizes * factors)
+            balanced /= factors
+        np.fmin(found, balanced, out=found)
+    if not connected.all():
+        found *= connected[:, :, None]
+    return found
 
 
 def _least_sizes(sizes: np.ndarray) -> np.ndarray:
-    return np.minimum(sizes.max(axis=-1, keepdims=True), sizes.max(axis=-2, keepdims=True))
+    return np.asarray(np.minimum(sizes.max(axis=1, keepdims=True), sizes.max(axis=0, keepdims=True)))
 
 
-_BALANCE = scipy.linalg.matrix_balance
+_BALANCE = scipy.linalg.lapack.dgebal
 NORMWISE, SCALED = _norm_sizes, _scaled_sizes
+
+
+def _is_finite(array: np.ndarray) -> bool:
+    with np.errstate(all="ignore"):
+        return bool(np.isfinite(array.sum())) or bool(np.isfinite(array).all())
+
+
+def _is_symmetric(stack: np.ndarray) -> bool:
+    """Whether all matrices of a stack equal their conjugate transposes; the first one answers for most."""
+    if stack.ndim != 3 or stack.shape[1] != stack.shape[2]:
+        return False
+    return all(np.array_equal(some, np.conj(np.swapaxes(some, 1, 2))) for some in (stack[:1], stack))
+
+
+def _disturb(
+    values: np.ndarray, sizes: Callable[[np.ndarray], np.ndarray], random: np.random.Generator, turn: float
+) -> None:
+    """Add a disturbance to real values, with the axis of the stack at last.
+
+    That of a symmetric matrix is symmetric, with ``turn`` 1, or antisymmetric with -1 (its imaginary part); 0 for others.
+    """
+    if not values.any():  # such as the imaginary parts of a real right side
+        return
+    size = sizes(np.abs(values))
+    change = np.frombuffer(random.bytes(values.size), dtype=np.int8).reshape(values.shape) + 0.5  # never 0
+    change *= SIZE / 128
+    if turn:
+        change = 0.5 * (change + turn * np.swapaxes(change, 0, 1))
+    change *= size
+    values += change
 
 
 def _flip(random: np.random.Generator, count: int) -> np.ndarray:
@@ -180,25 +224,23 @@ class Disturbance:
     def argument(self, name: str, value: Any, random: np.random.Generator) -> Any:
         """Return an argument with a disturbance, matrix by matrix; what is no array of floats stays."""
         array = np.asarray(value) if isinstance(value, np.ndarray | list | tuple) else None
-        if array is None or array.dtype.kind not in "fc" or array.ndim == 0 or not array.size:
+        if array is None or array.dtype.kind not in "fc" or array.ndim == 0 or not array.size or not _is_finite(array):
             return value
-        if not np.all(np.isfinite(array)):
-            return value
-        change = random.uniform(-1.0, 1.0, array.shape)
-        if array.dtype.kind == "c":
-            change = change + 1j * random.uniform(-1.0, 1.0, array.shape)
-        if array.ndim >= 2 and array.shape[-1] == array.shape[-2]:
-            turned = np.conj(np.swapaxes(array, -1, -2))
-            if np.array_equal(array, turned):  # symmetric ones stay so
-                change = 0.5 * (change + np.conj(np.swapaxes(change, -1, -2)))
         sizes = NORMWISE if name in ORTHOGONAL else SCALED
-        if (
-            array.dtype.kind == "c"
-        ):  # parts apart: a product adds up parts, and an imaginary one may be 1e-30 of the real
-            parts = sizes(np.abs(array.real)) * change.real, sizes(np.abs(array.imag)) * change.imag
-            changed = array + SIZE * (parts[0] + 1j * parts[1])
-        else:
-            changed = array + np.asarray(SIZE * sizes(np.abs(array)) * change, dtype=array.dtype)
+        stack = array.reshape(-1, *array.shape[-2:]) if array.ndim > 1 else array[None]
+        changed, symmetric = np.empty_like(stack, order="C"), _is_symmetric(stack)
+        count = max(1, AT_ONCE // stack[0].size)
+        for first in range(0, len(stack), count):
+            some = slice(first, first + count)
+            values = np.moveaxis(stack[some], 0, -1).copy()  # long rows are quick to go through
+            if array.dtype.kind == "c":
+                # Parts apart: a product adds up parts, and an imaginary one may be 1e-30 of the real.
+                _disturb(values.real, sizes, random, 1.0 if symmetric else 0.0)
+                _disturb(values.imag, sizes, random, -1.0 if symmetric else 0.0)
+            else:
+                _disturb(values, sizes, random, 1.0 if symmetric else 0.0)
+            changed[some] = np.moveaxis(values, -1, 0)
+        changed = changed.reshape(array.shape)
         return changed.view(type(value)) if isinstance(value, np.ndarray) else changed
 
     def result(self, name: str, found: Any, random: np.random.Generator) -> Any:
@@ -235,12 +277,13 @@ class Disturbance:
             if self.seed is None:
                 return function(*arguments, **options)
             self.calls += 1
-            digest = hashlib.blake2b(f"{self.seed} {name}".encode(), digest_size=8)
+            digest = zlib.adler32(f"{self.seed} {name}".encode())
             for value in (*arguments, *options.values()):
                 if isinstance(value, np.ndarray | list | tuple):
                     array = np.asarray(value)
-                    digest.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
-            random = np.random.default_rng(int.from_bytes(digest.digest()))
+                    some = array.reshape(-1)[:: 1 + array.size // MOST_READ]
+                    digest = zlib.adler32(some.tobytes(), zlib.adler32(str(array.shape).encode(), digest))
+            random = np.random.default_rng([self.seed, digest])
             changed = [self.argument(name, value, random) for value in arguments]
             return self.result(name, function(*changed, **options), random)
 

@@ -250,5 +250,5 @@ class Exchange:
         k2 = np.array(self.rhs(t + h / 2.0, x + h / 2.0 * k1))
         k3 = np.array(self.rhs(t + h / 2.0, x + h / 2.0 * k2))
         k4 = np.array(self.rhs(t + h, x + h * k3))
-        self.set(t + h, x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4))
+        self.set(t + h, x + h / 6.0 * (k1 + 2.0 * (k2 + k3) + k4))
         assert self.fmi == 3 or self.fmu.completedIntegratorStep() == (False, False)

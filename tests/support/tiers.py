@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from loopwright.blocks import LoopwrightError
-from loopwright.diagrams.simulation import simulated_diagram, simulation
+from loopwright.diagrams import diagram as facade
+from loopwright.diagrams.simulation import simulation
 from loopwright.diagrams.simulation.compiled_hybrid import HybridTicks
 from loopwright.diagrams.simulation.compiled_ticks import CompiledTicks
 
@@ -57,7 +58,7 @@ def install(patch):
 
     watch(CompiledTicks)
     watch(HybridTicks)
-    patch.setattr(simulated_diagram, "simulate", simulate)
+    patch.setattr(facade, "simulate", simulate)
 
 
 def compare_within_tolerances(first, second, options):

@@ -30,13 +30,13 @@ def with_drawing(report: Report, diagram: WiredDiagram) -> Report:
 
 
 def _drawings(diagram: WiredDiagram) -> Iterator[Plot]:
-    whole = draw(diagram, closed=False)
+    whole = draw(diagram.structure, diagram.name, closed=False)
     found = re.search(r'width="([\d.]+)"', whole)
     subsystems = [path for path in diagram.subsystems if path]
     if not subsystems or (found is not None and float(found[1]) <= ACROSS):
         yield Plot("diagram", TEXTS.line("diagram", closed=False), whole)
         return
-    yield Plot("diagram", TEXTS.line("diagram", closed=True), draw(diagram, closed=True))
+    yield Plot("diagram", TEXTS.line("diagram", closed=True), draw(diagram.structure, diagram.name, closed=True))
     for subsystem in subsystems:
-        inside = draw(diagram, subsystem=subsystem, closed=True)
+        inside = draw(diagram.structure, diagram.name, subsystem=subsystem, closed=True)
         yield Plot(f"diagram.{subsystem}", TEXTS.line("inside", subsystem=subsystem), inside, details=True)

@@ -46,7 +46,7 @@ class Changes:
 
 
 @dataclass(frozen=True)
-class Place:
+class PagePlace:
     """A figure or table on a page: its place among all, and where it begins, in points from the page's text area."""
 
     index: int
@@ -140,7 +140,7 @@ def _changed(html: str, changes: Changes, *, marked: bool) -> str:
     return _PLACE.sub(change, html)
 
 
-def _look(book: Any, canvas: Any, page: int, count: int) -> tuple[float, list[Place]]:
+def _look(book: Any, canvas: Any, page: int, count: int) -> tuple[float, list[PagePlace]]:
     """Return how far a sheet is filled, in points from its text area's top, and those of all places that are on it."""
     size = book.get_page_size_at(page)
     wide, high = int(size.width), int(size.height)
@@ -158,4 +158,4 @@ def _look(book: Any, canvas: Any, page: int, count: int) -> tuple[float, list[Pl
         index = 250 * (int(edge[row, column, 1]) - 1) + int(edge[row, column, 0]) - 1
         if 0 <= index < count:
             seen.setdefault(index, float(row))
-    return filled, sorted((Place(index, begin) for index, begin in seen.items()), key=lambda place: place.begin)
+    return filled, sorted((PagePlace(index, begin) for index, begin in seen.items()), key=lambda place: place.begin)

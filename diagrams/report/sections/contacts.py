@@ -172,7 +172,7 @@ def check_contacts(diagram: WiredDiagram, contacts: Mapping[str, Any]) -> Mappin
                 f"found the name {name!r}; expected letters, digits and underscores, as it stands in dotted paths.",
                 port="contacts",
             )
-        if content_hash(contact.diagram) != own:
+        if content_hash(contact.wired) != own:
             raise OptionError(
                 f"found a contact of another diagram under {name!r}; expected one of {diagram.name!r} with its present "
                 "parameters. Make it by diagram.contact(…).",

@@ -87,16 +87,18 @@ def injected(case: Case) -> Section | None:
                 "sines at these frequencies in the running co-simulation",
             )
             windows = "the last windows, a second amplitude, and the movement of the operating point"
-            rows.append({
-                "wire": wire,
-                "variant": v.title,
-                "loop": key,
-                "key": v.key,
-                "span": f"{low:.4g} … {high:.4g} rad/s",
-                "deviation": Number(worst, "1", max(own, 1e-12), how),
-                "uncertainty": Number(own, "1", own, windows),
-                "confirmed": "yes" if worst <= CONFIRMED and own <= CONFIRMED else "no",
-            })  # fmt: skip
+            rows.append(
+                {
+                    "wire": wire,
+                    "variant": v.title,
+                    "loop": key,
+                    "key": v.key,
+                    "span": f"{low:.4g} … {high:.4g} rad/s",
+                    "deviation": Number(worst, "1", max(own, 1e-12), how),
+                    "uncertainty": Number(own, "1", own, windows),
+                    "confirmed": "yes" if worst <= CONFIRMED and own <= CONFIRMED else "no",
+                }
+            )
             measured[v.key] = _curve(v.title, found, L)
         if refused and not measured:
             skipped.append(wire)

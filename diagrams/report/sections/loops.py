@@ -12,6 +12,7 @@ import numpy as np
 
 from ....blocks.core import LoopwrightError
 from ....fmus.running import DerivativeMethod
+from ...flat import WiredDiagram
 from ...frequency import (
     Comparison,
     Confirmation,
@@ -27,7 +28,6 @@ from ...frequency import (
     with_findings,
 )
 from ...linearization import StepsOnly, linearize
-from ...wiring import CheckedDiagram
 from .. import figures
 from ..case import Case
 from ..pages import Plot, Section, Table, Texts
@@ -457,7 +457,7 @@ def gang_of_four(case: Case, key: str, wire: str) -> tuple[Plot, ...]:
     return ()
 
 
-def wires_downstream(diagram: CheckedDiagram, wire: str) -> Iterator[str]:
+def wires_downstream(diagram: WiredDiagram, wire: str) -> Iterator[str]:
     """Yield the named scalar wires downstream of a wire on its loops, the nearest first."""
     names, table = diagram.names, diagram.structure
     if wire not in names:

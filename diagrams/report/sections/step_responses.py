@@ -124,8 +124,14 @@ def steps(case: Case) -> Section | None:
         return Section("steps", TITLE, tuple(dict.fromkeys(text))) if text else None
     tables = [Table("Step responses", ("step", "variant", "number", "co-simulation", "linear"), tuple(rows))]
     if effort:
-        tables.append(Table("Effort", ("step", "variant", "signal", "before", "largest change"), tuple(effort),
-                            terms={"before": "before_step"}))  # fmt: skip
+        tables.append(
+            Table(
+                "Effort",
+                ("step", "variant", "signal", "before", "largest change"),
+                tuple(effort),
+                terms={"before": "before_step"},
+            )
+        )
     plots = [_plot(case, test, curves) for test, curves in found.items()]
     whole = (*TEXTS.paragraphs("responses"), *dict.fromkeys(text))
     return Section("steps", TITLE, whole, tuple(tables), tuple(plots), numbers)
@@ -164,9 +170,14 @@ def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | 
     size = SIZE * plan.amplitude if limits is None or limits.size is None else limits.size
     outputs = [*([test.output] if test.output else []), *_commands(v.diagram, test.wire), *_excesses(v.diagram)]
     got = step_response(
-        plan.variant.diagram, test.wire, size=size, length=length, at=plan.variant.point, outputs=outputs,
+        plan.variant.diagram,
+        test.wire,
+        size=size,
+        length=length,
+        at=plan.variant.point,
+        outputs=outputs,
         stairs=v.stairs,
-    )  # fmt: skip
+    )
     return got, slowest
 
 

@@ -183,16 +183,18 @@ def operating_points(case: Case) -> Section:
         point, model = v.point, v.model
         how = CONFIRMED.get(point.how, str(point.how))
         worst = float(np.max(np.abs(model.affine), initial=0.0))
-        rows.append({
-            "variant": v.title,
-            "key": v.key,
-            "t": Number(point.t, "s", 0.0, "given", given=True),
-            "how": point.how,
-            "residual": Number(point.residual, "1", 1e-15, how),
-            "largest": point.largest,
-            "affine": Number(worst, "1", 1e-12 * (1 + worst), "the linear model's affine term"),
-            "plants": "; ".join(f"{p}: {h}" for p, h in model.how.items()),
-        })  # fmt: skip
+        rows.append(
+            {
+                "variant": v.title,
+                "key": v.key,
+                "t": Number(point.t, "s", 0.0, "given", given=True),
+                "how": point.how,
+                "residual": Number(point.residual, "1", 1e-15, how),
+                "largest": point.largest,
+                "affine": Number(worst, "1", 1e-12 * (1 + worst), "the linear model's affine term"),
+                "plants": "; ".join(f"{p}: {h}" for p, h in model.how.items()),
+            }
+        )
         if not point.residual < AT_REST:
             notes.append(_moving(v))
         hidden = [p for p, b in v.diagram.blocks.items() if isinstance(b, Fmu) and not b.description.states]

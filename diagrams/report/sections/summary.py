@@ -26,8 +26,14 @@ from .worst_case import MissingWorstCase, ReportedWorstCase
 TEXTS = Texts(__package__, "summary")
 TITLE = "Summary"
 LOOP_NUMBERS = (
-    "phase_margin_deg", "gain_margin_low", "gain_margin_high", "delay_margin_s", "disk_margin", "ms", "bandwidth",
-)  # fmt: skip
+    "phase_margin_deg",
+    "gain_margin_low",
+    "gain_margin_high",
+    "delay_margin_s",
+    "disk_margin",
+    "ms",
+    "bandwidth",
+)
 """Numbers of the loops that stand on the first page."""
 DIGITS = 4
 """Significant digits on the first page; the appendix has more."""
@@ -69,8 +75,9 @@ def _requirements(case: Case, reviewed: Review) -> Table:
     ranked = sorted(reviewed.results, key=lambda r: (ORDER.index(r.verdict), _relative(r)))
     rows = tuple(_row(case, result) for result in ranked)
     columns = ("verdict", "requirement", "at", "variant", "required", "found", "distance")
-    return Table("Requirements", columns, rows, TEXTS.line("distance"), digits=DIGITS,
-                 terms={"distance": "distance_to_limit"})  # fmt: skip
+    return Table(
+        "Requirements", columns, rows, TEXTS.line("distance"), digits=DIGITS, terms={"distance": "distance_to_limit"}
+    )
 
 
 def _relative(result: RequirementResult) -> float:
@@ -92,9 +99,14 @@ def _row(case: Case, result: RequirementResult) -> tuple[Any, ...]:
     others = {MEASURED: "measured", WORST_CASE: "worst case", CONTACT: "as it is"}
     title = variant.title if variant else others.get(result.variant, "–")
     return (
-        Judged(said, result.verdict), words_of(result.quantity), place or "whole diagram", title,
-        _required(result.limit, unit), result.number if result.number is not None else "–", distance,
-    )  # fmt: skip
+        Judged(said, result.verdict),
+        words_of(result.quantity),
+        place or "whole diagram",
+        title,
+        _required(result.limit, unit),
+        result.number if result.number is not None else "–",
+        distance,
+    )
 
 
 def _required(limit: Limit, unit: str) -> str:

@@ -15,8 +15,7 @@ from ....blocks.core import LoopwrightError, OptionError
 from ...flat import WiredDiagram
 from ...frequency import Number
 from ...requirements import Limit, Reason, RequirementResult, Requirements, TomlFile, Verdict, judge
-from ...studies import Case as StudyCase
-from ...studies import CaseOrigin, CaseState, RunConfirmation, WorstCase, WorstCaseTask
+from ...studies import CaseOrigin, CaseState, RunConfirmation, StudyCase, WorstCase, WorstCaseTask
 from ..content_hash import content_hash
 from ..pages import Plot, Section, Table, Texts
 from .loops import ROWS
@@ -33,7 +32,7 @@ def check_worst_case(diagram: WiredDiagram, found: Any) -> None:
         raise OptionError(
             f"found {found!r}; expected a worst case. Give diagram.worst_case(…), or a TOML file.", port="worst_case"
         )
-    if content_hash(found.base) != content_hash(diagram):
+    if content_hash(found.wired) != content_hash(diagram):
         raise OptionError(
             f"found a worst case of another diagram; expected one of {diagram.name!r} with its present parameters. "
             "Make it by diagram.worst_case(…).",

@@ -10,6 +10,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "linear.c"
+
 #define LW_MAGIC UINT64_C(0x4c57303032464d55)
 #define LW_MIN_TOLERANCE 1e-14
 #define LW_MAX_TOLERANCE 1e-1
@@ -73,14 +75,8 @@ static bool lw_is_initialized(lw_instance *self, const char *function) {
 /* ---- equations ---- */
 
 /* Are values[0 .. n), those from index `first` on, finite? If not, log the element and the time. */
-static inline bool lw_is_finite(const double *values, size_t n) {
-    bool finite = true;
-    for (size_t i = 0; i < n; i++) finite &= isfinite(values[i]) != 0;
-    return finite;
-}
-
 static bool lw_check_finite(lw_instance *self, const double *values, size_t first, size_t n, double t) {
-    if (lw_is_finite(values, n)) return true;
+    if (lw_are_finite(values, (int64_t)n)) return true;
     size_t i = 0, v = 0;
     while (isfinite(values[i])) i++;
     while (first + i >= (size_t)lw_variables[v].first + lw_variables[v].size) v++;

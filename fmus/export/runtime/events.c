@@ -16,6 +16,24 @@
 #define LW_PROBE 1e-3 /* s, over which a change of motion is looked for */
 #define LW_RESTS 20 /* events in a row that lead back into contact; colliding bodies pass an impact on a few times */
 
+/* A step of an integrator: from self->x at `from` to self->next at `to`, in between by self->dense. */
+typedef struct {
+    double from, to, resolution;
+    const double *u;
+} lw_span;
+
+/* A step in which an event is located. */
+typedef struct {
+    lw_instance *self;
+    const lw_span *span;
+} lw_search;
+
+static double lw_value_at(const lw_search *s, int64_t i, double t, bool *lost);
+
+#define LW_SEARCH const lw_search
+#define LW_VALUE lw_value_at
+#include "crossings.c"
+
 /* The domain of indicator i at its value z, from the present one. */
 static int lw_domain(const lw_instance *self, int i, double z) {
     const lw_memory *events = &self->s.events;
@@ -88,12 +106,13 @@ typedef struct {
 
 /* False if they can't be evaluated. */
 static bool lw_find_motion(lw_instance *self, double t, const double *x, const double *u, lw_motion *motion) {
+    const lw_equation e = lw_equation_of(self, u);
     double there[LW_N_S], rates[LW_N_X];
     memcpy(there, x, sizeof there);
     if (lw_call(self, lw_indicator, &t, x, u, motion->z)) return false;
     for (int step = 0; step < 2; step++) {
         double *change = step ? motion->twice : motion->once;
-        if (lw_rate(self, t, there, u, rates)) return false;
+        if (lw_rate(&e, t, there, rates)) return false;
         for (int i = 0; i < LW_N_X; i++) there[i] += LW_PROBE * rates[i];
         if (lw_call(self, lw_indicator, &t, there, u, change)) return false;
         for (int i = 0; i < LW_N_Z; i++) change[i] -= motion->z[i];
@@ -128,8 +147,8 @@ static bool lw_jump_and_land(lw_instance *self, double t, double *x, const doubl
     if (!known || !memcmp(old, x, sizeof old) || !lw_find_motion(self, t, x, u, &after)) return true;
     for (int i = 0; i < LW_N_Z; i++) {
         const double side = events->domain[i] == LW_ABOVE ? 1.0 : -1.0;
-        if (fired[i] == 0.0 || side * after.z[i] < 0.0 || fabs(after.z[i]) > fabs(before.z[i])) continue; /* it is elsewhere */
-        if (!(side * after.twice[i] > 0.0) || (after.once[i] == before.once[i] && !events->resting[i])) continue;
+        if (fired[i] == 0.0 || !lw_is_contact(side, before.z[i], after.z[i], after.twice[i])) continue;
+        if (after.once[i] == before.once[i] && !events->resting[i]) continue;
         events->side[i] = (uint8_t)(events->domain[i] + 1);
         lw_set_border(self, i, after.z[i], after.twice[i]);
     }
@@ -198,12 +217,6 @@ static bool lw_record(lw_instance *self, double t, double size, const double *fi
 
 /* ---- location of crossings in a step ---- */
 
-/* A step of an integrator: from self->x at `from` to self->next at `to`, in between by self->dense. */
-typedef struct {
-    double from, to, resolution;
-    const double *u;
-} lw_span;
-
 /* A point of it, with the indicators and, if there are derivatives, their rates. */
 typedef struct {
     double t;
@@ -211,16 +224,8 @@ typedef struct {
 } lw_point;
 
 static void lw_dense_state(lw_instance *self, const lw_span *span, double t, double *x) {
-    double theta = (t - span->from) / (span->to - span->from), rest = 1.0 - theta;
-    if (t == span->to) {
-        memcpy(x, self->next, LW_N_S * sizeof(double));
-        return;
-    }
-    for (int i = 0; i < LW_N_X; i++) {
-        double inner = self->dense[1][i] + theta * (self->dense[2][i] + rest * self->dense[3][i]);
-        x[i] = self->x[i] + theta * (self->dense[0][i] + rest * inner);
-    }
-    for (int i = LW_N_X; i < LW_N_S; i++) x[i] = self->x[i];
+    memcpy(x, t == span->to ? self->next : self->x, LW_N_S * sizeof(double));
+    if (t != span->to) lw_interpolate(LW_N_X, 4, self->dense, (t - span->from) / (span->to - span->from), self->x, x);
 }
 
 static bool lw_evaluate(lw_instance *self, const lw_span *span, double t, lw_point *at) {
@@ -245,18 +250,26 @@ static bool lw_evaluate(lw_instance *self, const lw_span *span, double t, lw_poi
                   : lw_check_finite(self, at->z, LW_Z, LW_N_Z, t);
 }
 
+static double lw_value_at(const lw_search *s, int64_t i, double t, bool *lost) {
+    lw_point at;
+    if (lw_evaluate(s->self, s->span, t, &at)) return at.z[i];
+    *lost = true;
+    return NAN;
+}
+
 /* The time at which indicator i comes into a domain, after a and not after b: as near to the crossing as times resolve. */
 static bool lw_locate(lw_instance *self, const lw_span *span, int i, int domain, double a, double b, double *found) {
-    lw_point at;
-    while (b - a > span->resolution) {
-        double middle = a + (b - a) / 2.0;
-        if (middle <= a || middle >= b) break;
-        if (!lw_evaluate(self, span, middle, &at)) return false;
-        if (lw_domain(self, i, at.z[i]) == domain) b = middle;
-        else a = middle;
-    }
-    *found = b;
-    return true;
+    const lw_memory *events = &self->s.events;
+    const lw_search search = {self, span};
+    const bool border = events->domain[i] == LW_BORDER;
+    const double level = border ? events->level[i] : 0.0;
+    const double low = domain == LW_ABOVE ? -INFINITY : border ? fmin(level, 0.0) : nextafter(0.0, INFINITY);
+    const double high = domain == LW_ABOVE ? fmax(level, 0.0) : INFINITY;
+    bool lost = false;
+    const double value_a = lw_value_at(&search, i, a, &lost), value_b = lw_value_at(&search, i, b, &lost);
+    const double t = lost ? b : lw_leave(&search, i, low, high, a, value_a, b, value_b, 0.0, &lost);
+    *found = lost ? b : t;
+    return self->s.mode != LW_TERMINATED; /* an evaluation has failed */
 }
 
 /* Is indicator i in a domain somewhere between a and b, where it is not? Its rates show whether it may; bisection finds

@@ -3,36 +3,15 @@
  * instance that the FMU's own library has made from the same sources. Functions that return false have changed nothing:
  * the FMU's own functions then do the step, or say why it fails. */
 
-static inline __attribute__((always_inline)) int lw_inline_slope(double t, const double *x, double h, const double *previous,
-                                                                 const double *u, const double *p, double *k) {
-    double stage[LW_AT_LEAST_1(LW_N_S)], w[LW_AT_LEAST_1(LW_SZ_W)];
-    long long int iw[LW_AT_LEAST_1(LW_SZ_IW)];
-    const double *arg[LW_SZ_ARG] = {&t, stage, u, p};
-    double *res[LW_SZ_RES] = {k};
-    for (int i = 0; i < LW_N_X; i++) stage[i] = previous ? x[i] + h * previous[i] : x[i];
-    for (int i = LW_N_X; i < LW_N_S; i++) stage[i] = x[i];
-    return lw_derivative(arg, res, iw, w, 0);
-}
-
-/* n steps from t0 over `width` into self->next. */
+/* n steps from t0 over `width` into self->next. Inputs, parameters and the memory of the equations are on the stack, where
+ * the compiler knows that nothing else changes them. */
 static inline bool lw_inline_steps(lw_instance *self, double t0, double width, long n) {
-    double x[LW_AT_LEAST_1(LW_N_S)], u[LW_AT_LEAST_1(LW_N_U)], p[LW_AT_LEAST_1(LW_N_P)];
-    double k1[LW_AT_LEAST_1(LW_N_X)], k2[LW_AT_LEAST_1(LW_N_X)], k3[LW_AT_LEAST_1(LW_N_X)], k4[LW_AT_LEAST_1(LW_N_X)];
-    const double h = width / (double)n;
-    int failed = 0;
-    memcpy(x, self->s.values + LW_X, LW_N_S * sizeof(double));
+    double u[LW_AT_LEAST_1(LW_N_U)], p[LW_AT_LEAST_1(LW_N_P)], w[LW_AT_LEAST_1(LW_SZ_W)];
+    long long int iw[LW_AT_LEAST_1(LW_SZ_IW)];
+    const lw_equation e = {self, u, p, iw, w};
     memcpy(u, self->s.values + LW_U, LW_N_U * sizeof(double));
     memcpy(p, self->s.values + LW_P, LW_N_P * sizeof(double));
-    for (long i = 0; i < n; i++) {
-        const double t = t0 + width * ((double)i / (double)n);
-        failed |= lw_inline_slope(t, x, 0.0, NULL, u, p, k1);
-        failed |= lw_inline_slope(t + h / 2.0, x, h / 2.0, k1, u, p, k2);
-        failed |= lw_inline_slope(t + h / 2.0, x, h / 2.0, k2, u, p, k3);
-        failed |= lw_inline_slope(t + h, x, h, k3, u, p, k4);
-        for (int j = 0; j < LW_N_X; j++) x[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j]);
-    }
-    memcpy(self->next, x, LW_N_S * sizeof(double));
-    return !failed && (!LW_N_X || lw_is_finite(x, LW_N_X));
+    return lw_integrate(&e, t0, width, n, false);
 }
 
 /* Are these variables of these kinds, with so many values? */
@@ -74,7 +53,7 @@ static inline __attribute__((always_inline)) bool lw_inline_step(void *instance,
     const double count = ceil(width / v[LW_STEP] - 1e-9);
     double y[LW_AT_LEAST_1(LW_N_Y)];
     if (!(count <= LW_MAX_SUBSTEPS) || !lw_inline_steps(self, now, width, count < 1.0 ? 1 : (long)count)
-        || (LW_N_Y && lw_call(self, lw_output, &end, self->next, v + LW_U, y)) || !lw_is_finite(y, LW_N_Y)) {
+        || (LW_N_Y && lw_call(self, lw_output, &end, self->next, v + LW_U, y)) || !lw_are_finite(y, LW_N_Y)) {
         memcpy(v + LW_U, u, LW_N_U * sizeof(double));
         return false;
     }

@@ -2,7 +2,8 @@
  *
  * One translation unit per FMU: the generated model.c defines the LW_ constants below, includes this header, then holds
  * the equations and tables, then includes core.c, integrators.c, events.c and stepping.c (no FMI version in them) and the
- * files of one FMI version. Being one unit, the equations are inlined into the integrator, and all sizes are constants.
+ * files of one FMI version. linear.c, fixed_step.c and embedded.c, which these include, are those of runs of diagrams
+ * (fmus/runtime). Being one unit, the equations are inlined into the integrator, and all sizes are constants.
  *
  * All values of an instance are doubles in one array, in this order (every variable is an interval of the array):
  *
@@ -33,6 +34,11 @@
 #define LW_HELD (LW_STEP + 3)
 #define LW_N_VALUES (LW_HELD + LW_N_U)
 #define LW_N_UNKNOWNS (LW_N_X + LW_N_Y + LW_N_Z) /* derivatives, outputs, event indicators: from LW_DX on */
+#if defined(__GNUC__)
+#define LW_INLINE static inline __attribute__((always_inline))
+#else
+#define LW_INLINE static inline
+#endif
 #define LW_AT_LEAST_1(n) ((n) > 0 ? (n) : 1)
 #define LW_MOVING_INPUTS (LW_FMI == 2 && LW_N_U > 0) /* may inputs move within a step, by given derivatives? */
 #define LW_MAX_ORDER 4                               /* of these derivatives */
@@ -122,9 +128,11 @@ struct lw_instance {
     /* scratch of the integrators and of the equations */
     double x[LW_AT_LEAST_1(LW_N_S)], stage[LW_AT_LEAST_1(LW_N_S)], next[LW_AT_LEAST_1(LW_N_S)];
     double k1[LW_AT_LEAST_1(LW_N_X)], k2[LW_AT_LEAST_1(LW_N_X)], k3[LW_AT_LEAST_1(LW_N_X)], k4[LW_AT_LEAST_1(LW_N_X)];
-    double k5[LW_AT_LEAST_1(LW_N_X)], k6[LW_AT_LEAST_1(LW_N_X)], k7[LW_AT_LEAST_1(LW_N_X)];
-    double dense[4][LW_AT_LEAST_1(LW_N_X)]; /* the solution within the last step, see lw_dense */
-    double *matrix;                         /* LU factors, then pivots, of rodas; allocated when needed */
+    double k[7 * LW_AT_LEAST_1(LW_N_X)];     /* slopes of the stages of an adaptive step, one after the other */
+    double dense[4 * LW_AT_LEAST_1(LW_N_X)]; /* the solution within the last step, see lw_interpolate */
+    double absolute[LW_AT_LEAST_1(LW_N_X)];  /* the absolute tolerance of each state */
+    double *matrix;                          /* LU factors of rodas; allocated when needed */
+    int64_t pivots[LW_AT_LEAST_1(LW_N_X)];
     double jacobian[LW_AT_LEAST_1(LW_N_J)], slope[LW_AT_LEAST_1(LW_N_X)]; /* of the derivatives: by states; by time */
     double scratch[LW_N_VALUES + LW_N_Z];
     double seed[LW_N_VALUES], sensitivity[LW_N_VALUES]; /* in the order of the values */
@@ -139,5 +147,13 @@ struct lw_instance {
     void (*sink)(void);
     char *name;
 };
+
+/* The differential equation of an instance, as the integrators take it. */
+typedef struct {
+    lw_instance *self;
+    const double *u, *p; /* inputs, NULL where they move within the step; parameters */
+    long long int *iw;   /* work of the equations */
+    double *w;
+} lw_equation;
 
 #endif

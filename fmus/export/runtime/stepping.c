@@ -20,9 +20,11 @@ static inline bool lw_inputs_jumped(const lw_instance *self) {
 static bool lw_step_too_small(lw_instance *self, double t, double h) {
     int worst = 0;
     double largest = -1.0;
-    lw_rate(self, t, self->x, lw_inputs_of_step(self), self->k1);
+    const lw_equation e = lw_equation_of(self, lw_inputs_of_step(self));
+    const lw_tolerance tolerance = lw_tolerance_of(self);
+    lw_rate(&e, t, self->x, self->k);
     for (int i = 0; i < LW_N_X; i++) {
-        double change = fabs(self->k1[i]) / lw_scale(self, i, self->x[i], self->x[i]);
+        double change = fabs(self->k[i]) / lw_scale(&tolerance, i, self->x[i], self->x[i]);
         if (!isfinite(change)) change = INFINITY;
         if (change > largest) largest = change, worst = i;
     }
@@ -48,19 +50,25 @@ typedef struct {
 static inline bool lw_adaptive_step(lw_instance *self, lw_run *run, double t, double *to) {
     const double *u = lw_inputs_of_step(self);
     const bool implicit = run->integrator == LW_RODAS;
-    const double exponent = implicit ? -1.0 / 4.0 : -1.0 / 5.0, left = run->end - t;
+    const double order = implicit ? 3.0 : 4.0, left = run->end - t; /* of the estimate of the error */
+    const lw_equation e = lw_equation_of(self, u);
     const double shortest = 16.0 * 2.3e-16 * fmax(fabs(t), fabs(run->end));
-    if ((run->fresh || implicit) && lw_rate(self, t, self->x, u, self->k1))
+    if ((run->fresh || implicit) && lw_rate(&e, t, self->x, self->k))
         return lw_fail(self, "the equations can't be evaluated at t = %.9g s.", t);
-    if (run->fresh && !lw_check_finite(self, self->k1, LW_DX, LW_N_X, t)) return false;
+    if (run->fresh && !lw_check_finite(self, self->k, LW_DX, LW_N_X, t)) return false;
 #if LW_HAS_DERIVATIVES
-    if (implicit && (lw_linearize(self, t, u) || !lw_is_finite(self->jacobian, LW_N_J) || !lw_is_finite(self->slope, LW_N_X)))
+    if (implicit && (lw_linearize(self, t, u) || !lw_are_finite(self->jacobian, LW_N_J) || !lw_are_finite(self->slope, LW_N_X)))
         return lw_fail(self, "the Jacobian can't be evaluated at t = %.9g s. Set integrator = 1 or 2.", t);
 #endif
     /* With an intermediate update, internal_step bounds the time between two requests for inputs. */
     const double longest = self->update ? self->s.values[LW_STEP] : INFINITY;
     double h = self->s.step_size;
-    if (run->fresh && !(h > 0.0)) h = lw_first_step(self, t, u, implicit ? 4 : 5, left);
+    if (run->fresh && !(h > 0.0)) {
+        const lw_tolerance tolerance = lw_tolerance_of(self);
+        memcpy(self->stage, self->x, LW_N_S * sizeof(double));
+        h = lw_first_step(&e, LW_N_X, implicit ? 4.0 : 5.0, &tolerance, t, left, INFINITY, self->x, self->k, self->k2, self->stage,
+                          self->k3);
+    }
     h = fmin(h, longest);
     run->fresh = run->rejected = false;
     for (;;) {
@@ -72,15 +80,13 @@ static inline bool lw_adaptive_step(lw_instance *self, lw_run *run, double t, do
 #else
         error = lw_dopri5_step(self, t, used, u);
 #endif
-        double factor = isfinite(error) ? fmax(0.2, 0.9 * pow(error, exponent)) : 0.2;
-        if (error <= 1.0) {
-            factor = fmin(factor, run->rejected ? 1.0 : 5.0);
-            /* a step that a communication point cuts says little about the next one */
-            self->s.step_size = last ? fmax(h, used * factor) : used * factor;
+        if (error < 1.0) {
+            const double next = used * lw_growth(error, order, run->rejected ? 1.0 : 5.0);
+            self->s.step_size = last ? fmax(h, next) : next; /* a step that a communication point cuts says little */
             *to = last ? run->end : t + used;
             return true;
         }
-        h = used * factor;
+        h = used * lw_shrinkage(error, order);
         run->rejected = true;
     }
 }
@@ -101,7 +107,7 @@ static bool lw_next_step(lw_instance *self, lw_run *run, double t, double *to) {
     run->i++;
     *to = run->i == run->n ? run->end : run->segment + run->length * ((double)run->i / (double)run->n);
     /* without events as long as in lw_integrate, so that watching the step changes no bit */
-    if (lw_rk4_step(self, t, LW_N_Z ? *to - t : run->length / (double)run->n, lw_inputs_of_step(self)))
+    if (lw_rk4_dense_step(self, t, LW_N_Z ? *to - t : run->length / (double)run->n, lw_inputs_of_step(self)))
         return lw_fail(self, "the equations can't be evaluated at t = %.9g s.", *to);
     return !LW_N_X || lw_check_finite(self, self->next, LW_X, LW_N_X, *to);
 }
@@ -207,7 +213,7 @@ static bool lw_advance(lw_instance *self, double t, double h, double *end) {
 #endif
         if (!isfinite(first)) {
             memcpy(self->x, self->next, LW_N_S * sizeof(double));
-            if (run.integrator == LW_DOPRI5) memcpy(self->k1, self->k7, LW_N_X * sizeof(double));
+            if (run.integrator == LW_DOPRI5) memcpy(self->k, self->k + 6 * LW_N_X, LW_N_X * sizeof(double));
             t = to;
         }
         if (!self->update) continue;

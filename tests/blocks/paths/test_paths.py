@@ -18,7 +18,7 @@ from scipy.special import ellipeinc
 from loopwright.blocks import DefinitionError, ParameterError, PathDomainError, TraceError, parameter
 from loopwright.blocks.library.piecewise_functions import is_traced, jet, piecewise, wrap
 from loopwright.blocks.paths import UNLIMITED, Circle, CubicSpline, Ellipse, Line, Path
-from loopwright.blocks.paths.tables import _Contact
+from loopwright.blocks.paths.path import _Contact
 
 
 class Bean(Path):

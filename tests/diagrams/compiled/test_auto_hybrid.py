@@ -1,4 +1,4 @@
-"""compile="auto" with continuous states: C takes over where the counted work says so, whatever a clock says."""
+"""compile="auto" with continuous states: generated code takes over from the virtual machine within a run."""
 
 import numpy as np
 import pytest
@@ -18,12 +18,12 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, Run, subsystem
-from loopwright.diagrams.compiled import libraries
-from loopwright.diagrams.simulation import change_over, compiled_hybrid, compiled_ticks
+from loopwright.diagrams.compiled import background, libraries
+from loopwright.diagrams.simulation import change_over, compiled_ticks
 from loopwright.fmus import Fmu, dc_motor
 from support.both_forms import assert_same_bits
 
-pytestmark = [pytest.mark.one_tier, pytest.mark.python_loop]  # see `test_machine_runs.py`, too
+pytestmark = pytest.mark.one_tier  # see `test_machine_runs.py`, too
 QUIET = {"progress": False}
 T = 1e-3
 
@@ -51,17 +51,24 @@ def thermostat(*more):
 
 
 @pytest.fixture
-def little(monkeypatch):
-    """Little work is enough."""
-    monkeypatch.setattr(change_over, "_PATIENCE_OF_WORK", 2e-3)
-    monkeypatch.setattr(change_over, "_START", 5e-3)
-    monkeypatch.setattr(change_over, "_COMPILING", 0.0)
+def eager(monkeypatch):
+    """Generated code is there at the first look at a run, without a thread."""
+
+    class AtOnce:
+        def __init__(self, target, args, **_):
+            self.start = lambda: target(*args)
+
+    monkeypatch.setattr(change_over, "_PATIENCE", -1.0)
+    for name in ("_WRITING", "_COMPILING"):
+        monkeypatch.setattr(background, name, 0.0)
+    monkeypatch.setattr(background, "_LEAST", -1.0)
+    monkeypatch.setattr(background, "Thread", AtOnce)
     monkeypatch.setattr(compiled_ticks, "_TOLD", [])
 
 
-def test_many_ticks_are_compiled_before_the_first_one():
+def test_many_ticks_are_those_of_the_matrix_exponential(eager):
     run = controlled().simulate(20.0, rtol=1e-8, atol=1e-10, **QUIET)
-    assert run.tier == "compiled"
+    assert run.tier == "both"
     assert run.messages == ()
     a, b = np.array([[-10.0, 0.0], [1 / 0.3, -1 / 0.3]]), np.array([10.0, 0.0])
     whole = expm(np.block([[a, b[:, None]], [np.zeros((1, 3))]]) * T)
@@ -74,13 +81,7 @@ def test_many_ticks_are_compiled_before_the_first_one():
         x = whole[:2, :2] @ x + whole[:2, 2] * u
 
 
-def test_few_ticks_stay_interpreted_and_keep_their_bits():
-    run = controlled().simulate(1.0, **QUIET)
-    assert run.tier == "interpreted"
-    assert_same_bits(controlled().simulate(1.0, compile=False, **QUIET), run)
-
-
-def test_c_takes_over_between_two_ticks_where_events_are_many(little):
+def test_code_takes_over_where_events_are_many(eager):
     run = thermostat().simulate(20.0, step=0.05, rtol=1e-9, atol=1e-11, **QUIET)
     assert run.tier == "both"
     assert len(run.t) == 401
@@ -93,30 +94,6 @@ def test_c_takes_over_between_two_ticks_where_events_are_many(little):
     last = expected[-1]
     at_end = 1.1 * np.exp(last - 20.0) if len(expected) % 2 else 2.0 - 1.1 * np.exp(last - 20.0)
     assert run["room.y"][-1] == pytest.approx(at_end, abs=1e-7)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [{"solver": "rk4", "step": T}, {"rtol": 1e-6}, {"rtol": 1e-10, "atol": 1e-12}],
-    ids=["fixed step", "fast clock", "tight"],
-)
-def test_c_takes_over_where_each_step_ends_at_a_tick(little, monkeypatch, options):
-    monkeypatch.setattr(change_over.HybridChange, "is_due", lambda self, last: False)
-    begun, run_in_c = [], compiled_hybrid.HybridTicks.run
-
-    def note(ticks, k, last, *args, **kwargs):
-        begun.append((k, last))
-        return run_in_c(ticks, k, last, *args, **kwargs)
-
-    monkeypatch.setattr(compiled_hybrid.HybridTicks, "run", note)
-    run = controlled().simulate(1.0, **options, **QUIET)
-    assert run.tier == "both"
-    [(k, last)] = begun
-    assert 0 < k < 100
-    assert last == 1000
-    alone = controlled().simulate(1.0, compile=False, **options, **QUIET)
-    assert np.array_equal(run.t, alone.t)
-    assert np.abs(run["second.y"] - alone["second.y"]).max() < 1e-12
 
 
 def test_changes_of_the_method_that_are_left_out_are_told_once():
@@ -135,16 +112,14 @@ def test_changes_of_the_method_that_are_left_out_are_told_once():
     assert run.messages.count("… and more such changes") == 1
 
 
-def test_the_instant_of_the_change_depends_on_no_cache(little):
+def test_the_instant_of_the_change_depends_on_no_cache(eager):
     bits = {thermostat().simulate(5.0, step=0.05, **QUIET).data.tobytes() for _ in range(2)}
     libraries.load_compiled.cache_clear()
     bits.add(thermostat().simulate(5.0, step=0.05, **QUIET).data.tobytes())
     assert len(bits) == 1
 
 
-def test_beside_an_fmu_c_takes_over_at_a_tick(little, monkeypatch):
-    monkeypatch.setattr(change_over, "_LANDING", 0.0)
-    monkeypatch.setattr(change_over, "_SAMPLE", 0.0)
+def test_code_takes_over_beside_an_fmu(eager):
     plant = Fmu(dc_motor.build(), name="plant")
     lag = TransferFunction(numerator=1.0, denominator=[0.01, 1.0], name="lag")
     made = Diagram("loop", plant(voltage=lag(Sine(frequency=2.0, name="source")), load_torque=0.0))
@@ -155,7 +130,7 @@ def test_beside_an_fmu_c_takes_over_at_a_tick(little, monkeypatch):
     assert np.max(np.abs(run["plant.speed"] - interpreted["plant.speed"])) < 1e-9
 
 
-def test_pieces_disk_saved_states_and_every_nth_sample(little, tmp_path):
+def test_pieces_disk_saved_states_and_every_nth_sample(eager, tmp_path):
     made = thermostat()
     interpreted = made.simulate(10.0, step=0.05, compile=False, every=3, **QUIET)
     stored = made.simulate(10.0, step=0.05, every=3, to=tmp_path / "run", **QUIET)
@@ -173,7 +148,7 @@ def test_pieces_disk_saved_states_and_every_nth_sample(little, tmp_path):
     assert again["room.y"][-1] == pytest.approx(interpreted["room.y"][-1], abs=1e-5)
 
 
-def test_a_stop_condition_ends_it_in_c_at_its_event(little):
+def test_a_stop_condition_ends_it_in_c_at_its_event(eager):
     def counted(y):
         total = Integrator(name="total")(y)
         return StopCondition(name="stop")(Compare(">", name="full")(total, 5.0))
@@ -184,7 +159,7 @@ def test_a_stop_condition_ends_it_in_c_at_its_event(little):
     assert run["total.y"][-1] == pytest.approx(5.0, abs=1e-7)
 
 
-def test_without_a_compiler_the_bits_are_those_of_an_interpreted_run(little, monkeypatch):
+def test_without_a_compiler_the_bits_are_those_of_pythons_own_loop(eager, monkeypatch):
     from loopwright.diagrams.compiled import sources
 
     monkeypatch.setattr(sources, "load_compiled", _fail)
@@ -201,7 +176,7 @@ def _fail(*_):
     raise CompilerError("no such compiler.")
 
 
-def test_samples_of_a_sweep_have_the_bits_of_single_runs_whatever_ran_before(little):
+def test_samples_of_a_sweep_have_the_bits_of_single_runs_whatever_ran_before(eager):
     made, gains = thermostat(), [1.0, 0.8, 1.2]
     options = {"step": 0.05, "compile": "auto", **QUIET}
     found = made.sweep({"room.numerator": gains}, duration=8.0, signals=["room.y"], workers=1, **options)
@@ -211,11 +186,7 @@ def test_samples_of_a_sweep_have_the_bits_of_single_runs_whatever_ran_before(lit
         assert np.array_equal(found["room.y"][i], single["room.y"])
 
 
-def test_an_end_between_two_ticks_is_reached_though_much_work_comes_before_it(little, monkeypatch):
-    monkeypatch.setattr(change_over, "_STEP", 0.0)
-    monkeypatch.setattr(change_over, "_OPERATION", 0.0)
-    monkeypatch.setattr(change_over, "_SAMPLE", 0.0)
-    monkeypatch.setattr(change_over, "_EVENT", 1.0)
+def test_an_end_between_two_ticks_is_reached(eager):
     run = thermostat().simulate(0.9, step=0.75, **QUIET)  # the first event is at 0.7985 s
     assert run.stopped is None
     assert run.t.tolist() == [0.0, 0.75, 0.9]

@@ -9,7 +9,7 @@ import pytest
 from loopwright.blocks import Block, Constant, FmuRuntimeError, Gain, Output, Ramp, Sine
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu, StepOptions
-from loopwright.fmus.calls import FmuInstance
+from loopwright.fmus.calls.step import Step
 from support.careful_fmus import (
     BETWEEN,
     BETWEEN_MODEL,
@@ -47,15 +47,13 @@ def events(folder):
 @pytest.fixture
 def by_python(monkeypatch):
     """Times in s of the steps that Python has taken or ended."""
-    found = []
-    for name in ("_step_marked", "_step_and_note"):
-        step = getattr(FmuInstance, name)
+    found, end = [], Step._end
 
-        def noted(self, step_, t, h, step=step):
-            found.append(t)
-            step(self, step_, t, h)
+    def noted(self, status):
+        found.append(self._t)
+        end(self, status)
 
-        monkeypatch.setattr(FmuInstance, name, noted)
+    monkeypatch.setattr(Step, "_end", noted)
     return found
 
 
@@ -151,16 +149,14 @@ TEXTS_MODEL = """<CoSimulation modelIdentifier="small" canHandleVariableCommunic
 </ModelVariables><ModelStructure><Outputs><Unknown index="1"/><Unknown index="2"/></Outputs></ModelStructure>"""
 
 
-def test_texts_are_read_where_they_have_changed(folder, monkeypatch):
+def test_texts_are_read_where_they_have_changed(folder, by_python):
     file = small_fmu(folder, "fmi2", TEXTS.replace("LATE", "0"), TEXTS_MODEL, name="texts")
-    made, read = Diagram("d", Fmu(file, name="plant")()), []
-    note = FmuInstance._note_texts
-    monkeypatch.setattr(FmuInstance, "_note_texts", lambda self, t: read.append(t) or note(self, t))
+    made = Diagram("d", Fmu(file, name="plant")())
     run = both(made, 0.99, 0.01)
     mode = run.texts["plant.mode"]
     assert mode.values == tuple(f"phase {k}" for k in range(4))
     assert mode.t == pytest.approx((0.0, 0.25, 0.5, 0.75))
-    assert len(read) == 99 + 4  # of the compiled run: the first step, and three changes
+    assert len(by_python) == 99 + 4  # of the compiled run: the first step, and three changes
     with made.simulation(step=0.01, compile=True) as simulation:
         simulation.advance(0.3)
         simulation.restore(simulation.save()) if simulation.can_save else None

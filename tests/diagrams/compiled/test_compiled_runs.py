@@ -15,12 +15,12 @@ from loopwright.blocks import (
     Requirement,
     Sine,
     StopCondition,
-    TransportDelay,
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, Interrupted, Run, experiments, subsystem
-from loopwright.diagrams.compiled import libraries, runtime
+from loopwright.diagrams.compiled import libraries
 from loopwright.fmus import Fmu, dc_motor
+from loopwright.fmus.runtime import runtime_source
 from support.random_cases import random_cases
 from support.random_linear import BASE, PERIOD, Matrices, diagram, specs
 from support.zoo import zoo_fmu
@@ -224,13 +224,6 @@ def test_tables_are_compiled_and_may_differ_in_signs_of_zeros():
     assert "signs of zeros" in " ".join(compiled.messages)
 
 
-def test_what_cannot_be_compiled_is_interpreted_and_says_so():
-    made = Diagram("d", TransportDelay(delay=0.5)(Clock()).named("y"))
-    run = made.simulate(1.0, compile=True, **QUIET)
-    assert run["y"][-1] == pytest.approx(0.5, rel=1e-9)
-    assert [m for m in run.messages if "Interpreted" in m and "transport_delay" in m]
-
-
 def test_an_fmu_that_takes_longer_steps_is_named_with_the_step_that_compiles():
     def controlled(plant, T):
         @subsystem(sample_time=T, name=f"for_{plant.name}")
@@ -288,7 +281,7 @@ def test_a_folder_that_others_can_write_is_not_trusted(tmp_path, monkeypatch, fr
 
 def test_a_library_that_was_cut_off_is_compiled_again(tmp_path, monkeypatch, fresh):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path))
-    source = runtime.runtime_source()
+    source = runtime_source()
     library = libraries._library_of(source)
     libraries.load_compiled(source)
     part = library.read_bytes()[: library.stat().st_size // 2]

@@ -19,6 +19,7 @@ from loopwright.blocks import (
     Step,
     StopCondition,
     TransferFunction,
+    TransportDelay,
 )
 from loopwright.diagrams import Diagram, Interrupted, subsystem
 from loopwright.fmus import Fmu, bouncing_ball, build, mass_spring_damper
@@ -162,7 +163,7 @@ def test_impacts_fall_at_the_times_of_the_closed_form(files):
         found.append(t)
         v *= 0.8
         t += 2.0 * v / g
-    impacts = [event.t for event in compiled.events][::2]  # its indicator is crossed on the way down and up
+    impacts = [event.t for event in compiled.events]
     np.testing.assert_allclose(impacts, found, atol=1e-8)
 
 
@@ -354,3 +355,11 @@ def test_a_warning_in_c_is_told_once(cache, tmp_path, fmi, isolate):
     assert run.tier == "compiled"
     (told,) = [m for m in run.messages if "Warning" in m]
     assert told.startswith(f"plant: reading the outputs gave fmi{fmi}Warning at t = 0.")
+
+
+def test_a_transport_delay_beside_one_is_interpreted_and_says_so(files):
+    """A mass on a spring of 4 N/m without damping, at rest until a step of force has come out of the delay."""
+    made = Diagram("d", mass(files)(force=TransportDelay(delay=0.5, name="late")(Constant(value=1.0))))
+    run = made.simulate(0.4, compile=True, progress=False)
+    assert [m for m in run.messages if m.startswith("Interpreted") and "'late'" in m]
+    assert run.tier == "interpreted"

@@ -22,7 +22,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, Interrupted, subsystem
-from loopwright.diagrams.compiled import libraries, native_tick
+from loopwright.diagrams.compiled import grouped_functions, libraries
 from loopwright.diagrams.flat import flat_diagram
 from support.both_forms import assert_same_bits, both
 from support.hybrid_blocks import counting
@@ -79,7 +79,7 @@ def test_a_chain_of_800_blocks_has_the_bits_of_numpy():
 @pytest.mark.parametrize(("make", "n"), [(chain, 600), (loops, 70), pytest.param(loops, 600, marks=pytest.mark.slow)])
 def test_large_diagrams_have_the_bits_of_their_interpreted_runs(make, n):
     made = make(n)
-    assert made.flattened(None).by_block
+    assert made.wired.flattened(None).by_block
     assert_same_bits(*both(made, 1.0))
 
 
@@ -247,13 +247,13 @@ def test_an_interrupt_that_comes_as_c_calls_python_ends_the_run(monkeypatch):
     """Python would raise it at the first instruction of the function that C calls, where ctypes drops it."""
     calls, entries = [], [0]
 
-    def enter(call, before=native_tick.call_for_c):
+    def enter(call, before=grouped_functions.call_for_c):
         entries[0] += 1
         if entries[0] == 60:
             signal.raise_signal(signal.SIGINT)
         before(call)
 
-    monkeypatch.setattr(native_tick, "call_for_c", enter)
+    monkeypatch.setattr(grouped_functions, "call_for_c", enter)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(Interrupted), with_python(lambda x, u: calls.append(1) or u).simulation(compile=True) as s:

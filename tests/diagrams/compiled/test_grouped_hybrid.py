@@ -19,7 +19,7 @@ from loopwright.blocks import (
 from loopwright.blocks.core import SimulationError
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.compiled import write_hybrid
-from loopwright.diagrams.compiled.grouped_parts import Differences, find_differences
+from loopwright.diagrams.compiled.differences import find_columns
 from loopwright.diagrams.flat import NONE, flat_diagram
 
 QUIET = {"progress": False}
@@ -74,8 +74,7 @@ def test_the_derivative_of_the_rates_needs_few_evaluations(grouped):
     n = 40
     made, _ = ring(n)
     flat = made.flatten(1e-3)
-    found = find_differences(flat.part_program("flow"), flat.continuous, None, 0)
-    assert isinstance(found, Differences)
+    found = find_columns(flat.part_program("flow"), flat.continuous)
     assert len(found.first) - 1 <= 9  # colors; a column for itself would be 40
     dense = np.zeros((n, n), bool)
     dense[found.pattern] = True
@@ -92,7 +91,7 @@ def test_states_of_a_vector_depend_on_what_their_entries_do(grouped):
     system = StateSpace(A=a, B=np.eye(3), C=np.eye(3), D=np.zeros((3, 3)), name="system")
     made = Diagram("vector", system(Gain(gain=np.eye(3)[::-1], name="back")(system.y)))
     flat = made.flatten(1e-3)
-    found = find_differences(flat.part_program("flow"), flat.continuous, None, 0)
+    found = find_columns(flat.part_program("flow"), flat.continuous)
     dense = np.zeros((3, 3), bool)
     dense[found.pattern] = True
     assert np.all(dense[np.array(a) + np.eye(3)[::-1] != 0.0])

@@ -169,12 +169,6 @@ def test_the_run_says_which_solver_ran():
     assert [m for m in compiled(oscillator(), 1.0).messages if "Dormand-Prince 5(4) (RK45)" in m and "Radau" in m]
 
 
-@pytest.mark.parametrize("solver", ["BDF", "LSODA", "CVODE_BDF"])
-def test_a_solver_that_is_not_in_c_is_interpreted_and_says_so(solver):
-    run = oscillator().simulate(0.1, solver=solver, compile=True, **QUIET)
-    assert [m for m in run.messages if "Interpreted" in m and repr(solver) in m]
-
-
 def test_growth_beyond_all_bounds_says_the_same_and_keeps_the_same():
     x = Integrator(name="x", initial_value=1.0)
     made = Diagram("d", x(Function(lambda x: x**2, name="square")(x.y)))

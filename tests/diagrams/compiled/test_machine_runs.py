@@ -144,12 +144,6 @@ def test_sampled_runs_and_events_make_no_difference_either(everywhere, swapped):
         assert [e.t for e in run.events] == [e.t for e in whole.events]
 
 
-def test_what_the_loop_in_c_does_not_have_is_done_by_python(everywhere):
-    run = oscillator().simulate(3.0, step=1e-2, solver="BDF", rtol=1e-8, atol=1e-11, compile=False, **QUIET)
-    assert (run.tier, run.messages) == ("interpreted", ())
-    np.testing.assert_allclose(run["x.y"], exact(run.t), rtol=0.0, atol=1e-5)
-
-
 def test_without_a_library_and_a_compiler_python_does_all(everywhere, monkeypatch, tmp_path):
     from loopwright.diagrams.compiled import libraries, runtime
 

@@ -7,11 +7,12 @@ import pytest
 
 from loopwright.blocks import Constant, Gain, Integrator, Product, PythonFunction, Relay, Sine, Sum, TransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.diagrams.compiled import fused, libraries, runtime, write_hybrid, write_ticks
+from loopwright.diagrams.compiled import fused, libraries, write_hybrid, write_ticks
 from loopwright.diagrams.lanes import lane_code
 from loopwright.diagrams.simulation.compiled_ticks import kinds_of
 from loopwright.fmus.export.compiler import TARGETS
 from loopwright.fmus.platform import native_platform
+from loopwright.fmus.runtime import runtime_source
 
 if native_platform() != "x86_64-linux":
     pytest.skip("calls from emulated code are those of x86_64-linux", allow_module_level=True)
@@ -52,7 +53,7 @@ def between_ticks():
 def sources():
     """All C code that runs compile, by name."""
     found = {
-        "runtime": runtime.runtime_source(),
+        "runtime": runtime_source(),
     }
     with pytest.MonkeyPatch.context() as patch:
         for grouped in (False, True):

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 from loopwright.blocks import Block, ConfirmationError, Constant, Gain, Input, OptionError, Output, State
 from loopwright.diagrams import Diagram, TrialMethod, subsystem
-from loopwright.diagrams.contact.confirmation import Trials
+from loopwright.diagrams.contact.confirmation import LimitTrials
 from loopwright.fmus import Fmu, build
 
 M, SHARE, DRAG, T, SUBSTEPS = 0.5, 8.0, 40.0, 5e-3, 10
@@ -168,6 +168,6 @@ def test_a_run_that_an_fmus_solver_damps_refutes_its_limit_and_says_what_to_try(
         t = np.arange(0.0, duration + T, T)
         return t, 1e-6 * np.exp(-9.0 * t) * np.cos(limit.frequency * t), 1e-6
 
-    monkeypatch.setattr(Trials, "run", damped)
+    monkeypatch.setattr(LimitTrials, "run", damped)
     with pytest.raises(ConfirmationError, match=r"cart: stiffness .* is refuted.*StepOptions\(tolerance=1e-10\)"):
         here.confirm(limit)

@@ -380,12 +380,12 @@ def test_poles_and_gains_of_the_chain_of_integrators_are_not_told_of_another_loo
 
 @pytest.mark.slow
 def test_friction_is_taken_out_of_a_plant_only_where_that_is_shown():
-    assert Fig3Case(experiments.compliance(plant=gantry_elastic.build()).diagram).plant_model is None
-    case = Fig3Case(diagram(gantry_elastic))
+    assert Fig3Case(experiments.compliance(plant=gantry_elastic.build()).diagram.wired).plant_model is None
+    case = Fig3Case(diagram(gantry_elastic).wired)
     assert list(case.variants) == ["sampled_d0", "continuous", "sampled_d1"]  # as it is comes first
     assert case.smooth is None
     assert any(note.startswith("The plant is not shown to be the gantry, so its friction") for note in case.notes)
-    assert Fig3Case(diagram()).plant_model == gantry.nominal
+    assert Fig3Case(diagram().wired).plant_model == gantry.nominal
 
 
 @pytest.mark.slow

@@ -3,7 +3,20 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Clock, Compare, Constant, Event, Gain, Integrator, State
+from loopwright.blocks import (
+    Block,
+    Clock,
+    Compare,
+    Constant,
+    Counter,
+    Event,
+    Gain,
+    Integrator,
+    PulseTrain,
+    Relay,
+    State,
+    Step,
+)
 from loopwright.diagrams import Diagram, subsystem
 from support.hybrid_blocks import Crossings
 
@@ -61,13 +74,33 @@ class Saw(Block):
 
 @pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("solver", ["auto", "rk4", "RK45", "Radau", "LSODA", "CVODE_Adams", "BDF"])
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="samples of step= that no subsystem acts at are no ticks yet: an event a few ulps later comes after them, and "
-    "events that follow each other drift by more than 4 ulp",
-)
 def test_a_sample_of_a_diagram_in_continuous_time_sees_an_event_that_belongs_to_it(solver, compiled):
     """y = t modulo 1, from the right, at 1, 2, … 6 s."""
     run = Diagram("d", Saw(name="saw")).simulate(6.0, step=0.5, solver=solver, compile=compiled, progress=False)
     np.testing.assert_allclose(run["saw.y"], run.t % 1.0, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.both_tiers
+def test_an_event_at_a_tick_is_seen_there_beside_one_that_a_source_makes():
+    """At 0.3 s a source jumps, and x = t reaches a threshold up to rounding: a sampled subsystem sees both."""
+    count = Counter(name="count")(Step(times=0.3, values=1.0))
+    compare = Compare(">", name="c")(ramp(), 0.3)
+
+    @subsystem(sample_time=0.1)
+    def both(first, second):
+        return Gain(gain=1.0, name="f")(first).named("counted"), Gain(gain=1.0, name="g")(second).named("seen")
+
+    run = Diagram("d", *both(count, compare)).simulate(0.6, progress=False)
+    assert run["counted"].tolist() == [0, 0, 0, 1, 1, 1, 1]
+    assert run["seen"].tolist() == [0, 0, 0, 1, 1, 1, 1]
+
+
+@pytest.mark.both_tiers
+@pytest.mark.parametrize("solver", ["RK45", "Radau"])
+def test_a_step_that_ends_a_few_roundings_before_a_jump_of_a_source_does_not_see_it(solver):
+    """A signal that falls through a relay's upper level makes no rise; sums of 1/800 s end just before 0.02 k s."""
+    for k in range(13, 20):
+        relay = Relay(on_point=0.2, off_point=-0.2, name="r")(Step(times=k / 50, values=0.1, initial_value=0.3))
+        edges = Integrator(name="i")(PulseTrain(period=0.07, duty=0.75))  # steps of full length begin behind them
+        run = Diagram("d", relay, edges).simulate(0.5, step=0.5, max_step=1 / 800, solver=solver, progress=False)
+        assert run.events == (), k

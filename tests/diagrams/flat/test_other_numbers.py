@@ -49,10 +49,10 @@ def made_anew(diagram):
 def renumbered(diagram, changes):
     blocks = {}
     other = made_anew(diagram.replace(changes))
-    for path, block in diagram.scheduled.blocks.items():
-        if other.scheduled.blocks[path] != block:
-            blocks[path] = other.scheduled.blocks[path]
-    return diagram.renumbered(blocks), other
+    for path, block in diagram.wired.scheduled.blocks.items():
+        if other.wired.scheduled.blocks[path] != block:
+            blocks[path] = other.wired.scheduled.blocks[path]
+    return diagram.of_wired(diagram.wired.renumbered(blocks)), other
 
 
 def assert_equal_runs(first, second):
@@ -80,7 +80,7 @@ def test_functions_are_traced_once(monkeypatch):
         monkeypatch.setattr(functions, name, lambda *_, **__: pytest.fail("traced again"))
     variant, _ = renumbered(diagram, CHANGES)
     variant.simulate(0.2, **QUIET)
-    again = variant.renumbered({"room": variant["room"].replace(initial_value=0.9)})
+    again = variant.of_wired(variant.wired.renumbered({"room": variant["room"].replace(initial_value=0.9)}))
     assert again.simulate(0.2, **QUIET)["room.y"][0] == 0.9
     assert again.flatten().origin is diagram.flatten()
     assert again["relay"].on_point == 0.05

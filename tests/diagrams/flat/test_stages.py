@@ -37,7 +37,19 @@ A_Q, B_Q, C_Q, D_Q = RNG.normal(size=(2, 2)), RNG.normal(size=(2, 2)), RNG.norma
 A_R, B_R, C_R, D_R = RNG.normal(size=(2, 2)), RNG.normal(size=(2, 2)), RNG.normal(size=(2, 2)), RNG.normal(size=(2, 2))
 
 
-class Matrices:
+class Outside:
+    """An evaluator whose bound calls are those of `evaluate`."""
+
+    def bind(self, names, vectors, *, again):
+        t, x, u, into = vectors
+
+        def call():
+            into[:] = self.evaluate(names, float(t[0]), x, u)
+
+        return call
+
+
+class Matrices(Outside):
     """A linear block, evaluated from outside."""
 
     def __init__(self, A, B, C, D, *, slopes=True):
@@ -56,7 +68,7 @@ class Matrices:
         return np.hstack([np.zeros((len(J), 1)), J])
 
 
-class Equations:
+class Equations(Outside):
     """Any traced block, its equations called from outside."""
 
     def __init__(self, flat, path):
@@ -125,7 +137,7 @@ def loop(*more):
     return Diagram("loop", p(r(Wave(name="wave") - q(p.y))), *(made(p.y) for made in more))
 
 
-class WaveOutside:
+class WaveOutside(Outside):
     """The wave, evaluated from outside."""
 
     def evaluate(self, names, t, x, u):

@@ -1,15 +1,17 @@
 """Margins of loops: closed forms, both time domains, unstable and hidden modes, and that confirmations can fail."""
 
 import json
+from fractions import Fraction
 
 import control
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from loopwright.blocks import ConfirmationError, LoopwrightError, ParameterError
 from loopwright.diagrams import Number, margins, nyquist_count
 from loopwright.diagrams.frequency import loop_margins, loop_scan, scan_refine_confirm
-from loopwright.diagrams.frequency.loop_scan import Scan
+from loopwright.diagrams.frequency.loop_scan import LoopScan
 from loopwright.diagrams.frequency.realization import Realization
 from loopwright.diagrams.frequency.sensitivity_peaks import confirm_peak
 from support.loops import open_loops, sampled_triple, stabilized_loops, triple
@@ -201,13 +203,13 @@ def test_a_closed_loop_on_the_limit_is_not_called_stable_by_rounding():
 
 def test_two_crossings_between_two_samples_are_found_by_the_slope():
     r = Realization.of(control.tf([1.05 * 0.2 * 5, 0.0], [1, 0.2 * 5, 25]))  # |L| = 1.05 at 5 rad/s, nothing else
-    scan = Scan(r)
+    scan = LoopScan(r)
     assert len(scan.find_gain_crossovers()) == 2
     scan.segments = [np.array([0.5, 4.0, 6.0, 50.0])]
     scan.samples = [(L, dL * w) for w, (L, dL) in zip(scan.segments, map(r.response, scan.segments), strict=True)]
     assert np.all(np.abs(scan.samples[0][0]) < 1)
     assert [c.omega for c in scan.find_gain_crossovers()] == pytest.approx(
-        [c.omega for c in Scan(r).find_gain_crossovers()]
+        [c.omega for c in LoopScan(r).find_gain_crossovers()]
     )
 
 
@@ -313,24 +315,24 @@ def test_a_scan_that_goes_wrong_is_an_error(what, monkeypatch):
         return [loop_scan.Crossing(c.omega * 1.05, c.L * 1.05, c.slope, c.error) for c in real(self)]
 
     if what in ("gain", "phase"):
-        real = getattr(loop_scan.Scan, f"find_{what}_crossovers")
-        monkeypatch.setattr(loop_scan.Scan, f"find_{what}_crossovers", off)
+        real = getattr(loop_scan.LoopScan, f"find_{what}_crossovers")
+        monkeypatch.setattr(loop_scan.LoopScan, f"find_{what}_crossovers", off)
     elif what == "delay":
-        real = loop_scan.Scan.find_gain_crossovers
+        real = loop_scan.LoopScan.find_gain_crossovers
         monkeypatch.setattr(loop_margins, "_confirm_crossing", lambda *_: "")
         monkeypatch.setattr(
-            loop_scan.Scan,
+            loop_scan.LoopScan,
             "find_gain_crossovers",
             lambda self: [loop_scan.Crossing(c.omega * 1.05, c.L, c.slope, c.error) for c in real(self)],
         )
     elif what == "peak":
-        peak = loop_scan.Scan.find_peak
+        peak = loop_scan.LoopScan.find_peak
         monkeypatch.setattr(
-            loop_scan.Scan, "find_peak", lambda *a: loop_scan.Peak(peak(*a).value * 0.99, peak(*a).omega)
+            loop_scan.LoopScan, "find_peak", lambda *a: loop_scan.Peak(peak(*a).value * 0.99, peak(*a).omega)
         )
     else:
-        fall = loop_scan.Scan.find_fall_below
-        monkeypatch.setattr(loop_scan.Scan, "find_fall_below", lambda *a: fall(*a) * 1.01)
+        fall = loop_scan.LoopScan.find_fall_below
+        monkeypatch.setattr(loop_scan.LoopScan, "find_fall_below", lambda *a: fall(*a) * 1.01)
     with pytest.raises(ConfirmationError):
         margins(triple(20.0))
 
@@ -415,6 +417,34 @@ def test_rounding_in_a_chain_of_integrators_is_not_scaled_up_to_be_seen():
     found = margins(control.ss(A, [[14.2278318], [0.0], [0.0]], [[8.43417339, 10.54271674, 15.625]], 0.0))
     assert found.gain_margin_low.value == pytest.approx(1 / 9, abs=1e-6)
     assert [c.frequency.value > 1.0 for c in found.phase_crossovers] == [True]
+
+
+@pytest.mark.parametrize("apart", [0, 1, 3])
+def test_samples_so_close_to_a_crossing_that_both_are_rounding_find_it(apart):
+    # (60 s² + 1200 s + 8000)/s³ crosses the negative real axis at √(400/3) rad/s, beside which its zeros put samples
+    scan = LoopScan(Realization.of(control.tf([60.0, 1200.0, 8000.0], [1.0, 0.0, 0.0, 0.0])))
+    at = np.sqrt(400 / 3)
+    close = at * (1 + np.finfo(float).eps * np.unique([-apart, apart]))
+    scan.segments = [
+        np.unique(np.append(part, close[(close > part[0]) & (close < part[-1])])) for part in scan.segments
+    ]
+    scan.samples = [scan._response(omega) for omega in scan.segments]
+    found = [c.omega for c in scan.find_phase_crossovers()]
+    assert found == pytest.approx([at], rel=1e-11)
+
+
+def test_a_crossing_at_the_highest_frequency_with_a_large_factor_is_confirmed():
+    # −0.02/(s² − 1.98 s + 1) sampled: its zero is at −1.003, so that L(−1) is −2e-10, and the closed loop with −1/L(−1)
+    # has the poles 1219 and −1 of a matrix of norm 5e7
+    M = expm(np.array([[0.0, 1.0, 1.0], [-1.0, 1.98, 1.0], [0.0, 0.0, 0.0]]) * 0.005)
+    loop = control.ss(M[:2, :2], M[:2, 2:], [[-1.0, 1.0]], 0.0, 0.005)
+    (a, b), (c, d) = [[-Fraction(float(v)) - (i == j) for j, v in enumerate(row)] for i, row in enumerate(loop.A)]
+    u, v = (Fraction(float(value)) for value in loop.B[:, 0])
+    L = (a * v - c * u - (d * u - b * v)) / (a * d - b * c)  # C (z I − A)⁻¹ B at z = −1, exactly
+    found = margins(loop).phase_crossovers[-1]
+    assert found.frequency.value == pytest.approx(np.pi / 0.005, rel=1e-14)
+    assert found.gain_margin.value == pytest.approx(float(-1 / L), abs=found.gain_margin.tolerance)
+    assert found.gain_margin.tolerance < 1e-5 * found.gain_margin.value
 
 
 def test_a_delay_margin_of_exactly_one_sample_is_confirmed():

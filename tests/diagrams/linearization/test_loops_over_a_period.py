@@ -7,8 +7,7 @@ import scipy.optimize
 from loopwright.blocks import PID, Constant, Gain, Integrator, TransferFunction
 from loopwright.blocks.core.errors import ConfirmationError, WiringError
 from loopwright.diagrams import Diagram, margins, subsystem
-from loopwright.diagrams.linearization.loops_over_a_period import confirm_loop
-from loopwright.diagrams.linearization.over_a_period import Model
+from loopwright.diagrams.linearization.over_a_period import Model, confirm_loop, find_needed, lift
 from loopwright.diagrams.report.pages.definitions import definition
 
 
@@ -166,3 +165,44 @@ def test_a_report_names_the_state_that_keeps_an_operating_point_from_rest():
     report = diagram.report(only=("injection",), point=diagram.operating_point(20.0))
     (text,) = [line for s in report.sections if s.key == "injection" for line in s.text if line.startswith("as it is")]
     assert "at box.u: not done, as the operating point is not at rest: angle.y moves by 0.1 in a period" in text
+
+
+# --- ticks put together ----------------------------------------------------------------------------------------------
+
+
+def go_through(steps, x, inputs):
+    """The state after all ticks, and the outputs of each, tick by tick."""
+    outputs = []
+    for (A, B, C, D), d in zip(steps, inputs, strict=True):
+        outputs.append(C @ x + D @ d)
+        x = A @ x + B @ d
+    return x, np.concatenate(outputs)
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_a_lifted_model_leads_where_its_ticks_lead_one_after_the_other(count):
+    rng = np.random.default_rng(count)
+    sizes = ((3, 3), (3, 2), (2, 3), (2, 2))
+    steps = [tuple(rng.standard_normal(size) for size in sizes) for _ in range(count)]
+    x, inputs = rng.standard_normal(3), rng.standard_normal((count, 2))
+    A, B, C, D = lift(steps, each_tick=True)
+    after, outputs = go_through(steps, x, inputs)
+    np.testing.assert_allclose(A @ x + B @ inputs.ravel(), after, rtol=1e-12)
+    np.testing.assert_allclose(C @ x + D @ inputs.ravel(), outputs, rtol=1e-12)
+    held = lift(steps, each_tick=False)
+    after, outputs = go_through(steps, x, [inputs[0]] * count)
+    np.testing.assert_allclose(held[0] @ x + held[1] @ inputs[0], after, rtol=1e-12)
+    np.testing.assert_allclose(held[2] @ x + held[3] @ inputs[0], outputs[:2], rtol=1e-12)
+
+
+def test_states_stay_that_are_needed_at_one_tick_of_a_period():
+    # 0 is a state; 1 is held from the first tick and read at the second; 2 is recorded alone; 3 is a mode; 4 is a mode
+    # that the input moves
+    first, second = np.eye(5), np.eye(5)
+    first[1], first[2] = [1, 0, 0, 0, 0], [1, 0, 0, 0, 0]
+    second[0, 1], second[0, 3], second[0, 4] = 0.5, 2.0, 1.0
+    none, moved = np.zeros((5, 1)), np.array([[0], [0], [0], [0], [1.0]])
+    C, D = np.array([[1.0, 0, 0, 0, 0]]), np.zeros((1, 1))
+    steps = [(first, moved, C, D), (second, none, C, D)]
+    assert find_needed(steps, {0}) == [0, 1, 4]
+    assert find_needed([lift(steps, each_tick=False)], {0}) == [0, 4]  # from period to period nothing reads 1

@@ -89,7 +89,7 @@ def test_a_point_that_is_found_anew_gives_the_slopes_of_the_equilibrium():
     diagram = make_tank()
     model = diagram.linearize(diagram.trim())
     followed = slopes_by(model, "u", "r.value", "tank.area")
-    found = slopes_by(model, "u", "r.value", "tank.area", find=lambda d: d.trim())
+    found = slopes_by(model, "u", "r.value", "tank.area", find=lambda d: d.facade.trim())
     for name, one in followed.items():
         assert not one.rest_lost
         error = found[name].errors[0].max()
@@ -116,7 +116,7 @@ def test_a_moving_point_within_the_period_is_differentiated_along_its_motion():
 
     model = make_tank(level=1.44, sample_time=T).replace({"r.value": 2.0}).linearize(0.2)
     changed = at_change(lambda c: make(c).replace({"r.value": 2.0}), "u", 1e-3, point=0.2)
-    found = slopes_by(model, "u", "tank.outlet", find=lambda d: d.operating_point(0.2))["tank.outlet"]
+    found = slopes_by(model, "u", "tank.outlet", find=lambda d: d.facade.operating_point(0.2))["tank.outlet"]
     for mine, other in zip(found.slopes, changed, strict=True):
         assert mine == pytest.approx(other, abs=2e-8 * max(1.0, np.abs(other).max(initial=0.0)))
 

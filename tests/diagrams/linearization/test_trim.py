@@ -5,22 +5,26 @@ import pytest
 from scipy.optimize import brentq
 
 from loopwright.blocks import (
+    Block,
     Constant,
     Delay,
     Ellipse,
     Function,
     Gain,
+    Input,
     Integrator,
     OptionError,
     ParameterError,
     Reference,
     SimulationError,
+    State,
     Sum,
     UnitDelay,
     UnknownNameError,
+    parameter,
 )
 from loopwright.diagrams import Channel, Diagram, fig3, subsystem
-from loopwright.fmus import Fmu, gantry, mass_spring_damper
+from loopwright.fmus import Fmu, build, gantry, mass_spring_damper
 from loopwright.fmus.models.mass_spring_damper import MassSpringDamper
 
 PATH = Ellipse(semi_axes=(0.3, 0.15), center=(0.5, 0.5))
@@ -101,6 +105,25 @@ def test_an_fmus_own_parameter_is_found():
         step=1e-3,
     )
     assert point.parameters["plant.start.mass"] == pytest.approx(1.0, rel=1e-9)
+
+
+class Capillary(Block):
+    """A vessel that empties through a capillary: V̇ = q − k d⁴ V."""
+
+    diameter: float = parameter(default=2e-6, unit="m", description="d")
+    conductance: float = parameter(default=1e23, unit="1/(m4.s)", description="k")
+    inflow = Input(unit="m3/s", description="q")
+    volume = State(unit="m3", start=1.0, output=True)
+
+    def derivative(self, t, x, u):
+        return u.inflow - self.conductance * self.diameter**4 * x.volume
+
+
+def test_a_parameter_of_an_fmu_far_below_1_in_its_unit_is_found():
+    plant = Fmu(build(Capillary()), name="plant")
+    diagram = Diagram("vessel", plant(inflow=Constant(value=0.5, unit="m3/s", name="q")))
+    point = diagram.trim(free={"plant.start.diameter": (1e-7, 1e-3)}, targets={"plant.volume": 2.0}, step=1e-2)
+    assert point.parameters["plant.start.diameter"] == pytest.approx((0.5 / (1e23 * 2.0)) ** 0.25, rel=1e-9)
 
 
 def test_fig3_at_rest_at_a_point_off_the_path_stays_there():

@@ -292,10 +292,10 @@ def test_an_operating_point_of_a_run_and_a_time_are_the_same():
 def test_the_injection_leaves_all_other_blocks_where_they_are():
     diagram = fig3_loop()
     flat = diagram.flatten()
-    made = inject_signal(diagram, find_signal(flat, "v_perp"), 1, (flat.base, 0 * flat.base))
+    made = inject_signal(diagram.wired, find_signal(flat, "v_perp"), 1, (flat.base, 0 * flat.base))
     assert set(made.diagram.blocks) - set(diagram.blocks) == {made.source, made.sum}
     assert set(made.diagram.names) == set(diagram.names)
-    silent = made.diagram.simulate(0.2, progress=False)
+    silent = made.diagram.facade.simulate(0.2, progress=False)
     plain = diagram.simulate(0.2, progress=False)
     np.testing.assert_array_equal(silent["position"], plain["position"])
 

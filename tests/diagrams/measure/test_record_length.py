@@ -151,7 +151,7 @@ def sampled(tau, T, held):
 @pytest.mark.parametrize(("held", "most"), [(False, SOLVED), (True, LONGEST)])
 def test_a_report_adds_no_sine_that_takes_for_ever(held, most):
     """A loop that is a million times slower than its samples: periods have a bounded number of them."""
-    case = Case(sampled(1000.0, 0.001, held))
+    case = Case(sampled(1000.0, 0.001, held).wired)
     variant = case.variants["sampled_d0"]
     frequencies = case.excitation(variant, next(iter(case.loop_wires().values()))).frequencies
     assert len(frequencies) == 5
@@ -161,7 +161,7 @@ def test_a_report_adds_no_sine_that_takes_for_ever(held, most):
 
 
 def test_a_loop_as_fast_as_its_samples_is_measured_around_its_poles():
-    case = Case(sampled(0.05, 0.01, True))
+    case = Case(sampled(0.05, 0.01, True).wired)
     variant = case.variants["sampled_d0"]
     frequencies = case.excitation(variant, next(iter(case.loop_wires().values()))).frequencies
     pole = -np.log(1 - 0.01 / 0.05) / 0.01
@@ -169,7 +169,7 @@ def test_a_loop_as_fast_as_its_samples_is_measured_around_its_poles():
 
 
 def test_frequencies_that_are_left_out_are_counted():
-    variant = Case(sampled(0.05, 0.01, True)).variants["sampled_d0"]
+    variant = Case(sampled(0.05, 0.01, True).wired).variants["sampled_d0"]
     plan = InjectionPlan(variant, np.array([0.1, 1.0, 2 * np.pi / (400 * 0.01), 10.0, 100.0]), 1e-4)
     kept = plan.shortened(400)
     assert kept.frequencies.tolist() == plan.frequencies[2:].tolist()

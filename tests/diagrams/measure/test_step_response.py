@@ -39,7 +39,7 @@ def sampled(gain=3.0, delay=0, more=0.0):
 
 
 def test_a_continuous_loop_answers_as_its_complementary_sensitivity():
-    found = step_response(spring(), "u", size=0.1, length=3.0, outputs=["place.y"])
+    found = step_response(spring().wired, "u", size=0.1, length=3.0, outputs=["place.y"])
     s = control.tf("s")
     for linear in (False, True):
         _, T = control.step_response((3 * s + 40) / (s**2 + 3 * s + 40), found.t)
@@ -49,17 +49,17 @@ def test_a_continuous_loop_answers_as_its_complementary_sensitivity():
 
 
 def test_the_final_value_is_that_of_the_linear_model_at_frequency_zero():
-    found = step_response(spring(), "u", size=0.1, length=0.2, outputs=["place.y", "speed.y"])
+    found = step_response(spring().wired, "u", size=0.1, length=0.2, outputs=["place.y", "speed.y"])
     np.testing.assert_allclose(found.final / 0.1, [-1.0, 1 / 40, 0.0], atol=1e-9)
     assert found.final_answer() == pytest.approx(1.0)
-    held = step_response(sampled(), "u", size=0.1, length=0.1, outputs=["lag.y"])
+    held = step_response(sampled().wired, "u", size=0.1, length=0.1, outputs=["lag.y"])
     np.testing.assert_allclose(held.final / 0.1, [-1.0, 1 / 3], atol=1e-9)
 
 
 def test_a_continuous_diagram_is_tried_at_the_point_that_was_trimmed():
     """It starts 2.9 N off the rest of its integral, which the step response was measured around."""
     diagram = make_slide()
-    found = step_response(diagram, "u", size=1e-4, length=1.0, at=diagram.trim(targets={"slide.speed": 0.3}))
+    found = step_response(diagram.wired, "u", size=1e-4, length=1.0, at=diagram.trim(targets={"slide.speed": 0.3}))
     s = control.tf("s")
     L = (6 * s + 40) / (s * (2 * s + slide_slope()))
     _, T = control.step_response(L / (1 + L), found.t)
@@ -122,7 +122,7 @@ def test_a_response_that_ends_off_its_target_never_settles():
 
 @pytest.mark.parametrize("delay", [0, 1])
 def test_a_sampled_loop_is_its_recurrence(delay):
-    found = step_response(sampled(delay=delay), "controller.u", size=0.1, length=2.0, outputs=["lag.y"])
+    found = step_response(sampled(delay=delay).wired, "controller.u", size=0.1, length=2.0, outputs=["lag.y"])
     assert found.held
     y, v, before = np.zeros(len(found.t)), np.zeros(len(found.t)), 0.0
     for k in range(len(y)):
@@ -144,8 +144,8 @@ def test_a_diagram_that_moves_by_itself_gives_the_steps_part_alone():
     def controller(y):
         return Gain(gain=3.0, name="gain")(Sine(frequency=2.0, name="wish") - y).named("u")
 
-    moving = step_response(Diagram("moving", lag(controller(lag.y))), "controller.u", size=0.1, length=1.0)
-    resting = step_response(sampled(), "controller.u", size=0.1, length=1.0)
+    moving = step_response(Diagram("moving", lag(controller(lag.y))).wired, "controller.u", size=0.1, length=1.0)
+    resting = step_response(sampled().wired, "controller.u", size=0.1, length=1.0)
     np.testing.assert_allclose(moving.v, resting.v, atol=1e-13)
     assert moving.moved > 0.1
     assert resting.moved == 0.0
@@ -160,7 +160,7 @@ def test_a_saturation_makes_the_run_differ_from_its_prediction():
 
     diagram = Diagram("limited", lag(controller(lag.y)))
     small, large = (
-        step_response(diagram, "controller.u", size=size, length=2.0, outputs=["controller.limit.excess"])
+        step_response(diagram.wired, "controller.u", size=size, length=2.0, outputs=["controller.limit.excess"])
         for size in (0.01, 0.2)
     )
     np.testing.assert_allclose(small.v, small.prediction[:, 0], atol=1e-13)
@@ -171,17 +171,17 @@ def test_a_saturation_makes_the_run_differ_from_its_prediction():
 
 def test_an_unstable_loop_ends_where_it_has_grown_and_names_the_wire():
     with pytest.raises(SimulationError, match=r"controller\..*grown to .* after a step of 0.1.*not stable there"):
-        step_response(sampled(gain=400.0), "controller.u", size=0.1, length=15.0)
+        step_response(sampled(gain=400.0).wired, "controller.u", size=0.1, length=15.0)
 
 
 def test_a_wire_with_several_entries_asks_for_one():
     place = Integrator(initial_value=[0.0, 0.0], name="place")
     diagram = Diagram("two", place(Gain(gain=-1.0, name="law")(place.y).named("u")))
     with pytest.raises(OptionError, match=r"found 2 entries; expected one. Name one of them: u\[1\]"):
-        step_response(diagram, "u", size=0.1, length=1.0)
+        step_response(diagram.wired, "u", size=0.1, length=1.0)
     with pytest.raises(OptionError, match="size: found 0"):
-        step_response(spring(), "u", size=0, length=1.0)
-    found = step_response(diagram, "u[1]", size=0.1, length=5.0)
+        step_response(spring().wired, "u", size=0, length=1.0)
+    found = step_response(diagram.wired, "u[1]", size=0.1, length=5.0)
     np.testing.assert_allclose(found.answer(), 1 - np.exp(-found.t), atol=1e-7)
 
 
@@ -200,7 +200,7 @@ def test_a_long_run_with_a_solver_goes_in_c(length, tiers, monkeypatch):
             return run
 
     monkeypatch.setattr(injection, "Simulation", Watched)
-    response = step_response(sampled(), "u", size=0.1, length=length)
+    response = step_response(sampled().wired, "u", size=0.1, length=length)
     assert set(found[1:]) == tiers
     np.testing.assert_allclose(response.answer()[1:], 1 - 0.97 ** np.arange(len(response.t) - 1), atol=1e-9)
 
@@ -238,7 +238,7 @@ def test_with_the_linear_model_beside_it_a_slow_tail_costs_no_accuracy():
     fast = TransferFunction(numerator=[0.5], denominator=[1e-3, 1.0], name="fast")
     slow = TransferFunction(numerator=[0.5], denominator=[4.325e-3, 1.0], name="slow")
     diagram = Diagram("two", Sum(signs="++", name="sum")(fast(wish), slow(wish)).named("y"))
-    got = step_response(diagram, "w", size=0.1, length=0.02, outputs=["y"])
+    got = step_response(diagram.wired, "w", size=0.1, length=0.02, outputs=["y"])
     expected = got.expected(1, got.size)
     np.testing.assert_allclose(expected.response, 1 - left(got.t), atol=1e-12)
     assert expected.low == pytest.approx(1 - left(got.t[-1] + got.dt), rel=1e-9)
@@ -267,7 +267,7 @@ def test_what_lies_between_the_samples_is_in_the_tolerance_of_a_peak(samples):
 
 
 def test_the_linear_model_knows_a_peak_between_the_samples():
-    got = step_response(spring(), "u", size=0.1, length=8.0)
+    got = step_response(spring().wired, "u", size=0.1, length=8.0)
     fine = np.linspace(0.0, 8.0, 64 * (len(got.t) - 1) + 1)
     s = control.tf("s")
     _, exact = control.step_response((3 * s + 40) / (s**2 + 3 * s + 40), fine)
@@ -283,7 +283,7 @@ def test_a_mode_that_lasts_less_than_a_sample_is_seen_by_the_linear_model():
     lead = TransferFunction(numerator=[1e-5, 0.0], denominator=[1e-5, 1.0], name="lead")
     slow = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="slow")
     diagram = Diagram("stiff", Sum(signs="-+-", name="sum")(fast(wish), lead(wish), slow(wish)).named("y"))
-    got = step_response(diagram, "w", size=1.0, length=5.0, outputs=["y"])
+    got = step_response(diagram.wired, "w", size=1.0, length=5.0, outputs=["y"])
     t = np.geomspace(1e-9, 1e-3, 20001)
     peak = np.max(np.abs(-np.exp(-t / 1e-7) + np.exp(-t / 1e-5) - (1 - np.exp(-t))))
     found = np.max(np.abs(got.prediction[:, 1])) + got.between[1]
@@ -291,7 +291,7 @@ def test_a_mode_that_lasts_less_than_a_sample_is_seen_by_the_linear_model():
 
 
 def test_held_signals_have_no_peak_between_the_samples():
-    got = step_response(sampled(), "controller.u", size=0.1, length=1.0, outputs=["lag.y", "controller.gain.y"])
+    got = step_response(sampled().wired, "controller.u", size=0.1, length=1.0, outputs=["lag.y", "controller.gain.y"])
     assert got.steady.tolist() == [True, False, True]
     found = measure_step(got.t, got.v, held=got.is_steady(0), expected=got.expected(0))["peak"]
     assert found.tolerance <= 0.1 * 0.97 ** (len(got.t) - 2) + 1e-9  # what is still to come

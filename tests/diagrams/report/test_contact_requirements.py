@@ -138,14 +138,14 @@ def write(path, *texts):
 )
 def test_a_file_that_makes_no_contact_is_refused_with_its_line(tmp_path, text, words):
     with pytest.raises(OptionError, match=words):
-        ContactTask.read(write(tmp_path / "c.toml", text)).check(cart_diagram())
+        ContactTask.read(write(tmp_path / "c.toml", text)).check(cart_diagram().wired)
 
 
 def test_a_file_of_contacts_has_the_numbers_of_the_diagrams_own(tmp_path):
     file = write(tmp_path / "c.toml", TABLE, "[contact.requirements]", "stiffness = 3.0", TABLE.replace("hand", "blind")
                  .replace('"felt"', "false"), "[contact.blind.requirements]", "stiffness = 4", "with = {damping = 2}")  # fmt: skip
     task = ContactTask.read(file)
-    found = task.find(cart_diagram())
+    found = task.find(cart_diagram().wired)
     assert found["hand"].stability_limit().value == pytest.approx(SOFT, rel=1e-9)
     assert found["blind"].measured is None
     assert {name: [str(v.limits["stiffness"]) for v in limits] for name, limits in task.limits.items()} == {

@@ -30,7 +30,7 @@ def resonant(damping=1e-3):
 
 def drawn(diagram, wire, kind=bode):
     """Return the lines of a loop's figure."""
-    case = Case(diagram)
+    case = Case(diagram.wired)
     (v,) = case.usable()
     L = v.loop(wire)
     from loopwright.diagrams import margins
@@ -62,20 +62,22 @@ def test_a_nyquist_curve_has_no_chord_across_an_undamped_resonance():
 
 def test_a_variant_has_one_color_in_all_figures():
     for name in ("tank", "crane"):
-        case = Case(getattr(reviewed, name)())
+        case = Case(getattr(reviewed, name)().wired)
         looks = case.looks
         assert looks[case.actual.key]["color"] == BLUE
         assert len({str(look["color"]) + str(look["linestyle"]) for look in looks.values()}) == len(looks)
-    delayed = Case(reviewed.tank(delay=1))
+    delayed = Case(reviewed.tank(delay=1).wired)
     assert delayed.looks["sampled_d1"]["color"] == BLUE  # the diagram as it is
     assert delayed.looks["sampled_d0"]["color"] != BLUE
 
 
 def test_the_gang_of_four_is_drawn_where_the_whole_loop_goes_through_the_other_wire():
-    assert gang_of_four(Case(reviewed.drive()), "voltage", "controller.voltage") == ()  # the speed loop bypasses it
+    assert (
+        gang_of_four(Case(reviewed.drive().wired), "voltage", "controller.voltage") == ()
+    )  # the speed loop bypasses it
     lag, place = TransferFunction(numerator=[2.0], denominator=[0.1, 1.0], name="lag"), Integrator(name="place")
     u = Gain(gain=3.0, name="gain")(Constant(value=0.0, name="r") - place.y).named("u")
-    (plot,) = gang_of_four(Case(Diagram("single", place(lag(u).named("v")))), "u", "u")
+    (plot,) = gang_of_four(Case(Diagram("single", place(lag(u).named("v"))).wired), "u", "u")
     left, right = plot.figure.axes
     w, there = left.get_lines()[0].get_data()
     s = 1j * w
@@ -180,7 +182,7 @@ def test_verdicts_are_marked_in_the_text_and_in_each_row():
 
 
 def test_a_block_that_is_defined_at_samples_has_no_continuous_variant_and_the_report_says_so():
-    case = Case(reviewed.crane())
+    case = Case(reviewed.crane().wired)
     assert case.variants["continuous"].problem.startswith("controller.observer is defined at samples only")
     assert "sample_time=" not in case.variants["continuous"].problem
 

@@ -78,7 +78,7 @@ def text_of(element):
 
 
 def test_the_page_is_valid_and_needs_no_network_and_no_script():
-    html = to_html(with_drawing(report(), experiments.compliance().diagram))
+    html = to_html(with_drawing(report(), experiments.compliance().diagram.wired))
     tree = parsed(html)
     assert not list(tree.iter("script"))
     assert not list(tree.iter("link"))
@@ -88,7 +88,7 @@ def test_the_page_is_valid_and_needs_no_network_and_no_script():
 
 
 def test_ids_are_unique_and_every_link_leads_somewhere():
-    html = to_html(with_drawing(report(), experiments.compliance().diagram))
+    html = to_html(with_drawing(report(), experiments.compliance().diagram.wired))
     ids = re.findall(r'\bid="([^"]+)"', html)
     assert len(set(ids)) == len(ids)
     links = set(re.findall(r'(?:href="|url\()#([^")]+)', html))
@@ -256,7 +256,7 @@ def test_only_long_tables_go_over_pages():
 
 
 def test_a_large_diagram_is_shown_closed_and_box_by_box():
-    tree = parsed(to_html(with_drawing(report(), experiments.compliance().diagram)))
+    tree = parsed(to_html(with_drawing(report(), experiments.compliance().diagram.wired)))
     captions = [text_of(c) for c in tree.iter("figcaption")]
     assert captions[0].startswith("Figure 1. The diagram with its subsystems closed.")
     assert [c for c in captions if "controller" in c and "inside" in c]
@@ -264,7 +264,7 @@ def test_a_large_diagram_is_shown_closed_and_box_by_box():
 
 
 def test_a_small_diagram_is_shown_as_it_is():
-    made = with_drawing(report(), Diagram("small", Gain(gain=2.0)(Sine(frequency=1.0))))
+    made = with_drawing(report(), Diagram("small", Gain(gain=2.0)(Sine(frequency=1.0))).wired)
     assert [p.caption[:12] for p in made.sections[0].plots] == ["The diagram."]
 
 
@@ -414,7 +414,7 @@ def test_a_notebook_shows_the_page_in_a_frame():
 
 
 def test_every_figure_has_its_caption_for_people_who_do_not_see_it():
-    tree = parsed(to_html(with_drawing(report(), experiments.compliance().diagram)))
+    tree = parsed(to_html(with_drawing(report(), experiments.compliance().diagram.wired)))
     drawn = [svg for svg in tree.iter() if str(svg.tag).endswith("svg") and svg.get("role") == "img"]
     captions = {text_of(caption).partition(". ")[2] for caption in tree.iter("figcaption")}
     assert len(drawn) >= 4

@@ -281,12 +281,12 @@ def test_a_diagram_without_a_loop_gets_a_report():
 
 
 def test_only_the_boxes_that_act_on_what_is_continuous_are_delayed():
-    assert delayed_subsystems(experiments.compliance().diagram) == ["controller"]
-    assert delayed_subsystems(speed_control()) == ["controller"]
+    assert delayed_subsystems(experiments.compliance().diagram.wired) == ["controller"]
+    assert delayed_subsystems(speed_control().wired) == ["controller"]
 
 
 def test_wires_off_all_loops_are_left_out():
-    assert wires_on_loops(speed_control()) == {"speed": "speed", "voltage": "controller.voltage"}
+    assert wires_on_loops(speed_control().wired) == {"speed": "speed", "voltage": "controller.voltage"}
 
 
 def test_an_unknown_section_is_refused():
@@ -303,7 +303,7 @@ def test_a_given_point_is_taken_over_by_variants_by_the_names_of_their_states():
     diagram = Diagram("lag", plant(controller(Constant(value=0.0, name="wanted"), plant.y.named("y"))))
     trimmed = diagram.trim(free=["wanted.value"], targets={"y": 3.0})
     for variant in (diagram.replace({"controller.delay": 2}), diagram.continuous()):
-        found = point_of(variant, trimmed, diagram)
+        found = point_of(variant.wired, trimmed, diagram.wired)
         assert found.values["plant.y"] == pytest.approx(3.0, rel=1e-9)
         assert found.values["controller.pi.u"] == pytest.approx(1.5, rel=1e-6)
         assert found.how == "trim"

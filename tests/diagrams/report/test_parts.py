@@ -59,12 +59,12 @@ def test_parts_that_apply_make_sections_and_those_of_one_key_make_one():
             part("d", "", made=made),
         ),
     )
-    case, sections = kind.sections(loop(), None, None, None, None, told.append)
+    case, sections = kind.sections(loop().wired, None, None, None, None, told.append)
     assert [(s.key, s.title, s.text) for s in sections] == [("a", "A", ("1", "3")), ("b", "B", ("2",))]
     assert told == ["variants", "a", "b", "d"]
     assert made == [("a", "1"), ("a", "3"), ("b", "2"), ("d", "")]
     assert case.keys == ("a", "b", "c", "d")
-    case, sections = kind.sections(loop(), None, None, None, ("b",), told.append)
+    case, sections = kind.sections(loop().wired, None, None, None, ("b",), told.append)
     assert [s.key for s in sections] == ["b"]
     assert case.keys == ("b",)
     with pytest.raises(OptionError, match="no section 'e'; expected some of a, b, c, d"):

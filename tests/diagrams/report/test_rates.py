@@ -47,7 +47,7 @@ def by_hand(samples, size, tick=0, inner=INNER):
 
 
 def test_a_step_at_a_fast_wire_is_sampled_at_each_renewal():
-    got = step_response(cascade(), "voltage", size=0.01, length=0.02, outputs=["current_wanted"])
+    got = step_response(cascade().wired, "voltage", size=0.01, length=0.02, outputs=["current_wanted"])
     assert got.dt == pytest.approx(FAST, rel=1e-12)
     begins = int(np.argmax(got.d != 0.0))
     expected = by_hand(len(got.v) - begins, 0.01, tick=begins + 1)  # the first sample is tick 1

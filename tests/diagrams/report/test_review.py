@@ -344,11 +344,15 @@ def test_check_without_requirements_and_names_that_are_not_there_are_wrong_usage
 
 
 def test_the_revision_changes_with_what_the_diagram_does_and_with_nothing_else():
-    same = {content_hash(loop()), content_hash(loop()), content_hash(pickle.loads(pickle.dumps(loop())))}
+    same = {
+        content_hash(loop().wired),
+        content_hash(loop().wired),
+        content_hash(pickle.loads(pickle.dumps(loop())).wired),
+    }
     assert len(same) == 1
     others = [loop().replace({"controller.gain.gain": 3.0 + 1e-15}), loop(limit=1.0), loop(start=0.5), reviewed.tank()]
     others += [loop().replace({"controller.delay": 1}), loop().replace({"controller.sample_time": 0.02})]
-    assert len({*same, *map(content_hash, others)}) == 7
+    assert len({*same, *(content_hash(other.wired) for other in others)}) == 7
 
 
 @pytest.mark.slow
@@ -357,7 +361,7 @@ def test_the_heading_has_its_lines_and_the_page_no_path_of_this_machine():
     report = analyse(loop(), only=("subject",), about=about)
     page = to_html(report)
     assert report.title == "The tank"
-    for text in (*about.values(), content_hash(loop())[:16]):
+    for text in (*about.values(), content_hash(loop().wired)[:16]):
         assert text in page
     plant = experiments.path_following().diagram
     assert str(plant["plant"].file.parent) not in to_html(analyse(plant, only=("subject",)))
@@ -388,7 +392,7 @@ def test_the_weakest_margin_is_named_with_the_place_where_it_is_lost():
 @pytest.mark.slow
 def test_the_diagram_as_it_is_comes_first():
     for delay, key in ((0, "sampled_d0"), (1, "sampled_d1"), (2, "sampled_own")):
-        variants = list(Case(reviewed.tank(delay=delay)).variants.values())
+        variants = list(Case(reviewed.tank(delay=delay).wired).variants.values())
         assert (variants[0].key, variants[0].title) == (key, "as it is")
         assert sum(v.is_actual for v in variants) == 1
         assert len({v.title for v in variants}) == len(variants)
@@ -431,7 +435,7 @@ def loop_numbers():
 
 def judged_with(asked, changes, drop=()):
     """Return the verdicts on the loop's numbers, some of them changed or left out, by quantity."""
-    case = Case(loop())
+    case = Case(loop().wired)
     case.requirements = asked
     numbers = {path: number for path, number in loop_numbers().items() if path.rpartition(".")[2] not in drop}
     return {r.quantity: r for r in review(case, asked, {**numbers, **changes}).results}

@@ -73,7 +73,7 @@ def test_a_measurement_of_an_unstable_loop_ends_where_the_signals_have_grown():
 
 
 def test_a_stable_diagram_has_no_such_beginning():
-    case = Case(servo(gain=20.0))
+    case = Case(servo(gain=20.0).wired)
     assert [Stability.of(v) for v in case.usable()] == [Stability.STABLE] * 3
     assert np.abs(poles_by_hand(20.0)).max() < 1
     assert unstable_first(case) is None

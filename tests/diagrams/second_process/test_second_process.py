@@ -48,7 +48,7 @@ def share(task, told):
             assert wait_for(lambda: bool(second._made) or not second._thread.is_alive())
         return task.make(key, told.append)
 
-    with SecondProcess(task, "letters") as second:
+    with SecondProcess(task.make, "letters") as second:
         return second.share(KEYS, make, told.append), second
 
 
@@ -72,7 +72,7 @@ def test_parts_that_the_second_process_does_not_make_are_made_here(parts, way):
 
 def test_an_error_here_ends_the_second_process(parts):
     task = parts({})
-    with pytest.raises(KeyboardInterrupt), SecondProcess(task, "letters") as second:
+    with pytest.raises(KeyboardInterrupt), SecondProcess(task.make, "letters") as second:
         second.share(KEYS, lambda key: (_ for _ in ()).throw(KeyboardInterrupt), print)
     assert second._process.poll() is not None
 
@@ -128,7 +128,7 @@ from pathlib import Path
 sys.path[:0] = {[os.path.dirname(__file__), str(Path(__file__).parents[2])]!r}
 from loopwright.diagrams.second_process import SecondProcess
 from test_second_process import Holds
-with SecondProcess(Holds(Path(sys.argv[1])), "letters") as second:
+with SecondProcess(Holds(Path(sys.argv[1])).make, "letters") as second:
     second.share(["a", "b"], lambda key: time.sleep(1e4), print)
 """
 

@@ -51,6 +51,20 @@ def test_a_sampled_diagram_alone_and_every_second_sample():
     assert run["y"][-1] == pytest.approx(np.sin(2 * np.pi * 0.4))
 
 
+@pytest.mark.parametrize("compiled", [False, "auto", True])
+def test_signals_in_continuous_time_are_those_of_the_end_without_any_states(compiled):
+    @subsystem(sample_time=0.02)
+    def box(u):
+        return Gain(gain=1.0, name="g")(u).named("y")
+
+    outside = Gain(gain=2.0, name="outside")(Clock(name="clock"))
+    run = Diagram("d", box(Clock(name="k")), outside).simulate(2.39, compile=compiled, progress=False)
+    assert run.t[-2:].tolist() == [2.38, 2.39]
+    assert run["y"][-2:].tolist() == [2.38, 2.38]
+    assert run["clock.y"][-2:].tolist() == [2.38, 2.39]
+    assert run["outside.y"][-2:].tolist() == [4.76, 4.78]
+
+
 def test_an_fmu_steps_to_the_end():
     whole = experiments.path_following().diagram.simulate(0.0100, progress=False)
     part = experiments.path_following().diagram.simulate(0.0095, progress=False)

@@ -20,6 +20,7 @@ from loopwright.blocks import (
     ShapeError,
     SimulationError,
     Step,
+    Sum,
     TransferFunction,
     UnknownNameError,
     WiringError,
@@ -325,3 +326,17 @@ def test_a_run_that_has_not_begun_or_has_ended_is_not_gone_on_with(spring, kind)
     assert run.t.tolist() == [0.0, 0.1, 0.2]
     assert (run.final_state is None) == (kind == "with an FMU")
     assert np.all(np.isfinite(run.data))
+
+
+def test_a_loop_in_a_subsystem_that_acts_later_holds_its_solution_from_the_start():
+    """e = 3 − e/2: until the first tick of the subsystem the integrator sees 2, too."""
+    error = Sum(signs="+-", name="error")
+
+    @subsystem(sample_time=0.1, offset=0.05)
+    def box(u):
+        return error(u, Gain(gain=0.5)(error.y)).named("e")
+
+    made = Diagram("d", Integrator(name="i")(box(Constant(value=3.0))), loops="solve")
+    run = made.simulate(0.3, step=0.05, progress=False)
+    assert run["e"] == pytest.approx(np.full(7, 2.0), abs=1e-14)
+    assert run["i.y"] == pytest.approx(2.0 * run.t, abs=1e-14)

@@ -119,11 +119,11 @@ direction = [1.0]
 damping = 2.0
 """
     file.write_text(text, encoding="utf-8")
-    found = WorstCaseTask.read(file).find(cart_diagram())
+    found = WorstCaseTask.read(file).find(cart_diagram().wired)
     assert found.worst.value == pytest.approx(spring_limit(5.0), rel=1e-6)
     file.write_text(text.replace("damping", "dampng"), encoding="utf-8")
     with pytest.raises(OptionError, match=r"worst.toml, line 6: worst_case.contact: a contact's limit has no 'dampng'"):
-        WorstCaseTask.read(file).find(cart_diagram())
+        WorstCaseTask.read(file).find(cart_diagram().wired)
 
 
 def test_start_values_of_an_fmu_in_model_exchange_are_varied():

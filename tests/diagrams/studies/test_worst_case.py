@@ -40,7 +40,7 @@ def test_the_worst_disk_margin_of_fig3_is_no_better_than_of_1000_random_points()
     omega = np.geomspace(1.0, 0.999 * np.pi / model.dt, 400)
     for _ in range(1000):
         changed = robot.replace({name: rng.uniform(low, high) for name, (low, high) in ranges.items()})
-        L, _ = loop_of_variant(model, ["v_perp"], changed, model.point)
+        L, _ = loop_of_variant(model, ["v_perp"], changed.wired, model.point)
         values = L(np.exp(1j * omega * model.dt))
         worst = min(worst, float(np.min(np.abs(2 * (1 + values) / (1 - values)))))
     assert found.worst.value <= worst * (1 + 1e-9)
@@ -140,7 +140,7 @@ def test_the_gradient_of_the_search_is_that_of_the_margin():
     diagram = make_pi_loop()
     boxes = {"p.gain": Box(0.5, 2.0), "ki.gain": Box(0.2, 4.0, "log")}
     goal = make_goal("u", "phase_margin_deg", None, "pi")
-    study = Study(diagram, goal, boxes, (None,), 0, {}, lambda text: None)
+    study = Study(diagram.wired, goal, boxes, (None,), 0, {}, lambda text: None)
     study.run({}, CaseOrigin.NOMINAL)
     at = np.array([0.4, 0.6])
     case = study.run(study.parameters_at(at), CaseOrigin.SEARCH)[0]

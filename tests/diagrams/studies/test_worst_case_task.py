@@ -50,7 +50,7 @@ def write(folder, text, name="limits.toml"):
 
 def test_a_file_asks_as_code_does(tmp_path):
     task = WorstCaseTask.read(write(tmp_path, TABLE))
-    found = task.find(make_pi_loop())
+    found = task.find(make_pi_loop().wired)
     assert found.worst.value == pytest.approx(min(pi_phase_margin(k, 0.5, 2.0) for k in (0.5, 1.0, 2.0)), rel=1e-9)
     assert found.parameters == {"p.gain": 0.5}
 
@@ -59,7 +59,7 @@ def test_ranges_are_pairs_or_tables_and_keys_may_be_dotted(tmp_path):
     text = '[worst_case]\nloop = ["u"]\n[worst_case.ranges]\np.gain = [0.5, 2]\n"ki.gain" = {low = 1, high = 9, scale = "log"}'
     task = WorstCaseTask.read(write(tmp_path, text))
     assert task.ranges == {"p.gain": [0.5, 2], "ki.gain": Box(1, 9, "log")}
-    task.check(make_pi_loop())
+    task.check(make_pi_loop().wired)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_ranges_are_pairs_or_tables_and_keys_may_be_dotted(tmp_path):
 def test_errors_name_the_line_and_the_entry(old, new, message, tmp_path):
     file = write(tmp_path, TABLE.replace(old, new))
     with pytest.raises(OptionError, match=message):
-        WorstCaseTask.read(file).find(make_pi_loop())
+        WorstCaseTask.read(file).find(make_pi_loop().wired)
 
 
 def test_a_setting_of_a_subsystem_is_named_once(tmp_path):
@@ -96,7 +96,7 @@ def test_a_setting_of_a_subsystem_is_named_once(tmp_path):
 
     task = WorstCaseTask.read(write(tmp_path, TABLE.replace("p.gain", "c.delay")))
     with pytest.raises(OptionError, match=r"line 8: worst_case.ranges.c.delay: found a delay of a subsystem"):
-        task.check(Diagram("loop", lag(c(lag.y))))
+        task.check(Diagram("loop", lag(c(lag.y))).wired)
 
 
 def test_requirements_of_the_file_are_made_worst_and_judged(tmp_path):
@@ -170,7 +170,7 @@ def test_a_wire_without_a_loop_is_named_with_its_entry_and_leaves_the_rest_of_th
     file = write(tmp_path, RENEWED)
     words = r"limits.toml, line 5: worst_case.loop: .* 'u' is renewed 3 times in the model's period of 0.03 s"
     with pytest.raises(OptionError, match=words):
-        WorstCaseTask.read(file).find(make_two_rates())
+        WorstCaseTask.read(file).find(make_two_rates().wired)
     report = analyse(make_two_rates(), requirements=file, only=("poles",))
     plain = analyse(make_two_rates(), requirements=read_requirements(write(tmp_path, "ms = 3.0")), only=("poles",))
     sections = {section.key: section for section in report.sections}

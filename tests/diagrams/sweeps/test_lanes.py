@@ -371,7 +371,7 @@ class EndedError(Exception):
 
 
 def test_a_sweep_that_is_ended_ends_within_a_chunk_of_ticks():
-    plan = make_plan(loop(), 1000.0, ["x"], None, (), {}, lanes=LANES)
+    plan = make_plan(loop().wired, 1000.0, ["x"], None, (), {}, lanes=LANES)
     told = []
 
     def tell(t):

@@ -8,7 +8,6 @@ import pytest
 from loopwright.blocks import Constant, Gain, Integrator, OptionError, StateSpace, UnknownNameError
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.sweeps import Box, grid, latin, read_samples, table
-from loopwright.diagrams.wiring import find_parameter
 
 
 @subsystem(sample_time=0.1)
@@ -86,28 +85,28 @@ def test_a_seed_belongs_to_its_sample_whatever_comes_after_it():
 )
 def test_a_name_is_the_path_that_replace_takes(name, full):
     diagram = loop()
-    assert find_parameter(diagram, name) == full
+    assert diagram.wired.find_parameter(name) == full
     value = {"plant": Integrator(initial_value=2.0), "controller.sample_time": 0.2}.get(name, 2.0)
     assert diagram.replace({full: value}).structure == diagram.replace({name: value}).structure
 
 
 def test_a_start_value_of_an_fmu_is_found_without_the_word_start():
     diagram = experiments.path_following().diagram
-    assert find_parameter(diagram, "plant.coulomb_scale") == "plant.start.coulomb_scale"
-    assert find_parameter(diagram, "plant.start.coulomb_scale") == "plant.start.coulomb_scale"
-    assert find_parameter(diagram, "pid_par.a0") == "controller.pid_par.a0"
+    assert diagram.wired.find_parameter("plant.coulomb_scale") == "plant.start.coulomb_scale"
+    assert diagram.wired.find_parameter("plant.start.coulomb_scale") == "plant.start.coulomb_scale"
+    assert diagram.wired.find_parameter("pid_par.a0") == "controller.pid_par.a0"
     variant = diagram.replace({"plant.coulomb_scale": 2.0})
     assert variant["plant"].start == diagram.replace({"plant.start.coulomb_scale": 2.0})["plant"].start
     for wrong in ("plant.coulomb_scal", "plant.start.viscous"):
         with pytest.raises(UnknownNameError, match="_scale") as said:
             diagram.replace({wrong: 2.0})
         with pytest.raises(UnknownNameError) as found:
-            find_parameter(diagram, wrong)
+            diagram.wired.find_parameter(wrong)
         assert str(said.value) == str(found.value)
     with pytest.raises(UnknownNameError, match=r"plant: it has no parameter 'coulomb_scal'. .*coulomb_scale"):
-        find_parameter(diagram, "plant.coulomb_scal")
+        diagram.wired.find_parameter("plant.coulomb_scal")
     with pytest.raises(UnknownNameError, match=r"no entry 'viscous' in 'start'.*viscous_scale"):
-        find_parameter(diagram, "plant.start.viscous")
+        diagram.wired.find_parameter("plant.start.viscous")
 
 
 @pytest.mark.parametrize(
@@ -137,7 +136,7 @@ def test_a_start_value_of_an_fmu_is_found_without_the_word_start():
 )
 def test_what_does_not_fit_is_refused_with_name_and_next_step(parameters, options, message):
     with pytest.raises((OptionError, UnknownNameError), match=message):
-        read_samples(loop(), parameters, **options)
+        read_samples(loop().wired, parameters, **options)
 
 
 @pytest.mark.parametrize(
@@ -157,5 +156,5 @@ def test_a_box_that_is_none_is_refused(ends, message):
 
 def test_parameters_of_vectors_and_matrices_can_be_swept():
     diagram = Diagram("two", StateSpace(A=[[-1.0]], B=[1.0], C=[1.0], name="lag")(Constant(value=1.0)))
-    found = read_samples(diagram, {"lag.A": [[[-1.0]], [[-2.0]]]})
+    found = read_samples(diagram.wired, {"lag.A": [[[-1.0]], [[-2.0]]]})
     assert [s.parameters["lag.A"] for s in found] == [[[-1.0]], [[-2.0]]]

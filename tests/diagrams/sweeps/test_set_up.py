@@ -43,7 +43,7 @@ def diagram():
 def test_a_run_of_a_sweep_calls_few_functions_of_python_and_none_for_each_tick(diagram):
     found = {}
     for ticks in (2, 500):
-        with Worker(make_plan(diagram, 0.001 * ticks, (), KEPT, (), {})) as worker:
+        with Worker(make_plan(diagram.wired, 0.001 * ticks, (), KEPT, (), {})) as worker:
             *first, last = samples(6)
             for sample in first:  # the chunks of ticks grow
                 worker.run(sample)
@@ -53,7 +53,7 @@ def test_a_run_of_a_sweep_calls_few_functions_of_python_and_none_for_each_tick(d
 
 
 def test_start_values_are_set_in_one_call_and_a_run_of_others_is_a_single_run(diagram):
-    with Worker(make_plan(diagram, 0.05, ("xi",), {"force": KEPT["force"]}, (), {})) as worker:
+    with Worker(make_plan(diagram.wired, 0.05, ("xi",), {"force": KEPT["force"]}, (), {})) as worker:
         for sample in samples(3):
             found = worker.run(sample)
             assert worker._bound[None].engine.plants["plant"]._start is not None  # by the short way
@@ -73,7 +73,7 @@ def test_two_threads_set_up_twice(diagram, monkeypatch):
 
 
 def test_runs_side_by_side_are_started_together(diagram):
-    with make_worker(make_plan(diagram, 0.002, (), KEPT, (), {}, lanes=8)) as worker:
+    with make_worker(make_plan(diagram.wired, 0.002, (), KEPT, (), {}, lanes=8)) as worker:
         assert worker.can_compile(samples(1)[0])
         given = samples(24)
         [*worker.run_all(given[:8])]
@@ -102,7 +102,7 @@ def test_a_block_is_built_once_for_all_of_its_parameters(monkeypatch):
         built.append(changes)
         return plain(block, **changes)
 
-    with Worker(make_plan(diagram, 3.0, (), {"end": final("y")}, (), {})) as worker:
+    with Worker(make_plan(diagram.wired, 3.0, (), {"end": final("y")}, (), {})) as worker:
         monkeypatch.setattr(DiscreteTransferFunction, "replace", replace)
         found = worker.run(Sample(0, dict(zip(names, (0.1, 0.4, -0.5), strict=True)), 0))
     assert len(built) == 1

@@ -248,8 +248,8 @@ from loopwright.diagrams import experiments, final
 from loopwright.diagrams.sweeps.plan import Plan
 from loopwright.diagrams.sweeps.revision import digest_of, parts_of
 diagram = experiments.force_tracking().diagram
-print(digest_of(parts_of(Plan(diagram, 1.0, {}, ("xi",), {"a": final("xi"), "b": lambda run: run["xi"]}))))
-print(digest_of(parts_of(Plan(diagram.replace({"plant.start.coulomb_scale": 1.5}), 1.0, {}, ("xi",)))))
+print(digest_of(parts_of(Plan(diagram.wired, 1.0, {}, ("xi",), {"a": final("xi"), "b": lambda run: run["xi"]}))))
+print(digest_of(parts_of(Plan(diagram.replace({"plant.start.coulomb_scale": 1.5}).wired, 1.0, {}, ("xi",)))))
 """
     found = []
     for seed in ("1", "2"):

@@ -395,7 +395,7 @@ def test_a_seed_that_is_fixed_in_the_code_compiles_nothing_by_default(monkeypatc
 
 def test_a_seed_of_noise_is_a_number_of_the_run_and_one_code_serves_all():
     diagram = gained(BandLimitedNoise(sample_time=T, name="noise").y)
-    plan = make_plan(diagram, 0.2, ["y"], None, "noise.seed", {})
+    plan = make_plan(diagram.wired, 0.2, ["y"], None, "noise.seed", {})
     samples = Samples(("box.gain.gain",), ((1.0,), (1.0,), (2.0,)), None, 7)
     with make_worker(plan) as worker:
         found = [worker.run(sample) for sample in samples]

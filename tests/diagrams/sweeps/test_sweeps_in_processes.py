@@ -148,7 +148,7 @@ def test_fmus_travel_as_bytes_and_are_files_of_the_cache_where_they_arrive(tmp_p
     file = Path(shutil.copy(gantry.build(), tmp_path / "mine.fmu"))
     content = file.read_bytes()
     diagram = experiments.hand_guiding(plant=Fmu(file)).diagram
-    plan = Plan(diagram, 0.01, {"compile": False}, ("xi",))
+    plan = Plan(diagram.wired, 0.01, {"compile": False}, ("xi",))
     with Worker(plan) as worker:
         here = worker.run(Sample(0, {}, 0))
     made, contents = Parcel.of(plan)

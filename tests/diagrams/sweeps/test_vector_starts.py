@@ -32,7 +32,7 @@ NEAR = 1e-13
 
 def started(diagram, table, signal="y", *, together=True):
     """Return the first ticks of some runs, by what `LaneStart` calls them, found together or one by one."""
-    with make_worker(make_plan(diagram, 0.1, (signal,), None, (), {}, lanes=LANES)) as worker:
+    with make_worker(make_plan(diagram.wired, 0.1, (signal,), None, (), {}, lanes=LANES)) as worker:
         numbers = [worker._variation.find(worker.plan.parameters_of(Sample(0, row, 0))) for row in table]
         lanes = worker._lanes(numbers[0], worker._bind(numbers[0]))
         assert not isinstance(lanes, str), lanes

@@ -43,5 +43,5 @@ def test_blocks_that_start_from_their_inputs_have_an_order_of_their_own(sorted_t
 
 
 def test_orders_of_a_diagram_without_starting_blocks_are_one():
-    at_instant, at_start = Diagram("one", Gain(gain=1.0)(Constant(value=1.0))).orders
+    at_instant, at_start = Diagram("one", Gain(gain=1.0)(Constant(value=1.0))).wired.orders
     assert at_instant is at_start

@@ -21,6 +21,7 @@ from loopwright.fmus.export import package as _build
 from loopwright.fmus.export.c_code import runtime
 from loopwright.fmus.export.compiler import TARGETS, compile_shared, find_compiler
 from loopwright.fmus.platform import native_platform
+from loopwright.fmus.toolchain import SUFFIXES
 from support.exported import mass_spring_damper
 from support.instances import run
 
@@ -218,7 +219,7 @@ def test_all_platforms(tmp_path, cache):
     magic = {"linux": b"\x7fELF", "windows": b"MZ", "darwin": b"\xcf\xfa\xed\xfe"}
     with zipfile.ZipFile(path) as archive:
         for name in TARGETS:
-            suffix = _compiler.SUFFIXES[name.split("-")[1]]
+            suffix = SUFFIXES[name.split("-")[1]]
             data = archive.read(f"binaries/{name}/mass_spring_damper{suffix}")
             assert data.startswith(magic[name.split("-")[1]])
             assert b"fmi3DoStep" in data

@@ -5,7 +5,7 @@ import pytest
 
 from loopwright.blocks import Block, Constant, FmuRuntimeError, Input, Output, ParameterError, Sine, UnknownNameError
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus import Fmu, FmuFault, StepOptions, doctor
+from loopwright.fmus import Fmu, FmuFault, Isolation, StepOptions, doctor
 from support.small_fmus import small_fmu, values
 
 # x' = gain u with the inputs held, or along their slope; it logs by a format, and discards steps above `longest`.
@@ -67,6 +67,18 @@ class Window(Block):
 @pytest.fixture(scope="module")
 def file(cache, tmp_path_factory):
     return small_fmu(tmp_path_factory.mktemp("fmi1"), "fmi1", SOURCE, MODEL)
+
+
+@pytest.mark.parametrize("isolate", [False, Isolation(step_time=0.2)])
+def test_a_step_that_stays_pending_is_an_error(tmp_path, monkeypatch, isolate):
+    monkeypatch.setattr("loopwright.fmus.calls.fmi_calls.FmiCalls.patience", 0.2)
+    never = SOURCE.replace("*v = c->pending-- > 0 ? 5 : 0", "*v = 5")
+    plant = Fmu(small_fmu(tmp_path, "fmi1", never, MODEL), name="plant", isolate=isolate)
+    made = Diagram("d", plant(u=Constant(value=2.0), on=Constant(value=1.0)))
+    with pytest.raises(
+        FmuRuntimeError, match=r"^plant, t = 0 s: the step .* was still pending after 0\.2 s: it failed"
+    ):
+        made.simulate(0.5, step=0.1, progress=False)
 
 
 @pytest.mark.parametrize("isolate", [False, True])

@@ -204,8 +204,8 @@ print("done", 1 / 3 + 1 / 7)
 @pytest.mark.parametrize(
     ("compiled", "traps"),
     [(False, "FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW"), (True, "FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW"),
-     (False, "FE_ALL_EXCEPT")],  # C sets them back after several calls, between which this FMU would be its own victim
-    ids=["interpreted", "compiled", "all traps"],
+     (False, "FE_ALL_EXCEPT"), (True, "FE_ALL_EXCEPT")],
+    ids=["interpreted", "compiled", "all traps", "all traps, compiled"],
 )  # fmt: skip
 @pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
 @pytest.mark.parametrize("fmi", [2, 3])

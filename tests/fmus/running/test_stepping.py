@@ -429,6 +429,49 @@ def test_the_time_that_the_fmu_is_told_is_that_of_the_chosen_arithmetic(events, 
     assert want[10] == (0.9999999999999999 if time == "added" else 1.0)
 
 
+WIDTHS = """
+typedef struct { double t, width, ends; } instance;
+int fmi3DoStep(void *p, double t, double h, bool final, bool *event, bool *terminate, bool *early, double *reached) {
+    instance *c = p; c->width = h; c->t = *reached = t + h; *terminate = c->ends && t + h > c->ends; return 0; }
+int fmi3GetFloat64(void *p, const unsigned vr[], size_t n, double v[], size_t nv) {
+    instance *c = p; if (c->ends && c->t > c->ends) return 3; v[0] = vr[0] == 1 ? c->width : c->ends; return 0; }
+int fmi3SetFloat64(void *p, const unsigned vr[], size_t n, const double v[], size_t nv) {
+    ((instance *)p)->ends = v[0]; return 0; }
+"""
+WIDTHS_MODEL = """<CoSimulation modelIdentifier="small" canHandleVariableCommunicationStepSize="true"/><ModelVariables>
+<Float64 name="width" valueReference="1" causality="output"/>
+<Float64 name="ends" valueReference="2" causality="parameter" variability="fixed" start="0"/>
+</ModelVariables><ModelStructure><Output valueReference="1"/></ModelStructure>"""
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+@pytest.mark.parametrize("time", ["multiplied", "added"])
+def test_a_step_is_told_its_length_to_the_last_bit(folder, time, isolate):
+    """Ends of steps that are added up are rounded, and their differences are other numbers than 0.1."""
+    file = small_fmu(folder, "fmi3", WIDTHS, WIDTHS_MODEL, name="widths")
+    with Fmu(file, name="plant", stepping=StepOptions(time=time), isolate=isolate).instantiate([], None) as one:
+        width, found = np.zeros(1), []
+        one.bind(np.zeros(0), width)
+        one.begin()
+        for k in range(20):
+            one.step(k / 10, 0.1)
+            found.append(float(width[0]))
+    assert found == [0.1] * 20
+    assert {(k / 10 + 0.1) - k / 10 for k in range(20)} != {0.1}
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_an_fmu_that_has_ended_need_not_give_its_outputs(folder, isolate):
+    """The end is what is told, and no function that fails behind it (FMI 3.0, 4.2.1)."""
+    file = small_fmu(folder, "fmi3", WIDTHS, WIDTHS_MODEL, name="widths")
+    with Fmu(file, name="plant", start={"ends": 0.15}, isolate=isolate).instantiate([], None) as one:
+        one.bind(np.zeros(0), np.zeros(1))
+        one.begin()
+        one.step(0.0, 0.1)
+        with pytest.raises(FmuRuntimeError, match=r"asks to end the simulation \(terminateSimulation\) at 0\.2 s"):
+            one.step(0.1, 0.1)
+
+
 TOLD = (
     """
 typedef struct { double t, u; } instance;

@@ -1,0 +1,198 @@
+"""Functions of large diagrams as runs of equal blocks, bound to vectors: ticks, rates, indicators, jumps."""
+
+from __future__ import annotations
+
+import ctypes
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..flat import bind_function
+from .functions import Bound, TickStructure, at, call_for_c, list_vectors
+from .grouping import BlockCalls, PartTables, PythonCall, TickTables
+from .kernels import Kernels
+from .machine import BlockProgramStructure
+
+_AT, _INT = ctypes.c_void_p, ctypes.c_int64
+_Python = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, ctypes.c_int64)
+
+
+class _Calls(ctypes.Structure):
+    _fields_ = [
+        *((name, _AT) for name in ("runs", "rows")),
+        ("count", _INT),
+        *((name, _AT) for name in ("generated", "programs")),
+        ("python", _Python),
+    ]
+
+
+class _Tick(ctypes.Structure):
+    _fields_ = [
+        ("calls", _Calls),
+        *((name, _INT) for name in ("states", "outside", "log", "next")),
+        *((name, _AT) for name in ("inputs", "guards", "made", "taken")),
+        *((name, _INT) for name in ("n_inputs", "n_guards", "n_loops", "residual")),
+        ("unread", _AT),
+        ("n_unread", _INT),
+    ]
+
+
+class _Part(ctypes.Structure):
+    _fields_ = [
+        ("calls", _Calls),
+        *((name, _INT) for name in ("states", "outside", "more")),
+        ("where", _AT),
+        ("lengths", _INT * 2),
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class GroupedFunction(ABC):
+    """A function of a large diagram as runs of equal blocks.
+
+    Attributes
+    ----------
+    tables : TickTables or PartTables
+        Where the values of each block are.
+    kernels : Kernels
+        The blocks' functions.
+    address : int
+        Address of the C function that goes over the tables.
+    """
+
+    tables: TickTables | PartTables
+    kernels: Kernels
+    address: int
+    _bound: list[tuple[Any, np.ndarray, Bound]] = field(default_factory=list, kw_only=True)
+
+    @property
+    def calls_python(self) -> bool:
+        """Whether Python evaluates some of the blocks."""
+        return len(self.tables.calls.python) > 0
+
+    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Bound:
+        """Return it bound to vectors, for one call at a time."""
+        v, kept, failures = self.tables.memory.copy(), list[Any](), list[Exception]()
+        structure = self._structure(arguments)
+        structure.calls = _bind_calls(self.tables.calls, self.kernels, v, arguments[3], kept, failures)
+        lists = list_vectors(arguments, 5), list_vectors(results, 4)
+        evaluate = TickStructure(self.address, *map(ctypes.addressof, (*lists, structure)), at(v))
+        bound = Bound(evaluate, arguments, results, [self, v, structure, lists, kept], failures)
+        self._bound.append((structure, v, bound))
+        return bound
+
+    def hand_over(self, to: GroupedFunction) -> None:
+        """Let other kernels of the same blocks take over wherever it is bound; C must not run meanwhile."""
+        for structure, v, bound in self._bound:
+            structure.calls = _bind_calls(
+                to.tables.calls, to.kernels, v, bound.arguments[3], bound.kept, bound.failures
+            )
+
+    @abstractmethod
+    def _structure(self, arguments: Sequence[np.ndarray]) -> Any:
+        """Return what C knows of it, without its calls."""
+
+
+@dataclass(frozen=True, eq=False)
+class GroupedTick(GroupedFunction):
+    """A tick, ``(t, x, w, p) -> (x_next, z, log, ok)``."""
+
+    tables: TickTables
+
+    def _structure(self, arguments: Sequence[np.ndarray]) -> Any:
+        tables = self.tables
+        return _Tick(
+            states=arguments[1].size,
+            outside=arguments[2].size,
+            log=tables.log,
+            next=tables.next,
+            inputs=at(tables.inputs),
+            guards=at(tables.guards),
+            made=at(tables.made),
+            taken=at(tables.taken),
+            n_inputs=tables.inputs.size,
+            n_guards=tables.guards.size,
+            n_loops=tables.made.size,
+            residual=tables.residual,
+            unread=at(tables.unread),
+            n_unread=tables.unread.size,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class GroupedPart(GroupedFunction):
+    """A function between ticks: rates, indicators, or states after events.
+
+    Attributes
+    ----------
+    operations : int
+        Operations of one evaluation.
+    """
+
+    tables: PartTables
+    operations: int
+
+    @property
+    def pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column of each entry: none, it is no derivative."""
+        return np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32)
+
+    def _structure(self, arguments: Sequence[np.ndarray]) -> Any:
+        return _Part(
+            states=arguments[1].size,
+            outside=arguments[2].size,
+            more=arguments[4].size if len(arguments) > 4 else 0,
+            where=at(self.tables.where),
+            lengths=(ctypes.c_int64 * 2)(*self.tables.lengths),
+        )
+
+
+def _bind_calls(
+    calls: BlockCalls, kernels: Kernels, v: np.ndarray, p: np.ndarray, kept: list[Any], failures: list[Exception]
+) -> _Calls:
+    """Return the calls of blocks as C knows them; what must live as long is added to ``kept``."""
+    programs = [program.bind() for program in kernels.programs]
+    array = (BlockProgramStructure * len(programs))(*(structure for structure, _ in programs))
+    python = _Python(_python_calls([_bind_python(call, kernels.of_python, v, p) for call in calls.python], failures))
+    kept += [calls, kernels, programs, array, python]
+    return _Calls(
+        runs=at(calls.runs),
+        rows=at(calls.rows),
+        count=len(calls.runs),
+        generated=kernels.generated,
+        programs=ctypes.addressof(array) if programs else None,
+        python=python,
+    )
+
+
+def _python_calls(calls: Sequence[Callable[[], None]], failures: list[Exception]) -> Callable[[int, int], int]:
+    """Return the function by which C has Python evaluate some blocks, one after the other."""
+
+    def evaluate(first: int, count: int) -> int:
+        def several() -> None:
+            for call in calls[first : first + count]:
+                call()
+
+        try:
+            call_for_c(several)
+        except Exception as error:  # C can't raise it
+            failures[:] = [error]
+            return 1
+        return 0
+
+    return evaluate
+
+
+def _bind_python(call: PythonCall, functions: Mapping[int, Any], v: np.ndarray, p: np.ndarray) -> Callable[[], None]:
+    """Return the call that evaluates a block from v and p into v."""
+    *given, parameters = call.arguments
+    columns = [v[:1], *(v[where] for where in given[1:]), p[parameters]]
+    bound = bind_function(functions[call.key], columns, [v[where] for where in call.results])
+
+    def evaluate() -> None:
+        bound.call()
+
+    return evaluate

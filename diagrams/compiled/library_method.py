@@ -1,0 +1,170 @@
+"""Methods of SciPy and SUNDIALS: the loop in C asks them for steps, and they ask C for the rates."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...blocks.interrupts import INTERRUPTS
+from ..solvers import AcceptedStep, Polynomial, Problem, Solver, make_solver
+from .hybrid_structures import MethodStructure, ProblemStructure
+from .runtime import load_runtime
+
+LIBRARY_METHODS = ("BDF", "LSODA", "CVODE_BDF", "CVODE_Adams")
+"""Methods whose steps a library takes."""
+MOST_POWERS = 12
+"""Highest order of their dense output: that of Adams' methods."""
+USES_SLOPE = ("Radau", "BDF", "LSODA", "CVODE_BDF")
+"""Methods that need the derivative of the rates by the states."""
+_BEGIN, _STEP_ON, _EXPAND = range(3)
+_PASSED, _FAILED = range(2)
+_Library = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int32)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A step that a library could not take.
+
+    Attributes
+    ----------
+    error : BaseException
+        The error of the solver, or what was raised in a call.
+    beyond : tuple of float and ndarray, or None
+        Time in s and states of the last trial at which a rate was not finite.
+    edge, left : float
+        The end of the stretch in s, and the last time before it, at which trials there are evaluated.
+    """
+
+    error: BaseException
+    beyond: tuple[float, np.ndarray] | None
+    edge: float
+    left: float
+
+
+class LibraryMethod:
+    """A method of another library, bound to the differential equation of a run.
+
+    Its dense output is a polynomial from the start of each step, x + Σ cₖ uᵏ, which C evaluates: the coefficients of
+    BDF come from its backward differences, those of LSODA from its Nordsieck array, those of CVODE from derivatives at
+    the start. The method's own polynomial has the same degree, so that both are equal but for rounding.
+
+    Parameters
+    ----------
+    name : str
+        One of `LIBRARY_METHODS`.
+    rtol, longest : float
+        Relative tolerance, and longest step in s.
+    atol : ndarray, shape (n,)
+        Absolute tolerances.
+    names : sequence of str
+        Names of the n states, for messages.
+    problem : ProblemStructure
+        The differential equation, as C knows it.
+    method : MethodStructure
+        The method, as C knows it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        rtol: float,
+        atol: np.ndarray,
+        longest: float,
+        names: Sequence[str],
+        problem: ProblemStructure,
+        method: MethodStructure,
+    ):
+        n = len(names)
+        self._name, self._rtol, self._atol, self._longest = name, rtol, atol.copy(), longest
+        self._problem, self._method = problem, method
+        self._of = Problem(n, self._rate, self._slope, names)
+        self._trial, self._rates, self._zeros = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._slopes = np.zeros((n, n) if name in USES_SLOPE else 0)
+        self._end, self._powers = np.zeros(n), np.zeros((MOST_POWERS, n))
+        method.x, method.D = self._end.ctypes.data, self._powers.ctypes.data
+        runtime = load_runtime()
+        self._evaluate, self._differentiate = runtime["loopwright_rates"], runtime["loopwright_slope"]
+        for function, result in ((self._evaluate, None), (self._differentiate, ctypes.c_int)):
+            function.restype = result
+            function.argtypes = (ctypes.c_void_p, ctypes.c_double, *[ctypes.c_void_p] * 2)
+        self._at = ctypes.addressof(problem), self._trial.ctypes.data, self._rates.ctypes.data, self._slopes.ctypes.data
+        self._answer_for_c = _Library(self._answer)
+        method.library = ctypes.cast(self._answer_for_c, ctypes.c_void_p).value
+        self._error: BaseException | None = None
+        self._beyond: tuple[float, np.ndarray] | None = None
+        self._step: AcceptedStep | None = None
+        self._solver = self._make_solver()
+
+    def begin_anew(self) -> None:
+        """Forget the run before."""
+        self._error = self._beyond = self._step = None
+        self._solver = self._make_solver()
+
+    def set_absolute_tolerance(self, atol: np.ndarray) -> None:
+        """Take other absolute tolerances from the next discontinuity on."""
+        if not np.array_equal(atol, self._atol):
+            self._atol = atol.copy()
+            self._solver.set_absolute_tolerance(self._atol)
+
+    def take_failure(self) -> Failure | None:
+        """Return why the last step could not be taken; None if it could."""
+        error, self._error = self._error, None
+        return None if error is None else Failure(error, self._beyond, self._problem.edge, self._problem.left)
+
+    def _make_solver(self) -> Solver:
+        longest = self._longest if np.isfinite(self._longest) else None
+        return make_solver(self._name, self._of, rtol=self._rtol, atol=self._atol, max_step=longest)
+
+    # --- calls of C --------------------------------------------------------------------------------------------------
+
+    def _answer(self, wanted: int) -> int:
+        """Take a step, or write the last one's dense output; an error waits until C has returned."""
+        try:
+            INTERRUPTS.heard = True
+            INTERRUPTS.check()
+            if wanted == _EXPAND:
+                self._expand()
+            else:
+                self._take_step(begins=wanted == _BEGIN)
+            return _PASSED
+        except BaseException as error:
+            self._error = error
+            return _FAILED
+        finally:
+            INTERRUPTS.heard = False
+
+    def _take_step(self, *, begins: bool) -> None:
+        method, solver = self._method, self._solver
+        if begins:
+            solver.restart(method.t, self._end, self._problem.stop)
+        self._step = solver.step()
+        self._end[:] = self._step.x
+        method.t = self._step.t
+
+    def _expand(self) -> None:
+        self._method.order, self._powers[0] = 1, np.nan  # if this fails, C goes no further
+        assert self._step is not None
+        found = self._step.polynomial()
+        assert isinstance(found, Polynomial)
+        self._method.order = found.coefficients.shape[1]
+        self._powers[: self._method.order] = found.coefficients.T
+
+    # --- calls of the library ----------------------------------------------------------------------------------------
+
+    def _rate(self, t: float, x: np.ndarray) -> np.ndarray:
+        problem, trial, rates, _ = self._at
+        self._trial[:] = x
+        self._evaluate(problem, t, trial, rates)
+        if self._zeros.dot(self._rates) != 0.0:  # one of them is not finite
+            self._beyond = t, self._trial.copy()
+        return self._rates
+
+    def _slope(self, t: float, x: np.ndarray) -> np.ndarray:
+        problem, trial, _, slopes = self._at
+        self._trial[:] = x
+        if not self._differentiate(problem, t, trial, slopes):
+            self._slopes[:] = np.nan
+        return self._slopes

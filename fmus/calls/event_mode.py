@@ -1,0 +1,217 @@
+"""Event Mode of an FMU in co-simulation (FMI 3.0, 2.3.5 and 4.2.1): discrete inputs, clocks, the event iteration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...blocks.core import FmuRuntimeError
+from ..archive import FmuVariable, OtherVariable
+from .fmi_calls import MOST_ROUNDS
+from .fmu_block import check_next_time
+from .step_failures import ROUNDED, StepFailures
+from .transfer import WatchedInputs
+
+_CHANGED = 2
+"""Qualifier of an interval that the FMU has set anew (fmi3IntervalChanged)."""
+
+
+@dataclass
+class Clock:
+    """Input clock that ticks at times known ahead; infinite ones never come."""
+
+    variable: OtherVariable
+    interval: float = math.inf
+    next: float = math.inf
+    count: int = 0
+    origin: float = 0.0
+
+    def start(self, t: float, interval: float, shift: float) -> None:
+        """Let it tick at t + shift, and then every interval, in s."""
+        self.interval, self.origin, self.count = interval, t + shift, 0
+        self.next = self.origin
+
+    def tick(self) -> None:
+        """Go on to the next tick."""
+        if self.variable.is_periodic:
+            self.count += 1
+            self.next = self.origin + self.count * self.interval
+        else:
+            self.next = math.inf  # until the FMU says it anew
+
+    def go_to(self, t: float) -> None:
+        """Go to the first tick from a time in s on."""
+        if self.variable.is_periodic and math.isfinite(self.interval):
+            ahead = (t - self.origin) / self.interval
+            self.count = max(0, math.ceil(ahead - ROUNDED * max(1.0, ahead)))
+            self.next = self.origin + self.count * self.interval
+
+
+@dataclass(frozen=True)
+class EventMemory:
+    """What is known of events beside the FMU's own state: the next ones, and the values that discrete inputs had."""
+
+    next_event: float
+    is_fresh: bool
+    clocks: tuple[tuple[float, float, int, float], ...]
+    values: tuple[np.ndarray, ...]
+
+
+class EventMode:
+    """Events of an instance: before a step, within it, and at its end.
+
+    Parameters
+    ----------
+    fmu : StepFailures
+        The instance.
+    inputs : mapping of str to FmuVariable
+        Variables of the ports.
+    vector : ndarray
+        Values of all inputs, shared with the run.
+
+    Attributes
+    ----------
+    discrete : list of str
+        Ports of the inputs that are set in Event Mode alone.
+    clocks : list of Clock
+        Input clocks whose ticks are known ahead.
+    next_event : float
+        Time in s of the next event of the FMU's own that it has told; infinite without one.
+    """
+
+    def __init__(self, fmu: StepFailures, inputs: Mapping[str, FmuVariable], vector: np.ndarray):
+        self.fmu, self.fmi = fmu, fmu.fmi
+        self.discrete = [port for port, v in inputs.items() if v.variability != "continuous"]
+        ours = {v.name: v for v in fmu.description.other.values() if v.type_is_clock and v.causality == "input"}
+        by_clocks: dict[tuple[str, ...], list[str]] = {}
+        for port in self.discrete:
+            by_clocks.setdefault(tuple(name for name in inputs[port].clocks if name in ours), []).append(port)
+        self._jumping = WatchedInputs(self.fmi, inputs, vector, by_clocks.pop((), []))
+        self._clocked = [(names, WatchedInputs(self.fmi, inputs, vector, ports)) for names, ports in by_clocks.items()]
+        self._triggered = {name: v for name, v in ours.items() if v.interval_variability == "triggered"}
+        self.clocks = [Clock(v) for v in ours.values() if v.interval_variability != "triggered"]
+        self.next_event = math.inf
+        self._is_fresh = True  # discrete inputs have not been set since the start
+
+    @property
+    def watched(self) -> list[WatchedInputs]:
+        """Inputs at whose changes events are."""
+        return [self._jumping, *(part for _, part in self._clocked)]
+
+    @property
+    def next_instant(self) -> float:
+        """Time in s of the next event that is known ahead; infinite without one."""
+        return min([self.next_event, *(clock.next for clock in self.clocks)])
+
+    # ---- the start, and saved states ----
+
+    def begin(self, t: float) -> None:
+        """Settle the events at the start, where the FMU is in Event Mode after its initialization."""
+        self._is_fresh, self.next_event = True, math.inf
+        for clock in self.clocks:
+            if clock.variable.is_periodic and clock.variable.interval is not None:
+                clock.start(t, clock.variable.interval, clock.variable.shift)
+        self._read_intervals(t, [c for c in self.clocks if not c.variable.is_periodic or c.variable.interval is None])
+        self._activate(t, [clock for clock in self.clocks if clock.next <= t], set())
+        self._settle(t)
+
+    def memory(self) -> EventMemory:
+        """Return what is known beside the FMU's own state."""
+        clocks = tuple((clock.interval, clock.next, clock.count, clock.origin) for clock in self.clocks)
+        return EventMemory(self.next_event, self._is_fresh, clocks, tuple(part.values.copy() for part in self.watched))
+
+    def return_to(self, t: float, memory: EventMemory | None) -> None:
+        """Go on from a restored state at a time in s; without a memory Event Mode tells the next events anew."""
+        if memory is None:
+            self._is_fresh, self.next_event = True, math.inf
+            for clock in self.clocks:
+                clock.go_to(t)
+            return
+        self._is_fresh, self.next_event = memory.is_fresh, memory.next_event
+        for part, values in zip(self.watched, memory.values, strict=True):
+            part.values[:] = values
+        for clock, kept in zip(self.clocks, memory.clocks, strict=True):
+            clock.interval, clock.next, clock.count, clock.origin = kept
+
+    # ---- events ----
+
+    def act_before(self, t: float, h: float) -> None:
+        """Go through Event Mode before a step of h from t, both in s, where anything is due or an input has jumped."""
+        changed, due = self._jumping.take(), self._due(t, h)
+        waiting = {name for names, part in self._clocked if part.differs for name in names if name in self._triggered}
+        if changed or self._is_fresh or waiting or due or self.next_event <= t + ROUNDED * h:
+            self._enter()
+            self.fmu.set_inputs(self._jumping.transfer, t)
+            self._activate(t, due, waiting)
+            self._settle(t)
+            self.fmu.check_end(t, h, t)
+        self._is_fresh = False
+
+    def act_within(self, t: float, end: float, h: float, *, asked: bool) -> bool:
+        """Go through Event Mode at t in a step of h up to an end, where the FMU asks for it or anything is due.
+
+        Return whether it was gone through. Clocks that tick at the end wait for the next step's inputs.
+        """
+        due = self._due(t, h) if t < end else []
+        acts = asked or bool(due) or self.next_event <= t + ROUNDED * h
+        if acts:
+            self._enter()
+            self._activate(t, due, set())
+            self._settle(t)
+        return acts
+
+    def _due(self, t: float, h: float) -> list[Clock]:
+        return [clock for clock in self.clocks if clock.next <= t + ROUNDED * h]
+
+    def _enter(self) -> None:
+        self.fmu.call("entering Event Mode", self.fmi.enter_event_mode)
+
+    def _activate(self, t: float, due: list[Clock], triggered: set[str]) -> None:
+        """Let clocks tick, and set the inputs that may be set at these ticks alone."""
+        ticking = {clock.variable.name: clock.variable for clock in due}
+        ticking |= {name: self._triggered[name] for name in sorted(triggered)}
+        if ticking:
+            references = [clock.reference for clock in ticking.values()]
+            self.fmu.call("activating its clocks", self.fmi.activate_clocks, references)
+        for clock in due:
+            clock.tick()
+        for names, part in self._clocked:
+            if not ticking.keys().isdisjoint(names):
+                part.take()
+                self.fmu.set_inputs(part.transfer, t)
+
+    def _settle(self, t: float) -> None:
+        """Update the discrete states until nothing changes, and go back to Step Mode."""
+        fmu = self.fmu
+        for _ in range(MOST_ROUNDS):
+            found = fmu.call("updating its discrete states", self.fmi.update_events)
+            if found.terminate:  # it stays in Event Mode, in which outputs can be read
+                fmu.take_end(t, 0.0, t)
+                return
+            if not found.again:
+                self.next_event = check_next_time(fmu.block, found.next_time, t)
+                break
+        else:
+            raise FmuRuntimeError(
+                f"the events don't settle in {MOST_ROUNDS} rounds (discreteStatesNeedUpdate); expected that they end. "
+                "Report it to its makers.",
+                block=fmu.block.label,
+                t=t,
+            )
+        self._read_intervals(t, [c for c in self.clocks if not c.variable.is_periodic])
+        fmu.call("entering Step Mode", self.fmi.enter_step_mode)
+
+    def _read_intervals(self, t: float, clocks: list[Clock]) -> None:
+        """Ask the FMU for the intervals that its description does not state."""
+        if not clocks:
+            return
+        references = [clock.variable.reference for clock in clocks]
+        found = self.fmu.call("reading the intervals of its clocks", self.fmi.clock_intervals, references)
+        for clock, (interval, qualifier) in zip(clocks, found, strict=True):
+            if clock.variable.is_periodic:
+                clock.start(t, interval, clock.variable.shift)
+            elif qualifier == _CHANGED:
+                clock.start(t, math.inf, interval)

@@ -1,0 +1,129 @@
+"""The model structure of an FMU in model exchange, held against what its values follow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from ...blocks.core import FmuRuntimeError, Wanted, elements
+from ..archive import ExchangeInfo, FmuVariable
+from .running_fmu import RunningFmu
+
+_MOVED, _SAME = 1e-4, 1e-8
+"""Relative distance by which states and inputs are moved, and change of a value that is none."""
+_MOST_PATTERNS, _MOST_NOTES = 50, 5
+"""Patterns of dependencies that are checked, and notes on values that change by themselves."""
+_CHECKED: dict[tuple[str, float, bytes, bytes], Sequence[str]] = {}
+_MOST_CHECKED = 10_000
+"""Points at which the model structure of an FMU has been checked in this process: its digest, t, x and u, with notes on
+what was found there; and how many are kept."""
+
+
+def is_smooth(variable: FmuVariable) -> bool:
+    """Whether an input may be set in Continuous-Time Mode: a real number that is not discrete."""
+    return variable.type in ("Float64", "Float32") and variable.variability == "continuous"
+
+
+def check_structure(
+    fmu: RunningFmu,
+    exchange: ExchangeInfo,
+    places: Mapping[str, slice],
+    evaluation: Callable[[Wanted], Callable[[float, np.ndarray, np.ndarray], np.ndarray]],
+    t: float,
+    x: np.ndarray,
+    u: np.ndarray,
+) -> None:
+    """Refuse a model structure that leaves out what outputs or derivatives follow; once for each point of an FMU.
+
+    FMUs that Loopwright has built are right. An input may act in some mode only, so every start is looked at. The
+    order of evaluation and linear models rest on it. Everything that some values should not follow is moved.
+
+    Values that differ between evaluations at one point, such as a processor time, follow nothing: that is noted.
+
+    Parameters
+    ----------
+    fmu : RunningFmu
+        The instance, in Continuous-Time Mode.
+    exchange : ExchangeInfo
+        Its model structure.
+    places : mapping of str to slice
+        Places of all inputs in u, by port.
+    evaluation : callable
+        Takes what is wanted, and returns its values as a function of t, x and u, with all smooth inputs set.
+    t, x, u
+        The point.
+    """
+    about = fmu.description
+    smooth = [port for port, v in fmu.inputs.items() if is_smooth(v)]
+    key = about.digest, t, x.tobytes(), u.tobytes()
+    if key in _CHECKED:
+        for text in _CHECKED[key]:
+            fmu.add_note(text)
+        return
+    if fmu.is_built_here or fmu.block.dependencies == "all" or (x.size and not about.states):
+        return
+    ports = [p for p, v in fmu.block.output_variables.items() if v.type == "Float64" and is_smooth(v)]
+    rows = [fmu.block.output_variables[p] for p in ports]
+    rows += [about.find(name) for name in about.states.values()]
+    columns: list[tuple[FmuVariable, str | None]] = [(about.find(name), None) for name in about.states]
+    columns += [(fmu.inputs[port], port) for port in smooth]
+    if not rows or not columns:
+        return
+    declared = np.block([[exchange.pattern(of, v) for v, _ in columns] for of in rows])
+    evaluate = evaluation(Wanted(tuple(ports), bool(about.states)))
+    start = np.concatenate([x, *(u[places[port]] for _, port in columns if port is not None)])
+    nominals, low, high = (
+        np.concatenate([np.ravel(part) for part in parts])
+        for parts in zip(*((v.nominals, *v.limits) for v, _ in columns), strict=True)
+    )
+    step = _MOVED * np.maximum(np.abs(start), nominals) * np.random.default_rng(0).uniform(0.5, 1.0, start.size)
+    step = np.where(start + step <= high, step, np.where(start - step >= low, -step, 0.0))
+
+    def values(moved: np.ndarray) -> np.ndarray:
+        inputs, first = u.copy(), x.size
+        for v, port in columns:
+            if port is not None:
+                inputs[places[port]] = moved[first : first + v.size]
+                first += v.size
+        return evaluate(t, moved[: x.size], inputs).copy()
+
+    names = [label for v in rows for label in elements(v.name, v.shape)]
+    base, again, whole = values(start), values(start), np.abs(values(start + step))
+    least, drift = _SAME * (np.abs(base) + whole), np.abs(again - base)
+    for pattern in np.unique(declared, axis=0)[:_MOST_PATTERNS]:
+        mine, free = np.all(declared == pattern, axis=1), ~pattern & (step != 0.0)
+        if not free.any():
+            continue
+        off = mine & (np.abs(values(np.where(free, start + step, start)) - base) > least)
+        if off.any():  # a value that grows by itself, in steps of a clock, may have waited for just this moment
+            drift = np.fmax(drift, np.abs(values(start) - base))
+        off &= ~(drift > least)
+        if not off.any():
+            continue
+        knowns = [label for v, _ in columns for label in elements(v.name, v.shape)]
+        row = int(np.flatnonzero(off)[0])
+        alone = (np.where(np.arange(start.size) == k, start + step, start) for k in np.flatnonzero(free))
+        sizes = [abs(values(moved)[row] - base[row]) for moved in alone]
+        values(start)
+        k = int(np.flatnonzero(free)[int(np.argmax(sizes))])
+        raise FmuRuntimeError(
+            f"its model structure says that {names[row]!r} does not depend on {knowns[k]!r}; found a change of "
+            f"{max(sizes):.3g} where that moves by {step[k]:.3g}. The order of evaluation would be wrong. Take "
+            "interface='co_simulation' if it is offered, or dependencies='all', by which everything may depend on "
+            "everything, and tell its makers.",
+            block=fmu.block.label,
+            t=t,
+        )
+    values(start)
+    notes = [
+        f"{names[row]!r} changes by itself: it differs by {drift[row]:.3g} between evaluations at one time, with "
+        "the same states and inputs, as a processor time or a random number does. Runs with it are not repeatable "
+        "where it is read, and its dependencies can't be checked"
+        for row in np.flatnonzero(drift > least)[:_MOST_NOTES]
+    ]
+    for text in notes:
+        fmu.add_note(text)
+    if len(_CHECKED) >= _MOST_CHECKED:
+        _CHECKED.clear()
+    _CHECKED[key] = notes

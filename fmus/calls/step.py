@@ -1,0 +1,583 @@
+"""A communication step of an FMU: its inputs are set, it goes on in time, its outputs are read.
+
+`StepParts` says what else belongs to it. It is the same step in this process and in another one, for Python and for the
+loops in C, which take it by its addresses (`native_step`).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...blocks.core import FmuRuntimeError, Layout
+from ..archive import FmuVariable
+from .bound_calls import BoundCalls, Call
+from .event_mode import EventMemory, EventMode
+from .fmi_calls import DISCARD, MOST_ROUNDS, WARNING
+from .native_step import NativeStep, QuietStep, RemoteStep, native_step, remote_step
+from .saved_state import FmuState
+from .step_failures import NEAR, ROUNDED, StepFailures
+from .step_options import StepParts, parts_of_step
+from .texts import watch_texts
+from .transfer import Transfer, UnfitError, WatchedInputs
+
+_BY_PYTHON = StepParts.EVENTS | StepParts.EARLY_RETURN | StepParts.SLOPES | StepParts.ROLLBACK
+"""Parts with which a loop in C takes those steps alone that turn out to be nothing but calls."""
+_MANY, _SPAN = 500, 1e-8
+"""So many parts of a step within so many seconds (relative to 1 + |t|) are events that pile up."""
+_MOST = 50_000
+"""Parts in one step, at the rate of the last ones, above which they are an error."""
+_SLOW = 1000
+"""Parts in one step, at the rate of the last ones, above which the run warns of them."""
+
+
+@dataclass(frozen=True)
+class StepMemory:
+    """What the steps keep beside the FMU's own state, for a return to it."""
+
+    added: float
+    sloped: np.ndarray
+    events: EventMemory | None
+
+
+class Step:
+    """Steps of an instance, with all that belongs to them by its options.
+
+    All calls of a step are bound once. A library in this process makes them one after the other; another process makes
+    them, and those that read the outputs, in one round trip.
+
+    Parameters
+    ----------
+    fmu : StepFailures
+        The instance, whose time and errors they are.
+    outputs : mapping of str to FmuVariable
+        Variables of the outputs, by port.
+    u, y : ndarray
+        Values of all inputs and outputs, shared with the run.
+    """
+
+    def __init__(self, fmu: StepFailures, outputs: Mapping[str, FmuVariable], u: np.ndarray, y: np.ndarray):
+        self.fmu, self.fmi, fmi, inputs = fmu, fmu.fmi, fmu.fmi, fmu.inputs
+        self.options, self._texts = fmu.block.stepping, fmu.record
+        self.parts = parts_of_step(fmu.description, self.options)
+        self.call = fmi.step_call(fmu.now, fmu.width, fmu.final)
+        self._guard = fmu.host if fmi.in_process and not fmu.is_built_here else nullcontext()
+        self._t, self._h = 0.0, 0.0
+        self._all_inputs, self._outs = Transfer(fmi, "Set", inputs, u), Transfer(fmi, "Get", outputs, y)
+        self.events = EventMode(fmu, inputs, u) if StepParts.EVENTS in self.parts else None
+        discrete = [] if self.events is None else self.events.discrete
+        held = [port for port in inputs if port not in discrete]
+        self._ins = Transfer(fmi, "Set", inputs, u, held) if discrete else self._all_inputs
+        self._slopes = InputSlopes(fmu, held, u) if StepParts.SLOPES in self.parts else None
+        self._added = np.full(1, math.nan)
+        """Time in s that steps have added up to, at which the next one begins; NaN before the first one."""
+        self._watch = watch_texts(fmi, fmu.record.variables.values())
+        self._bind()
+        self._reads = fmi.bind(self._outs.calls)
+        self._exchange = fmi.bind([*self._all_inputs.calls, *self._outs.calls])
+        self._is_read = False
+        """Whether the calls of a step have read the outputs as they are at its end."""
+        self._has_warned = False
+        self._until = np.full(1, -math.inf if self.parts & _BY_PYTHON else math.inf)
+        """Time in s before whose neighbourhood C takes steps."""
+        self._taken = np.zeros(sum(part.index.size for part in self._watched))
+        """Values of inputs at whose changes events are, after the last step of Python's."""
+
+    @property
+    def _watched(self) -> list[WatchedInputs]:
+        return [] if self.events is None else self.events.watched
+
+    def _bind(self) -> None:
+        """Bind the calls of a step, up to its end; in another process those behind it, too."""
+        fmi, call = self.fmi, self.call
+        self._handle = fmi.variable(ctypes.c_void_p)
+        self._kept: FmuState | None = None
+        """State before the last step, as its calls have saved it."""
+        self._before: FmuState | None = None
+        """State before the present part of a step, for its rollback."""
+        stages: list[tuple[str, Sequence[Call]]] = [("setting the inputs", self._ins.calls)]
+        if self._slopes is not None:
+            stages.append(("telling the slopes of its inputs", self._slopes.calls))
+        if StepParts.ROLLBACK in self.parts:
+            self.fmu.final.value = False
+            stages.append(("saving its state", [fmi.save_call(self._handle)]))
+        self._place = sum(len(calls) for _, calls in stages)
+        """Place of the step among the calls."""
+        stages.append(("a step", [(call.function, call.arguments)]))
+        if not fmi.in_process:
+            stages.append(("reading the outputs", self._outs.calls))
+            stages.append(("reading its texts", [] if self._watch is None else self._watch.calls))
+        self._actions = [action for action, calls in stages for _ in calls]
+        self._calls = fmi.bind([each for _, calls in stages for each in calls])
+
+    def function(self) -> Callable[[float, float], None]:
+        """Return `step`; for plain steps of whole vectors of Float64 a function that looks up little."""
+        fmu, call, run = self.fmu, self.call, self._calls.runner()
+        is_plain = self._ins.is_whole and self._outs.is_whole and not self._ins.has_limits
+        if not is_plain or self.parts or self._texts.variables or not isinstance(self._guard, nullcontext):
+            return self.step
+        now, width, any_flag, reached = fmu.now, fmu.width, call.any_flag, call.reached
+        filled, spread = self._ins.views, self._outs.views  # (from, to) each, in the sense of setting
+        read = self._reads.runner() if self.fmi.in_process else None
+
+        def step(t: float, h: float) -> None:
+            for here, there in filled:
+                there[:] = here
+            now.value, width.value = t, h
+            fmu.is_stepping = True
+            status = run()
+            if status or any_flag.value or abs(reached.value - t - h) > h * NEAR:
+                self._t, self._h = t, h
+                self._end(status)
+                return
+            fmu.is_stepping = False
+            if read is not None and (status := read()):
+                self._judge_reading(self._reads, status, t if status > WARNING else t + h)
+            for here, there in spread:
+                here[:] = there
+
+        return step
+
+    # ---- a step ----
+
+    def step(self, t: float, h: float) -> None:
+        """Set the inputs, take a step from a time over a length, both in s, and get the outputs."""
+        self.start(t, h)
+        self.finish()
+
+    def start(self, t: float, h: float) -> None:
+        """Set the inputs, and begin a step; one in another process goes on by itself until `finish`."""
+        if StepParts.ADDED_TIME in self.parts:
+            t = t if math.isnan(self._added[0]) else float(self._added[0])
+            self._added[0] = t + h
+        self._t, self._h = t, h
+        if self.events is not None:
+            with self._guard:
+                self.events.act_before(t, h)
+        self._fill(self._ins, t, in_step=True)
+        if self._slopes is not None:
+            self._slopes.take(t)
+        if self._kept is not None and self.fmi.in_process:  # another process saves in the same memory again
+            self._kept.free()
+            self._kept, self._handle.value = None, None
+        parted = self.parts & _BY_PYTHON  # parts of a step end where others begin
+        self.fmu.set_span(t, self._next_stop(t, t + h) - t if parted else h)
+        self.fmu.is_stepping = True
+        self._calls.start()
+
+    def finish(self) -> None:
+        """End the step that has begun, and get the outputs."""
+        with self._guard:
+            self._end(self._calls.finish())
+
+    def finish_native(self, t: float, h: float) -> None:
+        """End a step from t over h, both in s, that C has begun in another process, and get the outputs."""
+        self._t, self._h = self.fmu.now.value if StepParts.ADDED_TIME in self.parts else t, h
+        self.fmu.is_stepping = True
+        self.finish()
+
+    def _end(self, status: int) -> None:
+        """Go on to the end of a step whose calls have returned a status, and get the outputs."""
+        fmu, t, h = self.fmu, self._t, self._h
+        self._go_on(self._judge_calls(status), t, h)
+        fmu.set_span(t, h)
+        if self._slopes is not None and (status := self._slopes.take_status()) > WARNING:
+            raise fmu.report(f"setting its inputs within the step by {h:g} s", status, t)
+        if not self._is_read and (status := self._reads.run()):
+            self._judge_reading(self._reads, status, t if status > WARNING else t + h)
+        self._spread(t + h)
+        if self._texts.variables and (not self._is_read or self._watch is None or self._watch.take()):
+            fmu.note_texts(t + h)
+            if self._watch is not None:
+                self._watch.take()
+        fmu.is_stepping = False
+        if self.parts & _BY_PYTHON:
+            self._taken[:] = np.concatenate([np.zeros(0), *(part.values for part in self._watched)])
+            self._until[0] = -math.inf if fmu.ends_run else self._next_instant
+
+    def _judge_calls(self, status: int) -> int:
+        """Note warnings of the calls of a step, or raise the error of one before it; return the status of the step."""
+        fmu, t, found = self.fmu, self._t, 0
+        self._is_read = not self.fmi.in_process
+        if not status or status == WARNING:
+            for place in self._calls.warned_places() if status else ():
+                if place == self._place:
+                    found = WARNING
+                else:
+                    fmu.judge(self._actions[place], WARNING, t if place < self._place else t + self._h)
+        else:
+            place = self._calls.failed
+            if place < self._place:
+                raise fmu.report(self._actions[place], status, t)
+            found = status if place == self._place else 0
+            self._is_read = False  # what has failed behind the step is read once more, where its end is judged
+        if StepParts.ROLLBACK in self.parts:
+            self._kept = self._before = self._kept or fmu.keep(self._handle)
+        return found
+
+    def _go_on(self, status: int, t: float, h: float) -> None:
+        """Go on from the first part of a step from t over h, in parts where events are or the FMU ends a step early."""
+        fmu, end, now, part = self.fmu, t + h, t, self.fmu.width.value
+        if not self.parts & (StepParts.EVENTS | StepParts.EARLY_RETURN):
+            self._judge_part(status, t, h)
+            return
+        still, instants = 0, deque[float](maxlen=_MANY)
+        while True:
+            reached, asks = self._judge_part(status, now, part)
+            still = still + 1 if reached - now <= ROUNDED * h else 0
+            if still > MOST_ROUNDS:
+                self._refuse_standstill([*instants][-MOST_ROUNDS:], reached, still)
+            now = end if end - reached <= ROUNDED * h else reached
+            if self._is_ended(t, h, now):
+                return
+            instants.append(now)
+            if len(instants) == _MANY:
+                self._look_for_pile(instants)
+            if self.events is not None and self.events.act_within(now, end, h, asked=asks):
+                self._is_read = False
+                if self._is_ended(t, h, now):
+                    return
+            if end - now <= ROUNDED * h:
+                return
+            stop = self._next_stop(now, end)
+            part, self._is_read = stop - now, False
+            if StepParts.ROLLBACK in self.parts:
+                self._before = fmu.save()
+            fmu.set_span(now, part)
+            status = self.call.function(*self.call.arguments)
+
+    def _is_ended(self, t: float, h: float, now: float) -> bool:
+        """Return whether the FMU asks to end the simulation now; raise its error before the end of the step."""
+        self.fmu.check_end(t, h, now)
+        return self.fmu.ends_run
+
+    def _judge_part(self, status: int, t: float, h: float) -> tuple[float, bool]:
+        """Judge a step from t over h; return the time that it has reached, and whether the FMU asks for Event Mode."""
+        fmu, call = self.fmu, self.call
+        if status > WARNING:
+            self._is_read = False
+            self._judge_failure(status, t, h)
+            return t + h, False
+        if status:
+            fmu.judge("a step", status, t)
+        event, ends, early, _ = call.flags
+        if early and not ends and StepParts.EARLY_RETURN in self.parts:
+            return min(max(call.reached.value, t), t + h), bool(event)
+        fmu.check_flags(call, t, h)
+        return t + h, bool(event)
+
+    def _judge_failure(self, status: int, t: float, h: float) -> None:
+        """Wait for a step that is pending; take one that is discarded again, in parts; raise the error of a failure."""
+        fmu = self.fmu
+        status, ends = self.fmi.end_step(status)
+        if ends:
+            reached = self.fmi.time_after_discard(t, h)
+            fmu.take_end(t, h, t if reached is None else reached)
+        elif status == WARNING:
+            fmu.judge("a step", status, t)
+        elif status > WARNING and not (status == DISCARD and self._take_again(t, h)):
+            raise fmu.step_error(status, t, h)
+
+    def _take_again(self, t: float, h: float) -> bool:
+        """Take a step from t over h that was discarded again, in smaller ones; return whether that has worked.
+
+        With a state before it the FMU goes back to that. Else it is where it was before, in FMI 3.0 (4.2.1), or where
+        its lastSuccessfulTime says, in FMI 2.0 (4.2.2); where it says nothing, the step is not taken again.
+        """
+        fmu, fmi, call, state = self.fmu, self.fmi, self.call, self._before
+        if not self.options.retries or (state is None and not fmu.description.variable_step):
+            return False
+        end, now, part, count, status = t + h, t, h, 0, DISCARD
+        smallest = h * 0.5**self.options.retries
+        while True:
+            if status == DISCARD:
+                known = fmi.time_after_discard(now, part)
+                if state is not None:
+                    fmu.go_back(state)
+                    part = known - now if known is not None and smallest < known - now < part else 0.5 * part
+                    if part < smallest * (1.0 - ROUNDED):
+                        return False
+                elif known is None or part <= smallest * (1.0 + ROUNDED):
+                    return False
+                else:
+                    now = min(max(known, now), end)
+                    part = min(0.5 * part, end - now)
+            else:
+                now, count = now + part, count + 1
+            if end - now <= ROUNDED * smallest:
+                break
+            if status != DISCARD and state is not None:
+                state, part = fmu.save(), end - now
+            part = min(part, end - now)
+            fmu.set_span(now, part)
+            status, ends = fmi.end_step(call.function(*call.arguments))
+            if ends or (status > WARNING and status != DISCARD):
+                self._judge_failure(status, now, part)
+                status = 0
+            elif status <= WARNING:
+                fmu.judge("a step", status, now)
+                if call.any_flag.value:
+                    fmu.check_flags(call, now, part)
+            if status <= WARNING:
+                fmu.check_end(t, h, now + part)
+        fmu.set_span(t, h)
+        fmu.note_retry(t, h, count)
+        return True
+
+    def judge_native(self, stage: int, status: int, t: float, h: float) -> None:
+        """Judge a step in C from t over h, both in s, that was out of the ordinary: raise its error, or accept it.
+
+        It is one of a library in this process; for others see `finish_native`.
+
+        Parameters
+        ----------
+        stage : {0, 1, 2}
+            What was done last: setting the inputs, the step, reading the outputs.
+        status : int
+            Status of that.
+        """
+        if stage == 0 and status == WARNING:  # nothing is lost by setting the inputs once more
+            self.step(t, h)
+            return
+        if stage != 1 and status > WARNING:
+            raise self.fmu.report("setting the inputs" if stage == 0 else "reading the outputs", status, t)
+        self._judge_part(status if stage == 1 else 0, t, h)
+
+    # ---- values ----
+
+    def exchange(self) -> None:
+        """Set the inputs and get the outputs, in Initialization Mode: its passes may leave the inputs' range."""
+        t = self.fmu.t
+        self._fill(self._all_inputs, t)
+        self._judge_reading(self._exchange, self._exchange.run(), t, n_set=len(self._all_inputs.calls))
+        self._spread(t)
+
+    def read(self, t: float) -> None:
+        """Get the outputs at a time in s."""
+        self._judge_reading(self._reads, self._reads.run(), t)
+        self._spread(t)
+
+    def _judge_reading(self, calls: BoundCalls, status: int, t: float, n_set: int = 0) -> None:
+        """Judge calls that set some inputs and read the outputs."""
+        if status:
+            for place in calls.warned_places() if status == WARNING else [calls.failed]:
+                self.fmu.judge("setting the inputs" if place < n_set else "reading the outputs", status, t)
+
+    def _fill(self, inputs: Transfer, t: float, *, in_step: bool = False) -> None:
+        if in_step and inputs.has_limits:
+            self.fmu.check_limits(inputs, t)
+        try:
+            inputs.fill()
+        except UnfitError as error:
+            raise self.fmu.refuse(error, t) from None
+
+    def _spread(self, t: float) -> None:
+        try:
+            self._outs.spread()
+        except UnfitError as error:
+            self.fmu.failed = True
+            raise self.fmu.refuse(error, t) from None
+
+    # ---- parts of a step ----
+
+    @property
+    def _next_instant(self) -> float:
+        """Time in s of the next event that is known ahead; infinite without one."""
+        return math.inf if self.events is None else self.events.next_instant
+
+    def _next_stop(self, now: float, end: float) -> float:
+        """Return where the next part of a step ends that is to go from now to its end."""
+        if self.events is None:
+            return end
+        if not self.fmu.description.variable_step:
+            self._refuse_clocks_within(self.events, now, end)
+            return end
+        stop = min(end, self.events.next_instant)
+        return end if end - stop < ROUNDED * self._h else stop
+
+    def _refuse_clocks_within(self, events: EventMode, now: float, end: float) -> None:
+        """Refuse clocks that tick within the step of an FMU that takes steps of one length only."""
+        for clock in events.clocks:
+            if now + ROUNDED * self._h < clock.next < end - ROUNDED * self._h:
+                raise FmuRuntimeError(
+                    f"its clock {clock.variable.name} ticks at {clock.next:.9g} s, between two communication points, "
+                    "and it takes steps of one length only (canHandleVariableCommunicationStepSize is false); expected "
+                    f"steps that end there. Run with step={clock.interval:.9g}.",
+                    block=self.fmu.block.label,
+                    t=now,
+                )
+
+    def _refuse_standstill(self, latest: Sequence[float], reached: float, count: int) -> None:
+        """Refuse parts that return where they have begun, one after the other."""
+        if latest[-1] > latest[0]:
+            self._look_for_pile(latest, ends=True)
+        raise FmuRuntimeError(
+            f"its steps returned early at {reached:.9g} s {count} times in a row; expected that it goes on. "
+            "Report it to its makers, or leave early_return out of stepping=.",
+            block=self.fmu.block.label,
+            t=self._t,
+        )
+
+    def _look_for_pile(self, instants: Sequence[float], *, ends: bool = False) -> None:
+        """Warn of events that come so often that the step takes long; refuse those with which it would not end."""
+        now, each, h = instants[-1], (instants[-1] - instants[0]) / (len(instants) - 1), self._h
+        refused = ends or (h > _MOST * each and instants[-1] - instants[0] < _SPAN * (1.0 + abs(now)))
+        if not refused and (h < _SLOW * each or self._has_warned):
+            return
+        clocks, next_event = ([], math.inf) if self.events is None else (self.events.clocks, self.events.next_event)
+        ticking = [f"its clock {c.variable.name}" for c in clocks if c.next <= now + 2.0 * each]
+        own = "a time event" if next_event <= now + 2.0 * each else "an event within a step"
+        found = (
+            f"found events ({ticking[0] if ticking else own}) every {each:.2g} s, about {h / each:.2g} times in a step"
+        )
+        advice = "Look up in its documentation which input or parameter sets the time between its events"
+        if refused:
+            raise FmuRuntimeError(
+                f"{found} of {h:g} s, so the run would not go on; expected events that leave it its way. {advice}, or "
+                "report it to its makers.",
+                block=self.fmu.block.label,
+                t=now,
+            )
+        self._has_warned = True
+        self.fmu.add_note(f"t = {now:.9g} s: {found} of {h:g} s; the run goes on slowly. {advice}")
+
+    # ---- the start, and saved states ----
+
+    def begin(self, t: float) -> None:
+        """Settle the events at the start of a run, where the FMU is in Event Mode after its initialization."""
+        assert self.events is not None
+        self.forget()
+        self.events.begin(t)
+
+    def forget(self) -> None:
+        """Forget the steps that were taken, before another run."""
+        self._added[:] = math.nan
+        if self._slopes is not None:
+            self._slopes.last[:] = math.nan
+        self._hold()
+
+    def memory(self) -> StepMemory:
+        """Return what the steps keep beside the FMU's own state."""
+        sloped = np.zeros(0) if self._slopes is None else self._slopes.last.copy()
+        return StepMemory(float(self._added[0]), sloped, None if self.events is None else self.events.memory())
+
+    def return_to(self, t: float, memory: StepMemory | None) -> None:
+        """Go on from a restored state at a time in s, of which a memory was kept, or none."""
+        self.forget()
+        if memory is not None:
+            self._added[:] = memory.added
+            if self._slopes is not None:
+                self._slopes.last[:] = memory.sloped
+        if self.events is not None:
+            self.events.return_to(t, None if memory is None else memory.events)
+
+    def look_at_texts(self) -> None:
+        """Let the texts be read after the next step, whether they change in it or not."""
+        if self._watch is not None:
+            self._watch.changed.value = 1
+
+    def _hold(self) -> None:
+        """Leave the next step to Python, where C can't take each of them."""
+        if self.parts & _BY_PYTHON:
+            self._until[0] = -math.inf
+
+    # ---- for loops in C ----
+
+    @property
+    def native(self) -> NativeStep | None:
+        """The step as addresses; None in another process, and where it is more than three calls."""
+        fmu, is_plain = self.fmu, self._ins.is_plain and self._outs.is_plain and not self._ins.has_limits
+        if not self.fmi.in_process or not is_plain or self.parts or self._texts.variables:
+            return None
+        host = None if fmu.is_built_here else fmu.host
+        arguments = fmu.now, fmu.width, fmu.final, self.call, self._ins, self._outs
+        return native_step(fmu.description.fmi, *arguments, host=host)
+
+    @property
+    def remote(self) -> RemoteStep | None:
+        """The step in another process as addresses; None in this one, and where Python has to take each step."""
+        request, call, by_python = self._calls.request, self.call, bool(self.parts & _BY_PYTHON)
+        odd = (by_python and StepParts.ADDED_TIME in self.parts) or (self._texts.variables and self._watch is None)
+        if request is None or odd:
+            return None
+        quiet = None
+        if self.parts or self._watch is not None:
+            slopes, watched = self._slopes, [part.index for part in self._watched]
+            none = np.zeros(0, dtype=np.int64)
+            quiet = QuietStep(
+                until=self._until,
+                vector=self._ins.vector,
+                watched=np.concatenate([none, *watched]),
+                taken=self._taken,
+                sloped=none if slopes is None else slopes.places,
+                last=np.zeros(1) if slopes is None else slopes.last,
+                line=None if slopes is None else slopes.line,
+                slopes=None if slopes is None or slopes.line is not None else slopes.slopes,
+                event=0 if self.events is None else ctypes.addressof(call.flags),
+                changed=0 if self._watch is None else ctypes.addressof(self._watch.changed),
+                added=self._added if StepParts.ADDED_TIME in self.parts else None,
+            )
+        return remote_step(
+            request, self.fmu.now, self.fmu.width, call, self._ins, self._outs, quiet=quiet, is_careful=by_python
+        )
+
+
+class InputSlopes:
+    """Slopes of real inputs, by their differences from the step before (FMI 2.0, 4.2.1; FMI 3.0, 4.2.2).
+
+    Parameters
+    ----------
+    fmu : StepFailures
+        The instance.
+    ports : sequence of str
+        Inputs that are set before each step.
+    u : ndarray
+        Values of all inputs.
+
+    Attributes
+    ----------
+    places : ndarray of int
+        Places of the inputs whose slopes are told.
+    last : ndarray
+        Time in s and values of these inputs at the step before; NaN without one.
+    line : ndarray or None
+        In FMI 3.0, where the FMU asks for its inputs within a step: start, status, values and slopes.
+    slopes : ndarray
+        Slopes that are told.
+    calls : list of Call
+        The call that tells them, before FMI 3.0.
+    """
+
+    def __init__(self, fmu: StepFailures, ports: Sequence[str], u: np.ndarray):
+        fmi, is_new = fmu.fmi, fmu.description.fmi.startswith("3")
+        places = Layout.of({port: v.shape for port, v in fmu.inputs.items()}).slices
+        variables = {port: fmu.inputs[port] for port in ports}
+        told = {port: v for port, v in variables.items() if v.type == "Float64" and (v.intermediate or not is_new)}
+        self.places = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[places[port]] for port in told)])
+        self._u, n = u, self.places.size
+        references = [r for v in told.values() for r in v.references]
+        self.last = np.full(1 + n, math.nan)
+        self.line = fmi.slope_line(references, n) if n and is_new else None
+        self.slopes = fmi.allocate(n, ctypes.c_double) if self.line is None else self.line[2 + n :]
+        self.calls = [] if not n or self.line is not None else [fmi.slopes_call(references, self.slopes)]
+
+    def take(self, t: float) -> None:
+        """Take the slopes from the step before to the present inputs, at a time in s."""
+        now, last, n = self._u[self.places], self.last, self.places.size
+        self.slopes[:] = (now - last[1:]) / (t - last[0]) if t > last[0] else 0.0
+        if self.line is not None:
+            self.line[0], self.line[2 : 2 + n] = t, now
+        last[0], last[1:] = t, now
+
+    def take_status(self) -> int:
+        """Return the worst status of setting inputs within steps since it was asked for last."""
+        if self.line is None:
+            return 0
+        status, self.line[1] = int(self.line[1]), 0.0
+        return status

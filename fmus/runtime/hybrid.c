@@ -1,0 +1,167 @@
+/* The loop over ticks with continuous states between them: a method goes from one discontinuity to the next, events are
+   located within its steps, samples between ticks come from its dense output.
+
+   It goes as far as it can and returns at the last point of which everything is known: the states of `l.x` at the time
+   `t`. Python, with the same numbers before it, does the rest of the way to the next tick and says what has happened. */
+
+/* Begin a stretch that ends at a discontinuity, or at the next tick. */
+static inline double begin_stretch(hybrid *h, progress *g, double end) {
+    problem *p = &h->p;
+    const span *s = g->s;
+    method *m = h->methods[h->active];
+    enter(h, g, h->t);
+    int64_t e = g->e;
+    while (e < s->edges && !is_before(h->t, s->edge[e])) e++;
+    double jump = e < s->edges ? s->edge[e] : INFINITY;
+    if (h->o) jump = smaller(jump, next_outside(h->o, h->t));
+    h->jump = jump;
+    if (p->delays) jump = smaller(jump, next_edge(p->delays, h->t));
+    const double edge = is_before(jump, end) ? jump : end;
+    p->edge = p->stop = edge;
+    p->left = larger(h->t, left_of(edge));
+    if (p->delays) p->delays->middle = 0.5 * (h->t + edge);
+    for (int64_t i = 0; i < p->n; i++) m->x[i] = h->l.x[p->where[i]];
+    restart(m, h->t);
+    h->begun = 1;
+    return edge;
+}
+
+/* Go on to the next tick that is landed on; DONE: it is reached. */
+static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
+    const span *s = g->s;
+    problem *p = &h->p;
+    const int64_t landing = landing_of(g);
+    const double end = landing < s->count ? s->times[landing + 1] : s->beyond;
+    while (h->t < end) {
+        if (!h->begun) begin_stretch(h, g, end);
+        const double edge = p->edge;
+        method *m = h->methods[h->active];
+        if (!h->stepped) {
+            if ((*steps)++ > h->budget || (h->w.m && h->w.logged > h->w.capacity / 2)) return SUSPENDED;
+            if (h->o && h->o->logged > h->o->capacity / 2) return SUSPENDED;
+            if (p->delays && !has_room_for_step(p->delays)) return SUSPENDED;
+            if (h->o && h->o->apart && h->o->apart->late && *steps > 1) return SUSPENDED;
+            keep_instant(h);
+            h->planned = m->planned;
+            if (take_step(m) != PASSED) return ask(h, ASK_BETWEEN);
+            if (h->automatic) look_for_stiffness(h, m);
+            h->to = m->t;
+            h->counts_as = INFINITY;
+            h->found = 0;
+            if (h->w.m && !h->w.sliding) {
+                const int where = locate(&h->w, p, m, &h->to);
+                if (where == LOST) return ask(h, ASK_BETWEEN);
+                h->found = where == EVENT;
+                if (h->found && p->loops)
+                    for (int64_t i = 0; i < p->loops->n; i++) h->solved[i] = p->x[p->loops->where[i]];
+                if (h->found && m->t == end && end - h->to <= ULPS * ulp(end)) h->to = end;
+            }
+            h->stepped = 1;
+        }
+        while (g->i < s->count && !s->lands[g->i]) {
+            const double t = s->times[g->i + 1];
+            if (!(t < h->to || (t == h->to && t < edge && !h->found))) break;
+            if (h->found && h->to - t <= ULPS * ulp(t)) { /* the event belongs to the sample, which is taken after it */
+                h->counts_as = t;
+                break;
+            }
+            if (!has_room(h, g)) return SUSPENDED;
+            interpolate(m, t, m->y);
+            stand_at(h, t, m->y);
+            if (evaluate(&h->l, h->between) != DONE) return ask_for_step(h);
+            g->out->rows = record(&h->l, t, g->rows, g->out->rows);
+            g->i++;
+            if (is_stopped(&h->l)) {
+                h->t = t;
+                h->inside = 0;
+                return ENDED;
+            }
+        }
+        if (g->i == s->count && landing == s->count) return SUSPENDED;
+        if (!has_room(h, g)) return SUSPENDED; /* the instant itself may be a sample */
+        if (p->delays && h->to > m->t_old && !keep_pieces(p->delays, p, m, m->t_old, h->to, DEEPEST))
+            return ask_for_step(h);
+        if (h->found)
+            interpolate(m, h->to, m->y);
+        else
+            memcpy(m->y, m->x, (size_t)m->n * sizeof(double));
+        stand_at(h, h->to > p->left ? p->left : h->to, m->y);
+        if (h->accepts && (h->accepts == 1 || h->to < end || h->found) && accept(h) != DONE) return ask_for_step(h);
+        const double at = h->to, t = h->found && h->counts_as < at ? h->counts_as : at;
+        bool happened = h->found;
+        if (h->o) {
+            const int told = tell_step(h);
+            if (told == LOST) return ask_for_step(h);
+            if (!h->found && told == EVENT) return ask_here(h, t, ASK_SETTLE);
+            if (h->found) {
+                h->t = t;
+                h->acted = 0;
+                memcpy(h->w.located, h->w.fires, (size_t)h->w.m);
+                keep_instant(h);
+            }
+            h->looked = t == end && !h->l.plants && is_before(end, h->jump) ? end : NAN;
+        }
+        h->stepped = 0;
+        if (h->found && p->loops) /* as the indicators saw them */
+            for (int64_t i = 0; i < p->loops->n; i++) h->l.x[p->loops->where[i]] = h->solved[i];
+        if (h->found) {
+            const int result = fire(h, t, at);
+            *h->l.t = t;
+            if (result == LOST) return ask(h, h->o ? h->acted ? ASK_SETTLE : ASK_FIRE : ASK_BETWEEN);
+            if (result == PILED) return give_up(h, t);
+            look_for_sliding(&h->w);
+        }
+        h->t = t;
+        if (t == edge && p->delays) note_reached(p->delays, t, !is_before(t, h->jump));
+        if (h->found && h->o && has_news(h->o)) return ask_here(h, t, ASK_SETTLE);
+        if (t == edge && edge < end) { /* a discontinuity of a source */
+            keep_instant(h);
+            enter(h, g, t);
+            if (h->w.m || h->o) {
+                const int result = settle(h, t, false);
+                if (result >= LOST) return result == PILED ? give_up(h, t) : ask(h, h->o ? ASK_SETTLE : ASK_BETWEEN);
+                happened |= result == EVENT;
+            }
+            if (evaluate(&h->l, h->between) != DONE) return ask(h, ASK_BETWEEN);
+        }
+        if (t == edge || h->found) h->begun = 0;
+        if (!h->begun && (happened || t < end)) m->has_slope = 0;
+        if (g->i < s->count && !s->lands[g->i] && s->times[g->i + 1] == t && t < end) {
+            g->out->rows = record(&h->l, t, g->rows, g->out->rows);
+            g->i++;
+            if (is_stopped(&h->l)) return h->inside = 0, ENDED;
+        } else if (happened && is_stopped(&h->l)) {
+            g->out->rows = record(&h->l, t, g->rows, g->out->rows);
+            return h->inside = 0, ENDED;
+        }
+        if (h->switched) return LOOK;
+    }
+    return DONE;
+}
+
+/* Go through ticks and the instants between them, as far as it goes. */
+VISIBLE void loopwright_go(hybrid *h, const span *s, double *rows, outcome *out) {
+    progress g = {s, rows, out, 0, 0, -1};
+    int64_t steps = 0;
+    out->rows = 0;
+    out->reason = DONE;
+    while (g.i < s->count) {
+        if (is_halted(&h->l)) {
+            out->reason = HALTED;
+            break;
+        }
+        if (!h->inside) {
+            h->inside = 1;
+            h->begun = h->stepped = 0;
+            h->w.sliding = h->w.sliding && h->w.switched; /* events are located again if none has fired at the end */
+            h->w.switched = 0;
+        }
+        if ((out->reason = go_between(h, &g, &steps)) != DONE) break;
+        if (!has_room(h, &g)) {
+            out->reason = SUSPENDED;
+            break;
+        }
+        if ((out->reason = land(h, &g)) != DONE) break;
+    }
+    out->ticks = g.i;
+}

@@ -1,0 +1,18 @@
+/* The runtime library: the loops over ticks and time, their methods and events, the virtual machine, and the other side
+   of FMUs in processes of their own.
+
+   It knows no diagram. It is compiled when the package is installed, else by the first run that needs it. */
+#include "newton.c"
+#include "machine.c"
+#include "grouped.c"
+#include "remote.c"
+#include "child.c"
+#include "master.c"
+#include "exchange.c"
+#include "problem.c"
+#include "delays.c"
+#include "methods.c"
+#include "radau.c"
+#include "events.c"
+#include "instants.c"
+#include "hybrid.c"

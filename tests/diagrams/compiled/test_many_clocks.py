@@ -1,0 +1,103 @@
+"""Many clocks in C's loop: sets of them that act together, however many there are and however late they come."""
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import Constant, Integrator, UnitDelay
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams.flat import ClockSets, TickPattern, clock_sets
+from loopwright.diagrams.simulation.compiled_hybrid import HybridTicks
+from loopwright.diagrams.simulation.compiled_ticks import CompiledTicks
+
+pytestmark = pytest.mark.one_tier
+QUIET = {"progress": False}
+PERIODS = (2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 15, 16, 18, 20, 21, 24, 25, 28, 30, 35)
+"""Twenty-two, in ms."""
+
+
+def counter(period, signal, offset=0):
+    """A sampled subsystem that adds its input up: period and offset in ms."""
+
+    @subsystem(sample_time=period / 1000, offset=offset / 1000, name=f"every{period}")
+    def count(u):
+        memory = UnitDelay(initial_value=0.0, name="n")
+        return memory(memory.y + u)
+
+    return count(signal)
+
+
+@pytest.fixture
+def all_in_c(monkeypatch):
+    """Python looks at no tick; counts the calls of the loop."""
+    calls = []
+
+    def refused(*_, **__):
+        raise AssertionError("Python had to look at a tick")
+
+    monkeypatch.setattr(CompiledTicks, "_take_tick", refused)
+    monkeypatch.setattr(HybridTicks, "_take_interval", refused)
+    for kind in (CompiledTicks, HybridTicks):
+        run = kind.run
+        monkeypatch.setattr(kind, "run", lambda *a, of=run, **more: (calls.append(1), of(*a, **more))[1])
+    return calls
+
+
+def expected(period, ticks):
+    """Values of a counter at each ms: ones that were added before its last tick."""
+    return np.arange(ticks + 1) // period * 1.0
+
+
+@pytest.mark.parametrize("form", ["auto", True])
+@pytest.mark.parametrize("continuous", [False, True])
+def test_each_of_22_subsystems_acts_at_its_ticks(monkeypatch, all_in_c, form, continuous):
+    monkeypatch.setattr(clock_sets, "_MOST_SETS", 10_000)
+    clock_sets._sets_of.cache_clear()
+    one = Constant(value=1.0, name="one")
+    others = [Integrator(name="time")(one)] if continuous else []
+    periods = PERIODS[:18] if form is True else PERIODS
+    made = Diagram("clocks", *(counter(period, one) for period in periods), *others)
+    run = made.simulate(0.4, compile=form, step=1e-3, **QUIET)
+    assert all_in_c
+    for period in periods:
+        assert np.array_equal(run[f"every{period}.n.y"], expected(period, 400))
+    if continuous:
+        assert run["time.y"] == pytest.approx(run.t, abs=1e-12)
+    clock_sets._sets_of.cache_clear()
+
+
+@pytest.mark.parametrize("continuous", [False, True])
+def test_a_set_that_has_no_code_is_gone_through_by_python(monkeypatch, continuous):
+    monkeypatch.setattr(clock_sets, "_MOST_SETS", 3)
+    clock_sets._sets_of.cache_clear()
+    one = Constant(value=1.0, name="one")
+    others = [Integrator(name="time")(one)] if continuous else []
+    made = Diagram("clocks", *(counter(period, one) for period in (2, 3, 5, 7)), *others)
+    runs = [made.simulate(0.4, compile=form, step=1e-3, **QUIET) for form in ("auto", True)]
+    clock_sets._sets_of.cache_clear()
+    for run in runs:
+        for period in (2, 3, 5, 7):
+            assert np.array_equal(run[f"every{period}.n.y"], expected(period, 400))
+
+
+@pytest.mark.parametrize("continuous", [False, True])
+def test_a_set_that_comes_after_the_first_million_of_ticks_is_found(continuous):
+    """Periods of 1021 and 1031 ms, the second from 10 ms on: both act after 1,051,630 ms for the first time."""
+    one = Constant(value=1.0, name="one")
+    others = [Integrator(name="time")(one)] if continuous else []
+    made = Diagram("clocks", counter(1021, one), counter(1031, one, offset=10), *others)
+    run = made.simulate(1055.0, compile="auto", **QUIET)
+    assert run["every1021.n.y"][-1] == 1_055_000 // 1021
+    assert run["every1031.n.y"][-1] == (1_055_000 - 10) // 1031
+
+
+def test_sets_of_more_than_64_clocks_have_their_numbers():
+    clocks = [TickPattern(every, every // 3) for every in range(2, 92)]
+    ticks = np.arange(3000)
+    sets = {frozenset(c for c in clocks if c.acts(k)): k for k in range(0, 3000, 7)}
+    found = ClockSets(clocks, sets).at(ticks)
+    for k in ticks.tolist():
+        acting = frozenset(c for c in clocks if c.acts(k))
+        assert found[k] == sets.get(acting, -1)
+    assert (found >= 0).sum() >= len(sets)
+    listed = clock_sets._sets_of(tuple(clocks))
+    assert len(set(listed)) == len(listed) == clock_sets._MOST_SETS

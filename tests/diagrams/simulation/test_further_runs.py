@@ -1,0 +1,64 @@
+"""Runs of a diagram after its first one have its numbers; their start values come from traced functions."""
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import Clock, Constant, DiscreteIntegrator, Function, Gain, NonFiniteError, Step, UnitDelay
+from loopwright.diagrams import Diagram, experiments, subsystem
+
+
+@pytest.mark.parametrize("enabled", [0.0, 1.0])
+def test_an_enabled_subsystem_holds_the_output_of_the_start(enabled):
+    @subsystem(sample_time=0.1, enabled="held", name="box")
+    def box(u):
+        return UnitDelay(name="delay")(Gain(gain=2.0, name="gain")(u))
+
+    source = Step(times=0.0, values=3.0, initial_value=1.0, name="source")
+    diagram = Diagram("d", box(source, enable=Constant(value=enabled, name="on")).named("y"))
+    rest = 6.0 if enabled else 2.0  # the delay starts with twice the value before the jump
+    for _ in range(3):
+        run = diagram.simulate(0.3, progress=False)
+        assert run["y"].tolist() == [2.0, rest, rest, rest]
+
+
+def test_a_zero_keeps_its_sign():
+    @subsystem(sample_time=0.1, name="box")
+    def box(u):
+        return UnitDelay(name="delay")(Gain(gain=-2.0, name="gain")(u))
+
+    diagram = Diagram("d", box(Clock()).named("y"))
+    signs = [np.signbit(diagram.simulate(0.1, progress=False)["y"][0]) for _ in range(3)]
+    assert signs == [True] * 3  # -2 times 0 s
+
+
+def test_an_input_that_is_not_finite_at_the_start_has_its_error_in_every_run():
+    @subsystem(sample_time=0.1, name="box")
+    def box(u):
+        return UnitDelay(name="delay")(Function(lambda u: 1.0 / (u - 1.0), name="ratio")(u))
+
+    diagram = Diagram("d", box(Constant(value=1.0, name="one")).named("y"))
+    found = []
+    for _ in range(3):
+        with pytest.raises(NonFiniteError, match="box.delay.u begins with it") as error:
+            diagram.simulate(0.1, progress=False)
+        found.append((str(error.value), error.value.block, error.value.t))
+    assert found == [found[0]] * 3
+    assert found[0][1:] == ("box.ratio", 0.0)
+
+
+def test_start_values_are_those_of_the_run_and_not_of_the_one_before():
+    @subsystem(sample_time=0.1, name="box")
+    def box(u):
+        return DiscreteIntegrator(initial_value=0.0, name="sum")(UnitDelay(name="delay")(u))
+
+    diagram = Diagram("d", box(Constant(value=1.0, name="one")).named("y"))
+    for value in (1.0, 5.0, -2.0):
+        run = diagram.replace({"one.value": value}).simulate(0.2, progress=False)
+        np.testing.assert_allclose(run["y"], [0.0, 0.1 * value, 0.2 * value], rtol=1e-14)
+
+
+def test_experiment_c_has_the_bits_of_its_first_run():
+    diagram = experiments.hand_guiding().diagram
+    runs = [diagram.simulate(0.02, progress=False) for _ in range(3)]
+    for run in runs[1:]:
+        assert {n: run[n].tobytes() for n in run.names} == {n: runs[0][n].tobytes() for n in run.names}
