@@ -25,8 +25,8 @@ import fmpy.fmi3
 import numpy as np
 
 from loopwright.fmus import gantry
-from loopwright.fmus.export.compiler import SUFFIXES, compile_shared, find_compiler, flags
-from loopwright.fmus.platform import native_platform
+from loopwright.fmus.export.compiler import compile_shared, find_compiler
+from loopwright.fmus.toolchain import SUFFIXES, flags, native_platform
 
 TICK = 1e-3
 SUBSTEPS = 5
@@ -191,7 +191,7 @@ def exports(folder: Path) -> None:
 def main() -> None:
     """Print all."""
     compiler = find_compiler()
-    print(f"{compiler.identity.splitlines()[0]} {' '.join(flags(compiler, native_platform()))}")
+    print(f"{compiler.identity.splitlines()[0]} {' '.join(flags(native_platform(), zig=compiler.zig))}")
     with tempfile.TemporaryDirectory() as folder:
         for label, force in FORCES.items():
             steps(Path(folder) / label, label, force)

@@ -117,8 +117,17 @@ def test_every_file_that_is_no_code_is_listed_for_the_wheel():
     assert {ROOT / name for name in kept if not name.endswith(".py")} == listed - made
 
 
+BENCHMARKS = sorted((ROOT / "benchmarks").glob("*.py"))
+
+
+def test_the_benchmarks_find_what_they_import():
+    script = "import runpy, sys; [runpy.run_path(path) for path in sys.argv[1:]]"  # none is __main__: nothing is timed
+    done = call(sys.executable, "-c", script, *map(str, BENCHMARKS))
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", BENCHMARKS, ids=lambda path: path.stem)
 def test_the_benchmarks_run(path):
     done = call(sys.executable, str(path))  # what they measure is for people: no time is asserted
     assert done.returncode == 0, done.stdout + done.stderr

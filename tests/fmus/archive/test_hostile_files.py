@@ -9,6 +9,7 @@ from loopwright.blocks import FmuFileError
 from loopwright.diagrams import Diagram
 from loopwright.fmus import ArchiveLimits, Fmu, FmuFault, mass_spring_damper, read_description
 from loopwright.fmus.archive import FmuArchive, unpack
+from loopwright.fmus.child_processes.keeper import keep_folder, release_folder
 from support.hostile import ARCHIVES, CASES, XML, good_files, packed
 
 BOMB = "archive: bomb"  # 120 MB
@@ -26,11 +27,13 @@ def place(tmp_path, monkeypatch):
     def load(*arguments, **keywords):
         raise AssertionError("code of an FMU ran before it was checked")
 
+    keep_folder(tmp_path)  # the keeper of temporary folders is a process of ours: it runs before others are refused
     monkeypatch.setattr(ctypes, "CDLL", load)
     monkeypatch.setattr(subprocess, "Popen", load)
     (tmp_path / "inside").mkdir()
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "inside" / "cache"))
-    return tmp_path / "inside"
+    yield tmp_path / "inside"
+    release_folder(tmp_path)
 
 
 def files_in(folder):
