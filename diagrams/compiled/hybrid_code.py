@@ -84,15 +84,6 @@ def _hand_over(function: Any, to: Any) -> None:
             pass  # its rates are those between ticks
 
 
-def find_hybrid_obstacle(flat: FlatDiagram) -> str | None:
-    """Return why a diagram with continuous states can't go from tick to tick in C; None if it can."""
-    blocks = flat.table.blocks
-    delayed = sorted(path for path in blocks if blocks[path].transport and path not in flat.checked.traced)
-    if delayed and flat.outside:
-        return f"the transport delay {delayed[0]!r} is beside the FMU {flat.outside[0]!r} in model exchange"
-    return None
-
-
 def find_code_obstacle(flat: FlatDiagram) -> str | None:
     """Return why there can't be generated code of a diagram with continuous states; None if there can."""
     blocks = flat.table.blocks
@@ -228,6 +219,8 @@ def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *,
     schedules |= {"flow": flat.flow, "jump": flat.jump}
     if flat.events:
         schedules["indicators"] = flat.indicators
+    if has_delays(flat):
+        schedules["driven"] = flat.driven
     equations = {f"loops_at{i}": (c, flat.loop_equations(c)) for i, c in enumerate(kinds if flat.loops.slices else ())}
     looped = {name: (c, made.schedule) for name, (c, made) in equations.items() if made and made.schedule.opaque}
     schedules |= {name: schedule for name, (_, schedule) in looped.items()}

@@ -23,7 +23,6 @@ from ..compiled import (
     compile_hybrid,
     find_code_obstacle,
     find_exchange_obstacle,
-    find_hybrid_obstacle,
     hybrid_sources,
     interpret_hybrid,
 )
@@ -412,7 +411,7 @@ def make_hybrid(
     """
     native = plants_for_c(plants)
     flat = workspace.flat
-    reason = find_hybrid_obstacle(flat) or (None if machine else find_code_obstacle(flat))
+    reason = None if machine else find_code_obstacle(flat)
     if reason is None and continuous.exchanged is not None:
         reason = find_exchange_obstacle(continuous.exchanged.blocks)
     reason = reason or find_obstacle_at_ticks(workspace.flat, plants, native, steps, coupled=coupled)

@@ -4,6 +4,8 @@ from math import factorial
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 from loopwright.blocks import (
     Gain,
@@ -16,6 +18,7 @@ from loopwright.blocks import (
     TransportDelay,
 )
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.fmus import Fmu, bouncing_ball, mass_spring_damper
 
 QUIET = {"progress": False}
 pytestmark = pytest.mark.one_tier
@@ -124,3 +127,77 @@ def test_beside_a_block_of_python_and_in_a_diagram_of_many_blocks(monkeypatch):
         monkeypatch.setattr("loopwright.diagrams.flat.flat_diagram.LARGEST", 0)
         for run in forms(made, 3.0, step=0.01, solver="RK45", rtol=1e-9, atol=1e-11):
             assert np.max(np.abs(run["x.y"] - by_steps(run.t))) < 1e-7
+
+
+# --- beside FMUs in model exchange -----------------------------------------------------------------------------------
+
+A, B = np.array([[0.0, 1.0], [-100.0, -1.0]]), np.array([0.0, 1.0])  # the mass's default parameters
+START = np.array([0.1, 0.0])
+
+
+def exchanged(model, isolate):
+    return Fmu(model.build(), interface="model_exchange", name="plant", isolate=isolate)
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+@pytest.mark.parametrize("solver", ["RK45", "Radau", "BDF", "rk4"])
+def test_a_mass_of_another_tool_is_damped_late(solver, isolate):
+    """F = −3 N s/m of the velocity 0.15 s ago: SciPy from delay to delay; its late acceleration is integrated."""
+    delay, k, plant = 0.15, 3.0, exchanged(mass_spring_damper, isolate)
+    late = TransportDelay(delay=delay, initial_value=0.0, name="late")
+    after = TransportDelay(delay=delay, initial_value=0.0, name="after")
+    total = Integrator(name="total")
+    made = Diagram("d", plant(force=-k * late(plant.velocity)), total(after(plant.acceleration)))
+    pieces = [lambda t: np.zeros_like(t)]  # the velocity from one multiple of the delay to the next
+    x, expected, grid = START, [], np.arange(101) * 0.01
+    for n in range(7):
+        begin = n * delay
+        found = solve_ivp(
+            lambda t, x, of=pieces[-1]: A @ x - B * k * of(t - delay), (begin, begin + delay), x,
+            method="DOP853", rtol=1e-12, atol=1e-14, dense_output=True,
+        )  # fmt: skip
+        pieces.append(lambda t, of=found.sol: of(t)[1])
+        mine = grid[(grid >= begin) & (grid < begin + delay)]
+        expected += [*found.sol(mine).T]
+        x = found.y[:, -1]
+    expected = np.array(expected)[: grid.size]
+    for run in forms(made, 1.0, step=0.01, solver=solver, rtol=1e-8, atol=1e-11):
+        assert np.max(np.abs(run["plant.position"] - expected[:, 0])) < (1e-6 if solver != "rk4" else 2e-5)
+        assert np.max(np.abs(run["plant.velocity"] - expected[:, 1])) < (1e-5 if solver != "rk4" else 2e-4)
+        late_velocity = np.concatenate([np.zeros(15), expected[: grid.size - 15, 1]])
+        assert np.max(np.abs(run["total.y"] - late_velocity)) < (1e-5 if solver != "rk4" else 2e-4)
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_late_edges_reach_an_fmu_in_model_exchange(isolate):
+    """A pulse from 0.1 s to 0.2 s, 0.13 s late: the exponential of the matrix."""
+    plant = exchanged(mass_spring_damper, isolate)
+    source = PulseTrain(period=10.0, duty=0.01, delay=0.1, amplitude=20.0)
+    made = Diagram("d", plant(force=TransportDelay(delay=0.13, initial_value=0.0, name="late")(source)))
+
+    def pushed(t):  # by a step of 20 N at t = 0
+        return np.linalg.solve(A, (expm(A * max(t, 0.0)) - np.eye(2)) @ B * 20.0)
+
+    for run in forms(made, 0.6, step=0.01, solver="DOP853", rtol=1e-10, atol=1e-12):
+        expected = [expm(A * t) @ START + pushed(t - 0.23) - pushed(t - 0.33) for t in run.t]
+        assert np.max(np.abs(run["plant.position"] - np.array(expected)[:, 0])) < 1e-9
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_what_jumps_at_an_impact_comes_out_late_with_its_jump(isolate):
+    """The velocity of a ball that falls from 1 m and keeps 0.7 of it, 0.2 s late, and its integral."""
+    plant = exchanged(bouncing_ball, isolate)
+    late = TransportDelay(delay=0.2, initial_value=0.0, name="late")
+    made = Diagram("d", Integrator(name="way", initial_value=1.0)(late(plant.velocity)))
+    fall = np.sqrt(2.0 / 9.81)
+
+    def height(t):
+        begin, v = -fall, 9.81 * fall
+        while t >= begin + 2.0 * v / 9.81:
+            begin, v = begin + 2.0 * v / 9.81, 0.7 * v
+        return v * (t - begin) - 4.905 * (t - begin) ** 2, v - 9.81 * (t - begin)
+
+    for run in forms(made, 1.6, step=0.01, solver="heun"):  # exact for what falls, if it ends where a jump comes out
+        late_ones = np.array([height(t - 0.2) if t >= 0.2 else (1.0, 0.0) for t in run.t])
+        assert np.max(np.abs(run["way.y"] - late_ones[:, 0])) < 1e-8
+        assert np.max(np.abs(run["late.y"] - late_ones[:, 1])) < 1e-8
