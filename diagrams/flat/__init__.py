@@ -5,7 +5,7 @@ from .announced import Announcer, Times, announcers
 from .clock_sets import is_exact, kinds_of
 from .clocks import EVERY, NONE, ClockSets, TickPattern, ticks_after
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator, sort_names
-from .fast_functions import share_terms
+from .fast_functions import share_terms, speed_up
 from .flat_diagram import EXACT_LOOP, FlatDiagram
 from .flatten import renumber, write_numbers
 from .functions import indicators_of
@@ -74,6 +74,7 @@ __all__ = [
     "share_terms",
     "size_of_motion",
     "sort_names",
+    "speed_up",
     "takes_any_step",
     "ticks_after",
     "trace_schedule",

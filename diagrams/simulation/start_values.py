@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from operator import is_
 from typing import Any
@@ -12,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core import Block
-from ..flat import NONE, FlatDiagram, Instant, bind_function, evaluate, is_true
+from ..flat import NONE, FlatDiagram, Instant, bind_function, evaluate, is_true, speed_up
 from .initialize import find_initial_state, find_start_values, values_from_left
 from .workspace import Workspace
 
@@ -193,10 +192,8 @@ def _trace_start(flat: FlatDiagram, left: Mapping[Port, np.ndarray]) -> StartFun
             found[path] = dict(inputs)
 
     def make(columns: list[Any]) -> Any:
-        function = ca.Function("start", symbols, [ca.densify(ca.MX(column)) for column in columns])
-        with suppress(RuntimeError):  # of a table
-            function = function.expand()
-        return function
+        # as the first run has computed them: block by block, to the sign of a zero
+        return speed_up(ca.Function("start", symbols, [ca.densify(ca.MX(c)) for c in columns]), simplify=False)
 
     if starting:
         run(order=flat.start_order.steps, before=before, taps=taps)

@@ -76,7 +76,7 @@ def test_the_co_simulation_grows_as_the_contact_predicts(name, side, delay, vary
     assert fastest < 1e-5  # far below the friction's width, 1e-2 m/s; at 500 rad/s that is 20 nm, and the bristles hold
     measured = measured_growth(signal, 1e-3, first, span, window)
     assert measured == pytest.approx(predicted, abs=2e-3)
-    assert (measured > 0.0) is (factor > 1.0)
+    assert (measured > 0.0) == (factor > 1.0)
 
 
 @pytest.mark.slow

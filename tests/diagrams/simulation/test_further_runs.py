@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Clock, Constant, DiscreteIntegrator, Function, Gain, NonFiniteError, Step, UnitDelay
+from loopwright.blocks import Clock, Constant, DiscreteIntegrator, Function, Gain, NonFiniteError, Step, Sum, UnitDelay
 from loopwright.diagrams import Diagram, experiments, subsystem
 
 
@@ -29,6 +29,23 @@ def test_a_zero_keeps_its_sign():
     diagram = Diagram("d", box(Clock()).named("y"))
     signs = [np.signbit(diagram.simulate(0.1, progress=False)["y"][0]) for _ in range(3)]
     assert signs == [True] * 3  # -2 times 0 s
+
+
+def test_a_value_that_is_added_and_taken_away_again_is_computed_block_by_block():
+    """Before its first tick a subsystem holds what follows from its inputs: −1 times −u + u, and (u + 1e17) − 1e17."""
+
+    @subsystem(sample_time=0.2, offset=0.1, name="box")
+    def box(u):
+        zero = Gain(gain=-1.0, name="zero")(Sum(signs="-+", name="nothing")(u, u))
+        large = Constant(value=1e17, name="large")
+        return zero, Sum(signs="+-", name="back")(Sum(name="forth")(u, large), large)
+
+    zero, back = box(Constant(value=3.0, name="three"))
+    diagram = Diagram("d", zero.named("zero"), back.named("back"))
+    for _ in range(3):
+        run = diagram.simulate(0.1, progress=False)
+        assert np.signbit(run["zero"][0])
+        assert run["back"][0] == (3.0 + 1e17) - 1e17 == 0.0
 
 
 def test_an_input_that_is_not_finite_at_the_start_has_its_error_in_every_run():
