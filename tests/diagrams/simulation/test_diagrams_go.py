@@ -9,6 +9,8 @@ from loopwright.blocks import Compare, Gain, Integrator, Sine, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.flat import FlatDiagram
 
+pytestmark = pytest.mark.one_tier  # the comparison of forms keeps the diagram of its last run
+
 
 @subsystem(sample_time=0.01, name="box")
 def box(u):
