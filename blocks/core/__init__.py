@@ -2,7 +2,7 @@
 
 from . import arguments as kinds
 from . import arithmetic, source
-from .arguments import accepts, check_argument
+from .arguments import Kind, accepts, check_argument, shorten
 from .arithmetic import Gain, Product, Sum, check_shapes, shape_of
 from .block import SOLVED, Block
 from .brief import brief, count_of, enumerate_some
@@ -69,7 +69,7 @@ from .units import (
     same_unit,
     with_unit,
 )
-from .values import Array, Value, identity, parameter, shorten
+from .values import Array, Value, identity, parameter
 
 __all__ = [
     "BASE_UNITS",
@@ -100,6 +100,7 @@ __all__ = [
     "Gain",
     "GuardError",
     "Input",
+    "Kind",
     "Layout",
     "LoopwrightError",
     "NonFiniteError",

@@ -1,33 +1,100 @@
-"""Arguments of public functions: kinds of values, and an error that names what was found and expected."""
+"""Arguments and parameters: declared kinds of values, and one error that names what was found and expected.
+
+A kind stands at the signature: ``@accepts(windows=kinds.integer(2))`` above a function or a dataclass, and
+``parameter(kind=kinds.choice("linear", "previous"))`` in a block.
+"""
 
 from __future__ import annotations
 
 import inspect
+import math
 import os
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from types import UnionType
+from typing import Any, TypeVar
 
 import numpy as np
 
-from .errors import OptionError
+from .errors import LoopwrightError, OptionError, close_names, near
 from .explained_calls import BY_PLACE, EXPLAINED, UnknownArgumentError, misuse, name_of, own_names
-from .values import shorten
 
-P = ParamSpec("P")
-R = TypeVar("R")
-Kind = Callable[[Any], str]
-"""Returns in words which values are expected; "" for a value of the kind."""
+F = TypeVar("F", bound=Callable[..., Any])
 _LONGEST = 80
 
 
-def accepts(called: str = "", /, **kinds: Kind) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Check the kinds of a function's arguments before it runs; a default is always right.
+def shorten(value: Any) -> str:
+    """Return a parameter value as a short text, with numbers as people type them."""
+    if isinstance(value, np.ndarray):
+        return repr(value.tolist()) if value.size <= 12 else f"<{'×'.join(map(str, value.shape))} numbers>"
+    if isinstance(value, float) and abs(value) < 1e6 and value == int(value):
+        return str(int(value))
+    return repr(value)
+
+
+def shortened(name: str, value: Any) -> str:
+    """Return the words for a value that was found, as people type it."""
+    found = shorten(value)
+    return f"found {found}" if len(found) <= _LONGEST else f"found {found[:_LONGEST]}…"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Declared kind of values, with the words of the error for another one.
+
+    Attributes
+    ----------
+    expected : str
+        The kind in words.
+    holds : callable
+        Whether a value is of the kind.
+    step : str or callable, optional
+        One next step, or a function of the value that returns it; without one: to give such a value.
+    found : callable, optional
+        Returns the error's first words from the argument's name and its value.
+    """
+
+    expected: str
+    holds: Callable[[Any], object]
+    step: str | Callable[[Any], str] | None = None
+    found: Callable[[str, Any], str] = shortened
+
+    def worded(
+        self,
+        expected: str | None = None,
+        step: str | Callable[[Any], str] | None = None,
+        found: Callable[[str, Any], str] | None = None,
+    ) -> Kind:
+        """Return the same kind with other words."""
+        return replace(
+            self,
+            expected=self.expected if expected is None else expected,
+            step=self.step if step is None else step,
+            found=found or self.found,
+        )
+
+    def where(self, condition: Callable[[Any], object]) -> Kind:
+        """Return the kind of those values that fulfil a condition, too."""
+        return replace(self, holds=lambda value: self.holds(value) and condition(value))
+
+    def complaint(self, name: str, value: Any) -> str:
+        """Return the error's text for a value that is not of the kind."""
+        step = f"Give {name}= as that." if self.step is None else self.step
+        return (
+            f"{self.found(name, value)}; expected {self.expected}. {step(value) if callable(step) else step}".rstrip()
+        )
+
+
+def accepts(called: str = "", error: type[LoopwrightError] = OptionError, /, **kinds: Kind) -> Callable[[F], F]:
+    """Check the kinds of a function's arguments before it runs, or of a dataclass's fields; a default is always right.
 
     Parameters
     ----------
     called : str
         Name by which users know the function, where it is another one.
+    error : type
+        Class of the error.
     **kinds
         A kind for each argument that is checked; one of ``*args`` or ``**kwargs`` holds for each of their values.
 
@@ -37,60 +104,68 @@ def accepts(called: str = "", /, **kinds: Kind) -> Callable[[Callable[P, R]], Ca
         By the function: an argument of another kind.
     """
 
-    def wrap(function: Callable[P, R]) -> Callable[P, R]:
-        signature, who = inspect.signature(function), called or function.__name__
-        parameters = {**signature.parameters}
-        names = [name for name, p in parameters.items() if p.kind in BY_PLACE]
-        needed = {name for name, p in parameters.items() if p.default is p.empty}
-        is_plain = not any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters.values())
-
-        @wraps(function)
-        def checked(*args: P.args, **kwargs: P.kwargs) -> R:
-            given: Mapping[str, Any] = {}
-            if is_plain and len(args) <= len(names) and kwargs.keys() <= parameters.keys():
-                given = {**dict(zip(names, args, strict=False)), **kwargs}  # without the many calls of `bind`
-            if len(given) != len(args) + len(kwargs) or not needed <= given.keys():
-                try:
-                    given = signature.bind(*args, **kwargs).arguments
-                except TypeError as error:
-                    raise (misuse(function, args, kwargs, called) or error) from None
-            for name, value in given.items():
-                kind, parameter = kinds.get(name), parameters[name]
-                if kind is None or value is parameter.default:
-                    continue
-                if parameter.kind is parameter.VAR_KEYWORD:
-                    for key, each in value.items():
-                        check_argument(each, kind, key, who)
-                elif parameter.kind is parameter.VAR_POSITIONAL:
-                    for each in value:
-                        check_argument(each, kind, name, who)
-                else:
-                    check_argument(value, kind, name, who)
-            try:
-                return function(*args, **kwargs)
-            except UnknownArgumentError as error:
-                if error.argument in kwargs:
-                    error.offer(called or name_of(function, args), own_names(function))
-                raise
-
-        setattr(checked, EXPLAINED, True)
-        return checked
+    def wrap(subject: F) -> F:
+        if inspect.isclass(subject):
+            vars_of: Any = subject
+            vars_of.__init__ = _checked(vars_of.__init__, called or subject.__name__, error, kinds)
+            return subject
+        return _checked(subject, called, error, kinds)
 
     return wrap
 
 
-def check_argument(value: Any, kind: Kind, name: str, function: str) -> None:
+def _checked(function: F, called: str, error: type[LoopwrightError], kinds: Mapping[str, Kind]) -> F:
+    signature, who = inspect.signature(function), called or function.__name__
+    parameters = {**signature.parameters}
+    names = [name for name, p in parameters.items() if p.kind in BY_PLACE]
+    needed = {name for name, p in parameters.items() if p.default is p.empty}
+    is_plain = not any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters.values())
+
+    @wraps(function)
+    def checked(*args: Any, **kwargs: Any) -> Any:
+        given: Mapping[str, Any] = {}
+        if is_plain and len(args) <= len(names) and kwargs.keys() <= parameters.keys():
+            given = {**dict(zip(names, args, strict=False)), **kwargs}  # without the many calls of `bind`
+        if len(given) != len(args) + len(kwargs) or not needed <= given.keys():
+            try:
+                given = signature.bind(*args, **kwargs).arguments
+            except TypeError as unfit:
+                raise (misuse(function, args, kwargs, called) or unfit) from None
+        for name, value in given.items():
+            kind, parameter = kinds.get(name), parameters[name]
+            if kind is None or value is parameter.default:
+                continue
+            if parameter.kind is parameter.VAR_KEYWORD:
+                for key, each in value.items():
+                    check_argument(each, kind, key, who, error)
+            elif parameter.kind is parameter.VAR_POSITIONAL:
+                for each in value:
+                    check_argument(each, kind, name, who, error)
+            else:
+                check_argument(value, kind, name, who, error)
+        try:
+            return function(*args, **kwargs)
+        except UnknownArgumentError as unknown:
+            if unknown.argument in kwargs:
+                unknown.offer(called or name_of(function, args), own_names(function))
+            raise
+
+    setattr(checked, EXPLAINED, True)
+    return checked  # type: ignore[return-value]  # of the signature of the function that it wraps
+
+
+def check_argument(
+    value: Any, kind: Kind, name: str, function: str | None, error: type[LoopwrightError] = OptionError
+) -> None:
     """Refuse an argument of another kind.
 
     Raises
     ------
     OptionError
-        It names the function, the argument, what was found and what is expected.
+        It names the function, the argument, what was found and what is expected; or the class that is given.
     """
-    if expected := kind(value):
-        found = shorten(value)
-        found = found if len(found) <= _LONGEST else f"{found[:_LONGEST]}…"
-        raise OptionError(f"found {found}; expected {expected}. Give {name}= as that.", block=function, port=name)
+    if not kind.holds(value):
+        raise error(kind.complaint(name, value), block=function, port=name)
 
 
 def is_real(value: Any) -> bool:
@@ -106,127 +181,138 @@ def is_real(value: Any) -> bool:
     return number == number
 
 
-def number(value: Any) -> str:
-    """Kind of a real number."""
-    return "" if is_real(value) else "a number"
+# --- kinds ------------------------------------------------------------------------------------------------------------
 
 
-def real(value: Any) -> str:
-    """Kind of a real number, NaN among them, which the function refuses with words of its own."""
-    return "" if is_real(value) or (isinstance(value, float) and value != value) else "a number"
-
-
-def finite(value: Any) -> str:
-    """Kind of a finite number."""
-    return "" if is_real(value) and np.isfinite(float(value)) else "a finite number"
-
-
-def positive(value: Any) -> str:
-    """Kind of a finite number above zero."""
-    return "" if not finite(value) and float(value) > 0 else "a positive number"
-
-
-def whole(value: Any) -> str:
-    """Kind of a whole number."""
-    return "" if is_real(value) and np.isfinite(float(value)) and float(value) == int(value) else "a whole number"
-
-
-def count(value: Any) -> str:
-    """Kind of a whole number from 0 on."""
-    return "" if not whole(value) and float(value) >= 0 else "a whole number, 0 or more"
-
-
-def numbers(value: Any) -> str:
-    """Kind of a number, or an array of numbers, one at least; they are real."""
+def as_array(value: Any) -> np.ndarray:
+    """Return a value as NumPy reads it; rows of unequal length as an array of one object."""
     try:
-        array = np.asarray(value)
+        return np.asarray(value)
     except ValueError:
-        array = np.asarray(None)
-    return "" if array.dtype.kind in "iuf" and array.size else "a number, or an array of numbers"
+        return np.asarray(None)
 
 
-def row(value: Any) -> str:
-    """Kind of a list of finite numbers."""
-    good = not numbers(value) and np.ndim(value) == 1 and np.isfinite(value).all()
-    return "" if good else "a list of finite numbers"
+def _is_finite(value: Any) -> bool:
+    return is_real(value) and bool(np.isfinite(float(value)))
 
 
-def roots(value: Any) -> str:
-    """Kind of a list of numbers that may be complex."""
-    try:
-        array = np.asarray(value)
-    except ValueError:
-        array = np.asarray(None)
-    return "" if array.ndim == 1 and array.dtype.kind in "iufc" and array.size else "a list of numbers"
+def _is_row(value: Any) -> bool:
+    return bool(numbers.holds(value) and np.ndim(value) == 1 and np.isfinite(value).all())
 
 
-def matrix(value: Any) -> str:
-    """Kind of a matrix of numbers, or what NumPy reads as one."""
-    try:
-        array = np.asarray(value)
-    except ValueError:
-        array = np.asarray(None)
-    return "" if array.dtype.kind in "iuf" and array.size and array.ndim <= 2 else "a matrix of numbers"
-
-
-def text(value: Any) -> str:
-    """Kind of a text."""
-    return "" if isinstance(value, str) else "a text"
-
-
-def names(value: Any) -> str:
-    """Kind of a name, or of several."""
+def _is_names(value: Any) -> bool:
     if isinstance(value, str):
-        return ""
+        return True
     several = isinstance(value, Iterable) and not isinstance(value, Mapping | np.ndarray | bytes)
-    if several and (not isinstance(value, list | tuple | set | frozenset) or all(isinstance(v, str) for v in value)):
-        return ""
-    return "a name, or a list of names"
+    return several and (not isinstance(value, list | tuple | set | frozenset) or all(isinstance(v, str) for v in value))
 
 
-def several(value: Any) -> str:
-    """Kind of a collection of values."""
-    return "" if isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping) else "a list"
+def _is_path(value: Any) -> bool:
+    return isinstance(value, str | os.PathLike) and bool(str(value)) and "\0" not in str(value)
 
 
-def flag(value: Any) -> str:
-    """Kind of a truth value."""
-    return "" if isinstance(value, bool | np.bool_) else "True or False"
+def _is_paths(value: Any) -> bool:
+    good = several.holds(value) and not isinstance(value, np.ndarray)
+    return bool(good) and not (isinstance(value, list | tuple) and not all(map(_is_path, value)))
 
 
-def mapping(value: Any) -> str:
-    """Kind of a mapping by name."""
-    return "" if isinstance(value, Mapping) and all(isinstance(key, str) for key in value) else "a mapping by name"
+def by_shape(name: str, value: Any) -> str:
+    """Return the words for an array of which the shape is wrong."""
+    return f"found an array of shape {np.shape(value)}"
 
 
-def path(value: Any) -> str:
-    """Kind of a path of a file or folder."""
-    good = isinstance(value, str | os.PathLike) and str(value) and "\0" not in str(value)
-    return "" if good else "a path"
-
-
-def paths(value: Any) -> str:
-    """Kind of a list of paths; one that is made as it is read is taken as it is."""
-    good = not several(value) and not isinstance(value, np.ndarray)
-    return "" if good and not (isinstance(value, list | tuple) and any(map(path, value))) else "a list of paths"
-
-
-def function(value: Any) -> str:
-    """Kind of a function."""
-    return "" if callable(value) else "a function"
+number = Kind("a number", is_real)
+real = Kind("a number", lambda value: is_real(value) or (isinstance(value, float) and value != value))
+"""A real number, or NaN, which the function refuses with words of its own."""
+finite = Kind("a finite number", _is_finite)
+positive = Kind("a positive number", lambda value: _is_finite(value) and float(value) > 0)
+whole = Kind("a whole number", lambda value: _is_finite(value) and float(value) == int(value))
+count = Kind("a whole number, 0 or more", lambda value: whole.holds(value) and float(value) >= 0)
+numbers = Kind(
+    "a number, or an array of numbers",
+    lambda value: (array := as_array(value)).dtype.kind in "iuf" and array.size > 0,
+)
+"""A number, or an array of numbers, one at least; they are real."""
+row = Kind("a list of finite numbers", _is_row)
+roots = Kind(
+    "a list of numbers",
+    lambda value: (array := as_array(value)).ndim == 1 and array.dtype.kind in "iufc" and array.size > 0,
+)
+"""A list of numbers that may be complex."""
+matrix = Kind("a matrix of numbers", lambda value: numbers.holds(value) and as_array(value).ndim <= 2)
+"""A matrix of numbers, or what NumPy reads as one."""
+text = Kind("a text", lambda value: isinstance(value, str))
+names = Kind("a name, or a list of names", _is_names)
+several = Kind("a list", lambda value: isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping))
+flag = Kind("True or False", lambda value: isinstance(value, bool | np.bool_))
+mapping = Kind(
+    "a mapping by name",
+    lambda value: isinstance(value, Mapping) and all(isinstance(key, str) for key in value),
+)
+path = Kind("a path", _is_path)
+"""A path of a file or folder."""
+paths = Kind("a list of paths", _is_paths)
+"""A list of paths; one that is made as it is read is taken as it is."""
+function = Kind("a function", callable)
+system = Kind(
+    "a control.StateSpace or control.TransferFunction",
+    lambda value: hasattr(value, "ninputs") and hasattr(value, "poles"),
+)
+"""A linear system of python-control."""
 
 
 def either(*kinds: Kind) -> Kind:
     """Return the kind of a value that is of one of some kinds."""
-    return lambda value: "" if not all(kind(value) for kind in kinds) else ", or ".join(kind(value) for kind in kinds)
+    return Kind(", or ".join(kind.expected for kind in kinds), lambda value: any(kind.holds(value) for kind in kinds))
 
 
-def one_of_class(cls: type, said: str) -> Kind:
-    """Return the kind of the instances of a class, with its words."""
-    return lambda value: "" if isinstance(value, cls) else said
+def one_of_class(classes: type | tuple[type, ...] | UnionType, said: str) -> Kind:
+    """Return the kind of the instances of a class, or of several, with its words."""
+    return Kind(said, lambda value: isinstance(value, classes))
 
 
-def system(value: Any) -> str:
-    """Kind of a linear system of python-control."""
-    good = hasattr(value, "ninputs") and hasattr(value, "poles")
-    return "" if good else "a control.StateSpace or control.TransferFunction"
+def integer(minimum: int, maximum: float = math.inf) -> Kind:
+    """Return the kind of the integers of a range; a number such as 2.0 is none."""
+    words = {0: "an integer from 0 on", 1: "a positive integer"}.get(minimum, f"an integer from {minimum} on")
+    return Kind(
+        words if maximum == math.inf else f"an integer from {minimum} to {maximum:g}",
+        lambda value: (
+            isinstance(value, int | np.integer) and not isinstance(value, bool) and minimum <= value <= maximum
+        ),
+    )
+
+
+def dimensions(most: int) -> Kind:
+    """Return the kind of the arrays of a parameter with no more than some dimensions."""
+    return Kind(f"at most {most} dimensions", lambda value: np.ndim(value) <= most, found=by_shape)
+
+
+def choice(*words: str) -> Kind:
+    """Return the kind of a text that is one of some words."""
+    *first, last = map(repr, words)
+    return Kind(
+        f"{', '.join(first)} or {last}" if first else last,
+        lambda value: isinstance(value, str) and value in words,
+        step=lambda value: near(value, words) if close_names(str(value), words) else "Give one of them.",
+    )
+
+
+def by_name(name: str, value: Any) -> str:
+    """Return the words for a value that was found, with the argument's name, as it is written."""
+    return f"found {name}={value!r}"
+
+
+def as_written(name: str, value: Any) -> str:
+    """Return the words for a value that was found, as it is written."""
+    return f"found {value!r}"
+
+
+def alone(words: str) -> Callable[[str, Any], str]:
+    """Return a function that says what was found in fixed words."""
+    return lambda name, value: f"found {words}"
+
+
+rising = Kind(
+    "at least two numbers that rise",
+    lambda value: np.ndim(value) == 1 and np.size(value) > 1 and bool(np.all(np.diff(value) > 0)),
+)

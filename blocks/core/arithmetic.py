@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
+from . import arguments as kinds
 from .block import Block
-from .errors import ParameterError, ShapeError
+from .errors import ShapeError
 from .ports import Input, Output, Shape, number_inputs
 from .signals import register_operator_block
 from .values import Array, parameter
@@ -53,15 +52,14 @@ class Sum(Block):
     """
 
     same_units = True
-    signs: str = parameter(default="++", description="one + or - for each input")
+    signs: str = parameter(
+        default="++",
+        description="one + or - for each input",
+        kind=kinds.text.where(lambda signs: bool(signs) and not set(signs) - {"+", "-"}).worded(
+            "a + or - for each input, such as '+-'", "Give one for each."
+        ),
+    )
     y = Output(like="u1")
-
-    def check(self) -> None:
-        """Refuse anything but plus and minus signs."""
-        if not self.signs or set(self.signs) - {"+", "-"}:
-            raise ParameterError(
-                f"found {self.signs!r}; expected a + or - for each input, such as '+-'.", block=self.label, port="signs"
-            )
 
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
@@ -91,18 +89,12 @@ class Gain(Block):
         For an input with another number of entries than the vector or the matrix takes, when the diagram is built.
     """
 
-    gain: Array = parameter(description="number, array of the signal's shape, or matrix")
+    gain: Array = parameter(
+        description="number, array of the signal's shape, or matrix",
+        kind=kinds.dimensions(2).worded("a number, a vector or a matrix"),
+    )
     u = Input(shape=None, description="signal to multiply, of any shape")
     y = Output(shape=None, description="the product")
-
-    def check(self) -> None:
-        """Refuse a gain of more than two dimensions."""
-        if np.ndim(self.gain) > 2:
-            raise ParameterError(
-                f"found an array of shape {np.shape(self.gain)}; expected a number, a vector or a matrix.",
-                block=self.label,
-                port="gain",
-            )
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the product."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from .arguments import Kind
 from .explained_calls import explain_calls
 from .units import parse_unit
 
@@ -37,6 +38,7 @@ class ParameterSpec:
     structural: bool = False
     kw_only: bool = True
     tunable: bool = True
+    kind: Kind | None = None
     annotation: str = "Any"
 
     @property
@@ -58,6 +60,7 @@ def parameter(
     structural: bool = False,
     kw_only: bool = True,
     tunable: bool = True,
+    kind: Kind | None = None,
 ) -> Any:
     """Declare a parameter of a value: ``mass: float = parameter(unit="kg", above=0.0)``.
 
@@ -80,6 +83,8 @@ def parameter(
         False for the one object that defines the value and may come first, by position.
     tunable : bool, optional
         False when an FMU made from it must not change the value during a run (FMI's variability "fixed").
+    kind : Kind, optional
+        Further condition on the value, in its stored form, with its words: ``kinds.choice("linear", "previous")``.
 
     Raises
     ------
@@ -88,4 +93,4 @@ def parameter(
     """
     if unit is not None:
         parse_unit(unit)
-    return ParameterSpec(default, unit, description, above, minimum, maximum, shape, structural, kw_only, tunable)
+    return ParameterSpec(default, unit, description, above, minimum, maximum, shape, structural, kw_only, tunable, kind)

@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Self, dataclass_transform
 
 import numpy as np
 
+from .arguments import check_argument, shorten
 from .docstrings import ParameterSignature, parameter_section, with_section
 from .errors import DefinitionError, ParameterError, near
 from .frozen import freeze
@@ -87,6 +88,10 @@ class Value:
                     port=name,
                 )
             object.__setattr__(self, name, convert(kwargs.get(name, spec.default), spec, who, name))
+        for name, spec in cls.parameter_specs.items():
+            value = self.__dict__[name]
+            if spec.kind is not None and not (value is None and spec.default is None):
+                check_argument(value, spec.kind, name, getattr(self, "label", cls.__name__), ParameterError)
         self.check()
 
     def check(self) -> None:
@@ -156,15 +161,6 @@ def identity(value: Any) -> Any:
     if isinstance(value, frozenset):
         return frozenset, frozenset(identity(v) for v in value)
     return type(value), value
-
-
-def shorten(value: Any) -> str:
-    """Return a parameter value as a short text, with numbers as people type them."""
-    if isinstance(value, np.ndarray):
-        return repr(value.tolist()) if value.size <= 12 else f"<{'×'.join(map(str, value.shape))} numbers>"
-    if isinstance(value, float) and abs(value) < 1e6 and value == int(value):
-        return str(int(value))
-    return repr(value)
 
 
 def convert(value: Any, spec: ParameterSpec, owner: str, name: str) -> Any:

@@ -8,9 +8,24 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, Block, Event, Input, Output, ParameterError, ShapeError, State, parameter, shape_of, shorten
+from ..core import (
+    Array,
+    Block,
+    Event,
+    Input,
+    Output,
+    ParameterError,
+    ShapeError,
+    State,
+    kinds,
+    parameter,
+    shape_of,
+    shorten,
+)
 from .branching import check_fits
 from .sources import smooth_step
+
+_MATRIX_AT_MOST = kinds.dimensions(2).worded("at most two dimensions", "Give a number, a vector or a matrix.")
 
 
 class SpringDamper(Block):
@@ -25,21 +40,18 @@ class SpringDamper(Block):
         For inputs or parameters of different shapes, when the diagram is built.
     """
 
-    stiffness: Array = parameter(unit="N/m", description="stiffness k: a number, one for each axis, or a matrix")
-    damping: Array = parameter(default=0.0, unit="N.s/m", description="damping d: like the stiffness")
+    stiffness: Array = parameter(
+        unit="N/m", description="stiffness k: a number, one for each axis, or a matrix", kind=_MATRIX_AT_MOST
+    )
+    damping: Array = parameter(
+        default=0.0, unit="N.s/m", description="damping d: like the stiffness", kind=_MATRIX_AT_MOST
+    )
     rest: Array = parameter(default=0.0, unit="m", description="offset r from the anchor at which the spring rests")
     position = Input(shape=None, unit="m", description="position p of the body")
     velocity = Input(shape=None, unit="m/s", default=0.0, description="its velocity v")
     anchor = Input(shape=None, unit="m", default=0.0, description="position p_a of the anchor")
     anchor_velocity = Input(shape=None, unit="m/s", default=0.0, description="its velocity v_a")
     force = Output(shape=None, unit="N", description="force F on the body")
-
-    def check(self) -> None:
-        """Refuse stiffness and damping of more than two dimensions."""
-        for name in ("stiffness", "damping"):
-            if np.ndim(getattr(self, name)) > 2:
-                text = f"found an array of shape {np.shape(getattr(self, name))}; expected at most two dimensions. "
-                raise ParameterError(f"{text}Give a number, a vector or a matrix.", block=self.label, port=name)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the force."""
@@ -174,18 +186,17 @@ class HandProfile(Block):
     hold_time: float = parameter(unit="s", minimum=0.0, description="duration of the full force")
     release_time: float = parameter(default=0.3, unit="s", above=0.0, description="duration of the fall")
     peak_force: float = parameter(unit="N", description="full force F₀")
-    direction: Array = parameter(default=1.0, unit="1", description="direction e; its length does not matter")
+    direction: Array = parameter(
+        default=1.0,
+        unit="1",
+        description="direction e; its length does not matter",
+        kind=kinds.dimensions(1)
+        .where(np.any)
+        .worded(
+            "a direction that is not zero, such as (1, 0), or 1 or −1 for a scalar force", "Give one.", kinds.shortened
+        ),
+    )
     force = Output(shape=None, unit="N", description="force on the body, of the direction's shape")
-
-    def check(self) -> None:
-        """Refuse a direction of length zero, or a matrix."""
-        if np.ndim(self.direction) > 1 or not np.any(self.direction):
-            raise ParameterError(
-                f"found {shorten(self.direction)}; expected a direction that is not zero, such as (1, 0), or 1 or −1 "
-                "for a scalar force. Give one.",
-                block=self.label,
-                port="direction",
-            )
 
     def _corners(self) -> tuple[Array, Array, Array, Array]:
         """Return the times at which the rise begins and ends, and at which the fall begins and ends."""

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..core import Array, Block, Input, Output, ParameterError, State, lay_out, parameter
+from ..core import Array, Block, Input, Output, ParameterError, State, kinds, lay_out, parameter
 from .branching import truth
 from .delays import History, push
 from .integrators import check_limits, clip
@@ -33,7 +33,11 @@ class DiscreteIntegrator(Block):
         In a continuous subsystem, when the diagram is built.
     """
 
-    method: str = parameter(default="forward", description="'forward', 'backward' or 'trapezoidal'")
+    method: str = parameter(
+        default="forward",
+        description="'forward', 'backward' or 'trapezoidal'",
+        kind=kinds.choice(*_WEIGHTS).worded(f"one of {', '.join(map(repr, _WEIGHTS))}"),
+    )
     gain: float = parameter(default=1.0, description="factor of the input")
     initial_value: Array = parameter(default=0.0, description="the sum at the start, a number or of the input's shape")
     lower: float | None = parameter(default=None, description="lower limit of y; None: there is none")
@@ -48,13 +52,7 @@ class DiscreteIntegrator(Block):
     last = State(start=1.0, description="reset at the last tick")
 
     def check(self) -> None:
-        """Refuse an unknown rule, and limits that the sum can't keep."""
-        if self.method not in _WEIGHTS:
-            raise ParameterError(
-                f"found {self.method!r}; expected one of {', '.join(map(repr, _WEIGHTS))}.",
-                block=self.label,
-                port="method",
-            )
+        """Refuse limits that the sum can't keep."""
         check_limits(self, "initial_value")
 
     @property
@@ -97,20 +95,14 @@ class FIR(Block):
         In a continuous subsystem, when the diagram is built.
     """
 
-    coefficients: Array = parameter(description="c₀, c₁, …, at least two")
+    coefficients: Array = parameter(
+        description="c₀, c₁, …, at least two",
+        kind=kinds.row.where(lambda c: len(c) > 1).worded("two coefficients or more", "Use Gain for one."),
+    )
     initial_value: Array | None = parameter(default=None, description="earlier inputs; None: u just before t = 0")
     u = Input(shape=None, description="signal to filter, a scalar or a vector")
     y = Output(shape=None, description="the filtered input")
     line = History("taps", "initial_value", description="the last inputs, the oldest first, one row for each")
-
-    def check(self) -> None:
-        """Refuse fewer than two coefficients."""
-        if np.ndim(self.coefficients) != 1 or len(self.coefficients) < 2:
-            raise ParameterError(
-                f"found {self.coefficients!r}; expected two coefficients or more. Use Gain for one.",
-                block=self.label,
-                port="coefficients",
-            )
 
     @property
     def taps(self) -> int:

@@ -31,7 +31,11 @@ class Function(Block):
         diagram is built.
     """
 
-    function: object = parameter(kw_only=False, description="the function, of one array for each input")
+    function: object = parameter(
+        kw_only=False,
+        description="the function, of one array for each input",
+        kind=kinds.function.worded("a function, such as np.sin or lambda a, b: a * b", "Give one."),
+    )
     arguments: object = parameter(
         default=None, description="names of the inputs, or shapes by name; None takes the function's own names"
     )
@@ -41,9 +45,7 @@ class Function(Block):
     )
 
     def check(self) -> None:
-        """Refuse an object that is no function, and names that can't be ports."""
-        if not callable(self.function):
-            raise self._refuse("function", repr(self.function), "a function, such as np.sin or lambda a, b: a * b")
+        """Refuse names that can't be ports."""
         for name in self.inputs.keys() & self.outputs.keys():
             raise self._refuse("results", f"{name!r}, the name of an input too", "another name")
 
@@ -103,7 +105,7 @@ class Function(Block):
 
     def _shapes(self, parameter: str, given: Any) -> dict[str, Shape | None]:
         """Return the names of ports with the shapes given; None for a shape that is not given."""
-        if kinds.names(given) and not isinstance(given, Mapping):
+        if not kinds.names.holds(given) and not isinstance(given, Mapping):
             raise self._refuse(parameter, shorten(given), "names, such as ('a', 'b'), or shapes by name")
         named = given if isinstance(given, Mapping) else dict.fromkeys([given] if isinstance(given, str) else given)
         shapes: dict[str, Shape | None] = {}

@@ -15,7 +15,19 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..core import Array, Output, ParameterError, Source, move_earlier, next_edge, parameter, period_of, read_time
+from ..core import (
+    Array,
+    Kind,
+    Output,
+    ParameterError,
+    Source,
+    kinds,
+    move_earlier,
+    next_edge,
+    parameter,
+    period_of,
+    read_time,
+)
 from .piecewise_functions import piecewise
 
 _HALF = 2.0**24  # counters are mixed in two halves, since products of two such numbers are exact
@@ -67,7 +79,9 @@ class Chirp(Source):
     start_frequency: float = parameter(unit="Hz", minimum=0.0, description="frequency at the start, f₀")
     end_frequency: float = parameter(unit="Hz", minimum=0.0, description="frequency at the end, f₁")
     duration: float = parameter(unit="s", above=0.0, description="duration of the sweep, D")
-    sweep: str = parameter(default="linear", description="'linear' or 'logarithmic'")
+    sweep: str = parameter(
+        default="linear", description="'linear' or 'logarithmic'", kind=kinds.choice("linear", "logarithmic")
+    )
     start_time: float = parameter(default=0.0, unit="s", description="time at which the sweep starts, t₀")
     phase: float = parameter(default=0.0, unit="rad", description="phase at the start, φ₀")
     bias: float = parameter(default=0.0, description="mean value")
@@ -76,10 +90,6 @@ class Chirp(Source):
     def check(self) -> None:
         """Refuse a sweep that is not defined."""
         super().check()
-        if self.sweep not in ("linear", "logarithmic"):
-            raise ParameterError(
-                f"found {self.sweep!r}; expected 'linear' or 'logarithmic'.", block=self.label, port="sweep"
-            )
         first, last = self.start_frequency, self.end_frequency
         if self.sweep == "logarithmic" and (min(first, last) == 0.0 or first == last):
             raise ParameterError(
@@ -125,20 +135,17 @@ class PulseTrain(Source):
 
     amplitude: float = parameter(default=1.0, description="height of the pulses, A")
     period: float = parameter(unit="s", above=0.0, description="time from pulse to pulse, P")
-    duty: float = parameter(default=0.5, above=0.0, description="duration of a pulse as a part of the period, below 1")
+    duty: float = parameter(
+        default=0.5,
+        above=0.0,
+        description="duration of a pulse as a part of the period, below 1",
+        kind=kinds.number.where(lambda duty: duty < 1.0).worded(
+            "a part of the period below 1", "Use Step for a pulse without an end."
+        ),
+    )
     delay: float = parameter(default=0.0, unit="s", minimum=0.0, description="time at which the first pulse begins, t₀")
     base: float = parameter(default=0.0, description="value between the pulses")
     y = Output()
-
-    def check(self) -> None:
-        """Refuse pulses that don't end within the period."""
-        super().check()
-        if self.duty >= 1.0:
-            raise ParameterError(
-                f"found {self.duty:g}; expected a part of the period below 1. Use Step for a pulse without an end.",
-                block=self.label,
-                port="duty",
-            )
 
     def next_instant(self, t: float) -> float:
         """Return the next edge."""
@@ -155,19 +162,23 @@ class PulseTrain(Source):
 class _Table(Source):
     """Base of the sources that read a table over time."""
 
-    times: Array = parameter(unit="s", structural=True, description="times of the values, rising")
+    times: Array = parameter(
+        unit="s",
+        structural=True,
+        description="times of the values, rising",
+        kind=Kind(
+            "a list of rising times, one or more",
+            lambda times: np.ndim(times) == 1 and np.size(times) > 0 and bool(np.all(np.diff(times) > 0)),
+            "Sort them, with their values, and leave out repeated ones.",
+            lambda name, times: f"found times of shape {np.shape(times)}",
+        ),
+    )
     values: Array = parameter(structural=True, description="a value for each time: numbers, or a vector in each row")
 
     def check(self) -> None:
-        """Refuse times that don't rise, and values that don't fit them."""
+        """Refuse values that don't fit the times."""
         super().check()
         times, values = np.shape(self.times), np.shape(self.values)
-        if len(times) != 1 or not times[0] or np.any(np.diff(self.times) <= 0):
-            raise ParameterError(
-                f"found times of shape {times}; expected a list of rising times, one or more.",
-                block=self.label,
-                port="times",
-            )
         if len(values) not in (1, 2) or values[0] != times[0]:
             raise ParameterError(
                 f"found values of shape {values} for {times[0]} times; expected shape ({times[0]},), or "
@@ -231,17 +242,9 @@ class Recorded(_Table):
         For times that don't rise, not one value for each, or another interpolation.
     """
 
-    interpolation: str = parameter(default="linear", description="'linear' or 'previous'")
-
-    def check(self) -> None:
-        """Refuse an unknown interpolation."""
-        super().check()
-        if self.interpolation not in ("linear", "previous"):
-            raise ParameterError(
-                f"found {self.interpolation!r}; expected 'linear' or 'previous'.",
-                block=self.label,
-                port="interpolation",
-            )
+    interpolation: str = parameter(
+        default="linear", description="'linear' or 'previous'", kind=kinds.choice("linear", "previous")
+    )
 
     def piece_starts(self) -> np.ndarray:
         """Return the times, moved earlier by their rounding if values jump there."""

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..core import Array, Block, Input, Output, ParameterError, State, parameter
+from ..core import Array, Block, Input, Kind, Output, ParameterError, State, parameter
 from .python_control import (
     FixedSampleTime,
     block_name,
@@ -20,6 +20,11 @@ from .python_control import (
 )
 
 Names = tuple[str, ...] | None
+_COEFFICIENTS = Kind(
+    "a number, or coefficients in one list, highest power first",
+    lambda value: np.ndim(value) < 2 and np.size(value) > 0,
+    found=lambda name, value: f"found shape {np.shape(value)}",
+)
 
 
 def _ndim(value: Array) -> int:
@@ -167,8 +172,12 @@ class DiscreteStateSpace(FixedSampleTime, _StateSpace):
 class _TransferFunction(Block):
     """Common part of transfer functions in continuous and in discrete time."""
 
-    numerator: Array = parameter(tunable=False, description="coefficients of the numerator, highest power first")
-    denominator: Array = parameter(tunable=False, description="coefficients of the denominator, highest power first")
+    numerator: Array = parameter(
+        tunable=False, description="coefficients of the numerator, highest power first", kind=_COEFFICIENTS
+    )
+    denominator: Array = parameter(
+        tunable=False, description="coefficients of the denominator, highest power first", kind=_COEFFICIENTS
+    )
     input_names: Names = parameter(default=None, description="name of the input, for python-control")
     output_names: Names = parameter(default=None, description="name of the output, for python-control")
     u = Input(description="input")
@@ -187,14 +196,6 @@ class _TransferFunction(Block):
 
     def check(self) -> None:
         """Refuse coefficients that don't make a proper transfer function."""
-        for name in ("numerator", "denominator"):
-            if np.ndim(getattr(self, name)) > 1 or np.size(getattr(self, name)) == 0:
-                raise ParameterError(
-                    f"found shape {np.shape(getattr(self, name))}; expected a number, or coefficients in one list, "
-                    "highest power first.",
-                    block=self.label,
-                    port=name,
-                )
         a, b = np.atleast_1d(self.denominator), np.atleast_1d(self.numerator)
         if a[0] == 0:
             raise ParameterError(

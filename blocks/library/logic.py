@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, Block, Event, Input, Output, ParameterError, State, check_shapes, near, parameter
+from ..core import Array, Block, Event, Input, Output, State, check_shapes, kinds, parameter
 from .branching import NumberedInputs, check_fits, expect_scalar, truth
 
 _OPERATORS = {">": (1.0, 1.0), "<": (-1.0, 1.0), "<=": (1.0, 0.0), ">=": (-1.0, 0.0)}
@@ -34,22 +34,20 @@ class Compare(Block):
     """
 
     same_units = True
-    relation: str = parameter(kw_only=False, default=">", description="one of >, <, >= and <=")
+    relation: str = parameter(
+        kw_only=False,
+        default=">",
+        description="one of >, <, >= and <=",
+        kind=kinds.choice(*_OPERATORS).worded(
+            f"one of {', '.join(_OPERATORS)}",
+            "Equality of signals that vary continuously is no event; compare their distance with a tolerance.",
+        ),
+    )
     u1 = Input(shape=None, description="left side, of any shape")
     u2 = Input(shape=None, default=0.0, description="right side, of the same shape or a scalar")
     y = Output(shape=None, description="1 where the relation holds, else 0")
     holds = State(like="u1", discrete=True, description="1 while it holds")
     cross = Event("both", "the two sides cross")
-
-    def check(self) -> None:
-        """Refuse an unknown relation."""
-        if self.relation not in _OPERATORS:
-            raise ParameterError(
-                f"found {self.relation!r}; expected one of {', '.join(_OPERATORS)}. Equality of signals that vary "
-                "continuously is no event; compare their distance with a tolerance.",
-                block=self.label,
-                port="relation",
-            )
 
     def decide(self, u: Any) -> Array:
         """Return 1 where the relation holds, else 0."""
@@ -212,21 +210,15 @@ class EdgeDetector(Block):
         In a continuous subsystem, when the diagram is built.
     """
 
-    edge: str = parameter(default="rising", description="'rising', 'falling' or 'both'")
+    edge: str = parameter(
+        default="rising",
+        description="'rising', 'falling' or 'both'",
+        kind=kinds.choice("rising", "falling", "both"),
+    )
     initial_value: Array | None = parameter(default=None, description="u before the start; None: u just before t = 0")
     u = Input(shape=None, description="logic signal, of any shape")
     y = Output(shape=None, description="1 at an edge, else 0")
     last = State(start="initial_value", like="u", description="u at the last tick")
-
-    def check(self) -> None:
-        """Refuse an unknown kind of edge."""
-        if self.edge not in ("rising", "falling", "both"):
-            raise ParameterError(
-                f"found {self.edge!r}; expected 'rising', 'falling' or 'both'. "
-                f"{near(self.edge, ('rising', 'falling', 'both'))}",
-                block=self.label,
-                port="edge",
-            )
 
     @property
     def starts_from_inputs(self) -> bool:

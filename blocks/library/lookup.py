@@ -8,32 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core import Array, Block, GuardError, Input, Output, ParameterError, ShapeError, near, parameter, shape_of
+from ..core import Array, Block, GuardError, Input, Output, ParameterError, ShapeError, kinds, parameter, shape_of
 from .piecewise_functions import bilinear, piecewise
 
-_BEYOND = ("hold", "extrapolate", "error")
+_BEYOND = kinds.choice("hold", "extrapolate", "error")
+_BREAKPOINTS = kinds.rising.worded(step="Sort them, with their values, and leave out repeated ones.")
 _SLACK = 1e-9  # part of the table's range by which rounding may put an input outside
-
-
-def _check_choice(block: Block, name: str, known: tuple[str, ...]) -> None:
-    value = getattr(block, name)
-    if value not in known:
-        text = f"found {value!r}; expected {', '.join(map(repr, known[:-1]))} or {known[-1]!r}. {near(value, known)}"
-        raise ParameterError(text, block=block.label, port=name)
-
-
-def _check_breakpoints(block: Block, name: str) -> int:
-    """Return the number of breakpoints, and refuse breakpoints that don't rise."""
-    points = np.asarray(getattr(block, name))
-    if points.ndim != 1 or points.size < 2 or np.any(np.diff(points) <= 0):
-        text = f"found {points.tolist()!r}"[:200]
-        raise ParameterError(
-            f"{text}; expected at least two numbers that rise. Sort them, with their values, and leave out repeated "
-            "ones.",
-            block=block.label,
-            port=name,
-        )
-    return points.size
 
 
 def _clip(points: np.ndarray, u: Array) -> Array:
@@ -106,18 +86,22 @@ class Lookup1D(Block):
     """
 
     _hint = "lookup_1d"
-    breakpoints: Array = parameter(structural=True, description="values of u, rising")
+    breakpoints: Array = parameter(structural=True, description="values of u, rising", kind=_BREAKPOINTS)
     values: Array = parameter(structural=True, description="values of y there; with several columns y is a vector")
-    interpolation: str = parameter(default="linear", description="'linear', 'cubic' or 'monotone'")
-    beyond: str = parameter(default="hold", description="beyond the ends: 'hold', 'extrapolate' or 'error'")
+    interpolation: str = parameter(
+        default="linear",
+        description="'linear', 'cubic' or 'monotone'",
+        kind=kinds.choice("linear", "cubic", "monotone"),
+    )
+    beyond: str = parameter(
+        default="hold", description="beyond the ends: 'hold', 'extrapolate' or 'error'", kind=_BEYOND
+    )
     u = Input(shape=None, description="the argument: a scalar, or a vector of them")
     y = Output(shape=None, description="value of the table")
 
     def check(self) -> None:
-        """Refuse an unknown choice, breakpoints that don't rise, and values of another shape."""
-        _check_choice(self, "interpolation", ("linear", "cubic", "monotone"))
-        _check_choice(self, "beyond", _BEYOND)
-        n, shape = _check_breakpoints(self, "breakpoints"), np.shape(self.values)
+        """Refuse values of another shape."""
+        n, shape = np.size(self.breakpoints), np.shape(self.values)
         if len(shape) not in (1, 2) or shape[0] != n:
             raise ParameterError(
                 f"found shape {shape} for {n} breakpoints; expected ({n},), or ({n}, columns). Give one value, or one "
@@ -180,18 +164,19 @@ class Lookup2D(Block):
     """
 
     _hint = "lookup_2d"
-    rows: Array = parameter(structural=True, description="values of u₁, rising")
-    columns: Array = parameter(structural=True, description="values of u₂, rising")
+    rows: Array = parameter(structural=True, description="values of u₁, rising", kind=_BREAKPOINTS)
+    columns: Array = parameter(structural=True, description="values of u₂, rising", kind=_BREAKPOINTS)
     values: Array = parameter(structural=True, description="values of y: one row for each u₁, one column for each u₂")
-    beyond: str = parameter(default="hold", description="beyond the edges: 'hold', 'extrapolate' or 'error'")
+    beyond: str = parameter(
+        default="hold", description="beyond the edges: 'hold', 'extrapolate' or 'error'", kind=_BEYOND
+    )
     u1 = Input(description="argument along the rows' breakpoints")
     u2 = Input(description="argument along the columns' breakpoints")
     y = Output(description="value of the table")
 
     def check(self) -> None:
-        """Refuse an unknown choice, breakpoints that don't rise, and values of another shape."""
-        _check_choice(self, "beyond", _BEYOND)
-        expected = (_check_breakpoints(self, "rows"), _check_breakpoints(self, "columns"))
+        """Refuse values of another shape."""
+        expected = (np.size(self.rows), np.size(self.columns))
         if np.shape(self.values) != expected:
             raise ParameterError(
                 f"found shape {np.shape(self.values)}; expected {expected}, a row for each of rows and a column for "

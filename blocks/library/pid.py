@@ -7,11 +7,12 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from ..core import Array, Block, Event, Input, Output, ParameterError, State, parameter
+from ..core import Array, Block, Event, Input, Output, ParameterError, State, kinds, parameter
 from ..tracing import find_hold
 from .integrators import check_limits, clip
 
 _WAYS = ("back_calculation", "clamping", "none")
+_ONE_WAY = f"one of {', '.join(map(repr, _WAYS))}"
 
 
 class PID(Block):
@@ -56,7 +57,9 @@ class PID(Block):
     )
     lower: float | None = parameter(default=None, description="lower limit of u; None: there is none")
     upper: float | None = parameter(default=None, description="upper limit of u; None: there is none")
-    anti_windup: str = parameter(default="back_calculation", description=f"one of {', '.join(map(repr, _WAYS))}")
+    anti_windup: str = parameter(
+        default="back_calculation", description=_ONE_WAY, kind=kinds.choice(*_WAYS).worded(_ONE_WAY)
+    )
     tracking_time: float | None = parameter(
         default=None, unit="s", above=0.0, description="time constant of back-calculation, T_t; None: kp / ki"
     )
@@ -130,8 +133,6 @@ class PID(Block):
         if self.kd and self.filter_time is None:
             text = "found none; expected a filter for the derivative. Give filter_time, such as kd / (10 kp) in s."
             refuse("filter_time", text)
-        if self.anti_windup not in _WAYS:
-            refuse("anti_windup", f"found {self.anti_windup!r}; expected one of {', '.join(map(repr, _WAYS))}.")
         check_limits(self, None if self.tracking else "initial_output")
         if self.clamps and (self.lower is None or self.upper is None):
             text = "found clamping without both limits; give lower and upper, or use 'back_calculation'."

@@ -112,7 +112,7 @@ def check_names(block: Any, **numbers: int) -> None:
     """
     for parameter, n in numbers.items():
         names = getattr(block, parameter)
-        if names is not None and kinds.names(names):
+        if names is not None and not kinds.names.holds(names):
             raise ParameterError(
                 f"found {shorten(names)}; expected a name for each of the {n}. Give texts.",
                 block=block.label,

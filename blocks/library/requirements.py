@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, Block, Event, GuardError, Input, Output, ParameterError, State, near, parameter
+from ..core import Array, Block, Event, GuardError, Input, Output, ParameterError, State, kinds, parameter
 from .branching import expect_scalar, truth
 
 
@@ -70,10 +70,20 @@ class Requirement(Block):
         For a vector in a continuous subsystem, when the diagram is built.
     """
 
-    requirement: str = parameter(kw_only=False, description="the requirement in words")
+    requirement: str = parameter(
+        kw_only=False,
+        description="the requirement in words",
+        kind=kinds.text.where(str.strip).worded(
+            "the requirement in words, for the report of its violation", "Write it.", kinds.alone("no text")
+        ),
+    )
     lower: float | None = parameter(default=None, description="smallest value allowed")
     upper: float | None = parameter(default=None, description="largest value allowed")
-    on_violation: str = parameter(default="error", description="'error' stops the run, 'record' lets it go on")
+    on_violation: str = parameter(
+        default="error",
+        description="'error' stops the run, 'record' lets it go on",
+        kind=kinds.choice("error", "record"),
+    )
     u = Input(shape=None, description="a quantity, or a logic signal that must stay true")
     violated = Output(description="1 from the first violation on, 0 before")
     violated_at = Output(unit="s", description="time of the first violation, −1 before")
@@ -83,14 +93,7 @@ class Requirement(Block):
     above = Event("rising", "the signal rises above its upper bound")
 
     def check(self) -> None:
-        """Refuse an empty text, an unknown reaction, and bounds that cross."""
-        kinds = ("error", "record")
-        if not isinstance(self.requirement, str) or not self.requirement.strip():
-            text = "found no text; expected the requirement in words, for the report of its violation. Write it."
-            raise ParameterError(text, block=self.label, port="requirement")
-        if self.on_violation not in kinds:
-            text = f"found {self.on_violation!r}; expected 'error' or 'record'. {near(self.on_violation, kinds)}"
-            raise ParameterError(text, block=self.label, port="on_violation")
+        """Refuse bounds that cross."""
         if self.lower is not None and self.upper is not None and self.lower > self.upper:
             text = f"found lower={self.lower:g} above upper={self.upper:g}; expected it at or below. Exchange them."
             raise ParameterError(text, block=self.label, port="lower")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, Block, Call, Event, Input, Output, ParameterError, Signal, State, near, parameter
+from ..core import Array, Block, Call, Event, Input, Kind, Output, ParameterError, Signal, State, near, parameter
 from .branching import truth
 
 
@@ -43,7 +43,14 @@ class StateMachine(Block):
         For a condition that is no scalar, when the diagram is built.
     """
 
-    modes: tuple[str, ...] = parameter(description="names of the modes")
+    modes: tuple[str, ...] = parameter(
+        description="names of the modes",
+        kind=Kind(
+            "a tuple of different names",
+            lambda modes: isinstance(modes, tuple) and bool(modes) and len(set(modes)) == len(modes),
+            "Give each mode one.",
+        ),
+    )
     transitions: tuple[tuple[str, str, str], ...] = parameter(
         description="{(from, to): condition}, or a sequence of (from, to, condition); the first that holds is taken"
     )
@@ -137,10 +144,8 @@ def _error(machine: StateMachine, port: str, text: str) -> ParameterError:
 
 
 def _check_transitions(machine: StateMachine) -> None:
-    """Refuse modes that are no tuple of different names, and transitions that don't lead from one mode to another."""
+    """Refuse a start that is no mode, and transitions that don't lead from one mode to another."""
     modes, transitions = machine.modes, machine.transitions
-    if not isinstance(modes, tuple) or not modes or len(set(modes)) < len(modes):
-        raise _error(machine, "modes", f"found {modes!r}; expected a tuple of different names. Give each mode one.")
     if machine.start is not None and machine.start not in modes:
         raise _error(machine, "start", f"found {machine.start!r}, which is no mode. {near(machine.start, modes)}")
     rows: tuple[Any, ...] = transitions if isinstance(transitions, tuple) and transitions else (transitions,)

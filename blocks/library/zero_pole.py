@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..core import Array, Block, Input, Output, ParameterError, State, lay_out, parameter
+from ..core import Array, Block, Input, Kind, Output, ParameterError, State, lay_out, parameter
 from .linear import Names, section
 from .python_control import (
     FixedSampleTime,
@@ -87,11 +87,23 @@ def _find_fault(roots: Any) -> str | None:
     return None
 
 
+_ROOTS = Kind(
+    "a list of finite numbers, complex ones in conjugate pairs, such as [-1+2j, -1-2j]",
+    lambda value: _find_fault(value) is None,
+    "Give those.",
+    lambda name, value: f"found {value!r}{_find_fault(value)}",
+)
+
+
 class _ZeroPoleGain(Block):
     """Common part of zero-pole-gain blocks in continuous and in discrete time."""
 
-    zeros: Numbers = parameter(default=(), structural=True, description="zeros; complex ones in conjugate pairs")
-    poles: Numbers = parameter(structural=True, description="poles, at least one; complex ones in conjugate pairs")
+    zeros: Numbers = parameter(
+        default=(), structural=True, description="zeros; complex ones in conjugate pairs", kind=_ROOTS
+    )
+    poles: Numbers = parameter(
+        structural=True, description="poles, at least one; complex ones in conjugate pairs", kind=_ROOTS
+    )
     gain: float = parameter(default=1.0, description="factor k")
     input_names: Names = parameter(default=None, description="name of the input, for python-control")
     output_names: Names = parameter(default=None, description="name of the output, for python-control")
@@ -101,16 +113,6 @@ class _ZeroPoleGain(Block):
 
     def check(self) -> None:
         """Refuse zeros and poles that don't make a real, proper transfer function."""
-        for name in ("zeros", "poles"):
-            found = getattr(self, name)
-            why = _find_fault(found)
-            if why is not None:
-                raise ParameterError(
-                    f"found {found!r}{why}; expected a list of finite numbers, complex ones in conjugate pairs, such "
-                    "as [-1+2j, -1-2j].",
-                    block=self.label,
-                    port=name,
-                )
         if not len(self.poles) or len(self.zeros) > len(self.poles):
             raise ParameterError(
                 f"found {len(self.zeros)} zeros and {len(self.poles)} poles; expected a pole, and no more zeros than "

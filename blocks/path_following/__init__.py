@@ -5,16 +5,18 @@ from .environment import HandForce, PathSpring
 from .planar_model import PlanarModel
 from .planar_slopes import PlanarSlopes, planar_slopes
 from .transverse import (
+    A_MODEL,
+    A_PATH,
     FeedbackLinearization,
     ForceProjection,
     PathProjection,
     PathTracking,
     TransverseTransform,
-    expect_model,
-    expect_path,
 )
 
 __all__ = [
+    "A_MODEL",
+    "A_PATH",
     "AdmittanceFilter",
     "ErrorDynamics",
     "FeedbackLinearization",
@@ -26,7 +28,5 @@ __all__ = [
     "PlanarModel",
     "PlanarSlopes",
     "TransverseTransform",
-    "expect_model",
-    "expect_path",
     "planar_slopes",
 ]

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, Block, GuardError, Input, Output, ParameterError, PathDomainError, State, parameter, shorten
+from ..core import Array, Block, GuardError, Input, Output, ParameterError, PathDomainError, State, kinds, parameter
 from ..paths import Path, replace_unlimited
 from .planar_model import PlanarModel
 
@@ -20,36 +20,10 @@ _NEWTON = 4  # iterations in a tick; from 1 mm away, three reach the last digit
 _CONVERGED = 1e-9  # largest remaining Newton step, relative to the path's parameter range
 
 
-def expect_path(block: Block) -> None:
-    """Refuse a ``path`` that is no `Path`.
-
-    Raises
-    ------
-    ParameterError
-        For anything but a `Path`.
-    """
-    path = block.parameters["path"]
-    if not isinstance(path, Path):
-        hint = " The path comes first, then the model." if isinstance(path, PlanarModel) else ""
-        raise ParameterError(
-            f"found {shorten(path)}; expected a Path, such as Ellipse(semi_axes=(0.3, 0.15)).{hint}",
-            block=block.label,
-            port="path",
-        )
-
-
-def expect_model(block: Block, model: Any) -> None:
-    """Refuse a ``model`` that is no `PlanarModel`.
-
-    Raises
-    ------
-    ParameterError
-        For anything but a `PlanarModel`.
-    """
-    if not isinstance(model, PlanarModel):
-        raise ParameterError(
-            f"found {shorten(model)}; expected a PlanarModel, such as gantry.nominal.", block=block.label, port="model"
-        )
+A_PATH = kinds.one_of_class(Path, "a Path, such as Ellipse(semi_axes=(0.3, 0.15))").worded(
+    step=lambda value: "The path comes first, then the model." if isinstance(value, PlanarModel) else "Give one."
+)
+A_MODEL = kinds.one_of_class(PlanarModel, "a PlanarModel, such as gantry.nominal").worded(step="Give one.")
 
 
 class PathTracking(Block):
@@ -69,14 +43,10 @@ class PathTracking(Block):
     """
 
     memory = True
-    path: Path = parameter(kw_only=False, description="the path")
+    path: Path = parameter(kw_only=False, description="the path", kind=A_PATH)
     minimum_q: float = parameter(default=0.05, minimum=0.0, description="smallest allowed q = 1 − κ ξ₁")
     position = Input(shape=(2,), unit="m", description="position y in the plane")
     foot = State(description="last path parameter")
-
-    def check(self) -> None:
-        """Refuse a path that is no `Path`."""
-        expect_path(self)
 
     def initial(self, u: Any) -> float:
         """Return the global arg min of (4), in [0, period); within rounding before the seam counts as after it."""
@@ -194,18 +164,12 @@ class TransverseTransform(Block):
         For a path that is no `Path`, and a model that is no `PlanarModel`, when the block is made.
     """
 
-    path: Path = parameter(kw_only=False, description="the path")
+    path: Path = parameter(kw_only=False, description="the path", kind=A_PATH)
     model: PlanarModel | None = parameter(
-        default=None, kw_only=False, description="model with the output map h; None: h is the identity"
+        default=None, kw_only=False, description="model with the output map h; None: h is the identity", kind=A_MODEL
     )
     eta = Output(shape=(2,), unit=("m", "m/s"), description="tangential state η")
     xi = Output(shape=(2,), unit=("m", "m/s"), description="transversal state ξ")
-
-    def check(self) -> None:
-        """Refuse a path that is no `Path`, and a model that is no `PlanarModel`."""
-        expect_path(self)
-        if self.model is not None:
-            expect_model(self, self.model)
 
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
@@ -230,15 +194,11 @@ class ForceProjection(Block):
         For a path that is no `Path`, when the block is made.
     """
 
-    path: Path = parameter(kw_only=False, description="the path")
+    path: Path = parameter(kw_only=False, description="the path", kind=A_PATH)
     theta = Input(description="path parameter of the foot point")
     force = Input(shape=(2,), unit="N", description="measured force on the robot")
     f_par = Output(unit="N", description="tangential part F∥")
     f_perp = Output(unit="N", description="transversal part F⊥")
-
-    def check(self) -> None:
-        """Refuse a path that is no `Path`."""
-        expect_path(self)
 
     def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
         """Return F∥ and F⊥."""
@@ -269,8 +229,8 @@ class FeedbackLinearization(Block):
         In a run, if |det(dh G_v)| falls to ``minimum_determinant``.
     """
 
-    path: Path = parameter(kw_only=False, description="the path")
-    model: PlanarModel = parameter(kw_only=False, description="model that is inverted: f_v, G_v, h")
+    path: Path = parameter(kw_only=False, description="the path", kind=A_PATH)
+    model: PlanarModel = parameter(kw_only=False, description="model that is inverted: f_v, G_v, h", kind=A_MODEL)
     minimum_determinant: float = parameter(
         default=1e-9, minimum=0.0, description="smallest |det(dh G_v)|: below it the model can't be inverted"
     )
@@ -299,9 +259,7 @@ class FeedbackLinearization(Block):
         return Signal(self, "motor_force")
 
     def check(self) -> None:
-        """Refuse a path that is no `Path`, a model that is no `PlanarModel`, and a model without its equations."""
-        expect_path(self)
-        expect_model(self, self.model)
+        """Refuse a model without its equations."""
         for name, text in (("f_v", "f_v(x_c, x_v)"), ("G_v", "G_v(x_c)")):
             if getattr(type(self.model), name) is getattr(PlanarModel, name):
                 raise ParameterError(

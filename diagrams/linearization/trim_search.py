@@ -335,7 +335,7 @@ def trim(
     **options: Any,
 ) -> OperatingPoint:
     """Find an operating point; see `Diagram.trim`."""
-    if free is not None and not isinstance(free, Mapping) and (isinstance(free, str) or kinds.names(free)):
+    if free is not None and not isinstance(free, Mapping) and (isinstance(free, str) or not kinds.names.holds(free)):
         raise OptionError(
             f"found free={free!r}; expected names with bounds, or a list of names. Write, for instance, "
             "free={'force.value': (-10, 10)}.",

@@ -59,8 +59,8 @@ from ...blocks import (
     PlanarModel,
     Reference,
 )
-from ...blocks.core import Array, Finding, ParameterError, UnknownNameError, Value, parameter
-from ...blocks.path_following import expect_model, expect_path, planar_slopes
+from ...blocks.core import Array, Finding, ParameterError, UnknownNameError, Value, kinds, parameter
+from ...blocks.path_following import A_MODEL, A_PATH, planar_slopes
 from ...blocks.tracing import check_method
 from ..contact import SIDES, Contact, PortNames, Tool, make_contact, restrict
 from ..diagram import Diagram
@@ -73,6 +73,8 @@ from .shown_plant import check_plant
 from .wires import Channel, Rig, wire
 
 IMPLEMENTATIONS = ("ideal", "continuous", "sampled")
+_ADMITTANCE = kinds.one_of_class(AdmittanceFilter, "an AdmittanceFilter(…)").worded(step="Give one.")
+_PID = kinds.one_of_class(ErrorDynamics, "an ErrorDynamics(…)").worded(step="Give one.")
 LINEARIZATION = "controller.feedback_linearization"
 HALF = 1.0
 """Half the length in m of a line in whose middle the robot rests."""
@@ -97,14 +99,20 @@ class AdmittanceLoop(Value):
         is not Cartesian: its output is not its position, or it changes with the position.
     """
 
-    path: Path = parameter(kw_only=False, description="the path")
-    model: PlanarModel = parameter(kw_only=False, description="model that the feedback linearization inverts: M̂, Ĉ")
-    plant: PlanarModel | None = parameter(default=None, description="true robot: M, C; None for the model itself")
-    admittance_par: AdmittanceFilter = parameter(description="admittance along the path")
-    admittance_perp: AdmittanceFilter = parameter(description="admittance across the path")
-    pid_par: ErrorDynamics = parameter(description="error dynamics along the path")
-    pid_perp: ErrorDynamics = parameter(description="error dynamics across the path")
-    side: str = parameter(default="perp", description="direction of the environment, par or perp")
+    path: Path = parameter(kw_only=False, description="the path", kind=A_PATH)
+    model: PlanarModel = parameter(
+        kw_only=False, description="model that the feedback linearization inverts: M̂, Ĉ", kind=A_MODEL
+    )
+    plant: PlanarModel | None = parameter(
+        default=None, description="true robot: M, C; None for the model itself", kind=A_MODEL
+    )
+    admittance_par: AdmittanceFilter = parameter(description="admittance along the path", kind=_ADMITTANCE)
+    admittance_perp: AdmittanceFilter = parameter(description="admittance across the path", kind=_ADMITTANCE)
+    pid_par: ErrorDynamics = parameter(description="error dynamics along the path", kind=_PID)
+    pid_perp: ErrorDynamics = parameter(description="error dynamics across the path", kind=_PID)
+    side: str = parameter(
+        default="perp", description="direction of the environment, par or perp", kind=kinds.choice(*SIDES)
+    )
     eta: float = parameter(default=0.0, unit="m", description="arc length η₁ of the point on the path")
     xi: float = parameter(default=0.0, unit="m", description="offset ξ₁ of the point from the path")
     velocity: Array = parameter(
@@ -113,7 +121,9 @@ class AdmittanceLoop(Value):
         unit="m/s",
         description="velocity at which the friction's slope is taken; zero unless the path is straight",
     )
-    implementation: str = parameter(default="sampled", description="ideal, continuous or sampled")
+    implementation: str = parameter(
+        default="sampled", description="ideal, continuous or sampled", kind=kinds.choice(*IMPLEMENTATIONS)
+    )
     sample_time: float = parameter(default=1e-3, unit="s", above=0.0, description="sample time T")
     delay: int = parameter(default=0, minimum=0, maximum=100, description="samples of computational delay")
     method: str = parameter(default="exact", description="discretization of the admittance")
@@ -184,17 +194,6 @@ class AdmittanceLoop(Value):
 
     def check(self) -> None:
         """Refuse parameters that don't make a loop."""
-        expect_path(cast(Any, self))
-        for side, block in self.filters.items():
-            if not isinstance(block, AdmittanceFilter):
-                raise _make_error(f"admittance_{side}", block, "an AdmittanceFilter(…)")
-        for side, pid in self.pids.items():
-            if not isinstance(pid, ErrorDynamics):
-                raise _make_error(f"pid_{side}", pid, "an ErrorDynamics(…)")
-        if self.side not in SIDES:
-            raise _make_error("side", self.side, "'par' or 'perp'")
-        if self.implementation not in IMPLEMENTATIONS:
-            raise _make_error("implementation", self.implementation, "'ideal', 'continuous' or 'sampled'")
         check_method(self.method)
         left, right = self.path.reach(self.path.parameter_at(self.eta))
         if not -float(right) < self.xi < float(left) or self.q <= 0.0:
@@ -211,8 +210,6 @@ class AdmittanceLoop(Value):
                 block=type(self).__name__,
                 port="velocity",
             )
-        for model in (self.model, self.true_plant):
-            expect_model(cast(Any, self), model)
         _ = self.motions
 
     @property
@@ -299,12 +296,6 @@ class AdmittanceLoop(Value):
 def control_rate(pid: ErrorDynamics) -> float:
     """Return the rate of an error dynamics in 1/s: the largest of a₂, √a₁ and ∛a₀."""
     return float(max(abs(pid.a2), np.sqrt(abs(pid.a1)), np.cbrt(abs(pid.a0))))
-
-
-def _make_error(port: str, found: object, expected: str) -> ParameterError:
-    return ParameterError(
-        f"found {found!r}; expected {expected}. Correct it.", block=AdmittanceLoop.__name__, port=port
-    )
 
 
 def _reduce_to_motion(loop: AdmittanceLoop, model: PlanarModel) -> Motion:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-from ...blocks.core import OptionError, accepts, kinds, offer_elsewhere, on_one_thread
+from ...blocks.core import Kind, OptionError, accepts, kinds, offer_elsewhere, on_one_thread
 from ...fmus.running import Fmu
 from ..flat import WiredDiagram
 from ..linearization import find_signal
@@ -62,17 +62,17 @@ def check_workers(given: int | None, written: bool) -> int:
     return given
 
 
-def _reported(value: Any) -> str:
-    """Kind of all that is reported: diagrams, and experiments."""
-    return "" if _is_diagram(value) or _is_diagram(getattr(value, "diagram", None)) else "a Diagram, or an experiment"
-
-
 def _is_diagram(value: Any) -> bool:
     return isinstance(getattr(value, "wired", None), WiredDiagram)
 
 
+_REPORTED = Kind(
+    "a Diagram, or an experiment", lambda value: _is_diagram(value) or _is_diagram(getattr(value, "diagram", None))
+)
+
+
 @accepts(
-    diagram=_reported,
+    diagram=_REPORTED,
     loops=kinds.names,
     only=kinds.names,
     requirements=kinds.either(kinds.one_of_class(Requirements, "Requirements(…)"), kinds.path),

@@ -73,13 +73,8 @@ class RunKeywords(KeptKeywords, total=False):
     overwrite: bool
 
 
-def _kind_of_compile(value: Any) -> str:
-    """Kind of a truth value or a text, which `check_compile` reads."""
-    return 'True, False or "auto"' if kinds.either(kinds.flag, kinds.text)(value) else ""
-
-
 _KINDS = {
-    "compile": _kind_of_compile,
+    "compile": kinds.either(kinds.flag, kinds.text).worded('True, False or "auto"'),
     "states": kinds.flag,
     "overwrite": kinds.flag,
 }

@@ -12,6 +12,7 @@ import numpy as np
 
 from ...blocks.core import (
     ConfirmationError,
+    Kind,
     LoopwrightError,
     OptionError,
     SimulationError,
@@ -265,18 +266,16 @@ def _read_growth(v: np.ndarray, t: np.ndarray) -> float:
     return float(math.log(last / first) / (t[len(v) - half] - t[0])) if first > 0 and last > 0 else -math.inf
 
 
-def _sensitivities(value: Any) -> str:
-    """Kind of the result of a study of sensitivities, whose class is defined above this file."""
-    return "" if hasattr(value, "model") and hasattr(value, "of") else "the result of Diagram.sensitivity"
+_SENSITIVITIES = Kind(  # their class is defined above this file
+    "the result of Diagram.sensitivity", lambda value: hasattr(value, "model") and hasattr(value, "of")
+)
+_SENSITIVITY = Kind(
+    "one of the sensitivities found, such as found[name, 'ms']",
+    lambda value: hasattr(value, "parameter") and hasattr(value, "quantity"),
+)
 
 
-def _sensitivity(value: Any) -> str:
-    """Kind of one of its rows."""
-    good = hasattr(value, "parameter") and hasattr(value, "quantity")
-    return "" if good else "one of the sensitivities found, such as found[name, 'ms']"
-
-
-@accepts(found=_sensitivities, row=_sensitivity, delay=kinds.whole, skew=kinds.number)
+@accepts(found=_SENSITIVITIES, row=_SENSITIVITY, delay=kinds.whole, skew=kinds.number)
 def confirm_sensitivity(found: Sensitivities, row: Sensitivity, *, delay: int = 0, skew: float = 0.0) -> Sensitivity:
     """Return a sensitivity that a second computation has confirmed: differences of the margin itself.
 

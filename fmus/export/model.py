@@ -261,7 +261,7 @@ class ModelSpec:
         check_file_name(self.name)
         for field in ("internal_step", "stop_time", "step_size"):
             value = getattr(self, field)
-            if kinds.finite(value) or not value > 0:
+            if not kinds.finite.holds(value) or not value > 0:
                 raise ParameterError(
                     f"found {value!r}, expected a positive number of seconds.", block=self.name, port=field
                 )
@@ -271,7 +271,7 @@ class ModelSpec:
                 block=self.name,
                 port="integrator",
             )
-        if kinds.finite(self.tolerance) or not 1e-14 <= self.tolerance <= 0.1:
+        if not kinds.finite.holds(self.tolerance) or not 1e-14 <= self.tolerance <= 0.1:
             raise ParameterError(
                 f"found {self.tolerance!r}, expected a number from 1e-14 to 0.1.", block=self.name, port="tolerance"
             )

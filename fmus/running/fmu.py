@@ -13,7 +13,6 @@ from ...blocks.core import (
     FmuError,
     FmuFileError,
     FrozenMapping,
-    ParameterError,
     kinds,
     parameter,
 )
@@ -46,11 +45,21 @@ class Fmu(ExchangeMembers):
     """
 
     opaque = True
-    file: str | os.PathLike[str] = parameter(kw_only=False, description="path of the .fmu")
+    file: str | os.PathLike[str] = parameter(
+        kw_only=False,
+        description="path of the .fmu",
+        kind=kinds.one_of_class((str, os.PathLike), "the path of an .fmu file").worded(step="Give one."),
+    )
     start: Mapping[str, Any] = parameter(
         default={}, description="start values of parameters, states and inputs, by the FMU's names, in its units"
     )
-    rename: Mapping[str, str] = parameter(default={}, description="FMU's name → name of the port")
+    rename: Mapping[str, str] = parameter(
+        default={},
+        description="FMU's name → name of the port",
+        kind=kinds.mapping.where(lambda rename: all(isinstance(new, str) for new in rename.values())).worded(
+            "two names each", "Give them as {name: port}."
+        ),
+    )
     isolate: bool | Isolation | None = parameter(
         default=None, description="a process of its own: True, its limits, False; None for all but own builds"
     )
@@ -58,6 +67,9 @@ class Fmu(ExchangeMembers):
         default=None,
         description="FMU's names of the variables that are ports: inputs, outputs, local variables, tunable "
         "parameters as inputs; None for all inputs and outputs",
+        kind=kinds.names.where(lambda ports: not isinstance(ports, str)).worded(
+            "a list of names of variables", "Give one."
+        ),
     )
     convert_units: bool = parameter(
         default=False, description="convert wires to and from other units of a port's dimension, else refused"
@@ -72,34 +84,23 @@ class Fmu(ExchangeMembers):
         default="declared",
         description="of outputs and derivatives in model exchange: 'declared' by its model structure, or 'all', by "
         "which everything may depend on everything",
+        kind=kinds.choice(*DEPENDENCIES),
     )
-    limits: ArchiveLimits | None = parameter(default=None, description="limits of the file; None for the usual ones")
+    limits: ArchiveLimits | None = parameter(
+        default=None,
+        description="limits of the file; None for the usual ones",
+        kind=kinds.one_of_class(ArchiveLimits, "ArchiveLimits(…)").worded(step="Give one."),
+    )
 
     def check(self) -> None:
         """Check the file, the names of ``ports`` and ``rename``, and names, shapes and values of ``start``."""
         who = self.label
-        if not isinstance(self.file, str | os.PathLike):
-            raise ParameterError(f"found {self.file!r}; expected the path of an .fmu file.", block=who, port="file")
-        if self.ports is not None and (isinstance(self.ports, str) or kinds.names(self.ports)):
-            raise ParameterError(
-                f"found {self.ports!r}; expected a list of names of variables.", block=who, port="ports"
-            )
         check_isolation(self.isolate, who)
-        if kinds.mapping(self.rename) or not all(isinstance(new, str) for new in self.rename.values()):
-            raise ParameterError(f"found {self.rename!r}; expected two names each.", block=who, port="rename")
-        if not isinstance(self.limits, ArchiveLimits | None):
-            raise ParameterError(f"found {self.limits!r}; expected ArchiveLimits(…).", block=who, port="limits")
         description, sizes = read_sized(self.file, self.start, self.limits, who)
         object.__setattr__(self, "_content", description.digest)
         object.__setattr__(self, "_sizes", sizes)
         description = join_scalars(description, self.rename, who)
         choose_interface(description, self.interface, who)
-        if self.dependencies not in DEPENDENCIES:
-            raise ParameterError(
-                f"found {self.dependencies!r}; expected {' or '.join(map(repr, DEPENDENCIES))}.",
-                block=who,
-                port="dependencies",
-            )
         check_offered(self.stepping, description, who)
         ports, others = self._choose_ports(description), description.other_ports("output")
         if others and not ports.outputs:
