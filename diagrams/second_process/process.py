@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import os
 import pickle
-import subprocess
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from queue import Empty, SimpleQueue
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from ...blocks.core import LoopwrightError
-from ...fmus.child_processes import ProcessGroup, find_python
-from ..sweeps import receive, send, to_bytes
+from ...fmus.child_processes import ProcessGroup, PythonChild
+from ..sweeps import to_bytes
 from .child import Make
 
 T = TypeVar("T")
-_PROGRAM = "from loopwright.diagrams.second_process.child import main; main()"
 PAUSE = 0.1
 """Seconds between two looks at what the second process tells, while this one waits for it."""
 
@@ -44,7 +41,7 @@ class SecondProcess(Generic[T]):
     """
 
     def __init__(self, make: Make, name: str):
-        self._process: subprocess.Popen[bytes] | None = None
+        self._child: PythonChild | None = None
         self._told: SimpleQueue[str] = SimpleQueue()
         self._lock, self._over = threading.Lock(), False
         self._made: dict[str, bytes] = {}
@@ -52,35 +49,29 @@ class SecondProcess(Generic[T]):
         self._thread: threading.Thread | None = None
         try:
             data = to_bytes(make, name)
-            program = [find_python(), "-c", _PROGRAM]
             self._group = ProcessGroup()
             try:
-                self._process = self._group.start(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+                self._child = PythonChild(self._group, "loopwright.diagrams.second_process.child")
             except BaseException:
                 self._group.end()
                 raise
         except (LoopwrightError, OSError):  # such as a class of the main script: everything is made here
             return
-        self._send(sys.path)
-        self._send(data)
+        with suppress(OSError):  # it has ended: then everything is made here, too
+            self._child.send(data)
 
     def __enter__(self) -> SecondProcess[T]:
         return self
 
     def __exit__(self, *exc: object) -> None:
         self._over = True
-        process = self._process
-        if process is None:
+        if self._child is None:
             return
-        process.kill()
-        process.wait()
+        self._child.kill()
         self._group.end()
         if self._thread is not None:
             self._thread.join()
-        for pipe in (process.stdin, process.stdout):
-            if pipe is not None:
-                with suppress(OSError):
-                    pipe.close()
+        self._child.wait()
 
     def share(self, keys: Sequence[str], make: Callable[[str], T], tell: Callable[[str], None]) -> list[T]:
         """Return the parts of all keys: from the first one on made here, from the last one on in the second process.
@@ -97,8 +88,8 @@ class SecondProcess(Generic[T]):
             Told what the second process tells, by this thread.
         """
         self._left = deque(keys[1:])
-        if self._process is not None:
-            self._thread = threading.Thread(target=self._go, daemon=True)
+        if self._child is not None:
+            self._thread = threading.Thread(target=self._go, args=[self._child], daemon=True)
             self._thread.start()
         found: dict[str, T] = {}
         key = keys[0] if keys else None
@@ -126,28 +117,14 @@ class SecondProcess(Generic[T]):
                 return None
             return self._left.popleft() if first else self._left.pop()
 
-    def _go(self) -> None:
+    def _go(self, child: PythonChild) -> None:
         """Give the second process one key after the other, and keep its answers."""
         with suppress(EOFError, OSError):
             while (key := self._take(first=False)) is not None:
-                self._send(key)
-                kind, answer = self._receive()
+                child.send(key)
+                kind, answer = child.receive()
                 while kind == "told":
                     self._told.put(answer)
-                    kind, answer = self._receive()
+                    kind, answer = child.receive()
                 if kind == "made":
                     self._made[key] = answer
-
-    def _send(self, message: object) -> None:
-        assert self._process is not None
-        with suppress(OSError):  # it has ended: the answer tells it
-            send(_pipe(self._process.stdin), message)
-
-    def _receive(self) -> tuple[str, Any]:
-        assert self._process is not None
-        found: tuple[str, Any] = receive(_pipe(self._process.stdout))
-        return found
-
-
-def _pipe(file: Any) -> Any:
-    return file

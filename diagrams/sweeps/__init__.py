@@ -1,6 +1,5 @@
 """Sweeps: runs of a diagram with many values of its parameters, and studies over ranges of them."""
 
-from .child import receive, send
 from .outcome import Failure
 from .processes import to_bytes
 from .reductions import Reduction, final, maximum, mean, minimum, settling_time
@@ -23,8 +22,6 @@ __all__ = [
     "mean",
     "minimum",
     "read_samples",
-    "receive",
-    "send",
     "settling_time",
     "sweep",
     "table",

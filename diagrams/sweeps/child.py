@@ -1,58 +1,25 @@
-"""Worker process of a sweep: it reads a plan and samples from its standard input, and answers with outcomes."""
+"""Worker process of a sweep: it is sent a plan and samples, and answers with outcomes."""
 
 from __future__ import annotations
 
-import os
 import pickle
-import signal
-import struct
-import sys
-from typing import Any, BinaryIO
+from contextlib import suppress
 
-_HEAD = struct.Struct("<Q")
-
-
-def send(file: BinaryIO, message: object) -> None:
-    """Write a message: its length, then its bytes."""
-    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
-    file.write(_HEAD.pack(len(data)))
-    file.write(data)
-    file.flush()
-
-
-def receive(file: BinaryIO) -> Any:
-    """Read a message.
-
-    Raises
-    ------
-    EOFError
-        If the other side has ended.
-    """
-    head = file.read(_HEAD.size)
-    if len(head) < _HEAD.size:
-        raise EOFError
-    (size,) = _HEAD.unpack(head)
-    data = file.read(size)
-    if len(data) < size:
-        raise EOFError
-    return pickle.loads(data)
+from ...fmus.child_processes import Host
 
 
 def main() -> None:
-    """Answer samples until the standard input ends; what anybody prints goes to the standard error."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent process decides when it ends
-    if hasattr(signal, "SIGTTOU"):  # it is no foreground process, and may write to any terminal all the same
-        signal.signal(signal.SIGTTOU, signal.SIG_IGN)
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
-    orders = sys.stdin.buffer
+    """Answer samples until the sweep ends."""
+    with suppress(EOFError):
+        _answer(Host())
+
+
+def _answer(host: Host) -> None:
+    data = host.receive()
     try:
-        sys.path[:] = receive(orders)
-        plan = pickle.loads(receive(orders))
-    except EOFError:
-        return
+        plan = pickle.loads(data)
     except Exception as error:
-        send(answers, error_text(error))
+        host.send(error_text(error))
         return
     from ...blocks.core import one_thread
     from ...fmus.child_processes import end_all
@@ -60,14 +27,10 @@ def main() -> None:
 
     try:
         with one_thread(), make_worker(plan) as worker:
-            send(answers, "")
+            host.send("")
             while True:
-                try:
-                    sample = receive(orders)
-                except EOFError:
-                    return
-                for outcome in worker.run_all([sample]):
-                    send(answers, outcome)
+                for outcome in worker.run_all([host.receive()]):
+                    host.send(outcome)
     finally:
         end_all()
 

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import pickle
 import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Generator, Iterable
 from contextlib import suppress
-from typing import Any, BinaryIO
 
 from ...blocks.core import OptionError
-from ...fmus.child_processes import ProcessGroup, find_python
-from .child import receive, send
+from ...fmus.child_processes import ProcessGroup, PythonChild
 from .outcome import WORKER_ENDED, Failure, SampleOutcome
 from .plan import Plan
 from .sample_queue import SampleQueue
 from .samples import Sample
 
-_PROGRAM = "from loopwright.diagrams.sweeps.child import main; main()"
 _LEAVING = 10.0  # s in which a process that has nothing more to do ends by itself
 
 
@@ -97,58 +92,46 @@ class _Process:
 
     def __init__(self, data: bytes, group: ProcessGroup):
         self._data, self._group = data, group
-        self._process: subprocess.Popen[bytes] | None = None
+        self._child: PythonChild | None = None
         self._lock, self._over = threading.Lock(), False
 
     def work(self, queue: SampleQueue) -> None:
         """Run samples of the queue until there are none; then the process ends by itself, and so its FMUs do."""
         while taken := queue.take():
             queue.put(self.run(taken[0]))
-        process = self._process
-        if process is not None:
-            with suppress(OSError, subprocess.TimeoutExpired):
-                _pipe(process.stdin).close()
-                process.wait(_LEAVING)
+        child = self._child
+        if child is not None:
+            child.leave(_LEAVING)
 
     def run(self, sample: Sample) -> SampleOutcome:
         """Return the outcome of a sample; where the process ends, that is its failure."""
         try:
-            process = self._begin()
-            send(_pipe(process.stdin), sample)
-            found: SampleOutcome = receive(_pipe(process.stdout))
+            child = self._begin()
+            child.send(sample)
+            found: SampleOutcome = child.receive()
         except (EOFError, OSError):
             return SampleOutcome(sample.index, failure=Failure(sample.index, WORKER_ENDED, self._describe_end(sample)))
         return found
 
-    def _begin(self) -> subprocess.Popen[bytes]:
+    def _begin(self) -> PythonChild:
         with self._lock:
             if self._over:
                 raise EOFError
-            if self._process is None:
-                program = [find_python(), "-c", _PROGRAM]
-                self._process = self._group.start(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-                fresh = True
-            else:
-                fresh = False
-            process = self._process
+            child, fresh = self._child, self._child is None
+            if child is None:
+                child = self._child = PythonChild(self._group, "loopwright.diagrams.sweeps.child")
         if fresh:
-            send(_pipe(process.stdin), sys.path)
-            send(_pipe(process.stdin), self._data)
-            if text := receive(_pipe(process.stdout)):
+            child.send(self._data)
+            if text := child.receive():
                 raise OptionError(
                     f"the sweep can't be read in a worker process: {text}. Define its classes and functions in a "
                     "module that can be imported; workers=1 runs all in this process."
                 )
-        return process
+        return child
 
     def _describe_end(self, sample: Sample) -> str:
-        process, self._process = self._process, None
-        code: Any = None
-        if process is not None:
-            for pipe in (process.stdin, process.stdout):
-                with suppress(OSError):
-                    _pipe(pipe).close()
-            code = process.wait()
+        child, self._child = self._child, None
+        code = None if child is None else child.wait()
         end = f"with exit status {code}"
         if code is not None and code < 0:
             with suppress(ValueError):
@@ -160,15 +143,7 @@ class _Process:
         """End the process, whatever it does."""
         with self._lock:
             self._over = True
-            process = self._process
-        if process is not None:
-            process.kill()
-            process.wait()
-            for pipe in (process.stdin, process.stdout):
-                with suppress(OSError):
-                    _pipe(pipe).close()
-
-
-def _pipe(file: Any) -> BinaryIO:
-    found: BinaryIO = file
-    return found
+            child = self._child
+        if child is not None:
+            child.kill()
+            child.wait()

@@ -44,7 +44,7 @@ def parts(tmp_path, monkeypatch):
 
 def share(task, told):
     def make(key):
-        if key == "a" and second._process is not None:  # the second process gets its turn
+        if key == "a" and second._child is not None:  # the second process gets its turn
             assert wait_for(lambda: bool(second._made) or not second._thread.is_alive())
         return task.make(key, told.append)
 
@@ -74,7 +74,7 @@ def test_an_error_here_ends_the_second_process(parts):
     task = parts({})
     with pytest.raises(KeyboardInterrupt), SecondProcess(task.make, "letters") as second:
         second.share(KEYS, lambda key: (_ for _ in ()).throw(KeyboardInterrupt), print)
-    assert second._process.poll() is not None
+    assert second._child.has_ended()
 
 
 def test_a_task_that_can_not_be_sent_is_done_here():
@@ -83,7 +83,7 @@ def test_a_task_that_can_not_be_sent_is_done_here():
             raise TypeError("never")
 
     found, second = share(Local({}, os.getpid()), [])
-    assert second._process is None
+    assert second._child is None
     assert {place for _, place in found} == {os.getpid()}
 
 

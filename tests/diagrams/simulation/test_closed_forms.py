@@ -348,8 +348,8 @@ def test_an_integrator_that_resets_itself_fires_at_the_roots_of_its_closed_form(
     full = Compare(">", name="full")(y.y, 1.0)
     run = Diagram("fire", y(Ramp(slope=1.0), full)).simulate(10.0, step=0.01, **TIGHT)
     fired = [e.t for e in run.events if e.event == "restart"]
-    assert len(fired) == 49  # the fiftieth is due at the end, t = 10
-    assert np.max(np.abs(fired - np.sqrt(2 * np.arange(1, 50)))) < 1e-10
+    assert len(fired) in (49, 50)  # the fiftieth is due at the end, t = 10: the tolerance says on which side
+    assert np.max(np.abs(fired - np.sqrt(2 * np.arange(1, len(fired) + 1)))) < 1e-10
     count = np.searchsorted(fired, run.t[:-1], side="right")
     assert np.max(np.abs(run["i.y"][:-1] - (run.t[:-1] ** 2 / 2 - count))) < 1e-9
 
