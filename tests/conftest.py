@@ -118,6 +118,7 @@ def pytest_pycollect_makeitem(collector, name, obj):
     return items
 
 
+@pytest.hookimpl(optionalhook=True)  # the tests run without xdist, too
 def pytest_xdist_make_scheduler(config, log):
     """Give each file to one worker, so that what its tests share is made once; the longest first.
 
