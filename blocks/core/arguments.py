@@ -86,13 +86,14 @@ class Kind:
         )
 
 
-def accepts(called: str = "", error: type[LoopwrightError] = OptionError, /, **kinds: Kind) -> Callable[[F], F]:
+def accepts(called: str | None = "", error: type[LoopwrightError] = OptionError, /, **kinds: Kind) -> Callable[[F], F]:
     """Check the kinds of a function's arguments before it runs, or of a dataclass's fields; a default is always right.
 
     Parameters
     ----------
-    called : str
-        Name by which users know the function, where it is another one.
+    called : str or None
+        Name by which users know the function, where it is another one, or that of an argument's object:
+        ``"{diagram.name}"``. None: the callers fill it in.
     error : type
         Class of the error.
     **kinds
@@ -107,19 +108,25 @@ def accepts(called: str = "", error: type[LoopwrightError] = OptionError, /, **k
     def wrap(subject: F) -> F:
         if inspect.isclass(subject):
             vars_of: Any = subject
-            vars_of.__init__ = _checked(vars_of.__init__, called or subject.__name__, error, kinds)
+            vars_of.__init__ = _checked(vars_of.__init__, subject.__name__ if called == "" else called, error, kinds)
             return subject
         return _checked(subject, called, error, kinds)
 
     return wrap
 
 
-def _checked(function: F, called: str, error: type[LoopwrightError], kinds: Mapping[str, Kind]) -> F:
-    signature, who = inspect.signature(function), called or function.__name__
+def _checked(function: F, called: str | None, error: type[LoopwrightError], kinds: Mapping[str, Kind]) -> F:
+    signature, who = inspect.signature(function), function.__name__ if called == "" else called
+    is_format = who is not None and "{" in who
+    own_name = "" if is_format or called is None else called
     parameters = {**signature.parameters}
     names = [name for name, p in parameters.items() if p.kind in BY_PLACE]
     needed = {name for name, p in parameters.items() if p.default is p.empty}
     is_plain = not any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters.values())
+
+    def refuse(value: Any, kind: Kind, name: str, given: Mapping[str, Any]) -> None:
+        if not kind.holds(value):
+            check_argument(value, kind, name, who.format_map(given) if who and is_format else who, error)
 
     @wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
@@ -130,24 +137,24 @@ def _checked(function: F, called: str, error: type[LoopwrightError], kinds: Mapp
             try:
                 given = signature.bind(*args, **kwargs).arguments
             except TypeError as unfit:
-                raise (misuse(function, args, kwargs, called) or unfit) from None
+                raise (misuse(function, args, kwargs, own_name) or unfit) from None
         for name, value in given.items():
             kind, parameter = kinds.get(name), parameters[name]
             if kind is None or value is parameter.default:
                 continue
             if parameter.kind is parameter.VAR_KEYWORD:
                 for key, each in value.items():
-                    check_argument(each, kind, key, who, error)
+                    refuse(each, kind, key, given)
             elif parameter.kind is parameter.VAR_POSITIONAL:
                 for each in value:
-                    check_argument(each, kind, name, who, error)
+                    refuse(each, kind, name, given)
             else:
-                check_argument(value, kind, name, who, error)
+                refuse(value, kind, name, given)
         try:
             return function(*args, **kwargs)
         except UnknownArgumentError as unknown:
             if unknown.argument in kwargs:
-                unknown.offer(called or name_of(function, args), own_names(function))
+                unknown.offer(own_name or name_of(function, args), own_names(function))
             raise
 
     setattr(checked, EXPLAINED, True)
@@ -295,6 +302,25 @@ def choice(*words: str) -> Kind:
         lambda value: isinstance(value, str) and value in words,
         step=lambda value: near(value, words) if close_names(str(value), words) else "Give one of them.",
     )
+
+
+def _floats(value: Any) -> np.ndarray:
+    try:
+        return np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        return np.zeros(0)
+
+
+frequencies = Kind(
+    "positive frequencies in rad/s",
+    lambda value: (w := _floats(value)).size and np.all(np.isfinite(w)) and np.all(w > 0.0),
+    "Give some.",
+)
+
+
+def one_of(*words: str) -> Kind:
+    """Return the kind that `choice` returns, with words for a list of them."""
+    return choice(*words).worded(f"one of {', '.join(map(repr, words))}", "Choose one of them.")
 
 
 def by_name(name: str, value: Any) -> str:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from ...blocks.core import OptionError, explain_calls, near
+from ...blocks.core import OptionError, accepts, explain_calls, kinds, near
 
 
 class Scheme(StrEnum):
@@ -22,7 +21,19 @@ class Scheme(StrEnum):
     """The step is repeated until outputs and inputs agree at its end; inputs are the mean of beginning and end."""
 
 
+_POSITIVE = kinds.positive.where(lambda value: isinstance(value, int | float)).worded(step="Give one.")
+
+
 @explain_calls
+@accepts(
+    tolerance=_POSITIVE,
+    shortest=_POSITIVE,
+    error=_POSITIVE,
+    passes=kinds.integer(2).worded("a whole number from 2 on", "Give one."),
+    order=kinds.one_of_class((list, tuple), "a list of paths of FMUs")
+    .where(lambda order: all(isinstance(path, str) for path in order))
+    .worded(step="Give one."),
+)
 @dataclass(frozen=True, kw_only=True)
 class Coupling:
     """Exchange of values between FMUs in a run: ``simulate(…, coupling=Coupling(scheme="iterated"))``.
@@ -59,14 +70,6 @@ class Coupling:
         known = [scheme.value for scheme in Scheme]
         if not isinstance(self.scheme, str) or self.scheme not in known:
             raise OptionError(f"found scheme={self.scheme!r}. {near(str(self.scheme), known)}", port="coupling")
-        for name in ("tolerance", "shortest", *(() if self.error is None else ("error",))):
-            value = getattr(self, name)
-            if isinstance(value, bool | str) or not isinstance(value, int | float) or not 0 < value < math.inf:
-                raise OptionError(f"found {name}={value!r}; expected a positive number.", port="coupling")
-        if isinstance(self.passes, bool) or not isinstance(self.passes, int) or self.passes < 2:
-            raise OptionError(f"found passes={self.passes!r}; expected a whole number from 2 on.", port="coupling")
-        if not isinstance(self.order, list | tuple) or not all(isinstance(path, str) for path in self.order):
-            raise OptionError(f"found order={self.order!r}; expected a list of paths of FMUs.", port="coupling")
         if self.order and self.scheme != Scheme.GAUSS_SEIDEL:
             raise OptionError(
                 f"found an order with scheme={self.scheme!r}, which has none; expected scheme='gauss_seidel'.",

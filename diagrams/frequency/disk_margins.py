@@ -118,7 +118,13 @@ def mimo_disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -
     return _compute_disk_margin(Realization.of(loop, delay=delay), skew)
 
 
-@accepts(plant=kinds.system, controller=kinds.system, where=kinds.text)
+@accepts(
+    "loop_at",
+    ParameterError,
+    plant=kinds.system,
+    controller=kinds.system,
+    where=kinds.choice("input", "output", "both").worded(found=kinds.by_name),
+)
 @carries_findings
 def loop_at(plant: StateSpace, controller: StateSpace, where: str = "input") -> StateSpace:
     """Return the loop transfer matrix at the plant's input (C P), its output (P C), or both at once.
@@ -136,8 +142,6 @@ def loop_at(plant: StateSpace, controller: StateSpace, where: str = "input") -> 
         return controller * plant
     if where == "output":
         return plant * controller
-    if where != "both":
-        raise ParameterError(f"found where={where!r}; expected 'input', 'output' or 'both'.", block="loop_at")
     P = control.ss(plant)
     both = read_matrices(control.append(control.ss(controller), -P))
     inputs, outputs = int(P.ninputs), int(P.noutputs)

@@ -40,7 +40,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError, brief, explain_calls
+from ...blocks.core import OptionError, accepts, brief, explain_calls, kinds
 from ..flat import FlatDiagram, WiredDiagram
 from ..linearization import PointLike, find_signal, operating_point, ticks_to_renewal
 from ..results import OperatingPoint, PointOrigin, Snapshot
@@ -188,6 +188,7 @@ class FrequencyResponse:
         plain = {key: [n.replace(".", "_") for n in labels] for key, labels in names.items()}
         return FrequencyResponseData(data, self.omega, self.dt, name=f"{name}({self.wire})".replace(".", "_"), **plain)
 
+    @accepts(None, of=kinds.one_of("L", "S", "T").worded(found=kinds.by_name))
     def deviation(self, linearization: Linearization, of: str | None = None) -> np.ndarray:
         """Return the deviation of the measurement from a linear model at each frequency, relative to the model.
 
@@ -210,10 +211,6 @@ class FrequencyResponse:
         """
         of = ("L" if self.held else "S") if of is None else of
         made = {"L": linearization.loop, "S": linearization.sensitivity, "T": linearization.complementary}
-        if of not in made:
-            raise OptionError(
-                f"found of={of!r}; expected one of {', '.join(map(repr, made))}. Choose one of them.", port="of"
-            )
         if of == "L":
             self._check_held()
         model = made[of](self.wire)
@@ -238,6 +235,15 @@ class FrequencyResponse:
         return float(np.max(self.deviation(linearization, of)))
 
 
+@accepts(
+    "{diagram.name}",
+    frequencies=kinds.frequencies,
+    amplitude=kinds.positive.worded(
+        "a positive number, the largest value of the test signal in the wire's unit", "Give one."
+    ),
+    kind=kinds.one_of(*KINDS),
+    windows=kinds.integer(2).worded("a whole number of windows, at least 2", "Give one."),
+)
 def frequency_response(
     diagram: WiredDiagram,
     wire: str,
@@ -253,7 +259,7 @@ def frequency_response(
     **options: Any,
 ) -> FrequencyResponse:
     """Measure a frequency response; see `Diagram.frequency_response`."""
-    omega = _check_request(diagram, frequencies, amplitude, kind, windows)
+    omega, amplitude = np.unique(np.atleast_1d(np.asarray(frequencies, dtype=float))), float(amplitude)
     chosen, point, t0 = _find_beginning(diagram, at, dict(options))
     variant = diagram.replace(point.parameters) if point is not None and point.parameters else diagram
     discrete = diagram.has_clock or diagram.has_fmu
@@ -327,42 +333,6 @@ def frequency_response(
         signal.labels,
         labels,
     )
-
-
-def _check_request(
-    diagram: WiredDiagram, frequencies: ArrayLike, amplitude: object, kind: str, windows: object
-) -> np.ndarray:
-    """Refuse arguments that make no measurement; return the frequencies, sorted."""
-    try:
-        omega = np.unique(np.atleast_1d(np.asarray(frequencies, dtype=float)))
-    except (TypeError, ValueError):
-        omega = np.zeros(0)
-    if not (omega.size and np.all(omega > 0.0) and np.all(np.isfinite(omega))):
-        raise OptionError(
-            f"found {frequencies!r}; expected positive frequencies in rad/s. Give some.",
-            block=diagram.name,
-            port="frequencies",
-        )
-    if isinstance(amplitude, bool) or not isinstance(amplitude, int | float) or not 0 < amplitude < math.inf:
-        raise OptionError(
-            f"found {amplitude!r}; expected a positive number, the largest value of the test signal in the wire's "
-            "unit. Give one.",
-            block=diagram.name,
-            port="amplitude",
-        )
-    if kind not in KINDS:
-        raise OptionError(
-            f"found {kind!r}; expected one of {', '.join(map(repr, KINDS))}. Choose one of them.",
-            block=diagram.name,
-            port="kind",
-        )
-    if isinstance(windows, bool) or not isinstance(windows, int) or windows < 2:
-        raise OptionError(
-            f"found {windows!r}; expected a whole number of windows, at least 2. Give one.",
-            block=diagram.name,
-            port="windows",
-        )
-    return omega
 
 
 def _find_beginning(

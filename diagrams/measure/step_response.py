@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, OptionError, SimulationError, brief, explain_calls
+from ...blocks.core import LoopwrightError, OptionError, SimulationError, accepts, brief, explain_calls, kinds
 from ..flat import FlatDiagram, WiredDiagram
 from ..frequency import advance_held
 from ..linearization import (
@@ -166,6 +166,11 @@ class StepResponse:
         return bool(self.steady[column]) if self.steady is not None else self.held and column == 0
 
 
+@accepts(
+    None,
+    size=kinds.finite.where(lambda size: float(size) != 0.0).worded("a number that is not 0", "Give one."),
+    length=kinds.positive.worded(step="Give one."),
+)
 def step_response(
     diagram: WiredDiagram,
     wire: str,
@@ -202,9 +207,6 @@ def step_response(
     SimulationError
         The response grows without end.
     """
-    for name, value in (("size", size), ("length", length)):
-        if not (math.isfinite(value) and (value > 0 or (name == "size" and value < 0))):
-            raise OptionError(f"found {value!r}; expected a number that is not 0. Give one.", port=name)
     point = operating_point(diagram, at, {})
     variant = diagram.replace(point.parameters) if point.parameters else diagram
     sampled = diagram.has_clock or diagram.has_fmu

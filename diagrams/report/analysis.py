@@ -12,8 +12,8 @@ from ...fmus.running import Fmu
 from ..flat import WiredDiagram
 from ..linearization import find_signal
 from ..requirements import Requirements, TomlFile, read_requirements
-from ..second_process import processors
 from ..studies import ContactTask, WorstCase, WorstCaseTask
+from ..sweeps import processors
 from .case import Case, ReportedExperiment
 from .content_hash import content_hash
 from .figures import AxisUnits

@@ -11,7 +11,15 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from ...blocks.core import Layout, OptionError, SimulationError, UnknownNameError, describe_disk_error, enumerate_some
+from ...blocks.core import (
+    Layout,
+    SimulationError,
+    UnknownNameError,
+    check_argument,
+    describe_disk_error,
+    enumerate_some,
+    kinds,
+)
 from ..wiring import Wire
 from .memory import machine_memory
 from .signal_names import entries, resolve
@@ -19,6 +27,8 @@ from .stored import END, OTHER_PATH, Occurrence, PathLike, create, event_line, p
 
 _FIRST, _LARGEST = 1024, 2**26  # rows of the first chunk in memory, bytes of the largest
 _ROWS, _BYTES = 1024, 2**18  # of a chunk on its way to disk, whichever is less
+EVERY = kinds.integer(1).worded("a positive integer, such as 10 to keep one sample of 10", "Give one.", kinds.by_name)
+"""Kind of the number of ticks from one recorded sample to the next."""
 _LATEST = 1.0  # seconds after which a row is written at the latest when the next one comes
 
 
@@ -76,7 +86,7 @@ class Recorder:
         header: Mapping[str, object] | None = None,
         overwrite: bool = False,
     ):
-        check_every(every)
+        check_argument(every, EVERY, "every", None)
         self.every, self.has_residual = int(every), residual
         self.columns = None if columns is None else np.array([*columns], dtype=int)
         self._pick = self.columns
@@ -344,18 +354,6 @@ class Recorder:
         stored = read(self.to)
         self.events, self.residual = stored.events, stored.residual
         return stored.t, stored.data
-
-
-def check_every(every: object) -> None:
-    """Refuse an ``every`` that is no positive integer.
-
-    Raises
-    ------
-    OptionError
-        If it is none.
-    """
-    if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1:
-        raise OptionError(f"found every={every!r}; expected a positive integer, such as 10 to keep one sample of 10.")
 
 
 def select(

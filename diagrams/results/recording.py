@@ -9,14 +9,15 @@ from functools import cached_property
 
 import numpy as np
 
-from ...blocks.core import OptionError, PortUnit
+from ...blocks.core import OptionError, PortUnit, accepts
 from ..flat import FlatDiagram
 from ..wiring import join
 from .memory import check_memory
-from .recorder import Recorder, check_every, select
+from .recorder import EVERY, Recorder, select
 from .stored import PathLike, header
 
 
+@accepts(None, every=EVERY)
 @dataclass
 class Recording:
     """The choices of a recording: `Diagram.simulate` takes them as ``record``, ``every``, ``states`` and ``to``."""
@@ -30,7 +31,6 @@ class Recording:
     overwrite: bool
 
     def __post_init__(self) -> None:
-        check_every(self.every)
         if self.record is not None and not isinstance(self.record, Iterable):
             raise OptionError(
                 f"found record={self.record!r}; expected names of signals, such as record=['y'].", block=self.name

@@ -1,5 +1,5 @@
 """A second process that makes parts of a result while this one makes the others."""
 
-from .process import SecondProcess, processors
+from .process import SecondProcess
 
-__all__ = ["SecondProcess", "processors"]
+__all__ = ["SecondProcess"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 import threading
 from collections import deque
@@ -19,11 +18,6 @@ from .child import Make
 T = TypeVar("T")
 PAUSE = 0.1
 """Seconds between two looks at what the second process tells, while this one waits for it."""
-
-
-def processors() -> int:
-    """Return the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class SecondProcess(Generic[T]):

@@ -21,7 +21,7 @@ from .continuous import Continuous
 from .continuous_part import ContinuousPart
 from .diagnosis import opaque_failure
 from .initialize import find_start_values, initialize
-from .run_options import RunOptions, check_compile, check_start_exchange
+from .run_options import RunOptions
 from .start_at_point import start_at, take_over
 from .start_values import choose_start_values
 from .stops import StopConditions
@@ -70,8 +70,8 @@ class Engine:
         self.view = SimulationView.of(self.workspace, plants, blocks, self.position)
         self.continuous: Continuous | None = None
         self._stops = StopConditions(flat, self.workspace.log, self._find_asking)
-        self._passes_on = check_start_exchange(options.start_exchange)
-        self._compile, self._fuse = check_compile(options.compile, fuse=options.fuse), options.fuse
+        self._passes_on = options.start_exchange
+        self._compile, self._fuse = options.compiled, options.fuse
         self._changed = False  # whether generated code has taken over within the run
         self._compiled: CompiledTicks | HybridTicks | None = None
         self._generated = self._asked_machine = False  # whether it is generated code; whether the machine can be had

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from typing import Any, Self, TypedDict
 
-from ...blocks.core import OptionError, UnknownArgumentError, check_argument, explain_calls, kinds
+from ...blocks.core import OptionError, UnknownArgumentError, accepts, check_argument, explain_calls, kinds
 from ..coupling import Coupling
 from ..flat import FlatDiagram, WiredDiagram, takes_any_step
 from ..results import OperatingPoint, RunState
@@ -18,34 +18,6 @@ from ..wiring import stepped_blocks
 START_EXCHANGES = ("agree", "once", "none")
 """Exchanges of values with FMUs while they initialize; the first one is the default."""
 FIXED_STEP = ("euler", "heun", "rk4")
-
-
-def check_start_exchange(value: str) -> str:
-    """Return a way of exchanging values at the start.
-
-    Raises
-    ------
-    OptionError
-        For an unknown one.
-    """
-    if not isinstance(value, str) or value not in START_EXCHANGES:
-        raise OptionError(
-            f"found {value!r}; expected {', '.join(map(repr, START_EXCHANGES))}. Give one.", port="start_exchange"
-        )
-    return value
-
-
-def check_compile(value: bool | str, *, fuse: bool = False) -> bool | str:
-    """Return when ticks are compiled: True, False or "auto"; with ``fuse``, whose bits differ, "auto" is True.
-
-    Raises
-    ------
-    OptionError
-        For anything else.
-    """
-    if value is True or value is False or (isinstance(value, str) and value == "auto"):
-        return True if fuse and value == "auto" else value
-    raise OptionError(f'found {value!r}; expected True, False or "auto". Give one.', port="compile")
 
 
 class KeptKeywords(TypedDict, total=False):
@@ -73,15 +45,18 @@ class RunKeywords(KeptKeywords, total=False):
     overwrite: bool
 
 
-_KINDS = {
-    "compile": kinds.either(kinds.flag, kinds.text).worded('True, False or "auto"'),
-    "states": kinds.flag,
-    "overwrite": kinds.flag,
-}
-"""Kinds of options that nothing else checks before it reads them."""
+_YES_OR_NO = kinds.one_of_class(bool, "True or False").worded(step="Give one.")
 
 
 @explain_calls
+@accepts(
+    None,
+    states=kinds.flag,
+    overwrite=kinds.flag,
+    start_exchange=kinds.choice(*START_EXCHANGES).worded(", ".join(map(repr, START_EXCHANGES)), "Give one."),
+    compile=kinds.either(_YES_OR_NO, kinds.choice("auto")).worded('True, False or "auto"', "Give one."),
+    fuse=_YES_OR_NO,
+)
 @dataclass(frozen=True, eq=False)
 class RunOptions:
     """Options of a run, as `Diagram.simulate`, `Diagram.simulation` and `Experiment.simulate` take them.
@@ -185,25 +160,24 @@ class RunOptions:
                 block=block,
                 port="start",
             )
-        for name, kind in _KINDS.items():
-            if name in options:
-                check_argument(options[name], kind, name, block)
-        return cls(**options)
+        try:
+            return cls(**options)
+        except OptionError as error:
+            raise error.at(block=block) from None
+
+    @property
+    def compiled(self) -> bool | str:
+        """When ticks are compiled: True, False or "auto"; with ``fuse``, whose bits differ, "auto" is True."""
+        return True if self.fuse and self.compile == "auto" else self.compile
 
     def apply_fuse(self, diagram: WiredDiagram) -> tuple[WiredDiagram, tuple[str, ...]]:
         """Return the diagram that is run, and messages: with ``fuse`` its FMUs are compiled for this processor.
 
         Raises
         ------
-        OptionError
-            If ``fuse`` is neither True nor False.
         CompilerError
             If there is no compiler, or it fails.
         """
-        if self.fuse is not True and self.fuse is not False:
-            raise OptionError(
-                f"found {self.fuse!r}; expected True or False. Give one.", block=diagram.name, port="fuse"
-            )
         if not self.fuse:
             return diagram, ()
         from ..compiled import fuse  # only such a run needs a compiler

@@ -11,8 +11,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from ...blocks.core import OptionError, accepts, brief, enumerate_some, explain_calls, kinds
 from ..flat import WiredDiagram
 from ..frequency import order_key
@@ -178,7 +176,18 @@ def _short(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-@accepts("worst_case", loop=kinds.names, quantity=kinds.either(kinds.text, kinds.function), progress=kinds.function)
+_FROM_0 = kinds.integer(0).worded(step="Give one.", found=kinds.by_name)
+
+
+@accepts(
+    "worst_case",
+    loop=kinds.names,
+    quantity=kinds.either(kinds.text, kinds.function),
+    starts=_FROM_0,
+    steps=_FROM_0,
+    delay=_FROM_0,
+    progress=kinds.function,
+)
 def find_worst_case(
     diagram: WiredDiagram,
     parameters: Mapping[str, Any] | None,
@@ -204,9 +213,6 @@ def find_worst_case(
         quantity = "disk_margin"
     if points is not None and at is not None:
         raise OptionError("found at and points; expected one of them. Give points=[…] alone.", block=diagram.name)
-    for name, number in (("starts", starts), ("steps", steps), ("delay", delay)):
-        if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < 0:
-            raise OptionError(f"found {name}={number!r}; expected an integer from 0 on.", block=diagram.name, port=name)
     if measure is not None:
         goal = Goal({(measure.place,): {measure.name: None}})
     else:

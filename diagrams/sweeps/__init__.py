@@ -1,7 +1,7 @@
 """Sweeps: runs of a diagram with many values of its parameters, and studies over ranges of them."""
 
 from .outcome import Failure
-from .processes import to_bytes
+from .processes import processors, to_bytes
 from .reductions import Reduction, final, maximum, mean, minimum, settling_time
 from .result import Sweep
 from .samples import Box, Sample, Samples, grid, latin, read_samples, table
@@ -21,6 +21,7 @@ __all__ = [
     "maximum",
     "mean",
     "minimum",
+    "processors",
     "read_samples",
     "settling_time",
     "sweep",

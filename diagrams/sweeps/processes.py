@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import signal
 import threading
@@ -16,6 +17,11 @@ from .sample_queue import SampleQueue
 from .samples import Sample
 
 _LEAVING = 10.0  # s in which a process that has nothing more to do ends by itself
+
+
+def processors() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def run_in_processes(plan: Plan, samples: Iterable[Sample], count: int) -> Generator[SampleOutcome, None, None]:

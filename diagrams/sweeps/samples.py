@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Block, OptionError, brief, enumerate_some, explain_calls, near
+from ...blocks.core import Block, OptionError, accepts, brief, enumerate_some, explain_calls, kinds, near
 from ..flat import WiredDiagram
 
 KINDS = ("grid", "latin")
@@ -18,6 +18,7 @@ _SCALES = ("linear", "log")
 
 
 @explain_calls
+@accepts(None, scale=kinds.choice(*_SCALES).worded(found=kinds.by_name))
 @dataclass(frozen=True)
 class Box:
     """Range of one parameter, in its unit: a number, or an array of numbers with a range each.
@@ -44,8 +45,6 @@ class Box:
             low, high = np.array(self.low, dtype=float), np.array(self.high, dtype=float)
         except (TypeError, ValueError):
             raise OptionError(f"found a range from {self.low!r} to {self.high!r}; expected two numbers.") from None
-        if not isinstance(self.scale, str) or self.scale not in _SCALES:
-            raise OptionError(f"found scale={self.scale!r}; expected {' or '.join(map(repr, _SCALES))}.")
         if low.shape != high.shape:
             raise OptionError(f"found ends of shapes {low.shape} and {high.shape}; expected equal shapes.")
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (low <= high).all()):
@@ -202,6 +201,10 @@ def seed_of(seed: int, index: int) -> int:
     return int(np.random.SeedSequence(seed, spawn_key=(index,)).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
+_SEED = kinds.integer(0).worded(step="Give one.", found=kinds.by_name)
+
+
+@accepts(None, seed=_SEED)
 def grid(parameters: Mapping[str, Any], *, seed: int = 0) -> Samples:
     """Return every combination of the parameters' values, the last parameter running fastest.
 
@@ -219,9 +222,14 @@ def grid(parameters: Mapping[str, Any], *, seed: int = 0) -> Samples:
     """
     _check_parameters(parameters)
     axes = {name: _list_values(name, values) for name, values in parameters.items()}
-    return Samples(tuple(axes), tuple(product(*axes.values())), axes, check_seed(seed))
+    return Samples(tuple(axes), tuple(product(*axes.values())), axes, int(seed))
 
 
+@accepts(
+    None,
+    count=kinds.integer(1).worded("a positive integer, the number of samples", "Give one.", kinds.by_name),
+    seed=_SEED,
+)
 def latin(parameters: Mapping[str, Any], count: int, *, seed: int = 0) -> Samples:
     """Return a Latin hypercube: along each parameter, every one of ``count`` equal parts of its range has one sample.
 
@@ -243,9 +251,7 @@ def latin(parameters: Mapping[str, Any], count: int, *, seed: int = 0) -> Sample
 
     _check_parameters(parameters)
     boxes = {name: Box.of(value, name) for name, value in parameters.items()}
-    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-        raise OptionError(f"found count={count!r}; expected a positive integer, the number of samples.", port="count")
-    generator = np.random.default_rng(np.random.SeedSequence(check_seed(seed)))
+    generator = np.random.default_rng(np.random.SeedSequence(int(seed)))
     fractions = qmc.LatinHypercube(sum(box.size for box in boxes.values()), seed=generator).random(int(count))
     ends = np.cumsum([box.size for box in boxes.values()])[:-1]
     parts = zip(boxes.values(), np.split(fractions, ends, axis=1), strict=True)
@@ -254,6 +260,7 @@ def latin(parameters: Mapping[str, Any], count: int, *, seed: int = 0) -> Sample
     return Samples(tuple(boxes), tuple(rows), None, int(seed), boxes)
 
 
+@accepts(None, seed=_SEED)
 def table(rows: Any, *, seed: int = 0) -> Samples:
     """Return the samples of a table.
 
@@ -278,7 +285,7 @@ def table(rows: Any, *, seed: int = 0) -> Samples:
         if len(set(sizes.values())) > 1:
             found = ", ".join(f"{name}: {size}" for name, size in sizes.items())
             raise OptionError(f"found columns of unequal length ({found}); expected a value of each for every sample.")
-        return Samples(tuple(columns), tuple(zip(*columns.values(), strict=True)), None, check_seed(seed))
+        return Samples(tuple(columns), tuple(zip(*columns.values(), strict=True)), None, int(seed))
     if isinstance(rows, str) or not isinstance(rows, Sequence) or not all(isinstance(row, Mapping) for row in rows):
         raise OptionError(
             f"found {rows!r}; expected a list of samples, such as [{{'controller.gain': 2.0}}], or the values by name."
@@ -294,7 +301,7 @@ def table(rows: Any, *, seed: int = 0) -> Samples:
                 f"sample {place} gives {', '.join(map(str, row))}, and sample 0 {', '.join(names)}; expected the same "
                 f"parameters in all. Look at {', '.join(odd)}."
             )
-    return Samples(names, tuple(tuple(row[name] for name in names) for row in rows), None, check_seed(seed))
+    return Samples(names, tuple(tuple(row[name] for name in names) for row in rows), None, int(seed))
 
 
 def read_samples(
@@ -354,19 +361,6 @@ def read_samples(
         if name in diagram.structure.blocks and not any(isinstance(s.parameters[name], Block) for s in resolved):
             diagram.replace({name: resolved[0].parameters[name]})  # ends in an error that names its parameters
     return resolved
-
-
-def check_seed(seed: object) -> int:
-    """Return a seed.
-
-    Raises
-    ------
-    OptionError
-        If it is no integer from 0 on.
-    """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise OptionError(f"found seed={seed!r}; expected an integer from 0 on.", port="seed")
-    return int(seed)
 
 
 def _check_parameters(parameters: object) -> None:

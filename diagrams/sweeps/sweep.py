@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, accepts, kinds, one_thread
+from ...blocks.core import Kind, OptionError, accepts, kinds, one_thread
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import Run, entries, machine_memory, resolve, select
 from ..simulation import RunOptions, Simulation, progress_bar
 from .outcome import SampleOutcome
 from .plan import Plan
-from .processes import run_in_processes
+from .processes import processors, run_in_processes
 from .reductions import Reduction, check_reductions
 from .result import Sweep
 from .revision import key_of, parts_of
@@ -53,7 +53,23 @@ class InterruptedSweep(KeyboardInterrupt):
         self.sweep = sweep
 
 
-@accepts(duration=kinds.number, signals=kinds.names, seeds=kinds.names, progress=kinds.flag)
+_LANES_ASKED = Kind(
+    f"True for {_LANES} runs side by side, {', '.join(map(str, _MANY_LANES))}, or False for one after the other",
+    lambda lanes: lanes is False or lanes is True or (isinstance(lanes, int | np.integer) and lanes in _MANY_LANES),
+    "Give one of them.",
+    kinds.by_name,
+)
+
+
+@accepts(
+    duration=kinds.number,
+    signals=kinds.names,
+    seeds=kinds.names,
+    progress=kinds.flag,
+    to=kinds.path.worded("the path of a folder", "Give one."),
+    workers=kinds.integer(1).worded("a positive integer, or None for every core", "Give one.", kinds.by_name),
+    lanes=_LANES_ASKED,
+)
 def sweep(
     diagram: WiredDiagram,
     parameters: Mapping[str, Any] | None,
@@ -79,11 +95,8 @@ def sweep(
     found = read_samples(diagram, parameters, samples, count=count, seed=seed)
     plan = make_plan(diagram, duration, signals, reduce, seeds, options, count=len(found), lanes=lanes)
     _check_names(plan, found.names)
-    count_workers = _check_workers(workers)
     store, known = None, dict[str, SampleOutcome]()
     if to is not None:
-        if not isinstance(to, str | os.PathLike) or "\0" in str(to):
-            raise OptionError(f"found {to!r}; expected the path of a folder. Give one.", block=name, port="to")
         store = Store(Path(to), parts_of(plan), {"diagram": name, "duration": plan.duration}, overwrite=overwrite)
         known = store.read()
     outcomes: list[SampleOutcome | None] = [None] * len(found)
@@ -100,7 +113,7 @@ def sweep(
                 outcomes[place] = replace(known[key], index=place)
         done = reused = sum(outcome is not None for outcome in outcomes)
         left = [sample for sample in found if outcomes[sample.index] is None]
-        run = _run(plan, left, count_workers, client)
+        run = _run(plan, left, processors() if workers is None else int(workers), client)
         with one_thread(), _bar(name, len(found), progress) as show, closing(run) as stream:
             show(done)
             for outcome in stream:
@@ -153,9 +166,8 @@ def make_plan(
     if isinstance(record := options.get("record"), Iterable) and not isinstance(record, str):
         options = {**options, "record": tuple(record)}  # for each of the runs
     compiled = all(is_number(diagram, path) for path in paths)  # else each sample would be compiled again
-    plan = Plan(
-        diagram, duration, {"compile": compiled, **options}, chosen, reductions, tuple(paths), _check_lanes(lanes)
-    )
+    side_by_side = (_LANES if lanes else 1) if isinstance(lanes, bool) else int(lanes)
+    plan = Plan(diagram, duration, {"compile": compiled, **options}, chosen, reductions, tuple(paths), side_by_side)
     flat = Simulation(diagram, plan.run_options, duration=duration).flat  # it checks the options
     needed = [*chosen, *(f.signal for f in reductions.values() if isinstance(f, Reduction))]
     table = flat.table
@@ -228,26 +240,6 @@ def _check_names(plan: Plan, swept: Sequence[str]) -> None:
             block=plan.diagram.name,
             port="reduce",
         )
-
-
-def _check_lanes(lanes: object) -> int:
-    """Return the number of runs that go side by side."""
-    if lanes is False or lanes is True:
-        return _LANES if lanes else 1
-    if not isinstance(lanes, int | np.integer) or lanes not in _MANY_LANES:
-        raise OptionError(
-            f"found lanes={lanes!r}; expected True for {_LANES} runs side by side, {', '.join(map(str, _MANY_LANES))}, "
-            "or False for one after the other."
-        )
-    return int(lanes)
-
-
-def _check_workers(workers: int | None) -> int:
-    if workers is None:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if isinstance(workers, bool) or not isinstance(workers, int | np.integer) or workers < 1:
-        raise OptionError(f"found workers={workers!r}; expected a positive integer, or None for every core.")
-    return int(workers)
 
 
 def _check_room(plan: Plan, flat: FlatDiagram, count: int) -> None:

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from ....blocks.core import OptionError
+from ....blocks.core import OptionError, accepts, kinds
 from .filled_pages import fill_pages
 
 
@@ -24,17 +24,12 @@ def printer() -> Any:
 
 
 PAPERS = ("A4", "letter")
+PAPER = kinds.choice(*PAPERS).worded(f"one of {', '.join(PAPERS)}", "Choose one of them.")
 
 
-def check_paper(paper: str) -> None:
-    """Refuse an unknown size of paper."""
-    if paper not in PAPERS:
-        raise OptionError(f"found {paper!r}; expected one of {', '.join(PAPERS)}. Choose one of them.", port="paper")
-
-
+@accepts(None, paper=PAPER)
 def write_pdf(html: str, path: str | os.PathLike[str], paper: str = "A4") -> int:
     """Write a page as PDF; return the number of its pages."""
-    check_paper(paper)
     library = printer()
     size = library.PAGE_SIZE_LETTER if paper == "letter" else library.PAGE_SIZE_A4
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-from ....blocks.core import OptionError, check_file, explain_calls, replace_file, write_text
+from ....blocks.core import OptionError, accepts, check_file, explain_calls, replace_file, write_text
 from .document import Document
 from .html import to_html
 from .json import to_json
-from .pdf import check_paper, printer, write_pdf
+from .pdf import PAPER, printer, write_pdf
 
 
 @explain_calls
@@ -37,9 +37,9 @@ class Report(Document):
         return f'<iframe srcdoc="{page}" style="width:100%;height:45em;border:1px solid #d5dbe1"></iframe>'
 
 
+@accepts(None, paper=PAPER)
 def check_files(path: str | os.PathLike[str] | None, *, pdf: bool, json: bool, paper: str = "A4") -> None:
     """Find out, before anything is computed, whether the files of a report can be written."""
-    check_paper(paper)
     if path is None:
         if pdf or json:
             raise OptionError('a PDF or JSON stands beside the page; give its path, such as "fig3.html".', port="path")
