@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any, ClassVar, Self, Unpack
 
-from ..blocks.core import Block, OptionError, WiringError, check_name, explain_calls, without_collection
+from ..blocks.core import Block, WiringError, accepts, check_name, explain_calls, kinds, without_collection
 from .coupling import Coupling, CouplingReport, report_coupling, to_coupling
 from .flat import FlatDiagram, WiredDiagram
 from .results import OperatingPoint, Run
@@ -69,6 +69,7 @@ class Diagram:
     wired: WiredDiagram
     """Its blocks and wires, checked and ordered, with its functions: what the sub-packages take as a diagram."""
 
+    @accepts("{name}", loops=kinds.choice(*LOOPS).worded(found=kinds.by_name))
     @without_collection
     def __init__(self, name: str, *roots: object, loops: str = "error"):
         if not isinstance(name, str):
@@ -77,10 +78,6 @@ class Diagram:
             )
         if not roots:
             raise WiringError("a diagram needs at least one call, such as plant(motor_force=u).", block=name)
-        if not isinstance(loops, str) or loops not in LOOPS:
-            raise OptionError(
-                f"found loops={loops!r}; expected {' or '.join(map(repr, LOOPS))}.", block=name, port="loops"
-            )
         self._hold(WiredDiagram(check_name(name), Collector(roots).structure(), loops, type(self)))
 
     def __init_subclass__(cls) -> None:

@@ -78,6 +78,10 @@ class Kind:
         """Return the kind of those values that fulfil a condition, too."""
         return replace(self, holds=lambda value: self.holds(value) and condition(value))
 
+    def or_none(self) -> Kind:
+        """Return the same kind with None, where that is not the default."""
+        return replace(self, holds=lambda value: value is None or self.holds(value))
+
     def complaint(self, name: str, value: Any) -> str:
         """Return the error's text for a value that is not of the kind."""
         step = f"Give {name}= as that." if self.step is None else self.step
@@ -233,6 +237,12 @@ real = Kind("a number", lambda value: is_real(value) or (isinstance(value, float
 """A real number, or NaN, which the function refuses with words of its own."""
 finite = Kind("a finite number", _is_finite)
 positive = Kind("a positive number", lambda value: _is_finite(value) and float(value) > 0)
+above_zero = Kind(
+    "a positive number",
+    lambda value: isinstance(value, int | float) and not isinstance(value, bool) and value > 0,
+    "Give one.",
+)
+"""A number of Python's above zero, infinity among them: a limit."""
 whole = Kind("a whole number", lambda value: _is_finite(value) and float(value) == int(value))
 count = Kind("a whole number, 0 or more", lambda value: whole.holds(value) and float(value) >= 0)
 numbers = Kind(

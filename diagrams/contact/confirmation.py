@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, OptionError, explain_calls, near
+from ...blocks.core import ConfirmationError, OptionError, accepts, explain_calls, kinds, near
 from ...fmus.running import Fmu
 from ..linearization import PlantEquations, copy_point, find_signal, linearize, linearize_plant
 from ..simulation import RunOptions, simulate
 from .attached_environment import attach_environment
-from .environment import read_positive
 from .moored_plant import Mooring, hold_sources, library_class, moored_diagram
 from .parts import ContactParts
 from .ports import Ports
@@ -410,11 +409,19 @@ class ContactConfirmation:
         return self.below, self.above
 
 
+@accepts(
+    "{contact.plant}",
+    limit=kinds.one_of_class(ContactLimit, "a limit of this contact").worded(
+        step="Give contact.stability_limit(…), not its value."
+    ),
+    push=kinds.positive.worded("a positive velocity in m/s", "Give one."),
+)
 def confirm_limit(
     contact: TriedContact, limit: ContactLimit, push: float = PUSH, method: TrialMethod | str | None = None
 ) -> ContactConfirmation:
     """Run a contact's diagram at 0.97 and at 1.03 of a limit; see `Contact.confirm`."""
-    push = _check(contact, limit, push)
+    push = float(push)
+    _check(contact, limit)
     trials = LimitTrials.of(contact, limit, method)
     tried = trials.find_own_limit()
     values = [factor * tried for factor in FACTORS]
@@ -504,14 +511,8 @@ def _measure_uneven(t: np.ndarray, signal: np.ndarray, omega: float, begin: floa
     return float(np.log(sizes[1] / sizes[0]) / window)
 
 
-def _check(contact: TriedContact, limit: ContactLimit, push: float) -> float:
-    """Return the push; refuse what is no limit of the contact, or has no two sides."""
-    if not isinstance(limit, ContactLimit):
-        raise OptionError(
-            f"found {limit!r}; expected a limit of this contact. Give contact.stability_limit(…), not its value.",
-            block=contact.plant,
-            port="limit",
-        )
+def _check(contact: TriedContact, limit: ContactLimit) -> None:
+    """Refuse the limit of another contact, and one that has no two sides."""
     if not (math.isfinite(limit.value) and limit.value > 0.0):
         raise OptionError(
             f"found a limit of {limit.value:g} {limit.unit}; expected a finite one that is not 0, with runs on both "
@@ -530,7 +531,6 @@ def _check(contact: TriedContact, limit: ContactLimit, push: float) -> float:
             block=contact.plant,
             port="limit",
         )
-    return read_positive(push, "push", "velocity in m/s")
 
 
 def _others_decay(trials: LimitTrials, value: float, window: float) -> float:

@@ -10,16 +10,15 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from ...blocks import AdmittanceFilter, ForceProjection, PathProjection
-from ...blocks.core import Array, Finding, OptionError, UnknownNameError, brief, explain_calls
+from ...blocks.core import Array, Finding, OptionError, UnknownNameError, accepts, brief, explain_calls, kinds
 from ...fmus.running import Derivation
 from ..linearization import check_options, operating_point
 from .admittance import ContactAdmittance, compute_admittance, look_again
 from .environment import (
+    A_FREQUENCY,
     check_properties,
     check_property,
-    read_density,
-    read_frequencies,
-    read_positive,
+    points_in_a_decade,
     read_row,
     read_vector,
 )
@@ -50,7 +49,6 @@ SIDES = ("par", "perp")
 """Directions of a path: along it and across it."""
 SOON = 1e-9
 """Time in s just behind the start of a continuous diagram."""
-_FREQUENCY = "frequency in rad/s"
 
 
 @explain_calls
@@ -132,6 +130,7 @@ class Contact:
         """Kinks, stairs and flat slopes that the linear model leaves out."""
         return self.parts.findings
 
+    @accepts(None, omega=kinds.numbers.worded("frequencies in rad/s", "Give numbers."))
     def admittance(self, omega: Array) -> ContactAdmittance:
         """Return the admittance that the environment feels beside that of the diagram's filter, m/(N s).
 
@@ -146,7 +145,7 @@ class Contact:
         OptionError
             If a frequency is no number, not positive, or not below the Nyquist frequency.
         """
-        w = read_frequencies(omega)
+        w = np.asarray(omega, dtype=float)
         target = None
         if self.filter is not None:
             s, a = 1j * w, self.filter
@@ -281,19 +280,19 @@ class Contact:
         return map_growth(self.parts, self.direction, (x, across), (y, up), held)
 
 
-def find_sign(contact: Contact, *, low: float, high: float | None, per_decade: int) -> Passivity:
+@accepts(None, low=A_FREQUENCY, high=A_FREQUENCY, per_decade=points_in_a_decade(1))
+def find_sign(contact: Contact, *, low: float, high: float | None = None, per_decade: int) -> Passivity:
     """Return the frequencies at which the real part of an admittance is negative; see `Contact.passivity`."""
     T = contact.parts.shortest
     nyquist = math.pi / T if T else math.inf
-    top = (nyquist * (1.0 - 1e-9) if T else HIGHEST) if high is None else read_positive(high, "high", _FREQUENCY)
-    low = read_positive(low, "low", _FREQUENCY)
+    top = (nyquist * (1.0 - 1e-9) if T else HIGHEST) if high is None else float(high)
+    low, per_decade = float(low), int(per_decade)
     if not low < top < nyquist:
         raise OptionError(
             f"found a scan from {low:g} to {top:g} rad/s; expected it to rise"
             f"{f', below the Nyquist frequency {nyquist:.6g} rad/s' if T else ''}. Give other ends.",
             port="low",
         )
-    per_decade = read_density(per_decade, 1)
     intervals = find_negative(lambda w: compute_admittance(contact.parts, contact.direction, w), low, top, per_decade)
     poles = np.linalg.eigvals(close_loop(contact.parts, join_environment(contact.parts, contact.direction)).A)
     stable = bool(np.all(np.abs(poles) <= 1.0 + 1e-6) if T else np.all(poles.real <= 1e-4))

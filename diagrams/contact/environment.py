@@ -8,10 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Array, OptionError, ParameterError, UnknownArgumentError
+from ...blocks.core import Array, Kind, OptionError, ParameterError, UnknownArgumentError, kinds
 
 UNITS = {"stiffness": "N/m", "damping": "N.s/m", "mass": "kg", "tool_mass": "kg"}
 """Unit of each property."""
+
+
+A_FREQUENCY = kinds.positive.worded("a positive frequency in rad/s", "Give one.")
+
+
+def points_in_a_decade(fewest: int) -> Kind:
+    """Return the kind of the numbers of points in a decade that are enough."""
+    return kinds.whole.where(lambda value: value >= fewest).worded(
+        f"at least {fewest}, a whole number", "Give more.", lambda name, value: f"found {value!r} points in a decade"
+    )
 
 
 def read_number(value: Any, port: str, unit: str) -> float:
@@ -30,34 +40,6 @@ def read_number(value: Any, port: str, unit: str) -> float:
             port=port,
         )
     return float(found)
-
-
-def read_positive(value: Any, port: str, unit: str) -> float:
-    """Return a number that is finite and positive.
-
-    Raises
-    ------
-    OptionError
-        If it is something else.
-    """
-    found = _as_array(value)
-    if found is None or found.ndim != 0 or not 0.0 < float(found) < math.inf:
-        raise OptionError(f"found {value!r}; expected a positive {unit}. Give one.", port=port)
-    return float(found)
-
-
-def read_frequencies(value: Any) -> np.ndarray:
-    """Return frequencies in rad/s as they are given, as an array.
-
-    Raises
-    ------
-    OptionError
-        If they are no real numbers.
-    """
-    found = _as_array(value)
-    if found is None:
-        raise OptionError(f"found {value!r}; expected frequencies in rad/s. Give numbers.", port="omega")
-    return found
 
 
 def read_row(value: Any, name: str, *, rising: bool) -> np.ndarray:
@@ -82,23 +64,6 @@ def read_row(value: Any, name: str, *, rising: bool) -> np.ndarray:
             f"found the values {found.tolist()}; expected none that is negative. Leave it out.", port=name
         )
     return found
-
-
-def read_density(value: Any, fewest: int) -> int:
-    """Return a number of points in a decade.
-
-    Raises
-    ------
-    OptionError
-        If it is no whole number, or too small.
-    """
-    found = _as_array(value)
-    if found is None or found.ndim != 0 or not fewest <= float(found) < math.inf or float(found) != int(found):
-        raise OptionError(
-            f"found {value!r} points in a decade; expected at least {fewest}, a whole number. Give more.",
-            port="per_decade",
-        )
-    return int(found)
 
 
 def read_vector(value: Any) -> np.ndarray | None:

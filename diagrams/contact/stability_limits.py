@@ -15,9 +15,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...blocks.core import Array, ConfirmationError, Finding, OptionError, brief, explain_calls, on_one_thread
+from ...blocks.core import (
+    Array,
+    ConfirmationError,
+    Finding,
+    OptionError,
+    accepts,
+    brief,
+    explain_calls,
+    kinds,
+    on_one_thread,
+)
 from ..frequency import Number, refine_sign_change
-from .environment import UNITS, read_density, read_positive
+from .environment import UNITS, points_in_a_decade
 from .loop import (
     ClosedLoop,
     Modes,
@@ -550,7 +560,10 @@ def map_growth(
     return ContactMap(x[0], y[0], across, up, np.array(rows).reshape(len(up), len(across)), tuple(limits))
 
 
-def read_scan(vary: str, low: Any, high: Any, per_decade: Any) -> np.ndarray:
+@accepts(None, low=kinds.positive, high=kinds.positive, per_decade=points_in_a_decade(FEWEST_PER_DECADE))
+def read_scan(
+    vary: str, low: float | None = None, high: float | None = None, per_decade: int = PER_DECADE
+) -> np.ndarray:
     """Return the values of a property at which its scan looks.
 
     Raises
@@ -558,11 +571,8 @@ def read_scan(vary: str, low: Any, high: Any, per_decade: Any) -> np.ndarray:
     OptionError
         If the scan does not rise or is too coarse.
     """
-    unit = f"value in {UNITS[vary]}"
-    first, last = (
-        None if end is None else read_positive(end, name, unit) for name, end in (("low", low), ("high", high))
-    )
-    return scan_points(vary, (first, last), read_density(per_decade, FEWEST_PER_DECADE))
+    first, last = (None if end is None else float(end) for end in (low, high))
+    return scan_points(vary, (first, last), int(per_decade))
 
 
 def _model_error(loop: CoupledLoop, value: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -21,7 +22,7 @@ class Scheme(StrEnum):
     """The step is repeated until outputs and inputs agree at its end; inputs are the mean of beginning and end."""
 
 
-_POSITIVE = kinds.positive.where(lambda value: isinstance(value, int | float)).worded(step="Give one.")
+_POSITIVE = kinds.above_zero.where(math.isfinite)
 
 
 @explain_calls

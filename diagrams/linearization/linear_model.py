@@ -190,6 +190,7 @@ class Linearization:
         """Whether the operating point is an equilibrium."""
         return bool(np.max(np.abs(self.affine), initial=0.0) <= EQUILIBRIUM)
 
+    @accepts(None, slow=kinds.choice("closed", "open").worded(step="Choose one of them.", found=kinds.by_name))
     def loop(
         self,
         *wires: str,
@@ -235,8 +236,6 @@ class Linearization:
         ConfirmationError
             If the closed L does not have the diagram's poles.
         """
-        if slow not in ("closed", "open"):
-            raise OptionError(f"found slow={slow!r}; expected 'closed' or 'open'. Choose one of them.", port="slow")
         if to:
             diagram, point, port = split_consumers(self.wired, self.point, wires, _as_list(to))
             return replace(self, wired=diagram, point=point).loop(port, lifted=lifted, slow=slow)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
 
-from ...blocks.core import LoopwrightError, OptionError, UnknownNameError, brief, explain_calls, near
+from ...blocks.core import LoopwrightError, OptionError, UnknownNameError, accepts, brief, explain_calls, kinds, near
 from .contact_limits import ContactLimits, read_contacts
 from .number_limits import SENSES, STEP_SENSES, Limit, make_limit
 
@@ -177,6 +177,17 @@ class Requirements(LoopLimits):
 
     _kind = "requirements"
 
+    @accepts(
+        None,
+        stable=kinds.one_of_class(bool, "true or false").worded(step="Give one of them."),
+        loops=kinds.one_of_class(Mapping, "limits by loop").worded(
+            step="Write [loops.u], and ms = 1.6 below it; in Python loops={'u': {'ms': 1.6}}."
+        ),
+        numbers=kinds.one_of_class(Mapping, "ranges by dotted path").worded(
+            step="Write [numbers], and 'poles.sampled_d0.slowest' = [-100, -2] below it; in Python "
+            "numbers={…: (-100, -2)}."
+        ),
+    )
     def __init__(
         self,
         *,
@@ -193,26 +204,12 @@ class Requirements(LoopLimits):
         if len(own) > 1:
             raise OptionError("found two without an input; expected one. Name the wires of the others.", port="step")
         super().__init__(step=own[0] if own else None, variants=variants, **limits)
-        if not isinstance(stable, bool):
-            raise OptionError(f"found {stable!r}; expected true or false. Give one of them.", port="stable")
         self.stable = stable
         self.steps: tuple[StepLimits, ...] = tuple(one for one in steps if one.input)
-        if loops is not None and not isinstance(loops, Mapping):
-            raise OptionError(
-                f"found {loops!r}; expected limits by loop. Write [loops.u], and ms = 1.6 "
-                "below it; in Python loops={'u': {'ms': 1.6}}.",
-                port="loops",
-            )
         self.loops: Mapping[str, LoopLimits] = MappingProxyType(
             {str(wire): _loop_limits(given, f"loops.{wire}") for wire, given in (loops or {}).items()}
         )
         self.contacts: Mapping[str, tuple[ContactLimits, ...]] = MappingProxyType(read_contacts(contact))
-        if numbers is not None and not isinstance(numbers, Mapping):
-            raise OptionError(
-                f"found {numbers!r}; expected ranges by dotted path. Write [numbers], and "
-                "'poles.sampled_d0.slowest' = [-100, -2] below it; in Python numbers={…: (-100, -2)}.",
-                port="numbers",
-            )
         self.place: Callable[[LoopwrightError, str], LoopwrightError] | None = None
         self.numbers: Mapping[str, Limit] = MappingProxyType(
             {

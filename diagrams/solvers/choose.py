@@ -3,15 +3,33 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, accepts, kinds
 from .base import FIXED, SUNDIALS, FixedStep, NoStates, Problem, Solver, euler, solver_name
 from .cvode import Cvode
 from .scipy_methods import AutoSolver, SciPySolver
 
 
+def _as_it_is(name: str, value: Any) -> str:
+    return f"{name} is {value!r}"
+
+
+_SECONDS = kinds.one_of_class((int, float, np.number), "a positive number of seconds, such as 1e-3").where(
+    lambda value: value > 0
+)
+
+
+@accepts(
+    None,
+    rtol=kinds.number.where(lambda value: isinstance(value, int | float | np.number) and 3e-14 <= value < 1).worded(
+        "3e-14 <= rtol < 1", "1e-6 serves most diagrams.", _as_it_is
+    ),
+    step=_SECONDS.worded(step="Give one.", found=_as_it_is),
+    max_step=_SECONDS.worded(step="Give one.", found=_as_it_is),
+)
 def make_solver(
     name: str,
     problem: Problem,
@@ -43,16 +61,11 @@ def make_solver(
     """
     name = solver_name(name)
     size = problem.size
-    for option, value in (("step", step), ("max_step", max_step)):
-        if value is not None and not (isinstance(value, int | float | np.number) and value > 0):
-            raise OptionError(f"{option} is {value!r}; expected a positive number of seconds, such as 1e-3.")
     if name in FIXED:
         if step is None:
             raise OptionError(f"solver={name!r} has a fixed step and step is None; give step=1e-3 or so, in s.")
         return FixedStep(name, problem, step, FIXED[name])
     bound = math.inf if max_step is None else float(max_step)
-    if isinstance(rtol, bool) or not isinstance(rtol, int | float | np.number) or not 3e-14 <= rtol < 1:
-        raise OptionError(f"rtol is {rtol!r}; expected 3e-14 <= rtol < 1. 1e-6 serves most diagrams.")
     try:
         absolute = np.asarray(atol, dtype=float)
     except (TypeError, ValueError):

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-from ...blocks.core import OptionError, explain_calls
+from ...blocks.core import accepts, explain_calls, kinds
 
 
 @explain_calls
+@accepts(
+    "limits",
+    size=kinds.above_zero,
+    entries=kinds.above_zero,
+    ratio=kinds.above_zero,
+    description=kinds.above_zero,
+    elements=kinds.above_zero,
+)
 @dataclass(frozen=True)
 class ArchiveLimits:
     """Limits up to which an FMU is read and unpacked; beyond them it is refused before anything is written.
@@ -43,10 +50,3 @@ class ArchiveLimits:
     ratio: float = 100.0
     description: int = 10**9
     elements: int = 10**7
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not (number and value > 0 and not math.isnan(value)):
-                raise OptionError(f"found {value!r}; expected a positive number.", port=f"limits.{field.name}")

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, Flag, auto
 from fractions import Fraction
 from functools import reduce
 from operator import or_
+from typing import Any
 
-from ...blocks.core import ParameterError, explain_calls
+from ...blocks.core import Kind, ParameterError, accepts, explain_calls, kinds
 from ..archive import FmuDescription
 from .fmi_calls import FmiCalls
 
@@ -23,7 +25,38 @@ class StepTime(Enum):
     """t += h after each step, as some tools do: their records are then met bit for bit."""
 
 
+def _seconds(step: str, condition: Callable[[Any], object]) -> Kind:
+    return Kind(
+        "seconds, positive, or None",
+        lambda value: isinstance(value, float | int | Fraction) and not isinstance(value, bool) and condition(value),
+        step,
+        kinds.as_written,
+    )
+
+
+_FLAG = kinds.one_of_class(bool, "True or False").worded(step="Give one of them.")
+
+
 @explain_calls
+@accepts(
+    "stepping",
+    ParameterError,
+    tolerance=kinds.one_of_class((float, int), "a positive number, or None")
+    .where(lambda value: 0.0 < value < math.inf)
+    .worded(step="Give one such as 1e-6.", found=kinds.as_written),
+    event_mode=_FLAG,
+    early_return=_FLAG,
+    retries=kinds.integer(0, 50).worded(step="Give the number of times that a step is halved."),
+    rollback=_FLAG,
+    input_derivatives=_FLAG,
+    time=Kind(
+        " or ".join(repr(kind.value) for kind in StepTime),
+        lambda value: isinstance(value, StepTime) or value in [kind.value for kind in StepTime],
+        "Give one.",
+    ),
+    communication_step=_seconds("Give a multiple of the ticks, such as 0.01.", lambda value: 0 < value < math.inf),
+    stop_time=_seconds("Give the end of the longest run, such as 100.0.", lambda value: value > 0.0),
+)
 @dataclass(frozen=True)
 class StepOptions:
     """Options of the co-simulation of one FMU: ``Fmu(file, stepping=StepOptions(event_mode=True))``.
@@ -74,48 +107,11 @@ class StepOptions:
     stop_time: float | None = None
 
     def __post_init__(self) -> None:
-        """Check the values."""
-        if self.tolerance is not None and not (
-            isinstance(self.tolerance, float | int) and 0.0 < self.tolerance < math.inf
-        ):
-            raise ParameterError(
-                f"found {self.tolerance!r}; expected a positive number, or None. Give one such as 1e-6.",
-                port="stepping.tolerance",
-            )
-        step = self.communication_step
-        if step is not None and (
-            isinstance(step, bool) or not isinstance(step, float | int | Fraction) or not 0 < step < math.inf
-        ):
-            raise ParameterError(
-                f"found {step!r}; expected seconds, positive, or None. Give a multiple of the ticks, such as 0.01.",
-                port="stepping.communication_step",
-            )
-        stop = self.stop_time
-        if stop is not None and (isinstance(stop, bool) or not isinstance(stop, float | int) or not stop > 0.0):
-            raise ParameterError(
-                f"found {stop!r}; expected seconds, positive, or None. Give the end of the longest run, such as 100.0.",
-                port="stepping.stop_time",
-            )
-        if isinstance(self.retries, bool) or not isinstance(self.retries, int) or not 0 <= self.retries <= 50:
-            raise ParameterError(
-                f"found {self.retries!r}; expected an integer from 0 to 50. Give the number of times that a step is "
-                "halved.",
-                port="stepping.retries",
-            )
-        for name in ("event_mode", "early_return", "rollback", "input_derivatives"):
-            value = getattr(self, name)
-            if not isinstance(value, bool) and not (value is None and name in ("event_mode", "early_return")):
-                raise ParameterError(
-                    f"found {value!r}; expected True or False. Give one of them.", port=f"stepping.{name}"
-                )
-        try:
-            object.__setattr__(self, "time", StepTime(self.time))
-        except ValueError:
-            known = " or ".join(repr(kind.value) for kind in StepTime)
-            raise ParameterError(f"found {self.time!r}; expected {known}. Give one.", port="stepping.time") from None
+        """Read the name of an arithmetic."""
+        object.__setattr__(self, "time", StepTime(self.time))
 
 
-def check_offered(options: object, about: FmuDescription, label: str) -> None:
+def check_offered(options: StepOptions, about: FmuDescription, label: str) -> None:
     """Refuse options that an FMU does not offer.
 
     Raises
@@ -123,12 +119,6 @@ def check_offered(options: object, about: FmuDescription, label: str) -> None:
     ParameterError
         With the option's name as its port.
     """
-    if not isinstance(options, StepOptions):
-        raise ParameterError(
-            f"found {options!r}; expected a StepOptions. Give one: StepOptions(event_mode=True).",
-            block=label,
-            port="stepping",
-        )
     for name, offered, needed in (
         ("event_mode", about.has_event_mode, "hasEventMode is false in its description"),
         ("early_return", about.fmi.startswith("3"), f"only FMI 3.0 has that, and it is of FMI {about.fmi}"),

@@ -1,12 +1,11 @@
 """FMUs in processes of their own: the face of `fmus/calls`, with the library in a child."""
 
-from .limits import Isolation, check_isolation
+from .limits import Isolation
 from .opening import find_limits, open_fmu
 from .pool import count_processes, end_idle
 
 __all__ = [
     "Isolation",
-    "check_isolation",
     "count_processes",
     "end_idle",
     "find_limits",

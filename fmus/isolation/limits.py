@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-import math
 import os
 from dataclasses import dataclass, fields
 
-from ...blocks.core import ParameterError, explain_calls
+from ...blocks.core import ParameterError, accepts, explain_calls, kinds
 
 
 @explain_calls
+@accepts(
+    "isolate",
+    ParameterError,
+    step_time=kinds.above_zero,
+    start_time=kinds.above_zero,
+    memory=kinds.above_zero,
+    output=kinds.above_zero,
+)
 @dataclass(frozen=True)
 class Isolation:
     """Limits of a process that an FMU runs in; a call beyond one ends the process, and the run with an error."""
@@ -26,15 +33,6 @@ class Isolation:
     output: float = 256e6
     """Most bytes that the FMU may write to its standard output and standard error in one process."""
 
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value is None and field.name == "memory":
-                continue
-            if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0 or math.isnan(value):
-                raise ParameterError(f"found {value!r}; expected a positive number.", port=f"isolate.{field.name}")
-
     def __repr__(self) -> str:
         changed = (f for f in fields(self) if getattr(self, f.name) != f.default)
         return f"Isolation({', '.join(f'{f.name}={getattr(self, f.name)!r}' for f in changed)})"
@@ -46,17 +44,3 @@ def default_memory() -> float:
         return 0.75 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
         return 16e9
-
-
-def check_isolation(value: object, label: str) -> None:
-    """Refuse a value of ``isolate`` that is none; ``label`` names the block.
-
-    Raises
-    ------
-    ParameterError
-        If it is neither True, False, None nor an `Isolation`.
-    """
-    if value is not None and not isinstance(value, bool | Isolation):
-        raise ParameterError(
-            f"found {value!r}; expected True, False, None or an Isolation.", block=label, port="isolate"
-        )

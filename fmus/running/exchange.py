@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import Array, Event, FmuError, FmuFileError, ParameterError, State
+from ...blocks.core import Array, Event, FmuError, FmuFileError, State
 from ...blocks.tracing import NEXT
 from ..archive import ExchangeInfo, FmuDescription, FmuVariable
 from ..calls import ExchangeInstance, StepOptions, is_smooth
@@ -37,13 +37,6 @@ def choose_interface(description: FmuDescription, asked: str | None, label: str)
     """
     if asked is None:
         return INTERFACES[0] if description.co_simulation else INTERFACES[1]
-    if asked not in INTERFACES:
-        raise ParameterError(
-            f"found {asked!r}; expected {' or '.join(map(repr, INTERFACES))}, or None for co-simulation where the FMU "
-            "offers it.",
-            block=label,
-            port="interface",
-        )
     there = description.co_simulation if asked == INTERFACES[0] else description.exchange is not None
     if not there:
         other = INTERFACES[asked == INTERFACES[0]]

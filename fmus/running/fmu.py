@@ -18,8 +18,8 @@ from ...blocks.core import (
 )
 from ..archive import ArchiveLimits, FmuDescription, join_scalars, read_description
 from ..calls import FmuInstance, StepOptions, check_offered
-from ..isolation import Isolation, check_isolation, open_fmu
-from .exchange import DEPENDENCIES, ExchangeMembers, choose_interface
+from ..isolation import Isolation, open_fmu
+from .exchange import DEPENDENCIES, INTERFACES, ExchangeMembers, choose_interface
 from .fmu_point import FmuLinearization
 from .linearization import STEP, linear_model, step_difference
 from .replacement import check_replacement
@@ -61,7 +61,9 @@ class Fmu(ExchangeMembers):
         ),
     )
     isolate: bool | Isolation | None = parameter(
-        default=None, description="a process of its own: True, its limits, False; None for all but own builds"
+        default=None,
+        description="a process of its own: True, its limits, False; None for all but own builds",
+        kind=kinds.one_of_class((bool, Isolation), "True, False, None or an Isolation").worded(step="Give one."),
     )
     ports: Sequence[str] | None = parameter(
         default=None,
@@ -75,10 +77,16 @@ class Fmu(ExchangeMembers):
         default=False, description="convert wires to and from other units of a port's dimension, else refused"
     )
     stepping: StepOptions = parameter(
-        default=StepOptions(), description="options of its co-simulation: Event Mode, retries, tolerance and more"
+        default=StepOptions(),
+        description="options of its co-simulation: Event Mode, retries, tolerance and more",
+        kind=kinds.one_of_class(StepOptions, "a StepOptions").worded(step="Give one: StepOptions(event_mode=True)."),
     )
     interface: str | None = parameter(
-        default=None, description="'co_simulation' or 'model_exchange'; None for co-simulation where it is offered"
+        default=None,
+        description="'co_simulation' or 'model_exchange'; None for co-simulation where it is offered",
+        kind=kinds.choice(*INTERFACES).worded(
+            f"{' or '.join(map(repr, INTERFACES))}, or None for co-simulation where the FMU offers it", "Give one."
+        ),
     )
     dependencies: str = parameter(
         default="declared",
@@ -95,7 +103,6 @@ class Fmu(ExchangeMembers):
     def check(self) -> None:
         """Check the file, the names of ``ports`` and ``rename``, and names, shapes and values of ``start``."""
         who = self.label
-        check_isolation(self.isolate, who)
         description, sizes = read_sized(self.file, self.start, self.limits, who)
         object.__setattr__(self, "_content", description.digest)
         object.__setattr__(self, "_sizes", sizes)

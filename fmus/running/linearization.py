@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuError, Layout, ParameterError
+from ...blocks.core import FmuError, Layout, ParameterError, accepts, kinds
 from ...blocks.tracing import extrapolate
 from ..archive import FmuVariable
 from ..calls import FmuBlock, LoadedFmu, is_smooth
@@ -31,16 +31,17 @@ STEP = 1e-4
 """Relative distance of differences of steps, which an adaptive solver makes less smooth than equations."""
 
 
+@accepts(
+    "{block.label}",
+    ParameterError,
+    interface=kinds.choice("model_exchange", "co_simulation")
+    .or_none()
+    .worded("'model_exchange', 'co_simulation' or None", "Give one."),
+)
 def linear_model(
     block: FmuBlock, t: float, state: Any, inputs: Any, interface: str | None, exact: bool | None
 ) -> FmuLinearization:
     """Linearize an FMU's equations; see `Fmu.linear_model`."""
-    if interface not in (None, "model_exchange", "co_simulation"):
-        raise ParameterError(
-            f"found {interface!r}; expected 'model_exchange', 'co_simulation' or None.",
-            block=block.label,
-            port="interface",
-        )
     point = FmuPoint(block, t, state, inputs)
     about = point.about
     if not about.states:
@@ -340,13 +341,11 @@ def check_exchange_slopes(
 # --- a communication step ---------------------------------------------------------------------------------------------
 
 
+@accepts("{block.label}", ParameterError, h=kinds.positive, relative_step=kinds.positive)
 def step_difference(
     block: FmuBlock, h: float, t: float, state: Any, inputs: Any, relative_step: float
 ) -> FmuLinearization:
     """Linearize a communication step; see `Fmu.step_difference`."""
-    for name, value in (("h", h), ("relative_step", relative_step)):
-        if not 0 < value < np.inf:
-            raise ParameterError(f"found {value!r}; expected a positive number.", block=block.label, port=name)
     point = FmuPoint(block, t, state, inputs)
     about = point.about
     for name in point.states:
