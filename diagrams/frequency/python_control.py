@@ -17,11 +17,14 @@ from .scan_refine_confirm import confirm_limit, pick_test_values
 
 if TYPE_CHECKING:
     from control import StateSpace
+    from numpy.typing import ArrayLike
 
     from .state_space import LinearSystem
 
 SAME = 1e-4
 """Relative difference up to which two values are the same."""
+ENTRIES_AT_ONCE = 1 << 16
+"""Entries of matrices that are solved in one call: 1 MB of complex numbers."""
 T = TypeVar("T")
 
 
@@ -106,7 +109,7 @@ class _ControlValues:
     """python-control's numbers of a loop; a function that raises gives NaN and its message."""
 
     def __init__(self, L: StateSpace):
-        self.L = L
+        self.L = respond_at_once(L)
 
     def values(self, ours: Margins) -> dict[str, tuple[str, float, str]]:
         import control
@@ -126,7 +129,7 @@ class _ControlValues:
             return float(found[least])
 
         def bandwidth() -> float:
-            return float(control.bandwidth(control.feedback(L, 1)))
+            return float(control.bandwidth(respond_at_once(control.feedback(L, 1))))
 
         def encirclements() -> float:
             return float(control.nyquist_response(L).count)
@@ -154,6 +157,32 @@ class _ControlValues:
             value, message = _call_quietly(call)
             out[name] = (function, np.nan if value is None else value, message)
         return out
+
+
+def respond_at_once(system: StateSpace) -> StateSpace:
+    """Return a copy whose response at many points is a few calls of NumPy; python-control makes one for each point."""
+    import control
+
+    one_by_one = system.horner
+    A, B, C, D, n = system.A, system.B, system.C, system.D, system.nstates
+
+    def horner(x: ArrayLike, warn_infinite: bool = True) -> np.ndarray:
+        points = np.atleast_1d(np.asarray(x, dtype=complex))
+        if n < 2 or points.ndim > 1:  # python-control has forms of its own for these
+            return np.asarray(one_by_one(x, warn_infinite))
+        at_once = max(1, ENTRIES_AT_ONCE // n**2)
+        try:
+            parts = [
+                C @ np.linalg.solve(some[:, None, None] * np.eye(n) - A, B[None]) + D
+                for some in np.split(points, range(at_once, len(points), at_once))
+            ]
+        except np.linalg.LinAlgError:  # at a pole, where python-control tells infinity from NaN
+            return np.asarray(one_by_one(x, warn_infinite))
+        return np.moveaxis(np.concatenate(parts), 0, 2)
+
+    copy = control.ss(system)
+    copy.horner = horner
+    return copy
 
 
 def _call_quietly(call: Callable[[], T]) -> tuple[T | None, str]:

@@ -117,10 +117,38 @@ MOST_READ = 1000
 """Entries of an argument of which its disturbance depends: equal arguments have equal ones."""
 
 
+KINDS = (np.ndarray, list, tuple)
+"""Types of arguments that may hold a matrix."""
+
+POOL = 1 << 18
+"""Random numbers of a seed. A call takes those from a place on that hangs on its arguments: a generator would cost more."""
+
+
+class _Draw:
+    """The random numbers of one call: those of the pool from a place on, around in a circle; none is 0, and all are below 1e-15."""
+
+    def __init__(self, pool: np.ndarray, place: int):
+        self._pool, self._place = pool, place % POOL
+
+    def take(self, count: int) -> np.ndarray:
+        """Return the next numbers."""
+        first, self._place = self._place, (self._place + count) % POOL
+        if first + count <= POOL:
+            return self._pool[first : first + count]
+        return self._pool.take(np.arange(first, first + count), mode="wrap")
+
+
+@functools.cache
+def _make_pool(seed: int) -> np.ndarray:
+    pool = (np.random.default_rng(seed).integers(-128, 128, size=POOL) + 0.5) * (SIZE / 128)
+    pool.flags.writeable = False
+    return pool
+
+
 def _norm_sizes(sizes: np.ndarray) -> np.ndarray:
     """Return the norm of each matrix, or vector; the last axis is that of the stack."""
     axes = tuple(range(sizes.ndim - 1))
-    return np.asarray(np.sqrt(np.mean(sizes**2, axis=axes, keepdims=True)))
+    return np.asarray(np.sqrt(np.add.reduce(sizes**2, axis=axes, keepdims=True) * (sizes.shape[-1] / sizes.size)))
 
 
 def _scaled_sizes(sizes: np.ndarray) -> np.ndarray:
@@ -134,74 +162,67 @@ def _scaled_sizes(sizes: np.ndarray) -> np.ndarray:
         return sizes
     if sizes.shape[0] != sizes.shape[1]:
         return np.asarray(np.where(sizes > 0.0, _least_sizes(sizes), 0.0))
-    largest = sizes.max(axis=2)
-    connected = (largest > 0.0).astype(float)
-    for _ in range(int(sizes.shape[0]).bit_length()):
-        connected = ((connected + connected @ connected) > 0.0).astype(float)
+    largest = sizes[:, :, 0] if sizes.shape[2] == 1 else np.maximum.reduce(sizes, axis=2)
     found = _least_sizes(sizes)
     scale = _BALANCE(largest, scale=1, permute=0)[3]  # one balance for a stack: each takes too long
-    if (scale != scale[0]).any():
+    if np.count_nonzero(scale != scale[0]):
         factors = (scale / scale[:, None])[:, :, None]
         with np.errstate(all="ignore"):  # factors may be as large as numbers get
             balanced = _least_sizes(sizes * factors)
             balanced /= factors
         np.fmin(found, balanced, out=found)
-    if not connected.all():
+    if np.count_nonzero(largest) < largest.size:
+        connected = (largest > 0.0).astype(float)
+        for _ in range(int(sizes.shape[0]).bit_length()):
+            connected = ((connected + connected @ connected) > 0.0).astype(float)
         found *= connected[:, :, None]
     return found
 
 
 def _least_sizes(sizes: np.ndarray) -> np.ndarray:
-    return np.asarray(np.minimum(sizes.max(axis=1, keepdims=True), sizes.max(axis=0, keepdims=True)))
+    largest = np.maximum.reduce
+    return np.asarray(np.minimum(largest(sizes, axis=1, keepdims=True), largest(sizes, axis=0, keepdims=True)))
 
 
 _BALANCE = scipy.linalg.lapack.dgebal
 NORMWISE, SCALED = _norm_sizes, _scaled_sizes
 
 
-def _is_finite(array: np.ndarray) -> bool:
-    with np.errstate(all="ignore"):
-        return bool(np.isfinite(array.sum())) or bool(np.isfinite(array).all())
-
-
 def _is_symmetric(stack: np.ndarray) -> bool:
-    """Whether all matrices of a stack equal their conjugate transposes; the first one answers for most."""
+    """Whether all matrices of a stack equal their conjugate transposes; the corners of the first one answer for most."""
     if stack.ndim != 3 or stack.shape[1] != stack.shape[2]:
+        return False
+    if stack.item(0, 0, -1) != stack.item(0, -1, 0).conjugate():
         return False
     return all(np.array_equal(some, np.conj(np.swapaxes(some, 1, 2))) for some in (stack[:1], stack))
 
 
-def _disturb(
-    values: np.ndarray, sizes: Callable[[np.ndarray], np.ndarray], random: np.random.Generator, turn: float
-) -> None:
+def _disturb(values: np.ndarray, sizes: Callable[[np.ndarray], np.ndarray], draw: _Draw, turn: float) -> None:
     """Add a disturbance to real values, with the axis of the stack at last.
 
     That of a symmetric matrix is symmetric, with ``turn`` 1, or antisymmetric with -1 (its imaginary part); 0 for others.
     """
-    if not values.any():  # such as the imaginary parts of a real right side
+    if not np.count_nonzero(values):  # such as the imaginary parts of a real right side
         return
-    size = sizes(np.abs(values))
-    change = np.frombuffer(random.bytes(values.size), dtype=np.int8).reshape(values.shape) + 0.5  # never 0
-    change *= SIZE / 128
+    change = draw.take(values.size).reshape(values.shape)
     if turn:
         change = 0.5 * (change + turn * np.swapaxes(change, 0, 1))
-    change *= size
-    values += change
+    values += change * sizes(np.abs(values))
 
 
-def _flip(random: np.random.Generator, count: int) -> np.ndarray:
-    return random.choice([-1.0, 1.0], size=count)
+def _flip(draw: _Draw, count: int) -> np.ndarray:
+    return np.asarray(np.sign(draw.take(count)))
 
 
-def _shuffle(random: np.random.Generator, values: np.ndarray) -> np.ndarray:
+def _shuffle(draw: _Draw, values: np.ndarray) -> np.ndarray:
     """Return an order of eigenvalues; a conjugate pair stays together, as LAPACK promises."""
-    groups, i = [], 0
-    while i < len(values):
-        pair = i + 1 < len(values) and values[i].imag != 0.0 and values[i + 1] == np.conj(values[i])
+    groups, i, numbers = [], 0, values.tolist()
+    while i < len(numbers):
+        pair = i + 1 < len(numbers) and numbers[i].imag != 0.0 and numbers[i + 1] == numbers[i].conjugate()
         groups.append([i, i + 1] if pair else [i])
         i += len(groups[-1])
-    random.shuffle(groups)
-    return np.array([i for group in groups for i in group], dtype=int)
+    order = np.argsort(draw.take(len(groups)))
+    return np.array([i for place in order for i in groups[place]], dtype=int)
 
 
 class Disturbance:
@@ -221,45 +242,48 @@ class Disturbance:
         finally:
             self.seed = before
 
-    def argument(self, name: str, value: Any, random: np.random.Generator) -> Any:
+    def argument(self, name: str, value: Any, draw: _Draw) -> Any:
         """Return an argument with a disturbance, matrix by matrix; what is no array of floats stays."""
-        array = np.asarray(value) if isinstance(value, np.ndarray | list | tuple) else None
-        if array is None or array.dtype.kind not in "fc" or array.ndim == 0 or not array.size or not _is_finite(array):
+        array = np.asarray(value) if isinstance(value, KINDS) else None
+        if array is None or array.dtype.kind not in "fc" or array.ndim == 0 or not array.size:
+            return value
+        if not np.logical_and.reduce(np.isfinite(array), axis=None):
             return value
         sizes = NORMWISE if name in ORTHOGONAL else SCALED
         stack = array.reshape(-1, *array.shape[-2:]) if array.ndim > 1 else array[None]
-        changed, symmetric = np.empty_like(stack, order="C"), _is_symmetric(stack)
+        symmetric = _is_symmetric(stack)
+        to_last, to_first = ((1, 2, 0), (2, 0, 1)) if array.ndim > 1 else ((1, 0), (1, 0))
+        parts = []
         count = max(1, AT_ONCE // stack[0].size)
         for first in range(0, len(stack), count):
-            some = slice(first, first + count)
-            values = np.moveaxis(stack[some], 0, -1).copy()  # long rows are quick to go through
+            values = stack[first : first + count].transpose(to_last).copy()  # long rows are quick to go through
             if array.dtype.kind == "c":
                 # Parts apart: a product adds up parts, and an imaginary one may be 1e-30 of the real.
-                _disturb(values.real, sizes, random, 1.0 if symmetric else 0.0)
-                _disturb(values.imag, sizes, random, -1.0 if symmetric else 0.0)
+                _disturb(values.real, sizes, draw, 1.0 if symmetric else 0.0)
+                _disturb(values.imag, sizes, draw, -1.0 if symmetric else 0.0)
             else:
-                _disturb(values, sizes, random, 1.0 if symmetric else 0.0)
-            changed[some] = np.moveaxis(values, -1, 0)
-        changed = changed.reshape(array.shape)
+                _disturb(values, sizes, draw, 1.0 if symmetric else 0.0)
+            parts.append(values.transpose(to_first))
+        changed = (parts[0] if len(parts) == 1 else np.concatenate(parts)).reshape(array.shape)
         return changed.view(type(value)) if isinstance(value, np.ndarray) else changed
 
-    def result(self, name: str, found: Any, random: np.random.Generator) -> Any:
+    def result(self, name: str, found: Any, draw: _Draw) -> Any:
         """Return a result with eigenvalues in another order, and vectors with other signs."""
         if name in ("eig", "eigvals"):
             if isinstance(found, np.ndarray):
                 if found.ndim != 1:
-                    return np.stack([self.result(name, part, random) for part in found]) if len(found) else found
-                return found[_shuffle(random, found)]
+                    return np.stack([self.result(name, part, draw) for part in found]) if len(found) else found
+                return found[_shuffle(draw, found)]
             values, *vectors = found
             if values.ndim == 1:
-                order = _shuffle(random, values)
-                values, vectors = values[order], [v[:, order] * _flip(random, v.shape[1]) for v in vectors]
+                order = _shuffle(draw, values)
+                values, vectors = values[order], [v[:, order] * _flip(draw, v.shape[1]) for v in vectors]
             return _like(found, values, *vectors)
         if name == "eigh" and isinstance(found, tuple) and np.ndim(found[0]) == 1:
-            return _like(found, found[0], found[1] * _flip(random, found[1].shape[1]))
+            return _like(found, found[0], found[1] * _flip(draw, found[1].shape[1]))
         if name == "svd" and isinstance(found, tuple) and np.ndim(found[1]) == 1:
             U, s, Vh = found
-            signs = _flip(random, len(s))
+            signs = _flip(draw, len(s))
             U, Vh = U.copy(), Vh.copy()
             U[:, : len(s)] *= signs
             Vh[: len(s)] *= signs[:, None]
@@ -277,15 +301,15 @@ class Disturbance:
             if self.seed is None:
                 return function(*arguments, **options)
             self.calls += 1
-            digest = zlib.adler32(f"{self.seed} {name}".encode())
+            digest = zlib.crc32(f"{self.seed} {name}".encode())
             for value in (*arguments, *options.values()):
-                if isinstance(value, np.ndarray | list | tuple):
+                if isinstance(value, KINDS):
                     array = np.asarray(value)
                     some = array.reshape(-1)[:: 1 + array.size // MOST_READ]
-                    digest = zlib.adler32(some.tobytes(), zlib.adler32(str(array.shape).encode(), digest))
-            random = np.random.default_rng([self.seed, digest])
-            changed = [self.argument(name, value, random) for value in arguments]
-            return self.result(name, function(*changed, **options), random)
+                    digest = zlib.crc32(some.tobytes(), zlib.crc32(str(array.shape).encode(), digest))
+            draw = _Draw(_make_pool(self.seed), digest)
+            changed = [self.argument(name, value, draw) for value in arguments]
+            return self.result(name, function(*changed, **options), draw)
 
         return disturbed
 
@@ -323,6 +347,6 @@ def _like(found: Any, *parts: Any) -> Any:
 
 
 def _is_symbolic(value: Any) -> bool:
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return any(map(_is_symbolic, value))
-    return hasattr(type(value), "__array_function__") and not isinstance(value, np.ndarray | np.generic)
+    return not isinstance(value, (np.ndarray, np.generic)) and hasattr(type(value), "__array_function__")

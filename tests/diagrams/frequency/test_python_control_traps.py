@@ -10,7 +10,7 @@ from loopwright.blocks import ParameterError
 from loopwright.diagrams import compare_with_control, disk_margin, margins, nyquist_count, place
 from loopwright.diagrams.frequency.loop_scan import make_grid
 from loopwright.diagrams.frequency.poles_and_zeros import Features
-from loopwright.diagrams.frequency.python_control import _Judge, compare_margins
+from loopwright.diagrams.frequency.python_control import _Judge, compare_margins, respond_at_once
 from loopwright.diagrams.frequency.realization import Realization
 from support.loops import sampled_triple, triple
 
@@ -49,6 +49,26 @@ def quiet(function, *arguments, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return function(*arguments, **options)
+
+
+@pytest.mark.parametrize("states", [1, 2, 300])
+@pytest.mark.parametrize("dt", [0, 0.1])
+def test_responses_at_once_are_those_that_python_control_computes_one_by_one(states, dt):
+    rng = np.random.default_rng(states)
+    shapes = (states, states), (states, 1), (1, states), (1, 1)
+    system = control.ss(*(rng.normal(size=shape) for shape in shapes), dt)
+    points = rng.normal(size=5) + 1j * rng.normal(size=5)
+    np.testing.assert_allclose(respond_at_once(system)(points), system(points), rtol=1e-9)
+    assert respond_at_once(system)(points[0]) == pytest.approx(system(points[0]), rel=1e-9)
+
+
+def test_responses_at_once_are_those_of_python_control_at_a_pole_too():
+    for output in (1.0, 0.0):  # infinity, and NaN where a zero cancels the pole
+        system = control.ss(np.diag([0.0, -1.0]), [[1.0], [1.0]], [[output, 1.0]], 0.0)
+        at_once, one_by_one = (quiet(form, np.array([0.0, 1.0])) for form in (respond_at_once(system), system))
+        np.testing.assert_array_equal(at_once, one_by_one)
+        assert not np.isfinite(at_once[0])
+        assert at_once[1] == pytest.approx(output + 0.5)
 
 
 def test_rounding_in_a_denominator_moves_its_phase_margin_and_not_ours():
