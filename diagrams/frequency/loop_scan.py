@@ -128,7 +128,7 @@ class LoopScan:
         return L, dL * omega
 
     def _value(self, omega: float) -> complex:
-        return complex(self.r.response(omega)[0][0])
+        return complex(self.r.matrix(1j * np.array([omega]))[0, 0, 0])
 
     def _make_crossing(self, omega: float, function: Function) -> Crossing:
         L, dL = self._response(omega)
@@ -228,9 +228,11 @@ def make_grid(r: Realization, features: Features, *, delay: float = 0.0) -> list
 
 
 def _bisect(r: Realization, omega: np.ndarray, delay: float) -> np.ndarray:
+    def respond(at: np.ndarray) -> np.ndarray:
+        return np.asarray(r.matrix(1j * at)[:, 0, 0] * np.exp(-1j * at * delay))
+
+    L = respond(omega)
     for _ in range(14):
-        L, _ = r.response(omega)
-        L = L * np.exp(-1j * omega * delay)
         with np.errstate(divide="ignore", invalid="ignore"):
             step = np.log(L[1:] / L[:-1])
         coarse = ~((np.abs(step.real) < 0.3) & (np.abs(step.imag) < 0.15)) & (np.diff(omega) > 1e-12 * omega[1:])
@@ -238,5 +240,6 @@ def _bisect(r: Realization, omega: np.ndarray, delay: float) -> np.ndarray:
             coarse &= np.maximum(np.abs(L[1:]), np.abs(L[:-1])) > 0.3
         if not coarse.any() or len(omega) > 40_000:
             break
-        omega = np.sort(np.concatenate([omega, np.sqrt(omega[1:] * omega[:-1])[coarse]]))
+        between, after = np.sqrt(omega[1:] * omega[:-1])[coarse], np.flatnonzero(coarse) + 1
+        omega, L = np.insert(omega, after, between), np.insert(L, after, respond(between))
     return omega

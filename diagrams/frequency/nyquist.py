@@ -128,7 +128,7 @@ def _make_contour(r: Realization, features: Features, delay: float) -> list[np.n
     top = segments[-1][-1]
     if delay and not r.dt:  # beyond the last sample with |L| ≥ 0.95 the curve does not turn around 0
         every = np.concatenate(segments)
-        large = np.flatnonzero(np.abs(r.response(every)[0]) >= 0.95)
+        large = np.flatnonzero(np.abs(r.matrix(1j * every)[:, 0, 0]) >= 0.95)
         top = every[min(large[-1] + 1, len(every) - 1)] if len(large) else every[0]
     arcs = []
     for a in features.axis_poles:
@@ -162,8 +162,7 @@ def _make_contour(r: Realization, features: Features, delay: float) -> list[np.n
 def _follow_loop(r: Realization, s: np.ndarray, delay: float) -> NDArray[np.complex128]:
     """Return 1 + L e^(−s delay) along points, bisected until it turns by less than 0.5 rad from one to the next."""
     for _ in range(30):
-        L, _ = r.values(s)
-        f: NDArray[np.complex128] = 1 + L * np.exp(-s * delay)
+        f: NDArray[np.complex128] = 1 + r.matrix(s)[:, 0, 0] * np.exp(-s * delay)
         if np.any(f == 0):
             raise ConfirmationError(
                 "found 1 + L = 0 on the contour; expected no closed-loop pole on the limit of stability. Look at "
