@@ -19,7 +19,7 @@ from .libraries import load_compiled
 from .library_method import LIBRARY_METHODS, USES_SLOPE, Failure
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
 from .native_tick import bind_call
-from .remote import REFUSED, TOLD, UNDER_WAY, compile_other_side
+from .remote import REFUSED, TOLD, UNDER_WAY, PythonStep, compile_other_side
 from .sources import Code
 from .staged import NativeExchange
 from .watch import Fired, Pile, Watch
@@ -49,6 +49,7 @@ __all__ = [
     "NewtonOptions",
     "Outcome",
     "Pile",
+    "PythonStep",
     "Reason",
     "Span",
     "TickCode",

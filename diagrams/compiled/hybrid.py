@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..flat import NONE, FlatDiagram, TickPattern
+from ..flat import NONE, FlatDiagram, StepTable, TickPattern
 from .delays import NativeDelays, PastInputs
 from .differences import Differences
 from .functions import at
@@ -78,6 +78,8 @@ class Span(NamedTuple):
         Time of the first one after them that is landed on, in s.
     edges, late : ndarray
         Discontinuities of sources in s, and when they are seen at the instant itself.
+    steps : StepTable or None
+        Steps of the plants that end at each; None where all plants step at each of them.
     """
 
     times: np.ndarray
@@ -87,6 +89,7 @@ class Span(NamedTuple):
     beyond: float
     edges: np.ndarray
     late: np.ndarray
+    steps: StepTable | None = None
 
 
 class HybridOutcome(NamedTuple):
@@ -137,9 +140,6 @@ class CompiledHybrid:
     delays : PastInputs, optional
         The memory of transport delays, where there are some; their inputs are kept within ``tolerances``, relative and
         absolute.
-    held : pair of ndarray
-        Inputs of FMUs as they are now, and as they are held from a tick to the next one; one array where nothing
-        changes them between ticks.
     """
 
     def __init__(
@@ -155,7 +155,6 @@ class CompiledHybrid:
         spacing: float,
         own: Sequence[np.ndarray],
         accepts: int,
-        held: tuple[np.ndarray, np.ndarray],
         loops: NewtonOptions | None = None,
         exchange: NativeExchange | None = None,
         delays: PastInputs | None = None,
@@ -171,9 +170,7 @@ class CompiledHybrid:
         self._hybrid = hybrid = HybridStructure(l=loop.structure, automatic=len(methods) > 1, accepts=accepts)
         self._exchange, hybrid.looked = exchange, np.nan
         self._solver: NewtonStructure | None = None
-        self._tolerances, (z, inputs) = list[np.ndarray](), held
-        if inputs is not z:
-            hybrid.z, hybrid.held, hybrid.inputs = self._own(z), self._own(inputs), z.size
+        self._tolerances = list[np.ndarray]()
         hybrid.budget = self._largest_budget = _budget(code.between["flow"].operations, methods, n)
         if exchange is not None:
             hybrid.budget = min(hybrid.budget, _UNKNOWN)
@@ -446,6 +443,7 @@ class CompiledHybrid:
             late=at(span.late),
             room=len(rows),
         )
+        self.ticks.set_steps(span.steps)
         found = self._outcome
         if self._delays is not None:
             self._delays.hand_over(self._hybrid.t)

@@ -73,7 +73,7 @@ class HybridStructure(ctypes.Structure):
         *_fields(_INT, "active automatic accepts between budget inside begun stepped"),
         *_fields(_REAL, "t to counts_as"), *_fields(_INT, "found hits misses easy"), ("before", _AT), ("outputs", _INT),
         *_fields(_AT, "taken taken_first taken_states"), ("switched", _INT), ("solved", _AT), ("looked_at", _REAL),
-        *_fields(_AT, "z held"), ("inputs", _INT), ("planned", _REAL), ("o", _AT),
+        ("planned", _REAL), ("o", _AT),
         ("jump", _REAL), ("acted", _INT), ("looked", _REAL),
     ]  # fmt: skip
 

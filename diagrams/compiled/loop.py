@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -14,11 +15,11 @@ import numpy as np
 from ...blocks.interrupts import INTERRUPTS
 from ...fmus.calls import NEAR, FmuInstance, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
-from ..flat import TRUE, TickPattern
+from ..flat import TRUE, StepTable, TickPattern
 from .code import CompiledTick, TickCode
 from .functions import TickStructure, at
 from .grouped_functions import GroupedTick
-from .remote import RemotePlants
+from .remote import PythonStep, RemotePlants
 from .runtime import load_runtime
 from .staged_functions import Staged, StagedEquations
 
@@ -71,9 +72,14 @@ class LoopStructure(ctypes.Structure):
         ("near", ctypes.c_double),
         ("skip", ctypes.c_int64),
         ("halt", ctypes.c_int32),
-        ("loops", ctypes.c_void_p),
-        ("apart", ctypes.c_void_p),
+        *((name, ctypes.c_void_p) for name in ("loops", "apart", "z", "held")),
+        ("inputs", ctypes.c_int64),
+        ("own", ctypes.c_void_p),
     ]
+
+
+class _OwnSteps(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_void_p) for name in ("begins", "widths", "holds", "inputs")]
 
 
 class NewtonStructure(ctypes.Structure):
@@ -164,8 +170,8 @@ class CompiledLoop:
         The ticks.
     arguments, results : sequence of ndarray
         The vectors (t, x, w, p) and (x_next, z, log, ok) of the run.
-    plants : sequence of FmuInstance
-        The FMUs; Python takes the steps of those that are neither native nor remote.
+    plants : sequence of FmuInstance or PythonStep
+        The FMUs, of which Python steps those that are neither native nor remote; of other plants the steps.
     columns : ndarray or None
         Entries of the log that a sample keeps; None for the first ``width``.
     width : int
@@ -178,6 +184,10 @@ class CompiledLoop:
         How the algebraic loops of each tick are solved, where there are some.
     exchange : StagedBinding, optional
         Binds ticks in stages.
+    held : pair of ndarray, optional
+        Inputs of the plants as they are now, and as they are held between ticks; one array where that is the same.
+    inputs : sequence of slice, optional
+        The inputs of each plant among them, where plants step less often than the ticks.
     """
 
     def __init__(
@@ -185,7 +195,7 @@ class CompiledLoop:
         code: TickCode,
         arguments: Sequence[np.ndarray],
         results: Sequence[np.ndarray],
-        plants: Sequence[FmuInstance],
+        plants: Sequence[FmuInstance | PythonStep],
         *,
         columns: np.ndarray | None,
         width: int,
@@ -193,6 +203,8 @@ class CompiledLoop:
         stops: Sequence[int],
         loops: Mapping[frozenset[TickPattern], NewtonOptions] | None = None,
         exchange: StagedBinding | None = None,
+        held: tuple[np.ndarray, np.ndarray] | None = None,
+        inputs: Sequence[slice] = (),
     ):
         self._remote, self._far = RemotePlants(), list[int | None]()
         self._remotes = [self._remote, *([] if exchange is None else [exchange.remote])]
@@ -223,6 +235,13 @@ class CompiledLoop:
             near=NEAR,
         )
         self.structure.apart = self._remote.address
+        if held is not None and held[0] is not held[1]:
+            self.structure.z, self.structure.held = map(self._array, held)
+            self.structure.inputs = held[0].size
+        self._own = _OwnSteps()
+        if inputs:
+            self._own.inputs = self._array(np.array([[s.start, s.stop] for s in inputs], dtype=np.int64))
+            self.structure.own = ctypes.addressof(self._own)
         if code.loops:
             solvers = [self.bind_loops(code, clocks, arguments, (loops or {}).get(clocks)) for clocks in code.ticks]
             self.structure.loops = self._address(solvers, NewtonStructure)
@@ -285,18 +304,20 @@ class CompiledLoop:
             halvings=options.halvings,
         )
 
-    def _plant(self, place: int, plant: FmuInstance) -> ctypes.Structure:
-        step = plant.native or plant.remote
+    def _plant(self, place: int, plant: FmuInstance | PythonStep) -> ctypes.Structure:
         self._far.append(None)
-        if step is None:
+        if not isinstance(plant, FmuInstance):
             return _Plant(by_python=self._remote.add_python(place, plant, None))
+        step, take = plant.native or plant.remote, partial(_take_step, plant)
+        if step is None:
+            return _Plant(by_python=self._remote.add_python(place, take, None))
         self._kept.append(step)
         if isinstance(step, RemoteStep):
             far = self._far[-1] = self._remote.add(step)
             return _Plant(
                 now=step.now, width=step.width, flags=step.flags, reached=step.reached, far=far,
                 quiet=None if step.quiet is None else self._remote.add_quiet(step.quiet),
-                by_python=self._remote.add_python(place, plant, far) if step.is_careful else None,
+                by_python=self._remote.add_python(place, take, far) if step.is_careful else None,
             )  # fmt: skip
         return self._native(step)
 
@@ -324,6 +345,12 @@ class CompiledLoop:
             step.version, step.instance, step.step, inputs, outputs, step.now, step.width, step.final, step.flags,
             step.reached, changed,
         )  # fmt: skip
+
+    def set_steps(self, steps: StepTable | None) -> None:
+        """Take the steps to the ticks of the next call; None where all plants step at each of them."""
+        if steps is not None:
+            self._table = [steps.begins, steps.widths, steps.holds]
+            self._own.begins, self._own.widths, self._own.holds = map(at, self._table)
 
     def guard(self) -> AbstractContextManager[None]:
         """Leave this process's state as it was, whatever FMUs of others do to it meanwhile, and tell it.
@@ -357,7 +384,14 @@ class CompiledLoop:
     def skip(self, count: int) -> None:
         self.structure.skip = count
 
-    def run(self, times: np.ndarray, widths: np.ndarray, kinds: np.ndarray, rows: np.ndarray) -> Outcome:
+    def run(
+        self,
+        times: np.ndarray,
+        widths: np.ndarray,
+        kinds: np.ndarray,
+        rows: np.ndarray,
+        steps: StepTable | None = None,
+    ) -> Outcome:
         """Go through ticks, at most as many as there are rows to be written.
 
         Parameters
@@ -370,7 +404,10 @@ class CompiledLoop:
             Clocks that act at each of them, as places in `kinds`.
         rows : ndarray, shape (m, 1 + width)
             Samples: their time in s, then their values.
+        steps : StepTable, optional
+            Steps of the plants that end at each of them, where not all plants step at all.
         """
+        self.set_steps(steps)
         with self.guard():
             self._run(
                 ctypes.addressof(self.structure),
@@ -383,3 +420,8 @@ class CompiledLoop:
             )
         found = self._outcome
         return Outcome(found.ticks, found.rows, Reason(found.reason), found.plant, found.stage, found.status)
+
+
+def _take_step(plant: FmuInstance, t: float, h: float) -> bool:
+    plant.step(t, h)
+    return plant.ends_run

@@ -1,9 +1,9 @@
-"""FMUs that the loop in C does not call itself: it asks their processes for steps, or Python."""
+"""Plants that the loop in C does not call itself: it asks the processes of FMUs for steps, or Python."""
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError
 from ...blocks.interrupts import INTERRUPTS
-from ...fmus.calls import ERROR, BoundCalls, ChildFace, ChildRequest, FmuInstance, QuietStep, RemoteStep, SharedValues
+from ...fmus.calls import ERROR, BoundCalls, ChildFace, ChildRequest, QuietStep, RemoteStep, SharedValues
 from .functions import at
 from .runtime import load_runtime
 
@@ -21,6 +21,9 @@ taken it, and the loop can't go on."""
 _KINDS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "b1")
 _FEWEST = 4  # `wire.FEWEST`
 _IDLE, _POSTED, _ARRIVED = range(3)
+
+PythonStep = Callable[[float, float], bool]
+"""A step of a plant from t over h, both in s; returns whether the plant asks for the end of the run."""
 
 
 def compile_other_side() -> str | None:
@@ -119,14 +122,14 @@ class RemotePlants:
         self._kept += [quiet, watched, sloped, made]
         return ctypes.addressof(made)
 
-    def add_python(self, place: int, plant: FmuInstance, far: int | None) -> Any:
-        """Let Python take the steps of an FMU, and return the function for C; ``far`` is its structure, or None."""
+    def add_python(self, place: int, step: PythonStep, far: int | None) -> Any:
+        """Let Python take the steps of a plant, and return the function for C; ``far`` is its structure, or None."""
         if self.by_python is None:
             self.by_python = PythonSteps()
             self._kept.append(STEP(self.by_python.take))
             self._step = self._kept[-1]
         found = next(((p, r) for p, r in self._all if ctypes.addressof(r) == far), None)
-        self.by_python.add(place, plant, found)
+        self.by_python.add(place, step, found)
         return ctypes.cast(self._step, ctypes.c_void_p)
 
     def has_begun(self, structure: int | None) -> bool:
@@ -198,32 +201,32 @@ class RemotePlants:
 
 
 class PythonSteps:
-    """Steps of FMUs that Python takes at the request of C.
+    """Steps of plants that Python takes at the request of C.
 
     Attributes
     ----------
     error : BaseException or None
-        Why the last one has failed: an error of the FMU, or an interrupt.
+        Why the last one has failed: an error of the plant, or an interrupt.
     """
 
     def __init__(self) -> None:
         self.error: BaseException | None = None
-        self._plants: dict[int, tuple[FmuInstance, tuple[ChildFace, RemoteStructure] | None]] = {}
+        self._steps: dict[int, tuple[PythonStep, tuple[ChildFace, RemoteStructure] | None]] = {}
 
-    def add(self, place: int, plant: FmuInstance, far: tuple[ChildFace, RemoteStructure] | None) -> None:
-        """Take an FMU, and the requests to its process that are C's in other steps."""
-        self._plants[place] = plant, far
+    def add(self, place: int, step: PythonStep, far: tuple[ChildFace, RemoteStructure] | None) -> None:
+        """Take the steps of a plant, and the requests to its process that are C's in other steps."""
+        self._steps[place] = step, far
 
     def take(self, place: int, t: float, h: float) -> int:
         """Take a step from t over h, both in s; return 1 if C can't go on from there."""
         try:
-            plant, far = self._plants[place]
+            step, far = self._steps[place]
             INTERRUPTS.heard = True
             INTERRUPTS.check()
             if far is not None:
                 far[0].number = far[1].number
             try:
-                plant.step(t, h)
+                ends = step(t, h)
             finally:
                 if far is not None:
                     far[1].number = far[0].number
@@ -232,7 +235,7 @@ class PythonSteps:
             return 1
         finally:
             INTERRUPTS.heard = False
-        return int(plant.ends_run)
+        return int(ends)
 
     def check(self) -> None:
         """Raise the error of a step that has failed."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import SimulationError
-from ..flat import EVERY, FlatDiagram, takes_any_step
+from ..flat import EVERY, FlatDiagram, StepTable, takes_any_step
 from .plants import Plant, bind, part_of
 
 
@@ -32,8 +32,12 @@ class PlantSteps:
     ----------
     regular : bool
         Whether every plant steps at every tick that the run visits. Then inputs are read from z itself.
+    z : ndarray
+        Inputs of the plants, as the diagram has computed them last.
     inputs : ndarray
         Inputs of the plants, each as of its last communication point.
+    own : dict
+        The inputs of each plant among them, as a slice, by path.
     reached : dict
         Tick at which each plant stands, by path.
     """
@@ -50,14 +54,14 @@ class PlantSteps:
         coupled: bool = False,
     ) -> None:
         self._flat, self._plants, self._time_of = flat, plants, time_of
-        self._z, self._w = z, w
+        self.z, self._w = z, w
         self._visited = {EVERY} if every_tick else {*flat.visited}
         self.regular = all(map(self.is_regular, flat.plant_ticks))
         moves = flat.hybrid and bool(flat.plant_ticks) and not coupled  # z follows states between ticks
         self.inputs = z.copy() if moves or not self.regular else z
         self.reached: dict[str, int] = {}
         self._even = {path for path in flat.plant_ticks if not takes_any_step(flat.table.blocks[path])}
-        self._own = {path: part_of(flat, flat.plant_inputs, path) for path in flat.plant_ticks}
+        self.own = {path: part_of(flat, flat.plant_inputs, path) for path in flat.plant_ticks}
 
     def is_regular(self, path: str) -> bool:
         """Whether a plant steps at every tick that the run visits."""
@@ -70,8 +74,8 @@ class PlantSteps:
 
     def take_inputs(self) -> None:
         """Let every plant hold its inputs as they are in z."""
-        if self.inputs is not self._z:
-            self.inputs[:] = self._z
+        if self.inputs is not self.z:
+            self.inputs[:] = self.z
 
     def begin(self, k: int) -> None:
         """Let every plant stand at tick ``k``, and hold its inputs from there on."""
@@ -79,45 +83,71 @@ class PlantSteps:
         self.reached = dict.fromkeys(self._plants, k)
 
     def go(self, k: int, following: int, *, last: bool) -> None:
-        """Step the plants from a tick that the run has visited to the next one; see `step_to`."""
-        if self.regular:
-            self.step_together(self._time_of(k), float(self._flat.base * (following - k)))
+        """Step the plants from a tick that the run has visited to the next one; at the ``last`` tick all that can.
+
+        Those step of which the tick is a communication point, each from its last one. A plant that stops on its way, at
+        the end of a run, goes on from there with the inputs that it holds.
+        """
+        due = self.due(k, following, last=last)
+        if self.apart:
+            step_each((self._plants[path], *step) for path, step in due.items())
         else:
-            self.step_to(following, last=last)
+            for path, step in due.items():
+                self._plants[path].step(*step)
+        if not self.regular:
+            self.reached.update(dict.fromkeys(due, following))
+
+    def due(self, k: int, following: int, *, last: bool) -> dict[str, tuple[float, float]]:
+        """Return the steps from a visited tick to the next one: by path where each begins and its length, in s."""
+        if self.regular:
+            return dict.fromkeys(self._plants, (self._time_of(k), float(self._flat.base * (following - k))))
+        return {
+            path: (self._time_of(before), float(self._flat.base * (following - before)))
+            for path, before in self.reached.items()
+            if following > before and self._goes_to(path, following, last=last)
+        }
+
+    def _goes_to(self, path: str, k: int, *, last: bool) -> bool:
+        return self._flat.steps_at(path, k) or (last and path not in self._even)
+
+    def table(self, ticks: np.ndarray, last: int) -> StepTable | None:
+        """Return the steps to ticks that are visited from here on, of which ``last`` ends the run; None: all whole.
+
+        Times and lengths are those of `go` to the last bit: quotients of integers that a float64 holds.
+        """
+        if self.regular:
+            return None
+        shape, base = (len(ticks), len(self._plants)), self._flat.base
+        begins, widths, holds = np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=np.uint8)
+        for j, path in enumerate(self._plants):
+            points = np.logical_or.reduce([pattern.among(ticks) for pattern in self._flat.plant_ticks[path]])
+            ends = points if path in self._even else points | (ticks == last)
+            to = ticks[ends]
+            before = np.concatenate([[self.reached[path]], to[:-1]])[: len(to)]
+            begins[ends, j] = before * base.numerator / base.denominator
+            widths[ends, j] = (to - before) * base.numerator / base.denominator
+            holds[:, j] = points
+        return StepTable(begins, widths, holds)
+
+    def arrive(self, k: int, *, last: bool) -> None:
+        """Note that all plants have stepped up to tick ``k``, as `go` does to each tick that is visited."""
+        for path, before in () if self.regular else self.reached.items():
+            points = k if last and path not in self._even else max(p.latest(k) for p in self._flat.plant_ticks[path])
+            self.reached[path] = max(before, points)
 
     @property
     def apart(self) -> bool:
         """Whether several plants step, one of them in a process of its own."""
         return len(self._plants) > 1 and any(map(runs_apart, self._plants.values()))
 
-    def step_together(self, t: float, h: float) -> None:
-        """Step all plants from t over h, both in s."""
-        if self.apart:
-            step_all(self._plants.values(), t, h)
-        else:
-            for plant in self._plants.values():
-                plant.step(t, h)
-
-    def step_to(self, k: int, *, last: bool) -> None:
-        """Step the plants of which a tick is a communication point to it; at the ``last`` tick all that can.
-
-        A plant that stops on its way, at the end of a run, goes on from there with the inputs that it holds.
-        """
-        for path, plant in self._plants.items():
-            if self._flat.steps_at(path, k) or (last and path not in self._even):
-                before = self.reached[path]
-                if k > before:
-                    plant.step(self._time_of(before), float(self._flat.base * (k - before)))
-                    self.reached[path] = k
-
     def hold(self, k: int) -> None:
         """Let the plants of which a tick is a communication point hold their inputs from there on."""
         if self.regular:
             self.take_inputs()
             return
-        for path, own in self._own.items():
+        for path, own in self.own.items():
             if self._flat.steps_at(path, k):
-                self.inputs[own] = self._z[own]
+                self.inputs[own] = self.z[own]
 
     def end_at(self, end: float, k: int) -> None:
         """Step all plants from where they stand to the end of the run, in s, after tick ``k`` and before the next."""
@@ -153,9 +183,14 @@ def step_all(plants: Iterable[Plant], t: float, h: float) -> None:
     Every step that has begun is ended, also where one fails; then the first error is raised, and a plant's request to
     end the run only where nothing else has failed.
     """
+    step_each((plant, t, h) for plant in plants)
+
+
+def step_each(steps: Iterable[tuple[Plant, float, float]]) -> None:
+    """Let plants step, each from its own time over its own length, both in s; see `step_all`."""
     begun: list[Any] = []
     failure: SimulationError | None = None
-    for plant in plants:
+    for plant, t, h in steps:
         apart: Any = plant
         try:
             if hasattr(plant, "start_step"):

@@ -11,7 +11,7 @@ from .flatten import renumber, write_numbers
 from .functions import indicators_of
 from .layout import FlatEvent, StateLayout
 from .logic import TRUE, is_true
-from .plant_ticks import own_step, takes_any_step
+from .plant_ticks import StepTable, own_step, takes_any_step
 from .program import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE_OF, Ids, Operation, PartProgram, Program, TickProgram
 from .stages import Bound, Evaluators, OpaqueStage, Schedule, bind_function, evaluate_apart
 from .total_derivative import Derivative, size_of_motion
@@ -50,6 +50,7 @@ __all__ = [
     "Program",
     "Schedule",
     "StateLayout",
+    "StepTable",
     "TickPattern",
     "TickProgram",
     "Times",

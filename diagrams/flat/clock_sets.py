@@ -21,8 +21,12 @@ def is_exact(flat: FlatLayout, last: int) -> bool:
 
 
 def kinds_of(flat: FlatLayout, *, every: bool) -> list[frozenset[TickPattern]]:
-    """Return the sets of clocks that act together at some of the first million ticks; of very many the commonest."""
-    return [acting for acting in _sets_of(flat.distinct) if acting or every or not flat.distinct]
+    """Return the sets of clocks that act together at some of the first million ticks; of very many the commonest.
+
+    That of no clock is one of them where ticks are visited at which nothing but a plant has to do.
+    """
+    idle = every or not flat.distinct or not {*flat.visited} <= {*flat.distinct}
+    return [acting for acting in _sets_of(flat.distinct) if acting or idle]
 
 
 @lru_cache(maxsize=64)

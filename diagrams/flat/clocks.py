@@ -29,6 +29,10 @@ class TickPattern:
         """Return the first of its ticks after tick ``k``."""
         return self.offset if k < self.offset else k + self.every - (k - self.offset) % self.every
 
+    def latest(self, k: int) -> int:
+        """Return the last of its ticks up to tick ``k``; -1 if there is none."""
+        return -1 if k < self.offset else k - (k - self.offset) % self.every
+
 
 NONE: frozenset[TickPattern] = frozenset()
 """The clocks that act between two ticks."""

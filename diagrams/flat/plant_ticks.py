@@ -9,11 +9,35 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from fractions import Fraction
+
+import numpy as np
 
 from ...blocks.core import Block
 from ..wiring import Structure, exact_time, stepped_blocks
 from .clocks import EVERY, TickPattern, in_order
+
+
+@dataclass(frozen=True, eq=False)
+class StepTable:
+    """Steps of the plants that end at some ticks, for a loop over these; each array has a row for each tick.
+
+    Attributes
+    ----------
+    begins, widths : ndarray, shape (n, plants)
+        Where the step of each plant begins, and its length, in s; length 0 where none ends at the tick.
+    holds : ndarray, shape (n, plants), of uint8
+        Whether the plant takes the tick's inputs, and holds them to its next communication point.
+    """
+
+    begins: np.ndarray
+    widths: np.ndarray
+    holds: np.ndarray
+
+    def part(self, start: int, stop: int) -> StepTable:
+        """Return some of its ticks, by their places."""
+        return StepTable(self.begins[start:stop], self.widths[start:stop], self.holds[start:stop])
 
 
 def takes_any_step(plant: Block) -> bool:

@@ -1,20 +1,16 @@
-"""Between Python and C: plans of the solver, domains of indicators, and plants are handed over and taken back."""
+"""Between Python and C: plans of the solver and domains of indicators are handed over and taken back."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 
 from ...blocks.core import SimulationError
-from ...fmus.calls import FmuInstance
 from ..compiled import (
     LIBRARY_METHODS,
-    REFUSED,
-    TOLD,
-    UNDER_WAY,
     CompiledHybrid,
     CompiledLoop,
     Fired,
@@ -25,15 +21,14 @@ from ..compiled import (
     Pile,
     TickCode,
     Watch,
-    compile_other_side,
 )
-from ..coupling import Plant, PlantSteps, end_all, runs_apart, step_all
 from ..events import Domains
 from ..exchange import INPUT_EVENT
 from ..flat import NONE, TickPattern
 from ..results import Recorder
 from ..solvers import SUNDIALS, AutoSolver
 from .algebraic_loops import newton_options
+from .compiled_plants import PlantsInC
 from .continuous import Continuous
 from .solver_setup import has_guards, next_instant, remembers
 from .workspace import Workspace
@@ -44,7 +39,7 @@ _METHODS = {"euler": "Euler", "heun": "Heun", "rk4": "Runge-Kutta 4", "RK23": "B
 
 
 def bind_loop(
-    workspace: Workspace, plants: Iterable[FmuInstance], code: TickCode, recorder: Recorder, stops: Sequence[int],
+    workspace: Workspace, plants: PlantsInC, code: TickCode, recorder: Recorder, stops: Sequence[int],
     exchange: NativeExchange | None = None,
 ) -> CompiledLoop:  # fmt: skip
     """Return the loop over ticks in C, bound to the numbers of a run, its plants, and the samples that it keeps."""
@@ -53,13 +48,15 @@ def bind_loop(
         code,
         [here.t, here.x, here.w, here.p],
         [workspace.x_next, workspace.z, workspace.log, workspace.ok],
-        [*plants],
+        [*plants.entries.values()],
         columns=entries,
         width=workspace.log.size if entries is None else len(entries),
         every=recorder.every,
         stops=stops,
         loops={clocks: newton_options(workspace.flat, clocks) for clocks in code.loops},
         exchange=exchange,
+        held=plants.held,
+        inputs=plants.inputs,
     )
 
 
@@ -67,8 +64,7 @@ def bind_hybrid(
     code: HybridCode,
     workspace: Workspace,
     continuous: Continuous,
-    plants: Iterable[FmuInstance],
-    steps: PlantSteps,
+    plants: PlantsInC,
     recorder: Recorder,
     stops: Sequence[int],
     methods: Sequence[MethodOptions],
@@ -78,9 +74,9 @@ def bind_hybrid(
     handed = (
         None if blocks is None else HandedOver(flat, blocks.blocks, blocks.evaluators, partial(_tell_jump, continuous))
     )
-    native, plants = None if handed is None else handed.native, [*plants]
+    native = None if handed is None else handed.native
     ticks = bind_loop(workspace, plants, code.ticks, recorder, stops, native)
-    always = bool(plants) or workspace.looped or remembers(flat) or has_guards(flat)
+    always = bool(plants.entries) or workspace.looped or remembers(flat) or has_guards(flat)
     judged = code.judged and not continuous.fixed
     loop = CompiledHybrid(
         code, flat, ticks, [here.t, here.x, here.w, here.p], workspace.x_next, methods,
@@ -88,7 +84,6 @@ def bind_hybrid(
         spacing=math.inf if domains is None else domains.spacing,
         own=() if domains is None else domains.own,
         accepts=1 if always or (judged and native is None) else 2 if judged else 0,
-        held=(workspace.z, steps.inputs),
         loops=newton_options(flat, NONE) if flat.active_loops(NONE) else None,
         exchange=native,
         delays=continuous.delays,
@@ -201,73 +196,6 @@ def restore_plans(continuous: Continuous, methods: Sequence[MethodOptions], step
         continuous.solver.restore(saved)
     elif "planned" in saved:
         continuous.solver.restore({"planned": steps[0]})
-
-
-def plants_for_c(plants: Mapping[str, Plant]) -> dict[str, FmuInstance]:
-    """Return the plants that the loop in C can go over, by path: FMUs, whose steps are its own or Python's."""
-    return {path: plant for path, plant in plants.items() if isinstance(plant, FmuInstance)}
-
-
-def prepare(plants: Iterable[FmuInstance]) -> Callable[[], object]:
-    """Return a function that compiles what the steps of plants need beside the code of a diagram."""
-    apart = any(map(runs_apart, plants))
-    return compile_other_side if apart else lambda: None
-
-
-def step_plants(plants: Sequence[FmuInstance], t: float, h: float) -> None:
-    """Step all plants from t over h, both in s, by Python."""
-    if len(plants) > 1 and any(map(runs_apart, plants)):
-        step_all(plants, t, h)
-    else:
-        for plant in plants:
-            plant.step(t, h)
-
-
-def end_steps(
-    loop: CompiledLoop, plants: Sequence[FmuInstance], first: int, stage: int, status: int, t: float, h: float
-) -> None:
-    """Go on with steps from t over h, both in s, from the plant on that C could not go beyond.
-
-    Parameters
-    ----------
-    loop : CompiledLoop
-        The loop that has returned.
-    plants : sequence of FmuInstance
-        All plants; those before the first one have taken their steps.
-    first : int
-        Place of that plant.
-    stage, status : int
-        How far C has come with it; see `Outcome`.
-
-    Raises
-    ------
-    SimulationError
-        Of the first plant that fails, once no other one is under way.
-    """
-    if stage == REFUSED:
-        step_plants(plants, t, h)
-        return
-    rest = list[Callable[[], None]]()
-    for plant, begun in zip(plants[first:], loop.begun()[first:], strict=True):
-        if begun:
-            rest.append(partial(plant.finish_remote, t, h))
-        elif plant is not plants[first]:
-            rest.append(partial(plant.step, t, h))
-        elif stage == TOLD:
-            rest.append(loop.check_steps)
-        else:
-            assert stage != UNDER_WAY
-            rest.append(partial(_judge, plant, stage, status, t, h))
-    if len(plants) > 1 and any(map(runs_apart, plants)):
-        end_all(rest)
-    else:
-        for end in rest:
-            end()
-
-
-def _judge(plant: FmuInstance, stage: int, status: int, t: float, h: float) -> None:
-    plant.judge_native(stage, status, t, h)
-    plant.read(t + h)
 
 
 def changes_method(workspace: Workspace, continuous: Continuous, t: float, h: float) -> bool:

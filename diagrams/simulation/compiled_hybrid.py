@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from time import perf_counter
 from typing import Any
@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import CompilerError, LoopwrightError, SimulationError
-from ...fmus.calls import FmuInstance
 from ..compiled import (
     USES_SLOPE,
     BackgroundCode,
@@ -26,7 +25,6 @@ from ..compiled import (
     hybrid_sources,
     interpret_hybrid,
 )
-from ..coupling import Plant, PlantSteps
 from ..flat import EVERY, ClockSets, FlatDiagram, is_exact, kinds_of, ticks_after
 from ..results import Recorder
 from .compiled_hand_over import (
@@ -34,7 +32,6 @@ from .compiled_hand_over import (
     bind_hybrid,
     changes_method,
     describe_methods,
-    end_steps,
     end_tick,
     find_edges,
     hand_over_domains,
@@ -42,20 +39,12 @@ from .compiled_hand_over import (
     methods_of,
     pile_up,
     planned_steps,
-    plants_for_c,
-    prepare,
     restore_plans,
     take_back_domains,
     tell_fired,
 )
-from .compiled_ticks import (
-    FIRST,
-    LARGEST_CHUNK,
-    WISHED,
-    LaterCode,
-    find_obstacle_at_ticks,
-    tell_missing_once,
-)
+from .compiled_plants import PlantsInC
+from .compiled_ticks import FIRST, LARGEST_CHUNK, WISHED, LaterCode, tell_missing_once
 from .continuous import Continuous
 from .diagnosis import forget_trials
 from .ticks import take_tick
@@ -71,10 +60,8 @@ class HybridTicks:
         The run's numbers.
     continuous : Continuous
         Its solver and events.
-    plants : mapping of str to FmuInstance
-        The plants by path, bound.
-    steps : PlantSteps
-        Their steps, as Python takes them.
+    plants : PlantsInC
+        The plants, bound.
     stops : sequence of int
         Entries of the log that end the run where they are true.
     every : bool
@@ -94,8 +81,7 @@ class HybridTicks:
         self,
         workspace: Workspace,
         continuous: Continuous,
-        plants: Mapping[str, FmuInstance],
-        steps: PlantSteps,
+        plants: PlantsInC,
         stops: Sequence[int],
         *,
         every: bool,
@@ -103,14 +89,14 @@ class HybridTicks:
         fuse: bool = False,
     ):
         flat = self._flat = workspace.flat
-        self._workspace, self._continuous, self._plants, self._steps = workspace, continuous, plants, steps
+        self._workspace, self._continuous, self._plants = workspace, continuous, plants
         self._stops = stops
         self._methods = methods_of(continuous)
         self._acting, self._stiff = kinds_of(flat, every=every), is_stiff(continuous)
         self._code = find_code(flat, continuous, every=every, machine=machine, fuse=fuse)
-        self._clocks = flat.visited if plants else flat.distinct
+        self._clocks = flat.visited if plants.entries else flat.distinct
         self._sampled = every or not self._clocks or EVERY in self._clocks
-        lands = continuous.fixed or bool(plants) or continuous.lands
+        lands = continuous.fixed or bool(plants.entries) or continuous.lands
         self._lands = lands or not self._sampled
         self._loop: CompiledHybrid | None = None
         self._recorder: Recorder | None = None
@@ -130,7 +116,7 @@ class HybridTicks:
     def make_later(self) -> LaterCode[HybridCode]:
         """Return generated code of these functions that is made while they are interpreted."""
         write = partial(hybrid_sources, self._flat, self._acting, stiff=self._stiff)
-        return LaterCode(BackgroundCode(self._flat, write, prepare(self._plants.values())))
+        return LaterCode(BackgroundCode(self._flat, write, self._plants.prepare()))
 
     # --- going on ----------------------------------------------------------------------------------------------------
 
@@ -203,6 +189,7 @@ class HybridTicks:
             done, rest = rest[: found.ticks], rest[found.ticks :]
             if found.ticks:
                 k = int(done[-1])
+                self._plants.arrive(k, last)
                 landed = np.flatnonzero(lands[: found.ticks])
                 in_step = found.reason is HybridReason.FMU_FAILED
                 over = landed.size and arrived(int(done[landed[-1]]), in_step)
@@ -259,7 +246,8 @@ class HybridTicks:
         ends = np.concatenate([[k], ticks])
         n, d = base.numerator, base.denominator
         kinds = kinds[: len(ticks)]
-        return Span(ends * n / d, np.diff(ends) * n / d, kinds, lands, self._time_of(beyond), *edges), lands
+        steps, then = self._plants.table(ticks, last), self._time_of(beyond)
+        return Span(ends * n / d, np.diff(ends) * n / d, kinds, lands, then, *edges, steps), lands
 
     # --- by Python ---------------------------------------------------------------------------------------------------
 
@@ -279,19 +267,22 @@ class HybridTicks:
 
                 ended = continuous.advance(found.t, end, (), sample)
                 if ended is None:
-                    self._steps.go(k, following, last=following == last)
+                    self._plants.go(k, following, last)
             elif found.reason in (HybridReason.FMU_FAILED, HybridReason.FMU_FLAGS):
-                self._judge(found, self._time_of(k), float(flat.base * (following - k)))
-            elif found.reason is HybridReason.OUTSIDE_FAILED and self._handed is not None:
+                self._plants.go_on(loop.ticks, found, k, following, last)
+            elif found.reason is HybridReason.OUTSIDE_FAILED:
+                assert self._handed is not None
                 self._handed.judge()
+            else:
+                self._plants.arrive(following, last)
         except SimulationError as error:
             raise error.at(t=end) from error.__cause__
         if ended is None:
             if found.reason is HybridReason.ASK_REST:
                 end_tick(workspace, continuous, loop, end, flat.acting(following))
             else:
-                take_tick(workspace, continuous, self._plants, end, flat.acting(following))
-            self._steps.hold(following)
+                take_tick(workspace, continuous, self._plants.entries, end, flat.acting(following))
+            self._plants.steps.hold(following)
             recorder.row(end, workspace.log)
         self._hand_over(loop, end if ended is None else ended)
         return ended
@@ -309,19 +300,13 @@ class HybridTicks:
         self._hand_over(loop, found.t)
         return ended
 
-    def _judge(self, found: HybridOutcome, now: float, h: float) -> None:
-        """Go on from the call of an FMU that the loop could not go beyond."""
-        status = found.status if found.reason is HybridReason.FMU_FAILED else 0
-        assert self._loop is not None
-        end_steps(self._loop.ticks, [*self._plants.values()], found.plant, found.stage, status, now, h)
-
     # --- between Python and C ----------------------------------------------------------------------------------------
 
     def _bind(self, recorder: Recorder) -> CompiledHybrid:
         if self._loop is None or recorder is not self._recorder:
             self._loop, self._handed = bind_hybrid(
-                self._code, self._workspace, self._continuous, self._plants.values(), self._steps, recorder,
-                self._stops, self._methods,
+                self._code, self._workspace, self._continuous, self._plants, recorder, self._stops,
+                self._methods,
             )  # fmt: skip
             self._recorder = recorder
             self._kinds = ClockSets(self._flat.distinct, self._loop.kinds)
@@ -389,12 +374,10 @@ _ACTING = frozenset({HybridReason.ASK_SETTLE, HybridReason.ASK_FIRE})
 def make_hybrid(
     workspace: Workspace,
     continuous: Continuous,
-    plants: Mapping[str, Plant],
-    steps: PlantSteps,
+    plants: PlantsInC,
     stops: Sequence[int],
     *,
     every: bool,
-    coupled: bool,
     machine: bool = False,
     fuse: bool = False,
 ) -> tuple[HybridTicks | None, tuple[str, ...]]:
@@ -402,22 +385,24 @@ def make_hybrid(
 
     Parameters
     ----------
-    coupled : bool
-        Whether another coupling than "jacobi" is asked for.
+    plants : PlantsInC
+        The plants, bound.
     machine : bool, default False
         Let the virtual machine evaluate the functions; then nothing is said but that the library can't be had.
     fuse : bool, default False
         Compile them for the processor of this machine.
     """
-    native = plants_for_c(plants)
     flat = workspace.flat
     reason = None if machine else find_code_obstacle(flat)
     if reason is None and continuous.exchanged is not None:
         reason = find_exchange_obstacle(continuous.exchanged.blocks)
-    reason = reason or find_obstacle_at_ticks(workspace.flat, plants, native, steps, coupled=coupled)
+    if plants.are_coupled:
+        reason = reason or (
+            "coupling= asks for another one than 'jacobi': Python takes FMUs and continuous states to the next tick"
+        )
     if reason is None:
         try:
-            found = HybridTicks(workspace, continuous, native, steps, stops, every=every, machine=machine, fuse=fuse)
+            found = HybridTicks(workspace, continuous, plants, stops, every=every, machine=machine, fuse=fuse)
         except (LoopwrightError, OSError) as error:
             if machine:
                 return None, tell_missing_once(error)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -28,10 +28,19 @@ from ..compiled import (
     interpret_ticks,
     write_ticks,
 )
-from ..coupling import Plant, PlantSteps
-from ..flat import EVERY, EXACT_LOOP, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of, ticks_after
+from ..flat import (
+    EVERY,
+    EXACT_LOOP,
+    ClockSets,
+    FlatDiagram,
+    TickPattern,
+    is_exact,
+    kinds_of,
+    ticks_after,
+)
 from ..results import Recorder
-from .compiled_hand_over import bind_loop, end_steps, plants_for_c, prepare, step_plants
+from .compiled_hand_over import bind_loop
+from .compiled_plants import PlantsInC
 from .diagnosis import forget_trials
 from .workspace import Workspace
 
@@ -83,8 +92,8 @@ class CompiledTicks:
     ----------
     workspace : Workspace
         The run's numbers.
-    plants : mapping of str to FmuInstance
-        The plants by path, bound.
+    plants : PlantsInC
+        The plants, bound.
     stops : sequence of int
         Entries of the log that end the run where they are true.
     every : bool
@@ -101,14 +110,14 @@ class CompiledTicks:
     def __init__(
         self,
         workspace: Workspace,
-        plants: Mapping[str, FmuInstance],
+        plants: PlantsInC,
         stops: Sequence[int],
         *,
         every: bool,
         code: TickCode | None = None,
     ):
         flat = self._flat = workspace.flat
-        self._workspace, self._plants, self._every, self._stops = workspace, [*plants.values()], every, stops
+        self._workspace, self._plants, self._every, self._stops = workspace, plants, every, stops
         self._code = compile_ticks(flat, kinds_of(flat, every=every)) if code is None else code
         self._loop: CompiledLoop | None = None
         self._recorder: Recorder | None = None
@@ -137,7 +146,7 @@ class CompiledTicks:
     def make_later(self) -> LaterCode[TickCode]:
         """Return generated code of these ticks that is made while they are interpreted."""
         write = partial(write_ticks, self._flat.origin, [*self._code.ticks])
-        return LaterCode(BackgroundCode(self._flat, write, prepare(self._plants)))
+        return LaterCode(BackgroundCode(self._flat, write, self._plants.prepare()))
 
     def run(
         self,
@@ -159,32 +168,40 @@ class CompiledTicks:
             Told the time after each chunk.
         """
         for window in self._windows(k, last):
-            if self._run_window(window, recorder, arrived, progress):
+            if self._run_window(window, last, recorder, arrived, progress):
                 return
 
     def _run_window(
-        self, window: _Window, recorder: Recorder, arrived: Callable[..., bool], progress: Callable[[float], Any]
+        self,
+        window: _Window,
+        last: int,
+        recorder: Recorder,
+        arrived: Callable[..., bool],
+        progress: Callable[[float], Any],
     ) -> bool:
         """Run some ticks; return whether the run ends there."""
         at, k = 0, window.before
+        table = self._plants.table(np.asarray(window.ticks), last)
         while at < len(window.kinds):
             loop = self._bind(recorder)  # generated code may have come
             rows = recorder.room(float(window.times[at]))
             loop.skip = recorder.skip
             stop = window.known(at, min(at + self._chunk, at + recorder.skip + (len(rows) - 1) * recorder.every + 1))
             started = perf_counter()
-            found = loop.run(window.times[at : stop + 1], window.widths[at:stop], window.kinds[at:stop], rows)
+            steps = None if table is None else table.part(at, stop)
+            found = loop.run(window.times[at : stop + 1], window.widths[at:stop], window.kinds[at:stop], rows, steps)
             recorder.took(found.rows, loop.skip)
             at += found.ticks
             if found.ticks:
                 k = int(window.ticks[at - 1])
+                self._plants.arrive(k, last)
                 if arrived(k, found.reason is Reason.FMU_FAILED):
                     return True
             if found.reason is Reason.HALTED and found.ticks:
                 self._chunk = max(1, self._chunk // 2)
             elif at < stop or not found.ticks:  # Python looks at this tick
                 following = int(window.ticks[at])
-                self._take_tick(k, following, found, recorder)
+                self._take_tick(k, following, last, found, recorder)
                 k, at = following, at + 1
                 if arrived(k):
                     return True
@@ -228,24 +245,24 @@ class CompiledTicks:
             self._loop = bind_loop(self._workspace, self._plants, self._code, recorder, self._stops)
         return self._loop
 
-    def _take_tick(self, before: int, k: int, found: Outcome, recorder: Recorder) -> None:
+    def _take_tick(self, before: int, k: int, last: int, found: Outcome, recorder: Recorder) -> None:
         """Go through a tick at which the loop has returned: from the call on that it could not go beyond."""
         workspace, base = self._workspace, self._flat.base
-        now, h = before * base.numerator / base.denominator, float(base * (k - before))
         t = k * base.numerator / base.denominator
         try:
             if found.reason is Reason.NOT_OK:
+                self._plants.arrive(k, last)
                 forget_trials(self._flat)  # an interrupt of a block of Python is raised
             elif found.reason in (Reason.FMU_FAILED, Reason.FMU_FLAGS):
-                status = found.status if found.reason is Reason.FMU_FAILED else 0
                 assert self._loop is not None
-                end_steps(self._loop, self._plants, found.plant, found.stage, status, now, h)
+                self._plants.go_on(self._loop, found, before, k, last)
             else:
-                step_plants(self._plants, now, h)
+                self._plants.go(before, k, last)
         except SimulationError as error:
             raise error.at(t=t) from error.__cause__
         workspace.here.t[0] = t
         workspace.tick(self._flat.acting(k))
+        self._plants.steps.hold(k)
         recorder.row(t, workspace.log)
 
 
@@ -275,12 +292,10 @@ def bind_evaluations(
 
 def make_compiled(
     workspace: Workspace,
-    plants: Mapping[str, Plant],
+    plants: PlantsInC,
     stops: Sequence[int],
     *,
-    steps: PlantSteps,
     every: bool,
-    coupled: bool,
     machine: bool = False,
     fuse: bool = False,
 ) -> tuple[CompiledTicks | None, tuple[str, ...]]:
@@ -288,24 +303,20 @@ def make_compiled(
 
     Parameters
     ----------
-    steps : PlantSteps
-        Steps of the plants.
-    coupled : bool
-        Whether another coupling than "jacobi" is asked for.
+    plants : PlantsInC
+        The plants, bound.
     machine : bool, default False
         Let the virtual machine evaluate them; then nothing is said where they can't be had.
     fuse : bool, default False
         Compile ticks and plants of our own together, for the processor of this machine.
     """
-    native = plants_for_c(plants)
     reason = None if machine else find_obstacle(workspace.flat)
-    reason = reason or find_obstacle_at_ticks(workspace.flat, plants, native, steps, coupled=coupled)
     if reason is None:
         try:
             acting = kinds_of(workspace.flat, every=every)
-            code = _fuse(workspace.flat, native, every=every) if fuse else None
+            code = _fuse(workspace.flat, plants, every=every) if fuse else None
             code = interpret_ticks(workspace.flat, acting) if machine else code
-            found = CompiledTicks(workspace, native, stops, every=every, code=code)
+            found = CompiledTicks(workspace, plants, stops, every=every, code=code)
         except (LoopwrightError, OSError) as error:
             if machine:
                 return None, tell_missing_once(error)
@@ -319,20 +330,21 @@ def make_compiled(
     return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)
 
 
-def _fuse(flat: FlatDiagram, native: Mapping[str, FmuInstance], *, every: bool) -> TickCode:
+def _fuse(flat: FlatDiagram, plants: PlantsInC, *, every: bool) -> TickCode:
     from ...fmus.running import Fmu  # only such a run needs the block
 
-    plants = {}
-    for path, plant in native.items():
-        block, step = flat.table.blocks[path], plant.native
-        assert isinstance(block, Fmu)
+    found = {}
+    for path, plant in plants.entries.items():
+        step = plant.native if isinstance(plant, FmuInstance) else None
         if step is None:
-            plants[path] = FusedPlant(None, (), ())
+            found[path] = FusedPlant(None, (), ())
             continue
+        block = flat.table.blocks[path]
+        assert isinstance(block, Fmu)
         file = block.description.file if _is_plain(block) else None
         to, of = (() if ports is None else ports.read_references() for ports in (step.inputs, step.outputs))
-        plants[path] = FusedPlant(file, to, of)
-    return compile_fused(flat, kinds_of(flat, every=every), plants)
+        found[path] = FusedPlant(file, to, of)
+    return compile_fused(flat, kinds_of(flat, every=every), found)
 
 
 def _is_plain(block: Fmu) -> bool:
@@ -380,26 +392,3 @@ def _tell_once(failure: Exception, text: str) -> tuple[str, ...]:
         return ()
     _TOLD.append(failure)
     return (text.format(str(failure).rstrip(".")),)
-
-
-def find_obstacle_at_ticks(
-    flat: FlatDiagram,
-    plants: Mapping[str, Plant],
-    native: Mapping[str, FmuInstance],
-    steps: PlantSteps,
-    *,
-    coupled: bool,
-) -> str | None:
-    """Return why the clocks and the plants of a run can't be gone over in C; None if they can."""
-    if coupled:
-        return "coupling= asks for another one than 'jacobi', whose steps Python takes"
-    if not steps.regular:
-        path = next(path for path in flat.plant_ticks if not steps.is_regular(path))
-        return (
-            f"{path!r} takes longer steps than from one tick to the next. With step={float(flat.base):.9g} all plants "
-            "step at each tick"
-        )
-    for path in plants:
-        if path not in native:
-            return f"{path!r} is no FMU"
-    return None

@@ -199,27 +199,19 @@ class Engine:
 
     def _make_compiled(self, *, machine: bool = False) -> CompiledTicks | HybridTicks | None:
         """Return the ticks in C; None, with a message, where they can't be had."""
+        from .compiled_hybrid import make_hybrid
+        from .compiled_plants import PlantsInC
         from .compiled_ticks import make_compiled
 
-        if self.continuous is not None:
-            return self._make_hybrid(machine=machine)
-        found, message = make_compiled(
-            self.workspace, self.plants, self._stops.entries, steps=self.steps, every=self.every_tick,
-            coupled=self.coupled is not None, machine=machine, fuse=self._fuse,
-        )  # fmt: skip
+        plants, stops = PlantsInC(self.flat, self.plants, self.steps, self.coupled), self._stops.entries
+        found: CompiledTicks | HybridTicks | None
+        options = {"every": self.every_tick, "machine": machine, "fuse": self._fuse}
+        if self.continuous is None:
+            found, message = make_compiled(self.workspace, plants, stops, **options)
+        else:
+            found, message = make_hybrid(self.workspace, self.continuous, plants, stops, **options)
         self.messages += message
         return found
-
-    def _make_hybrid(self, *, machine: bool = False) -> HybridTicks | None:
-        from .compiled_hybrid import make_hybrid
-
-        assert self.continuous is not None
-        ticks, message = make_hybrid(
-            self.workspace, self.continuous, self.plants, self.steps, self._stops.entries, every=self.every_tick,
-            coupled=self.coupled is not None, machine=machine, fuse=self._fuse,
-        )  # fmt: skip
-        self.messages += message
-        return ticks
 
     def take_first_tick(self, point: OperatingPoint | None, row: Row) -> None:
         """Go through the tick with which the run begins, tick 0 or that of an operating point, and record it."""

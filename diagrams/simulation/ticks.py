@@ -70,7 +70,7 @@ def run_ticks(
                 for step in each:
                     step(now, h)
             else:
-                steps.step_to(k, last=k == last)
+                steps.go(k - width, k, last=k == last)
         except SimulationError as error:
             raise error.at(t=k * n / d) from error.__cause__
         t[0] = now = k * n / d
@@ -197,7 +197,7 @@ def end_between_ticks(
 def take_tick(
     workspace: Workspace,
     continuous: Continuous | None,
-    plants: Mapping[str, Plant],
+    plants: Mapping[str, object],
     now: float,
     acting: frozenset[TickPattern],
 ) -> None:

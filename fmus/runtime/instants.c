@@ -37,9 +37,6 @@ typedef struct hybrid {
     int64_t switched;   /* 1: stiff, it seems; 2: no longer */
     double *solved;     /* values of the algebraic loops at an event */
     double looked_at;   /* step in s at which it seemed so */
-    const double *z;    /* inputs of all plants as they are now, and as they are held between ticks */
-    double *held;
-    int64_t inputs;
     double planned;     /* step in s that the method had in mind before it took the last one */
     outside *o;         /* FMUs in model exchange; NULL without any */
     double jump;        /* first discontinuity of a source, or event of time of an FMU, behind the stretch's begin */
@@ -510,7 +507,7 @@ static inline int64_t land(hybrid *h, progress *g) {
     loop *l = &h->l;
     const int64_t i = g->i, kind = s->kinds[i];
     const double t = s->times[i + 1];
-    const int64_t reason = step_plants(l, s->times[i], s->widths[i], g->out);
+    const int64_t reason = step_plants(l, i, s->times[i], s->widths[i], g->out);
     if (reason != DONE) return h->inside = 0, reason;
     keep_instant(h);
     enter(h, g, t);
@@ -533,7 +530,7 @@ static inline int64_t land(hybrid *h, progress *g) {
                 states[h->taken[j]] = h->taken_states[h->taken[j]];
     }
     h->inside = 0;
-    for (int64_t j = 0; j < h->inputs; j++) h->held[j] = h->z[j];
+    hold_inputs(l, i);
     g->out->rows = record(l, t, g->rows, g->out->rows);
     g->i++;
     return is_stopped(l) || (h->o && has_news(h->o)) ? STOPPED : DONE;

@@ -35,6 +35,13 @@ typedef struct {
     const quiet *quiet; /* ... but for those in which nothing is out of the ordinary; NULL: none */
 } plant;
 
+/* Steps of FMUs that don't all step at every tick: a row for each tick of a call, with an entry for each FMU. */
+typedef struct {
+    const double *begins, *widths; /* of the step that ends at the tick, in s; width 0: none does */
+    const uint8_t *holds;          /* whether the FMU takes the tick's inputs, and holds them to its next one */
+    const int64_t *inputs;         /* of each FMU: where its inputs begin and end */
+} own_steps;
+
 typedef struct {
     int64_t kinds, plants, states, row, stops, every;
     const tick *ticks;
@@ -49,6 +56,10 @@ typedef struct {
     volatile int32_t halt;  /* not 0: return before the next tick */
     newton *loops;          /* of each kind of tick; NULL: no algebraic loops */
     apart *apart;           /* of FMUs in other processes, or stepped by Python; NULL: there are none */
+    const double *z;        /* inputs of all FMUs as they are now */
+    double *held;           /* ... and as they are held between ticks; NULL: these are the same */
+    int64_t inputs;         /* number of both */
+    const own_steps *own;   /* NULL: every FMU steps at every tick */
 } loop;
 
 enum { DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED };
@@ -145,20 +156,36 @@ static inline bool is_for_c(const plant *p, double now, double width) {
     return p->far && (!p->by_python || is_quiet(p->quiet, now, width));
 }
 
+/* A step in s; of width 0 where there is none. */
+typedef struct {
+    double now, width;
+} stride;
+
+/* Return the step of FMU j to the end of tick i, which is `whole`. */
+static inline stride stride_of(const loop *l, int64_t i, int64_t j, stride whole) {
+    if (!l->own) return whole;
+    const int64_t k = i * l->plants + j;
+    return (stride){l->own->begins[k], l->own->widths[k]};
+}
+
 /* Let the FMUs in other processes begin their steps, all of them or none. */
-static inline int64_t begin_apart(const loop *l, double now, double width, outcome *out) {
-    for (int64_t j = 0; j < l->plants; j++)
-        if (is_for_c(l->fmus + j, now, width) && !fill_all(l->fmus[j].far)) {
+static inline int64_t begin_apart(const loop *l, int64_t i, stride whole, outcome *out) {
+    for (int64_t j = 0; j < l->plants; j++) {
+        const plant *p = l->fmus + j;
+        const stride s = stride_of(l, i, j, whole);
+        if (s.width != 0.0 && is_for_c(p, s.now, s.width) && !fill_all(p->far)) {
             out->plant = j;
             out->stage = REFUSED;
             return out->status = 0, FMU_FAILED;
         }
+    }
     for (int64_t j = 0; j < l->plants; j++) {
         const plant *p = l->fmus + j;
-        if (!is_for_c(p, now, width)) continue;
-        *p->now = begin_step(p->quiet, now, width);
-        *p->width = p->by_python ? now + width - now : width; /* parts of a step end where others begin */
-        if (p->quiet) tell_slopes(p->quiet, now);
+        const stride s = stride_of(l, i, j, whole);
+        if (s.width == 0.0 || !is_for_c(p, s.now, s.width)) continue;
+        *p->now = begin_step(p->quiet, s.now, s.width);
+        *p->width = p->by_python ? s.now + s.width - s.now : s.width; /* parts of a step end where others begin */
+        if (p->quiet) tell_slopes(p->quiet, s.now);
         post(p->far);
     }
     return DONE;
@@ -185,31 +212,47 @@ static inline bool step_by_python(const loop *l, const plant *p, double now, dou
     return false;
 }
 
-/* Step all FMUs, one after the other; those in other processes step meanwhile. */
-static inline int64_t step_plants(const loop *l, double now, double width, outcome *out) {
+/* Step the FMUs to the end of tick i, one after the other; those in other processes step meanwhile. */
+static inline int64_t step_plants(const loop *l, int64_t i, double now, double width, outcome *out) {
+    const stride whole = {now, width};
     if (l->apart) {
-        const int64_t reason = begin_apart(l, now, width, out);
+        const int64_t reason = begin_apart(l, i, whole, out);
         if (reason != DONE) return reason;
     }
     for (int64_t j = 0; j < l->plants; j++) {
         const plant *p = l->fmus + j;
+        const stride s = stride_of(l, i, j, whole);
         int64_t reason;
+        if (s.width == 0.0) continue;
         out->plant = j;
-        if (STEP_FUSED(j, p, now, width)) continue;
+        if (STEP_FUSED(j, p, s.now, s.width)) continue;
         if (p->far && p->far->state != IDLE) {
-            if ((reason = end_apart(l, p, width, out)) != DONE) return reason;
+            if ((reason = end_apart(l, p, s.width, out)) != DONE) return reason;
             continue;
         }
         if (p->by_python) {
-            if (step_by_python(l, p, now, width, out)) return FMU_FAILED;
+            if (step_by_python(l, p, s.now, s.width, out)) return FMU_FAILED;
             continue;
         }
         const uint64_t own = p->changed ? modes() : 0;
-        if ((reason = step_plant(p, now, width, own, out)) == DONE) reason = read_plant(p, now, width, l->near, out);
+        if ((reason = step_plant(p, s.now, s.width, own, out)) == DONE)
+            reason = read_plant(p, s.now, s.width, l->near, out);
         set_back(p, own);
         if (reason != DONE) return reason;
     }
     return DONE;
+}
+
+/* Let the FMUs that have come to the end of tick i hold their inputs from there on. */
+static inline void hold_inputs(const loop *l, int64_t i) {
+    if (!l->held) return;
+    if (!l->own) {
+        memcpy(l->held, l->z, (size_t)l->inputs * sizeof(double));
+        return;
+    }
+    for (int64_t j = 0; j < l->plants; j++)
+        if (l->own->holds[i * l->plants + j])
+            for (int64_t k = l->own->inputs[2 * j]; k < l->own->inputs[2 * j + 1]; k++) l->held[k] = l->z[k];
 }
 
 /* Evaluate a tick at which clocks of some kind act; return DONE, or why its results are not to be taken over. */
@@ -257,10 +300,11 @@ VISIBLE void loopwright_run(loop *l, int64_t count, const double *times, const d
             out->reason = HALTED;
             break;
         }
-        if ((out->reason = step_plants(l, times[i], widths[i], out)) != DONE) break;
+        if ((out->reason = step_plants(l, i, times[i], widths[i], out)) != DONE) break;
         *l->t = times[i + 1];
         if ((out->reason = evaluate(l, kinds[i])) != DONE) break;
         memcpy(l->x, l->x_next, (size_t)l->states * sizeof(double));
+        hold_inputs(l, i);
         out->rows = record(l, times[i + 1], rows, out->rows);
         if (is_stopped(l)) {
             out->reason = STOPPED;

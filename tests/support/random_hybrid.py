@@ -10,12 +10,13 @@ import numpy as np
 
 from loopwright import blocks as lw
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus import Fmu, build
+from loopwright.fmus import Fmu, StepOptions, build
 
 from .plain_blocks import HUNDREDTH, KINDS, Draw, Pendulum
 from .reference_loop import DelicateError, Part, ReferenceLoop
 
-FAMILIES = ("sampled", "continuous", "hybrid", "plants")
+FAMILIES = ("sampled", "continuous", "hybrid", "plants", "slower")
+"""Of the last two with FMUs, "slower" with communication steps of their own; every other one of these has no solver."""
 PERIODS = (2, 3, 4, 5, 6, 10, Fraction(20, 3))
 EVENTFUL = ("alarm", "takes", "latch", "counter", "relay", "resettable_integrator", "crossings", "compare")
 """Kinds that are drawn more often: what they keep jumps."""
@@ -58,6 +59,8 @@ class Node:
     reads: tuple[str, ...]
     makes: str
     sources: list[str] = field(default_factory=list)
+    own: Fraction | None = None
+    """Communication step in s that an FMU asks for."""
 
 
 def reference(case):
@@ -128,7 +131,8 @@ def make(family, seed):
         made, part = kind.make(Draw(rng, name, None if clock is None else float(clock[0]), end), **given)
         nodes.append(Node(name, frame, made, replace(part, clock=clock), kind.reads, kind.makes))
 
-    frames_at_hand = range(int(family == "sampled"), len(frames))
+    solved = family != "sampled" and (family != "slower" or seed % 2 == 0)  # else nothing moves between ticks
+    frames_at_hand = range(int(not solved), len(frames))
     for name_of_kind in ("sine", "step", "logic_train", "clock"):
         add(name_of_kind, pick(frames_at_hand))
     for _ in range(int(rng.integers(6, 16))):
@@ -136,9 +140,10 @@ def make(family, seed):
         fits = {n: k for n, k in KINDS.items() if (k.sampled if frame else k.continuous)}
         shares = np.array([(4 if k.reads else 1) * (3 if n in EVENTFUL else 1) for n, k in fits.items()], dtype=float)
         add(str(rng.choice(list(fits), p=shares / shares.sum())), frame)
-    if family == "plants":
-        for _ in range(int(rng.integers(1, 3))):
-            add_plant(nodes, rng)
+    if family in ("plants", "slower"):
+        for _ in range(int(rng.integers(1, 3)) + (family == "slower")):
+            own = Fraction(pick(PERIODS)) / 100 if family == "slower" and rng.random() < 0.7 else None
+            add_plant(nodes, rng, own)
     for i, node in enumerate(nodes):
         for wanted in node.reads:
             allowed = [
@@ -150,12 +155,12 @@ def make(family, seed):
             jumping = [n for n in allowed if n.part.events and n.part.z]
             source = pick(jumping if jumping and node.frame and rng.random() < 0.6 else allowed)
             node.sources.append(f"{source.name}.{pick(source.part.ports)}")
-    if family in ("hybrid", "plants"):
+    if family in ("hybrid", "plants") or (family == "slower" and solved):
         add_alarm(nodes, add, pick, frames, rng, end)
     loops = rng.random() < 0.4
     if loops:
         close_loops(nodes, frames_at_hand, frames, rng, end)
-    clocks = sorted({n.part.clock for n in nodes} - {None})
+    clocks = sorted({n.part.clock for n in nodes} - {None} | {(n.own, Fraction(0)) for n in nodes if n.own})
     solver = pick([name for name in SOLVERS if family in ("continuous", "hybrid") or name != "rk4"])
     options = {"step": None, "every": pick((1, 1, 1, 2, 3))}
     if family != "sampled":
@@ -168,6 +173,10 @@ def make(family, seed):
     elif family != "sampled" and rng.random() < 0.5:
         options["step"] = base_of(clocks, None) / pick((1, 1, 2))
     step = options["step"]
+    if (
+        family == "slower"
+    ):  # else plants stop at the last tick, too, and go on from there with the inputs that they hold
+        end = int(end / base_of(clocks, step)) * base_of(clocks, step)
     settle_plants(nodes, step, clocks)
     parts = [replace(n.part, inputs=tuple(n.sources)) for n in nodes]
     samples = visited(parts, clocks, step, end, options["every"])
@@ -211,10 +220,11 @@ def pendulum_fmu():
     return build(Pendulum(), internal_step=5e-4)
 
 
-def add_plant(nodes, rng):
-    """Add a pendulum as an FMU, with its equations in the reference loop."""
+def add_plant(nodes, rng, own):
+    """Add a pendulum as an FMU, with its equations in the reference loop; ``own`` is its communication step or None."""
     name, w, damping, angle = f"plant{len(nodes)}", *(float(v) for v in rng.uniform([1, 0.1, -2], [4, 0.5, 2]))
-    made = Fmu(pendulum_fmu(), name=name, start={"w": w, "damping": damping, "y": angle})
+    start, stepping = {"w": w, "damping": damping, "y": angle}, StepOptions(communication_step=own)
+    made = Fmu(pendulum_fmu(), name=name, start=start, stepping=stepping)
     part = Part(
         name,
         lambda t, x, z, u: x[0],
@@ -223,7 +233,7 @@ def add_plant(nodes, rng):
         direct=False,
         plant=((Fraction(1), Fraction(0)),),  # until `settle_plants`
     )
-    nodes.append(Node(name, 0, made, part, ("real",), "real"))
+    nodes.append(Node(name, 0, made, part, ("real",), "real", own=own))
 
 
 def settle_plants(nodes, step, clocks):
@@ -255,6 +265,7 @@ def settle_plants(nodes, step, clocks):
     for n in plants:
         own = {of[m].part.clock for name in groups[n.name] for m in reached[name]} - {None}
         ticks = [(base_of(clocks, step), Fraction(0))] if step else sorted(own or set(clocks))
+        ticks = [(n.own, Fraction(0))] if n.own else ticks
         n.part = replace(n.part, plant=tuple(ticks))
 
 

@@ -9,14 +9,19 @@ import sys
 from pathlib import Path
 
 _STEP_PLANTS = """\
-    const int64_t reason = step_plants(l, s->times[i], s->widths[i], g->out);
+    const int64_t reason = step_plants(l, i, s->times[i], s->widths[i], g->out);
     if (reason != DONE) return h->inside = 0, reason;
 """
 _TAKE_STATES = "memcpy(l->x, l->x_next, (size_t)l->states * sizeof(double));\n"
 _SETTLE = "    if (h->w.m || h->o) {\n        enter(h, g, t);"
 _RECORD = "    g->out->rows = record(l, t, g->rows, g->out->rows);\n"
-_HOLD = "    for (int64_t j = 0; j < h->inputs; j++) h->held[j] = h->z[j];\n"
-_LATE = "    static double late[64];\n    for (int64_t j = 0; j < h->inputs; j++) h->held[j] = late[j], late[j] = h->z[j];\n"
+_HOLD = "    h->inside = 0;\n    hold_inputs(l, i);\n"
+_LATE = """\
+    static double late[64];
+    h->inside = 0;
+    for (int64_t j = 0; j < l->inputs; j++) l->held[j] = late[j], late[j] = l->z[j];
+"""
+_STRIDE = "    return (stride){l->own->begins[k], l->own->widths[k]};"
 _ROOT = "lw_leave(&(search){w, p, m}, i, low, high, a, value_a, b, value_b, w->finest, lost);"
 _EVALUATE = "        if ((out->reason = evaluate(l, kinds[i])) != DONE) break;\n"
 
@@ -26,6 +31,13 @@ FAULTS = {
         (_SETTLE, _STEP_PLANTS + _SETTLE),
     ],
     "plants get the inputs of the tick before": [(_HOLD, _LATE)],
+    "plants with longer steps take the inputs of every tick": [
+        ("if (l->own->holds[i * l->plants + j])", "if (l->own->holds[i * l->plants + j] || i >= 0)"),
+    ],
+    "longer steps of plants are as short as the ticks": [
+        (_STRIDE, "    return (stride){l->own->begins[k], l->own->widths[k] > 0.0 ? whole.width : 0.0};"),
+    ],
+    "plants with longer steps step at every tick, too": [("    if (!l->own) return whole;", "    return whole;")],
     "an event is at the end of the bracket": [("const double t = " + _ROOT, "const double t = b;")],
     "events wait for the tick": [
         ("        const int result = settle(h, t, true);", "        const int result = QUIET;"),
@@ -64,7 +76,7 @@ FAULTS = {
     "step control accepts errors a thousand times too large": [
         ("        if (error < 1.0) {", "        if (error < 1e3) {")
     ],
-    "sampled states are a tick old": [("        " + _TAKE_STATES + "        out->rows", "        out->rows")],
+    "sampled states are a tick old": [("        " + _TAKE_STATES + "        hold_inputs", "        hold_inputs")],
     "sampled states change before the tick": [
         (_EVALUATE, _EVALUATE + "        " + _TAKE_STATES + "        evaluate(l, kinds[i]);\n"),
     ],

@@ -224,22 +224,6 @@ def test_tables_are_compiled_and_may_differ_in_signs_of_zeros():
     assert "signs of zeros" in " ".join(compiled.messages)
 
 
-def test_an_fmu_that_takes_longer_steps_is_named_with_the_step_that_compiles():
-    def controlled(plant, T):
-        @subsystem(sample_time=T, name=f"for_{plant.name}")
-        def controller(speed):
-            return Gain(gain=-0.1, name="k")(speed)
-
-        return plant(voltage=controller(plant.speed), load_torque=0.0)
-
-    file = dc_motor.build()
-    made = Diagram("d", controlled(Fmu(file, name="slow"), 0.004), controlled(Fmu(file, name="fast"), 0.001))
-    run = made.simulate(0.02, compile=True, **QUIET)
-    assert run.tier == "interpreted"
-    assert [m for m in run.messages if "'slow' takes longer steps" in m and "step=0.001" in m]
-    assert made.simulate(0.02, step=0.001, compile=True, **QUIET).tier == "compiled"
-
-
 @pytest.fixture
 def fresh():
     """No library that this process has loaded counts."""

@@ -24,7 +24,7 @@ def records(tmp_path_factory):
     """A file with what the reference loop says of random diagrams."""
     found = {}
     for family in FAMILIES:
-        for seed in range(10 if family in ("sampled", "plants") else 25):
+        for seed in range(10 if family in ("sampled", "plants", "slower") else 25):
             case = make_if_possible(family, seed)
             expected = None if case is None else reference(case)
             if expected is not None:

@@ -9,6 +9,7 @@ import pytest
 from loopwright.blocks import Constant, FmuError, FmuRuntimeError, Gain, Integrator
 from loopwright.diagrams import Coupling, Diagram, subsystem
 from loopwright.fmus import Fmu, StepOptions
+from support.both_forms import only_c
 from support.eventful import eventful_fmu
 from support.small_fmus import small_fmu, values
 
@@ -157,16 +158,20 @@ def test_a_compiled_run_ends_there_too(files, last):
     [("jacobi", 0.5), ("gauss_seidel", 0.5), ("iterated", 0.5), (Coupling(scheme="jacobi", error=1e-6), 0.5)],
     ids=["jacobi", "gauss_seidel", "iterated", "adaptive"],
 )
-def test_coupled_fmus_end_the_run_together(files, coupling, ends):
+@pytest.mark.parametrize("compiled", [False, "auto", True])
+def test_coupled_fmus_end_the_run_together(files, coupling, ends, compiled):
     def other(last):
         plant = Fmu(files["fmi3"], name="plant", start={"last": last})
         follower = Fmu(files["fmi3"], name="follower", start={"last": 9.0})
         return Diagram("d", follower(u=plant(u=Constant(value=1.0)).y))
 
-    run = other(0.5).simulate(1.0, step=0.1, coupling=coupling, progress=False)
+    options = {"step": 0.1, "coupling": coupling, "compile": compiled, "progress": False}
+    with only_c(compiled):
+        run = other(0.5).simulate(1.0, **options)
     check_end(run, ends)
     assert len(run["follower.y"]) == 6
-    within = other(0.53).simulate(1.0, step=0.1, coupling=coupling, progress=False)
+    with only_c(compiled):
+        within = other(0.53).simulate(1.0, **options)
     assert within.stopped.block == "plant"
     assert within.stopped.t == within.t[-1] == pytest.approx(0.53 if coupling == "jacobi" else 0.5, abs=1e-14)
     np.testing.assert_allclose(within["plant.y"], within.t, rtol=0, atol=1e-13)

@@ -1,0 +1,148 @@
+"""The plants of a run as the loop in C steps them: by itself, or by Python where it can't."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+
+import numpy as np
+
+from ...fmus.calls import FmuInstance
+from ..compiled import (
+    REFUSED,
+    TOLD,
+    UNDER_WAY,
+    CompiledLoop,
+    HybridOutcome,
+    Outcome,
+    PythonStep,
+    Reason,
+    compile_other_side,
+)
+from ..coupling import CoupledSteps, Plant, PlantSteps, end_all, runs_apart
+from ..flat import FlatDiagram, StepTable
+
+
+class PlantsInC:
+    """The plants of a run, in the order in which the loop in C goes over them.
+
+    Parameters
+    ----------
+    flat : FlatDiagram
+        The diagram.
+    plants : mapping of str to Plant
+        The plants by path, bound.
+    steps : PlantSteps
+        Their steps.
+    coupled : CoupledSteps, optional
+        Their coupling, where it is another one than "jacobi".
+
+    Attributes
+    ----------
+    entries : dict
+        What C goes over, by path: an FMU, or a step that Python takes; one step of all plants where they are coupled.
+    """
+
+    def __init__(
+        self, flat: FlatDiagram, plants: Mapping[str, Plant], steps: PlantSteps, coupled: CoupledSteps | None = None
+    ):
+        self._flat, self._plants, self.steps, self._coupled = flat, plants, steps, coupled
+        self.entries: dict[str, FmuInstance | PythonStep] = {
+            path: plant if isinstance(plant, FmuInstance) else partial(_step, plant) for path, plant in plants.items()
+        }
+        if coupled is not None:
+            self.entries = {"": self._step_coupled}
+
+    @property
+    def are_coupled(self) -> bool:
+        """Whether another coupling than "jacobi" is asked for."""
+        return self._coupled is not None
+
+    @property
+    def held(self) -> tuple[np.ndarray, np.ndarray]:
+        """Inputs of all plants as they are now, and as they are held between ticks; one array where these agree."""
+        return self.steps.z, self.steps.inputs
+
+    @property
+    def inputs(self) -> list[slice]:
+        """The inputs of each plant among them; none where all plants step at all ticks."""
+        return [] if self.steps.regular else [self.steps.own[path] for path in self.entries]
+
+    def _step_coupled(self, t: float, h: float) -> bool:
+        base = self._flat.base
+        self._go_coupled(t, round((t + h) * base.denominator / base.numerator), h)
+        return any(getattr(plant, "ends_run", False) for plant in self._plants.values())
+
+    def _go_coupled(self, t: float, following: int, h: float) -> None:
+        assert self._coupled is not None
+        base = self._flat.base
+        self._coupled.go(t, following * base.numerator / base.denominator, h)
+
+    def prepare(self) -> Callable[[], object]:
+        """Return a function that compiles what the steps of plants need beside the code of a diagram."""
+        return compile_other_side if any(map(runs_apart, self.entries.values())) else lambda: None
+
+    def table(self, ticks: np.ndarray, last: int) -> StepTable | None:
+        """Return the steps to ticks that come next; None where all plants step at each of them."""
+        return self.steps.table(ticks, last)
+
+    def arrive(self, k: int, last: int) -> None:
+        """Note that C has stepped the plants up to a tick."""
+        self.steps.arrive(k, last=k == last)
+
+    def go(self, k: int, following: int, last: int) -> None:
+        """Take the steps from a visited tick to the next one by Python."""
+        if self._coupled is not None:
+            base = self._flat.base
+            now = k * base.numerator / base.denominator
+            self._go_coupled(now, following, float(base * (following - k)))
+        else:
+            self.steps.go(k, following, last=following == last)
+
+    def go_on(self, loop: CompiledLoop, found: Outcome | HybridOutcome, k: int, following: int, last: int) -> None:
+        """Go on with the steps from a visited tick to the next one, from the plant on that C could not go beyond.
+
+        Raises
+        ------
+        SimulationError
+            Of the first plant that fails, once no other one is under way.
+        """
+        if found.stage == REFUSED:
+            self.go(k, following, last)
+            return
+        if self._coupled is not None:
+            loop.check_steps()
+            return
+        due, rest = self.steps.due(k, following, last=following == last), list[Callable[[], None]]()
+        places = enumerate(zip(self._plants.items(), loop.begun(), strict=True))
+        for place, ((path, plant), begun) in places:
+            if place < found.plant or path not in due:
+                continue
+            if begun:
+                assert isinstance(plant, FmuInstance)
+                rest.append(partial(plant.finish_remote, *due[path]))
+            elif place > found.plant:
+                rest.append(partial(plant.step, *due[path]))
+            elif found.stage == TOLD:
+                rest.append(loop.check_steps)
+            else:
+                assert found.stage != UNDER_WAY
+                assert isinstance(plant, FmuInstance)
+                status = found.status if int(found.reason) == Reason.FMU_FAILED else 0
+                rest.append(partial(_judge, plant, found.stage, status, *due[path]))
+        if self.steps.apart:
+            end_all(rest)
+        else:
+            for end in rest:
+                end()
+        self.steps.arrive(following, last=following == last)
+
+
+def _step(plant: Plant, t: float, h: float) -> bool:
+    plant.step(t, h)
+    return bool(getattr(plant, "ends_run", False))
+
+
+def _judge(plant: FmuInstance, stage: int, status: int, t: float, h: float) -> None:
+    plant.judge_native(stage, status, t, h)
+    plant.read(t + h)
