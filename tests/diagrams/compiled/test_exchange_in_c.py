@@ -19,7 +19,6 @@ from loopwright.blocks import (
     Step,
     StopCondition,
     TransferFunction,
-    TransportDelay,
 )
 from loopwright.diagrams import Diagram, Interrupted, subsystem
 from loopwright.fmus import Fmu, bouncing_ball, build, mass_spring_damper
@@ -355,11 +354,3 @@ def test_a_warning_in_c_is_told_once(cache, tmp_path, fmi, isolate):
     assert run.tier == "compiled"
     (told,) = [m for m in run.messages if "Warning" in m]
     assert told.startswith(f"plant: reading the outputs gave fmi{fmi}Warning at t = 0.")
-
-
-def test_a_transport_delay_beside_one_is_interpreted_and_says_so(files):
-    """A mass on a spring of 4 N/m without damping, at rest until a step of force has come out of the delay."""
-    made = Diagram("d", mass(files)(force=TransportDelay(delay=0.5, name="late")(Constant(value=1.0))))
-    run = made.simulate(0.4, compile=True, progress=False)
-    assert [m for m in run.messages if m.startswith("Interpreted") and "'late'" in m]
-    assert run.tier == "interpreted"
