@@ -126,11 +126,15 @@ def _checked(function: F, called: str | None, error: type[LoopwrightError], kind
     parameters = {**signature.parameters}
     names = [name for name, p in parameters.items() if p.kind in BY_PLACE]
     needed = {name for name, p in parameters.items() if p.default is p.empty}
-    is_plain = not any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters.values())
+    several = {name for name, p in parameters.items() if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+    is_plain = not several
+    if unknown := kinds.keys() - parameters.keys():
+        raise TypeError(f"{who} has no argument {', '.join(unknown)}, of which a kind is declared.")
+    single = [(name, kind, parameters[name].default) for name, kind in kinds.items() if name not in several]
+    listed = [(name, kinds[name]) for name in several & kinds.keys()]
 
     def refuse(value: Any, kind: Kind, name: str, given: Mapping[str, Any]) -> None:
-        if not kind.holds(value):
-            check_argument(value, kind, name, who.format_map(given) if who and is_format else who, error)
+        check_argument(value, kind, name, who.format_map(given) if who and is_format else who, error)
 
     @wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
@@ -142,18 +146,15 @@ def _checked(function: F, called: str | None, error: type[LoopwrightError], kind
                 given = signature.bind(*args, **kwargs).arguments
             except TypeError as unfit:
                 raise (misuse(function, args, kwargs, own_name) or unfit) from None
-        for name, value in given.items():
-            kind, parameter = kinds.get(name), parameters[name]
-            if kind is None or value is parameter.default:
-                continue
-            if parameter.kind is parameter.VAR_KEYWORD:
-                for key, each in value.items():
-                    refuse(each, kind, key, given)
-            elif parameter.kind is parameter.VAR_POSITIONAL:
-                for each in value:
-                    refuse(each, kind, name, given)
-            else:
+        for name, kind, default in single:
+            value = given.get(name, default)
+            if value is not default and not kind.holds(value):
                 refuse(value, kind, name, given)
+        for name, kind in listed:
+            values = given.get(name, ())
+            for key, each in values.items() if isinstance(values, dict) else ((name, each) for each in values):
+                if not kind.holds(each):
+                    refuse(each, kind, key, given)
         try:
             return function(*args, **kwargs)
         except UnknownArgumentError as unknown:

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Self, dataclass_transform
 
 import numpy as np
 
-from .arguments import check_argument, shorten
+from .arguments import Kind, check_argument, shorten
 from .docstrings import ParameterSignature, parameter_section, with_section
 from .errors import DefinitionError, ParameterError, near
 from .frozen import freeze
@@ -32,6 +32,7 @@ class Value:
 
     parameter_specs: ClassVar[Mapping[str, ParameterSpec]] = {}
     _keywords: ClassVar[frozenset[str]] = frozenset()  # constructor keywords that are no parameters (a block's name)
+    _conditions: ClassVar[tuple[tuple[str, Kind, bool], ...]] = ()  # of parameters, and whether None is their default
     _content: ClassVar[Any] = None  # a further part of equality, such as the digest of a file
     __signature__ = ParameterSignature()
 
@@ -55,6 +56,9 @@ class Value:
                     port=name,
                 )
         cls.parameter_specs = specs
+        cls._conditions = tuple(
+            (n, spec.kind, spec.default is None) for n, spec in specs.items() if spec.kind is not None
+        )
         written = cls.__dict__.get("__doc__") or f"{cls.__name__}."
         section = parameter_section(cls.parameter_specs, cls._keywords)
         cls.__doc__ = with_section(inspect.cleandoc(written), "Parameters", section)
@@ -88,10 +92,10 @@ class Value:
                     port=name,
                 )
             object.__setattr__(self, name, convert(kwargs.get(name, spec.default), spec, who, name))
-        for name, spec in cls.parameter_specs.items():
+        for name, kind, takes_none in cls._conditions:
             value = self.__dict__[name]
-            if spec.kind is not None and not (value is None and spec.default is None):
-                check_argument(value, spec.kind, name, getattr(self, "label", cls.__name__), ParameterError)
+            if not (takes_none and value is None) and not kind.holds(value):
+                check_argument(value, kind, name, getattr(self, "label", cls.__name__), ParameterError)
         self.check()
 
     def check(self) -> None:

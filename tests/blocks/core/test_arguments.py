@@ -74,6 +74,28 @@ def test_values_of_the_kind_and_defaults_are_taken():
     assert Table(points=[0, 1]).points.tolist() == [0.0, 1.0]
 
 
+@accepts("{owner.name}", values=kinds.integer(0), limits=kinds.positive)
+def collect(owner: object, *values: int, **limits: float) -> int:
+    """Return the number of its arguments."""
+    return len(values) + len(limits)
+
+
+def test_each_of_several_arguments_is_checked_and_the_owner_is_named():
+    class Owner:
+        name = "robot"
+
+    assert collect(Owner(), 1, 2, low=1.0) == 3
+    with pytest.raises(OptionError, match="^robot.values: found -1; expected an integer from 0 on"):
+        collect(Owner(), 1, -1)
+    with pytest.raises(OptionError, match="^robot.low: found 0; expected a positive number"):
+        collect(Owner(), 1, low=0.0)
+
+
+def test_a_kind_of_no_argument_is_refused_at_the_definition():
+    with pytest.raises(TypeError, match="has no argument windwos"):
+        accepts(windwos=kinds.flag)(collect)
+
+
 def test_signatures_and_pickles_stay():
     assert list(inspect.signature(listen).parameters) == ["windows", "kind", "at"]
     assert str(inspect.signature(Settings)) == "(retries: int = 3, other: object = None) -> None"
