@@ -297,8 +297,8 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
 
 def _make_grid(r: Realization) -> np.ndarray:
     """Return angles θ up to π that resolve the poles of the open and the closed loop."""
-    s = r.logarithm(np.concatenate([np.linalg.eigvals(r.A), r.eigenvalues()])) * r.dt
-    s = s[np.isfinite(s)]
+    s = r.logarithm(np.concatenate([np.linalg.eigvals(r.A), r.eigenvalues()]))
+    s = s[np.isfinite(s)] * r.dt  # those of z = 0 are no numbers
     sizes = np.abs(s)[np.abs(s) > 1e-9]
     low = 1e-2 * float(np.min(sizes, initial=1.0))
     around = [np.abs(s.imag) + np.abs(s.real) * side for side in SIDES]

@@ -219,6 +219,12 @@ def test_an_integrator_with_a_small_gain_has_margins():
     assert np.isnan(found.delay_margin_s.value)
 
 
+def test_a_loop_with_a_pole_at_zero_has_margins():
+    """0.4/(z (z − 1)): z² − z + k is stable for 0 < k < 1."""
+    found = periodic_margins(control.ss([[1.0, 0.0], [1.0, 0.0]], [[1.0], [0.0]], [[0.0, 0.4]], [[0.0]], 0.1))
+    assert found.gain_margin_high.value == pytest.approx(2.5, rel=1e-9)
+
+
 def test_an_unstable_periodic_loop_says_so_with_its_poles():
     found = periodic_margins(unlifted(3.0))
     assert not found.stable
