@@ -148,11 +148,17 @@ def pytest_collection_modifyitems(items):
     items.sort(key=place)
 
 
+def pytest_collection(session):
+    """Collect no garbage while the tests are imported: a fifth of the time, and nearly all of it stays."""
+    gc.disable()
+
+
 def pytest_collection_finish(session):
     """Collect garbage less often, and never what the collection of the tests has made: a tenth of the set's time."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 50)
+    gc.enable()
 
 
 def pytest_unconfigure(config):
