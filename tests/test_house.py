@@ -173,3 +173,24 @@ def test_every_name_of_ours_in_a_text_exists():
                 named.setdefault(name, f"{path.relative_to(ROOT)}:{text[: found.start()].count(chr(10)) + 1}")
     assert len(named) > 20
     assert {where: name for name, where in named.items() if not exists(name)} == {}
+
+
+def unstable_sorts(tree):
+    """Yield the lines that ask for an order of sorting in which equal values stand as the processor leaves them."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "argsort":
+            kinds = [k.value.value for k in node.keywords if k.arg == "kind" and isinstance(k.value, ast.Constant)]
+            if kinds != ["stable"]:
+                yield node.lineno
+
+
+def test_no_order_of_equal_values_hangs_on_the_processor():
+    trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in SOURCES}
+    found = [(path.relative_to(ROOT).as_posix(), line) for path, tree in trees.items() for line in unstable_sorts(tree)]
+    assert not found, (
+        f"NumPy sorts by the processor's vectors; give argsort kind='stable', or lexsort a second key: {found}"
+    )
+    assert [*unstable_sorts(ast.parse("np.argsort(x)\nx.argsort(kind='quicksort')\nnp.argsort(x, kind='stable')"))] == [
+        1,
+        2,
+    ]

@@ -48,7 +48,7 @@ def integrate(speed: Callable[[np.ndarray], np.ndarray], knots: np.ndarray) -> t
             break
         start, width = np.concatenate([start, start + width]), np.concatenate([width, width])
     starts, widths, fits = (np.concatenate([d[i] for d in done]) for i in range(3))
-    order = np.argsort(starts)
+    order = np.argsort(starts, kind="stable")
     starts, widths, fits = starts[order], widths[order], fits[order]
     k = np.arange(0, _DEGREE + 1, 2)
     areas = widths * (fits[:, k] @ (1.0 / (1.0 - k**2)))  # ∫ T_k over [−1, 1] is 2 / (1 − k²) for even k

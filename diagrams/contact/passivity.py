@@ -191,7 +191,7 @@ class _Aliases:
         padded = np.concatenate([[np.inf], margins, [np.inf]])
         lowest = np.flatnonzero((margins <= padded[:-2]) & (margins <= padded[2:]) & (margins < 1.0 - PRECISE))
         found = [(float(np.min(margins)), float(grid[np.argmin(margins)]))]
-        for i in lowest[np.argsort(margins[lowest])][:MINIMA]:
+        for i in lowest[np.argsort(margins[lowest], kind="stable")][:MINIMA]:
             a, b = grid[max(i - 1, 0)], grid[min(i + 1, len(grid) - 1)]
             best = minimize_scalar(
                 lambda w: float(self.margins(np.array([w]))[0]),

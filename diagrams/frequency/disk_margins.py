@@ -145,7 +145,7 @@ def loop_at(plant: StateSpace, controller: StateSpace, where: str = "input") -> 
     P = control.ss(plant)
     both = read_matrices(control.append(control.ss(controller), -P))
     inputs, outputs = int(P.ninputs), int(P.noutputs)
-    order = np.argsort([*range(outputs, outputs + inputs), *range(outputs)])  # (u, y) feed (P, C)
+    order = np.argsort([*range(outputs, outputs + inputs), *range(outputs)], kind="stable")  # (u, y) feed (P, C)
     return make_state_space(both.A, both.B[:, order], both.C, both.D[:, order], both.dt)
 
 

@@ -189,7 +189,7 @@ def _read(data: Any, uncertainty: ArrayLike | None) -> tuple[np.ndarray, np.ndar
             block=name,
             port="uncertainty",
         )
-    order = np.argsort(w)
+    order = np.argsort(w, kind="stable")
     w, loop, r = w[order], loop[order], np.broadcast_to(r, w.shape)[order]
     fits = np.isfinite(loop) & (loop != 0.0)
     if (twice := w[1:][np.diff(w) <= 0.0]).size:

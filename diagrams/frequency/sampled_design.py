@@ -76,7 +76,7 @@ def sampled_poles(
     w = np.roots(polynomial)
     with np.errstate(divide="ignore"):
         s = np.log((1 + sample_time * w).astype(complex)) / sample_time
-    order = np.argsort(np.abs(s))
+    order = np.lexsort((-s.imag, np.abs(s)))  # of a pair the upper one first
     return SampledDesign(
         gains=tuple(float(a) for a in gains),
         sample_time=sample_time,

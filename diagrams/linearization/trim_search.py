@@ -392,7 +392,7 @@ def _solve_trim(
     equations = _Equations(base, flat, guess, parameters, target)
     unknown = solve(equations)
     left = equations.scale_residual(unknown)
-    order = [i for i in np.argsort(-left) if equations.keep[i]]
+    order = [i for i in np.argsort(-left, kind="stable") if equations.keep[i]]
     residuals = {equations.names[i]: float(left[i]) for i in order}
     worst = float(left[order[0]]) if order else 0.0
     x, w, xp, q = equations.split(unknown)
