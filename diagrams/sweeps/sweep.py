@@ -66,10 +66,10 @@ _LANES_ASKED = Kind(
     signals=kinds.names,
     seeds=kinds.names,
     progress=kinds.flag,
-    to=kinds.path.worded("the path of a folder", "Give one."),
     workers=kinds.integer(1).worded("a positive integer, or None for every core", "Give one.", kinds.by_name),
     lanes=_LANES_ASKED,
 )
+@accepts("{diagram.name}", to=kinds.path.worded("the path of a folder", "Give one."))
 def sweep(
     diagram: WiredDiagram,
     parameters: Mapping[str, Any] | None,
