@@ -194,3 +194,15 @@ def test_no_order_of_equal_values_hangs_on_the_processor():
         1,
         2,
     ]
+
+
+def test_no_file_has_the_name_of_what_its_package_hands_out_of_it():
+    """Names are loaded when they are used: once somebody has imported such a file, the package would have that."""
+    hidden = [
+        (stub.relative_to(ROOT).as_posix(), node.module)
+        for room in ("blocks", "fmus", "diagrams")
+        for stub in (ROOT / room).rglob("__init__.pyi")
+        for node in ast.walk(ast.parse(stub.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and node.module in {name.name for name in node.names}
+    ]
+    assert not hidden

@@ -15,7 +15,7 @@ from .experiment_numbers import DEFINITIONS, key_numbers
 from .experiments import DEFAULTS, EXPERIMENTS, Experiment
 from .fig3_diagram import Fig3Diagram, fig3
 from .figures import plot_experiment, plot_path
-from .rendered_admittance import (
+from .rendered import (
     passivity,
     rendered_admittance,
     rendered_response,

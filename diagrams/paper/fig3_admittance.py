@@ -35,7 +35,7 @@ from .compliance_loop import AdmittanceLoop
 from .coupled_stability import growth_rate, stability_limit
 from .fig3_case import Fig3Case
 from .reduced_loops import FRICTION, OPTIONS, ReducedLoops, each_implementation
-from .rendered_admittance import passivity, rendered_admittance, target_admittance
+from .rendered import passivity, rendered_admittance, target_admittance
 
 TEXTS = Texts(__package__, "admittance")
 TITLE = "Admittance and coupled stability"
