@@ -206,3 +206,14 @@ def test_no_file_has_the_name_of_what_its_package_hands_out_of_it():
         if isinstance(node, ast.ImportFrom) and node.module in {name.name for name in node.names}
     ]
     assert not hidden
+
+
+def test_tests_share_nothing_but_what_stands_in_support():
+    """Older pytests know no package `tests`, and no neighbours of a test's file."""
+    wrong = [
+        (path.relative_to(ROOT).as_posix(), node.lineno)
+        for path in (ROOT / "tests").rglob("test_*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and (node.level or (node.module or "").split(".")[0] == "tests")
+    ]
+    assert not wrong

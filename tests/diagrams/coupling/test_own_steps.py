@@ -6,7 +6,7 @@ import pytest
 from loopwright.blocks import Gain
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu
-from tests.support.closed_form import closed_form_fmu
+from support.closed_form import closed_form_fmu
 
 TRUNCATES = "{ double n = floor(20.0 * h / 0.01 + 1e-9); h = n * 0.01 / 20.0; }"
 """Its solver takes whole steps of 0.01 s alone, and does not say that it stops short."""

@@ -7,7 +7,7 @@ from scipy.linalg import expm
 from loopwright.blocks import Constant, Gain
 from loopwright.diagrams import Diagram, StepsOnly, subsystem
 from loopwright.fmus import Fmu
-from tests.support.closed_form import closed_form_fmu
+from support.closed_form import closed_form_fmu
 
 DT = 0.1
 

@@ -9,7 +9,7 @@ from loopwright.diagrams import Diagram, InexactDerivatives, RefutedDerivatives,
 from loopwright.diagrams.linearization.exchanged import PointEvaluator
 from loopwright.diagrams.requirements import Limit, Reason, Verdict, judge
 from loopwright.fmus import Fmu
-from tests.support.misstated import A, B, misstated_fmu
+from support.misstated import A, B, misstated_fmu
 
 WAYS = ("model_exchange", "co_simulation")
 POINT = {"x": 0.3, "v": 0.2}

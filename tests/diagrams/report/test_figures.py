@@ -17,7 +17,7 @@ from loopwright.diagrams.report.pages.html import to_html
 from loopwright.diagrams.report.pages.svg import embedded
 from loopwright.diagrams.report.sections.loops import gang_of_four
 from loopwright.diagrams.results import BLUE
-from tests.support import reviewed
+from support import reviewed
 
 
 def resonant(damping=1e-3):

@@ -31,7 +31,7 @@ from loopwright.diagrams.report.pages.html import to_html
 from loopwright.diagrams.report.pages.json import to_json
 from loopwright.diagrams.report.review import review
 from loopwright.diagrams.requirements import Limit, Reason, RequirementResult, Review
-from tests.support import reviewed
+from support import reviewed
 
 PARTS = ("poles", "inner")
 ASKED = {

@@ -14,9 +14,8 @@ import pytest
 
 from loopwright.diagrams import experiments
 from loopwright.fmus import Fmu, gantry, gantry_contact, gantry_elastic, gantry_stiction, scara
+from support.followed import PATH, follow
 from support.foreign_gantry import by_casadi, by_pythonfmu, by_pythonfmu3
-
-from .test_plants_under_the_controller import PATH, follow
 
 PLANTS = (gantry, gantry_elastic, gantry_stiction, gantry_contact)
 

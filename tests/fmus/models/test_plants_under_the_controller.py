@@ -9,19 +9,13 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from loopwright.blocks import (
-    ErrorDynamics,
-    FeedbackLinearization,
     PathDomainError,
-    PathProjection,
-    SmoothStep,
-    TransverseTransform,
 )
-from loopwright.diagrams import Diagram, experiments, subsystem
+from loopwright.diagrams import experiments
 from loopwright.fmus import Fmu, gantry, gantry_contact, gantry_elastic, gantry_stiction, scara
 from support import oracle
+from support.followed import PATH, follow
 from support.plants import WEIGHT, D, K, elastic, sticking
-
-PATH = experiments.ELLIPSE
 
 
 def errors(run, start=1.0):
@@ -149,25 +143,6 @@ def test_half_of_the_damping_and_the_paper_s_gains_are_unstable():
     xi = late["xi"][-200:, 0] - np.mean(late["xi"][-200:, 0])
     spectrum = np.abs(np.fft.rfft(xi * np.hanning(200)))
     assert np.argmax(spectrum[1:]) + 1 == pytest.approx(20, abs=4)  # of 5 Hz each: near 100 Hz
-
-
-def follow(plant, model, motor, coordinate, rate):
-    """Wire the notebook's path follower around any plant, and run experiment A."""
-
-    @subsystem(sample_time=1e-3)
-    def path_follower(position, velocity, coordinate, rate, eta_p, xi_p):
-        theta = PathProjection(PATH)(position).named("theta")
-        eta, xi = TransverseTransform(PATH)(theta, position, velocity).named("eta", "xi")
-        v_par = ErrorDynamics.from_poles([-20] * 3, name="pid_par")(eta, eta_p.named("eta_p"))
-        v_perp = ErrorDynamics.from_poles([-40] * 3, name="pid_perp")(xi, xi_p.named("xi_p"))
-        return FeedbackLinearization(PATH, model)(theta, coordinate, rate, np.zeros(2), v_par, v_perp)
-
-    eta_p = SmoothStep(levels=(0.12, 0.75, 1.60), start_times=(1.0, 5.5), durations=(2.0, 2.0), name="eta_d")
-    xi_p = SmoothStep(
-        levels=(0.0, -0.03, 0.03, 0.0), start_times=(4.0, 8.5, 9.5), durations=(0.5, 0.5, 0.5), name="xi_d"
-    )
-    command = path_follower(plant.position, plant.velocity, coordinate, rate, eta_p, xi_p).named("command")
-    return Diagram("d", plant(**{motor: command}, external_force=np.zeros(2))).simulate(11.0, progress=False)
 
 
 @pytest.mark.slow

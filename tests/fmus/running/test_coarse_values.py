@@ -8,7 +8,7 @@ from loopwright.blocks import Constant
 from loopwright.diagrams import CoarseValues, Diagram
 from loopwright.fmus import Fmu
 from loopwright.fmus.running.differences import find_slopes
-from tests.support.closed_form import closed_form_fmu
+from support.closed_form import closed_form_fmu
 
 WAYS = ("model_exchange", "co_simulation")
 X, U = 0.7, 0.3

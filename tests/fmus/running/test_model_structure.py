@@ -7,8 +7,8 @@ from scipy.linalg import expm
 from loopwright.blocks import AlgebraicLoopError, Constant, FmuRuntimeError, ParameterError
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu
-from tests.support.closed_form import closed_form_fmu
-from tests.support.misstated import misstated_fmu
+from support.closed_form import closed_form_fmu
+from support.misstated import misstated_fmu
 
 RATE = {
     2: '<Unknown index="4" dependencies="1 2 5"/>',
