@@ -7,9 +7,8 @@ from loopwright.blocks import OptionError, UnitError, UnknownNameError
 from loopwright.diagrams import experiments
 from loopwright.fmus import Fmu
 from support import oracle
+from support.agreement import assert_agrees
 from support.scalar_gantry import scalar_gantry
-
-from .test_experiments import assert_agrees
 
 ARRAYS = {
     "F_my": "motor_force[1]", "F_mz": "motor_force[2]", "F_ey": "external_force[1]", "F_ez": "external_force[2]",

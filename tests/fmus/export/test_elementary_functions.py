@@ -7,39 +7,21 @@ import math
 import shutil
 import subprocess
 import zipfile
-from importlib import resources
 
 import mpmath
 import numpy as np
 import pytest
 
-import loopwright.fmus.export as export
 from loopwright.blocks import Block, Output, State
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu, build
 from loopwright.fmus.export import compile_shared, own_functions, processor_flags
-from loopwright.fmus.export.elementary_tables import FUNCTIONS, prepare_functions, restore_functions
+from loopwright.fmus.export.elementary_tables import FUNCTIONS, prepare_functions
 from loopwright.fmus.models import gantry
+from support.elementary import ONE_FUNCTION, RUNTIME, arguments, powers, signed, source
 
-RUNTIME = resources.files(export) / "runtime" / "elementary.c"
 BOUNDS = {"sin": 0.78, "cos": 0.78, "tanh": 0.58, "exp": 0.52, "expm1": 0.6, "log": 0.52, "pow": 0.54}
 """Largest errors in ulp that docs/export.md states, for results that are neither tiny nor near overflow."""
-ONE_FUNCTION = """
-#ifdef _WIN32
-__declspec(dllexport)
-#else
-__attribute__((visibility("default")))
-#endif
-void many_{0}(const double *x, const double *z, double *y, long long n) {{
-    (void)z;
-    for (long long i = 0; i < n; i++) y[i] = lw_{0}(x[i]{1});
-}}
-"""
-
-
-def source() -> str:
-    text = prepare_functions(" ".join(f"{name}(x)" for name in FUNCTIONS)) + restore_functions()
-    return text + "".join(ONE_FUNCTION.format(name, ", z[i]" if name == "pow" else "") for name in FUNCTIONS)
 
 
 class Functions:
@@ -62,46 +44,6 @@ def ours(tmp_path_factory):
     out = tmp_path_factory.mktemp("elementary") / "functions.so"
     compile_shared({"all.c": source(), "elementary.c": RUNTIME.read_text("utf-8")}, out, compiled=["all.c"])
     return Functions(out)
-
-
-def signed(rng, sizes):
-    return sizes * rng.choice([-1.0, 1.0], len(sizes))
-
-
-def arguments(name, n, rng):
-    """Yield arrays of arguments: the whole range, about 0 and 1, and where two of a function's forms meet."""
-    if name in ("sin", "cos"):
-        yield rng.uniform(-7, 7, n)
-        yield signed(rng, 10 ** rng.uniform(-12, 6, n))
-        yield signed(rng, 10 ** rng.uniform(6, 308, n))
-        yield np.arange(1, n) * (math.pi / 2)  # as near to its zeros as doubles come
-        yield signed(rng, rng.uniform(1599, 1601, n))
-        yield signed(rng, 2.0**20 + rng.uniform(-1, 1, n))
-    elif name == "tanh":
-        yield signed(rng, 10 ** rng.uniform(-12, 1.4, n))
-        yield signed(rng, rng.uniform(0.15, 0.25, n))
-        yield rng.uniform(18.5, 19.5, n)
-    elif name == "exp":
-        yield rng.uniform(-690, 690, n)
-        yield signed(rng, 10 ** rng.uniform(-18, 0, n))
-    elif name == "expm1":
-        yield rng.uniform(-45, 690, n)
-        yield signed(rng, 10 ** rng.uniform(-18, 0, n))
-        yield signed(rng, rng.uniform(0.15, 0.4, n))
-    elif name == "log":
-        yield 10 ** rng.uniform(-323, 308, n)
-        yield 1 + signed(rng, 10 ** rng.uniform(-16, -1, n))
-        yield rng.uniform(0.5, 2, n)
-
-
-def powers(n, rng):
-    """Yield pairs whose power is neither tiny nor near overflow."""
-    for low, high in ((-12, -6), (-6, -2), (-2, -0.5)):
-        x = 1 + signed(rng, 10 ** rng.uniform(low, high, n))
-        yield x, rng.uniform(-690, 690, n) / np.log(x)
-    x = 10 ** rng.uniform(-300, 300, n)
-    yield x, rng.uniform(-1, 1, n)
-    yield -np.floor(10 ** rng.uniform(0, 3, n)), np.floor(rng.uniform(-90, 90, n))
 
 
 def ulps(found, exact):

@@ -11,8 +11,7 @@ from loopwright.fmus.export import compile_shared
 from loopwright.fmus.models import gantry_contact, scara
 from loopwright.fmus.platform import native_platform
 from loopwright.fmus.toolchain import SUFFIXES, TARGETS
-
-from . import test_elementary_functions as elementary
+from support import elementary
 
 if native_platform() != "x86_64-linux":
     pytest.skip("calls from emulated code are those of x86_64-linux", allow_module_level=True)
