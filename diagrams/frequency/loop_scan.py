@@ -156,7 +156,8 @@ class LoopScan:
                     searched = len(omega) if behind is None else behind
                     if before is not None and behind is not None and h[before] * h[behind] < 0:
                         span = float(omega[before]), float(omega[behind])  # both samples are too close to the root
-                        found.append(self._polish(lambda w: self._evaluate(function, w, 0), span))
+                        if not any(span[0] < w < span[1] for w in found):  # rounding may have shown it before the first
+                            found.append(self._polish(lambda w: self._evaluate(function, w, 0), span))
                     continue
                 if left == 0.0:
                     found.append(span[0])
