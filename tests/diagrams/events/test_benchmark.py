@@ -17,7 +17,7 @@ def test_events_and_their_instants_are_counted_apart():
     # a cycle of the brake: the valve closes; its torque reaches zero; the valve opens and lets the torque go, at once
     benchmark = load_benchmark()
     diagram, _, step = benchmark.antilock()
-    run = diagram.simulate(0.03, step=step, progress=False, compile=False)
+    run = diagram.simulate(0.03, step=step, progress=False)
     events, instants = benchmark.count(run)
     assert events == len(run.events) > 50
     assert abs(3 * events - 4 * instants) <= 4  # the last cycle may be cut off

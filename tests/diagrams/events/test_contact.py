@@ -76,7 +76,7 @@ def test_a_start_on_the_floor_without_a_way_out_is_a_rest(speed):
     assert caught.value.t == pytest.approx(0.0, abs=1e-6)
 
 
-@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("compiled", ["auto", True])
 @pytest.mark.parametrize("solver", ["auto", "RK45", "Radau", "LSODA", "CVODE_Adams", "rk4"])
 @pytest.mark.parametrize(
     ("restitution", "height", "floor"),
