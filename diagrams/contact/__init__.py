@@ -3,7 +3,7 @@
 from .admittance import ContactAdmittance, compute_admittance
 from .confirmation import ContactConfirmation, ContactTrial, TrialMethod, try_limit
 from .contact import SIDES, Contact, find_sign, make_contact
-from .environment import UNITS, check_environment
+from .environment import UNITS, check_properties, check_property
 from .loop import close_loop, controller_rows, join_environment
 from .measured_force import Tool
 from .moored_plant import hold_sources
@@ -14,8 +14,6 @@ from .stability_limits import (
     PER_DECADE,
     ContactLimit,
     ContactMap,
-    GrowthMap,
-    describe_limit,
     find_limit,
     find_poles,
     scan_points,
@@ -33,18 +31,17 @@ __all__ = [
     "ContactLimit",
     "ContactMap",
     "ContactTrial",
-    "GrowthMap",
     "Passivity",
     "PassivityReason",
     "PortNames",
     "PortPassivity",
     "Tool",
     "TrialMethod",
-    "check_environment",
+    "check_properties",
+    "check_property",
     "close_loop",
     "compute_admittance",
     "controller_rows",
-    "describe_limit",
     "find_limit",
     "find_poles",
     "find_sign",

@@ -13,7 +13,7 @@ from ...blocks import AdmittanceFilter, ForceProjection, PathProjection
 from ...blocks.core import Array, Finding, OptionError, UnknownNameError, accepts, brief, explain_calls, kinds
 from ...fmus.running import Derivation
 from ..linearization import check_options, operating_point
-from .admittance import ContactAdmittance, compute_admittance, look_again
+from .admittance import ContactAdmittance, compute_admittance
 from .environment import (
     A_FREQUENCY,
     check_properties,
@@ -206,11 +206,7 @@ class Contact:
             If python-control's interconnection of the same parts disagrees.
         """
         held = check_properties(environment, vary)
-        found = find_limit(self.parts, self.direction, vary, held, read_scan(vary, low, high, per_decade))
-        alone = not any(held.values()) and "tool_mass" not in held
-        if vary == "stiffness" and alone and 0.0 < found.value < math.inf:
-            found = replace(found, second_look=look_again(self.parts, self.direction, found.frequency))
-        return found
+        return find_limit(self.parts, self.direction, vary, held, read_scan(vary, low, high, per_decade))
 
     def confirm(
         self, limit: ContactLimit, *, push: float = 1e-6, method: TrialMethod | str | None = None
@@ -275,8 +271,9 @@ class Contact:
             If python-control's interconnection of the same parts disagrees with a limit.
         """
         held = check_properties(environment, check_property(x, "x"))
-        check_properties({**environment, x: 0.0}, check_property(y, "y"))
-        across, up = read_row(x_values, x, rising=True), read_row(y_values, y, rising=False)
+        across = read_row(x_values, x, rising=True)
+        check_properties({**environment, x: across.tolist()[0]}, check_property(y, "y"))
+        up = read_row(y_values, y, rising=False)
         return map_growth(self.parts, self.direction, (x, across), (y, up), held)
 
 

@@ -110,7 +110,8 @@ def check_properties(held: Mapping[str, Any], vary: str) -> dict[str, float]:
         check_property(name, str(name))
         if name == vary:
             raise OptionError(
-                "found it among the held properties, too; expected it only as the one that varies. Leave it out.",
+                f"found it among the held properties, as {held[name]!r}; expected it only as the one that varies. "
+                "Leave it out.",
                 port=name,
             )
     return {name: read_number(value, name, UNITS[name]) for name, value in held.items()}

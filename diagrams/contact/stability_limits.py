@@ -27,6 +27,7 @@ from ...blocks.core import (
     on_one_thread,
 )
 from ..frequency import Number, refine_sign_change
+from .admittance import look_again
 from .environment import UNITS, points_in_a_decade
 from .loop import (
     ClosedLoop,
@@ -82,7 +83,7 @@ def growth_rounding(rates: Callable[[np.ndarray], np.ndarray], A: np.ndarray) ->
 
 
 class FoundLimit(NamedTuple):
-    """A limit that a scan has found; the names are those of `StabilityLimit` and `ContactLimit`."""
+    """A limit that a scan has found; the names are those of `ContactLimit`."""
 
     value: float
     restabilizes: tuple[float, ...]
@@ -90,42 +91,6 @@ class FoundLimit(NamedTuple):
     growth_above: float
     tolerance: float
     confirmed_by: str
-
-
-def describe_limit(name: str, value: float, unit: str, frequency: float, environment: Mapping[str, float]) -> str:
-    """Return the short text of a limit of a property."""
-    held = ", ".join(f"{held} {value:g}" for held, value in environment.items())
-    facts = (
-        f"{name} {value:.6g} {unit}",
-        f"at {frequency:.4g} rad/s" if frequency == frequency else "",
-        held and f"with {held}",
-    )
-    return brief("limit of coupled stability", *facts, then=".value, .frequency, .confirmed_by")
-
-
-@dataclass(frozen=True, eq=False)
-class GrowthMap:
-    """Growth rates over two properties of the environment.
-
-    Attributes
-    ----------
-    x, y : str
-        Properties.
-    x_values, y_values : ndarray
-        Values of the properties.
-    growth : ndarray, shape (len(y_values), len(x_values))
-        σ in 1/s, negative where the loop is stable.
-    """
-
-    x: str
-    y: str
-    x_values: np.ndarray
-    y_values: np.ndarray
-    growth: np.ndarray
-
-    def __repr__(self) -> str:
-        facts = f"{len(self.y_values)} × {len(self.x_values)} growth rates over {self.y} and {self.x}"
-        return brief("map of coupled stability", facts, then=".growth, .limits")
 
 
 def scan_points(name: str, ends: tuple[float | None, float | None], per_decade: int) -> np.ndarray:
@@ -345,10 +310,16 @@ class ContactLimit:
     confirmed_by: str
     environment: dict[str, float] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
-    second_look: float = math.nan
+    second_look: float = field(default=math.nan, compare=False)
 
     def __repr__(self) -> str:
-        return describe_limit(self.vary, self.value, self.unit, self.frequency, self.environment)
+        held = ", ".join(f"{held} {value:g}" for held, value in self.environment.items())
+        facts = (
+            f"{self.vary} {self.value:.6g} {self.unit}",
+            f"at {self.frequency:.4g} rad/s" if math.isfinite(self.frequency) else "",
+            held and f"with {held}",
+        )
+        return brief("limit of coupled stability", *facts, then=".value, .frequency, .confirmed_by")
 
     @property
     def number(self) -> Number:
@@ -358,18 +329,33 @@ class ContactLimit:
 
 @explain_calls
 @dataclass(frozen=True, eq=False, repr=False)
-class ContactMap(GrowthMap):
-    """Growth rates over two properties of the environment; see `GrowthMap` for ``x``, ``y`` and ``growth``.
+class ContactMap:
+    """Growth rates over two properties of the environment.
 
     The growth rates are those of the modes that the environment can move, and of those that grow whatever it is.
 
     Attributes
     ----------
+    x, y : str
+        Properties.
+    x_values, y_values : ndarray
+        Values of the properties.
+    growth : ndarray, shape (len(y_values), len(x_values))
+        σ in 1/s, negative where the loop is stable.
     limits : tuple of ContactLimit
         Limit of x at each value of y.
     """
 
+    x: str
+    y: str
+    x_values: np.ndarray
+    y_values: np.ndarray
+    growth: np.ndarray
     limits: tuple[ContactLimit, ...]
+
+    def __repr__(self) -> str:
+        facts = f"{len(self.y_values)} × {len(self.x_values)} growth rates over {self.y} and {self.x}"
+        return brief("map of coupled stability", facts, then=".growth, .limits")
 
 
 @dataclass(frozen=True, eq=False)
@@ -510,7 +496,7 @@ def find_limit(
         If python-control's interconnection of the same parts is not stable below the limit and unstable above it.
     """
     loop = CoupledLoop.of(parts, direction, vary, held)
-    frequency, moved = math.nan, tuple[float, ...]()
+    frequency, moved, second = math.nan, tuple[float, ...](), math.nan
     if (fixed := loop.find_fixed_growth()) is not None:
         rate, frequency, moved = fixed
         grows = f"a mode that no such environment moves grows by {rate:.4g} 1/s"
@@ -527,6 +513,9 @@ def find_limit(
         )
         if found.value < math.inf:
             frequency, moved = loop.fastest_mode(found.value or float(grid[0]))
+        alone = vary == "stiffness" and not any(held.values()) and "tool_mass" not in held
+        if alone and 0.0 < found.value < math.inf:
+            second = look_again(parts, direction, frequency)
     return ContactLimit(
         vary=vary,
         unit=UNITS[vary],
@@ -535,6 +524,7 @@ def find_limit(
         scanned=(float(grid[0]), float(grid[-1])),
         environment=dict(held),
         findings=parts.findings,
+        second_look=second,
         **found._asdict(),
     )
 

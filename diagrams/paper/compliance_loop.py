@@ -320,13 +320,16 @@ def _contact_of(loop: AdmittanceLoop) -> Contact:
     """Return the contact of a loop, in its own direction where that stands alone, else in both."""
     if loop.implementation == "ideal":
         made = make_contact(_perfect_diagram(loop), PortNames("plant.external_force", force=None), [1.0], None, {})
-        return replace(made, side=loop.side, filter=loop.admittance, scale=loop.scale)
-    axis = np.eye(2)[SIDES.index(loop.side)]
-    made = make_contact(_diagram_at_rest(loop), PortNames("plant.external_force"), axis, None, {})
-    parts = replace(made.parts, is_stepped=True, tool=Tool(made.parts.tool.sensor, loop.tool_mass))
-    axes = np.array([SIDES.index(side) for side in loop.directions])
-    parts = restrict(parts, axes)
-    return replace(made, parts=parts, direction=axis[axes], side=loop.side, filter=loop.admittance, scale=loop.scale)
+        # the force moves it as its sensor feels it, so that another tool is another mass
+        sensed = made.parts.controller._replace(D=np.eye(1))
+        parts, direction = replace(made.parts, controller=sensed, force=0.0 * made.parts.force), made.direction
+    else:
+        axis = np.eye(2)[SIDES.index(loop.side)]
+        made = make_contact(_diagram_at_rest(loop), PortNames("plant.external_force"), axis, None, {})
+        axes = np.array([SIDES.index(side) for side in loop.directions])
+        parts, direction = restrict(replace(made.parts, is_stepped=True), axes), axis[axes]
+    parts = replace(parts, tool=Tool(parts.tool.sensor, loop.tool_mass), findings=loop.findings)
+    return replace(made, parts=parts, direction=direction, side=loop.side, filter=loop.admittance, scale=loop.scale)
 
 
 def _perfect_diagram(loop: AdmittanceLoop) -> WiredDiagram:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ...blocks import AdmittanceFilter
 from ...blocks.core import ConfirmationError, LoopwrightError, OptionError
-from ..contact import SIDES, Contact, PortNames, make_contact, try_limit
+from ..contact import SIDES, Contact, ContactLimit, PortNames, make_contact, try_limit
 from ..frequency import Number
 from ..linearization import StepsOnly
 from ..report import (
@@ -32,20 +33,20 @@ from ..report import (
 from ..report.sections import contacts
 from ..results import legend_above, new_figure, style
 from .compliance_loop import AdmittanceLoop
-from .coupled_stability import growth_rate, stability_limit
+from .coupled_stability import growth_rate
 from .fig3_case import Fig3Case
 from .reduced_loops import FRICTION, OPTIONS, ReducedLoops, each_implementation
-from .rendered import passivity, rendered_admittance, target_admittance
+from .rendered import passivity, rendered_admittance
 
 TEXTS = Texts(__package__, "admittance")
 TITLE = "Admittance and coupled stability"
 SAMPLED, DELAYED = Implementation.SAMPLED, Implementation.DELAYED
 ROUGH = SAMPLED + FRICTION
 """Key of the sampled variant with friction."""
-TARGET, RULE = "target", "rule_of_thumb"
-"""Curves besides those of variants."""
-Looks = Mapping[str, Mapping[str, Any]]
-"""Color and line of each variant by its key, as of `Case.looks`."""
+UNSHOWN = {"passive": None, "direction": None}
+"""Facts that a reduced loop's tables don't show: its contact has one direction alone, or the frame of the path."""
+Variants = Sequence[tuple[Mapping[str, Any], Contact]]
+"""Contacts of variants, each with the facts of its rows: its title, its key, and the end of that."""
 
 SIGN = TableForm(
     "Sign of Re Y(jω)", {"variant": "variant", **contacts.SIGN}, {"first": "first_non_passive.{key}{suffix}"}
@@ -106,8 +107,18 @@ def not_shown(case: Fig3Case) -> tuple[str, ...]:
     return (*TEXTS.paragraphs("not_shown"), str(case.reduced))
 
 
-def _section(side: str, text: Sequence[str], a: AdmittanceFilter, tables: Sequence[Table], *plots: Plot) -> Section:
-    """Return the section of a direction; ``a`` is its admittance filter."""
+def _section(
+    case: Fig3Case,
+    side: str,
+    variants: Variants,
+    text: Sequence[str],
+    tables: Sequence[Table],
+    tried: Sequence[Table] = (),
+    plots: Sequence[Plot] = (),
+) -> Section:
+    """Return the section of a direction, with the largest masses and the admittances of its variants."""
+    a = variants[0][1].filter
+    assert a is not None  # a reduced loop has one, and _find_contacts looks
     target = {
         "mass": (a.mass, "kg"),
         "damping": (float(a.effective_damping), "N.s/m"),
@@ -117,8 +128,23 @@ def _section(side: str, text: Sequence[str], a: AdmittanceFilter, tables: Sequen
         f"target.{name}": Number(value, unit, 1e-15 * abs(value), "given", given=True)
         for name, (value, unit) in target.items()
     }
+    environment, held = _held(a)
+    masses = (
+        {**_facts(c.stability_limit(vary, **environment)), **facts, "name": contacts.LIMITS[vary], "mass": word}
+        for facts, c in variants
+        for vary, word in contacts.WORDS.items()
+        if vary in ("mass", "tool_mass")
+    )
+    tables = (*tables, MASSES.fill(masses, held=held), *tried)
     symbol = "along the path, ∥" if side == "par" else "across the path, ⊥"
-    return Section(side, f"Direction {symbol}", tuple(text), tuple(tables), plots, numbers)
+    plots = (_draw_admittances(case, side, variants, a), *plots)
+    return Section(side, f"Direction {symbol}", tuple(text), tables, plots, numbers)
+
+
+def _facts(found: ContactLimit) -> dict[str, Any]:
+    """Return the facts of a limit, with words where there is no direction and no change beyond."""
+    facts = contacts.limit_facts(found)
+    return {**facts, "direction": facts["direction"] or "–", "again": facts["again"] or "no"}
 
 
 def _held(a: AdmittanceFilter) -> tuple[dict[str, Any], str]:
@@ -128,10 +154,17 @@ def _held(a: AdmittanceFilter) -> tuple[dict[str, Any], str]:
     return {"stiffness": contacts.SPRING}, f"on a spring of {contacts.SPRING:g} N/m"
 
 
-def _span(a: AdmittanceFilter, top: float) -> np.ndarray:
-    """Return the frequencies in rad/s at which admittances are drawn."""
+def _draw_admittances(case: Fig3Case, side: str, variants: Variants, a: AdmittanceFilter) -> Plot:
+    """Return the figure of admittances over ω in rad/s; with friction that of the sampled variant alone."""
+    periods = [c.sample_time for _, c in variants if c.sample_time]
     centre = math.sqrt(a.stiffness / a.mass) if a.stiffness > 0 else float(a.effective_damping) / a.mass
-    return np.geomspace(centre / 50, top, 500)
+    w = np.geomspace(centre / 50, 0.999 * math.pi / max(periods) if periods else 1e5, 500)
+    drawn: list[tuple[str, Any, Mapping[str, Any]]] = [("target", variants[0][1].admittance(w).target, DOTTED)]
+    for facts, c in variants:
+        if (key := facts["key"] + facts["suffix"]) == ROUGH or not facts["suffix"]:
+            look = case.looks.get(key) or look_of(key, len(drawn))
+            drawn.append((facts["variant"], c.admittance(w).rendered, look))
+    return Plot(f"admittance_{side}", TEXTS.line("rendered", along=side == "par"), draw_admittances(w, drawn))
 
 
 # --- a rigid gantry: reduced loops ------------------------------------------------------------------------------------
@@ -139,72 +172,32 @@ def _span(a: AdmittanceFilter, top: float) -> np.ndarray:
 
 def _reduced_side(case: Fig3Case, loops: ReducedLoops, side: str) -> Section:
     loop, titles = loops.plain[side], {key: v.title for key, v in case.variants.items()}
-    variants = [
-        ({"variant": titles.get(key + suffix, key + suffix), "key": key, "suffix": suffix}, variant)
-        for suffix, of in loops.suffixed(side).items()
-        for key, variant in each_implementation(of).items()
-    ]
-    signs = ({**facts, **_reduced_sign(v)} for facts, v in variants)
-    environment, held = _held(loop.admittance)
-    masses = (
-        {
-            **facts,
-            "name": contacts.LIMITS[vary],
-            "mass": contacts.WORDS[vary],
-            "limit": found.number,
-            "again": contacts.stable_again(found.restabilizes, found.unit) or "no",
-        }
-        for facts, v in variants
-        for vary in ("mass", "tool_mass")
-        if (found := stability_limit(v, vary, **environment))
-    )
-    tables = (SIGN.fill(signs), *_reduced_stiffness(loops, side, titles), MASSES.fill(masses, held=held))
+    variants, signs = [], []
+    for suffix, of in loops.suffixed(side).items():
+        for key, variant in each_implementation(of).items():
+            facts = {"variant": titles.get(key + suffix, key + suffix), "key": key, "suffix": suffix, **UNSHOWN}
+            variants.append((facts, variant.contact))
+            sign = contacts.sign_of_admittance(passivity(variant), partial(rendered_admittance, variant))
+            signs.append({**sign, **facts})
     text = (*TEXTS.paragraphs("asked", loop=loop), passivity(loop).caveat)
-    plots = _reduced_admittances(loops, side, titles, case.looks), _stability_map(loops, side, titles, case.looks)
-    return _section(side, text, loop.admittance, tables, *plots)
-
-
-def _reduced_sign(loop: AdmittanceLoop) -> dict[str, Any]:
-    """Return the facts of a loop's sign of Re Y; passivity with aliases is that of contacts alone."""
-    sign = contacts.sign_of_admittance(passivity(loop), lambda w: rendered_admittance(loop, w))
-    return {**sign, "passive": None}
+    tables = (SIGN.fill(signs), *_reduced_stiffness(loops, side, titles))
+    return _section(case, side, variants, text, tables, plots=[_stability_map(case, loops, side, titles)])
 
 
 def _reduced_stiffness(loops: ReducedLoops, side: str, titles: Mapping[str, str]) -> Iterator[Table]:
     for key, kind in loops.kinds(side).items():
         rows = []
         for implementation in OPTIONS:
-            variant = implementation + kind.suffix
+            variant = titles.get(implementation + kind.suffix, implementation + kind.suffix)
+            facts = {"variant": variant, "key": implementation, "prefix": kind.prefix, "suffix": kind.suffix, **UNSHOWN}
             for b in contacts.DAMPINGS:
                 found = loops.limit(side, key, implementation, b)
-                rows.append(
-                    {
-                        "variant": titles.get(variant, variant),
-                        "key": implementation,
-                        "prefix": kind.prefix,
-                        "suffix": kind.suffix,
-                        "damping": b,
-                        "limit": found.number,
-                        "rule": Number(found.rule_of_thumb, "N/m", 0.0, "closed form (d + b_e)/T_d"),
-                        "frequency": contacts.frequency_number(found.frequency, found.confirmed_by, found.findings),
-                        "again": contacts.stable_again(found.restabilizes, found.unit) or "no",
-                    }
-                )
+                rule = Number(found.rule_of_thumb, "N/m", 0.0, "closed form (d + b_e)/T_d")
+                rows.append({**_facts(found), **facts, "damping": b, "rule": rule})
         yield STIFFNESS.fill(rows, kind=f", {kind.title}")
 
 
-def _reduced_admittances(loops: ReducedLoops, side: str, titles: Mapping[str, str], looks: Looks) -> Plot:
-    loop = loops.plain[side]
-    w = _span(loop.admittance, 0.999 * math.pi / loop.sample_time)
-    curves: dict[str, tuple[str, np.ndarray]] = {TARGET: ("target", target_admittance(loop, w))}
-    for name, variant in each_implementation(loop).items():
-        curves[name] = (titles.get(name, name), rendered_admittance(variant, w))
-    if side in loops.rough:
-        curves[ROUGH] = (titles.get(ROUGH, ROUGH), rendered_admittance(loops.rough[side], w))
-    return _draw_admittances(side, w, curves, looks)
-
-
-def _stability_map(loops: ReducedLoops, side: str, titles: Mapping[str, str], looks: Looks) -> Plot:
+def _stability_map(case: Fig3Case, loops: ReducedLoops, side: str, titles: Mapping[str, str]) -> Plot:
     loop = loops.plain[side]
     k, b = np.geomspace(10.0, 1e6, 120), np.geomspace(0.1, 1e3, 41)
 
@@ -212,20 +205,17 @@ def _stability_map(loops: ReducedLoops, side: str, titles: Mapping[str, str], lo
         return np.asarray(growth_rate(of, stiffness=k[None, :], damping=b[:, None]))
 
     shown = growth(loop)
-    lines: dict[str, tuple[str, np.ndarray]] = {
-        SAMPLED: (titles.get(SAMPLED, SAMPLED), _first_unstable(k, shown)),
-        DELAYED: (titles.get(DELAYED, DELAYED), _first_unstable(k, growth(loop.replace(delay=1)))),
-    }
+    lines: dict[str, np.ndarray] = {SAMPLED: shown, DELAYED: growth(loop.replace(delay=1))}
     if side in loops.rough:
-        lines[ROUGH] = (titles.get(ROUGH, ROUGH), _first_unstable(k, growth(loops.rough[side])))
+        lines[ROUGH] = growth(loops.rough[side])
     d = float(loop.admittance.effective_damping) / loop.scale
-    lines[RULE] = ("rule of thumb, no delay", (d + b) / (0.5 * loop.sample_time))
     with style():
         figure = new_figure(2.9)
         ax = figure.subplots()
         fill_growth(ax, k, b, shown, least=-100.0)
-        for name, (title, x) in lines.items():
-            ax.plot(x, b, label=title, **(DOTTED if name == RULE else looks.get(name, {})))
+        for name, rates in lines.items():
+            ax.plot(_first_unstable(k, rates), b, label=titles.get(name, name), **case.looks.get(name, {}))
+        ax.plot((d + b) / (0.5 * loop.sample_time), b, label="rule of thumb, no delay", **DOTTED)
         legend_above(figure, ax)
     return Plot(f"stability_{side}", TEXTS.line("map", along=side == "par"), figure)
 
@@ -269,39 +259,20 @@ def _contact_side(case: Fig3Case, found: Mapping[Implementation, Contact], side:
         ({"variant": case.variants[key].title, "key": key, "prefix": "", "suffix": ""}, contact)
         for key, contact in found.items()
     ]
-    one = variants[0][1]
-    a = one.filter
-    assert a is not None  # _find_contacts looks
     signs = ({**facts, **contacts.contact_sign(c)} for facts, c in variants)
     stiffness = (
-        {**facts, **_limit(c, "stiffness", damping=b), "damping": b} for facts, c in variants for b in contacts.DAMPINGS
-    )
-    environment, held = _held(a)
-    masses = (
-        {**facts, **_limit(c, vary, **environment), "name": contacts.LIMITS[vary], "mass": contacts.WORDS[vary]}
+        {**facts, **_facts(c.stability_limit("stiffness", damping=b)), "damping": b}
         for facts, c in variants
-        for vary in ("mass", "tool_mass")
+        for b in contacts.DAMPINGS
     )
     tried, remarks = _tried(variants)
-    tables = (SIGN.fill(signs), STIFFNESS.fill(stiffness, kind=""), MASSES.fill(masses, held=held), *tried)
+    one = variants[0][1]
     seen = one.passivity()
-    text = (*TEXTS.paragraphs("asked_of", filter=a, scale=one.scale), seen.caveat, str(seen.port), *remarks)
-    periods = [c.sample_time for c in found.values() if c.sample_time]
-    w = _span(a, 0.999 * math.pi / max(periods) if periods else 1e5)
-    target = one.admittance(w).target
-    assert target is not None  # as there is a filter
-    curves: dict[str, tuple[str, np.ndarray]] = {TARGET: ("target", target)}
-    curves |= {facts["key"]: (facts["variant"], c.admittance(w).rendered) for facts, c in variants}
-    return _section(side, text, a, tables, _draw_admittances(side, w, curves, case.looks))
+    text = (*TEXTS.paragraphs("asked_of", filter=one.filter, scale=one.scale), seen.caveat, str(seen.port), *remarks)
+    return _section(case, side, variants, text, (SIGN.fill(signs), STIFFNESS.fill(stiffness, kind="")), tried)
 
 
-def _limit(contact: Contact, vary: str, **environment: Any) -> dict[str, Any]:
-    """Return the facts of a limit, with words where there is no direction and no change beyond."""
-    facts = contacts.limit_facts(contact.stability_limit(vary, **environment))
-    return {**facts, "direction": facts["direction"] or "–", "again": facts["again"] or "no"}
-
-
-def _tried(variants: Sequence[tuple[Mapping[str, Any], Contact]]) -> tuple[list[Table], list[str]]:
+def _tried(variants: Variants) -> tuple[list[Table], list[str]]:
     """Return the table of limits that were tried in the nonlinear run, and why others were not.
 
     A run that contradicts a limit however small the push raises its `ConfirmationError`.
@@ -323,12 +294,3 @@ def _tried(variants: Sequence[tuple[Mapping[str, Any], Contact]]) -> tuple[list[
         trials = contacts.trial_facts(found, "the nonlinear run with the environment inside the plant")
         rows += [{**facts, **trial, "damping": damping} for trial in trials]
     return [IN_RUNS.fill(rows, damping=damping)] if rows else [], list(remarks)
-
-
-def _draw_admittances(side: str, w: np.ndarray, curves: Mapping[str, tuple[str, np.ndarray]], looks: Looks) -> Plot:
-    """Return the figure of admittances over ω in rad/s; curves have the keys of their variants."""
-    drawn = [
-        (title, Y, DOTTED if name == TARGET else looks.get(name) or look_of(name, i))
-        for i, (name, (title, Y)) in enumerate(curves.items())
-    ]
-    return Plot(f"admittance_{side}", TEXTS.line("rendered", along=side == "par"), draw_admittances(w, drawn))

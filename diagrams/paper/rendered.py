@@ -12,7 +12,6 @@ has it: of a sampled loop the fundamental.
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -145,7 +144,7 @@ def passivity(
     OptionError
         If an end of the scan is not positive, or not below the Nyquist frequency.
     """
-    return replace(find_sign(loop.contact, low=low, high=high, per_decade=per_decade), findings=loop.findings)
+    return find_sign(loop.contact, low=low, high=high, per_decade=per_decade)
 
 
 def _state_labels(loop: AdmittanceLoop) -> list[str]:

@@ -46,6 +46,7 @@ def test_every_result_of_a_loop_carries_its_findings():
     kink = Kink("plant", "velocity", "motor_force", 0.0, 1.0)
     loop = AdmittanceLoop.of(robot(), "perp").replace(findings=(kink,))
     assert passivity(loop).findings == (kink,)
+    assert loop.contact.findings == loop.contact.admittance(1.0).findings == (kink,)
     assert stability_limit(loop, "mass", high=1e3).number.findings == (kink,)
     (limit,) = stability_map(loop, np.geomspace(1e2, 1e5, 5), [0.0]).limits
     assert limit.findings == (kink,)

@@ -93,6 +93,15 @@ def test_ideal_poles_are_those_of_two_impedances_in_parallel(side):
     np.testing.assert_allclose(got, np.divide(want, want[0]), rtol=1e-12)
 
 
+@SIDE
+def test_the_contact_of_an_ideal_loop_feels_another_tool(side):
+    model = loop(side, implementation="ideal", tool_mass=0.2)
+    a, held = model.admittance, {"stiffness": 100.0, "damping": 5.0, "mass": 0.5}
+    for tool in (0.0, 0.2, 1.7):
+        want = np.roots([a.mass + 0.5 + tool, a.effective_damping + 5.0, a.stiffness + 100.0]).real.max()
+        assert model.contact.loop("tool_mass", **held).growth_at(tool) == pytest.approx(want, rel=1e-12)
+
+
 VARIANTS = {
     "d0": {},
     "d1": {"delay": 1},
@@ -246,7 +255,9 @@ def test_without_feed_forward_the_stiffness_is_limited_as_in_the_errata(side, to
     assert limit.value == pytest.approx(told, rel=5e-3)
     a, pid = model.admittance, model.pid
     D = np.polymul([1.0, pid.a2, pid.a1, pid.a0], [a.mass, a.effective_damping, a.stiffness])
-    assert limit.value == pytest.approx(routh_limit(D, [0, 0, 0, pid.a2, pid.a1, pid.a0]), rel=1e-9)
+    expected = routh_limit(D, [0, 0, 0, pid.a2, pid.a1, pid.a0])
+    assert limit.value == pytest.approx(expected, rel=1e-9)
+    assert limit.second_look == pytest.approx(expected, rel=1e-9)
     assert limit.rule_of_thumb == math.inf
 
 
@@ -311,6 +322,7 @@ def test_a_limit_says_what_it_is():
         "confirmed_by": limit.confirmed_by,
     }
     assert pickle.loads(pickle.dumps(limit)) == limit
+    assert pickle.loads(pickle.dumps(stability_limit(loop(), "mass"))) == stability_limit(loop(), "mass")
 
 
 def test_the_rule_of_thumb_counts_the_hold_and_the_delay():
@@ -403,6 +415,8 @@ def test_a_map_holds_growth_and_limits():
         loop(), np.geomspace(0.1, 5.0, 12), np.array([0.1, 0.5]), x="mass", y="tool_mass", stiffness=500.0
     )
     assert other.limits[0].environment == {"tool_mass": 0.1, "stiffness": 500.0}
+    assert [limit.over for limit in other.limits] == ["mass", "mass"]
+    assert [limit.rule_of_thumb for limit in found.limits] == [rule_of_thumb(loop(delay=1), float(v)) for v in b]
     np.testing.assert_array_equal(other.growth[1] < 0.0, other.x_values < other.limits[1].value)
 
 
