@@ -75,17 +75,6 @@ def disturbed(request):
 
 
 @pytest.fixture(autouse=True)
-def loops_of_python(request):
-    """Runs with ``compile=False`` are Python's own loop, which others are held against, as are all in tests marked so."""
-    from loopwright.diagrams.simulation.engine import Engine
-
-    everywhere = request.node.get_closest_marker("python_loop") is not None
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Engine, "may_use_machine", staticmethod(lambda option: option == "auto" and not everywhere))
-        yield
-
-
-@pytest.fixture(autouse=True)
 def by_block(request):
     """Take every diagram for a large one, with ``--grouped``."""
     with pytest.MonkeyPatch.context() as patch:

@@ -4,8 +4,18 @@ from .background import BackgroundCode
 from .code import LARGEST, TickCode, compile_ticks, find_obstacle, interpret_ticks, write_ticks
 from .fused import FusedPlant, compile_fused, fuse
 from .grouping import make_tables
-from .handed_over import HandedOver, find_exchange_obstacle
-from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOptions, Span
+from .handed_over import HandedOver
+from .hybrid import (
+    FIXED,
+    BrokenOff,
+    CompiledHybrid,
+    HybridOutcome,
+    HybridReason,
+    Lost,
+    MethodOptions,
+    Sign,
+    Span,
+)
 from .hybrid_code import (
     HybridCode,
     compile_hybrid,
@@ -21,8 +31,8 @@ from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
 from .native_tick import bind_call
 from .remote import REFUSED, TOLD, UNDER_WAY, PythonStep, compile_other_side
 from .sources import Code
-from .staged import NativeExchange
-from .watch import Fired, Pile, Watch
+from .staged import NativeExchange, OwnEvent
+from .watch import Fired, Pile
 
 __all__ = [
     "FIXED",
@@ -33,6 +43,7 @@ __all__ = [
     "UNDER_WAY",
     "USES_SLOPE",
     "BackgroundCode",
+    "BrokenOff",
     "Code",
     "CompiledHybrid",
     "CompiledLoop",
@@ -44,23 +55,24 @@ __all__ = [
     "HybridOutcome",
     "HybridReason",
     "Kernel",
+    "Lost",
     "MethodOptions",
     "NativeExchange",
     "NewtonOptions",
     "Outcome",
+    "OwnEvent",
     "Pile",
     "PythonStep",
     "Reason",
+    "Sign",
     "Span",
     "TickCode",
-    "Watch",
     "bind_call",
     "compile_fused",
     "compile_hybrid",
     "compile_other_side",
     "compile_ticks",
     "find_code_obstacle",
-    "find_exchange_obstacle",
     "find_obstacle",
     "fuse",
     "hybrid_sources",

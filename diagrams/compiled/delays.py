@@ -58,7 +58,6 @@ class NativeDelays:
         tolerances: tuple[float, float],
     ):
         self._past, self._kept = past, list[Any]([driven, z, here, trial])
-        self._edges = np.empty((0, 2))  # those of an instant that can be gone back to
         self.structure = DelaysStructure(
             n=len(past.taus),
             distinct=len(set(past.taus)),
@@ -95,9 +94,7 @@ class NativeDelays:
         """Let C go on from a time in s."""
         past, of = self._past, self.structure
         past.make_room(t)
-        if len(self._edges) != len(past.edges):
-            self._edges = np.empty_like(past.edges)
-        of.pieces, of.edges, of.kept_edges = at(past.pieces), at(past.edges), at(self._edges)
+        of.pieces, of.edges = at(past.pieces), at(past.edges)
         of.capacity, of.room, of.count, of.noted = len(past.pieces), len(past.edges), past.count, past.noted
 
     def take_back(self) -> None:

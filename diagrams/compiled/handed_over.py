@@ -7,9 +7,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..flat import FlatDiagram
+from ...blocks.core import EvaluationVectors, FmuRuntimeError, SimulationError
+from ..exchange import OWN_EVENTS, ExchangeEvaluator, Look
+from ..flat import JUMP, FlatDiagram, OpaqueStage
 from .runtime import load_runtime
-from .staged import NativeBlock, NativeExchange
+from .staged import NativeBlock, NativeExchange, OwnEvent
+
+_DONE, _NOT_COMPUTED = range(2)
+_FIRED = -1
 
 
 class HandedBlock(NativeBlock, Protocol):
@@ -17,9 +22,10 @@ class HandedBlock(NativeBlock, Protocol):
 
     next_time: float
     ends_run: bool
+    nominals: np.ndarray
 
     def find_native_obstacle(self) -> str | None:
-        """Return why a loop in C can't evaluate it; None if it can."""
+        """Return why a loop in C can't evaluate it by itself; None if it can."""
 
     @property
     def reached_inputs(self) -> np.ndarray:
@@ -42,21 +48,6 @@ class HandedBlock(NativeBlock, Protocol):
         """Raise the error of a call of C that has failed."""
 
 
-class Wanting(Protocol):
-    """Notes whether a block wants an event at the instant that was accepted."""
-
-    wants_event: bool
-
-
-def find_exchange_obstacle(blocks: Mapping[str, Any]) -> str | None:
-    """Return why blocks that are evaluated from outside can't be handed over to C; None if they can."""
-    for path, block in blocks.items():
-        reason = block.find_native_obstacle() if hasattr(block, "find_native_obstacle") else "is evaluated by Python"
-        if reason is not None:
-            return f"the FMU {path!r} in model exchange {reason}"
-    return None
-
-
 class HandedOver:
     """Blocks that are evaluated from outside, in a run that goes on in C.
 
@@ -66,63 +57,112 @@ class HandedOver:
         The diagram.
     blocks : mapping of str to HandedBlock
         The blocks by path, loaded.
-    notes : mapping of str to Wanting
-        Whether each wants an event.
+    evaluators : mapping of str to ExchangeEvaluator
+        Their evaluators, by which Python does what C can't.
     tell : callable
-        ``tell(t, path, before, after)``: told events of inputs that have changed states, with all states before and
-        after them.
+        Told events of the blocks' own.
+    count : callable
+        ``count(t, path, name)``: notes an event of time or of a step, and refuses those that pile up.
     """
 
     def __init__(
         self,
         flat: FlatDiagram,
         blocks: Mapping[str, Any],
-        notes: Mapping[str, Wanting],
-        tell: Callable[[float, str, np.ndarray, np.ndarray], None],
+        evaluators: Mapping[str, ExchangeEvaluator],
+        tell: Callable[[OwnEvent], None],
+        count: Callable[[float, str, str], None],
     ):
-        self._notes, self._tell = notes, tell
+        self._evaluators, self._tell, self._count = evaluators, tell, count
         self._blocks: dict[str, HandedBlock] = {path: blocks[path] for path in flat.outside}
         first = {path: flat.states.slices[path].start for path in flat.outside}
-        self.native = NativeExchange(self._blocks, first, flat.width, load_runtime())
+        self.native = NativeExchange(self._blocks, first, flat.width, load_runtime(), self._by_python)
         """The blocks as C knows them."""
         self._with_c = False
+
+    # --- Python for C ------------------------------------------------------------------------------------------------
+
+    def _by_python(self, stage: OpaqueStage, vectors: EvaluationVectors) -> Callable[[], int]:
+        """Return the function that evaluates a stage, or looks at an instant, by Python while C waits."""
+        path, call = stage.path, self._evaluators[stage.path].bind(stage.names, vectors, again=False)
+
+        def evaluate() -> int:
+            try:
+                with self.native.lent(path):
+                    call()
+            except FmuRuntimeError:
+                raise
+            except SimulationError:  # a step that is shorter may have values
+                return _NOT_COMPUTED
+            return _DONE
+
+        def look() -> int:
+            with self.native.lent(path):
+                self._look(path, float(vectors.t[0]), call)
+            return _DONE
+
+        return look if stage.names == (JUMP,) else evaluate
+
+    def _look(self, path: str, t: float, call: Callable[[], None]) -> None:
+        evaluator, block, state = self._evaluators[path], self._blocks[path], self.native.state_of(path)
+        changed = self._take_block(path)
+        evaluator.look = Look.STEP if self.native.completes_step else Look.EVENTS
+        evaluator.event = None
+        nominals = np.array(block.nominals)
+        call()
+        self._give_block(path)
+        state.other_nominals = changed or not np.array_equal(nominals, block.nominals)
+        if evaluator.event is None:
+            return
+        state.acted, state.event = True, OWN_EVENTS.index(evaluator.event) if evaluator.event else _FIRED
+        if state.event > 0:
+            self._count(t, path, evaluator.event)
+
+    # --- from one to the other ---------------------------------------------------------------------------------------
 
     def hand_over(self) -> None:
         """Let C go on from an instant that Python has come to."""
         self._with_c = True
-        for path, block in self._blocks.items():
-            self.native.hand_over(
-                path,
-                block.reached_inputs,
-                block.next_time,
-                asks=self._notes[path].wants_event,
-                ended=block.ends_run,
-                final=block.is_final,
-            )
+        for path in self._blocks:
+            self._give_block(path)
+
+    def _give_block(self, path: str) -> None:
+        block, state = self._blocks[path], self.native.state_of(path)
+        self.native.hand_over(
+            path,
+            self.native.inputs_of(path) if state.by_python else block.reached_inputs,
+            block.next_time,
+            asks=self._evaluators[path].wants_event,
+            ended=block.ends_run,
+            final=not state.by_python and block.is_final,
+        )
 
     def take_back(self) -> bool:
         """Let Python go on from where C has come to; return whether nominal values have changed."""
-        changed = False
         if not self._with_c:  # Python has gone on, and has been interrupted
-            return changed
+            return False
         self._with_c = False
-        for path, block in self._blocks.items():
-            state = self.native.state_of(path)
-            self._notes[path].wants_event = bool(state.asks)
-            if state.ended and not block.ends_run:
-                block.take_end(state.end, in_event=bool(state.in_event))
-            block.take_back(self.native.inputs_of(path), state.next_time, read_nominals=bool(state.other_nominals))
-            changed |= bool(state.other_nominals)
-            state.other_nominals = 0
+        changed = [self._take_block(path) for path in self._blocks]
+        return any(changed)
+
+    def _take_block(self, path: str) -> bool:
+        block, state = self._blocks[path], self.native.state_of(path)
+        changed, state.other_nominals = bool(state.other_nominals), 0
+        if state.by_python:
+            return changed
+        self._evaluators[path].wants_event = bool(state.asks)
+        if state.ended and not block.ends_run:
+            block.take_end(state.end, in_event=bool(state.in_event))
+        block.take_back(self.native.inputs_of(path), state.next_time, read_nominals=changed)
         return changed
 
     def tell(self) -> None:
-        """Tell what has happened in C: warnings, and events of inputs that have changed states."""
+        """Tell what has happened in C: warnings, and events of the blocks' own."""
         self.native.remote.take_messages()
         for path, action, t in self.native.take_warnings():
             self._blocks[path].take_warning(action, t)
         for event in self.native.take_events():
-            self._tell(event.t, event.path, event.before, event.after)
+            self._tell(event)
 
     def has_news(self) -> bool:
         """Whether a block asks for the end of the run, or has other nominal values."""

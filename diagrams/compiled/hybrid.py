@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..events import Domains
 from ..flat import NONE, FlatDiagram, StepTable, TickPattern
+from .called_back import CALL, CalledBack
 from .delays import NativeDelays, PastInputs
 from .differences import Differences
 from .functions import at
@@ -35,8 +37,60 @@ _UNKNOWN = 20  # steps of the first call beside FMUs that may take any time
 class HybridReason(IntEnum):
     """Reasons for which the loop returns: those of `Reason`, and more."""
 
-    DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED, SUSPENDED, ASK_BETWEEN, ASK_TICK, ENDED, LOOK = range(11)
-    ASK_REST, ASK_SETTLE, ASK_FIRE, OUTSIDE_FAILED, PILED_UP = range(11, 16)
+    DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED, SUSPENDED, ENDED, LOOK, OUTSIDE_FAILED = range(10)
+    PILED_UP, BROKEN_OFF = range(10, 12)
+
+
+class Lost(IntEnum):
+    """What can't be done where the loop breaks off: see problem.c."""
+
+    NOWHERE, IN_STEP, IN_PROGRESS, IN_SLOPE, AT_TRIAL, AT_INSTANT = range(6)
+
+
+class Sign(IntEnum):
+    """Signs that another method may go on: the problem is stiff, no longer, or this method can take no step."""
+
+    NONE, STIFF, EASY, STUCK = range(4)
+
+
+class BrokenOff(NamedTuple):
+    """Where and why the loop has broken off.
+
+    Attributes
+    ----------
+    lost : Lost
+        What can't be done.
+    acting : frozenset of TickPattern, or None
+        At an instant: the clocks that act there; None where too seldom for code of its own.
+    method : str
+        Name of the method.
+    t_old, t : float
+        Begin and end of its last step, in s.
+    x_old, x : ndarray
+        The continuous states there.
+    trial_t, trial_x
+        The trial: its time in s, and the continuous states.
+    beyond : tuple of float and ndarray, or None
+        Time in s and continuous states of the last trial at which a rate was not finite.
+    step : float
+        Mean length of the last steps in s, of a run that does not get on.
+    edge, left : float
+        The end of the stretch in s, and the last time before it.
+    """
+
+    lost: Lost
+    acting: frozenset[TickPattern] | None
+    method: str
+    t_old: float
+    t: float
+    x_old: np.ndarray
+    x: np.ndarray
+    trial_t: float
+    trial_x: np.ndarray
+    beyond: tuple[float, np.ndarray] | None
+    step: float
+    edge: float
+    left: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +134,8 @@ class Span(NamedTuple):
         Discontinuities of sources in s, and when they are seen at the instant itself.
     steps : StepTable or None
         Steps of the plants that end at each; None where all plants step at each of them.
+    stays : bool
+        Whether the first tick is where the run is, so that no plant steps to it.
     """
 
     times: np.ndarray
@@ -90,6 +146,7 @@ class Span(NamedTuple):
     edges: np.ndarray
     late: np.ndarray
     steps: StepTable | None = None
+    stays: bool = False
 
 
 class HybridOutcome(NamedTuple):
@@ -126,10 +183,8 @@ class CompiledHybrid:
         The method, and, where it may be changed for one that is made for stiff problems, that one.
     step : float or None
         Fixed step of the method in s; None where it chooses its steps.
-    spacing : float
-        Longest time in s between two instants at which indicators of events are evaluated.
-    own : sequence of ndarray
-        For each event: the places of its block's states among the integrated ones.
+    domains : Domains, optional
+        What is kept of events, where there are some.
     loops : NewtonOptions, optional
         Newton's method for the algebraic loops between ticks, where there are some.
     exchange : NativeExchange, optional
@@ -140,6 +195,10 @@ class CompiledHybrid:
     delays : PastInputs, optional
         The memory of transport delays, where there are some; their inputs are kept within ``tolerances``, relative and
         absolute.
+    drain : callable
+        Called where no more events can be logged: takes those that have been.
+    coupled : bool
+        Whether the continuous states go on within the steps of the plants, by `run_between`.
     """
 
     def __init__(
@@ -152,19 +211,20 @@ class CompiledHybrid:
         methods: Sequence[MethodOptions],
         *,
         step: float | None,
-        spacing: float,
-        own: Sequence[np.ndarray],
+        domains: Domains | None,
         accepts: int,
         loops: NewtonOptions | None = None,
         exchange: NativeExchange | None = None,
         delays: PastInputs | None = None,
         tolerances: tuple[float, float] = (0.0, 0.0),
+        drain: Callable[[], None],
+        coupled: bool = False,
     ):
         self.ticks, self._kept = loop, list[Any]([code, arguments, x_next])
         self.kinds: Mapping[frozenset[TickPattern], int] = loop.kinds
         n, width, (_, x, w, p) = flat.continuous.size, flat.width, arguments
         trial = [np.zeros(1), x.copy(), w if delays is None else w.copy(), p]
-        where = self._own(flat.continuous.astype(np.int64))
+        where = flat.continuous
         slope = code.between.get("slope")
         slopes = np.zeros(0 if slope is None else n * n if loops else len(slope.pattern[0]))
         self._hybrid = hybrid = HybridStructure(l=loop.structure, automatic=len(methods) > 1, accepts=accepts)
@@ -178,7 +238,7 @@ class CompiledHybrid:
         hybrid.p = ProblemStructure(
             n=n,
             width=width,
-            where=where,
+            where=self._own(where.astype(np.int64)),
             flow=self._bind(code.between["flow"], trial, [np.zeros(n)]),
             t=self._own(trial[0]),
             x=self._own(trial[1]),
@@ -219,13 +279,18 @@ class CompiledHybrid:
             loop.calls_python = True
         for i, method in enumerate(self.methods):
             hybrid.methods[i] = ctypes.addressof(method)
-        hybrid.before = self._own(np.zeros(width))
+        hybrid.before, hybrid.p.beyond = self._own(np.zeros(width)), self._own(np.zeros(n))
+        self._beyond: np.ndarray = self._kept[-1]
+        self._trial, self._where = trial, where
+        self._called = CalledBack()
+        hybrid.drain = self._called.function(CALL, drain)
+        hybrid.coupled = coupled
         hybrid.outputs = flat.log.total
         self.watch: Watch | None = None
         """The events; None without any."""
-        if flat.events:
+        if domains is not None:
             self.watch = Watch(
-                flat, code.between, trial, arguments, x_next, spacing=spacing, step=step, own=own, exchange=exchange
+                flat, code.between, trial, arguments, x_next, domains=domains, step=step, exchange=exchange
             )
             hybrid.w = self.watch.structure
         if exchange is not None:
@@ -234,16 +299,27 @@ class CompiledHybrid:
             fired = np.zeros(0) if self.watch is None else self.watch.fired
             exchange.bind_jump(jump, [*arguments, fired], [x_next])
             hybrid.o = ctypes.addressof(exchange.structure)
-        taken = [flat.taken_at(clocks) for clocks in self.kinds]
+        taken = [*(flat.taken_at(clocks) for clocks in self.kinds), np.arange(width)]
         self.taken_states = self._zeros(width)
         """All states that a tick leaves, before the events behind it."""
-        hybrid.taken = self._own(np.concatenate([np.zeros(0), *taken]).astype(np.int64))
-        hybrid.taken_first = self._own(np.cumsum([0, *map(len, taken)]).astype(np.int64))
+        self._taken = np.concatenate([np.zeros(0), *taken]).astype(np.int64)
+        self._taken_first = np.cumsum([0, *map(len, taken)]).astype(np.int64)
+        hybrid.taken, hybrid.taken_first = self._own(self._taken), self._own(self._taken_first)
         hybrid.taken_states = self._own(self.taken_states)
         self._outcome = OutcomeStructure()
-        self._run, self._guard = load_runtime()["loopwright_go"], loop.guard
-        self._run.restype = None
+        library = load_runtime()
+        self._run, self._run_between, self._note_beyond = (
+            library[f"loopwright_{name}"] for name in ("go", "go_between", "note_beyond")
+        )
+        self._run.restype = self._run_between.restype = self._note_beyond.restype = None
+        self._guard = loop.guard
         self._fresh = [(structure, bytes(structure)) for structure in (hybrid, *self.methods)]
+
+    def note_taken(self, states: np.ndarray) -> None:
+        """Note which states the tick renews that Python has just evaluated for C; see `CompiledLoop`."""
+        first = self._taken_first[-2]
+        self._taken_first[-1] = first + len(states)
+        self._taken[first : first + len(states)] = states
 
     def begin_anew(self) -> None:
         """Forget the run before: methods have no step in mind, and no sign of stiffness has been seen."""
@@ -327,28 +403,25 @@ class CompiledHybrid:
         """Begin an interval at a tick, or at any instant between two, that the run has reached."""
         self._hybrid.inside, self._hybrid.t = 0, t
 
-    @property
-    def fired_times(self) -> int:
-        """Number of instants at which events have fired."""
-        return int(self._hybrid.w.fired_times)
+    def hand_over_domains(self, domains: Domains) -> None:
+        """Let C go on with what is kept of events beside its arrays."""
+        watch = self._hybrid.w
+        watch.fired_times, (watch.sliding, watch.switched) = domains.fired_times, domains.sliding
 
-    @fired_times.setter
-    def fired_times(self, count: int) -> None:
-        self._hybrid.w.fired_times = count
-
-    @property
-    def sliding(self) -> tuple[bool, bool]:
-        """Whether events of a fixed step wait for its end, and whether one has fired there; see `Sliding`."""
-        return bool(self._hybrid.w.sliding), bool(self._hybrid.w.switched)
-
-    @sliding.setter
-    def sliding(self, state: tuple[bool, bool]) -> None:
-        self._hybrid.w.sliding, self._hybrid.w.switched = state
+    def take_back_domains(self, domains: Domains) -> None:
+        """Let Python go on with what is kept of events beside its arrays."""
+        watch = self._hybrid.w
+        domains.fired_times, domains.sliding = int(watch.fired_times), (bool(watch.sliding), bool(watch.switched))
 
     @property
     def pile(self) -> tuple[Pile, int, int]:
         """How events have piled up, the event that is to blame, and how many times in a row."""
         return Pile(self._hybrid.w.pile), int(self._hybrid.w.culprit), int(self._hybrid.w.piled)
+
+    def own_event(self, place: int) -> str:
+        """Return the name of the last event of its own that an FMU in model exchange has had, by its place."""
+        assert self._exchange is not None
+        return self._exchange.name_of_event(place)
 
     def take_fired(self) -> list[Fired]:
         """Return the events that have fired since the last call."""
@@ -363,12 +436,6 @@ class CompiledHybrid:
         """Let the methods take steps of some lengths in s next; None: they choose their first step."""
         for method, step in zip(self.methods, steps, strict=True):
             method.planned = np.nan if step is None else step
-
-    @property
-    def left(self) -> float | None:
-        """Time in s from the left of the discontinuity that has been reached; None where there is none."""
-        problem = self._hybrid.p
-        return float(problem.left) if problem.edge == self._hybrid.t else None
 
     def set_tolerances(self, methods: Sequence[MethodOptions]) -> None:
         """Take other absolute tolerances of the methods."""
@@ -398,10 +465,34 @@ class CompiledHybrid:
         if place != self._hybrid.active:
             self._hybrid.active, self._hybrid.hits, self._hybrid.misses, self._hybrid.easy = place, 0, 0, 0
 
-    def looked_at(self) -> float:
-        """Return the step in s at which the problem has seemed stiff, or no longer; going on is possible then."""
-        self._hybrid.switched = 0
-        return float(self._hybrid.looked_at)
+    def take_sign(self) -> tuple[Sign, float]:
+        """Return the sign that another method may go on, and the step in s at which it came; C may go on then."""
+        sign, self._hybrid.switched = Sign(self._hybrid.switched), Sign.NONE
+        return sign, float(self._hybrid.looked_at)
+
+    def broken_off(self) -> BrokenOff:
+        """Return where and why the loop has broken off."""
+        hybrid = self._hybrid
+        problem, method, n = hybrid.p, self.methods[hybrid.active], self._where.size
+        lost, step = Lost(problem.lost), float(problem.beyond_t)
+        with self._guard():
+            if lost is Lost.IN_STEP:
+                self._note_beyond(ctypes.byref(hybrid))
+        beyond = None if lost is not Lost.IN_STEP or np.isnan(problem.beyond_t) else problem.beyond_t
+        x_old, x = (
+            np.array((ctypes.c_double * n).from_address(a)) if n else np.zeros(0) for a in (method.x_old, method.x)
+        )
+        clocks = next((clocks for clocks, kind in self.kinds.items() if kind == hybrid.lost_at), None)
+        return BrokenOff(
+            lost, clocks, self._names[hybrid.active], method.t_old, method.t, x_old, x,
+            float(self._trial[0][0]), self._trial[1][self._where].copy(),
+            None if beyond is None else (beyond, self._beyond.copy()), step, problem.edge, problem.left,
+        )  # fmt: skip
+
+    @property
+    def coupled(self) -> bool:
+        """Whether the continuous states go on within the steps of the plants."""
+        return bool(self._hybrid.coupled)
 
     @property
     def planned(self) -> list[float | None]:
@@ -431,6 +522,13 @@ class CompiledHybrid:
         rows : ndarray, shape (m, 1 + width)
             Samples: their time in s, then their values.
         """
+        return self._go(self._run, span, rows, self._outcome)
+
+    def run_between(self, span: Span, rows: np.ndarray) -> HybridOutcome:
+        """Go to the end of a span, before a tick there, while `run` waits for the plants; see `run`."""
+        return self._go(self._run_between, span, rows, OutcomeStructure())
+
+    def _go(self, run: Any, span: Span, rows: np.ndarray, found: OutcomeStructure) -> HybridOutcome:
         given = SpanStructure(
             count=len(span.widths),
             times=at(span.times),
@@ -442,15 +540,17 @@ class CompiledHybrid:
             edge=at(span.edges),
             late=at(span.late),
             room=len(rows),
+            stays=span.stays,
         )
-        self.ticks.set_steps(span.steps)
-        found = self._outcome
+        if span.steps is not None:
+            self.ticks.set_steps(span.steps)
         if self._delays is not None:
             self._delays.hand_over(self._hybrid.t)
         with self._guard():
-            self._run(ctypes.byref(self._hybrid), ctypes.byref(given), ctypes.c_void_p(at(rows)), ctypes.byref(found))
+            run(ctypes.byref(self._hybrid), ctypes.byref(given), ctypes.c_void_p(at(rows)), ctypes.byref(found))
         if self._delays is not None:
             self._delays.take_back()
+        self._called.check()
         return HybridOutcome(
             found.ticks, found.rows, HybridReason(found.reason), found.plant, found.stage, found.status, self._hybrid.t
         )

@@ -24,7 +24,7 @@ class ProblemStructure(ctypes.Structure):
         *_fields(_INT, "n width"), ("where", _AT), ("flow", TickStructure), ("slope", TickStructure),
         *_fields(_AT, "t x slopes"), ("entries", _INT), *_fields(_AT, "row column"),
         *_fields(_REAL, "stop edge left at late"), *_fields(_AT, "loops here by_loops delays"),
-        *_fields(_INT, "rates jacobians"),
+        *_fields(_INT, "rates jacobians lost noting"), ("beyond_t", _REAL), ("beyond", _AT),
     ]  # fmt: skip
 
 
@@ -39,8 +39,8 @@ class DelaysStructure(ctypes.Structure):
         ("driven", TickStructure),
         *_fields(_AT, "z found"),
         *_fields(_REAL, "rtol atol"),
-        *_fields(_AT, "pieces edges kept_edges"),
-        *_fields(_INT, "count capacity noted room kept_count kept_noted smoothed"),
+        *_fields(_AT, "pieces edges"),
+        *_fields(_INT, "count capacity noted room smoothed"),
         ("middle", _REAL),
     ]
 
@@ -71,10 +71,10 @@ class HybridStructure(ctypes.Structure):
     _fields_ = [
         ("l", LoopStructure), ("p", ProblemStructure), ("w", WatchStructure), ("methods", _AT * 2),
         *_fields(_INT, "active automatic accepts between budget inside begun stepped"),
-        *_fields(_REAL, "t to counts_as"), *_fields(_INT, "found hits misses easy"), ("before", _AT), ("outputs", _INT),
-        *_fields(_AT, "taken taken_first taken_states"), ("switched", _INT), ("solved", _AT), ("looked_at", _REAL),
-        ("planned", _REAL), ("o", _AT),
-        ("jump", _REAL), ("acted", _INT), ("looked", _REAL),
+        *_fields(_REAL, "t to counts_as"), *_fields(_INT, "found hits misses easy outputs"),
+        *_fields(_AT, "taken taken_first taken_states before"), ("switched", _INT), ("solved", _AT),
+        ("looked_at", _REAL), ("o", _AT), ("jump", _REAL), ("drain", _AT), *_fields(_INT, "coupled lost_at"),
+        ("looked", _REAL),
     ]  # fmt: skip
 
 
@@ -83,5 +83,5 @@ class SpanStructure(ctypes.Structure):
 
     _fields_ = [
         ("count", _INT), *_fields(_AT, "times widths kinds lands"), ("beyond", _REAL), ("edges", _INT),
-        *_fields(_AT, "edge late"), ("room", _INT),
+        *_fields(_AT, "edge late"), *_fields(_INT, "room stays"),
     ]  # fmt: skip

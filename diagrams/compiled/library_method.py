@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...blocks.interrupts import INTERRUPTS
-from ..solvers import AcceptedStep, Polynomial, Problem, Solver, make_solver
+from ..solvers import AcceptedStep, Problem, Solver, make_solver
 from .hybrid_structures import MethodStructure, ProblemStructure
 from .runtime import load_runtime
 
@@ -147,10 +147,9 @@ class LibraryMethod:
     def _expand(self) -> None:
         self._method.order, self._powers[0] = 1, np.nan  # if this fails, C goes no further
         assert self._step is not None
-        found = self._step.polynomial()
-        assert isinstance(found, Polynomial)
-        self._method.order = found.coefficients.shape[1]
-        self._powers[: self._method.order] = found.coefficients.T
+        found = self._step.prepare().coefficients
+        self._method.order = len(found)
+        self._powers[: self._method.order] = found
 
     # --- calls of the library ----------------------------------------------------------------------------------------
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from enum import IntEnum
@@ -12,10 +12,12 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from ...blocks.core import SimulationError
 from ...blocks.interrupts import INTERRUPTS
 from ...fmus.calls import NEAR, FmuInstance, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
 from ..flat import TRUE, StepTable, TickPattern
+from .called_back import CALL, TICK, CalledBack
 from .code import CompiledTick, TickCode
 from .functions import TickStructure, at
 from .grouped_functions import GroupedTick
@@ -91,6 +93,7 @@ class NewtonStructure(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("where", "r", "J", "v", "before", "direction", "column", "lu", "rows")),
         *((name, ctypes.c_double) for name in ("tolerance", "rounding", "singular")),
         *((name, ctypes.c_int64) for name in ("iterations", "halvings")),
+        ("help", ctypes.c_void_p),
     ]
 
 
@@ -109,6 +112,9 @@ class NewtonOptions:
         Least singular value of the derivative that surely determines the values, relative to 1 + the loop's gain.
     iterations, halvings : int
         Steps, and halvings of a step, at most.
+    solver : callable
+        ``solver(t, x, call, r, J)`` returns Python's function that solves the loops where C can't: with the vectors t and
+        x, and the function that evaluates the mismatch r and its derivative J, both written by ``call``.
     """
 
     where: Sequence[int]
@@ -117,6 +123,7 @@ class NewtonOptions:
     singular: float
     iterations: int
     halvings: int
+    solver: Callable[..., Callable[[], None]]
 
 
 class Outcome(NamedTuple):
@@ -188,6 +195,9 @@ class CompiledLoop:
         Inputs of the plants as they are now, and as they are held between ticks; one array where that is the same.
     inputs : sequence of slice, optional
         The inputs of each plant among them, where plants step less often than the ticks.
+    rest : callable, optional
+        Evaluates a tick at which clocks act together for which there is no code: the kind after all `kinds`. It returns 0,
+        or 1 where it can't be evaluated.
     """
 
     def __init__(
@@ -205,7 +215,9 @@ class CompiledLoop:
         exchange: StagedBinding | None = None,
         held: tuple[np.ndarray, np.ndarray] | None = None,
         inputs: Sequence[slice] = (),
+        rest: Callable[[], int] | None = None,
     ):
+        self.called = CalledBack()
         self._remote, self._far = RemotePlants(), list[int | None]()
         self._remotes = [self._remote, *([] if exchange is None else [exchange.remote])]
         self._kept: list[Any] = [code, arguments, results, plants, columns, exchange]
@@ -215,14 +227,17 @@ class CompiledLoop:
         t, x, _, _ = arguments
         x_next, _, log, ok = results
         self.kinds = {clocks: i for i, clocks in enumerate(code.ticks)}
+        ticks = [self._tick(tick, arguments, results) for tick in code.ticks.values()]
+        if rest is not None:
+            ticks.append(TickStructure(self.called.function(TICK, lambda *_: rest(), 1)))
         self.structure = LoopStructure(
-            kinds=len(code.ticks),
+            kinds=len(ticks),
             plants=len(plants),
             states=x.size,
             row=width,
             stops=len(stops),
             every=every,
-            ticks=self._address([self._tick(tick, arguments, results) for tick in code.ticks.values()], TickStructure),
+            ticks=self._address(ticks, TickStructure),
             fmus=self._address([self._plant(j, plant) for j, plant in enumerate(plants)], _Plant),
             t=at(t),
             x=at(x),
@@ -244,6 +259,7 @@ class CompiledLoop:
             self.structure.own = ctypes.addressof(self._own)
         if code.loops:
             solvers = [self.bind_loops(code, clocks, arguments, (loops or {}).get(clocks)) for clocks in code.ticks]
+            solvers += [NewtonStructure()] * (len(ticks) - len(solvers))
             self.structure.loops = self._address(solvers, NewtonStructure)
         self._outcome = OutcomeStructure()
         self._run = code.master or load_runtime()["loopwright_run"]
@@ -286,15 +302,16 @@ class CompiledLoop:
         """Return the algebraic loops at a tick, bound to the vectors (t, x, w, p); valid as long as this lives."""
         if clocks not in code.loops or options is None:
             return NewtonStructure()
-        n = len(options.where)
-        r, J = np.zeros(n), np.zeros(n * n)
-        return NewtonStructure(
+        n, where = len(options.where), np.array(options.where, dtype=np.int64)
+        r, J, before = np.zeros(n), np.zeros(n * n), np.zeros(n)
+        found = NewtonStructure(
             n=n,
             equations=self._tick(code.loops[clocks], arguments, [r, J]),
-            where=self._array(np.array(options.where, dtype=np.int64)),
+            where=self._array(where),
             r=self._array(r),
             J=self._array(J),
-            **{name: self._array(np.zeros(n)) for name in ("v", "before", "direction", "column")},
+            before=self._array(before),
+            **{name: self._array(np.zeros(n)) for name in ("v", "direction", "column")},
             lu=self._array(np.zeros(n * n)),
             rows=self._array(np.zeros(n, dtype=np.int64)),
             tolerance=options.tolerance,
@@ -303,6 +320,20 @@ class CompiledLoop:
             iterations=options.iterations,
             halvings=options.halvings,
         )
+        evaluate = load_runtime()["loopwright_evaluate_loops"]
+        solve = options.solver(arguments[0], arguments[1], lambda: evaluate(ctypes.byref(found)), r, J)
+
+        def help_c() -> int:
+            arguments[1][where] = before
+            try:
+                solve()
+            except SimulationError:  # told where the run can't do without
+                return 0
+            return 1
+
+        found.help = self.called.function(CALL, help_c)
+        self._kept.append(found)
+        return found
 
     def _plant(self, place: int, plant: FmuInstance | PythonStep) -> ctypes.Structure:
         self._far.append(None)
@@ -418,6 +449,7 @@ class CompiledLoop:
                 at(rows),
                 ctypes.addressof(self._outcome),
             )
+        self.called.check()
         found = self._outcome
         return Outcome(found.ticks, found.rows, Reason(found.reason), found.plant, found.stage, found.status)
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from ...blocks.interrupts import INTERRUPTS
+from .called_back import TICK
 from .code import CompiledTick
 from .staged_functions import Staged
-
-_Tick = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4, ctypes.c_int)
 
 
 def bind_call(tick: CompiledTick, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Callable[[], None]:
@@ -19,7 +17,7 @@ def bind_call(tick: CompiledTick, arguments: Sequence[np.ndarray], results: Sequ
     assert not isinstance(tick, Staged)
     bound = tick.bind(arguments, results)
     of = bound.structure
-    function = _Tick(of.evaluate)
+    function = TICK(of.evaluate)
 
     def call() -> None:
         if function(of.arguments, of.results, of.iw, of.w, 0):

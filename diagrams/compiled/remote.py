@@ -153,6 +153,18 @@ class RemotePlants:
         self._all.append((asked.process, made))
         return made
 
+    @contextmanager
+    def lent(self, structure: RemoteStructure | None) -> Iterator[None]:
+        """Let Python ask a process while C waits: requests are numbered on."""
+        found = next((both for both in self._all if both[1] is structure), None)
+        if found is not None:
+            found[0].number = found[1].number
+        try:
+            yield
+        finally:
+            if found is not None:
+                found[1].number = found[0].number
+
     def note_status(self, structure: RemoteStructure | None, status: int) -> None:
         """Note the status of a call that has failed: no other instance is made in a process after an error."""
         for process, made in self._all:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -11,14 +12,17 @@ import numpy as np
 from ...blocks.core import EvaluationVectors, Wanted
 from ...fmus.calls import BoundCalls, NativeAction, NativeLook
 from ...fmus.host_state import HostState
+from ..exchange import OWN_EVENTS
 from ..flat import JUMP, OpaqueStage
+from .called_back import CALL, CalledBack
 from .differences import color_columns
 from .functions import TickStructure, address_of, at, list_vectors
 from .loop import NewtonStructure
 from .remote import WAIT, LateReplies, RemotePlants
 from .staged_functions import Staged, StagedEquations, StagedSlopes
 
-_LOGGED = 2**20  # bytes of events of inputs in a call
+_LOGGED = 2**20  # bytes of events in a call
+_TO_STEP, _FAILED_IN_PYTHON = 0, 2
 _INT, _REAL, _AT = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
 
@@ -53,7 +57,7 @@ class _Exchanged(ctypes.Structure):
         ("next_time", _REAL),
         *_fields(_INT, "asks ended in_event"),
         ("end", _REAL),
-        *_fields(_INT, "other_nominals acted"),
+        *_fields(_INT, "other_nominals acted event by_python"),
         *_fields(_AT, "changed far"),
     ]
 
@@ -78,7 +82,9 @@ class _Stage(ctypes.Structure):
     _fields_ = [
         ("f", TickStructure),
         ("fmu", _AT),
+        ("looks", _INT),
         ("calls", _Sequence),
+        ("by_python", _AT),
         *_fields(_AT, "t x u into"),
         ("made", _INT),
     ]
@@ -110,11 +116,12 @@ class NativeBlock(Protocol):
         """Return all that a look at an instant that is reached may do."""
 
 
-class InputEvent(NamedTuple):
-    """An event of an input that has changed states: its time in s, its block, and the states before and after it."""
+class OwnEvent(NamedTuple):
+    """An event of a block's own: its time in s, block and name, and the states before and after it."""
 
     t: float
     path: str
+    name: str
     before: np.ndarray
     after: np.ndarray
 
@@ -126,6 +133,11 @@ class CallFailure(NamedTuple):
     action: str
     status: int
     t: float
+
+
+def find_obstacle(block: Any) -> str | None:
+    """Return why C can't evaluate a block by itself, so that Python does for it; None if it can."""
+    return block.find_native_obstacle() if hasattr(block, "find_native_obstacle") else "is evaluated by Python"
 
 
 class NativeExchange:
@@ -141,10 +153,21 @@ class NativeExchange:
         Number of all states.
     library : CDLL
         The runtime library.
+    by_python : callable
+        Returns, for a stage and its vectors, the function that does for C what it can't.
     """
 
-    def __init__(self, blocks: Mapping[str, NativeBlock], first: Mapping[str, int], width: int, library: ctypes.CDLL):
-        self._blocks, self._width, self._kept = blocks, width, list[Any]()
+    def __init__(
+        self,
+        blocks: Mapping[str, NativeBlock],
+        first: Mapping[str, int],
+        width: int,
+        library: ctypes.CDLL,
+        by_python: Callable[[OpaqueStage, EvaluationVectors], Callable[[], int]],
+    ):
+        self._blocks, self._width, self._kept, self._by_python = blocks, width, list[Any](), by_python
+        self.called = CalledBack()
+        """Calls of Python, with the error that has ended a run."""
         names = ("stages", "slopes", "equations")
         self._stages, self._slopes, self._equations = (address_of(library, f"loopwright_{name}") for name in names)
         self.paths = [*blocks]
@@ -168,6 +191,9 @@ class NativeExchange:
         for i, (path, block) in enumerate(blocks.items()):
             e = self._each[i]
             e.of, e.place, e.first, e.next_time = ctypes.addressof(self.structure), i, first[path], np.inf
+            e.by_python = find_obstacle(block) is not None
+            if e.by_python:
+                continue
             if (host := block.native_host) is not None:
                 self.watched.append((host, ctypes.c_bool()))
                 e.changed = ctypes.addressof(self.watched[-1][1])
@@ -253,8 +279,13 @@ class NativeExchange:
         vectors = stage.vectors(t, c)
         structure.fmu = ctypes.addressof(self._each) + place * ctypes.sizeof(_Exchanged)
         structure.t, structure.x, structure.u, structure.into = map(at, vectors)
-        structure.made = vectors.into.size
-        if stage.names == (JUMP,):
+        structure.made, structure.looks = vectors.into.size, stage.names == (JUMP,)
+        structure.by_python = self.called.function(CALL, self._by_python(stage, vectors), _FAILED_IN_PYTHON)
+        if fmu.by_python:
+            fmu.states = vectors.x.size
+            self._inputs.setdefault(stage.path, np.zeros(0))
+            return
+        if structure.looks:
             self._bind_look(fmu, stage.path, block.native_look(vectors), vectors.x.size)
             fmu.events = vectors.u.size - fmu.inputs
             return
@@ -323,9 +354,24 @@ class NativeExchange:
         """Return the inputs of a block at the last instant that was reached."""
         return self._inputs[path]
 
+    @property
+    def completes_step(self) -> bool:
+        """Whether a look is one at the end of a step, and no event acts."""
+        return bool(self.structure.look == _TO_STEP)
+
+    @contextmanager
+    def lent(self, path: str) -> Iterator[None]:
+        """Let Python ask a block's process while C waits."""
+        with self.remote.lent(self._far.get(path)):
+            yield
+
     def state_of(self, path: str) -> Any:
         """Return what C knows of a block: ``next_time``, ``asks``, ``ended``, ``in_event``, ``end`` and so on."""
         return self._each[self.paths.index(path)]
+
+    def name_of_event(self, place: int) -> str:
+        """Return the name of the last event of its own that a block has had, by its place."""
+        return OWN_EVENTS[self._each[place].event]
 
     def take_warnings(self) -> list[tuple[str, str, float]]:
         """Return calls that have given a warning since the last time: block, name and time in s of the first one."""
@@ -347,14 +393,18 @@ class NativeExchange:
             If the process of an FMU has ended.
         """
         self._late.check()
+        self.called.check()
         o = self.structure
         names = () if o.action is None else self._names[o.action]
         name = names[min(o.call, len(names) - 1)] if names else ""
         self.remote.note_status(self._far.get(self.paths[o.plant]), o.status)
         return CallFailure(self.paths[o.plant], name, o.status, o.at)
 
-    def take_events(self) -> list[InputEvent]:
+    def take_events(self) -> list[OwnEvent]:
         """Return the events since the last call."""
-        rows, w = self._log[: self.structure.logged].copy(), self._width
+        rows, w, n = self._log[: self.structure.logged].copy(), self._width, len(self.paths)
         self.structure.logged = 0
-        return [InputEvent(float(r[0]), self.paths[int(r[1])], r[2 : 2 + w], r[2 + w :]) for r in rows]
+        return [
+            OwnEvent(float(r[0]), self.paths[int(r[1]) % n], OWN_EVENTS[int(r[1]) // n], r[2 : 2 + w], r[2 + w :])
+            for r in rows
+        ]

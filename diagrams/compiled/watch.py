@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..events import Domains
 from ..flat import FlatDiagram
 from .differences import Differences
 from .functions import TickStructure, at
@@ -18,7 +19,6 @@ from .staged_functions import Staged, StagedSlopes
 
 _LOGGED = 2**22  # bytes of what has fired in a call
 _INSTANTS = 1100  # of a step that are looked at together, at most
-_LATEST, RECENT = 9, 500
 _INT, _REAL, _AT = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
 
@@ -26,29 +26,26 @@ def _fields(kind: Any, names: str) -> list[tuple[str, Any]]:
     return [(name, kind) for name in names.split()]
 
 
-_BY_C, _BY_FMU = range(2)  # who lets an event fire
-
-
 class WatchStructure(ctypes.Structure):
     """The events as C knows them."""
 
     _fields_ = [
         ("m", _INT), ("indicators", TickStructure), ("jump", TickStructure),
-        *_fields(_AT, "z open fired rising falling hysteretic asks hysteresis own own_first"),
-        *_fields(_REAL, "spacing finest step"), ("state_size", _INT), ("state", _AT),
+        *_fields(_AT, "z open fired rising falling hysteretic hysteresis own own_first"),
+        *_fields(_REAL, "spacing finest step"),
         *_fields(_AT, "domain low high slack size rounding largest counts latest fresh"),
         *_fields(_AT, "side stuck briefs brief_at recent recent_fired"), ("fired_times", _INT),
-        ("kept", _AT), *_fields(_INT, "kept_times kept_log"), ("log", _AT), *_fields(_INT, "logged capacity"),
-        *_fields(_AT, "times seen gates domains x x_before now strict values motion later fires following located"),
+        ("log", _AT), *_fields(_INT, "logged capacity"),
+        *_fields(_AT, "times seen gates domains x x_before now strict values motion later fires following"),
         *_fields(_AT, "gate inside inside_first start"), *_fields(_INT, "sliding switched"), ("slid", _AT),
         *_fields(_INT, "pile culprit piled"),
     ]  # fmt: skip
 
 
 class Pile(IntEnum):
-    """How events pile up so that a run can't go on; see `loopwright.diagrams.events`."""
+    """How events pile up so that a run can't go on; see `EventLimits`."""
 
-    IN_CONTACT, ZENO, CHATTERS, ENDLESS = range(4)
+    IN_CONTACT, ZENO, CHATTERS, ENDLESS, ENDLESS_OUTSIDE = range(5)
 
 
 class Fired(NamedTuple):
@@ -73,21 +70,17 @@ class Watch:
         The vectors (t, x, w, p) of a trial, and of the instant that is reached.
     x_next : ndarray
         Where jumps write the next states.
-    spacing : float
-        Longest time in s between two instants at which indicators are evaluated.
+    domains : Domains
+        What is kept of them, where C writes.
     step : float or None
         Fixed step of the method in s; None where it chooses its steps.
-    own : sequence of ndarray
-        For each event: the places of its block's states among the integrated ones.
     exchange : NativeExchange, optional
-        FMUs in model exchange: Python lets their events fire.
+        FMUs in model exchange, whose events they are, too.
 
     Attributes
     ----------
     structure : WatchStructure
         It as C knows it; valid as long as this lives.
-    domain, low, high, slack, size, rounding, largest : ndarray
-        One entry for each event; see `loopwright.diagrams.events.Domains`.
     """
 
     def __init__(
@@ -98,16 +91,15 @@ class Watch:
         here: Sequence[np.ndarray],
         x_next: np.ndarray,
         *,
-        spacing: float,
+        domains: Domains,
         step: float | None,
-        own: Sequence[np.ndarray],
         exchange: NativeExchange | None = None,
     ):
         self._kept: list[Any] = []
         events, n = flat.events, flat.continuous.size
         m = self._m = len(events)
         self._width = flat.width
-        self.structure = WatchStructure(m=m, spacing=spacing, finest=2e-16 * spacing)
+        self.structure = WatchStructure(m=m, spacing=domains.spacing, finest=2e-16 * domains.spacing)
         self.structure.step = np.nan if step is None else step
         z, opened, fired = np.zeros(m), np.zeros(m), np.zeros(m)
         for name, vectors in {"z": z, "open": opened, "fired": fired}.items():
@@ -125,25 +117,19 @@ class Watch:
             "rising": [e.direction != "falling" for e in events],
             "falling": [e.direction != "rising" for e in events],
             "hysteretic": [e.hysteresis > 0.0 for e in events],
-            "asks": [_BY_FMU if e.path in flat.outside else _BY_C for e in events],
         }
         for name, values in flags.items():
             self._put(name, np.array(values, dtype=np.uint8))
         self._put("hysteresis", np.array([e.hysteresis for e in events]))
-        self._put("own", np.concatenate([np.zeros(0), *own]).astype(np.int64))
-        self._put("own_first", np.cumsum([0, *map(len, own)]).astype(np.int64))
+        self._put("own", np.concatenate([np.zeros(0), *domains.own]).astype(np.int64))
+        self._put("own_first", np.cumsum([0, *map(len, domains.own)]).astype(np.int64))
         self._put_resets(flat)
-        self._make_state(m)
-        self.start, self._slid = np.zeros(m), np.full(m, np.nan)
-        """Domains where the run has begun, to which those inside a subsystem go back that is reset."""
-        self._put("start", self.start)
+        for name, part in domains.parts.items():
+            self._put(name, part)
+        self._slid = np.full(m, np.nan)
         self._put("slid", self._slid)
-        self.recent = np.zeros(RECENT), np.zeros((RECENT, m), dtype=np.uint8)
-        """Rings of the times in s at which any event has fired last, and which did; see `EventLimits`."""
-        self._put("recent", self.recent[0])
-        self._put("recent_fired", self.recent[1])
         row = 2 + 2 * self._width
-        self._log = np.zeros((max(200, _LOGGED // (8 * row)), row))
+        self._log = np.zeros((max(200, m, _LOGGED // (8 * row)), row))
         self._put("log", self._log)
         self.structure.capacity = len(self._log)
         for name in ("times", "seen", "gates", "domains"):
@@ -157,9 +143,6 @@ class Watch:
         """Which events fire at the instant that C has come to."""
         self._put("fires", self.fires)
         self._put("following", np.zeros(m, dtype=np.uint8))
-        self.located = np.zeros(m, dtype=np.uint8)
-        """Which events fire at an instant that was found in a step, where C has left that to Python."""
-        self._put("located", self.located)
 
     def _put(self, name: str, vector: np.ndarray) -> None:
         self._kept.append(vector)
@@ -185,49 +168,6 @@ class Watch:
         bound = function.bind(arguments, results)
         self._kept.append(bound)
         setattr(self.structure, name, bound.structure)
-
-    def _make_state(self, m: int) -> None:
-        """Lay out what C goes back to where an event is left to Python: one vector, of parts."""
-        sizes = dict.fromkeys(["domain", "low", "high", "slack", "size", "rounding", "largest", "counts"], m)
-        sizes |= dict.fromkeys(["side", "stuck", "briefs", "brief_at"], m)
-        sizes |= {"latest": _LATEST * m, "fresh": 1}
-        state = np.zeros(sum(sizes.values()))
-        self._put("state", state)
-        self._put("kept", state.copy())
-        self.structure.state_size = state.size
-        self._parts: dict[str, np.ndarray] = {}
-        first = 0
-        for name, size in sizes.items():
-            part = self._parts[name] = state[first : first + size]
-            setattr(self.structure, name, at(part))
-            first += size
-        parts = self._parts
-        self.domain, self.low, self.high, self.slack = (parts[name] for name in ("domain", "low", "high", "slack"))
-        self.size, self.rounding, self.largest = (parts[name] for name in ("size", "rounding", "largest"))
-        self.rest = [parts[name] for name in ("side", "stuck", "briefs", "brief_at")]
-        """A rest in contact: see `EventLimits`."""
-
-    @property
-    def fresh(self) -> bool:
-        """Whether an event has fired since the last step without one."""
-        return bool(self._parts["fresh"][0])
-
-    @fresh.setter
-    def fresh(self, value: bool) -> None:
-        self._parts["fresh"][0] = value
-
-    @property
-    def latest(self) -> list[list[float]]:
-        """Times in s at which each event has fired last."""
-        rows, counts = self._parts["latest"].reshape(self._m, _LATEST), self._parts["counts"]
-        return [row[: int(count)].tolist() for row, count in zip(rows, counts, strict=True)]
-
-    @latest.setter
-    def latest(self, times: Sequence[Sequence[float]]) -> None:
-        rows = self._parts["latest"].reshape(self._m, _LATEST)
-        for i, own in enumerate(times):
-            rows[i, : len(own)] = own
-            self._parts["counts"][i] = len(own)
 
     def take_slid(self) -> list[tuple[float, int]]:
         """Return the events that have begun to slide since the last call, and when, in s."""

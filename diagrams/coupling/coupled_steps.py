@@ -14,7 +14,7 @@ from .links import Links
 from .options import Coupling, Scheme
 from .plant_steps import PlantSteps, step_all
 from .plants import Plant
-from .rest import Rest, Sample, never
+from .rest import Rest
 from .rollback import Beginning, Rollback, accept_steps, find_taken_back, save_plant, texts_of, try_steps
 from .search import Search
 
@@ -143,7 +143,7 @@ class CoupledSteps:
 
     # --- from tick to tick --------------------------------------------------------------------------------------------
 
-    def go(self, t: float, end: float, h: float, sample: Sample = never) -> float | None:
+    def go(self, t: float, end: float, h: float) -> float | None:
         """Go from one tick to the next.
 
         Parameters
@@ -152,8 +152,6 @@ class CoupledSteps:
             Times of the ticks in s.
         h : float
             Length of the step between them in s, rounded once.
-        sample : callable
-            Records the instant at which a stop condition ends the run.
 
         Returns
         -------
@@ -165,7 +163,6 @@ class CoupledSteps:
         SimulationError
             If an iteration does not converge, a communication step gets too short, or a plant fails.
         """
-        self._rest.sample = sample
         if self.coupling.error is not None or self.coupling.scheme == Scheme.ITERATED:
             try_steps(self._plants.values())
             if self._untried:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import SimulationError
-from ..flat import EVERY, FlatDiagram, StepTable, takes_any_step
+from ..flat import EVERY, FlatDiagram, StepTable, takes_any_step, times_of
 from .plants import Plant, bind, part_of
 
 
@@ -113,19 +113,18 @@ class PlantSteps:
     def table(self, ticks: np.ndarray, last: int) -> StepTable | None:
         """Return the steps to ticks that are visited from here on, of which ``last`` ends the run; None: all whole.
 
-        Times and lengths are those of `go` to the last bit: quotients of integers that a float64 holds.
+        Times and lengths are those of `go` to the last bit.
         """
         if self.regular:
             return None
-        shape, base = (len(ticks), len(self._plants)), self._flat.base
+        shape = len(ticks), len(self._plants)
         begins, widths, holds = np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=np.uint8)
         for j, path in enumerate(self._plants):
             points = np.logical_or.reduce([pattern.among(ticks) for pattern in self._flat.plant_ticks[path]])
             ends = points if path in self._even else points | (ticks == last)
             to = ticks[ends]
             before = np.concatenate([[self.reached[path]], to[:-1]])[: len(to)]
-            begins[ends, j] = before * base.numerator / base.denominator
-            widths[ends, j] = (to - before) * base.numerator / base.denominator
+            begins[ends, j], widths[ends, j] = times_of(self._flat, before), times_of(self._flat, to - before)
             holds[:, j] = points
         return StepTable(begins, widths, holds)
 

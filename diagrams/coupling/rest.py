@@ -2,15 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Protocol
-
-Sample = Callable[[float], bool]
-
-
-def never(t: float) -> bool:
-    """Return that no stop condition ends the run at a time."""
-    return False
 
 
 class Rest(Protocol):
@@ -18,9 +10,6 @@ class Rest(Protocol):
 
     A protocol: the loop over time, above this sub-package, gives them to a coupling scheme.
     """
-
-    sample: Sample
-    """Records the instant at which a stop condition ends the run."""
 
     def advance(self, t: float, end: float) -> float | None:
         """Go from t to the end, with the plants' outputs as they stand in w; return where a stop condition ended it."""

@@ -1,7 +1,6 @@
-"""Events in continuous time: domains of indicators, the search for changes within a step, and limits of both."""
+"""Events in continuous time: the domains of their indicators, and errors where events pile up."""
 
-from .domains import Domains
-from .many import ManyInstants, evaluate_many
-from .sliding import Sliding
+from .domains import LATEST, Domains
+from .limits import RECENT
 
-__all__ = ["Domains", "ManyInstants", "Sliding", "evaluate_many"]
+__all__ = ["LATEST", "RECENT", "Domains"]

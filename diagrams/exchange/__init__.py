@@ -1,13 +1,14 @@
 """Blocks that a run evaluates from outside, such as FMUs in model exchange: their evaluators and their events."""
 
-from .evaluator import INPUT_EVENT, ExchangedBlock, ExchangeEvaluator
+from .evaluator import OWN_EVENTS, ExchangedBlock, ExchangeEvaluator, Look
 from .events import OutsideEvents
 from .exchanged_blocks import ExchangedBlocks
 
 __all__ = [
-    "INPUT_EVENT",
+    "OWN_EVENTS",
     "ExchangeEvaluator",
     "ExchangedBlock",
     "ExchangedBlocks",
+    "Look",
     "OutsideEvents",
 ]

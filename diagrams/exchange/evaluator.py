@@ -115,7 +115,7 @@ class Exchangeable(Protocol):
         """Load it for a run; see `loopwright.blocks.Block`."""
 
 
-INPUT_EVENT, TIME_EVENT, STEP_EVENT = "input_event", "time_event", "step_event"
+OWN_EVENTS = INPUT_EVENT, TIME_EVENT, STEP_EVENT = "input_event", "time_event", "step_event"
 """Names of events that no indicator fires: an input has jumped, a time has come, a step has ended."""
 
 

@@ -2,7 +2,7 @@
 
 from ...blocks.core import Layout
 from .announced import Announcer, Times, announcers
-from .clock_sets import is_exact, kinds_of
+from .clock_sets import kinds_of, times_of
 from .clocks import EVERY, NONE, ClockSets, TickPattern, ticks_after
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator, sort_names
 from .fast_functions import share_terms, speed_up
@@ -61,7 +61,6 @@ __all__ = [
     "evaluate",
     "evaluate_apart",
     "indicators_of",
-    "is_exact",
     "is_true",
     "join_columns",
     "kinds_of",
@@ -78,6 +77,7 @@ __all__ = [
     "speed_up",
     "takes_any_step",
     "ticks_after",
+    "times_of",
     "trace_schedule",
     "write_numbers",
 ]

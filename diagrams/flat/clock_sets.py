@@ -15,9 +15,12 @@ _MOST_TICKS, _MOST_SETS = 2**20, 256
 _AT_ONCE = 32  # clocks whose bits are looked at together
 
 
-def is_exact(flat: FlatLayout, last: int) -> bool:
-    """Whether times up to a tick are quotients of integers that a float64 holds."""
-    return max(flat.base.denominator, last * flat.base.numerator) < _EXACT
+def times_of(flat: FlatLayout, ticks: np.ndarray) -> np.ndarray:
+    """Return the times of ticks, or lengths of so many ticks, in s: each the float64 that is nearest."""
+    n, d = flat.base.numerator, flat.base.denominator
+    if max(d, int(ticks.max(initial=0)) * n) < _EXACT:  # quotients of integers that a float64 holds
+        return np.asarray(ticks * n / d)
+    return np.array([k * n / d for k in ticks.tolist()])
 
 
 def kinds_of(flat: FlatLayout, *, every: bool) -> list[frozenset[TickPattern]]:

@@ -83,10 +83,12 @@ class ClockSets:
     clocks : sequence of TickPattern
         All clocks.
     sets : mapping of frozenset of TickPattern to int
-        The number of each set, from 0 on; all others have the number -1.
+        The number of each set, from 0 on.
+    rest : int, default -1
+        The number of all others.
     """
 
-    def __init__(self, clocks: Sequence[TickPattern], sets: Mapping[frozenset[TickPattern], int]):
+    def __init__(self, clocks: Sequence[TickPattern], sets: Mapping[frozenset[TickPattern], int], rest: int = -1):
         self._clocks = tuple(clocks)
         self._branches: list[np.ndarray] = []
         nodes: dict[tuple[bool, ...], int] = {(): 0}  # of each level, by whether the clocks so far act
@@ -99,7 +101,7 @@ class ClockSets:
                 branches[nodes[path[:-1]], int(path[-1])] = node
             self._branches.append(branches)
             nodes = following
-        self._numbers = np.full(len(nodes) + 1, -1, dtype=np.int32)
+        self._numbers = np.full(len(nodes) + 1, rest, dtype=np.int32)
         for acting, number in sets.items():
             self._numbers[nodes[tuple(c in acting for c in self._clocks)]] = number
 

@@ -261,8 +261,41 @@ def _text(values: np.ndarray) -> str:
     return f"{float(values[0]):.6g}" if len(values) == 1 else f"({', '.join(f'{float(v):.6g}' for v in values)})"
 
 
-def newton_options(flat: FlatDiagram, clocks: frozenset[TickPattern]) -> NewtonOptions:
-    """Return Newton's method in C for the algebraic loops at a tick at which some clocks act."""
+def loop_solver(
+    flat: FlatDiagram, clocks: frozenset[TickPattern], t: np.ndarray, x: np.ndarray, call: Callable[[], None],
+    r: np.ndarray, J: np.ndarray,
+) -> LoopSolver:  # fmt: skip
+    """Return the solver of the algebraic loops at a tick at which some clocks act; see `LoopSolver`."""
+    where = flat.active_loops(clocks)
+    names = {
+        entry: name if stop - start == 1 else f"{name}[{entry - start + 1}]"
+        for name, slot in flat.loops.slices.items()
+        for start, stop in [(slot.start, slot.stop)]
+        for entry in range(start, stop)
+    }
+    return LoopSolver([names[i] for i in where], where, t, x, call, r, J, flat.order.loops)
+
+
+def newton_options(flat: FlatDiagram, clocks: frozenset[TickPattern], here: np.ndarray) -> NewtonOptions:
+    """Return Newton's method in C for the algebraic loops at a tick at which some clocks act.
+
+    Parameters
+    ----------
+    here : ndarray
+        States of the instant that is reached, at which the loops have to determine their values.
+    """
     from ..compiled import NewtonOptions
 
-    return NewtonOptions(flat.active_loops(clocks), TOLERANCE, ROUNDING, SINGULAR, ITERATIONS, HALVINGS)
+    def solver(
+        t: np.ndarray, x: np.ndarray, call: Callable[[], None], r: np.ndarray, J: np.ndarray
+    ) -> Callable[[], None]:
+        loops = loop_solver(flat, clocks, t, x, call, r, J)
+
+        def solve() -> None:
+            loops.solve()
+            if x is here:
+                loops.check_determined()
+
+        return solve
+
+    return NewtonOptions(flat.active_loops(clocks), TOLERANCE, ROUNDING, SINGULAR, ITERATIONS, HALVINGS, solver)

@@ -1,14 +1,13 @@
-"""Between Python and C: plans of the solver and domains of indicators are handed over and taken back."""
+"""Between Python and C: what the loop is bound to, and the plans of the method."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 
-from ...blocks.core import SimulationError
 from ..compiled import (
     LIBRARY_METHODS,
     CompiledHybrid,
@@ -18,15 +17,13 @@ from ..compiled import (
     HybridCode,
     MethodOptions,
     NativeExchange,
-    Pile,
+    OwnEvent,
+    Sign,
     TickCode,
-    Watch,
 )
-from ..events import Domains
-from ..exchange import INPUT_EVENT
-from ..flat import NONE, TickPattern
+from ..flat import NONE
 from ..results import Recorder
-from ..solvers import SUNDIALS, AutoSolver
+from ..solvers import SUNDIALS
 from .algebraic_loops import newton_options
 from .compiled_plants import PlantsInC
 from .continuous import Continuous
@@ -40,7 +37,7 @@ _METHODS = {"euler": "Euler", "heun": "Heun", "rk4": "Runge-Kutta 4", "RK23": "B
 
 def bind_loop(
     workspace: Workspace, plants: PlantsInC, code: TickCode, recorder: Recorder, stops: Sequence[int],
-    exchange: NativeExchange | None = None,
+    exchange: NativeExchange | None = None, rest: Callable[[], int] | None = None,
 ) -> CompiledLoop:  # fmt: skip
     """Return the loop over ticks in C, bound to the numbers of a run, its plants, and the samples that it keeps."""
     entries, here = recorder.entries, workspace.here
@@ -53,10 +50,11 @@ def bind_loop(
         width=workspace.log.size if entries is None else len(entries),
         every=recorder.every,
         stops=stops,
-        loops={clocks: newton_options(workspace.flat, clocks) for clocks in code.loops},
+        loops={clocks: newton_options(workspace.flat, clocks, here.x) for clocks in code.loops},
         exchange=exchange,
         held=plants.held,
         inputs=plants.inputs,
+        rest=rest,
     )
 
 
@@ -68,32 +66,48 @@ def bind_hybrid(
     recorder: Recorder,
     stops: Sequence[int],
     methods: Sequence[MethodOptions],
+    *,
+    rest: Callable[[], int],
+    drain: Callable[[], None],
 ) -> tuple[CompiledHybrid, HandedOver | None]:
-    """Return the loop in C, bound to the numbers of a run, and its blocks that are evaluated from outside."""
+    """Return the loop in C, bound to the numbers of a run, and its blocks that are evaluated from outside.
+
+    Parameters
+    ----------
+    rest : callable
+        Evaluates a tick for which there is no code; see `CompiledLoop`.
+    drain : callable
+        Tells the events that have happened.
+    """
     flat, here, domains, blocks = workspace.flat, workspace.here, continuous.domains, continuous.exchanged
     handed = (
-        None if blocks is None else HandedOver(flat, blocks.blocks, blocks.evaluators, partial(_tell_jump, continuous))
+        None
+        if blocks is None or continuous.outside is None
+        else HandedOver(
+            flat, blocks.blocks, blocks.evaluators, partial(_tell_outside, continuous), continuous.outside.count
+        )
     )
     native = None if handed is None else handed.native
-    ticks = bind_loop(workspace, plants, code.ticks, recorder, stops, native)
+    ticks = bind_loop(workspace, plants, code.ticks, recorder, stops, native, rest)
     always = bool(plants.entries) or workspace.looped or remembers(flat) or has_guards(flat)
     judged = code.judged and not continuous.fixed
     loop = CompiledHybrid(
         code, flat, ticks, [here.t, here.x, here.w, here.p], workspace.x_next, methods,
         step=float(flat.base) if continuous.fixed else None,
-        spacing=math.inf if domains is None else domains.spacing,
-        own=() if domains is None else domains.own,
+        domains=domains,
         accepts=1 if always or (judged and native is None) else 2 if judged else 0,
-        loops=newton_options(flat, NONE) if flat.active_loops(NONE) else None,
+        loops=newton_options(flat, NONE, here.x) if flat.active_loops(NONE) else None,
         exchange=native,
         delays=continuous.delays,
         tolerances=continuous.resolution,
+        drain=drain,
+        coupled=plants.are_coupled,
     )  # fmt: skip
     return loop, handed
 
 
-def _tell_jump(continuous: Continuous, t: float, path: str, before: np.ndarray, after: np.ndarray) -> None:
-    continuous.tell_outside(t, path, INPUT_EVENT, before, after)
+def _tell_outside(continuous: Continuous, event: OwnEvent) -> None:
+    continuous.tell_outside(*event)
 
 
 def describe_methods(methods: Sequence[MethodOptions], solver: str) -> str:
@@ -105,51 +119,15 @@ def describe_methods(methods: Sequence[MethodOptions], solver: str) -> str:
     return f"{names} runs in C as solver={solver!r}"
 
 
-def hand_over_domains(domains: Domains, loop: CompiledHybrid, watch: Watch) -> None:
-    """Let C go on with the domains, and with the times at which events have fired last."""
-    (domain, watch.start[:], low, high, slack), (size, rounding), watch.fresh, limits = domains.save()
-    watch.latest, watch.largest[:], (loop.fired_times, *recent), rest = limits
-    watch.domain[:], watch.low[:], watch.high[:], watch.slack[:] = domain, low, high, slack
-    watch.size[:], watch.rounding[:] = size, rounding
-    parts: list[np.ndarray] = [*watch.recent, *watch.rest]
-    for part, values in zip(parts, [*recent, *rest], strict=True):
-        part[:] = values
-
-
-def take_back_domains(domains: Domains, loop: CompiledHybrid, watch: Watch) -> None:
-    """Let Python go on with the domains from C."""
-    side, stuck, briefs, brief_at = watch.rest
-    rest = side.astype(int), stuck.astype(int), briefs.astype(int), brief_at
-    states = watch.domain.astype(int), watch.start.astype(int), watch.low, watch.high, watch.slack
-    limits = watch.latest, np.array(watch.largest), (loop.fired_times, *watch.recent), rest
-    domains.restore((states, (watch.size, watch.rounding), watch.fresh, limits))
-
-
-def pile_up(continuous: Continuous, loop: CompiledHybrid, t: float) -> SimulationError:
-    """Return the error of events that pile up at t in s, where C has come to; the domains have been taken back."""
-    assert continuous.domains is not None
-    assert loop.watch is not None
-    limits, (pile, event, times) = continuous.domains.limits, loop.pile
-    if pile is Pile.IN_CONTACT:
-        return limits.rests_in_contact(t, event, times)
-    if pile is Pile.ZENO:
-        return limits.shows_zeno(event)
-    if pile is Pile.CHATTERS:
-        continuous.enter(t)
-        return continuous.domains.chatters(t, continuous.workspace.here.x[continuous.where])
-    return limits.endless(t, loop.watch.fires, times)
-
-
 def methods_of(continuous: Continuous) -> list[MethodOptions]:
-    """Return the methods in C that do what a run's solver does."""
-    solver, n = continuous.solver, continuous.where.size
+    """Return the methods in C that integrate a run."""
+    method, n = continuous.method, continuous.where.size
     if not n:
-        return [MethodOptions("euler", 1.0, np.zeros(0), solver.max_step)]
-    if solver.fixed:
-        return [MethodOptions(solver.name, 1.0, np.zeros(n), solver.max_step)]
-    atol = np.broadcast_to(np.asarray(solver.atol, dtype=float), (n,)).copy()
-    names = [solver.name] if solver.name != "auto" else ["RK45" if solver.rtol >= 1e-8 else "DOP853", "Radau"]
-    return [MethodOptions(name, solver.rtol, atol, solver.max_step) for name in names]
+        return [MethodOptions("euler", 1.0, np.zeros(0), method.max_step)]
+    if method.fixed:
+        return [MethodOptions(method.name, 1.0, np.zeros(n), method.max_step)]
+    atol = np.broadcast_to(np.asarray(method.atol, dtype=float), (n,)).copy()
+    return [MethodOptions(name, method.rtol, atol, method.max_step) for name in method.names]
 
 
 def find_edges(
@@ -175,84 +153,29 @@ def find_edges(
     return edges, np.array([continuous.late.get(float(edge), float(edge)) for edge in edges])
 
 
-def active_method(continuous: Continuous, methods: Sequence[MethodOptions]) -> int:
-    """Return the place of the method that a run's solver goes on with."""
-    active = continuous.solver.save().get("active")
-    return next((i for i, m in enumerate(methods) if m.name == active), 0)
+def active_method(continuous: Continuous) -> int:
+    """Return the place of the method that a run goes on with."""
+    return continuous.method.names.index(continuous.method.active) if continuous.where.size else 0
 
 
-def planned_steps(continuous: Continuous, methods: Sequence[MethodOptions]) -> list[float | None]:
-    """Return the steps in s that a run's solver would take next, by its methods."""
-    saved = continuous.solver.save()
-    each = saved.get("methods", {})
-    return [each.get(m.name, saved).get("planned") for m in methods]
+def planned_steps(continuous: Continuous) -> list[float | None]:
+    """Return the steps in s that a run's methods would take next."""
+    return [*continuous.method.planned.values()]
 
 
-def restore_plans(continuous: Continuous, methods: Sequence[MethodOptions], steps: Sequence[float | None]) -> None:
-    """Let a run's solver take steps of some lengths in s next."""
-    saved = continuous.solver.save()
-    if "methods" in saved:
-        saved["methods"] = {m.name: {"planned": step} for m, step in zip(methods, steps, strict=True)}
-        continuous.solver.restore(saved)
-    elif "planned" in saved:
-        continuous.solver.restore({"planned": steps[0]})
+def restore_plans(continuous: Continuous, steps: Sequence[float | None]) -> None:
+    """Let a run's methods take steps of some lengths in s next."""
+    continuous.method.planned = dict(zip(continuous.method.names, steps, strict=True))
 
 
-def changes_method(workspace: Workspace, continuous: Continuous, t: float, h: float) -> bool:
-    """Decide, after signs of stiffness or of none in steps of h, whether another method goes on from t."""
-    solver = continuous.solver
-    assert isinstance(solver, AutoSolver)
-    continuous.enter(t)
-    told = len(solver.statistics.messages)
-    found = solver.decide(t, workspace.here.x[continuous.where], h)
-    workspace.messages += tuple(solver.statistics.messages[told:])
-    return found
+def changes_method(workspace: Workspace, continuous: Continuous, t: float, sign: Sign, h: float) -> None:
+    """Decide, after a sign at steps of h in s, whether another method goes on from t."""
+    continuous.stand_in(math.inf, math.inf)
+    x = workspace.here.x[continuous.where]
+    workspace.messages += continuous.method.decide(t, x, h, stuck=sign is Sign.STUCK)
 
 
 def tell_fired(continuous: Continuous, fired: Sequence[Fired]) -> None:
     """Tell events that have fired in C."""
     for one in fired:
         continuous.tell_event(one.t, one.event, one.before, one.after)
-
-
-# --- blocks that are evaluated from outside -------------------------------------------------------------------------
-
-
-def let_act(
-    workspace: Workspace, continuous: Continuous, t: float, left: float | None, fired: np.ndarray | None
-) -> bool:
-    """Let events act at an instant between ticks that C has come to; return whether a stop condition is true there.
-
-    Parameters
-    ----------
-    left : float or None
-        Where a discontinuity is at t: the time in s from the left of it, at which the events act.
-    fired : ndarray or None
-        Which events of indicators fire; None for events of blocks from outside alone.
-    """
-    if left is not None:
-        continuous.enter(t)
-        continuous.stand_left(t, left)
-        if fired is None:
-            continuous.settle(t)
-    elif fired is not None:
-        continuous.enter(t)
-    if fired is not None:
-        continuous.fire(t, fired)
-        workspace.messages += continuous.sliding.look(continuous.domains, t)
-    continuous.enter(t)
-    continuous.settle(t)
-    continuous.accept()
-    workspace.evaluate()
-    return continuous.is_stopped()
-
-
-def end_tick(
-    workspace: Workspace, continuous: Continuous, loop: CompiledHybrid, t: float, acting: frozenset[TickPattern]
-) -> None:
-    """Let events act behind a tick whose blocks C has evaluated."""
-    continuous.enter(t)
-    continuous.settle(t)
-    continuous.accept()
-    flat, taken = workspace.flat, workspace.flat.taken_at(acting)
-    workspace.log[flat.log.total :][taken] = loop.taken_states[taken]

@@ -1,15 +1,16 @@
-"""From tick to tick in C with continuous states between them, and by Python where something is out of the ordinary."""
+"""From tick to tick in C with continuous states between them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import CompilerError, LoopwrightError, SimulationError
+from ...blocks.core import CompilerError, SimulationError
 from ..compiled import (
     USES_SLOPE,
     BackgroundCode,
@@ -21,33 +22,27 @@ from ..compiled import (
     Span,
     compile_hybrid,
     find_code_obstacle,
-    find_exchange_obstacle,
     hybrid_sources,
     interpret_hybrid,
 )
-from ..flat import EVERY, ClockSets, FlatDiagram, is_exact, kinds_of, ticks_after
+from ..flat import EVERY, NONE, ClockSets, FlatDiagram, TickPattern, kinds_of, ticks_after, times_of
 from ..results import Recorder
+from .broken_off import explain, explain_library, pile_up
 from .compiled_hand_over import (
     active_method,
     bind_hybrid,
     changes_method,
     describe_methods,
-    end_tick,
     find_edges,
-    hand_over_domains,
-    let_act,
     methods_of,
-    pile_up,
     planned_steps,
     restore_plans,
-    take_back_domains,
     tell_fired,
 )
 from .compiled_plants import PlantsInC
-from .compiled_ticks import FIRST, LARGEST_CHUNK, WISHED, LaterCode, tell_missing_once
+from .compiled_ticks import FIRST, LARGEST_CHUNK, WISHED, LaterCode
 from .continuous import Continuous
 from .diagnosis import forget_trials
-from .ticks import take_tick
 from .workspace import Workspace
 
 
@@ -91,7 +86,7 @@ class HybridTicks:
         flat = self._flat = workspace.flat
         self._workspace, self._continuous, self._plants = workspace, continuous, plants
         self._stops = stops
-        self._methods = methods_of(continuous)
+        plants.turn = self._turn
         self._acting, self._stiff = kinds_of(flat, every=every), is_stiff(continuous)
         self._code = find_code(flat, continuous, every=every, machine=machine, fuse=fuse)
         self._clocks = flat.visited if plants.entries else flat.distinct
@@ -102,10 +97,6 @@ class HybridTicks:
         self._recorder: Recorder | None = None
         self._chunk = FIRST
         self._handed: HandedOver | None = None
-
-    def reaches(self, last: int) -> bool:
-        """Whether times up to a tick are quotients of integers that a float64 holds."""
-        return is_exact(self._flat, last)
 
     def hand_over(self, code: HybridCode) -> None:
         """Let generated code of the same functions go on; C must not run meanwhile."""
@@ -157,35 +148,13 @@ class HybridTicks:
         progress: Callable[[float], Any],
     ) -> float | None:
         visited, rest = (EVERY,) if self._sampled else self._clocks, np.zeros(0, dtype=np.int64)
-        while rest.size or (rest := ticks_after(visited, k, last, self._chunk)).size:
-            rows = recorder.room(t)
-            loop.skip = recorder.skip
+        stays = False  # whether the plants have come to the next tick, by Python
+        while rest.size or (rest := ticks_after(visited, k, last, 1 if loop.coupled else self._chunk)).size:
             started = perf_counter()
-            kinds = self._kinds.at(rest)
-            known = int(np.append(np.flatnonzero(kinds < 0), len(kinds))[0])
-            if not known:  # sets of clocks that are too rare to have code of their own
-                following = int(rest[0])
-                asked = HybridOutcome(0, 0, HybridReason.ASK_BETWEEN, 0, 0, 0, t)
-                ended = self._take_interval(loop, k, following, last, asked, recorder)
-                if ended is not None:
-                    return ended
-                k, rest, t = following, rest[1:], self._time_of(following)
-                if arrived(k):
-                    return None
-                continue
-            span, lands = self._span(k, rest[:known], kinds, last, t)
-            found = loop.run(span, rows)
-            recorder.took(found.rows, loop.skip)
-            self._tell(loop)
-            if loop.ticks.calls_python:
-                forget_trials(self._flat)  # an interrupt of a block of Python is raised
-            t = found.t
+            span, lands = self._span(k, rest, last, t)
+            found = self._call(loop, span._replace(stays=stays), recorder)
+            stays, t = False, found.t
             loop.limit_budget(perf_counter() - started)
-            if self._handed is not None:
-                self._handed.tell()
-                if self._handed.has_news():
-                    self._take_back(loop)
-                    self._hand_over(loop, t)
             done, rest = rest[: found.ticks], rest[found.ticks :]
             if found.ticks:
                 k = int(done[-1])
@@ -195,43 +164,129 @@ class HybridTicks:
                 over = landed.size and arrived(int(done[landed[-1]]), in_step)
                 if over and found.reason is not HybridReason.ENDED:
                     return None
-            failure = loop.take_failure()
-            if failure is not None and found.reason is not HybridReason.OUTSIDE_FAILED:
-                raise self._continuous.explain_failure(failure)
             if found.reason is HybridReason.ENDED:
                 return t
-            if found.reason is HybridReason.PILED_UP:
-                self._take_back(loop)
-                raise pile_up(self._continuous, loop, t)
-            if found.reason is HybridReason.LOOK:
-                self._take_back(loop)
-                if changes_method(self._workspace, self._continuous, t, loop.looked_at()):
-                    self._hand_over(loop, t)
-            if found.reason in _ACTING and self._let_act(loop, found, recorder):
-                return t
-            if found.reason in _ASKING:
+            if found.reason in (HybridReason.FMU_FAILED, HybridReason.FMU_FLAGS):
                 following = int(rest[0])
-                ended = self._take_interval(loop, k, following, last, found, recorder)
-                if ended is not None:
-                    return ended
-                k, rest, t = following, rest[1:], self._time_of(following)
-                if arrived(k):
-                    return None
+                self._step_plants(loop, found, k, following, last)
+                if self._plants.ended is not None:
+                    recorder.row(self._plants.ended, self._workspace.log)
+                    return self._plants.ended
+                stays = True
             elif perf_counter() - started < WISHED and found.ticks == len(span.widths):
                 self._chunk = min(2 * self._chunk, LARGEST_CHUNK)
             progress(t)
         return None
 
-    def _time_of(self, k: int) -> float:
-        base = self._flat.base
-        return k * base.numerator / base.denominator
+    def _step_plants(self, loop: CompiledHybrid, found: HybridOutcome, k: int, following: int, last: int) -> None:
+        """Let Python go on with the steps of the plants."""
+        try:
+            self._plants.go_on(loop.ticks, found, k, following, last)
+        except SimulationError as error:
+            raise error.at(t=self._time_of(following)) from error.__cause__
 
-    def _span(self, k: int, ticks: np.ndarray, kinds: np.ndarray, last: int, t: float) -> tuple[Span, np.ndarray]:
-        """Return the ticks of a call, from tick ``k`` on, where the states have come to t; and which are landed on.
+    def take_first(self, t: float, acting: frozenset[TickPattern], recorder: Recorder) -> None:
+        """Go through the tick with which a run begins, at t in s, with the events there, and record it."""
+        loop = self._bind(recorder)
+        loop.begin_anew()
+        self._land(loop, t, loop.kinds.get(acting, len(loop.kinds)), recorder)
 
-        ``kinds`` are the sets of clocks that act at them.
+    def end_between_ticks(self, k: int, end: float, recorder: Recorder) -> float | None:
+        """Go on from tick ``k`` to the end of the run in s, before the next tick, and record it; see `run`."""
+        loop, t = self._bind(recorder), self._time_of(k)
+        ended = None if self._plants.are_coupled else self.go_between(t, end)
+        if ended is None:
+            ended = self._plants.end_at(end, k)
+        if ended is not None:
+            recorder.row(ended, self._workspace.log)
+            return ended
+        self._land(loop, end, loop.kinds[NONE], recorder)
+        return None
+
+    def _land(self, loop: CompiledHybrid, t: float, kind: int, recorder: Recorder) -> None:
+        """Go through a tick where the run is, with the events there, and record it; no plant steps to it."""
+        ends, width, kinds = np.array([t, t]), np.zeros(1), np.array([kind], dtype=np.int32)
+        self._hand_over(loop, t)
+        try:
+            edges = find_edges(self._continuous, t, t, limited=False)
+            assert edges is not None
+            span = Span(ends, width, kinds, np.ones(1, dtype=np.uint8), t, *edges, self._plants.no_steps(), stays=True)
+            self._call(loop, span, recorder)
+        finally:
+            self._take_back(loop)
+
+    def go_between(self, t: float, end: float) -> float | None:
+        """Go on from t to an instant, both in s, before any tick there; nothing is recorded.
+
+        Within a step of the plants the loop waits for this; see `PlantsInC`.
+
+        Returns
+        -------
+        float or None
+            Time in s at which a stop condition has ended the run.
         """
-        base = self._flat.base
+        loop, none = self._loop, np.zeros((1, 0))
+        assert loop is not None
+        self._hand_over(loop, t)
+        kinds, lands = np.zeros(1, dtype=np.int32), np.ones(1, dtype=np.uint8)
+        skip, loop.skip = loop.skip, 1
+        try:
+            while True:
+                ends, edges = np.array([t, end]), find_edges(self._continuous, t, end, limited=False)
+                assert edges is not None
+                found = loop.run_between(Span(ends, np.diff(ends), kinds, lands, end, *edges), none)
+                self._look_at(loop, found)
+                t = found.t
+                if found.reason in (HybridReason.ENDED, HybridReason.DONE):
+                    return t if found.reason is HybridReason.ENDED else None
+        finally:
+            loop.skip = skip
+            self._take_back(loop)
+
+    def _call(self, loop: CompiledHybrid, span: Span, recorder: Recorder) -> HybridOutcome:
+        """Let C go on, and take note of what has happened; see `_look_at`."""
+        rows = recorder.room(float(span.times[0]))
+        loop.skip = recorder.skip
+        found = loop.run(span, rows)
+        recorder.took(found.rows, loop.skip)
+        self._look_at(loop, found)
+        return found
+
+    def _look_at(self, loop: CompiledHybrid, found: HybridOutcome) -> None:
+        """Take note of what has happened.
+
+        Raises
+        ------
+        SimulationError
+            If the run can't go on.
+        """
+        self._tell()
+        failure = loop.take_failure()
+        if failure is not None and found.reason is not HybridReason.OUTSIDE_FAILED:
+            raise explain_library(self._continuous, failure)
+        if found.reason is HybridReason.BROKEN_OFF:
+            raise explain(self._continuous, loop.broken_off())
+        if loop.ticks.calls_python:
+            forget_trials(self._flat)  # an interrupt of a block of Python is raised
+        if found.reason is HybridReason.OUTSIDE_FAILED:
+            assert self._handed is not None
+            self._handed.judge()
+        if found.reason is HybridReason.PILED_UP:
+            self._take_back(loop)
+            raise pile_up(self._continuous, loop, found.t)
+        if self._handed is not None and self._handed.has_news():
+            self._take_back(loop)
+            self._hand_over(loop, found.t)
+        if found.reason is HybridReason.LOOK:
+            self._take_back(loop)
+            changes_method(self._workspace, self._continuous, found.t, *loop.take_sign())
+            self._hand_over(loop, found.t)
+
+    def _time_of(self, k: int) -> float:
+        return float(k * self._flat.base)
+
+    def _span(self, k: int, ticks: np.ndarray, last: int, t: float) -> tuple[Span, np.ndarray]:
+        """Return the ticks of a call, from tick ``k`` on, where the states have come to t; and which are landed on."""
         edges = find_edges(self._continuous, t, self._time_of(int(ticks[-1])))
         while edges is None:
             ticks = ticks[: max(1, len(ticks) // 2)]
@@ -244,61 +299,9 @@ class HybridTicks:
         end = int(ticks[-1])
         beyond = min([*(clock.after(end) for clock in self._clocks), last]) if not lands[-1] else end
         ends = np.concatenate([[k], ticks])
-        n, d = base.numerator, base.denominator
-        kinds = kinds[: len(ticks)]
         steps, then = self._plants.table(ticks, last), self._time_of(beyond)
-        return Span(ends * n / d, np.diff(ends) * n / d, kinds, lands, then, *edges, steps), lands
-
-    # --- by Python ---------------------------------------------------------------------------------------------------
-
-    def _take_interval(
-        self, loop: CompiledHybrid, k: int, following: int, last: int, found: HybridOutcome, recorder: Recorder
-    ) -> float | None:
-        """Go on to the next tick from the point at which the loop has returned; see `run`."""
-        workspace, continuous, flat = self._workspace, self._continuous, self._flat
-        self._take_back(loop)
-        end, ended = self._time_of(following), None
-        try:
-            if found.reason is HybridReason.ASK_BETWEEN:
-
-                def sample(t: float) -> bool:
-                    recorder.row(t, workspace.log)
-                    return continuous.is_stopped()
-
-                ended = continuous.advance(found.t, end, (), sample)
-                if ended is None:
-                    self._plants.go(k, following, last)
-            elif found.reason in (HybridReason.FMU_FAILED, HybridReason.FMU_FLAGS):
-                self._plants.go_on(loop.ticks, found, k, following, last)
-            elif found.reason is HybridReason.OUTSIDE_FAILED:
-                assert self._handed is not None
-                self._handed.judge()
-            else:
-                self._plants.arrive(following, last)
-        except SimulationError as error:
-            raise error.at(t=end) from error.__cause__
-        if ended is None:
-            if found.reason is HybridReason.ASK_REST:
-                end_tick(workspace, continuous, loop, end, flat.acting(following))
-            else:
-                take_tick(workspace, continuous, self._plants.entries, end, flat.acting(following))
-            self._plants.steps.hold(following)
-            recorder.row(end, workspace.log)
-        self._hand_over(loop, end if ended is None else ended)
-        return ended
-
-    def _let_act(self, loop: CompiledHybrid, found: HybridOutcome, recorder: Recorder) -> bool:
-        """Let events beside blocks from outside act at an instant between ticks; return whether the run ends there."""
-        self._take_back(loop)
-        fired = None
-        if found.reason is HybridReason.ASK_FIRE:
-            assert loop.watch is not None
-            fired = loop.watch.located.astype(bool)
-        ended = let_act(self._workspace, self._continuous, found.t, loop.left, fired)
-        if ended:
-            recorder.row(found.t, self._workspace.log)
-        self._hand_over(loop, found.t)
-        return ended
+        times, widths = times_of(self._flat, ends), times_of(self._flat, np.diff(ends))
+        return Span(times, widths, self._kinds.at(ticks), lands, then, *edges, steps), lands
 
     # --- between Python and C ----------------------------------------------------------------------------------------
 
@@ -306,40 +309,59 @@ class HybridTicks:
         if self._loop is None or recorder is not self._recorder:
             self._loop, self._handed = bind_hybrid(
                 self._code, self._workspace, self._continuous, self._plants, recorder, self._stops,
-                self._methods,
+                methods_of(self._continuous), rest=self._take_rare_tick, drain=self._tell,
             )  # fmt: skip
             self._recorder = recorder
-            self._kinds = ClockSets(self._flat.distinct, self._loop.kinds)
+            self._kinds = ClockSets(self._flat.distinct, self._loop.kinds, len(self._loop.kinds))
         return self._loop
+
+    def _take_rare_tick(self) -> int:
+        """Evaluate a tick for C at which clocks act together too seldom for code of its own."""
+        assert self._loop is not None
+        acting = self._flat.acting(round(float(self._workspace.here.t[0]) / self._flat.base))
+        self._workspace.evaluate(acting)
+        self._loop.note_taken(self._flat.taken_at(acting))
+        return 0
+
+    @contextmanager
+    def _turn(self, end: float) -> Iterator[None]:
+        """Let Python take the plants, and the continuous states within their step, to a time in s, while C waits."""
+        assert self._loop is not None
+        self._take_back(self._loop)
+        yield
+        self._hand_over(self._loop, end)
 
     def _hand_over(self, loop: CompiledHybrid, t: float) -> None:
         """Let C go on from an instant that Python has come to."""
+        continuous = self._continuous
         loop.begin(t)
         if self._handed is not None:
             self._handed.hand_over()
-            loop.set_tolerances(methods_of(self._continuous))
-        loop.plan(planned_steps(self._continuous, self._methods))
-        loop.active = active_method(self._continuous, self._methods)
-        if loop.watch is not None:
-            assert self._continuous.domains is not None
-            hand_over_domains(self._continuous.domains, loop, loop.watch)
-            loop.sliding = self._continuous.sliding.save()
+            loop.set_tolerances(methods_of(continuous))
+        loop.plan(planned_steps(continuous))
+        loop.active = active_method(continuous)
+        if continuous.domains is not None:
+            loop.hand_over_domains(continuous.domains)
 
     def _take_back(self, loop: CompiledHybrid) -> None:
         """Let Python go on from where C has come to."""
-        restore_plans(self._continuous, self._methods, loop.planned)
+        continuous = self._continuous
+        restore_plans(continuous, loop.planned)
         if self._handed is not None and self._handed.take_back():
-            self._continuous.follow()
-        if loop.watch is not None:
-            assert self._continuous.domains is not None
-            take_back_domains(self._continuous.domains, loop, loop.watch)
-            self._continuous.sliding.restore(loop.sliding)
+            continuous.follow()
+        if continuous.domains is not None:
+            loop.take_back_domains(continuous.domains)
 
-    def _tell(self, loop: CompiledHybrid) -> None:
-        """Tell the events that have fired."""
-        tell_fired(self._continuous, loop.take_fired())
+    def _tell(self) -> None:
+        """Tell what has happened in C: events that have fired, and those of blocks from outside."""
+        loop, continuous = self._loop, self._continuous
+        assert loop is not None
+        tell_fired(continuous, loop.take_fired())
+        if self._handed is not None:
+            self._handed.tell()
         for t, event in () if loop.watch is None else loop.watch.take_slid():
-            self._workspace.messages += self._continuous.sliding.tell(self._flat.events[event], t)
+            assert continuous.domains is not None
+            self._workspace.messages += continuous.domains.tell_slid(t, event)
 
 
 def find_code(
@@ -355,20 +377,6 @@ def find_code(
 def is_stiff(continuous: Continuous) -> bool:
     """Whether the solver needs the derivative of the rates."""
     return any(method.name in USES_SLOPE for method in methods_of(continuous))
-
-
-_ASKING = frozenset(
-    {
-        HybridReason.ASK_BETWEEN,
-        HybridReason.ASK_TICK,
-        HybridReason.FMU_FAILED,
-        HybridReason.FMU_FLAGS,
-        HybridReason.NOT_OK,
-        HybridReason.ASK_REST,
-        HybridReason.OUTSIDE_FAILED,
-    }
-)
-_ACTING = frozenset({HybridReason.ASK_SETTLE, HybridReason.ASK_FIRE})
 
 
 def make_hybrid(
@@ -394,26 +402,18 @@ def make_hybrid(
     """
     flat = workspace.flat
     reason = None if machine else find_code_obstacle(flat)
-    if reason is None and continuous.exchanged is not None:
-        reason = find_exchange_obstacle(continuous.exchanged.blocks)
-    if plants.are_coupled:
-        reason = reason or (
-            "coupling= asks for another one than 'jacobi': Python takes FMUs and continuous states to the next tick"
-        )
     if reason is None:
         try:
             found = HybridTicks(workspace, continuous, plants, stops, every=every, machine=machine, fuse=fuse)
-        except (LoopwrightError, OSError) as error:
+        except CompilerError as error:
             if machine:
-                return None, tell_missing_once(error)
-            if not isinstance(error, CompilerError):
                 raise
             reason = str(error)
         else:
             if machine:
                 return found, ()
             told = (
-                f"Compiled: {describe_methods(methods_of(continuous), continuous.solver.name)}, by the same rules as "
+                f"Compiled: {describe_methods(methods_of(continuous), continuous.method.name)}, by the same rules as "
                 "interpreted; values differ from those of an interpreted run by rounding and within the tolerances."
             )
             fused = (
@@ -421,6 +421,4 @@ def make_hybrid(
                 "magnify."
             )
             return found, (*((told,) if continuous.where.size else ()), *((fused,) if fuse else ()))
-    if machine:
-        return None, ()
     return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 
 import numpy as np
@@ -20,7 +21,7 @@ from ..compiled import (
     compile_other_side,
 )
 from ..coupling import CoupledSteps, Plant, PlantSteps, end_all, runs_apart
-from ..flat import FlatDiagram, StepTable
+from ..flat import FlatDiagram, StepTable, times_of
 
 
 class PlantsInC:
@@ -47,6 +48,10 @@ class PlantsInC:
         self, flat: FlatDiagram, plants: Mapping[str, Plant], steps: PlantSteps, coupled: CoupledSteps | None = None
     ):
         self._flat, self._plants, self.steps, self._coupled = flat, plants, steps, coupled
+        self.ended: float | None = None
+        """Time in s at which a stop condition has ended the run within a coupled step."""
+        self.turn: Callable[[float], AbstractContextManager[None]] = lambda t: nullcontext()
+        """Gives the run's numbers to Python for a coupled step that ends at a time in s."""
         self.entries: dict[str, FmuInstance | PythonStep] = {
             path: plant if isinstance(plant, FmuInstance) else partial(_step, plant) for path, plant in plants.items()
         }
@@ -69,14 +74,12 @@ class PlantsInC:
         return [] if self.steps.regular else [self.steps.own[path] for path in self.entries]
 
     def _step_coupled(self, t: float, h: float) -> bool:
-        base = self._flat.base
-        self._go_coupled(t, round((t + h) * base.denominator / base.numerator), h)
-        return any(getattr(plant, "ends_run", False) for plant in self._plants.values())
-
-    def _go_coupled(self, t: float, following: int, h: float) -> None:
         assert self._coupled is not None
         base = self._flat.base
-        self._coupled.go(t, following * base.numerator / base.denominator, h)
+        end = round((t + h) * base.denominator / base.numerator) * base.numerator / base.denominator
+        with self.turn(end):
+            self.ended = self._coupled.go(t, end, h)
+        return self.ended is not None or any(getattr(plant, "ends_run", False) for plant in self._plants.values())
 
     def prepare(self) -> Callable[[], object]:
         """Return a function that compiles what the steps of plants need beside the code of a diagram."""
@@ -92,12 +95,26 @@ class PlantsInC:
 
     def go(self, k: int, following: int, last: int) -> None:
         """Take the steps from a visited tick to the next one by Python."""
-        if self._coupled is not None:
-            base = self._flat.base
-            now = k * base.numerator / base.denominator
-            self._go_coupled(now, following, float(base * (following - k)))
-        else:
+        if self._coupled is None:
             self.steps.go(k, following, last=following == last)
+        else:
+            now, h = times_of(self._flat, np.array([k, following - k])).tolist()
+            self._step_coupled(now, h)
+
+    def end_at(self, end: float, k: int) -> float | None:
+        """Take the steps to the end of a run, in s, after tick ``k`` and before the next; see `CoupledSteps.go`."""
+        if self._coupled is None:
+            self.steps.end_at(end, k)
+            return None
+        now = k * self._flat.base.numerator / self._flat.base.denominator
+        return self._coupled.go(now, end, end - now)
+
+    def no_steps(self) -> StepTable | None:
+        """Return that no plant steps to a tick; None where all plants step at all ticks."""
+        if self.steps.regular:
+            return None
+        shape = 1, len(self._plants)
+        return StepTable(np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=np.uint8))
 
     def go_on(self, loop: CompiledLoop, found: Outcome | HybridOutcome, k: int, following: int, last: int) -> None:
         """Go on with the steps from a visited tick to the next one, from the plant on that C could not go beyond.

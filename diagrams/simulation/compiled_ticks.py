@@ -34,9 +34,9 @@ from ..flat import (
     ClockSets,
     FlatDiagram,
     TickPattern,
-    is_exact,
     kinds_of,
     ticks_after,
+    times_of,
 )
 from ..results import Recorder
 from .compiled_hand_over import bind_loop
@@ -135,10 +135,6 @@ class CompiledTicks:
             return (*self._code.notes, _LOOPS.format(largest))
         return self._code.notes + (() if self._code.exact else (_SIGNS,))
 
-    def reaches(self, last: int) -> bool:
-        """Whether times up to a tick are quotients of integers that a float64 holds."""
-        return is_exact(self._flat, last)
-
     def hand_over(self, code: TickCode) -> None:
         """Let generated code of the same ticks go on; C must not run meanwhile."""
         self._code, self._loop = code, None
@@ -224,8 +220,8 @@ class CompiledTicks:
             k = int(window.ticks[-1])
 
     def _window(self, k: int, last: int) -> _Window:
-        flat, base = self._flat, self._flat.base
-        n, d = base.numerator, base.denominator
+        flat = self._flat
+        n, d = flat.base.numerator, flat.base.denominator
         if last - k <= _FEW:
             few = [*flat.ticks(k, last, every=self._every)]
             numbers = [self._numbers.get(flat.acting(tick), -1) for tick in few]
@@ -237,7 +233,7 @@ class CompiledTicks:
         ends = np.concatenate([[k], ticks])
         kinds = self._kinds.at(ticks)
         unknown = np.flatnonzero(kinds < 0)
-        return _Window(k, ticks, ends * n / d, np.diff(ends) * n / d, kinds, unknown)
+        return _Window(k, ticks, times_of(flat, ends), times_of(flat, np.diff(ends)), kinds, unknown)
 
     def _bind(self, recorder: Recorder) -> CompiledLoop:
         if self._loop is None or recorder is not self._recorder:
@@ -317,16 +313,12 @@ def make_compiled(
             code = _fuse(workspace.flat, plants, every=every) if fuse else None
             code = interpret_ticks(workspace.flat, acting) if machine else code
             found = CompiledTicks(workspace, plants, stops, every=every, code=code)
-        except (LoopwrightError, OSError) as error:
+        except CompilerError as error:
             if machine:
-                return None, tell_missing_once(error)
-            if not isinstance(error, CompilerError):
                 raise
             reason = str(error)
         else:
             return found, () if machine else found.messages
-    if machine:
-        return None, ()
     return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)
 
 
@@ -377,18 +369,8 @@ _TOLD: list[Exception] = []  # the failure that this process has told
 
 def tell_failure_once(failure: Exception) -> tuple[str, ...]:
     """Return a message that there is no compiler, or one that fails; once in a process."""
-    return _tell_once(
-        failure, "Interpreted, though the run is long enough for C: {}. compile=False asks for no compiler."
-    )
-
-
-def tell_missing_once(failure: Exception) -> tuple[str, ...]:
-    """Return a message that the loop in C can't be had; once in a process."""
-    return _tell_once(failure, "Interpreted by Python's own loop, which takes several times as long as C's: {}.")
-
-
-def _tell_once(failure: Exception, text: str) -> tuple[str, ...]:
     if _TOLD:
         return ()
     _TOLD.append(failure)
+    text = "Interpreted, though the run is long enough for C: {}. compile=False asks for no compiler."
     return (text.format(str(failure).rstrip(".")),)

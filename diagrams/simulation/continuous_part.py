@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -25,6 +25,13 @@ class _Saved:
     events: int
 
 
+class Between(Protocol):
+    """Takes the blocks in continuous time from one instant to another; see `HybridTicks`."""
+
+    def go_between(self, t: float, end: float) -> float | None:
+        """Go from t to an instant, both in s, before any tick there; return where a stop condition has ended the run."""
+
+
 class ContinuousPart:
     """The blocks in continuous time between two ticks: advanced, saved and restored; see `Rest`.
 
@@ -35,16 +42,20 @@ class ContinuousPart:
     workspace : Workspace
         The run's numbers.
     continuous : Continuous or None
-        The solver with its events; None where nothing happens between ticks.
+        Its method, events and delays; None where nothing happens between ticks.
     exchanged : ExchangedBlocks
         Model-exchange FMUs, which keep memory of their own.
+
+    Attributes
+    ----------
+    loop : Between or None
+        The loop that takes them from one instant to another; None where nothing happens between ticks.
     """
 
     def __init__(self, workspace: Workspace, continuous: Continuous | None, exchanged: ExchangedBlocks):
         self._workspace, self._continuous, self._exchanged = workspace, continuous, exchanged
         self._events: list[Occurrence] = []
-        self.sample: Callable[[float], bool] = lambda t: False
-        """Records the instant at which a stop condition ends the run."""
+        self.loop: Between | None = None
         if continuous is not None:
             self._tell = continuous.on_event
             continuous.on_event = self._events.append
@@ -53,10 +64,11 @@ class ContinuousPart:
         """Go from t to the end, both in s; return the time at which a stop condition has ended the run."""
         if self._continuous is None:
             return None
-        self._continuous.enter(t)
+        assert self.loop is not None
+        self._workspace.here.t[0] = t
         if self._continuous.delays is not None:
             self._continuous.delays.note_edge(t)  # the outputs of the plants have jumped
-        return self._continuous.advance(t, end, (), self.sample)
+        return self.loop.go_between(t, end)
 
     def save(self) -> _Saved:
         """Return the present state."""

@@ -25,13 +25,15 @@ from .run_options import RunOptions
 from .start_at_point import start_at, take_over
 from .start_values import choose_start_values
 from .stops import StopConditions
-from .ticks import Progress, Row, end_between_ticks, run_hybrid, run_ticks, take_tick
 from .view import Position, SimulationView
 from .workspace import Workspace
+
+Progress = Callable[[float], Any]
 
 if TYPE_CHECKING:
     from ..compiled import TickCode
     from .compiled_hybrid import HybridTicks
+    from .compiled_plants import PlantsInC
     from .compiled_ticks import CompiledTicks
 
 
@@ -74,7 +76,8 @@ class Engine:
         self._compile, self._fuse = options.compiled, options.fuse
         self._changed = False  # whether generated code has taken over within the run
         self._compiled: CompiledTicks | HybridTicks | None = None
-        self._generated = self._asked_machine = False  # whether it is generated code; whether the machine can be had
+        self._in_c: PlantsInC | None = None
+        self._generated = False  # whether generated code is gone through, and no virtual machine
         self.messages: tuple[str, ...] = ()
         self._can_stop = self._stops.exist or bool(self.exchanged)
         self.is_ahead = False
@@ -83,7 +86,7 @@ class Engine:
         if flat.hybrid:
             self.continuous = Continuous(
                 self.workspace, name, options.solver, options.rtol, options.atol, options.max_step,
-                self._on_event, self._stops.is_met, self.exchanged,
+                self._on_event, self.exchanged,
             )  # fmt: skip
         elif options.solver != "auto":
             solver_name(options.solver)  # an unknown one is an error here, too
@@ -97,11 +100,12 @@ class Engine:
             every_tick=self.every_tick, coupled=is_coupled,
         )  # fmt: skip
         self._change_over = ChangeOver(self.position)
-        if is_coupled:
+        self._part = ContinuousPart(self.workspace, self.continuous, self.exchanged) if is_coupled else None
+        if self._part is not None:
             refuse_exchanged(self.coupling, {path: flat.table.blocks[path] for path in flat.outside})
             self.coupled = CoupledSteps(
                 flat, name, self.plants, self.coupling, self.steps, self.workspace.z, self.workspace.here.w,
-                self.workspace.bind_exchange(), ContinuousPart(self.workspace, self.continuous, self.exchanged),
+                self.workspace.bind_exchange(), self._part,
             )  # fmt: skip
 
     def load(self, stack: ExitStack, start_time: float) -> None:
@@ -127,14 +131,13 @@ class Engine:
         self.steps.bind()
         large, sampled = self.flat.by_block, self.continuous is None
         plain = sampled and large if self._fuse else sampled or large
-        if (plain and self._compile is True) or (large and self.may_use_machine(self._compile)):
+        if (plain and self._compile is True) or large:
             from .compiled_ticks import bind_evaluations
 
             self.workspace.native = bind_evaluations(self.workspace, self._find_tick_code)
         self._find_start(choose_start_values(self.workspace))
         if self._compile is True:
-            self._compiled = self._make_compiled()
-            self._generated = self._compiled is not None
+            self._make_compiled(machine=False)
 
     def _find_tick_code(self) -> TickCode:
         """Return the code of the ticks, for an evaluation of one."""
@@ -161,11 +164,6 @@ class Engine:
         found = "both" if self._changed else "compiled" if self._generated else "interpreted"
         self._changed = False
         return found
-
-    @staticmethod
-    def may_use_machine(option: bool | str) -> bool:
-        """Whether the virtual machine evaluates a run with this ``compile``; tests compare Python's own loop."""
-        return option is not True
 
     @property
     def is_compiled(self) -> bool:
@@ -197,32 +195,61 @@ class Engine:
             plant.read(0.0)
         self._find_start(set_start or find_start_values)
 
-    def _make_compiled(self, *, machine: bool = False) -> CompiledTicks | HybridTicks | None:
-        """Return the ticks in C; None, with a message, where they can't be had."""
+    def _make_compiled(self, *, machine: bool) -> None:
+        """Make the loop in C, with generated code or the virtual machine; a message tells where code can't be had."""
         from .compiled_hybrid import make_hybrid
-        from .compiled_plants import PlantsInC
         from .compiled_ticks import make_compiled
 
-        plants, stops = PlantsInC(self.flat, self.plants, self.steps, self.coupled), self._stops.entries
+        plants, stops = self._plants_in_c(), self._stops.entries
         found: CompiledTicks | HybridTicks | None
         options = {"every": self.every_tick, "machine": machine, "fuse": self._fuse}
         if self.continuous is None:
             found, message = make_compiled(self.workspace, plants, stops, **options)
         else:
             found, message = make_hybrid(self.workspace, self.continuous, plants, stops, **options)
+            if self._part is not None:
+                self._part.loop = found
         self.messages += message
+        self._compiled, self._generated = found, found is not None and not machine
+
+    def _plants_in_c(self) -> PlantsInC:
+        from .compiled_plants import PlantsInC
+
+        if self._in_c is None:
+            self._in_c = PlantsInC(self.flat, self.plants, self.steps, self.coupled)
+        return self._in_c
+
+    def _ticks(self) -> CompiledTicks | HybridTicks:
+        """Return the loop in C, which goes from tick to tick."""
+        if self._compiled is None:
+            self._make_compiled(machine=True)
+        assert self._compiled is not None
+        return self._compiled
+
+    def _hybrid_ticks(self) -> HybridTicks:
+        from .compiled_hybrid import HybridTicks
+
+        found = self._ticks()
+        assert isinstance(found, HybridTicks)
         return found
 
-    def take_first_tick(self, point: OperatingPoint | None, row: Row) -> None:
+    def take_first_tick(self, point: OperatingPoint | None, recorder: Recorder) -> None:
         """Go through the tick with which the run begins, tick 0 or that of an operating point, and record it."""
-        first = 0 if point is None else start_at(self.workspace, point, self.name)
-        if self.continuous is not None:
-            self.continuous.begin(at_start=point is None)
-        now = self.position.time_of(first)
-        self.workspace.begin(self.flat.acting(first))
-        take_tick(self.workspace, self.continuous, self.plants, now, self.flat.acting(first))
+        workspace, continuous = self.workspace, self.continuous
+        first = 0 if point is None else start_at(workspace, point, self.name)
+        now, acting = self.position.time_of(first), self.flat.acting(first)
+        if continuous is not None:
+            continuous.begin(at_start=point is None)
+        workspace.begin(acting)
+        if continuous is not None and (continuous.domains is not None or continuous.exchanged is not None):
+            self._hybrid_ticks().take_first(now, acting, recorder)
+        else:
+            workspace.here.t[0] = now
+            workspace.tick(acting)
+            recorder.row(now, workspace.log)
+        if (acting or self.plants) and continuous is not None and continuous.delays is not None:
+            continuous.delays.note_edge(now)  # held signals have jumped
         self.steps.begin(first)
-        row(now, self.workspace.log)
         self._arrive(first)
 
     def go(self, last: int, recorder: Recorder, progress: Progress) -> None:
@@ -240,39 +267,18 @@ class Engine:
         SimulationError
             With the block that is to blame.
         """
-        workspace, plants, position, row = self.workspace, self.plants, self.position, recorder.row
-        self.is_ahead = False
+        self.is_ahead, ticks = False, self._ticks()
+        if self._compile == "auto" and not self._generated:
+            progress = self._change_over.watch(last, progress, ticks.make_later, self._hand_over)
         try:
-            if self._compiled is None and not self._asked_machine and self.may_use_machine(self._compile):
-                self._asked_machine = True
-                self._compiled = self._make_compiled(machine=True)
-            if self._compiled is not None and self._compiled.reaches(last):
-                self._go_in_c(last, recorder, progress)
-            elif self.continuous is None:
-                run_ticks(
-                    workspace, plants, self.steps, self.coupled, position.tick, last, every=self.every_tick, row=row,
-                    arrived=self._arrive, progress=progress,
-                )  # fmt: skip
-            else:
-                ended = run_hybrid(
-                    workspace, self.continuous, plants, self.steps, self.coupled, position, last,
-                    every=self.every_tick, row=row, arrived=self._arrive, progress=progress,
-                )  # fmt: skip
-                if ended is not None:
-                    position.stopped = self._stops.met_at(ended)
+            ended = ticks.run(self.position.tick, last, recorder, arrived=self._arrive, progress=progress)
+            self.messages += self._change_over.tell_failure()
+            if ended is not None:
+                self.position.stopped = self._stops.met_at(ended)
         except SimulationError as error:
             if not self._end_within_step(error):
                 culprit = self.blame(error)
                 raise culprit from culprit.__cause__
-
-    def _go_in_c(self, last: int, recorder: Recorder, progress: Progress) -> None:
-        assert self._compiled is not None
-        if self._compile == "auto" and not self._generated:
-            progress = self._change_over.watch(last, progress, self._compiled.make_later, self._hand_over)
-        ended = self._compiled.run(self.position.tick, last, recorder, arrived=self._arrive, progress=progress)
-        self.messages += self._change_over.tell_failure()
-        if ended is not None:
-            self.position.stopped = self._stops.met_at(ended)
 
     def _hand_over(self) -> None:
         """Let generated code go on where the virtual machine has come to."""
@@ -280,12 +286,18 @@ class Engine:
         self._compiled.hand_over(self._change_over.code)
         self._changed = self._generated = True
 
-    def end_between_ticks(self, end: float, row: Row, progress: Progress) -> None:
+    def end_between_ticks(self, end: float, recorder: Recorder, progress: Progress) -> None:
         """Go on from a tick to the end of the run, before the next tick, and record it; see `go`."""
-        position = self.position
+        position, workspace = self.position, self.workspace
         try:
-            parts = (self.workspace, self.continuous, self.plants, self.steps, self.coupled)
-            ended = end_between_ticks(*parts, position, end, row)
+            ended = None
+            if self.continuous is not None:
+                ended = self._hybrid_ticks().end_between_ticks(position.tick, end, recorder)
+            else:
+                self._plants_in_c().end_at(end, position.tick)
+                workspace.here.t[0] = end
+                workspace.evaluate_with_held()
+                recorder.row(end, workspace.log)
             position.end = end
             if ended is not None:
                 position.stopped = self._stops.met_at(ended)

@@ -149,7 +149,7 @@ class Simulation:
         try:
             engine.initialize()
             if self._start_state is None:
-                engine.take_first_tick(self._point, self._recorder.row)
+                engine.take_first_tick(self._point, self._recorder)
                 self._begun = True
             else:
                 self.restore(self._start_state)
@@ -235,7 +235,7 @@ class Simulation:
                 if count:
                     self._engine.go(last, self._recorder, tell)
                 if end is not None and self.stopped is None:
-                    self._engine.end_between_ticks(end, self._recorder.row, tell)
+                    self._engine.end_between_ticks(end, self._recorder, tell)
         except SimulationError as error:
             self._elapsed += time.perf_counter() - started
             raise self._with_run(error) from error.__cause__

@@ -21,7 +21,7 @@ from ..flat import (
     evaluate,
     evaluate_apart,
 )
-from .algebraic_loops import LoopSolver
+from .algebraic_loops import LoopSolver, loop_solver
 from .diagnosis import failure
 
 
@@ -299,16 +299,8 @@ class Workspace:
             function = self.flat.loop_equations(acting)
             if function is None:
                 return None
-            bound, where = self._bind(function, vectors), self.flat.active_loops(acting)
-            names = {
-                entry: name if stop - start == 1 else f"{name}[{entry - start + 1}]"
-                for name, slot in self.flat.loops.slices.items()
-                for start, stop in [(slot.start, slot.stop)]
-                for entry in range(start, stop)
-            }
-            r, J = bound.outputs
-            ports = [names[i] for i in where]
-            self._solved[key] = LoopSolver(ports, where, vectors.t, vectors.x, bound.call, r, J, self.flat.order.loops)
+            bound = self._bind(function, vectors)
+            self._solved[key] = loop_solver(self.flat, acting, vectors.t, vectors.x, bound.call, *bound.outputs)
         return self._solved[key]
 
     def solve_loops(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:

@@ -1,13 +1,13 @@
-"""Solvers of fixed and variable step behind one interface."""
+"""The method of a run, and the multistep methods of libraries behind one interface."""
 
-from .base import SUNDIALS, AcceptedStep, Polynomial, Problem, Solver, solver_name
-from .choose import make_solver
-from .scipy_methods import AutoSolver
+from .base import SOLVERS, SUNDIALS, AcceptedStep, Polynomial, Problem, Solver, solver_name
+from .choose import Method, make_solver
 
 __all__ = [
+    "SOLVERS",
     "SUNDIALS",
     "AcceptedStep",
-    "AutoSolver",
+    "Method",
     "Polynomial",
     "Problem",
     "Solver",

@@ -21,26 +21,25 @@ euler          Runge-Kutta 1, fixed     to see the effect of a controller's forw
 
 The multistep methods start again at order 1 after every discontinuity, so that a sampled controller costs them most.
 
-A solver never evaluates the rates beyond its `stop`, and lands on it exactly: discontinuities in time are put there.
-The state at times inside a step comes from the method's own dense output, with a fixed step from a shorter step.
+The loop in C takes the steps of all one-step methods, `fmus/runtime/methods.c`; here are the multistep methods, which are
+those of libraries. No method evaluates the rates beyond its `stop`, and each lands on it exactly: discontinuities in time
+are put there. The state at times inside a step comes from the method's own dense output, with a fixed step from a shorter
+step.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from ...blocks.core import NonFiniteError, OptionError, SimulationError, near
 
-Dense = Callable[[float], np.ndarray]
-
-_STRETCH = 2_000  # steps between two looks at the progress
-_HOPELESS = 1e7  # steps to go, at which a run is given up
+STRETCH = 2_000  # steps between two looks at the progress
+HOPELESS = 1e7  # steps to go, at which a run is given up
 
 
 @dataclass(frozen=True)
@@ -65,101 +64,83 @@ class Problem:
     names: Sequence[str]
 
 
-@dataclass
-class Statistics:
-    """Counts of a solver's work, and its messages; ``rejected`` is None where the method does not count them."""
+@dataclass(frozen=True)
+class Polynomial:
+    """The state over a step of a method: x + Σ cₖ ((time − t)/h)ᵏ, k ≥ 1.
 
-    solver: str
-    steps: int = 0
-    rejected: int | None = 0
-    rate_evaluations: int = 0
-    jacobian_evaluations: int = 0
-    messages: list[str] = field(default_factory=list)
-
-
-class Polynomial(NamedTuple):
-    """The state over a step as a polynomial: x + Σ cₖ ((time − t)/h)ᵏ, k ≥ 1, with cₖ the columns of coefficients."""
+    Attributes
+    ----------
+    t, h : float
+        Start and length of the step, in s.
+    x : ndarray, shape (n,)
+        State at the start.
+    coefficients : ndarray, shape (q, n)
+        c₁ to c_q.
+    """
 
     t: float
     h: float
     x: np.ndarray
     coefficients: np.ndarray
 
+    def __call__(self, t: float) -> np.ndarray:
+        """Return the state at a time within the step."""
+        u = (t - self.t) / self.h
+        change = np.zeros_like(self.x)
+        for c in self.coefficients[::-1]:
+            change = (change + c) * u
+        return np.asarray(self.x + change)
 
+
+@dataclass(frozen=True)
 class AcceptedStep:
-    """One accepted step, from ``t_old`` to ``t``, where the state is ``x``."""
+    """One accepted step, from ``t_old`` to ``t``, where the state is ``x``; both in s.
 
-    __slots__ = ("_dense", "_prepare", "t", "t_old", "x")
+    Attributes
+    ----------
+    prepare : callable
+        Returns the dense output; valid until the solver's next step or restart.
+    """
 
-    def __init__(self, t_old: float, t: float, x: np.ndarray, prepare: Callable[[], Dense]):
-        self.t_old, self.t, self.x, self._prepare = t_old, t, x, prepare
-        self._dense: Dense | None = None
-
-    def interpolate(self, t: float) -> np.ndarray:
-        """Return the state at ``t`` in [t_old, t]; valid until the solver's next step or restart."""
-        if t == self.t:
-            return self.x.copy()
-        if self._dense is None:
-            self._dense = self._prepare()
-        return self._dense(t)
-
-    def interpolate_many(self, times: np.ndarray) -> np.ndarray:
-        """Return the states at several such times, which ascend, one row each; to rounding those of `interpolate`."""
-        if self._dense is None:
-            self._dense = self._prepare()
-        many = getattr(self._dense, "many", None)
-        found: np.ndarray = np.array([self._dense(float(t)) for t in times]) if many is None else many(times)
-        if times[-1] == self.t:
-            found[-1] = self.x
-        return found
-
-    def polynomial(self) -> Polynomial | None:
-        """Return the state as a polynomial, to rounding that of `interpolate`; None if the method has another form."""
-        if self._dense is None:
-            self._dense = self._prepare()
-        of = getattr(self._dense, "polynomial", None)
-        return None if of is None else of()
+    t_old: float
+    t: float
+    x: np.ndarray
+    prepare: Callable[[], Polynomial]
 
 
-class Solver(ABC):
-    """The interface of all solvers: `restart`, then `step` until ``t == stop``."""
+class Integration:
+    """A differential equation, the method that integrates it, and its tolerances; with the errors of that method.
+
+    Parameters
+    ----------
+    name : str
+        Name of the method.
+    problem : Problem
+        The equation.
+    rtol, atol : float, float or ndarray
+        Tolerances of a step; NaN with a fixed step.
+    max_step : float
+        Longest step in s; with a fixed step that step.
+    """
 
     fixed = False
     stiff = False  # made for stiff problems
 
     def __init__(self, name: str, problem: Problem, rtol: float, atol: float | np.ndarray, max_step: float):
         self.name, self.problem, self.rtol, self.atol, self.max_step = name, problem, rtol, atol, max_step
-        self.statistics = Statistics(name)
         self.stop = -math.inf
-
-    @abstractmethod
-    def restart(self, t: float, x: np.ndarray, stop: float) -> None:
-        """Start at (t, x), up to ``stop``: after each discontinuity, and at the start."""
-
-    @abstractmethod
-    def step(self) -> AcceptedStep:
-        """Take one step that the error control accepts, at most to ``stop``."""
-
-    def save(self) -> dict[str, Any]:
-        """Return the solver's memory beside the state, such as the step that it would take next."""
-        return {}
-
-    def restore(self, saved: Mapping[str, Any]) -> None:
-        """Take over the memory that `save` returned; of another method's memory nothing is used."""
-        return
+        """The next discontinuity in s, beyond which the rates are not evaluated."""
 
     def set_absolute_tolerance(self, atol: float | np.ndarray) -> None:
-        """Take another absolute tolerance; it counts from the next `restart` on."""
+        """Take another absolute tolerance; it counts from the next discontinuity on."""
         self.atol = atol
 
     def rate(self, t: float, x: np.ndarray) -> np.ndarray:
         """Evaluate the rates, never beyond ``stop`` (t + h can be one ulp above it). The array is the caller's own."""
-        self.statistics.rate_evaluations += 1
         return np.array(self.problem.rate(min(t, self.stop), x), dtype=float)
 
     def jacobian(self, t: float, x: np.ndarray) -> np.ndarray:
         """Evaluate the exact Jacobian. The array is the caller's own."""
-        self.statistics.jacobian_evaluations += 1
         return np.array(self.problem.jacobian(min(t, self.stop), x), dtype=float)
 
     def check_finite(self, t: float, values: np.ndarray, quantity: str) -> None:
@@ -203,42 +184,35 @@ class Solver(ABC):
         stuck.state = self.problem.names[i]
         return stuck
 
+    def no_progress(self, t: float, x: np.ndarray, h: float) -> SimulationError:
+        """Return the error of steps of a mean length h, in s, that are so small that the run would never end."""
+        found = f"got no further than {h:.2g} s per step in {STRETCH} steps, with {self.stop - t:.3g} s to go"
+        return self.failure(t, x, h, found)
 
-class VariableStep(Solver):
-    """Base of the variable-step solvers: one step of Heun's method crosses an interval of a few ulps."""
 
-    _sliver: tuple[float, np.ndarray] | None = None
+class Solver(Integration, ABC):
+    """A method of a library: `restart`, then `step` until ``t == stop``.
+
+    C crosses intervals of a few ulps by itself, so that each stretch is longer than that.
+    """
+
     _count, _mark = 0, 0.0
 
     def restart(self, t: float, x: np.ndarray, stop: float) -> None:
-        """Start at (t, x), up to ``stop``."""
-        t, x, self.stop = float(t), np.array(x, dtype=float), float(stop)
-        sliver = self.stop - t <= 100 * math.ulp(max(abs(t), abs(self.stop)))
-        self._sliver = (t, x) if sliver else None
-        self._count, self._mark = 0, t
-        if not sliver:
-            self._start(t, x)
+        """Start at (t, x), up to ``stop``: after each discontinuity, and at the start."""
+        self.stop = float(stop)
+        self._count, self._mark = 0, float(t)
+        self._start(float(t), np.array(x, dtype=float))
 
     def step(self) -> AcceptedStep:
         """Take one step that the error control accepts, at most to ``stop``."""
-        if self._sliver is None:
-            step = self._advance()
-            self._count += 1
-            if self._count % _STRETCH == 0:
-                self._check_progress(step)
-            return step
-        t, x = self._sliver
-        f = self.rate(t, x)
-        self.check_finite(t, f, "rate")
-        self.statistics.steps += 1
-        return AcceptedStep(t, self.stop, _heun(self.rate, t, x, f, self.stop), lambda: lambda time: x + (time - t) * f)
-
-    def _check_progress(self, step: AcceptedStep) -> None:
-        """Raise if the last steps were so small that the run would never end, as at a jump that is no event."""
-        h, self._mark = (step.t - self._mark) / _STRETCH, step.t
-        if self.stop - step.t > _HOPELESS * h:
-            found = f"got no further than {h:.2g} s per step in {_STRETCH} steps, with {self.stop - step.t:.3g} s to go"
-            raise self.failure(step.t, step.x, h, found)
+        step = self._advance()
+        self._count += 1
+        if self._count % STRETCH == 0:
+            h, self._mark = (step.t - self._mark) / STRETCH, step.t
+            if self.stop - step.t > HOPELESS * h:
+                raise self.no_progress(step.t, step.x, h)
+        return step
 
     @abstractmethod
     def _start(self, t: float, x: np.ndarray) -> None:
@@ -249,81 +223,11 @@ class VariableStep(Solver):
         """Take one step of the method."""
 
 
-class FixedStep(Solver):
-    """Explicit Runge-Kutta methods of fixed step.
-
-    A stop that is further away than ``step`` is reached in equal steps of at most ``step``.
-    """
-
-    fixed = True
-
-    def __init__(self, name: str, problem: Problem, step: float, formula: Callable[..., np.ndarray]):
-        super().__init__(name, problem, math.nan, math.nan, step)
-        self._formula, self._t, self._x = formula, 0.0, np.empty(0)
-        self._start, self._done, self._count = 0.0, 0, 0
-
-    def restart(self, t: float, x: np.ndarray, stop: float) -> None:
-        """Start at (t, x), up to ``stop``."""
-        self._start = self._t = float(t)
-        self._x, self.stop, self._done = np.array(x, dtype=float), float(stop), 0
-        self._count = max(1, math.ceil((self.stop - self._t) / self.max_step * (1 - 1e-9)))
-
-    def step(self) -> AcceptedStep:
-        """Take one step."""
-        t, x = self._t, self._x
-        self._done += 1
-        last = self._done >= self._count
-        t_new = self.stop if last else self._start + self._done * ((self.stop - self._start) / self._count)
-        if self.problem.size:
-            with np.errstate(all="ignore"):
-                f = self.rate(t, x)
-                self.check_finite(t, f, "rate")
-                x_new = self._formula(self.rate, t, x, f, t_new)
-            self.check_finite(t_new, x_new, "state")
-        else:
-            f = x_new = x
-        self._t, self._x = t_new, x_new
-        self.statistics.steps += 1
-        return AcceptedStep(t, t_new, x_new.copy(), lambda: lambda time: self._formula(self.rate, t, x, f, time))
-
-
-def euler(rate: Callable[..., np.ndarray], t: float, x: np.ndarray, f: np.ndarray, t_new: float) -> np.ndarray:
-    """Forward Euler, order 1, one stage: x + h f(t, x). Stable for |1 + hλ| < 1: h < 2/|λ| for a real pole.
-
-    Reference for all three methods: Hairer, Nørsett, Wanner, Solving Ordinary Differential Equations I, II.1.
-    """
-    return x + (t_new - t) * f
-
-
-def _heun(rate: Callable[..., np.ndarray], t: float, x: np.ndarray, f: np.ndarray, t_new: float) -> np.ndarray:
-    """Heun's method, order 2, two stages: the mean of the rates at both ends. Stable for h < 2/|λ| for a real pole."""
-    h = t_new - t
-    x_new: np.ndarray = x + (0.5 * h) * (f + rate(t_new, x + h * f))
-    return x_new
-
-
-def _rk4(rate: Callable[..., np.ndarray], t: float, x: np.ndarray, f: np.ndarray, t_new: float) -> np.ndarray:
-    """Classical Runge-Kutta method, order 4, four stages. Stable for h < 2.78/|λ| (real), h < 2.83/|λ| (imaginary)."""
-    h = t_new - t
-    middle = t + 0.5 * h
-    k2 = rate(middle, x + (0.5 * h) * f)
-    k3 = rate(middle, x + (0.5 * h) * k2)
-    k4 = rate(t_new, x + h * k3)
-    x_new: np.ndarray = x + (h / 6) * (f + 2 * (k2 + k3) + k4)
-    return x_new
-
-
-FIXED = {"euler": euler, "heun": _heun, "rk4": _rk4}
+FIXED = ("euler", "heun", "rk4")
 _SCIPY = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 SUNDIALS = ("CVODE_BDF", "CVODE_Adams")
 
 SOLVERS: tuple[str, ...] = ("auto", *FIXED, *_SCIPY, *SUNDIALS)
-
-
-class NoStates(FixedStep):
-    """Solver of a diagram without continuous states: one step to ``stop``, or several of ``max_step``."""
-
-    fixed = False
 
 
 def solver_name(name: str) -> str:

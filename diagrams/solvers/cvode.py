@@ -21,14 +21,14 @@ import ctypes
 import functools
 import weakref
 from collections.abc import Callable
-from ctypes import CFUNCTYPE, POINTER, byref, c_char_p, c_double, c_int, c_int64, c_long, c_void_p
+from ctypes import CFUNCTYPE, POINTER, byref, c_char_p, c_double, c_int, c_int64, c_void_p
 from typing import Any
 
 import numpy as np
 
 from ...blocks.core import NonFiniteError, OptionError
 from ...blocks.interrupts import INTERRUPTS
-from .base import AcceptedStep, Dense, Problem, Statistics, VariableStep
+from .base import AcceptedStep, Polynomial, Problem, Solver
 from .dense_output import from_derivatives
 
 _ADAMS, _BDF, _ONE_STEP = 1, 2, 2
@@ -73,7 +73,6 @@ _FUNCTIONS: dict[str, dict[str, tuple[Any, ...]]] = {  # library â†’ function â†
         "CVodeGetDky": (c_int, c_void_p, c_double, c_int, c_void_p),
         "CVodeGetLastOrder": (c_int, c_void_p, POINTER(c_int)),
         "CVodeGetCurrentStep": (c_int, c_void_p, POINTER(c_double)),
-        "CVodeGetNumErrTestFails": (c_int, c_void_p, POINTER(c_long)),
         "SUNNonlinSol_FixedPoint": (c_void_p, c_void_p, c_int, c_void_p),
         "SUNNonlinSolFree": (c_int, c_void_p),
     },
@@ -117,8 +116,8 @@ def _load_library() -> _Library:
 class _Calls:
     """Callbacks for CVODE. Python's exceptions can't pass through C: they are kept, and raised afterwards."""
 
-    def __init__(self, problem: Problem, statistics: Statistics, library: _Library):
-        self.problem, self.statistics, self.library = problem, statistics, library
+    def __init__(self, problem: Problem, library: _Library):
+        self.problem, self.library = problem, library
         self.stop, self.message = 0.0, ""
         self.error: BaseException | None = None
         self._views: dict[int, np.ndarray] = {}
@@ -138,7 +137,6 @@ class _Calls:
         try:
             INTERRUPTS.heard = True
             INTERRUPTS.check()
-            self.statistics.rate_evaluations += 1
             rates = self.vector(f)
             rates[:] = self.problem.rate(min(t, self.stop), self.vector(x))
             return 0 if np.isfinite(rates).all() else 1  # 1: try a shorter step
@@ -152,7 +150,6 @@ class _Calls:
         try:
             INTERRUPTS.heard = True
             INTERRUPTS.check()
-            self.statistics.jacobian_evaluations += 1
             n = self.problem.size
             columns = self.view(self.library.SUNDenseMatrix_Data(matrix), n * n).reshape(n, n)
             columns.T[:] = self.problem.jacobian(min(t, self.stop), self.vector(x))
@@ -167,13 +164,13 @@ class _Calls:
         self.message = message.decode("utf-8", "replace")
 
 
-class Cvode(VariableStep):
+class Cvode(Solver):
     """CVODE with variable-order BDF (stiff) or Adams (not stiff). It selects its first step anew at each restart."""
 
     def __init__(self, name: str, problem: Problem, rtol: float, atol: float | np.ndarray, max_step: float):
         super().__init__(name, problem, rtol, atol, max_step)
         self._library = library = _load_library()
-        self._calls = calls = _Calls(problem, self.statistics, library)
+        self._calls = calls = _Calls(problem, library)
         context = c_void_p()
         library.SUNContext_Create(0, byref(context))
         library.SUNContext_ClearErrHandlers(context)
@@ -201,16 +198,15 @@ class Cvode(VariableStep):
         vectors = (self._x, self._dky, tolerances)
         weakref.finalize(self, _free, calls, memory, (matrix, linear, fixed_point), vectors, context)
         self._tolerances = tolerances
-        self._t, self._x_old, self._fails, self._t_new = 0.0, np.empty(0), 0, c_double()
+        self._t, self._x_old, self._t_new = 0.0, np.empty(0), c_double()
 
     def set_absolute_tolerance(self, atol: float | np.ndarray) -> None:
-        """Take another absolute tolerance; see `Solver.set_absolute_tolerance`."""
+        """Take another absolute tolerance; see `Integration.set_absolute_tolerance`."""
         super().set_absolute_tolerance(atol)
         self._calls.vector(self._tolerances)[:] = atol
         self._library.CVodeSVtolerances(self._memory, self.rtol, self._tolerances)
 
     def _start(self, t: float, x: np.ndarray) -> None:
-        self._fails += self._count_failed_tests()
         self._calls.stop, self._calls.error, self._t, self._x_old = self.stop, None, t, x
         self._calls.vector(self._x)[:] = x
         self._check(self._library.CVodeReInit(self._memory, t, self._x))
@@ -223,16 +219,9 @@ class Cvode(VariableStep):
         self._check(code)
         self._t, self._x_old = self._t_new.value, self._calls.vector(self._x).copy()
         self.check_finite(self._t, self._x_old, "state")
-        self.statistics.steps += 1
-        self.statistics.rejected = self._fails + self._count_failed_tests()
         return AcceptedStep(t, self._t, self._x_old.copy(), lambda: self._prepare_dense(t, x_old))
 
-    def _count_failed_tests(self) -> int:
-        count = c_long()
-        self._library.CVodeGetNumErrTestFails(self._memory, byref(count))
-        return count.value
-
-    def _prepare_dense(self, t_old: float, x_old: np.ndarray) -> Dense:
+    def _prepare_dense(self, t_old: float, x_old: np.ndarray) -> Polynomial:
         order = c_int()
         self._check(self._library.CVodeGetLastOrder(self._memory, byref(order)))
         derivatives = np.empty((order.value, self.problem.size))

@@ -146,7 +146,7 @@ class BoundRun:
         recorder.begin_anew()
         try:
             self.begin(numbers)
-            engine.take_first_tick(None, recorder.row)
+            engine.take_first_tick(None, recorder)
             if engine.position.stopped is None:
                 if self.count:
                     engine.go(self.count, recorder, progress)

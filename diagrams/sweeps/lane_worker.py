@@ -13,7 +13,7 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError
 from ...fmus.calls import FmuInstance
-from ..flat import EVERY, Announcer, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of, ticks_after
+from ..flat import EVERY, Announcer, ClockSets, FlatDiagram, TickPattern, kinds_of, ticks_after, times_of
 from ..lanes import LaneCode, LaneEnd, LaneRuns, LaneStart, LaneVectors, NoLanesError, compile_lanes, make_room
 from ..results import Run, Stopped, machine_memory
 from ..simulation import START_EXCHANGES, StopConditions, newton_options
@@ -146,8 +146,8 @@ class _Lanes:
         if not bound.is_compiled:
             reason = next(iter(engine.messages), "compile=True was not asked for")
             raise NoLanesError(f"they don't go from tick to tick in C ({reason.rstrip('.')})")
-        if bound.ends_between_ticks or not is_exact(flat, bound.count):
-            raise NoLanesError("their duration is no whole number of ticks, or of too many")
+        if bound.ends_between_ticks:
+            raise NoLanesError("their duration is no whole number of ticks")
         acting = kinds_of(flat, every=engine.every_tick)
         visited = [EVERY] if engine.every_tick else [*flat.visited]
         self._ticks = ticks_after(visited, 0, bound.count, bound.count) if bound.count else np.zeros(0, dtype=np.int64)
@@ -158,8 +158,7 @@ class _Lanes:
             acting.append(flat.acting(int(missing[0])))
             self._kinds = _number(flat, acting, self._ticks)
         ends, base = np.concatenate([[0], self._ticks]), flat.base
-        self._times = ends * base.numerator / base.denominator
-        self._widths = np.diff(ends) * base.numerator / base.denominator
+        self._times, self._widths = times_of(flat, ends), times_of(flat, np.diff(ends))
         entries = bound.recorder.entries
         self._columns = np.arange(engine.workspace.log.size) if entries is None else entries
         needed = 3 * 8 * count * (len(self._ticks) // bound.recorder.every + 2) * len(self._columns)

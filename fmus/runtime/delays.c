@@ -21,8 +21,8 @@ typedef struct delays {
     double *z, *found;                    /* its result; the polynomial's value there */
     double rtol, atol;
     double *pieces;                       /* past inputs: rows of begin, end, and z at each of the nodes */
-    double *edges, *kept_edges;           /* discontinuities that come out: rows of time, and order of the derivative */
-    int64_t count, capacity, noted, room, kept_count, kept_noted;
+    double *edges;                        /* discontinuities that come out: rows of time, and order of the derivative */
+    int64_t count, capacity, noted, room;
     int64_t smoothed;                     /* whether a state is between any output and any input of a delay */
     double middle;                        /* an instant on the side of a discontinuity that is wanted */
 } delays;
@@ -80,7 +80,7 @@ static void put_delayed(const delays *d, double t, double *w) {
 /* Write the inputs at a time of the last step. */
 static bool find_inputs(delays *d, problem *p, method *m, double t, double *out) {
     interpolate(m, t, m->y);
-    if (!look(p, t, m->y) || call(&d->driven)) return false;
+    if (!look(p, t, m->y) || call(&d->driven)) return p->lost = AT_TRIAL, false;
     if (out != d->z) memcpy(out, d->z, (size_t)d->inputs * sizeof(double));
     return true;
 }
@@ -161,16 +161,3 @@ static void note_reached(delays *d, double t, bool from_source) {
     if (order < SMOOTH) note_edge(d, t, order);
 }
 
-/* --- an instant that can be gone back to -------------------------------------------------------------------------- */
-
-static void keep_delays(delays *d) {
-    d->kept_count = d->count;
-    d->kept_noted = d->noted;
-    memcpy(d->kept_edges, d->edges, (size_t)d->noted * 2 * sizeof(double));
-}
-
-static void restore_delays(delays *d) {
-    d->count = d->kept_count;
-    d->noted = d->kept_noted;
-    memcpy(d->edges, d->kept_edges, (size_t)d->noted * 2 * sizeof(double));
-}

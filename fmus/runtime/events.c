@@ -2,10 +2,10 @@
 
    The rules are those of diagrams/events, which says why: an indicator leaves its domain beyond its hysteresis; one that
    has just crossed zero has some slack for rounding errors; one that comes close to zero between two instants is followed
-   to where it is closest. An indicator that is not finite is left to Python. */
+   to where it is closest. At an indicator that is not finite the run ends. */
 
 enum { QUIET, EVENT, LOST, PILED }; /* PILED: events pile up, and the run can't go on: */
-enum { IN_CONTACT, ZENO, CHATTERS, ENDLESS };
+enum { IN_CONTACT, ZENO, CHATTERS, ENDLESS, ENDLESS_OUTSIDE }; /* the last one: of FMUs in model exchange */
 enum { ULPS = 16 }; /* an event within so many ulps of a tick or a sample belongs to it */
 enum { HALVINGS = 40, FEW = 48, BLOCK = 63, MOST = 1024, LATEST = 9, RECENT = 500, SLIDES = 10, ROUNDS = 100, AROUND = 5 };
 enum { RESTS = 20, BRIEFS = 100 }; /* events in a row that lead back into contact; impacts in a row with brief flights */
@@ -19,45 +19,27 @@ typedef struct {
     int64_t m;                    /* events */
     tick indicators, jump;        /* at the trial, and at the instant that is reached */
     double *z, *open, *fired;     /* results of the indicators, argument of the jump */
-    const uint8_t *rising, *falling, *hysteretic, *asks; /* asks: who lets it fire */
+    const uint8_t *rising, *falling, *hysteretic;
     const double *hysteresis;
     const int64_t *own, *own_first; /* integrated states of the event's block: own[own_first[i]] and so on */
     double spacing, finest, step; /* step: of a method of fixed step, else NaN */
-    int64_t state_size;
-    double *state;                /* the next ones, one after the other */
     double *domain, *low, *high, *slack, *size, *rounding, *largest, *counts, *latest, *fresh;
     double *side, *stuck;         /* from where an indicator on the border is held, 1 or -1; events that led back there */
     double *briefs, *brief_at;    /* impacts in a row with brief flights after them; time of the last one */
     double *recent;               /* a ring of times at which events fired */
     uint8_t *recent_fired;        /* which did then, a row for each time */
     int64_t fired_times;
-    double *kept;                 /* copy of state */
-    int64_t kept_times, kept_log;
     double *log;                  /* time, event, states before and after it */
     int64_t logged, capacity;
     double *times, *seen, *gates, *domains; /* of a block of instants */
     double *x, *x_before, *now, *strict, *values, *motion, *later;
-    uint8_t *fires, *following, *located; /* located: what fires at the instant that was found in a step */
+    uint8_t *fires, *following;
     const int64_t *gate, *inside, *inside_first; /* of an event that resets a subsystem: its gate, the events inside */
     const double *start;          /* domains at the start */
     int64_t sliding, switched;    /* whether events of a fixed step wait for its end; whether one has fired there */
     double *slid;                 /* when each has begun to slide for the first time, s; NaN: it has not */
     int64_t pile, culprit, piled; /* why the run can't go on, by which event, and how many times in a row */
 } watch;
-
-enum { BY_C, BY_FMU };
-
-static void keep(watch *w) {
-    memcpy(w->kept, w->state, (size_t)w->state_size * sizeof(double));
-    w->kept_times = w->fired_times;
-    w->kept_log = w->logged;
-}
-
-static void go_back(watch *w) {
-    memcpy(w->state, w->kept, (size_t)w->state_size * sizeof(double));
-    w->fired_times = w->kept_times;
-    w->logged = w->kept_log;
-}
 
 static inline double lowest(const watch *w, int64_t i, double domain, double slack) {
     if (domain < 0.0) return -INFINITY;
@@ -94,11 +76,10 @@ static void take_fired(watch *w) {
 
 /* Evaluate the indicators; false if one in an open subsystem is not finite. */
 static bool indicate(watch *w, problem *p, double t, const double *x) {
-    if (!look(p, t, x)) return false;
-    if (call(&w->indicators)) return false;
-    for (int64_t i = 0; i < w->m; i++)
-        if (!isfinite(w->z[i]) && w->open[i] > 0.5) return false;
-    return true;
+    bool known = look(p, t, x) && !call(&w->indicators);
+    for (int64_t i = 0; known && i < w->m; i++) known = isfinite(w->z[i]) || !(w->open[i] > 0.5);
+    if (!known) p->lost = AT_TRIAL;
+    return known;
 }
 
 static bool indicate_in(watch *w, problem *p, method *m, double t) {

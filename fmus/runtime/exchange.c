@@ -1,13 +1,16 @@
 /* FMUs in model exchange: functions of a diagram in stages, with calls of FMUs between them.
 
    An evaluation leaves all that an FMU keeps as it is. A look at an instant that is reached tells the FMU that a step is
-   complete, or lets an event act: of its indicators, or of inputs that have jumped; those of time and of steps are Python's.
+   complete, or lets an event act: of its indicators, or of inputs that have jumped. Python lets those of time and of steps
+   act, and does whatever C can't: it transfers values that don't fit, and evaluates blocks that are no FMU of C's.
    An FMU in a process of its own is asked for all calls between two copies at once: its buffers are in the memory that
    both share. It stands behind `remote.c` and `master.c`. */
 
 enum { TAKE, GIVE, SET_TIME, CALL, ASK };
 enum { OK, WARNING, DISCARD, LOST_PROCESS };
-enum { TO_STEP, TO_EVENTS, TO_OTHERS, TO_ACT };
+enum { TO_STEP, TO_EVENTS };
+enum { FIRED = -1, INPUT, TIME, COMPLETE }; /* events that have acted: of indicators, inputs, time, a step */
+enum { DONE_BY_PYTHON, NOT_COMPUTED, FAILED_IN_PYTHON };
 enum { EVENT_ROUNDS = 100 };
 
 typedef struct {
@@ -44,7 +47,8 @@ typedef struct {
     int64_t asks;               /* whether it wants an event at the instant that is reached */
     int64_t ended, in_event;    /* whether it asks for the end of the run, at `end` */
     double end;
-    int64_t other_nominals, acted;
+    int64_t other_nominals, acted, event;
+    int64_t by_python;          /* whether Python does all that C asks it for */
     bool *changed;              /* see `plant` in master.c */
     remote *far;                /* its process; NULL: this one */
 } exchanged;
@@ -54,13 +58,13 @@ typedef struct outside {
     int64_t count;
     exchanged *each;
     tick jump;                  /* a look at the instant that is reached */
-    int64_t look;               /* a step is complete; events act; no FMU acts by itself, and then those that fire act */
-    int64_t lost;               /* whether Python has to look */
+    int64_t look;               /* a step is complete, or events act */
+    int64_t lost;               /* whether Python has to do what was begun */
     int64_t failed, plant;      /* whether a call has failed: `action` of `plant`, with a status, at `at` */
     const action *action;
     int64_t call, status;       /* call: its place in the action */
     double at;
-    double *log;                /* an event of inputs that has changed states: time, FMU, all states before and after it */
+    double *log;                /* an event: time, FMU and kind, all states before and after it */
     int64_t logged, capacity;
     int64_t warned;             /* whether a call has given its first warning */
     apart *apart;               /* of FMUs in other processes */
@@ -71,7 +75,9 @@ typedef struct outside {
 typedef struct {
     tick f;
     exchanged *fmu;             /* NULL: a traced function */
-    sequence calls;             /* of an evaluation; none of a look */
+    int64_t looks;              /* whether it is a look at an instant that is reached, and no evaluation */
+    sequence calls;             /* of an evaluation */
+    int (*by_python)(void);     /* Python does all that it asks for */
     const double *t, *x, *u;
     double *into;
     int64_t made;
@@ -284,36 +290,51 @@ static void let_act(exchanged *e, double t, const double *u, double *into) {
     if (go_through_all(e, &e->leave, t) && nominals) e->other_nominals = 1;
 }
 
+/* Let Python do what a stage asks for; it keeps an error until C has returned. */
+static int ask_python(const stage_of *g) {
+    outside *o = g->fmu->of;
+    o->lost = 0;
+    const int result = g->by_python();
+    if (result == FAILED_IN_PYTHON) o->failed = 1, o->plant = g->fmu->place, o->action = NULL, o->status = 0, o->at = *g->t;
+    return result;
+}
+
 /* Look at an instant that is reached. Behind the inputs stands 1 for each event that fires. */
 static void look_at(const stage_of *g) {
     exchanged *e = g->fmu;
     outside *o = e->of;
-    for (int64_t i = 0; i < e->states; i++) g->into[i] = g->x[i];
     bool fires = false;
+    for (int64_t i = 0; i < e->states; i++) g->into[i] = g->x[i];
+    if (e->by_python) {
+        ask_python(g);
+        return;
+    }
     for (int64_t i = 0; i < e->events; i++) fires |= g->u[e->inputs + i] != 0.0;
-    if (o->look == TO_STEP) {
+    if (o->look == TO_STEP)
         complete_step(e, *g->t, g->u);
-    } else if (o->look == TO_ACT) {
-        if (!fires) return;
-        let_act(e, *g->t, g->u, g->into);
-        e->asks = 0;
-    } else if (fires) {
-        if (!is_within(e, g->u)) o->lost = 1;
-    } else if (*g->t >= e->next_time || e->asks) {
+    else if (!fires && (*g->t >= e->next_time || e->asks))
         o->lost = 1;
-    } else if (has_jumped(e, g->u)) {
-        if (o->look == TO_EVENTS && is_within(e, g->u))
+    else if (fires || has_jumped(e, g->u)) {
+        e->event = fires ? FIRED : INPUT;
+        if (is_within(e, g->u))
             let_act(e, *g->t, g->u, g->into);
         else
             o->lost = 1;
+        if (fires) e->asks = 0;
     }
+    if (o->lost) ask_python(g);
 }
 
 static void evaluate_fmu(stage_of *g) {
-    const unsigned status = go_through(g->fmu, &g->calls, *g->t);
-    if (status == OK) return;
+    const bool python = g->fmu->by_python;
+    const unsigned status = python ? OK : go_through(g->fmu, &g->calls, *g->t);
+    if (python || g->fmu->of->lost) {
+        if (ask_python(g) == DONE_BY_PYTHON) return;
+    } else {
+        if (status == OK) return;
+        if (status != DISCARD) g->fmu->of->failed = 1;
+    }
     for (int64_t i = 0; i < g->made; i++) g->into[i] = NAN;
-    if (status != DISCARD && !g->fmu->of->lost) g->fmu->of->failed = 1;
 }
 
 /* Evaluate a function in stages; the last one writes the results. */
@@ -328,11 +349,11 @@ VISIBLE int loopwright_stages(const double **arguments, double **results, long l
         }
         exchanged *e = g->fmu;
         if (e->of->failed) return 1;
-        if (g->calls.count)
-            evaluate_fmu(g);
-        else
+        if (g->looks)
             look_at(g);
-        if (e->of->failed || e->of->lost) return 1;
+        else
+            evaluate_fmu(g);
+        if (e->of->failed) return 1;
     }
     return 0;
 }
@@ -345,17 +366,17 @@ static inline double next_outside(const outside *o, double t) {
     return first;
 }
 
-/* Whether an event of time or of a step is due. */
-static inline bool is_due(const outside *o, double t) {
+/* Whether an FMU asks for the end of the run. */
+static inline bool has_ended(const outside *o) {
     for (int64_t j = 0; j < o->count; j++)
-        if (t >= o->each[j].next_time || o->each[j].asks) return true;
+        if (o->each[j].ended) return true;
     return false;
 }
 
-/* Whether an FMU asks for the end of the run, or has other nominal values: Python takes note. */
-static inline bool has_news(const outside *o) {
+/* Whether an FMU has other nominal values: Python makes tolerances of them. */
+static inline bool has_other_nominals(const outside *o) {
     for (int64_t j = 0; j < o->count; j++)
-        if (o->each[j].ended || o->each[j].other_nominals) return true;
+        if (o->each[j].other_nominals) return true;
     return false;
 }
 

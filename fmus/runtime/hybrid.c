@@ -1,8 +1,7 @@
 /* The loop over ticks with continuous states between them: a method goes from one discontinuity to the next, events are
    located within its steps, samples between ticks come from its dense output.
 
-   It goes as far as it can and returns at the last point of which everything is known: the states of `l.x` at the time
-   `t`. Python, with the same numbers before it, does the rest of the way to the next tick and says what has happened. */
+   It goes as far as it can. Where it breaks off, `p.lost` says at which of its numbers, and Python says why. */
 
 /* Begin a stretch that ends at a discontinuity, or at the next tick. */
 static inline double begin_stretch(hybrid *h, progress *g, double end) {
@@ -26,6 +25,9 @@ static inline double begin_stretch(hybrid *h, progress *g, double end) {
     return edge;
 }
 
+/* Whether the run ends at the instant that has been evaluated. */
+static inline bool is_at_end(const hybrid *h) { return is_stopped(&h->l) || (h->o && has_ended(h->o)); }
+
 /* Go on to the next tick that is landed on; DONE: it is reached. */
 static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
     const span *s = g->s;
@@ -37,20 +39,22 @@ static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
         const double edge = p->edge;
         method *m = h->methods[h->active];
         if (!h->stepped) {
-            if ((*steps)++ > h->budget || (h->w.m && h->w.logged > h->w.capacity / 2)) return SUSPENDED;
-            if (h->o && h->o->logged > h->o->capacity / 2) return SUSPENDED;
+            if ((*steps)++ > h->budget) return SUSPENDED;
             if (p->delays && !has_room_for_step(p->delays)) return SUSPENDED;
             if (h->o && h->o->apart && h->o->apart->late && *steps > 1) return SUSPENDED;
-            keep_instant(h);
-            h->planned = m->planned;
-            if (take_step(m) != PASSED) return ask(h, ASK_BETWEEN);
+            if (take_step(m) != PASSED) {
+                if (!h->automatic || m->kind == RADAU || (h->o && h->o->failed)) return break_off(h, h->t, LOST);
+                h->switched = STUCK;
+                h->begun = 0;
+                return LOOK;
+            }
             if (h->automatic) look_for_stiffness(h, m);
             h->to = m->t;
             h->counts_as = INFINITY;
             h->found = 0;
             if (h->w.m && !h->w.sliding) {
                 const int where = locate(&h->w, p, m, &h->to);
-                if (where == LOST) return ask(h, ASK_BETWEEN);
+                if (where == LOST) return break_off(h, h->t, LOST);
                 h->found = where == EVENT;
                 if (h->found && p->loops)
                     for (int64_t i = 0; i < p->loops->n; i++) h->solved[i] = p->x[p->loops->where[i]];
@@ -68,7 +72,7 @@ static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
             if (!has_room(h, g)) return SUSPENDED;
             interpolate(m, t, m->y);
             stand_at(h, t, m->y);
-            if (evaluate(&h->l, h->between) != DONE) return ask_for_step(h);
+            if (!evaluate_here(h, h->between)) return break_off(h, t, LOST);
             g->out->rows = record(&h->l, t, g->rows, g->out->rows);
             g->i++;
             if (is_stopped(&h->l)) {
@@ -80,26 +84,24 @@ static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
         if (g->i == s->count && landing == s->count) return SUSPENDED;
         if (!has_room(h, g)) return SUSPENDED; /* the instant itself may be a sample */
         if (p->delays && h->to > m->t_old && !keep_pieces(p->delays, p, m, m->t_old, h->to, DEEPEST))
-            return ask_for_step(h);
+            return break_off(h, h->t, LOST);
         if (h->found)
             interpolate(m, h->to, m->y);
         else
             memcpy(m->y, m->x, (size_t)m->n * sizeof(double));
         stand_at(h, h->to > p->left ? p->left : h->to, m->y);
-        if (h->accepts && (h->accepts == 1 || h->to < end || h->found) && accept(h) != DONE) return ask_for_step(h);
+        if (h->accepts && (h->accepts == 1 || h->to < end || h->found) && !accept(h)) return break_off(h, h->to, LOST);
         const double at = h->to, t = h->found && h->counts_as < at ? h->counts_as : at;
         bool happened = h->found;
         if (h->o) {
-            const int told = tell_step(h);
-            if (told == LOST) return ask_for_step(h);
-            if (!h->found && told == EVENT) return ask_here(h, t, ASK_SETTLE);
-            if (h->found) {
-                h->t = t;
-                h->acted = 0;
-                memcpy(h->w.located, h->w.fires, (size_t)h->w.m);
-                keep_instant(h);
+            int told = tell_step(h);
+            if (told == EVENT && !h->found) {
+                happened = true;
+                told = settle(h, t, false);
+                if (told < LOST && has_ended(h->o) && !accept(h)) told = LOST;
             }
-            h->looked = t == end && !h->l.plants && is_before(end, h->jump) ? end : NAN;
+            if (told >= LOST) return break_off(h, t, told);
+            h->looked = t == end && !happened && !h->l.plants && is_before(end, h->jump) ? end : NAN;
         }
         h->stepped = 0;
         if (h->found && p->loops) /* as the indicators saw them */
@@ -107,34 +109,32 @@ static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
         if (h->found) {
             const int result = fire(h, t, at);
             *h->l.t = t;
-            if (result == LOST) return ask(h, h->o ? h->acted ? ASK_SETTLE : ASK_FIRE : ASK_BETWEEN);
-            if (result == PILED) return give_up(h, t);
+            if (result >= LOST) return break_off(h, t, result);
             look_for_sliding(&h->w);
         }
         h->t = t;
         if (t == edge && p->delays) note_reached(p->delays, t, !is_before(t, h->jump));
-        if (h->found && h->o && has_news(h->o)) return ask_here(h, t, ASK_SETTLE);
         if (t == edge && edge < end) { /* a discontinuity of a source */
-            keep_instant(h);
             enter(h, g, t);
             if (h->w.m || h->o) {
                 const int result = settle(h, t, false);
-                if (result >= LOST) return result == PILED ? give_up(h, t) : ask(h, h->o ? ASK_SETTLE : ASK_BETWEEN);
+                if (result >= LOST) return break_off(h, t, result);
                 happened |= result == EVENT;
             }
-            if (evaluate(&h->l, h->between) != DONE) return ask(h, ASK_BETWEEN);
+            if (!evaluate_here(h, h->between)) return break_off(h, t, LOST);
         }
-        if (t == edge || h->found) h->begun = 0;
+        if (t == edge || happened) h->begun = 0;
         if (!h->begun && (happened || t < end)) m->has_slope = 0;
         if (g->i < s->count && !s->lands[g->i] && s->times[g->i + 1] == t && t < end) {
             g->out->rows = record(&h->l, t, g->rows, g->out->rows);
             g->i++;
-            if (is_stopped(&h->l)) return h->inside = 0, ENDED;
-        } else if (happened && is_stopped(&h->l)) {
+            if (is_at_end(h)) return h->inside = 0, ENDED;
+        } else if (happened && is_at_end(h)) {
             g->out->rows = record(&h->l, t, g->rows, g->out->rows);
             return h->inside = 0, ENDED;
         }
         if (h->switched) return LOOK;
+        if (h->o && has_other_nominals(h->o)) return SUSPENDED;
     }
     return DONE;
 }
@@ -156,7 +156,7 @@ VISIBLE void loopwright_go(hybrid *h, const span *s, double *rows, outcome *out)
             h->w.sliding = h->w.sliding && h->w.switched; /* events are located again if none has fired at the end */
             h->w.switched = 0;
         }
-        if ((out->reason = go_between(h, &g, &steps)) != DONE) break;
+        if (!h->coupled && (out->reason = go_between(h, &g, &steps)) != DONE) break;
         if (!has_room(h, &g)) {
             out->reason = SUSPENDED;
             break;
@@ -165,3 +165,18 @@ VISIBLE void loopwright_go(hybrid *h, const span *s, double *rows, outcome *out)
     }
     out->ticks = g.i;
 }
+
+/* Go on to an instant before any tick there, within a step of the plants; the span ends there. */
+VISIBLE void loopwright_go_between(hybrid *h, const span *s, double *rows, outcome *out) {
+    progress g = {s, rows, out, 0, 0, -1};
+    int64_t steps = 0;
+    out->ticks = out->rows = 0;
+    if (!h->inside) {
+        h->inside = 1;
+        h->begun = h->stepped = 0;
+    }
+    out->reason = go_between(h, &g, &steps);
+}
+
+/* Note at which trial of a step that has failed a rate is not finite; see `problem`. */
+VISIBLE void loopwright_note_beyond(hybrid *h) { note_beyond(h->methods[h->active]); }

@@ -1,9 +1,8 @@
 /* One instant of a run with continuous states: its values from the right, the events that fire there, the tick. */
 
 /* Reasons, after those of the loop over ticks. */
-enum {
-    SUSPENDED = HALTED + 1, ASK_BETWEEN, ASK_TICK, ENDED, LOOK, ASK_REST, ASK_SETTLE, ASK_FIRE, OUTSIDE_FAILED, PILED_UP
-};
+enum { SUSPENDED = HALTED + 1, ENDED, LOOK, OUTSIDE_FAILED, PILED_UP, BROKEN_OFF };
+enum { STIFF = 1, EASY, STUCK }; /* signs that another method may go on: the last one is that this one can't */
 
 /* Ticks and instants to be recorded. */
 typedef struct {
@@ -15,6 +14,7 @@ typedef struct {
     int64_t edges;
     const double *edge, *late;    /* discontinuities of sources; when they are seen at the time itself */
     int64_t room;                 /* rows that can be written */
+    int64_t stays;                /* whether the first tick is where the run is: no plant steps to it */
 } span;
 
 typedef struct hybrid {
@@ -30,17 +30,18 @@ typedef struct hybrid {
     double counts_as;   /* sample to which the event there belongs, a few ulps before; else infinite */
     int64_t found;
     int64_t hits, misses, easy;
-    double *before;     /* states that can be gone back to */
     int64_t outputs;    /* entries of the log before those of the states */
     const int64_t *taken, *taken_first; /* states that a tick of each kind renews */
     double *taken_states;
-    int64_t switched;   /* 1: stiff, it seems; 2: no longer */
+    double *before;     /* states before FMUs act */
+    int64_t switched;   /* a sign that another method may go on, and has to be looked at */
     double *solved;     /* values of the algebraic loops at an event */
     double looked_at;   /* step in s at which it seemed so */
-    double planned;     /* step in s that the method had in mind before it took the last one */
     outside *o;         /* FMUs in model exchange; NULL without any */
     double jump;        /* first discontinuity of a source, or event of time of an FMU, behind the stretch's begin */
-    int64_t acted;      /* whether one has acted since an event was located */
+    void (*drain)(void); /* Python takes the events that have been logged */
+    int64_t coupled;    /* whether the continuous states go on within the steps of the plants */
+    int64_t lost_at;    /* kind of the tick that can't be evaluated */
     double looked;      /* tick at which they have been looked at, and before which nothing changes any more */
 } hybrid;
 
@@ -86,16 +87,24 @@ static inline void stand_at(hybrid *h, double t, const double *x) {
     if (h->p.delays) put_delayed(h->p.delays, t, h->p.delays->here);
 }
 
+/* Evaluate everything at the present instant; false: the run can't go on. */
+static inline bool evaluate_here(hybrid *h, int64_t kind) {
+    if (evaluate(&h->l, kind) == DONE) return true;
+    h->p.lost = AT_INSTANT;
+    h->lost_at = kind;
+    return false;
+}
+
 /* Evaluate everything at the present instant between ticks; take over what blocks remember, if asked for. */
-static inline int64_t accept(hybrid *h) {
-    if (evaluate(&h->l, h->between) != DONE) return NOT_OK;
+static inline bool accept(hybrid *h) {
+    if (!evaluate_here(h, h->between)) return false;
     memcpy(h->l.x, h->l.x_next, (size_t)h->l.states * sizeof(double));
     memcpy(h->p.x, h->l.x, (size_t)h->l.states * sizeof(double));
-    return DONE;
+    return true;
 }
 
 /* End the events of an instant: what goes into delays may have jumped. */
-static inline int64_t end_events(hybrid *h, double t) {
+static inline bool end_events(hybrid *h, double t) {
     if (h->p.delays) note_edge(h->p.delays, t, 0.0);
     return accept(h);
 }
@@ -117,7 +126,7 @@ static void look_for_stiffness(hybrid *h, const method *m) {
             norm = fmax(norm, sum / (m->atol[i] + m->rtol * fabs(m->x[i])));
         }
         h->easy = width * norm < 1.0 ? h->easy + 1 : 0;
-        if (h->easy >= 20) h->easy = 0, h->switched = 2, h->looked_at = width;
+        if (h->easy >= 20) h->easy = 0, h->switched = EASY, h->looked_at = width;
         return;
     }
     if (!h->hits && m->steps % 10) return;
@@ -139,7 +148,7 @@ static void look_for_stiffness(hybrid *h, const method *m) {
     h->misses = 0;
     if (++h->hits < 15) return;
     h->hits = 0;
-    h->switched = 1;
+    h->switched = STIFF;
     h->looked_at = width;
 }
 
@@ -267,101 +276,111 @@ static void reset_domains(const hybrid *h, watch *w, int64_t i) {
     for (int64_t j = w->inside_first[i]; j < w->inside_first[i + 1]; j++) w->domain[w->inside[j]] = w->start[w->inside[j]];
 }
 
-static inline void keep_instant(hybrid *h);
-
-/* Let FMUs see an instant that is reached; the states after it are taken over, those of events of their own. */
-static bool see(hybrid *h, int64_t look) {
+/* Note events of FMUs' own that have acted at t: all of them but those of inputs that have changed no state. */
+static void log_outside(hybrid *h, double t, const double *before) {
     outside *o = h->o;
+    const int64_t width = h->l.states;
+    for (int64_t j = 0; j < o->count; j++) {
+        const exchanged *e = o->each + j;
+        const bool same = !memcmp(before + e->first, h->l.x + e->first, (size_t)e->states * sizeof(double));
+        if (!e->acted || e->event == FIRED || (e->event == INPUT && same)) continue;
+        if (o->logged == o->capacity) h->drain();
+        double *row = o->log + o->logged++ * (2 + 2 * width);
+        row[0] = t;
+        row[1] = (double)(j + o->count * e->event);
+        memcpy(row + 2, before, (size_t)width * sizeof(double));
+        memcpy(row + 2 + width, h->l.x, (size_t)width * sizeof(double));
+    }
+}
+
+/* Let FMUs see an instant that is reached, at which events in w->fired fire; the states after it are taken over. */
+static bool see(hybrid *h, double t, int64_t look, bool *acted) {
+    outside *o = h->o;
+    const size_t size = (size_t)h->l.states * sizeof(double);
+    h->p.lost = AT_INSTANT;
+    h->lost_at = h->between;
     o->look = look;
-    for (int64_t i = 0; i < h->w.m; i++) h->w.fired[i] = 0.0;
-    if (o->lost || o->failed) return false;
-    if (h->p.loops && !solve_loops(h->l.loops + h->between, h->l.x)) return false; /* states may have jumped */
+    *acted = false;
+    for (int64_t j = 0; j < o->count; j++) o->each[j].acted = 0;
+    if (o->failed || (h->p.loops && !solve_loops(h->l.loops + h->between, h->l.x))) return false; /* states may have jumped */
+    memcpy(h->before, h->l.x, size);
     if (call(&o->jump)) return false;
-    memcpy(h->l.x, h->l.x_next, (size_t)h->l.states * sizeof(double));
-    memcpy(h->p.x, h->l.x, (size_t)h->l.states * sizeof(double));
+    memcpy(h->l.x, h->l.x_next, size);
+    memcpy(h->p.x, h->l.x, size);
+    for (int64_t j = 0; j < o->count; j++) *acted |= o->each[j].acted;
+    if (*acted) log_outside(h, t, h->before);
     return true;
 }
 
-/* Let FMUs act whose inputs have jumped, until none has. LOST: Python has to, from the last instant that was kept. */
+static void fire_none(hybrid *h) {
+    for (int64_t i = 0; i < h->w.m; i++) h->w.fired[i] = 0.0;
+}
+
+/* Let events of FMUs' own act, until there are none. */
 static int look_outside(hybrid *h, double t) {
-    outside *o = h->o;
-    const size_t size = (size_t)h->l.states * sizeof(double);
-    if (is_due(o, t)) return LOST;
+    fire_none(h);
     for (int round = 0; round < ROUNDS; round++) {
-        bool acted = false;
-        if (o->logged + o->count > o->capacity) return LOST;
-        for (int64_t j = 0; j < o->count; j++) o->each[j].acted = 0;
-        double *row = o->log + o->logged * (2 + 2 * h->l.states);
-        memcpy(row + 2, h->l.x, size);
-        if (!see(h, TO_EVENTS)) return LOST;
-        for (int64_t j = 0; j < o->count; j++) {
-            const exchanged *e = o->each + j;
-            if (!e->acted) continue;
-            acted = true;
-            double *next = o->log + o->logged * (2 + 2 * h->l.states);
-            if (!memcmp(row + 2 + e->first, h->l.x + e->first, (size_t)e->states * sizeof(double))) continue;
-            if (next != row) memcpy(next + 2, row + 2, size);
-            next[0] = t;
-            next[1] = (double)j;
-            memcpy(next + 2 + h->l.states, h->l.x, size);
-            o->logged++;
-        }
+        bool acted;
+        if (!see(h, t, TO_EVENTS, &acted)) return LOST;
         if (!acted) return round ? EVENT : QUIET;
-        keep_instant(h); /* Python goes on from behind what has acted */
-        h->acted = 1;
-        if (is_due(o, t)) return LOST;
     }
-    return LOST;
+    for (int64_t j = 0; j < h->o->count; j++)
+        if (h->o->each[j].acted) return pile_up(&h->w, ENDLESS_OUTSIDE, j, ROUNDS);
+    return LOST; /* not reached */
+}
+
+/* Note the events that fire at t, with the states before them. */
+static void log_before(hybrid *h, double t) {
+    watch *w = &h->w;
+    const int64_t width = h->l.states, row = 2 + 2 * width;
+    int64_t count = 0;
+    for (int64_t i = 0; i < w->m; i++) count += w->fires[i];
+    if (w->logged + count > w->capacity) h->drain();
+    double *log = w->log + w->logged * row;
+    for (int64_t i = 0; i < w->m; i++) {
+        if (!w->fires[i]) continue;
+        log[0] = t;
+        log[1] = (double)i;
+        memcpy(log + 2, h->l.x, (size_t)width * sizeof(double));
+        log += row;
+    }
+}
+
+/* Let the jumps of the events in w->fired act. */
+static bool jump(hybrid *h, double at) {
+    problem *p = &h->p;
+    bool acted;
+    if (h->o) return see(h, at, TO_EVENTS, &acted);
+    p->lost = AT_INSTANT;
+    h->lost_at = h->between;
+    if ((p->loops && !solve_loops(h->l.loops + h->between, h->l.x)) || call(&h->w.jump)) return false;
+    memcpy(h->l.x, h->l.x_next, (size_t)h->l.states * sizeof(double));
+    memcpy(p->x, h->l.x, (size_t)h->l.states * sizeof(double));
+    return true;
 }
 
 /* Let the events in w->fires fire at t, and those that they make fire; jumps are evaluated at `at`, a few ulps later
-   perhaps. LOST: Python has to; nothing that has happened here counts then. PILED: the run can't go on. */
+   perhaps. LOST or PILED: the run can't go on. */
 static int fire(hybrid *h, double t, double at) {
     watch *w = &h->w;
     problem *p = &h->p;
     const int64_t width = h->l.states, row = 2 + 2 * width;
     for (int round = 0; round < ROUNDS; round++) {
-        bool moves = false, acts = false;
-        int64_t count = 0;
+        bool moves = false;
         for (int64_t i = 0; i < w->m; i++) {
             w->fired[i] = w->fires[i];
-            if (!w->fires[i]) continue;
-            acts |= w->asks[i] == BY_FMU;
-            moves |= w->own_first[i] < w->own_first[i + 1];
-            count++;
+            moves |= w->fires[i] && w->own_first[i] < w->own_first[i + 1];
         }
-        if (w->logged + count > w->capacity) return LOST;
         memcpy(w->following, w->fires, (size_t)w->m);
         here_states(h, w->x_before);
         if (moves && !move_on(h, at, w->motion)) return LOST;
-        double *log = w->log + w->logged * row;
-        for (int64_t i = 0; i < w->m; i++) {
-            if (!w->fires[i]) continue;
-            log[0] = t;
-            log[1] = (double)i;
-            memcpy(log + 2, h->l.x, (size_t)width * sizeof(double));
-            log += row;
-        }
-        if (p->loops && !solve_loops(h->l.loops + h->between, h->l.x)) return LOST;
-        if (h->o) {
-            h->o->look = TO_OTHERS;
-            if (call(&h->o->jump)) return LOST;
-            h->o->look = TO_ACT; /* an FMU that has acted can't go back */
-            if (acts && call(&h->o->jump)) return LOST;
-        } else {
-            call(&w->jump);
-        }
-        memcpy(h->l.x, h->l.x_next, (size_t)width * sizeof(double));
-        memcpy(p->x, h->l.x, (size_t)width * sizeof(double));
+        log_before(h, t);
+        if (!jump(h, at)) return LOST;
         *w->fresh = 1.0;
         for (int64_t i = 0; i < w->m; i++) {
             if (!w->fires[i]) continue;
             memcpy(w->log + w->logged++ * row + 2 + width, h->l.x, (size_t)width * sizeof(double));
             reset_domains(h, w, i);
-        }
-        if (acts) {
-            h->acted = 1;
-            keep_instant(h); /* Python goes on from behind what has acted */
         }
         for (int64_t i = 0; i < w->m; i++)
             if (w->fires[i] && count_event(w, i, t) == PILED) return PILED;
@@ -377,14 +396,14 @@ static int fire(hybrid *h, double t, double at) {
         take_fired(w);
         if (!again && h->o) {
             const int outside = look_outside(h, at);
-            if (outside == LOST) return LOST;
+            if (outside >= LOST) return outside;
             if (outside == EVENT) {
                 if (!indicate(w, p, at, here_states(h, w->x))) return LOST;
                 again = take_domains(w, w->domain, w->now, w->fires);
                 take_fired(w);
             }
         }
-        if (!again) return end_events(h, t) == DONE ? EVENT : LOST;
+        if (!again) return end_events(h, t) ? EVENT : LOST;
     }
     for (int64_t i = 0; i < w->m; i++)
         if (w->fires[i]) return pile_up(w, ENDLESS, i, ROUNDS);
@@ -443,62 +462,33 @@ static int settle(hybrid *h, double t, bool ahead) {
                 memcpy(w->later, w->z, (size_t)w->m * sizeof(double));
             }
         }
-        if (round) return end_events(h, t) == DONE ? EVENT : LOST;
+        if (round) return end_events(h, t) ? EVENT : LOST;
         const int later = w->m && ahead ? fire_ahead(h, t) : QUIET;
         if (later >= LOST) return later;
         if (later == EVENT) result = EVENT;
         if (!h->o || (known && result == QUIET)) return result;
         const int outside = look_outside(h, t);
-        if (outside != EVENT) return outside == LOST ? LOST : result;
+        if (outside != EVENT) return outside >= LOST ? outside : result;
     }
     return LOST; /* not reached */
 }
 
 /* --- a tick -------------------------------------------------------------------------------------------------------- */
 
-static inline void keep_instant(hybrid *h) {
-    memcpy(h->before, h->l.x, (size_t)h->l.states * sizeof(double));
-    if (h->w.m) keep(&h->w);
-    if (h->p.delays) keep_delays(h->p.delays);
-}
-
-/* Go back to the last instant that was kept, from which Python goes on. */
-static int64_t ask(hybrid *h, int64_t reason) {
-    memcpy(h->l.x, h->before, (size_t)h->l.states * sizeof(double));
-    *h->l.t = h->t;
-    if (h->w.m) go_back(&h->w);
-    if (h->p.delays) restore_delays(h->p.delays);
-    h->inside = 0;
-    if (h->o) h->methods[h->active]->has_slope = 0;
-    return h->o && h->o->failed ? OUTSIDE_FAILED : reason;
-}
-
-/* Let Python go on at t, which the states have reached. */
-static int64_t ask_here(hybrid *h, double t, int64_t reason) {
+/* The run can't go on from the present instant: Python says why. */
+static int64_t break_off(hybrid *h, double t, int result) {
     h->t = t;
-    h->inside = 0;
-    h->methods[h->active]->has_slope = 0;
-    return reason;
+    return result == PILED ? PILED_UP : h->o && h->o->failed ? OUTSIDE_FAILED : BROKEN_OFF;
 }
 
-/* The run can't go on, as events pile up at t. */
-static int64_t give_up(hybrid *h, double t) {
-    h->t = t;
-    return PILED_UP;
-}
-
-/* Tell FMUs that a step is complete. */
+/* Tell FMUs that a step is complete; EVENT: one wants an event there, or the end of the run. */
 static int tell_step(hybrid *h) {
-    if (!see(h, TO_STEP)) return LOST;
+    bool acted;
+    fire_none(h);
+    if (!see(h, *h->l.t, TO_STEP, &acted)) return LOST;
     for (int64_t j = 0; j < h->o->count; j++)
         if (h->o->each[j].asks || h->o->each[j].ended) return EVENT;
     return QUIET;
-}
-
-/* Go back to before the last step, which Python takes again as it was taken. */
-static int64_t ask_for_step(hybrid *h) {
-    h->methods[h->active]->planned = h->planned;
-    return ask(h, ASK_BETWEEN);
 }
 
 /* Go through a tick that the continuous states have reached: FMUs, events before and after it, a sample. */
@@ -507,24 +497,24 @@ static inline int64_t land(hybrid *h, progress *g) {
     loop *l = &h->l;
     const int64_t i = g->i, kind = s->kinds[i];
     const double t = s->times[i + 1];
-    const int64_t reason = step_plants(l, i, s->times[i], s->widths[i], g->out);
-    if (reason != DONE) return h->inside = 0, reason;
-    keep_instant(h);
+    if (!s->stays || i) {
+        const int64_t reason = step_plants(l, i, s->times[i], s->widths[i], g->out);
+        if (reason != DONE) return h->inside = 0, reason;
+    }
     enter(h, g, t);
     if (h->w.m || (h->o && kind != h->between)) {
         const int result = settle(h, t, true);
-        if (result >= LOST) return result == LOST ? ask(h, ASK_TICK) : give_up(h, t);
+        if (result >= LOST) return break_off(h, t, result);
     }
-    if (evaluate(l, kind) != DONE) return ask(h, ASK_TICK);
+    if (!evaluate_here(h, kind)) return break_off(h, t, LOST);
     memcpy(l->x, l->x_next, (size_t)l->states * sizeof(double));
     if (h->p.delays && (kind != h->between || l->plants)) note_edge(h->p.delays, t, 0.0); /* held signals have jumped */
     if (h->w.m || h->o) {
         enter(h, g, t);
         double *states = (double *)l->log + h->outputs;
         memcpy(h->taken_states, states, (size_t)l->states * sizeof(double));
-        if (h->o) keep_instant(h);
         const int result = settle(h, t, false);
-        if (result >= LOST) return result == PILED ? give_up(h, t) : ask(h, h->o ? ASK_REST : ASK_TICK);
+        if (result >= LOST) return break_off(h, t, result);
         if (result == EVENT)
             for (int64_t j = h->taken_first[kind]; j < h->taken_first[kind + 1]; j++)
                 states[h->taken[j]] = h->taken_states[h->taken[j]];
@@ -533,5 +523,5 @@ static inline int64_t land(hybrid *h, progress *g) {
     hold_inputs(l, i);
     g->out->rows = record(l, t, g->rows, g->out->rows);
     g->i++;
-    return is_stopped(l) || (h->o && has_news(h->o)) ? STOPPED : DONE;
+    return is_stopped(l) || (h->o && (has_ended(h->o) || has_other_nominals(h->o))) ? STOPPED : DONE;
 }

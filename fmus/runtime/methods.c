@@ -19,13 +19,13 @@ static inline bool look(problem *p, double t, const double *x) {
 static inline void rate(problem *p, double t, const double *x, double *f) {
     if (!p->n) return;
     p->rates++;
-    if (!look(p, t < p->stop ? t : p->stop, x)) { /* a step that is shorter may have a solution */
-        for (int64_t i = 0; i < p->n; i++) f[i] = NAN;
-        return;
-    }
     p->flow.results[0] = f;
-    if (call(&p->flow))
+    if (!look(p, t < p->stop ? t : p->stop, x) || call(&p->flow)) /* a step that is shorter may have a solution */
         for (int64_t i = 0; i < p->n; i++) f[i] = NAN;
+    if (p->noting && !lw_are_finite(f, p->n)) {
+        p->beyond_t = t;
+        memcpy(p->beyond, x, (size_t)p->n * sizeof(double));
+    }
 }
 
 #define LW_EQUATION problem
@@ -134,14 +134,37 @@ static inline int take_step(method *m) {
         result = step_of_library(m);
     else
         result = m->kind == RADAU ? step_radau(m) : step_explicit(m);
-    if (result != PASSED) return result;
+    if (result != PASSED) {
+        if (m->of->lost != IN_SLOPE) m->of->lost = IN_STEP;
+        return result;
+    }
     m->steps++;
     if (m->kind > RK4 && ++m->segment % 2000 == 0) { /* so small steps that the run would never end */
         const double h = (m->t - m->mark) / 2000.0;
         m->mark = m->t;
-        if (m->of->stop - m->t > 1e7 * h) return FAILED;
+        if (m->of->stop - m->t > 1e7 * h) return m->of->lost = IN_PROGRESS, m->of->beyond_t = h, FAILED;
     }
     return PASSED;
+}
+
+/* Take a step that has failed once more, as short as can be, and note the last trial at which a rate is not finite. */
+static void note_beyond(method *m) {
+    problem *p = m->of;
+    int (*own)(struct method *) = m->step;
+    p->beyond_t = NAN;
+    if (m->kind == LIBRARY) return;
+    if (m->kind <= RK4 || m->sliver) { /* the step has been taken, to states that are not finite */
+        memcpy(m->x, m->x_old, (size_t)m->n * sizeof(double));
+        m->t = m->t_old;
+        m->done--;
+    } else {
+        m->h = 10.0 * ulp(m->t);
+    }
+    m->step = NULL;
+    p->noting = 1;
+    take_step(m);
+    p->noting = 0;
+    m->step = own;
 }
 
 /* Make the dense output of the last step. */

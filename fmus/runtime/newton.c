@@ -1,6 +1,6 @@
 /* Compiled functions with their vectors, and algebraic loops by Newton's method, as an interpreted run solves them.
 
-   A loop that is not solved, is not determined, or meets a value that is not finite is left to Python. */
+   Python helps with a loop that is not solved, is not surely determined, or meets a value that is not finite. */
 
 #ifndef _POSIX_C_SOURCE
 #define _POSIX_C_SOURCE 200809L /* of the system: clock_gettime and poll */
@@ -43,6 +43,7 @@ typedef struct {
     int64_t *rows;
     double tolerance, rounding, singular;
     int64_t iterations, halvings;
+    int (*help)(void); /* Python solves the loops, from the values before; 0: it can't. NULL: there is no help */
 } newton;
 
 static double largest(const double *values, int64_t n) {
@@ -91,8 +92,8 @@ static bool evaluate_loops(const newton *s) {
     return !call(&s->equations) && lw_are_finite(s->r, s->n) && lw_are_finite(s->J, s->n * s->n);
 }
 
-/* Solve the loops from the values in x on, as `LoopSolver` does; false: Python is to do it. */
-static bool solve_loops(newton *s, double *x) {
+/* Solve the loops from the values in x on, as `LoopSolver` does; false where that fails. */
+static bool seek_loops(newton *s, double *x) {
     int64_t n = s->n;
     for (int64_t i = 0; i < n; i++) s->before[i] = s->v[i] = x[s->where[i]];
     if (!evaluate_loops(s)) return false;
@@ -126,6 +127,11 @@ static bool solve_loops(newton *s, double *x) {
     for (int64_t i = 0; i < n; i++) s->v[i] = x[s->where[i]];
     return largest(s->r, n) / (1 + largest(s->v, n)) <= s->tolerance && is_determined(s);
 }
+
+static bool solve_loops(newton *s, double *x) { return seek_loops(s, x) || (s->help && s->help()); }
+
+/* For Python, which helps. */
+VISIBLE void loopwright_evaluate_loops(newton *s) { call(&s->equations); }
 
 static void undo_loops(const newton *s, double *x) {
     for (int64_t i = 0; i < s->n; i++) x[s->where[i]] = s->before[i];

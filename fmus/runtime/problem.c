@@ -16,7 +16,14 @@ typedef struct {
     double *by_loops;        /* of the slope: ∂f/∂v, then ∂r/∂x, for loops with the values v and r(x, v) = 0 */
     struct delays *delays;   /* transport delays; NULL: none */
     int64_t rates, jacobians;
+    int64_t lost;            /* where a run can't go on */
+    int64_t noting;          /* whether a trial is noted at which a rate is not finite */
+    double beyond_t, *beyond; /* the last such trial: its time, NaN without one, and its states; IN_PROGRESS: mean step, s */
 } problem;
+
+/* What can't be done: a step of the method; steps that lead on; the derivative of the rates at a step's begin; a value at
+   the trial; everything at the instant that is reached. */
+enum { NOWHERE, IN_STEP, IN_PROGRESS, IN_SLOPE, AT_TRIAL, AT_INSTANT };
 
 enum { EULER, HEUN, RK4, EXPLICIT, EIGHT, RADAU, LIBRARY }; /* LIBRARY: one of another library's, by a callback */
 enum { PASSED, FAILED };

@@ -172,7 +172,7 @@ static int step_radau(method *m) {
         h = h > m->longest ? m->longest : least;
         h_before = error_before = NAN;
     }
-    if (!m->has_slope && !differentiate(m, m->t, m->x)) return FAILED;
+    if (!m->has_slope && !differentiate(m, m->t, m->x)) return p->lost = IN_SLOPE, FAILED;
     for (;;) {
         if (!(h >= least)) return FAILED;
         to = m->t + h;

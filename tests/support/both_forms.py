@@ -1,9 +1,7 @@
 """Runs in both forms, interpreted and compiled."""
 
-from contextlib import contextmanager
 from unittest import mock
 
-from loopwright.diagrams.simulation import engine
 from loopwright.diagrams.simulation.compiled_ticks import CompiledTicks
 
 
@@ -20,14 +18,3 @@ def assert_same_bits(first, second):
     assert first.t.tobytes() == second.t.tobytes()
     assert first.data.tobytes() == second.data.tobytes()
     assert first.stopped == second.stopped
-
-
-@contextmanager
-def only_c(form="auto"):
-    """Runs go in C from tick to tick, but with ``compile=False``, which is Python's own loop in tests."""
-    error = None if form is False else AssertionError("Python's own loop goes on")
-    with (
-        mock.patch.object(engine, "run_ticks", wraps=engine.run_ticks, side_effect=error),
-        mock.patch.object(engine, "run_hybrid", wraps=engine.run_hybrid, side_effect=error),
-    ):
-        yield

@@ -307,5 +307,5 @@ def emulate(patch, platform, folder):
     _replace(patch, runtime.load_runtime, lru_cache(runtime.load_runtime.__wrapped__))
     _replace(patch, libraries.load_compiled, load)
     patch.setattr(remote, "load_runtime", native_runtime)  # code of other processes
-    patch.setattr(native_tick, "_Tick", function)
+    patch.setattr(native_tick, "TICK", function)
     return processor

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from loopwright.diagrams import Diagram
-from loopwright.diagrams.simulation.compiled_hybrid import HybridTicks
+from loopwright.diagrams.compiled.handed_over import HandedOver
 from loopwright.fmus import Fmu, bouncing_ball
 
 TIGHT = {"rtol": 1e-8, "atol": 1e-10, "progress": False}
@@ -12,16 +12,14 @@ TIGHT = {"rtol": 1e-8, "atol": 1e-10, "progress": False}
 
 @pytest.fixture
 def returns(monkeypatch):
-    """Times in s at which C has left events to Python."""
-    found = []
-    for name in ("_let_act", "_take_interval"):
-        method = getattr(HybridTicks, name)
+    """Times in s at which Python has looked at an FMU for C."""
+    found, look = [], HandedOver._look
 
-        def noted(self, *arguments, method=method):
-            found.append(next(a.t for a in arguments if hasattr(a, "reason")))
-            return method(self, *arguments)
+    def noted(self, path, t, call):
+        found.append(t)
+        look(self, path, t, call)
 
-        monkeypatch.setattr(HybridTicks, name, noted)
+    monkeypatch.setattr(HandedOver, "_look", noted)
     return found
 
 

@@ -5,18 +5,8 @@ import pytest
 
 from loopwright.blocks import Clock, Function, Gain, Integrator, Relay, Sum
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.simulation.compiled_hybrid import HybridTicks
 
 QUIET = {"progress": False}
-
-
-@pytest.fixture(autouse=True)
-def asked(monkeypatch):
-    """Intervals that C has left to Python: none, in these runs."""
-    seen = []
-    monkeypatch.setattr(HybridTicks, "_take_interval", lambda *arguments: seen.append(arguments))
-    yield
-    assert not seen
 
 
 def cubic():

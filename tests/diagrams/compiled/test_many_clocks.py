@@ -35,7 +35,6 @@ def all_in_c(monkeypatch):
         raise AssertionError("Python had to look at a tick")
 
     monkeypatch.setattr(CompiledTicks, "_take_tick", refused)
-    monkeypatch.setattr(HybridTicks, "_take_interval", refused)
     for kind in (CompiledTicks, HybridTicks):
         run = kind.run
         monkeypatch.setattr(kind, "run", lambda *a, of=run, **more: (calls.append(1), of(*a, **more))[1])

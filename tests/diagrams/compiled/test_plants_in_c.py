@@ -31,7 +31,7 @@ from loopwright.diagrams.flat import kinds_of
 from loopwright.diagrams.simulation import compiled_hand_over, compiled_hybrid, compiled_ticks
 from loopwright.diagrams.simulation.algebraic_loops import newton_options
 from loopwright.fmus import Fmu, StepOptions, build_fmu
-from support.both_forms import assert_same_bits, both, only_c
+from support.both_forms import assert_same_bits, both
 from support.careful_fmus import EVENTS, MODEL, OUTPUTS
 from support.exported import mass_spring_damper
 from support.small_fmus import small_fmu
@@ -51,8 +51,7 @@ def folder(cache, tmp_path_factory):
 
 
 def simulate(made, duration, form, **options):
-    with only_c(form):
-        return made.simulate(float(duration), compile=form, progress=False, **options)
+    return made.simulate(float(duration), compile=form, progress=False, **options)
 
 
 def in_all_forms(made, duration, *, solved=False, **options):
@@ -81,7 +80,7 @@ def failures(made, duration, kind, *, solved=False, **options):
     """Return the error of each form; its text, block, time, and samples are the same."""
     found = []
     for form in FORMS:
-        with only_c(form), pytest.raises(kind) as caught:
+        with pytest.raises(kind) as caught:
             made.simulate(float(duration), compile=form, progress=False, **options)
         found.append(caught.value)
     for error in found[1:]:
@@ -181,7 +180,7 @@ def test_saved_between_two_steps_of_a_plant_it_goes_on_in_every_form(folder, sol
     made = Diagram("d", slow(force=t), sampled(MS, "box")(t), *aside)
     whole = simulate(made, 0.03, False)
     for first in FORMS:
-        with only_c(first), made.simulation(compile=first) as simulation:
+        with made.simulation(compile=first) as simulation:
             simulation.advance(0.011)
             assert dict(simulation.reached) == {"slow": 11}  # pieces of a run end its steps
             simulation.advance(0.003)
@@ -189,8 +188,7 @@ def test_saved_between_two_steps_of_a_plant_it_goes_on_in_every_form(folder, sol
             simulation.advance(0.016)
             rest = simulation.run()
         for second in FORMS:
-            with only_c(second):
-                again = made.simulate(0.016, start=half, compile=second, progress=False)
+            again = made.simulate(0.016, start=half, compile=second, progress=False)
             if solved:
                 np.testing.assert_allclose(again.data, rest.data[-len(again.t) :], rtol=1e-6, atol=1e-9)
             else:
@@ -207,12 +205,11 @@ def test_a_plant_that_takes_whole_steps_is_saved_on_its_way(folder, monkeypatch,
     slow = Fmu(mass, name="slow", stepping=StepOptions(communication_step=4 * MS))
     made = Diagram("d", slow(force=t), sampled(MS, "box")(t))
     whole = simulate(made, 0.03, False)
-    with only_c(form):
-        with made.simulation(compile=form) as simulation:
-            simulation.advance(0.007)
-            assert dict(simulation.reached) == {"slow": 4}
-            half = simulation.save()
-        again = made.simulate(0.023, start=half, compile=form, progress=False)
+    with made.simulation(compile=form) as simulation:
+        simulation.advance(0.007)
+        assert dict(simulation.reached) == {"slow": 4}
+        half = simulation.save()
+    again = made.simulate(0.023, start=half, compile=form, progress=False)
     assert again.data.tobytes() == whole.data[-len(again.t) :].tobytes()
 
 
@@ -436,7 +433,7 @@ def test_what_a_plant_of_python_raises_ends_the_run(folder, solved, error):
     fast = zoo(zoo_fmu(folder, 3), "fast", isolate=True)
     made = Diagram("d", FaultyTank(area=1.0, error=error, name="tank")(u=t), fast(u=sampled(MS, "box")(t)), *aside)
     for form in FORMS:
-        with only_c(form), made.simulation(compile=form) as simulation:
+        with made.simulation(compile=form) as simulation:
             with pytest.raises(type(error), match=r"it leaks|no number") as caught:
                 simulation.advance(0.02)
             assert simulation.t == pytest.approx(0.007, abs=1e-12)
@@ -452,7 +449,7 @@ def test_ctrl_c_within_a_step_of_python_keeps_what_was_recorded():
     tank = FaultyTank(area=1.0, error=KeyboardInterrupt(), name="tank")
     made = Diagram("d", tank(u=Ramp(slope=1.0, name="ramp")), sampled(MS, "box")(Clock(name="clock")))
     for form in FORMS:
-        with only_c(form), pytest.raises(Interrupted) as caught:
+        with pytest.raises(Interrupted) as caught:
             made.simulate(0.02, compile=form, progress=False)
         assert caught.value.run.t == pytest.approx(np.arange(8) * 1e-3, abs=1e-12)
 
@@ -462,13 +459,12 @@ def test_a_plant_of_python_is_saved_and_goes_on_in_every_form():
     made = Diagram("d", tank(u=t), sampled(MS, "box")(t))
     whole = simulate(made, 0.03, False)
     for first in FORMS:
-        with only_c(first), made.simulation(compile=first) as simulation:
+        with made.simulation(compile=first) as simulation:
             simulation.advance(0.007)
             assert dict(simulation.reached) == {"slow": 4}
             half = simulation.save()
         for second in FORMS:
-            with only_c(second):
-                again = made.simulate(0.023, start=half, compile=second, progress=False)
+            again = made.simulate(0.023, start=half, compile=second, progress=False)
             assert again.data.tobytes() == whole.data[-len(again.t) :].tobytes()
 
 
@@ -536,19 +532,26 @@ def test_coupled_plants_are_saved_and_go_on_in_every_form(cache, coupling):
     made = Diagram("d", right(force=pull), left(force=sampled(10 * MS, "box")(right.position)))
     whole = simulate(made, 0.2, False, coupling=coupling)
     for first in FORMS:
-        with only_c(first), made.simulation(compile=first, coupling=coupling) as simulation:
+        with made.simulation(compile=first, coupling=coupling) as simulation:
             simulation.advance(0.1)
             half = simulation.save()
             simulation.advance(0.1)
             assert simulation.run().data.tobytes() == whole.data.tobytes()
         for second in FORMS:
-            with only_c(second):
-                again = made.simulate(0.1, start=half, compile=second, coupling=coupling, progress=False)
+            again = made.simulate(0.1, start=half, compile=second, coupling=coupling, progress=False)
             assert again.data.tobytes() == whole.data[-len(again.t) :].tobytes()
 
 
-def test_beside_continuous_states_python_takes_the_steps_of_another_coupling(folder):
-    made = chain(zoo_fmu(folder, 3), Integrator(name="aside")(Clock(name="other")))
-    run = made.simulate(0.1, coupling="gauss_seidel", compile=True, progress=False)
-    assert run.tier == "interpreted"
-    assert [m for m in run.messages if "coupling= asks for another one than 'jacobi'" in m and "continuous states" in m]
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("coupling", SCHEMES, ids=NAMES)
+def test_coupled_plants_step_beside_continuous_states(folder, coupling, compiled):
+    """The continuous states go on within the steps, as the scheme asks for; they have no wire to the plants."""
+    ramp = Integrator(name="aside")(Clock(name="other"))
+    made, alone, end = chain(zoo_fmu(folder, 3), ramp), chain(zoo_fmu(folder, 3)), 100 * MS
+    run = made.simulate(end, coupling=coupling, compile=compiled, rtol=1e-9, atol=1e-12, progress=False)
+    assert run.tier == ("compiled" if compiled else "interpreted")
+    np.testing.assert_allclose(run["aside.y"], run.t**2 / 2, rtol=0.0, atol=1e-12)
+    reference = alone.simulate(end, coupling=coupling, progress=False)
+    where = np.searchsorted(run.t, reference.t - 1e-12)
+    for name in ("a.y", "b.y"):
+        np.testing.assert_allclose(run[name][where], reference[name], rtol=0.0, atol=1e-13)

@@ -8,19 +8,9 @@ from scipy.linalg import block_diag, expm
 from loopwright.blocks import Block, Event, State, TransferFunction, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.compiled.radau import radau_numbers
-from loopwright.diagrams.simulation.compiled_hybrid import HybridTicks
 
 QUIET = {"progress": False}
 T = 1e-3
-
-
-@pytest.fixture(autouse=True)
-def asked(monkeypatch):
-    """Intervals that C has left to Python: none, in these runs."""
-    seen = []
-    monkeypatch.setattr(HybridTicks, "_take_interval", lambda *arguments: seen.append(arguments))
-    yield
-    assert not seen
 
 
 class Hires(Block):

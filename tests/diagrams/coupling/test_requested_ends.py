@@ -9,7 +9,6 @@ import pytest
 from loopwright.blocks import Constant, FmuError, FmuRuntimeError, Gain, Integrator
 from loopwright.diagrams import Coupling, Diagram, subsystem
 from loopwright.fmus import Fmu, StepOptions
-from support.both_forms import only_c
 from support.eventful import eventful_fmu
 from support.small_fmus import small_fmu, values
 
@@ -166,12 +165,10 @@ def test_coupled_fmus_end_the_run_together(files, coupling, ends, compiled):
         return Diagram("d", follower(u=plant(u=Constant(value=1.0)).y))
 
     options = {"step": 0.1, "coupling": coupling, "compile": compiled, "progress": False}
-    with only_c(compiled):
-        run = other(0.5).simulate(1.0, **options)
+    run = other(0.5).simulate(1.0, **options)
     check_end(run, ends)
     assert len(run["follower.y"]) == 6
-    with only_c(compiled):
-        within = other(0.53).simulate(1.0, **options)
+    within = other(0.53).simulate(1.0, **options)
     assert within.stopped.block == "plant"
     assert within.stopped.t == within.t[-1] == pytest.approx(0.53 if coupling == "jacobi" else 0.5, abs=1e-14)
     np.testing.assert_allclose(within["plant.y"], within.t, rtol=0, atol=1e-13)

@@ -103,7 +103,7 @@ def test_a_step_event_sets_states_and_nominal_values_anew(file):
     np.testing.assert_allclose(run["plant.x"], [0.0, 0.4, 0.8, 0.0, 0.4], atol=1e-12)
     with diagram.simulation(step=0.05, solver="RK45", atol=1e-7) as simulation:
         simulation.advance(0.05)
-        solver = simulation._engine.continuous.solver
+        solver = simulation._engine.continuous.method
         assert np.ravel(solver.atol) == [1e-7]
         simulation.advance(0.5)
         assert np.ravel(solver.atol) == [5e-7]  # the nominal value is 5 after the event

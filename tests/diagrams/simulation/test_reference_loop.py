@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from support.both_forms import only_c
 from support.random_hybrid import FAMILIES, differences, make_if_possible, reference, run
 from support.reference_loop import DelicateError, Part, ReferenceLoop
 
@@ -135,8 +134,7 @@ def check(family, seeds, compiled):
         expected = None if case is None else reference(case)
         if expected is not None:
             compared += 1
-            with only_c():
-                found = run(case, compiled=compiled)
+            found = run(case, compiled=compiled)
             told += [f"{case.diagram.name}: {text}" for text in differences(case, expected, found)]
     assert not told, "\n".join(told)
     assert compared > 0.7 * len(seeds), f"only {compared} of {len(seeds)} diagrams are well conditioned"
