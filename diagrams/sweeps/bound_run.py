@@ -151,7 +151,7 @@ class BoundRun:
                 if self.count:
                     engine.go(self.count, recorder, progress)
                 if self._end is not None and engine.position.stopped is None:
-                    engine.end_between_ticks(self._end, recorder.row, progress)
+                    engine.end_between_ticks(self._end, recorder, progress)
         except SimulationError as error:
             culprit = engine.blame(error).at(t=engine.position.t)
             raise culprit.keep(self._take_record(started)) from culprit.__cause__

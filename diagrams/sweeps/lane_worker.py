@@ -199,10 +199,12 @@ class _Lanes:
         NoLanesError
             If this run can't go with others.
         """
-        bound, rows = self.bound, list[np.ndarray]()
+        bound = self.bound
         engine, workspace = bound.engine, bound.engine.workspace
+        bound.recorder.begin_anew()
         bound.begin(numbers)
-        engine.take_first_tick(None, lambda t, log: rows.append(log[self._columns]))
+        engine.take_first_tick(None, bound.recorder)
+        row = workspace.log[self._columns]
         if engine.position.stopped is not None or not len(self._ticks):
             return None
         if engine.continuous is not None:
@@ -216,7 +218,7 @@ class _Lanes:
             steps.append(step)
         here = workspace.here
         vectors = here.x.copy(), here.w.copy(), workspace.z.copy(), here.p.copy()
-        return LaneStart(*vectors, plants, tuple(steps), rows[0], bound.take_messages())
+        return LaneStart(*vectors, plants, tuple(steps), row, bound.take_messages())
 
     def _refuse_between_ticks(self, sources: Iterable[tuple[str, Announcer]]) -> None:
         """Raise NoLanesError for a source that is not smooth between ticks, where a run's steps would be its own."""
