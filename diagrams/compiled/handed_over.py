@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...blocks.core import EvaluationVectors, FmuRuntimeError, SimulationError
-from ..exchange import OWN_EVENTS, ExchangeEvaluator, Look
+from ..exchange import OWN_EVENTS, ExchangeEvaluator
 from ..flat import JUMP, FlatDiagram, OpaqueStage
 from .runtime import load_runtime
 from .staged import NativeBlock, NativeExchange, OwnEvent
@@ -106,17 +106,15 @@ class HandedOver:
     def _look(self, path: str, t: float, call: Callable[[], None]) -> None:
         evaluator, block, state = self._evaluators[path], self._blocks[path], self.native.state_of(path)
         changed = self._take_block(path)
-        evaluator.look = Look.STEP if self.native.completes_step else Look.EVENTS
-        evaluator.event = None
         nominals = np.array(block.nominals)
-        call()
+        event = evaluator.look_at(call, completes_step=self.native.completes_step)
         self._give_block(path)
         state.other_nominals = changed or not np.array_equal(nominals, block.nominals)
-        if evaluator.event is None:
+        if event is None:
             return
-        state.acted, state.event = True, OWN_EVENTS.index(evaluator.event) if evaluator.event else _FIRED
+        state.acted, state.event = True, OWN_EVENTS.index(event) if event else _FIRED
         if state.event > 0:
-            self._count(t, path, evaluator.event)
+            self._count(t, path, event)
 
     # --- from one to the other ---------------------------------------------------------------------------------------
 

@@ -113,8 +113,8 @@ class NewtonOptions:
     iterations, halvings : int
         Steps, and halvings of a step, at most.
     solver : callable
-        ``solver(t, x, call, r, J)`` returns Python's function that solves the loops where C can't: with the vectors t and
-        x, and the function that evaluates the mismatch r and its derivative J, both written by ``call``.
+        ``solver(t, x, call, r, J)`` returns Python's function that solves the loops where C can't: with the vectors t
+        and x, and ``call``, which evaluates the mismatch r and its derivative J.
     """
 
     where: Sequence[int]
@@ -196,8 +196,8 @@ class CompiledLoop:
     inputs : sequence of slice, optional
         The inputs of each plant among them, where plants step less often than the ticks.
     rest : callable, optional
-        Evaluates a tick at which clocks act together for which there is no code: the kind after all `kinds`. It returns 0,
-        or 1 where it can't be evaluated.
+        Evaluates a tick at which clocks act together for which there is no code: the kind after all `kinds`. It returns
+        0, or 1 where it can't be evaluated.
     """
 
     def __init__(

@@ -14,11 +14,11 @@ from there fires nothing.
 **Rest.** A jump whose motion leads back beyond contact at once, again and again, rests there. That is an error which
 names the event: its block needs a state of rest.
 
-**Sliding.** With a fixed step, events that follow each other without end, as those of an ideal relay, wait for the end of
-the step from there on, until none fires at the end of one.
+**Sliding.** With a fixed step, events that follow each other without end, as those of an ideal relay, wait for the end
+of the step from there on, until none fires at the end of one.
 
-The loop in C finds events, lets them fire and keeps the domains; `fmus/runtime/events.c` has the search, `instants.c` what
-happens at an instant. Here are the domains with which a run begins, what is kept of them, and the errors.
+The loop in C finds events, lets them fire and keeps the domains: `fmus/runtime/events.c` has the search, `instants.c`
+what happens at an instant. Here are the domains with which a run begins, what is kept of them, and the errors.
 """
 
 from __future__ import annotations
@@ -55,12 +55,13 @@ class Domains:
     own : list of ndarray
         Places of the states of each event's block among the continuous ones.
     parts : dict of str to ndarray
-        By the names that C has for them: the ``domain`` of each indicator (1 above, -1 below, 0 on the border) and at the
-        ``start``; ``low`` and ``high``, between which one on the border stays; the ``slack`` beyond zero of one that has
-        just crossed it; ``size`` and ``rounding``, its largest value and its rounding errors in a step; ``fresh``, whether
-        an event has fired since the last step without one; ``latest``, ``counts`` and ``largest``: last times of each
-        event, their number, the longest interval; ``side``, ``stuck``, ``briefs``, ``brief_at``: a rest in contact;
-        ``recent`` and ``recent_fired``: rings of the last instants at which any has fired, and which did.
+        By the names that C has for them: the ``domain`` of each indicator (1 above, -1 below, 0 on the border) and at
+        the ``start``; ``low`` and ``high``, between which one on the border stays; the ``slack`` beyond zero of one
+        that has just crossed it; ``size`` and ``rounding``, its largest value and its rounding errors in a step;
+        ``fresh``, whether an event has fired since the last step without one; ``latest``, ``counts`` and ``largest``:
+        last times of each event, their number, the longest interval; ``side``, ``stuck``, ``briefs``, ``brief_at``: a
+        rest in contact; ``recent`` and ``recent_fired``: rings of the last instants at which any has fired, and which
+        did.
     fired_times : int
         Number of instants at which events have fired.
     sliding : tuple of bool
@@ -98,10 +99,11 @@ class Domains:
             return ()
         self._told.add(event)
         of = self._flat.events[event]
-        return (
-            f"t = {t:.6g} s: {of.path}.{of.name} switches back and forth without end (a sliding mode); from here on it is "
-            "looked at once a step. A hysteresis would make it an event again.",
+        told = (
+            f"t = {t:.6g} s: {of.path}.{of.name} switches back and forth without end (a sliding mode); from here on it "
+            "is looked at once a step. A hysteresis would make it an event again."
         )
+        return (told,)
 
     def begin_anew(self) -> None:
         """Tell of events again that were told in a run before."""

@@ -1,6 +1,6 @@
 """Blocks that a run evaluates from outside, such as FMUs in model exchange: their evaluators and their events."""
 
-from .evaluator import OWN_EVENTS, ExchangedBlock, ExchangeEvaluator, Look
+from .evaluator import OWN_EVENTS, ExchangedBlock, ExchangeEvaluator
 from .events import OutsideEvents
 from .exchanged_blocks import ExchangedBlocks
 
@@ -9,6 +9,5 @@ __all__ = [
     "ExchangeEvaluator",
     "ExchangedBlock",
     "ExchangedBlocks",
-    "Look",
     "OutsideEvents",
 ]

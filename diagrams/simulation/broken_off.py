@@ -1,4 +1,4 @@
-"""Why a run can't go on: the error of the block, or of the method, behind the place at which the loop has broken off."""
+"""Why a run can't go on: the error of the block, or of the method, behind the place where the loop has broken off."""
 
 from __future__ import annotations
 

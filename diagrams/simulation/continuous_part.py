@@ -29,7 +29,7 @@ class Between(Protocol):
     """Takes the blocks in continuous time from one instant to another; see `HybridTicks`."""
 
     def go_between(self, t: float, end: float) -> float | None:
-        """Go from t to an instant, both in s, before any tick there; return where a stop condition has ended the run."""
+        """Go from t to an instant, both in s, before any tick there; return where a stop condition ends the run."""
 
 
 class ContinuousPart:

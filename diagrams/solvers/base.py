@@ -21,10 +21,10 @@ euler          Runge-Kutta 1, fixed     to see the effect of a controller's forw
 
 The multistep methods start again at order 1 after every discontinuity, so that a sampled controller costs them most.
 
-The loop in C takes the steps of all one-step methods, `fmus/runtime/methods.c`; here are the multistep methods, which are
-those of libraries. No method evaluates the rates beyond its `stop`, and each lands on it exactly: discontinuities in time
-are put there. The state at times inside a step comes from the method's own dense output, with a fixed step from a shorter
-step.
+The loop in C takes the steps of all one-step methods, `fmus/runtime/methods.c`; here are the multistep methods, which
+are those of libraries. No method evaluates the rates beyond its `stop`, and each lands on it exactly: discontinuities
+in time are put there. The state at times inside a step comes from the method's own dense output, with a fixed step from
+a shorter step.
 """
 
 from __future__ import annotations

@@ -134,7 +134,7 @@ class Method(Integration):
         super().__init__(name, problem, rtol, absolute, step if self.fixed else bound)
         by_stiffness = ("RK45" if rtol >= 1e-8 else "DOP853", "Radau")
         self.names = ("euler",) if not problem.size else by_stiffness if name == "auto" else (name,)
-        """Names of the methods that may go on: with "auto" that for problems that are not stiff, and that for those that are."""
+        """Names of the methods that may go on; with "auto" the one for problems that are not stiff comes first."""
         self.active = self.names[0]
         """Name of the method that goes on."""
         self.planned: dict[str, float | None] = dict.fromkeys(self.names)
@@ -163,7 +163,7 @@ class Method(Integration):
         stuck : bool
             Whether the explicit method can take no step there.
         """
-        explicit, implicit = self.names
+        explicit, implicit = self.names[0], self.names[-1]
         if self.active == implicit:
             return self._change(explicit, t, h, "no longer stiff")
         if stuck:

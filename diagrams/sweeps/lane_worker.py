@@ -157,7 +157,7 @@ class _Lanes:
                 raise NoLanesError(f"more than {_MOST_KINDS} sets of clocks act together")
             acting.append(flat.acting(int(missing[0])))
             self._kinds = _number(flat, acting, self._ticks)
-        ends, base = np.concatenate([[0], self._ticks]), flat.base
+        ends = np.concatenate([[0], self._ticks])
         self._times, self._widths = times_of(flat, ends), times_of(flat, np.diff(ends))
         entries = bound.recorder.entries
         self._columns = np.arange(engine.workspace.log.size) if entries is None else entries
@@ -165,8 +165,8 @@ class _Lanes:
         if needed > 0.3 * machine_memory():
             raise NoLanesError(f"the samples of {count} runs at a time would take {needed / 2**30:.0f} GiB")
         search = StartSearch(bound) if agrees else None
-        source = None if search is None else search.source
-        loops = {clocks: newton_options(flat, clocks) for clocks in acting if flat.active_loops(clocks)}
+        source, here = None if search is None else search.source, engine.workspace.here.x
+        loops = {clocks: newton_options(flat, clocks, here) for clocks in acting if flat.active_loops(clocks)}
         self._code: LaneCode = compile_lanes(flat, acting, count, source, method if flat.continuous.size else "", loops)
         width, every = max(1, len(self._columns)), bound.recorder.every
         self._chunk = max(1, min(len(self._ticks), every * _BYTES // (8 * width * count)))
@@ -203,7 +203,10 @@ class _Lanes:
         engine, workspace = bound.engine, bound.engine.workspace
         bound.recorder.begin_anew()
         bound.begin(numbers)
-        engine.take_first_tick(None, bound.recorder)
+        try:
+            engine.take_first_tick(None, bound.recorder)
+        finally:
+            bound.recorder.finish()
         row = workspace.log[self._columns]
         if engine.position.stopped is not None or not len(self._ticks):
             return None

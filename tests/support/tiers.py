@@ -1,4 +1,4 @@
-"""Every run of a test in all forms: by the machine, by generated code and by Python's own loop, and they are compared."""
+"""Every run of a test in both forms, by the virtual machine and by generated code, and they are compared."""
 
 from collections import Counter
 from dataclasses import replace
@@ -48,12 +48,6 @@ def install(patch):
         else:
             compare(first, second, exact=not used[0].messages)
             counts["compiled"] += 1
-        if used and options.compile == "auto":
-            third = original(diagram, duration, replace(options, compile=False), progress=False)  # Python's own loop
-            if isinstance(used[0], HybridTicks):
-                compare_within_tolerances(first, third, options)
-            else:
-                compare(first, third, exact=not used[0].messages)
         return first
 
     watch(CompiledTicks)

@@ -1,4 +1,4 @@
-"""Transport delays in C's loop: the method of steps in closed form, and runs of Python's loop."""
+"""Transport delays in C's loop: the method of steps in closed form, in both forms."""
 
 from math import factorial
 
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.one_tier
 
 
 def forms(made, duration, **options):
-    """Return the runs by Python's loop, by the virtual machine and by generated code."""
+    """Return the runs by the virtual machine, by that under "auto", and by generated code."""
     runs = [made.simulate(duration, compile=form, **options, **QUIET) for form in (False, "auto", True)]
     assert not [m for m in runs[2].messages if m.startswith("Interpreted")]
     return runs

@@ -1,4 +1,4 @@
-"""Steps of SciPy's and SUNDIALS' methods within C's loop: SciPy's own runs, closed forms, and runs of Python's loop."""
+"""Steps of SciPy's and SUNDIALS' methods within C's loop: SciPy's own runs, closed forms."""
 
 import signal
 
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.one_tier
 
 
 def forms(made, duration, **options):
-    """Return the runs by Python's loop, by the virtual machine and by generated code."""
+    """Return the runs by the virtual machine, by that under "auto", and by generated code."""
     runs = [made.simulate(duration, compile=form, **options, **QUIET) for form in (False, "auto", True)]
     assert not [m for m in runs[2].messages if m.startswith("Interpreted")]
     return runs

@@ -1,6 +1,6 @@
 """Plants in the loop in C that step less often than the run has ticks, that are no FMU, or that are coupled.
 
-FMUs are the zoo's, y' = u, which are exact where inputs are held. Python's own loop is ``compile=False``.
+FMUs are the zoo's, y' = u, which are exact where inputs are held.
 """
 
 from contextlib import contextmanager
@@ -42,7 +42,7 @@ from support.zoo import zoo_fmu
 pytestmark = [pytest.mark.one_tier, pytest.mark.usefixtures("no_process_left")]
 MS = Fraction(1, 1000)
 FORMS = (False, "auto", True)
-"""Python's own loop, C's with the virtual machine, C's with generated code."""
+"""The virtual machine, the same until generated code comes, and generated code."""
 
 
 @pytest.fixture(scope="module")
