@@ -9,8 +9,9 @@ from scipy.linalg import expm
 from loopwright.blocks import Clock, Gain, Integrator, OptionError, ParameterError, SampleTimeError, Sine
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, StepOptions, mass_spring_damper
+from support.counted import counted_steps
 
-pytestmark = [pytest.mark.one_tier, pytest.mark.python_loop]  # it counts calls
+pytestmark = pytest.mark.one_tier  # it counts calls
 
 P = mass_spring_damper.MassSpringDamper()
 A = np.array([[0.0, 1.0], [-P.stiffness / P.mass, -P.damping / P.mass]])
@@ -50,17 +51,7 @@ def spring(T, *others, stepped=None):
 @pytest.fixture
 def steps(monkeypatch):
     """Steps of all FMUs, as (t, h)."""
-    from loopwright.fmus.calls import FmuInstance
-
-    found, bind = [], FmuInstance.bind
-
-    def watched(self, inputs, outputs):
-        bind(self, inputs, outputs)
-        step = self.step
-        self.step = lambda t, h: (found.append((t, h)), step(t, h))[1]
-
-    monkeypatch.setattr(FmuInstance, "bind", watched)
-    return found
+    return counted_steps(monkeypatch)
 
 
 def one_step_only(monkeypatch):

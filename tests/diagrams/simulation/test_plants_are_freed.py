@@ -19,6 +19,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Diagram, experiments
 from loopwright.fmus import Fmu, gantry
+from support.counted import stepped_by_python
 
 pytestmark = pytest.mark.one_tier  # it counts calls
 
@@ -140,7 +141,6 @@ def test_the_first_plant_too_where_the_second_one_cannot_start(calls, file, monk
     assert lives(calls) == [COMPLETE, ["instantiate", "freeInstance", "freeLibrary"]]
 
 
-@pytest.mark.python_loop  # it has a method of the plant interrupted
 def test_after_an_interruption(calls, file, monkeypatch):
     # Ctrl-C within a step of the plant, in the 51st tick
     from loopwright.fmus.running.fmu import FmuInstance
@@ -160,6 +160,7 @@ def test_after_an_interruption(calls, file, monkeypatch):
         self.step = stepping
 
     monkeypatch.setattr(FmuInstance, "bind", interrupted)
+    stepped_by_python(monkeypatch)
     with pytest.raises(KeyboardInterrupt) as error:
         Diagram("d", resting(file)()).simulate(0.1, step=1e-3, progress=False)
     assert lives(calls) == [COMPLETE]

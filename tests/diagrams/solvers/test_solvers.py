@@ -4,7 +4,6 @@ All of them by runs of diagrams; what SciPy's and SUNDIALS' methods alone have, 
 """
 
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -504,29 +503,6 @@ def go(solver, x, stops):
             t, x, count = step.t, step.x, count + 1
         assert t == stop
     return count
-
-
-@pytest.mark.parametrize("name", LIBRARY)
-def test_statistics_count_what_was_done(name):
-    calls = []
-
-    def rate(t, x):
-        calls.append(t)
-        return -x
-
-    solver = make_solver(name, problem(rate, lambda t, x: -np.eye(1), 1))
-    assert go(solver, [1.0], [1.0, 2.0, 2.5]) == solver.statistics.steps
-    assert solver.statistics.rate_evaluations == len(calls)
-    assert max(calls) <= 2.5
-    pickle.dumps(solver.statistics)
-
-
-@pytest.mark.parametrize("name", ["CVODE_Adams", "CVODE_BDF"])
-def test_cvode_counts_rejected_steps(name):
-    kick = problem(lambda t, x: [1e4 * math.exp(-(((t - 1) / 1e-3) ** 2))], lambda t, x: np.zeros((1, 1)), 1)
-    solver = make_solver(name, kick, max_step=0.01)
-    go(solver, [0.0], [2.0])
-    assert 1 <= solver.statistics.rejected < solver.statistics.steps
 
 
 @pytest.mark.parametrize("name", ["LSODA", "CVODE_BDF"])

@@ -10,6 +10,7 @@ from loopwright.blocks import Clock, Constant, Counter, Gain, PulseTrain, Sample
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu
 from loopwright.fmus.models import mass_spring_damper
+from support.counted import counted_steps
 
 
 def sampled(time, function=lambda u: UnitDelay(initial_value=0.0)(u), **options):
@@ -75,21 +76,6 @@ def oscillator():
     return Fmu(mass_spring_damper.build(), name="plant")
 
 
-def counted(plant, monkeypatch):
-    """Return the list into which every step of an FMU is written, as (t, h)."""
-    from loopwright.fmus.calls import FmuInstance
-
-    steps, bind = [], FmuInstance.bind
-
-    def watched(self, inputs, outputs):
-        bind(self, inputs, outputs)
-        step = self.step
-        self.step = lambda t, h: (steps.append((t, h)), step(t, h))[1]
-
-    monkeypatch.setattr(FmuInstance, "bind", watched)
-    return steps
-
-
 def exact(force, times):
     """Return the positions of the library's oscillator under a constant force."""
     p = mass_spring_damper.MassSpringDamper()
@@ -100,10 +86,9 @@ def exact(force, times):
 
 
 @pytest.mark.one_tier
-@pytest.mark.python_loop  # it counts calls of a method
 def test_an_fmu_steps_where_a_subsystem_acts_and_not_at_the_base(cache, monkeypatch):
     plant = oscillator()
-    steps = counted(plant, monkeypatch)
+    steps = counted_steps(monkeypatch)
 
     @subsystem(sample_time=1 / 44100)
     def fast(y):
@@ -121,11 +106,10 @@ def test_an_fmu_steps_where_a_subsystem_acts_and_not_at_the_base(cache, monkeypa
 
 
 @pytest.mark.one_tier
-@pytest.mark.python_loop
 def test_an_fmu_that_takes_steps_of_one_length_steps_at_the_base(cache, monkeypatch):
     plant = oscillator()
     monkeypatch.setattr(Fmu, "variable_step", property(lambda self: False))
-    steps = counted(plant, monkeypatch)
+    steps = counted_steps(monkeypatch)
     a, b = sampled(1e-3, lambda u: Gain(gain=1.0)(u), name="a"), sampled(0.7e-3, name="b")
     run = Diagram("d", plant(force=a(plant.position)), b(plant.position)).simulate(7e-3, progress=False)
     assert len(steps) == 70
