@@ -159,11 +159,6 @@ class ExchangeEvaluator:
         """Take the block of a run."""
         self._loaded = block
 
-    def next_instant(self, t: float) -> float:
-        """Return its first time event after t, in s; infinite without one."""
-        time = self.block.next_time
-        return time if time > t else math.inf
-
     def look_at(self, call: Callable[[], None], *, completes_step: bool) -> str | None:
         """Look at an instant that is reached, and return the name of the event that has acted, if any: see `event`.
 

@@ -5,13 +5,12 @@ past: it is a known function of time, and the delays cost the solver no states (
 is kept as the polynomial through the input at Chebyshev points of the second kind, halved until that is as exact as the
 solver's tolerance asks for: what goes in need not be what the solver looks at. A discontinuity of the input comes out τ
 later, and the solver lands there. Where no delay feeds through to another, each way round is smoothed by a state: after
-some of them the solver need not land there any more.
+some of them the solver need not land there any more. C keeps the steps (`fmus/runtime/delays.c`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,12 +20,8 @@ from ..flat import FlatDiagram
 from ..wiring import join
 
 _NODES = 9
-_BETWEEN = (0.0211, 0.2671, 0.5837, 0.9113)  # where the polynomial is compared with the input, parts of a step
-_DEEPEST = 10  # a step is halved so often at most
-_ROUNDING = 1e-13
 _ROOM = 2048  # pieces and discontinuities that there is memory for, at first
-_STEP = 1100  # of them, that one step may make: halved _DEEPEST times, it has 1024 parts
-_SMOOTH = 8  # a discontinuity in the derivative of this order is none to a solver
+_STEP = 1100  # of them, that one step may make: halved ten times, it has 1024 parts
 
 
 class Delays:
@@ -95,19 +90,6 @@ class Delays:
         """Take the side of a discontinuity that is towards a time within the segment that is being solved."""
         self._middle = t
 
-    def sample_times(self, t_old: float, t: float) -> np.ndarray:
-        """Return the instants of a step at which `keep` wants the inputs."""
-        found = t_old + (t - t_old) * self.nodes
-        found[-1] = t
-        return np.array(found)
-
-    def keep(self, t_old: float, t: float, samples: np.ndarray) -> None:
-        """Keep a step: the vector z at each of `sample_times`."""
-        self.make_room(t)
-        self.pieces[self.count, :2] = t_old, t
-        self.pieces[self.count, 2:] = np.ravel(samples)
-        self.count += 1
-
     def make_room(self, t: float) -> None:
         """Forget inputs that no delay reaches any more at a time in s; make room for a step of a loop in C."""
         edges = max(_STEP, 20 * len(self.taus))
@@ -134,28 +116,6 @@ class Delays:
                 self.edges[i + 1 : self.noted + 1] = self.edges[i : self.noted].copy()
                 self.edges[i], self.noted = (t + tau, order), self.noted + 1
 
-    def _pass_edges(self, t: float) -> float:
-        """Forget the discontinuities up to ``t``; return the least order among them."""
-        passed, order = 0, math.inf
-        while passed < self.noted and not is_before(t, float(self.edges[passed, 0])):
-            order = min(order, float(self.edges[passed, 1]))
-            passed += 1
-        if passed:
-            self.edges[: self.noted - passed] = self.edges[passed : self.noted].copy()
-            self.noted -= passed
-        return order
-
-    def next_edge(self, t: float) -> float:
-        """Return the next time after ``t`` at which a discontinuity comes out."""
-        self._pass_edges(t)
-        return float(self.edges[0, 0]) if self.noted else math.inf
-
-    def note_reached(self, t: float, *, from_source: bool) -> None:
-        """Note a discontinuity at ``t``, of a source or out of a delay: it goes into the delays."""
-        order = min(0 if from_source else math.inf, self._pass_edges(t) + self.smoothed)
-        if order < _SMOOTH:
-            self.note_edge(t, int(order))
-
     def outputs_at(self, t: float, w: np.ndarray) -> None:
         """Write the outputs at a time into w."""
         for tau, into, where in zip(self.taus, self.outputs, self.inputs, strict=True):
@@ -179,36 +139,6 @@ class Delays:
         self.count, self.noted = len(pieces), len(edges)
         self.pieces = np.concatenate([pieces, np.empty((_ROOM, pieces.shape[1]))])
         self.edges = np.concatenate([edges, np.empty((_ROOM, 2))])
-
-
-def keep_step(
-    delays: Delays,
-    t_old: float,
-    t: float,
-    state: Callable[[float], np.ndarray],
-    inputs: Callable[[float, np.ndarray], np.ndarray],
-    tolerance: tuple[float, float],
-) -> None:
-    """Keep one accepted step of the solver, in as many pieces as the tolerance (relative, absolute) asks for."""
-    rtol, atol = tolerance
-
-    def at(times: np.ndarray) -> np.ndarray:
-        return np.array([inputs(float(s), state(float(s))).copy() for s in times])
-
-    def keep_piece(a: float, b: float, depth: int) -> None:
-        samples = at(delays.sample_times(a, b))
-        between = np.array([barycentric(delays, part, samples) for part in _BETWEEN])
-        found = at(a + (b - a) * np.array(_BETWEEN))
-        size = np.max(np.abs(samples), axis=0)
-        allowed = np.maximum(0.1 * (atol + rtol * size), _ROUNDING * size)
-        middle = 0.5 * (a + b)
-        if depth and a < middle < b and np.any(np.abs(between - found) > allowed):
-            keep_piece(a, middle, depth - 1)
-            keep_piece(middle, b, depth - 1)
-        else:
-            delays.keep(a, b, samples)
-
-    keep_piece(t_old, t, _DEEPEST)
 
 
 def barycentric(delays: Delays, part: float, samples: np.ndarray) -> np.ndarray:

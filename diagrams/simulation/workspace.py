@@ -250,12 +250,6 @@ class Workspace:
 
         return evaluate
 
-    def plain(self, function: Schedule, outputs: list[np.ndarray], vectors: Vectors) -> Callable[[], None]:
-        """Return the call of another function of (t, x, w, p) between ticks."""
-        call: Callable[[], None] = self._bind(function, vectors, outputs).call
-        solve = self.loop_solver(NONE, vectors)
-        return call if solve is None else _one_after_the_other(solve, call)
-
     def bind_exchange(self) -> Callable[[float], np.ndarray]:
         """Return ``z(t)`` at ``here`` between ticks, with the outputs that sampled blocks had at the last tick."""
         log = self.log[: self.flat.log.total]
