@@ -9,8 +9,10 @@ import sys
 from pathlib import Path
 
 _STEP_PLANTS = """\
-    const int64_t reason = step_plants(l, i, s->times[i], s->widths[i], g->out);
-    if (reason != DONE) return h->inside = 0, reason;
+    if (!s->stays || i) {
+        const int64_t reason = step_plants(l, i, s->times[i], s->widths[i], g->out);
+        if (reason != DONE) return h->inside = 0, reason;
+    }
 """
 _TAKE_STATES = "memcpy(l->x, l->x_next, (size_t)l->states * sizeof(double));\n"
 _SETTLE = "    if (h->w.m || h->o) {\n        enter(h, g, t);"
@@ -27,7 +29,7 @@ _EVALUATE = "        if ((out->reason = evaluate(l, kinds[i])) != DONE) break;\n
 
 FAULTS = {
     "the tick is evaluated before the plants have stepped": [
-        (_STEP_PLANTS + "    keep_instant(h);", "    keep_instant(h);"),
+        (_STEP_PLANTS, ""),
         (_SETTLE, _STEP_PLANTS + _SETTLE),
     ],
     "plants get the inputs of the tick before": [(_HOLD, _LATE)],

@@ -26,9 +26,9 @@ from loopwright.blocks import (
     TransportDelay,
 )
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.simulation.transport_delays import Delays
 from loopwright.fmus import Fmu, mass_spring_damper
 from support.hybrid_blocks import TIGHT, Crossings, Lag
+from support.work_in_c import simulate_counted
 
 
 def delayed_feedback(tau=0.25, gain=1.0, initial=0.0):
@@ -108,19 +108,22 @@ def test_a_kink_of_what_goes_in_comes_out():
     assert np.max(np.abs(run["late.y"] - np.clip(sine, -0.5, 0.5))) < 5e-4
 
 
-def test_discontinuities_are_landed_on_until_states_have_smoothed_them():
-    """Two delays would have quadratically many, two that feed through to each other do."""
-    for smoothed in (True, False):
-        delays = Delays([0.01, 0.0137], [slice(0, 1), slice(1, 2)], [slice(0, 1), slice(1, 2)], [np.zeros(1)] * 2)
-        delays.smoothed = smoothed
-        delays.note_edge(0.0)
-        t, found = 0.0, []
-        while (t := delays.next_edge(t)) < 1.0:
-            found.append(t)
-            delays.note_reached(t, from_source=False)
-        sums = ((i, k, 100 * i + 137 * k) for i in range(101) for k in range(74))
-        expected = {s for i, k, s in sums if 0 < s < 10_000 and (not smoothed or i + k <= 8)}
-        assert [round(1e4 * t) for t in found] == sorted(expected)
+@pytest.mark.parametrize("smoothed", [True, False])
+def test_discontinuities_are_landed_on_until_states_have_smoothed_them(smoothed):
+    """Two delays would have quadratically many, two that feed through to each other do; a step ends at each, and at ticks.
+
+    The start is a discontinuity: it comes out at all sums of the delays, up to the eighth derivative that jumps.
+    """
+    one, two = (TransportDelay(delay=d, name=n) for d, n in ((0.01, "one"), (0.0137, "two")))
+    state = Integrator(name="state", initial_value=1.0)
+    if smoothed:
+        diagram = Diagram("d", state(-one(state.y) - two(state.y)))
+    else:
+        diagram = Diagram("d", two(one(0.5 * two.y + state.y)), state(Constant(value=0.0)))
+    _, work = simulate_counted(diagram, 1.0, step=0.01, solver="euler")
+    sums = ((i, k, 100 * i + 137 * k) for i in range(101) for k in range(74))
+    edges = {s for i, k, s in sums if 0 < s <= 10_000 and (not smoothed or i + k <= 8)}
+    assert work.steps == len(edges | {100 * k for k in range(1, 101)})
 
 
 def test_pulses_keep_their_edges_through_two_delays():
