@@ -154,7 +154,7 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
         closed = [_close_loop(loop) for loop in loops]
         return _plot_step(closed, names, t, max(map(_horizon, loops)))
 
-    @accepts(measured=kinds.text, labels=kinds.names)
+    @accepts(measured=kinds.text, omega=kinds.frequencies, labels=kinds.names)
     def gang_of_four(
         self, measured: str, *others: LoopTransfer, omega: ArrayLike | None = None, labels: Sequence[str] | None = None
     ) -> Figure:

@@ -51,7 +51,9 @@ _FLAG = kinds.one_of_class(bool, "True or False").worded(step="Give one of them.
     input_derivatives=_FLAG,
     time=Kind(
         " or ".join(repr(kind.value) for kind in StepTime),
-        lambda value: isinstance(value, StepTime) or value in [kind.value for kind in StepTime],
+        lambda value: (
+            isinstance(value, StepTime) or (isinstance(value, str) and value in [kind.value for kind in StepTime])
+        ),
         "Give one.",
     ),
     communication_step=_seconds("Give a multiple of the ticks, such as 0.01.", lambda value: 0 < value < math.inf),
