@@ -6,7 +6,6 @@ from .fused import FusedPlant, compile_fused, fuse
 from .grouping import make_tables
 from .handed_over import HandedOver
 from .hybrid import (
-    FIXED,
     BrokenOff,
     CompiledHybrid,
     HybridOutcome,
@@ -26,7 +25,7 @@ from .hybrid_code import (
 )
 from .kernels import Kernel
 from .libraries import load_compiled
-from .library_method import LIBRARY_METHODS, USES_SLOPE, Failure
+from .library_method import Failure
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
 from .native_tick import bind_call
 from .remote import REFUSED, TOLD, UNDER_WAY, PythonStep, compile_other_side
@@ -35,13 +34,10 @@ from .staged import NativeExchange, OwnEvent
 from .watch import Fired, Pile
 
 __all__ = [
-    "FIXED",
     "LARGEST",
-    "LIBRARY_METHODS",
     "REFUSED",
     "TOLD",
     "UNDER_WAY",
-    "USES_SLOPE",
     "BackgroundCode",
     "BrokenOff",
     "Code",

@@ -12,13 +12,14 @@ import numpy as np
 
 from ..events import Domains
 from ..flat import NONE, FlatDiagram, StepTable, TickPattern
+from ..solvers import METHODS, Kind
 from .called_back import CALL, CalledBack
 from .delays import NativeDelays, PastInputs
 from .differences import Differences
 from .functions import at
 from .hybrid_code import Between, HybridCode
 from .hybrid_structures import HybridStructure, MethodStructure, ProblemStructure, SpanStructure
-from .library_method import LIBRARY_METHODS, USES_SLOPE, Failure, LibraryMethod
+from .library_method import Failure, LibraryMethod
 from .loop import CompiledLoop, NewtonOptions, NewtonStructure, OutcomeStructure
 from .radau import radau_numbers
 from .runtime import load_runtime
@@ -26,9 +27,6 @@ from .staged import NativeExchange
 from .staged_functions import Staged, StagedSlopes
 from .watch import Fired, Pile, Watch
 
-FIXED = ("euler", "heun", "rk4")
-_KINDS = {"euler": 0, "heun": 1, "rk4": 2, "RK23": 3, "RK45": 3, "DOP853": 4, "Radau": 5}
-_KINDS |= dict.fromkeys(LIBRARY_METHODS, 6)
 _SECONDS = 0.05  # of a call, about, after which Ctrl-C has its turn
 _LIBRARY_STEP = 200_000  # ns that a library takes for a step, about
 _UNKNOWN = 20  # steps of the first call beside FMUs that may take any time
@@ -100,7 +98,7 @@ class MethodOptions:
     Attributes
     ----------
     name : str
-        Its name: "euler", "heun", "rk4", "RK23", "RK45", "DOP853", "Radau", or one of `LIBRARY_METHODS`.
+        Its name: one of `METHODS`.
     rtol : float
         Relative tolerance.
     atol : ndarray, shape (n,)
@@ -273,7 +271,7 @@ class CompiledHybrid:
         self._libraries = {
             i: LibraryMethod(one.name, one.rtol, one.atol, one.longest, flat.continuous_labels, hybrid.p, method)
             for i, (one, method) in enumerate(zip(methods, self.methods, strict=True))
-            if one.name in LIBRARY_METHODS
+            if METHODS[one.name].kind is Kind.LIBRARY
         }
         if self._libraries:
             loop.calls_python = True
@@ -360,9 +358,16 @@ class CompiledHybrid:
     def _method(self, options: MethodOptions, n: int, of: int, step: int | None) -> MethodStructure:
         import scipy.integrate
 
-        name = options.name
+        name, facts = options.name, METHODS[options.name]
         made = MethodStructure(
-            kind=_KINDS[name], n=n, of=of, rtol=options.rtol, longest=options.longest, planned=np.nan, step=step
+            kind=facts.kind,
+            stages=facts.stages,
+            n=n,
+            of=of,
+            rtol=options.rtol,
+            longest=options.longest,
+            planned=np.nan,
+            step=step,
         )
         self._tolerances.append(np.broadcast_to(options.atol, (n,)).astype(float))
         made.atol = self._own(self._tolerances[-1])
@@ -558,7 +563,7 @@ class CompiledHybrid:
 
 def _budget(flow: int, methods: Sequence[MethodOptions], n: int) -> int:
     """Return the steps of a call: an operation takes about 1 ns, and so does one of the factors of a Jacobian."""
-    step = 100 + 15 * flow + (4 * n**3 if any(m.name in USES_SLOPE for m in methods) else 0)
-    if any(m.name in LIBRARY_METHODS for m in methods):
+    step = 100 + 15 * flow + (4 * n**3 if any(METHODS[m.name].uses_slope for m in methods) else 0)
+    if any(METHODS[m.name].kind is Kind.LIBRARY for m in methods):
         step += _LIBRARY_STEP
     return max(10, int(_SECONDS * 1e9 / step))

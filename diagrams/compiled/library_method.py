@@ -9,16 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...blocks.interrupts import INTERRUPTS
-from ..solvers import AcceptedStep, Problem, Solver, make_solver
+from ..solvers import METHODS, AcceptedStep, Problem, Solver, make_solver
 from .hybrid_structures import MethodStructure, ProblemStructure
 from .runtime import load_runtime
 
-LIBRARY_METHODS = ("BDF", "LSODA", "CVODE_BDF", "CVODE_Adams")
-"""Methods whose steps a library takes."""
 MOST_POWERS = 12
 """Highest order of their dense output: that of Adams' methods."""
-USES_SLOPE = ("Radau", "BDF", "LSODA", "CVODE_BDF")
-"""Methods that need the derivative of the rates by the states."""
 _BEGIN, _STEP_ON, _EXPAND = range(3)
 _PASSED, _FAILED = range(2)
 _Library = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int32)
@@ -54,7 +50,7 @@ class LibraryMethod:
     Parameters
     ----------
     name : str
-        One of `LIBRARY_METHODS`.
+        A method of `METHODS` whose steps a library takes.
     rtol, longest : float
         Relative tolerance, and longest step in s.
     atol : ndarray, shape (n,)
@@ -82,7 +78,7 @@ class LibraryMethod:
         self._problem, self._method = problem, method
         self._of = Problem(n, self._rate, self._slope, names)
         self._trial, self._rates, self._zeros = np.zeros(n), np.zeros(n), np.zeros(n)
-        self._slopes = np.zeros((n, n) if name in USES_SLOPE else 0)
+        self._slopes = np.zeros((n, n) if METHODS[name].uses_slope else 0)
         self._end, self._powers = np.zeros(n), np.zeros((MOST_POWERS, n))
         method.x, method.D = self._end.ctypes.data, self._powers.ctypes.data
         runtime = load_runtime()

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from string import Template
 from typing import Any
 
 from ...blocks.core import left_of
+from ..solvers import METHODS
 from .methods import write_methods
 from .scalar_calls import ScalarFunctions
-
-METHODS: Mapping[str, str] = {
-    "euler": "$n, h, now, k1, now",
-    "heun": "&e, $n, h, to, now, k1, k2, stage, now",
-    "rk4": "&e, $n, from, h, to, now, k1, k2, k3, k4, stage, now",
-}
-"""Methods of fixed step in fmus/runtime/fixed_step.c, with their arguments in `_TEXT`."""
 
 _RATES = Template("""
 typedef struct { const vec *x, *w, *p, *kept; } states;
@@ -37,12 +31,11 @@ _STEP = Template("""
 static inline void step_states(double from, double end, vec *x, const vec *w, const vec *p, const vec *kept) {
     static const int where[] = {$where};
     const states e = {x, w, p, kept};
-    vec k1[$n], k2[$n], k3[$n], k4[$n], stage[$n], now[$n];
+    vec k1[$n], K[$rows], stage[$n], now[$n];
     const double h = end - from, to = fmax(from, end - $left * fabs(end));
-    (void)k2, (void)k3, (void)k4, (void)stage, (void)to;
     for (int i = 0; i < $n; i++) now[i] = x[where[i]];
     flow_rate(&e, from, now, k1);
-    flow_lw_$method($arguments);
+    flow_lw_fixed(&e, $n, $stages, from, h, to, now, k1, K, stage, now);
     for (int i = 0; i < $n; i++) x[where[i]] = now[i];
 }
 """)
@@ -59,7 +52,7 @@ class FlowSource:
     where : sequence of int
         Entries of x that they belong to.
     method : str
-        One of `METHODS`.
+        A method of fixed step.
     """
 
     rates: Any
@@ -76,11 +69,7 @@ def write_flow(source: FlowSource, scalars: ScalarFunctions) -> tuple[str, int]:
         For an operation that has no form over vectors.
     """
     code = scalars.write_calls("flow", source.rates, ("t", "x", "w", "p"), {3})
-    sizes = {"where": ", ".join(map(str, source.where)), "n": str(len(source.where))}
-    step = _STEP.substitute(
-        sizes,
-        method=source.method,
-        arguments=Template(METHODS[source.method]).substitute(sizes),
-        left=(1.0 - left_of(1.0)).hex(),
-    )
+    n, stages = len(source.where), METHODS[source.method].stages
+    sizes = {"where": ", ".join(map(str, source.where)), "n": str(n)}
+    step = _STEP.substitute(sizes, stages=stages, rows=max(1, stages - 1) * n, left=(1.0 - left_of(1.0)).hex())
     return code.text + _RATES.substitute(sizes) + write_methods("flow", "const states") + step, code.kept

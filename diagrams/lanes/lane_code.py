@@ -13,7 +13,8 @@ from ...fmus import Fmu
 from ...fmus.export import describe_processor, processor_flags
 from ..compiled import LARGEST, NewtonOptions, load_compiled
 from ..flat import NONE, TRUE, FlatDiagram, TickPattern
-from .flow_code import METHODS, FlowSource, write_flow
+from ..solvers import FIXED
+from .flow_code import FlowSource, write_flow
 from .lane_plants import LanePlant, read_plant
 from .loop_code import LoopSource, write_loops
 from .no_lanes import NoLanesError
@@ -317,7 +318,7 @@ def _bind_starts(library: ctypes.CDLL, source: StartSource) -> LaneStarts:
 
 def _between_ticks(flat: FlatDiagram, method: str) -> str:
     """Return what happens between ticks that lanes don't do, as a clause; empty where nothing does."""
-    if flat.continuous.size and method not in METHODS:
+    if flat.continuous.size and method not in FIXED:
         path = next(p for p, where in flat.states.slices.items() if where.start <= flat.continuous[0] < where.stop)
         return (
             f"it has continuous states, those of {path}, and each run would choose its steps; give a solver of fixed "

@@ -12,6 +12,7 @@ import numpy as np
 from ...blocks.core import Layout, OptionError, UnknownArgumentError, accepts, kinds
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, PointOrigin, Snapshot, layout_of, units_of
+from ..solvers import FIXED
 
 if TYPE_CHECKING:
     from ..simulation import Simulation
@@ -213,7 +214,7 @@ def _keeps_step(options: Mapping[str, Any], t: float, has_fmu: bool) -> bool:
     if options.get("step") is None:
         return False
     steps = t / float(options["step"])
-    return has_fmu or options.get("solver") in ("euler", "heun", "rk4") or abs(steps - round(steps)) <= 1e-12 * steps
+    return has_fmu or options.get("solver") in FIXED or abs(steps - round(steps)) <= 1e-12 * steps
 
 
 def _check_tick(diagram: WiredDiagram, base: Fraction, t: float) -> None:

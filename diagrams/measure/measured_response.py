@@ -44,6 +44,7 @@ from ...blocks.core import OptionError, accepts, brief, explain_calls, kinds
 from ..flat import FlatDiagram, WiredDiagram
 from ..linearization import PointLike, find_signal, operating_point, ticks_to_renewal
 from ..results import OperatingPoint, PointOrigin, Snapshot
+from ..solvers import FIXED
 from .injection import InjectionRun, inject_signal
 from .measurement import Measurement, measure_part, refine_tolerances
 from .waveforms import KINDS, Part, choose_step, plan_signal
@@ -280,7 +281,7 @@ def frequency_response(
     measured = [find_signal(flat, name) for name in ([outputs] if isinstance(outputs, str) else outputs)]
     if flat.hybrid:
         chosen = {"rtol": 1e-9, "atol": 1e-12, **chosen}
-        if chosen.get("solver", "auto") not in ("euler", "heun", "rk4"):
+        if chosen.get("solver", "auto") not in FIXED:
             chosen.setdefault("max_step", 0.5 * np.pi / omega[-1])
     plan = list(plan_signal(kind, omega, dt, amplitude))
     tick = point.tick if point is not None else round(t0 / float(flat.base))

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...blocks.core import SimulationError
 from ..flat import FlatDiagram
+from ..solvers import FIXED
 from .injection import InjectionRun
 from .waveforms import Part, compute_phasors
 
@@ -79,7 +80,7 @@ class Measurement:
 
 def refine_tolerances(flat: FlatDiagram, chosen: Mapping[str, Any]) -> dict[str, Any]:
     """Return options with smaller tolerances, where a solver has some."""
-    if not flat.hybrid or chosen.get("solver", "auto") in ("euler", "heun", "rk4"):
+    if not flat.hybrid or chosen.get("solver", "auto") in FIXED:
         return dict(chosen)
     return {**chosen, "rtol": FINER * float(chosen["rtol"]), "atol": FINER * np.asarray(chosen["atol"])}
 

@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 
 from ..compiled import (
-    LIBRARY_METHODS,
     CompiledHybrid,
     CompiledLoop,
     Fired,
@@ -23,7 +22,7 @@ from ..compiled import (
 )
 from ..flat import NONE
 from ..results import Recorder
-from ..solvers import SUNDIALS
+from ..solvers import METHODS, Kind
 from .algebraic_loops import newton_options
 from .compiled_plants import PlantsInC
 from .continuous import Continuous
@@ -31,8 +30,6 @@ from .solver_setup import has_guards, next_instant, remembers
 from .workspace import Workspace
 
 _MOST_EDGES = 100_000  # discontinuities of sources in a call
-_METHODS = {"euler": "Euler", "heun": "Heun", "rk4": "Runge-Kutta 4", "RK23": "Bogacki-Shampine 3(2)",
-            "RK45": "Dormand-Prince 5(4)", "DOP853": "Dormand-Prince 8(5,3)", "Radau": "Radau IIA 5"}  # fmt: skip
 
 
 def bind_loop(
@@ -112,10 +109,10 @@ def _tell_outside(continuous: Continuous, event: OwnEvent) -> None:
 
 def describe_methods(methods: Sequence[MethodOptions], solver: str) -> str:
     """Return in words which methods integrate for a solver of a name, and where."""
-    if solver in LIBRARY_METHODS:
-        library = "SUNDIALS" if solver in SUNDIALS else "SciPy"
-        return f"{library} takes steps of {solver}, and the rest of the run is C"
-    names = ", and where it is stiff ".join(f"{_METHODS[m.name]} ({m.name})" for m in methods)
+    facts = METHODS.get(solver)
+    if facts is not None and facts.kind is Kind.LIBRARY:
+        return f"{facts.title} takes steps of {solver}, and the rest of the run is C"
+    names = ", and where it is stiff ".join(f"{METHODS[m.name].title} ({m.name})" for m in methods)
     return f"{names} runs in C as solver={solver!r}"
 
 

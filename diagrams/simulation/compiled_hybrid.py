@@ -12,7 +12,6 @@ import numpy as np
 
 from ...blocks.core import CompilerError, SimulationError
 from ..compiled import (
-    USES_SLOPE,
     BackgroundCode,
     CompiledHybrid,
     HandedOver,
@@ -27,6 +26,7 @@ from ..compiled import (
 )
 from ..flat import EVERY, NONE, ClockSets, FlatDiagram, TickPattern, kinds_of, ticks_after, times_of
 from ..results import Recorder
+from ..solvers import METHODS
 from .broken_off import explain, explain_library, pile_up
 from .compiled_hand_over import (
     active_method,
@@ -376,7 +376,7 @@ def find_code(
 
 def is_stiff(continuous: Continuous) -> bool:
     """Whether the solver needs the derivative of the rates."""
-    return any(method.name in USES_SLOPE for method in methods_of(continuous))
+    return any(METHODS[method.name].uses_slope for method in methods_of(continuous))
 
 
 def make_hybrid(

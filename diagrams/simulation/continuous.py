@@ -14,7 +14,7 @@ from ..events import Domains
 from ..exchange import ExchangedBlocks, OutsideEvents
 from ..flat import FlatDiagram, announcers
 from ..results import Occurrence
-from ..solvers import Method, Problem
+from ..solvers import METHODS, Kind, Method, Problem
 from .diagnosis import state_values
 from .initialize import domains_from_left
 from .solver_setup import absolute_tolerances, find_late, longest_step, scales_of, time_scale_of
@@ -24,8 +24,8 @@ from .workspace import Workspace
 _AT_ONCE = 1e-6
 """Part of the time between two samples within which an indicator has come back at once."""
 NOTHING: frozenset[Any] = frozenset()
-TIGHT, ONE_STEP = 1e-9, ("auto", "RK23", "RK45", "DOP853", "Radau")
-"""Below this relative tolerance these methods, to which a stop costs little, land on every sample."""
+TIGHT = 1e-9
+"""Below this relative tolerance methods of one step, to which a stop costs little, land on every sample."""
 
 
 class Continuous:
@@ -91,7 +91,8 @@ class Continuous:
             max_step=longest_step(flat, max_step, time_scale, shortest),
         )
         self.fixed = self.method.fixed
-        self.lands = rtol < TIGHT and self.method.name in ONE_STEP
+        multistep = any(METHODS[name].kind is Kind.LIBRARY for name in self.method.names)
+        self.lands = rtol < TIGHT and not (self.method.fixed or multistep)
         """Whether the method lands on every sample: the dense output is of lower order than the step."""
         if self.fixed and self.delays is not None and float(flat.base) > self.delays.shortest * (1 + 1e-12):
             raise OptionError(

@@ -17,7 +17,6 @@ from ..wiring import stepped_blocks
 
 START_EXCHANGES = ("agree", "once", "none")
 """Exchanges of values with FMUs while they initialize; the first one is the default."""
-FIXED_STEP = ("euler", "heun", "rk4")
 
 
 class KeptKeywords(TypedDict, total=False):
@@ -244,9 +243,9 @@ def default_step(diagram: WiredDiagram, step: Any, duration: float | None, solve
         return start.base
     if duration is None:
         return step
-    from ..solvers import solver_name
+    from ..solvers import FIXED, solver_name
 
-    if diagram.has_fmu or solver_name(solver) in FIXED_STEP:
+    if diagram.has_fmu or solver_name(solver) in FIXED:
         return step
     try:
         span = Fraction(repr(float(duration)))

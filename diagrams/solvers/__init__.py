@@ -1,12 +1,14 @@
-"""The method of a run, and the multistep methods of libraries behind one interface."""
+"""The methods by name, the method of a run, and the multistep methods of libraries behind one interface."""
 
-from .base import SOLVERS, SUNDIALS, AcceptedStep, Polynomial, Problem, Solver, solver_name
+from .base import FIXED, METHODS, SOLVERS, AcceptedStep, Kind, Polynomial, Problem, Solver, solver_name
 from .choose import Method, make_solver
 
 __all__ = [
+    "FIXED",
+    "METHODS",
     "SOLVERS",
-    "SUNDIALS",
     "AcceptedStep",
+    "Kind",
     "Method",
     "Polynomial",
     "Problem",

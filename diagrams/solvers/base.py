@@ -33,6 +33,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
@@ -223,11 +224,50 @@ class Solver(Integration, ABC):
         """Take one step of the method."""
 
 
-FIXED = ("euler", "heun", "rk4")
-_SCIPY = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
-SUNDIALS = ("CVODE_BDF", "CVODE_Adams")
+class Kind(IntEnum):
+    """Kinds of methods, as `fmus/runtime/problem.c` numbers them."""
 
-SOLVERS: tuple[str, ...] = ("auto", *FIXED, *_SCIPY, *SUNDIALS)
+    FIXED_STEP, EXPLICIT, EIGHT, RADAU, LIBRARY = range(5)
+
+
+@dataclass(frozen=True)
+class MethodFacts:
+    """What there is to know of a method.
+
+    Attributes
+    ----------
+    title : str
+        Its name in messages; of a library's method the library.
+    kind : Kind
+        How C takes its steps.
+    stages : int
+        Of a fixed step: evaluations of the rates, by which `fmus/runtime/fixed_step.c` knows the method; else 0.
+    uses_slope : bool
+        Whether it needs the derivative of the rates by the states.
+    """
+
+    title: str
+    kind: Kind = Kind.EXPLICIT
+    stages: int = 0
+    uses_slope: bool = False
+
+
+METHODS = {
+    "euler": MethodFacts("Euler", Kind.FIXED_STEP, stages=1),
+    "heun": MethodFacts("Heun", Kind.FIXED_STEP, stages=2),
+    "rk4": MethodFacts("Runge-Kutta 4", Kind.FIXED_STEP, stages=4),
+    "RK23": MethodFacts("Bogacki-Shampine 3(2)"),
+    "RK45": MethodFacts("Dormand-Prince 5(4)"),
+    "DOP853": MethodFacts("Dormand-Prince 8(5,3)", Kind.EIGHT),
+    "Radau": MethodFacts("Radau IIA 5", Kind.RADAU, uses_slope=True),
+    "BDF": MethodFacts("SciPy", Kind.LIBRARY, uses_slope=True),
+    "LSODA": MethodFacts("SciPy", Kind.LIBRARY, uses_slope=True),
+    "CVODE_BDF": MethodFacts("SUNDIALS", Kind.LIBRARY, uses_slope=True),
+    "CVODE_Adams": MethodFacts("SUNDIALS", Kind.LIBRARY),
+}
+"""All methods, by the name that ``solver`` takes."""
+SOLVERS: tuple[str, ...] = ("auto", *METHODS)
+FIXED = tuple(name for name, facts in METHODS.items() if facts.kind is Kind.FIXED_STEP)
 
 
 def solver_name(name: str) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import OptionError, accepts, kinds
-from .base import FIXED, SUNDIALS, Integration, Problem, Solver, solver_name
+from .base import FIXED, METHODS, Integration, Problem, Solver, solver_name
 from .cvode import Cvode
 from .scipy_methods import SciPySolver
 
@@ -87,7 +87,7 @@ def make_solver(
     """
     name, tolerance = _check(name, problem.size, rtol=rtol, atol=atol, max_step=max_step)
     longest = math.inf if max_step is None else float(max_step)
-    return (Cvode if name in SUNDIALS else SciPySolver)(name, problem, rtol, tolerance, longest)
+    return (Cvode if METHODS[name].title == "SUNDIALS" else SciPySolver)(name, problem, rtol, tolerance, longest)
 
 
 class Method(Integration):
@@ -191,5 +191,5 @@ class Method(Integration):
     def named(self, name: str) -> Integration:
         """Return the method that goes on by its own name, for its errors."""
         made = Integration(name, self.problem, self.rtol, self.atol, self.max_step)
-        made.fixed, made.stiff, made.stop = self.fixed, name == "Radau", self.stop
+        made.fixed, made.stiff, made.stop = self.fixed, METHODS[name].uses_slope, self.stop
         return made

@@ -34,3 +34,11 @@ LW_INLINE int lw_rk4(LW_EQUATION *e, int64_t n, double t, double h, double to, c
     for (int64_t i = 0; i < n; i++) out[i] = x[i] + (h / 6.0) * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i]);
     return failed;
 }
+
+/* Take a step of the explicit method of fixed step that has so many stages; K has room for the rates of all but the first. */
+LW_INLINE int lw_fixed(LW_EQUATION *e, int64_t n, int stages, double t, double h, double to, const LW_NUMBER *x,
+                       const LW_NUMBER *k1, LW_NUMBER *K, LW_NUMBER *y, LW_NUMBER *out) {
+    if (stages == 1) return lw_euler(n, h, x, k1, out);
+    if (stages == 2) return lw_heun(e, n, h, to, x, k1, K, y, out);
+    return lw_rk4(e, n, t, h, to, x, k1, K, K + n, K + 2 * n, y, out);
+}

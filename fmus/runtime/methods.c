@@ -37,14 +37,8 @@ static inline void rate(problem *p, double t, const double *x, double *f) {
 static inline void apply(method *m, double t, const double *x, const double *f, double to, double *out) {
     problem *p = m->of;
     const int64_t n = m->n;
-    const double h = to - t;
-    double *k2 = m->K + n, *k3 = k2 + n, *k4 = k3 + n;
-    if (m->kind == EULER)
-        lw_euler(n, h, x, f, out);
-    else if (m->kind == RK4)
-        lw_rk4(p, n, t, h, to, x, f, k2, k3, k4, m->y, out);
-    else
-        lw_heun(p, n, h, to, x, f, k2, m->y, out);
+    const int stages = m->kind == FIXED_STEP ? (int)m->stages : 2; /* others cross a few ulps by Heun's method */
+    lw_fixed(p, n, stages, t, to - t, to, x, f, m->K + n, m->y, out);
 }
 
 /* Start at (t, m->x), up to p->stop. */
@@ -54,7 +48,7 @@ static inline void restart(method *m, double t) {
     m->prepared = 0;
     m->done = m->segment = 0;
     m->predicts = 0;
-    if (m->kind <= RK4) {
+    if (m->kind == FIXED_STEP) {
         m->count = (int64_t)ceil((p->stop - t) / m->longest * (1 - 1e-9));
         if (m->count < 1) m->count = 1;
         return;
@@ -126,7 +120,7 @@ static inline int take_step(method *m) {
     m->prepared = 0;
     if (m->step && !m->sliver)
         result = m->step(m);
-    else if (m->kind <= RK4)
+    else if (m->kind == FIXED_STEP)
         result = step_fixed(m);
     else if (m->sliver)
         result = step_sliver(m);
@@ -139,7 +133,7 @@ static inline int take_step(method *m) {
         return result;
     }
     m->steps++;
-    if (m->kind > RK4 && ++m->segment % 2000 == 0) { /* so small steps that the run would never end */
+    if (m->kind != FIXED_STEP && ++m->segment % 2000 == 0) { /* so small steps that the run would never end */
         const double h = (m->t - m->mark) / 2000.0;
         m->mark = m->t;
         if (m->of->stop - m->t > 1e7 * h) return m->of->lost = IN_PROGRESS, m->of->beyond_t = h, FAILED;
@@ -153,7 +147,7 @@ static void note_beyond(method *m) {
     int (*own)(struct method *) = m->step;
     p->beyond_t = NAN;
     if (m->kind == LIBRARY) return;
-    if (m->kind <= RK4 || m->sliver) { /* the step has been taken, to states that are not finite */
+    if (m->kind == FIXED_STEP || m->sliver) { /* the step has been taken, to states that are not finite */
         memcpy(m->x, m->x_old, (size_t)m->n * sizeof(double));
         m->t = m->t_old;
         m->done--;
@@ -173,7 +167,7 @@ static void prepare(method *m) {
     const int64_t n = m->n;
     const double h = m->t - m->t_old;
     m->prepared = 1;
-    if (m->kind <= RK4 || m->sliver || m->kind == RADAU) return;
+    if (m->kind == FIXED_STEP || m->sliver || m->kind == RADAU) return;
     if (m->kind == LIBRARY) {
         m->library(EXPAND);
         return;
@@ -214,7 +208,7 @@ static inline void interpolate(method *m, double t, double *out) {
         return;
     }
     if (!m->prepared) prepare(m);
-    if (m->kind <= RK4) {
+    if (m->kind == FIXED_STEP) {
         apply(m, m->t_old, m->x_old, m->K, t, out);
     } else if (m->sliver) {
         for (int64_t i = 0; i < n; i++) out[i] = m->x_old[i] + (t - m->t_old) * m->K[i];

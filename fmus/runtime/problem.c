@@ -25,7 +25,7 @@ typedef struct {
    the trial; everything at the instant that is reached. */
 enum { NOWHERE, IN_STEP, IN_PROGRESS, IN_SLOPE, AT_TRIAL, AT_INSTANT };
 
-enum { EULER, HEUN, RK4, EXPLICIT, EIGHT, RADAU, LIBRARY }; /* LIBRARY: one of another library's, by a callback */
+enum { FIXED_STEP, EXPLICIT, EIGHT, RADAU, LIBRARY }; /* LIBRARY: one of another library's, by a callback */
 enum { PASSED, FAILED };
 enum { BEGIN, STEP_ON, EXPAND }; /* calls of a library's method: begin and take a step, take one, write dense output */
 

@@ -29,5 +29,5 @@ for _path in sorted(EVENTS.glob("test_*.py")):
     for _name, _value in vars(_module).items():
         if _name.startswith("test_") and callable(_value):
             globals()[f"test_{_path.stem.removeprefix('test_')}_{_name.removeprefix('test_')}"] = _value
-        elif type(_value).__name__ == "FixtureFunctionDefinition":
+        elif type(_value).__name__ == "FixtureFunctionDefinition" or hasattr(_value, "_pytestfixturefunction"):
             globals()[_name] = _value
