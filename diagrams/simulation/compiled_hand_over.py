@@ -22,7 +22,7 @@ from ..compiled import (
 )
 from ..flat import NONE
 from ..results import Recorder
-from ..solvers import METHODS, Kind
+from ..solvers import METHODS
 from .algebraic_loops import newton_options
 from .compiled_plants import PlantsInC
 from .continuous import Continuous
@@ -110,8 +110,8 @@ def _tell_outside(continuous: Continuous, event: OwnEvent) -> None:
 def describe_methods(methods: Sequence[MethodOptions], solver: str) -> str:
     """Return in words which methods integrate for a solver of a name, and where."""
     facts = METHODS.get(solver)
-    if facts is not None and facts.kind is Kind.LIBRARY:
-        return f"{facts.title} takes steps of {solver}, and the rest of the run is C"
+    if facts is not None and facts.library is not None:
+        return f"{facts.library.value} takes steps of {facts.title}, and the rest of the run is C"
     names = ", and where it is stiff ".join(f"{METHODS[m.name].title} ({m.name})" for m in methods)
     return f"{names} runs in C as solver={solver!r}"
 

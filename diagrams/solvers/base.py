@@ -33,7 +33,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import Enum, IntEnum
 
 import numpy as np
 
@@ -230,6 +230,12 @@ class Kind(IntEnum):
     FIXED_STEP, EXPLICIT, EIGHT, RADAU, LIBRARY = range(5)
 
 
+class Library(Enum):
+    """Libraries whose methods are taken; the value names them in messages."""
+
+    SCIPY, SUNDIALS = "SciPy", "SUNDIALS"
+
+
 @dataclass(frozen=True)
 class MethodFacts:
     """What there is to know of a method.
@@ -237,9 +243,11 @@ class MethodFacts:
     Attributes
     ----------
     title : str
-        Its name in messages; of a library's method the library.
+        Its name in messages.
     kind : Kind
         How C takes its steps.
+    library : Library, optional
+        The library that it is one of.
     stages : int
         Of a fixed step: evaluations of the rates, by which `fmus/runtime/fixed_step.c` knows the method; else 0.
     uses_slope : bool
@@ -248,6 +256,7 @@ class MethodFacts:
 
     title: str
     kind: Kind = Kind.EXPLICIT
+    library: Library | None = None
     stages: int = 0
     uses_slope: bool = False
 
@@ -260,10 +269,10 @@ METHODS = {
     "RK45": MethodFacts("Dormand-Prince 5(4)"),
     "DOP853": MethodFacts("Dormand-Prince 8(5,3)", Kind.EIGHT),
     "Radau": MethodFacts("Radau IIA 5", Kind.RADAU, uses_slope=True),
-    "BDF": MethodFacts("SciPy", Kind.LIBRARY, uses_slope=True),
-    "LSODA": MethodFacts("SciPy", Kind.LIBRARY, uses_slope=True),
-    "CVODE_BDF": MethodFacts("SUNDIALS", Kind.LIBRARY, uses_slope=True),
-    "CVODE_Adams": MethodFacts("SUNDIALS", Kind.LIBRARY),
+    "BDF": MethodFacts("BDF", Kind.LIBRARY, Library.SCIPY, uses_slope=True),
+    "LSODA": MethodFacts("LSODA", Kind.LIBRARY, Library.SCIPY, uses_slope=True),
+    "CVODE_BDF": MethodFacts("CVODE_BDF", Kind.LIBRARY, Library.SUNDIALS, uses_slope=True),
+    "CVODE_Adams": MethodFacts("CVODE_Adams", Kind.LIBRARY, Library.SUNDIALS),
 }
 """All methods, by the name that ``solver`` takes."""
 SOLVERS: tuple[str, ...] = ("auto", *METHODS)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import OptionError, accepts, kinds
-from .base import FIXED, METHODS, Integration, Problem, Solver, solver_name
+from .base import FIXED, METHODS, Integration, Library, Problem, Solver, solver_name
 from .cvode import Cvode
 from .scipy_methods import SciPySolver
 
@@ -87,7 +87,9 @@ def make_solver(
     """
     name, tolerance = _check(name, problem.size, rtol=rtol, atol=atol, max_step=max_step)
     longest = math.inf if max_step is None else float(max_step)
-    return (Cvode if METHODS[name].title == "SUNDIALS" else SciPySolver)(name, problem, rtol, tolerance, longest)
+    return (Cvode if METHODS[name].library is Library.SUNDIALS else SciPySolver)(
+        name, problem, rtol, tolerance, longest
+    )
 
 
 class Method(Integration):
