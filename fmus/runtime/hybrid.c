@@ -43,7 +43,8 @@ static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
             if (p->delays && !has_room_for_step(p->delays)) return SUSPENDED;
             if (h->o && h->o->apart && h->o->apart->late && *steps > 1) return SUSPENDED;
             if (take_step(m) != PASSED) {
-                if (!h->automatic || m->kind == RADAU || (h->o && h->o->failed)) return break_off(h, h->t, LOST);
+                const bool other = h->automatic && m->kind != RADAU && p->lost == IN_STEP;
+                if (!other || (h->o && h->o->failed)) return break_off(h, h->t, LOST);
                 h->switched = STUCK;
                 h->begun = 0;
                 return LOOK;
