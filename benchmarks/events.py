@@ -3,10 +3,9 @@
 Everyday diagrams that switch often: a thermostat, a PWM by a comparator, a bouncing ball, a wheel that an anti-lock
 brake holds by a relay; and, if asked for (python benchmarks/events.py antilock), a car that brakes with a fast valve,
 with 12,900 events at 9,675 instants: 6,450 switches of the valve, and as often its torque reaches or leaves zero. With
-"compiled" behind it (python benchmarks/events.py antilock compiled) they run in C. Printed are the events of a run, the
-instants at which they fall, the time for one instant to be found in a step (the search; none in Python for a compiled
-run), and the whole time of the run by its instants: the search, the solver, the jumps, the record. Times are the
-processor's, the smallest of three runs; nothing else should run beside it.
+"compiled" behind it (python benchmarks/events.py antilock compiled) they run by generated code. Printed are the events
+of a run, the instants at which they fall, and the whole time of the run by its instants: the search, the solver, the
+jumps, the record. Times are the processor's, the smallest of three runs; nothing else should run beside it.
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ from loopwright.blocks import (
     TransferFunction,
 )
 from loopwright.diagrams import Diagram, Run
-from loopwright.diagrams.events import Domains
 
 
 class Ball(Block):
@@ -121,37 +119,21 @@ def count(run: Run) -> tuple[int, int]:
     return len(run.events), len({event.t for event in run.events})
 
 
-def measure(
-    diagram: Diagram, duration: float, step: float, runs: int = 3, *, form: bool = False
-) -> tuple[Run, float, float]:
-    """Return a run, and the least time in s of its searches and of all of it; in C, if asked for."""
-    spent = [0.0]
-    locate = Domains.locate
-
-    def timed(self, step):
+def measure(diagram: Diagram, duration: float, step: float, runs: int = 3, *, form: bool = False) -> tuple[Run, float]:
+    """Return a run, and the least time in s that it took; with generated code, if asked for."""
+    diagram.simulate(20 * step, step=step, progress=False, compile=form)
+    total = np.inf
+    for _ in range(runs):
         start = time.thread_time()
-        found = locate(self, step)
-        spent[0] += time.thread_time() - start
-        return found
-
-    Domains.locate = timed
-    try:
-        diagram.simulate(20 * step, step=step, progress=False, compile=form)
-        search = total = np.inf
-        for _ in range(runs):
-            spent[0], start = 0.0, time.thread_time()
-            run = diagram.simulate(duration, step=step, progress=False, compile=form)
-            total, search = min(total, time.thread_time() - start), min(search, spent[0])
-    finally:
-        Domains.locate = locate
-    return run, search, total
+        run = diagram.simulate(duration, step=step, progress=False, compile=form)
+        total = min(total, time.thread_time() - start)
+    return run, total
 
 
 if __name__ == "__main__":
-    print(f"{'diagram':12s} {'events':>7s} {'instants':>9s} {'search, ms an instant':>22s} {'all, ms an instant':>19s}")
+    print(f"{'diagram':12s} {'events':>7s} {'instants':>9s} {'ms an instant':>14s} {'s a run':>8s}")
     makes = (antilock,) if "antilock" in sys.argv else (thermostat, pwm, ball, brake)
     for make in makes:
-        run, search, total = measure(*make(), runs=1 if make is antilock else 3, form="compiled" in sys.argv)
+        run, total = measure(*make(), runs=1 if make is antilock else 3, form="compiled" in sys.argv)
         events, instants = count(run)
-        each = f"{1e3 * search / instants:22.3f} {1e3 * total / instants:19.3f}"
-        print(f"{make.__name__:12s} {events:7d} {instants:9d} {each}")
+        print(f"{make.__name__:12s} {events:7d} {instants:9d} {1e3 * total / instants:14.4f} {total:8.3f}")

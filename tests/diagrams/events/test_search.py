@@ -11,6 +11,8 @@ from loopwright.diagrams import Diagram
 from support.hybrid_blocks import Crossings, Lag
 from support.work_in_c import simulate_counted
 
+pytestmark = pytest.mark.one_tier  # they count calls
+
 
 def watch(indicator):
     """Return the events of one step of 1 s, and how often it takes an indicator, a function of the time."""

@@ -294,6 +294,7 @@ def jumps():
     return [*times, 0.2, math.nextafter(0.2, 1), 0.2 + 1e-15, 0.2 + 1e-12, 0.2 + 1e-9, *(k / 7 for k in range(2, 14))]
 
 
+@pytest.mark.one_tier
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_solver_lands_on_jumps_and_never_looks_beyond(name):
     """x' = −x and x' = 0 in turns; rounding in t + (s − t) does not carry a stage beyond s, either."""
