@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import Relay, Sine, StateSpace, TransferFunction, UnitDelay
+from loopwright.blocks import PID, Integrator, Lookup1D, Relay, Sine, StateSpace, TransferFunction, UnitDelay
 from loopwright.blocks.core import CompilerError
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.compiled import background
@@ -48,8 +48,8 @@ def exact(t):
     return np.array([expm(np.array([[0.0, 1.0], [-9.0, -0.6]]) * time)[:, 0] for time in t])
 
 
-def two_rates():
-    """Two sampled subsystems."""
+def two_rates(table=False):
+    """Two sampled subsystems, one of them with a table."""
 
     @subsystem(sample_time=0.01, name="fast")
     def fast(u):
@@ -58,7 +58,7 @@ def two_rates():
 
     @subsystem(sample_time=0.03, name="slow")
     def slow(u):
-        return 2.0 * u
+        return Lookup1D(breakpoints=[-1.0, 0.0, 2.0], values=[3.0, 0.0, -1.0], name="table")(u) if table else 2.0 * u
 
     return Diagram("d", fast(slow(Sine(frequency=0.7, name="u"))))
 
@@ -79,6 +79,37 @@ def test_a_solution_is_that_of_the_matrix_exponential_without_generated_code(sol
     assert run.tier == "interpreted"
     assert run.messages == ()
     np.testing.assert_allclose(run["x.y"], exact(run.t), rtol=0.0, atol=bound)
+
+
+@pytest.mark.parametrize("table", [False, True])
+def test_sampled_runs_are_those_of_a_loop_by_hand_and_have_the_bits_of_generated_code(table):
+    made = two_rates(table)
+    run = made.simulate(20.0, compile=False, **QUIET)
+    source, expected, held, total = np.sin(2 * np.pi * 0.7 * np.arange(2001) / 100), [], 0.0, 0.0
+    for k, u in enumerate(source):
+        if k % 3 == 0:
+            held = np.interp(u, [-1.0, 0.0, 2.0], [3.0, 0.0, -1.0]) if table else 2.0 * u
+        expected.append(total)
+        total += 0.01 * held
+    np.testing.assert_allclose(run["fast.sum.y"], expected, rtol=0.0, atol=1e-12)
+    assert made.simulate(20.0, compile=True, **QUIET).data.tobytes() == run.data.tobytes()
+
+
+def test_a_loop_of_every_day_is_simulated_between_ticks_and_at_them():
+    """A motor's speed under a PI controller, and its angle, by the matrix exponential from tick to tick."""
+    plant = TransferFunction(numerator=2.0, denominator=[0.3, 1.0], name="plant")
+    control = subsystem(sample_time=0.01, name="control")(lambda y: PID(kp=3.0, ki=2.0, name="pid")(1.0, y))
+    made = Diagram("d", Integrator(name="angle")(plant(control(plant.y))))
+    run = made.simulate(2.0, rtol=1e-9, atol=1e-12, compile=False, **QUIET)
+    whole = expm(0.01 * np.array([[-1 / 0.3, 0.0, 2 / 0.3], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    x, integral, expected = np.zeros(2), 0.0, []
+    for _ in range(201):
+        expected.append(x)
+        error = 1.0 - x[0]
+        x = whole[:2, :2] @ x + whole[:2, 2] * (3.0 * error + integral)
+        integral += 0.01 * 2.0 * error
+    found = np.stack([run["plant.y"], run["angle.y"]], axis=1)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-7)
 
 
 @pytest.mark.parametrize("solver", ["rk4", "RK45", "DOP853", "Radau"])
