@@ -32,7 +32,6 @@ from support.work_in_c import simulate_counted
 
 FIXED = {"euler": 1, "heun": 2, "rk4": 4}
 VARIABLE = [name for name in SOLVERS if name not in FIXED]
-LIBRARY = ["BDF", "LSODA", "CVODE_BDF", "CVODE_Adams"]
 STIFF = ["auto", "Radau", "BDF", "LSODA", "CVODE_BDF"]
 ONE_STEP = {"RK23": 3, "RK45": 4, "DOP853": 7, "Radau": 3}  # order of the dense output
 QUIET = {"progress": False}
