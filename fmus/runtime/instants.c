@@ -112,7 +112,8 @@ static inline bool end_events(hybrid *h, double t) {
 static inline bool has_room(const hybrid *h, const progress *g) { return h->l.skip || g->out->rows < g->s->room; }
 
 
-/* Look for signs that stability bounds an explicit method's steps, or that it would no longer; see AutoSolver. */
+/* Look for signs that stability bounds an explicit method's steps, or that it would no longer; Python decides
+   (diagrams/solvers/choose.py). */
 static void look_for_stiffness(hybrid *h, const method *m) {
     const int64_t n = m->n, last = m->stages - 1;
     const double width = m->t - m->t_old;
