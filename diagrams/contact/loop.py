@@ -40,6 +40,8 @@ SLOW, SLOW_RATE = 1e-3, 1.0
 """Distance of |z| from 1, and rate in 1/s, within which a stable mode is looked at."""
 _RANK = 1e-9
 """Part of a direction, relative to the directions found before, below which it is none of its own."""
+_SAFETY = 10.0
+"""Factor on the rounding of a matrix, for the routines that it goes through."""
 
 
 class Joined(NamedTuple):
@@ -183,11 +185,14 @@ class Modes:
         ``left @ A @ right`` is the matrix of the modes that the environment can move.
     fixed : ndarray
         Poles of the others, s or z.
+    growing : ndarray of bool
+        Which of the others grow by more than rounding. A drift doesn't.
     """
 
     left: np.ndarray
     right: np.ndarray
     fixed: np.ndarray
+    growing: np.ndarray
 
     def reduce(self, A: np.ndarray) -> np.ndarray:
         """Return the matrix of the modes that the environment can move."""
@@ -243,13 +248,14 @@ def split_modes(parts: ContactParts, direction: np.ndarray, loop: ClosedLoop, us
     shifted = A - np.eye(size) if T else A
     balanced, scale = matrix_balance(shifted, permute=False, separate=True)
     scale = scale[0]
-    V, fixed = _split_fixed(balanced, pushes / scale[:, None], bool(T))
-    W, more = _split_fixed((V.T @ balanced @ V).T, (felt * scale @ V).T, bool(T))
-    return Modes(W.T @ V.T / scale, scale[:, None] * (V @ W), np.concatenate([fixed, more]) + (1.0 if T else 0.0))
+    V, fixed, growing = _split_fixed(balanced, pushes / scale[:, None], bool(T))
+    W, more, grow = _split_fixed((V.T @ balanced @ V).T, (felt * scale @ V).T, bool(T))
+    poles = np.concatenate([fixed, more]) + (1.0 if T else 0.0)
+    return Modes(W.T @ V.T / scale, scale[:, None] * (V @ W), poles, np.concatenate([growing, grow]))
 
 
-def _split_fixed(A: np.ndarray, B: np.ndarray, sampled: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return a basis of what is left without the slow and unstable modes that B doesn't reach, and their poles.
+def _split_fixed(A: np.ndarray, B: np.ndarray, sampled: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a basis of what is left without the slow and unstable modes that B doesn't reach, their poles, which grow.
 
     The basis spans a subspace that A, and A + B F for every F, leads into itself. Its modes are those of (A, B); A is
     z − 1 in a sampled loop.
@@ -262,24 +268,46 @@ def _split_fixed(A: np.ndarray, B: np.ndarray, sampled: bool) -> tuple[np.ndarra
     _, right, count = schur(A, sort=is_slow)
     _, left, again = schur(A.T, sort=is_slow)
     if not count or again != count:
-        return np.eye(len(A)), np.zeros(0)
+        return np.eye(len(A)), np.zeros(0), np.zeros(0, dtype=bool)
     right, left = right[:, :count], left[:, :count]
     dual = np.linalg.solve(left.T @ right, left.T)  # dual @ right is the unit matrix
     inner = dual @ A @ right
-    rest = _not_reached(inner, dual @ B, np.linalg.norm(B, axis=0), float(np.linalg.norm(A, 2)))
+    size = float(np.linalg.norm(A, 2))
+    rest, least = _not_reached(inner, dual @ B, np.linalg.norm(B, axis=0), size)
     if not rest.shape[1]:
-        return np.eye(len(A)), np.zeros(0)
+        return np.eye(len(A)), np.zeros(0), np.zeros(0, dtype=bool)
     whole, _ = np.linalg.qr(dual.T @ rest, mode="complete")
-    return whole[:, rest.shape[1] :], np.linalg.eigvals(rest.T @ inner @ rest)
+    own = rest.T @ inner @ rest
+    poles = np.linalg.eigvals(own)
+    # Schur's form is exact for a matrix n ε |A| away, z − 1 has the rounding of z; the projection on the slow modes
+    # enlarges that by |dual|, and the subspace that B reaches is known to it over its least singular value (Wedin).
+    unit = _SAFETY * len(A) * float(np.finfo(float).eps)
+    rounding = unit * (size + float(sampled)) * float(np.linalg.norm(dual, 2)) / least
+    return whole[:, rest.shape[1] :], poles, np.array([_grows(own, p, rounding, sampled) for p in poles], dtype=bool)
 
 
-def _not_reached(A: np.ndarray, B: np.ndarray, lengths: np.ndarray, size: float) -> np.ndarray:
-    """Return an orthonormal basis beside the subspace that B reaches through A.
+def _grows(A: np.ndarray, pole: complex, rounding: float, sampled: bool) -> bool:
+    """Whether a pole is unstable for more than the rounding of its matrix, which is that of z − 1 in a sampled loop.
+
+    A pole that rounding has moved from the border has all its way there within the pseudospectrum of that rounding:
+    |A − s|⁻¹ is large at every s between, whether the pole stood alone or several in one place. Halfway is looked at,
+    since a drift stands on the border where another pole's way may end.
+    """
+    place = complex(pole) + float(sampled)
+    if (abs(place) <= 1.0) if sampled else (place.real <= 0.0):
+        return False
+    border = place / abs(place) if sampled else 1j * place.imag
+    halfway = 0.5 * (place + border) - float(sampled)
+    return bool(np.linalg.svd(A - halfway * np.eye(len(A)), compute_uv=False)[-1] > rounding)
+
+
+def _not_reached(A: np.ndarray, B: np.ndarray, lengths: np.ndarray, size: float) -> tuple[np.ndarray, float]:
+    """Return an orthonormal basis beside the subspace that B reaches through A, and the least part told as reached.
 
     ``lengths`` are the sizes of the columns of B, ``size`` that of A, against which rounding is told.
     """
     n = len(A)
-    V, new, reference = np.zeros((n, 0)), B, lengths
+    V, new, reference, least = np.zeros((n, 0)), B, lengths, 1.0
     while new.shape[1] and V.shape[1] < n:
         rest = new / np.where(reference > 0.0, reference, 1.0)
         for _ in range(2):  # twice, against rounding
@@ -287,9 +315,10 @@ def _not_reached(A: np.ndarray, B: np.ndarray, lengths: np.ndarray, size: float)
         U, s, _ = np.linalg.svd(rest, full_matrices=False)
         found = U[:, s > _RANK]
         V = np.hstack([V, found])
+        least = min(least, float(s[s > _RANK].min(initial=1.0)))
         new, reference = A @ found, np.full(found.shape[1], size)
     whole, _ = np.linalg.qr(V, mode="complete")
-    return whole[:, V.shape[1] :]
+    return whole[:, V.shape[1] :], least
 
 
 SAMPLES = 16

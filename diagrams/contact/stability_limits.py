@@ -413,18 +413,13 @@ class CoupledLoop:
     def find_fixed_growth(self) -> tuple[float, float, tuple[float, ...]] | None:
         """Return σ, frequency and direction of an unstable mode that no such environment moves, or None.
 
-        A pure drift is no instability. Its poles, of which several at one place scatter by rounding, are marginal.
+        A pure drift is no instability, see `Modes`.
         """
-        fixed, sampled = self.modes.fixed, bool(self.parts.sample_time)
-        near_rest = np.abs(fixed - (1.0 if sampled else 0.0)) < (1e-3 if sampled else 1.0)
-        loop = self.close(np.float64(0.0))
-        known = not sampled and bool(np.all(np.isfinite(loop.A)))
-        size = max(1.0, float(np.max(np.abs(np.linalg.eigvals(loop.A)), initial=0.0))) if known else 1.0
-        scatter = 3.0 * 1e-16 ** (1.0 / max(1, int(np.count_nonzero(near_rest)))) * size
-        excess = np.abs(fixed) - 1.0 if sampled else fixed.real
-        if not np.any(excess > scatter):
+        fixed = self.modes.fixed[self.modes.growing]
+        if not len(fixed):
             return None
-        pole = fixed[int(np.argmax(excess))]
+        pole = fixed[int(np.argmax(np.abs(fixed) if self.parts.sample_time else fixed.real))]
+        loop = self.close(np.float64(0.0))
         rate = to_rates(self.parts, np.array([pole]))[0]
         found, vectors = np.linalg.eig(loop.A)
         state = vectors[:, int(np.argmin(np.abs(found - pole)))]

@@ -64,6 +64,14 @@ def test_another_tool_is_that_of_the_contacts_sensor_alone():
     assert found.below.measured < 0.0 < found.above.measured
 
 
+@pytest.mark.parametrize("seed", [7, 14])
+def test_a_drift_across_grows_by_no_rounding(seed, disturbance):
+    with disturbance.on(seed):  # the pole of the position across, 0, came out as 4e-14: the limit was 0
+        limit = diagram().contact("plate.push", force="felt", **PORTS).stability_limit("tool_mass", stiffness=3e4)
+    expected = (second(0.0) - LAG * M * (1.0 + SHARE) * 3e4 / (DRAG + LAG * 3e4)) / -SHARE
+    assert limit.value == pytest.approx(expected, rel=1e-9)
+
+
 def test_a_force_that_two_sensors_feel_acts_on_both():
     here = diagram(other_feels=True, share=2.0).contact("plate.push", force="felt", **PORTS)
     assert here.entry == "hand.y"
