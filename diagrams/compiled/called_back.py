@@ -10,28 +10,43 @@ from ...blocks.interrupts import INTERRUPTS
 
 
 class CalledBack:
-    """Functions of Python that C calls; an error of one, or an interrupt, waits until C has returned.
-
-    Attributes
-    ----------
-    error : BaseException or None
-        The first error since the last `check`.
-    """
+    """Functions of Python that C calls; an error of one, or an interrupt, waits until C has returned."""
 
     def __init__(self) -> None:
-        self.error: BaseException | None = None
+        self._error: BaseException | None = None
         self._kept: list[Any] = []
 
-    def function(self, kind: Any, call: Callable[..., int | None], failed: int = 0) -> int:
-        """Return the address of a function for C, which lives as long as this; ``failed`` is its result at an error."""
+    def function(
+        self,
+        kind: Any,
+        call: Callable[..., int | None],
+        failed: int = 0,
+        *,
+        interrupted: Callable[..., None] | None = None,
+    ) -> int:
+        """Return the address of a function for C, which lives as long as this.
+
+        Parameters
+        ----------
+        kind : ctypes function type
+            Its arguments and its result.
+        call : callable
+            The function; None stands for 0.
+        failed : int, default 0
+            Its result where an error waits.
+        interrupted : callable, optional
+            Called in its place, with its arguments, where an interrupt has come before.
+        """
 
         def guarded(*arguments: Any) -> int:
             try:
                 INTERRUPTS.heard = True
+                if interrupted is not None and INTERRUPTS.came:
+                    interrupted(*arguments)
                 INTERRUPTS.check()
                 return call(*arguments) or 0
             except BaseException as error:
-                self.error = self.error or error
+                self._error = self._error or error
                 return failed
             finally:
                 INTERRUPTS.heard = False
@@ -41,9 +56,14 @@ class CalledBack:
         assert address is not None
         return address
 
+    def take_error(self) -> BaseException | None:
+        """Return the first error that waits, and forget it; None without any."""
+        error, self._error = self._error, None
+        return error
+
     def check(self) -> None:
         """Raise the error that waits."""
-        error, self.error = self.error, None
+        error = self.take_error()
         if error is not None:
             raise error
 

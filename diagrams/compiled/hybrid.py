@@ -13,7 +13,7 @@ import numpy as np
 from ..events import Domains
 from ..flat import NONE, FlatDiagram, StepTable, TickPattern
 from ..solvers import METHODS, Kind
-from .called_back import CALL, CalledBack
+from .called_back import CALL
 from .delays import NativeDelays, PastInputs
 from .differences import Differences
 from .functions import at
@@ -280,8 +280,7 @@ class CompiledHybrid:
         hybrid.before, hybrid.p.beyond = self._own(np.zeros(width)), self._own(np.zeros(n))
         self._beyond: np.ndarray = self._kept[-1]
         self._trial, self._where = trial, where
-        self._called = CalledBack()
-        hybrid.drain = self._called.function(CALL, drain)
+        hybrid.drain = loop.called.function(CALL, drain)
         hybrid.coupled = coupled
         hybrid.outputs = flat.log.total
         self.watch: Watch | None = None
@@ -555,7 +554,6 @@ class CompiledHybrid:
             run(ctypes.byref(self._hybrid), ctypes.byref(given), ctypes.c_void_p(at(rows)), ctypes.byref(found))
         if self._delays is not None:
             self._delays.take_back()
-        self._called.check()
         return HybridOutcome(
             found.ticks, found.rows, HybridReason(found.reason), found.plant, found.stage, found.status, self._hybrid.t
         )

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...blocks.interrupts import INTERRUPTS
 from ..solvers import METHODS, AcceptedStep, Problem, Solver, make_solver
+from .called_back import CalledBack
 from .hybrid_structures import MethodStructure, ProblemStructure
 from .runtime import load_runtime
 
@@ -87,16 +87,16 @@ class LibraryMethod:
             function.restype = result
             function.argtypes = (ctypes.c_void_p, ctypes.c_double, *[ctypes.c_void_p] * 2)
         self._at = ctypes.addressof(problem), self._trial.ctypes.data, self._rates.ctypes.data, self._slopes.ctypes.data
-        self._answer_for_c = _Library(self._answer)
-        method.library = ctypes.cast(self._answer_for_c, ctypes.c_void_p).value
-        self._error: BaseException | None = None
+        self._called = CalledBack()
+        method.library = self._called.function(_Library, self._answer, _FAILED)
         self._beyond: tuple[float, np.ndarray] | None = None
         self._step: AcceptedStep | None = None
         self._solver = self._make_solver()
 
     def begin_anew(self) -> None:
         """Forget the run before."""
-        self._error = self._beyond = self._step = None
+        self._beyond = self._step = None
+        self._called.take_error()
         self._solver = self._make_solver()
 
     def set_absolute_tolerance(self, atol: np.ndarray) -> None:
@@ -107,7 +107,7 @@ class LibraryMethod:
 
     def take_failure(self) -> Failure | None:
         """Return why the last step could not be taken; None if it could."""
-        error, self._error = self._error, None
+        error = self._called.take_error()
         return None if error is None else Failure(error, self._beyond, self._problem.edge, self._problem.left)
 
     def _make_solver(self) -> Solver:
@@ -117,20 +117,12 @@ class LibraryMethod:
     # --- calls of C --------------------------------------------------------------------------------------------------
 
     def _answer(self, wanted: int) -> int:
-        """Take a step, or write the last one's dense output; an error waits until C has returned."""
-        try:
-            INTERRUPTS.heard = True
-            INTERRUPTS.check()
-            if wanted == _EXPAND:
-                self._expand()
-            else:
-                self._take_step(begins=wanted == _BEGIN)
-            return _PASSED
-        except BaseException as error:
-            self._error = error
-            return _FAILED
-        finally:
-            INTERRUPTS.heard = False
+        """Take a step, or write the last one's dense output."""
+        if wanted == _EXPAND:
+            self._expand()
+        else:
+            self._take_step(begins=wanted == _BEGIN)
+        return _PASSED
 
     def _take_step(self, *, begins: bool) -> None:
         method, solver = self._method, self._solver

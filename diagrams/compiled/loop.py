@@ -356,6 +356,10 @@ class CompiledLoop:
         """Return for each FMU whether C has begun a step in another process whose end Python has to see to."""
         return [far is not None and self._remote.has_begun(far) for far in self._far]
 
+    def check(self) -> None:
+        """Raise the error of a function that C has called; to be asked once what a call has recorded is taken."""
+        self.called.check()
+
     def check_steps(self) -> None:
         """Raise the error of a step that Python has taken for the loop."""
         if self._remote.by_python is not None:
@@ -449,7 +453,6 @@ class CompiledLoop:
                 at(rows),
                 ctypes.addressof(self._outcome),
             )
-        self.called.check()
         found = self._outcome
         return Outcome(found.ticks, found.rows, Reason(found.reason), found.plant, found.stage, found.status)
 

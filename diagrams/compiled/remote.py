@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import numpy as np
 
 from ...blocks.core import LoopwrightError
-from ...blocks.interrupts import INTERRUPTS
 from ...fmus.calls import ERROR, BoundCalls, ChildFace, ChildRequest, QuietStep, RemoteStep, SharedValues
+from .called_back import CalledBack
 from .functions import at
 from .runtime import load_runtime
 
@@ -122,15 +122,13 @@ class RemotePlants:
         self._kept += [quiet, watched, sloped, made]
         return ctypes.addressof(made)
 
-    def add_python(self, place: int, step: PythonStep, far: int | None) -> Any:
-        """Let Python take the steps of a plant, and return the function for C; ``far`` is its structure, or None."""
+    def add_python(self, place: int, step: PythonStep, far: int | None) -> int:
+        """Let Python take the steps of a plant, and return the address for C; ``far`` is its structure, or None."""
         if self.by_python is None:
             self.by_python = PythonSteps()
-            self._kept.append(STEP(self.by_python.take))
-            self._step = self._kept[-1]
         found = next(((p, r) for p, r in self._all if ctypes.addressof(r) == far), None)
         self.by_python.add(place, step, found)
-        return ctypes.cast(self._step, ctypes.c_void_p)
+        return self.by_python.step
 
     def has_begun(self, structure: int | None) -> bool:
         """Whether C has asked a process for a step whose end Python has to see to."""
@@ -153,17 +151,9 @@ class RemotePlants:
         self._all.append((asked.process, made))
         return made
 
-    @contextmanager
-    def lent(self, structure: RemoteStructure | None) -> Iterator[None]:
-        """Let Python ask a process while C waits: requests are numbered on."""
-        found = next((both for both in self._all if both[1] is structure), None)
-        if found is not None:
-            found[0].number = found[1].number
-        try:
-            yield
-        finally:
-            if found is not None:
-                found[1].number = found[0].number
+    def lent(self, structure: RemoteStructure | None) -> AbstractContextManager[None]:
+        """Let Python ask a process while C waits."""
+        return _lend(next((both for both in self._all if both[1] is structure), None))
 
     def note_status(self, structure: RemoteStructure | None, status: int) -> None:
         """Note the status of a call that has failed: no other instance is made in a process after an error."""
@@ -212,97 +202,80 @@ class RemotePlants:
             process.number, process.arrived = structure.number, structure.state == _ARRIVED
 
 
-class PythonSteps:
+@contextmanager
+def _lend(far: tuple[ChildFace, RemoteStructure] | None) -> Iterator[None]:
+    """Let Python make the requests to a process meanwhile: it numbers them on."""
+    if far is None:
+        yield
+        return
+    process, structure = far
+    process.number = structure.number
+    try:
+        yield
+    finally:
+        structure.number = process.number
+
+
+_STEP = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, ctypes.c_double, ctypes.c_double)
+
+
+class PythonSteps(CalledBack):
     """Steps of plants that Python takes at the request of C.
 
     Attributes
     ----------
-    error : BaseException or None
-        Why the last one has failed: an error of the plant, or an interrupt.
+    step : int
+        Address of the function by which C asks for one; it returns 1 if C can't go on from there.
     """
 
     def __init__(self) -> None:
-        self.error: BaseException | None = None
+        super().__init__()
         self._steps: dict[int, tuple[PythonStep, tuple[ChildFace, RemoteStructure] | None]] = {}
+        self.step = self.function(_STEP, self._take, 1)
 
     def add(self, place: int, step: PythonStep, far: tuple[ChildFace, RemoteStructure] | None) -> None:
         """Take the steps of a plant, and the requests to its process that are C's in other steps."""
         self._steps[place] = step, far
 
-    def take(self, place: int, t: float, h: float) -> int:
-        """Take a step from t over h, both in s; return 1 if C can't go on from there."""
-        try:
-            step, far = self._steps[place]
-            INTERRUPTS.heard = True
-            INTERRUPTS.check()
-            if far is not None:
-                far[0].number = far[1].number
-            try:
-                ends = step(t, h)
-            finally:
-                if far is not None:
-                    far[1].number = far[0].number
-        except BaseException as error:  # C has to return first
-            self.error = error
-            return 1
-        finally:
-            INTERRUPTS.heard = False
-        return int(ends)
-
-    def check(self) -> None:
-        """Raise the error of a step that has failed."""
-        error, self.error = self.error, None
-        if error is not None:
-            raise error
+    def _take(self, place: int, t: float, h: float) -> int:
+        step, far = self._steps[place]
+        with _lend(far):
+            return int(step(t, h))
 
 
-STEP = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, ctypes.c_double, ctypes.c_double)
-"""Kind of the function by which C asks for `PythonSteps.take`."""
+_WAIT = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64)
 
 
-class LateReplies:
+class LateReplies(CalledBack):
     """Python's wait for replies that C has not seen in time: the process is slow, or hangs, or has ended.
 
     Attributes
     ----------
-    error : BaseException or None
-        Why a reply has not come: the error of the process, or an interrupt.
+    wait : int
+        Address of the function by which C asks for a reply; it returns 0 if it never comes.
     """
 
     def __init__(self) -> None:
-        self.error: BaseException | None = None
+        super().__init__()
         self._asked: dict[int, tuple[RemoteStructure, dict[int, BoundCalls]]] = {}
+        self.wait = self.function(_WAIT, self._wait, interrupted=self._give_up)
 
     def add(self, place: int, structure: RemoteStructure, sequence: int, calls: BoundCalls) -> None:
         """Take calls that C will ask for."""
         self._asked.setdefault(place, (structure, {}))[1][sequence] = calls
 
-    def check(self) -> None:
-        """Raise the error of a reply that has not come."""
-        error, self.error = self.error, None
-        if error is not None:
-            raise error
-
-    def wait(self, place: int) -> int:
-        """Wait for the reply of an FMU; return 0 if it never comes."""
-        try:
-            structure, asked = self._asked[place]
-            calls = asked[structure.sequence]
-            assert calls.request is not None
-            process = calls.request.process
-            process.number = structure.number
-            INTERRUPTS.heard = True
-            if INTERRUPTS.came:  # before the wait, which gives the process up at an interrupt
-                process.give_up()
-            INTERRUPTS.check()
-            calls.finish()
-        except BaseException as error:  # C has to return first
-            self.error = error
-            return 0
-        finally:
-            INTERRUPTS.heard = False
+    def _wait(self, place: int) -> int:
+        calls, process = self._find(place)
+        process.number = self._asked[place][0].number
+        calls.finish()
         return 1
 
+    def _give_up(self, place: int) -> None:
+        """End a process at an interrupt before the wait; one within the wait ends it there."""
+        self._find(place)[1].give_up()
 
-WAIT = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64)
-"""Kind of the function by which C asks for `LateReplies.wait`."""
+    def _find(self, place: int) -> tuple[BoundCalls, ChildFace]:
+        structure, asked = self._asked[place]
+        calls = asked[structure.sequence]
+        assert calls.request is not None
+        return calls, calls.request.process

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -18,7 +18,7 @@ from .called_back import CALL, CalledBack
 from .differences import color_columns
 from .functions import TickStructure, address_of, at, list_vectors
 from .loop import NewtonStructure
-from .remote import WAIT, LateReplies, RemotePlants
+from .remote import LateReplies, RemotePlants
 from .staged_functions import Staged, StagedEquations, StagedSlopes
 
 _LOGGED = 2**20  # bytes of events in a call
@@ -74,7 +74,7 @@ class _Outside(ctypes.Structure):
         ("log", _AT),
         *_fields(_INT, "logged capacity warned"),
         ("apart", _AT),
-        ("wait", WAIT),
+        ("wait", ctypes.c_void_p),
     ]
 
 
@@ -186,7 +186,7 @@ class NativeExchange:
             log=at(self._log),
             capacity=len(self._log),
             apart=ctypes.addressof(self.remote.structure),
-            wait=WAIT(self._late.wait),
+            wait=self._late.wait,
         )
         for i, (path, block) in enumerate(blocks.items()):
             e = self._each[i]
@@ -359,11 +359,9 @@ class NativeExchange:
         """Whether a look is one at the end of a step, and no event acts."""
         return bool(self.structure.look == _TO_STEP)
 
-    @contextmanager
-    def lent(self, path: str) -> Iterator[None]:
+    def lent(self, path: str) -> AbstractContextManager[None]:
         """Let Python ask a block's process while C waits."""
-        with self.remote.lent(self._far.get(path)):
-            yield
+        return self.remote.lent(self._far.get(path))
 
     def state_of(self, path: str) -> Any:
         """Return what C knows of a block: ``next_time``, ``asks``, ``ended``, ``in_event``, ``end`` and so on."""

@@ -260,6 +260,7 @@ class HybridTicks:
         SimulationError
             If the run can't go on.
         """
+        loop.ticks.check()
         self._tell()
         failure = loop.take_failure()
         if failure is not None and found.reason is not HybridReason.OUTSIDE_FAILED:
@@ -319,7 +320,10 @@ class HybridTicks:
         """Evaluate a tick for C at which clocks act together too seldom for code of its own."""
         assert self._loop is not None
         acting = self._flat.acting(round(float(self._workspace.here.t[0]) / self._flat.base))
-        self._workspace.evaluate(acting)
+        try:
+            self._workspace.evaluate(acting)
+        except SimulationError:  # told where the loop breaks off
+            return 1
         self._loop.note_taken(self._flat.taken_at(acting))
         return 0
 

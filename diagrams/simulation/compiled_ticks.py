@@ -187,6 +187,7 @@ class CompiledTicks:
             steps = None if table is None else table.part(at, stop)
             found = loop.run(window.times[at : stop + 1], window.widths[at:stop], window.kinds[at:stop], rows, steps)
             recorder.took(found.rows, loop.skip)
+            loop.check()
             at += found.ticks
             if found.ticks:
                 k = int(window.ticks[at - 1])

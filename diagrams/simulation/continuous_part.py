@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -25,13 +25,6 @@ class _Saved:
     events: int
 
 
-class Between(Protocol):
-    """Takes the blocks in continuous time from one instant to another; see `HybridTicks`."""
-
-    def go_between(self, t: float, end: float) -> float | None:
-        """Go from t to an instant, both in s, before any tick there; return where a stop condition ends the run."""
-
-
 class ContinuousPart:
     """The blocks in continuous time between two ticks: advanced, saved and restored; see `Rest`.
 
@@ -48,14 +41,14 @@ class ContinuousPart:
 
     Attributes
     ----------
-    loop : Between or None
-        The loop that takes them from one instant to another; None where nothing happens between ticks.
+    go_between : callable or None
+        Takes them from one instant to another, as `HybridTicks.go_between`; None where nothing happens between ticks.
     """
 
     def __init__(self, workspace: Workspace, continuous: Continuous | None, exchanged: ExchangedBlocks):
         self._workspace, self._continuous, self._exchanged = workspace, continuous, exchanged
         self._events: list[Occurrence] = []
-        self.loop: Between | None = None
+        self.go_between: Callable[[float, float], float | None] | None = None
         if continuous is not None:
             self._tell = continuous.on_event
             continuous.on_event = self._events.append
@@ -64,11 +57,11 @@ class ContinuousPart:
         """Go from t to the end, both in s; return the time at which a stop condition has ended the run."""
         if self._continuous is None:
             return None
-        assert self.loop is not None
+        assert self.go_between is not None
         self._workspace.here.t[0] = t
         if self._continuous.delays is not None:
             self._continuous.delays.note_edge(t)  # the outputs of the plants have jumped
-        return self.loop.go_between(t, end)
+        return self.go_between(t, end)
 
     def save(self) -> _Saved:
         """Return the present state."""

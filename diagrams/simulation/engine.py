@@ -208,7 +208,7 @@ class Engine:
         else:
             found, message = make_hybrid(self.workspace, self.continuous, plants, stops, **options)
             if self._part is not None:
-                self._part.loop = found
+                self._part.go_between = None if found is None else found.go_between
         self.messages += message
         self._compiled, self._generated = found, found is not None and not machine
 
@@ -247,8 +247,8 @@ class Engine:
             workspace.here.t[0] = now
             workspace.tick(acting)
             recorder.row(now, workspace.log)
-        if (acting or self.plants) and continuous is not None and continuous.delays is not None:
-            continuous.delays.note_edge(now)  # held signals have jumped
+            if (acting or self.plants) and continuous is not None and continuous.delays is not None:
+                continuous.delays.note_edge(now)  # held signals have jumped
         self.steps.begin(first)
         self._arrive(first)
 

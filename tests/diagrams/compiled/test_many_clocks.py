@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, Integrator, UnitDelay
+from loopwright.blocks import Constant, Integrator, PythonFunction, Ramp, SimulationError, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.flat import ClockSets, TickPattern, clock_sets
 from loopwright.diagrams.simulation.compiled_hybrid import HybridTicks
@@ -100,3 +100,38 @@ def test_sets_of_more_than_64_clocks_have_their_numbers():
     assert (found >= 0).sum() >= len(sets)
     listed = clock_sets._sets_of(tuple(clocks))
     assert len(set(listed)) == len(listed) == clock_sets._MOST_SETS
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+@pytest.mark.parametrize("continuous", [False, True])
+def test_what_was_recorded_before_an_error_at_such_a_set_is_kept(monkeypatch, continuous, error):
+    """The clocks of 2, 3, 5 and 7 ms act together at 210 ms, for which there is no code; samples end before."""
+    monkeypatch.setattr(clock_sets, "_MOST_SETS", 3)
+    clock_sets._sets_of.cache_clear()
+
+    raised = []
+
+    def fails(u):
+        if u > 0.205 and (error is ValueError or not raised):  # an interrupt comes once
+            raised.append(u)
+            raise error("enough")
+        return u
+
+    time = Ramp(slope=1.0, name="ramp")
+
+    @subsystem(sample_time=0.07, name="slow")
+    def slow(u):
+        called = PythonFunction(fails, arguments={"u": ()}, results={"y": ()}, name="python")
+        return UnitDelay(initial_value=0.0, name="late")(called(u))
+
+    one = Constant(value=1.0, name="one")
+    others = [Integrator(name="time")(one)] if continuous else []
+    made = Diagram("clocks", *(counter(period, one) for period in (2, 3, 5, 7)), slow(time), *others)
+    expected_error = KeyboardInterrupt if error is KeyboardInterrupt else SimulationError
+    with pytest.raises(expected_error, match="enough|interrupted at t = 0.209 s") as caught:
+        made.simulate(0.4, step=1e-3, solver="rk4" if continuous else "auto", **QUIET)
+    clock_sets._sets_of.cache_clear()
+    run = caught.value.run
+    assert run.t[-1] == pytest.approx(0.209, abs=1e-9)
+    for period in (2, 3, 5, 7):
+        assert np.array_equal(run[f"every{period}.n.y"], expected(period, 209))

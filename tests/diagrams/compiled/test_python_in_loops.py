@@ -19,6 +19,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.flat import flat_diagram
+from loopwright.diagrams.simulation.algebraic_loops import LoopSolver
 from loopwright.diagrams.simulation.compiled_hybrid import HybridTicks
 from loopwright.diagrams.simulation.compiled_ticks import CompiledTicks
 from loopwright.fmus import Fmu, mass_spring_damper
@@ -112,6 +113,42 @@ def test_an_error_within_a_loop_names_the_block(form, large, monkeypatch):
     assert (
         0.15 < caught.value.run.t[-1] < 0.21
     )  # 2 sin(6π t) / 3 is below −0.3 from 0.191 s on; slopes are looked at beside it
+
+
+class Steep(Block):
+    """y = 3 sin u."""
+
+    u = Input()
+    y = Output()
+
+    def output(self, t, x, u):
+        return 3.0 * np.sin(u.u)
+
+
+@pytest.mark.parametrize("continuous", [False, True])
+def test_an_interrupt_where_python_solves_a_loop_keeps_what_was_recorded(monkeypatch, continuous):
+    """y = u − 3 sin y has folds, beyond which Newton's method in C fails and Python's is asked: there Ctrl-C comes."""
+    solve, came = LoopSolver.solve, []
+
+    def interrupted(self, **more):
+        if self.t[0] > 0.05 and not came:
+            came.append(float(self.t[0]))
+            raise KeyboardInterrupt
+        solve(self, **more)
+
+    monkeypatch.setattr(LoopSolver, "solve", interrupted)
+
+    @subsystem(sample_time=0.01, name="box")
+    def box(u):
+        total = Sum(signs="+-", name="total")
+        return UnitDelay(initial_value=0.0, name="late")(total(u, Steep(name="steep")(total.y)))
+
+    out = box(Sine(frequency=1.0, amplitude=8.0, name="source"))
+    lag = TransferFunction(numerator=1.0, denominator=[1.0, 1.0], name="lag")
+    made = Diagram("d", lag(out) if continuous else out, loops="solve")
+    with pytest.raises(KeyboardInterrupt, match="interrupted at t = ") as caught:
+        made.simulate(20.0, step=0.01, **QUIET)
+    assert came[0] - 0.0101 < caught.value.run.t[-1] <= came[0] + 1e-9
 
 
 @pytest.mark.parametrize("form", ["auto", True])

@@ -491,8 +491,8 @@ int fmi2DoStep(void *p, double t, double h, int f) { ((instance *)p)->t = t; ret
 def test_added_times_cost_no_requests_of_their_own(cache, tmp_path, monkeypatch, isolate, compiled):
     """In another process a step is one request: nothing else is done but with plain times."""
     asked = []
-    original = PythonSteps.take
-    monkeypatch.setattr(PythonSteps, "take", lambda self, *step: asked.append(step) or original(self, *step))
+    original = PythonSteps._take
+    monkeypatch.setattr(PythonSteps, "_take", lambda self, *step: asked.append(step) or original(self, *step))
     requests = []
     ask = ChildProcess.request
     monkeypatch.setattr(ChildProcess, "request", lambda self, *a, **k: requests.append(a) or ask(self, *a, **k))
