@@ -208,6 +208,15 @@ def test_no_file_has_the_name_of_what_its_package_hands_out_of_it():
     assert not hidden
 
 
+def test_a_name_of_a_class_means_one_thing():
+    found = {}
+    for source in SOURCES:
+        for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                found.setdefault(node.name, []).append(str(source.relative_to(ROOT)))
+    assert not {name: files for name, files in found.items() if len(files) > 1}
+
+
 def test_tests_share_nothing_but_what_stands_in_support():
     """Older pytests know no package `tests`, and no neighbours of a test's file."""
     wrong = [

@@ -25,8 +25,8 @@ from .hybrid_code import (
 )
 from .kernels import Kernel
 from .libraries import load_compiled
-from .library_method import Failure
-from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
+from .library_method import StepFailure
+from .loop import CompiledLoop, NewtonOptions, Outcome, ReturnReason
 from .native_tick import bind_call
 from .remote import REFUSED, TOLD, UNDER_WAY, PythonStep, compile_other_side
 from .sources import Code
@@ -43,7 +43,6 @@ __all__ = [
     "Code",
     "CompiledHybrid",
     "CompiledLoop",
-    "Failure",
     "Fired",
     "FusedPlant",
     "HandedOver",
@@ -59,9 +58,10 @@ __all__ = [
     "OwnEvent",
     "Pile",
     "PythonStep",
-    "Reason",
+    "ReturnReason",
     "Sign",
     "Span",
+    "StepFailure",
     "TickCode",
     "bind_call",
     "compile_fused",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..flat import Operation, PartProgram
-from .functions import Bound, TickStructure, at, list_vectors
+from .functions import BoundFunction, TickStructure, at, list_vectors
 from .grouped_functions import GroupedPart
 
 _AT, _INT = ctypes.c_void_p, ctypes.c_int64
@@ -55,7 +55,7 @@ class Columns:
 
 
 @dataclass(frozen=True, eq=False)
-class Differences:
+class RateDifferences:
     """The derivative of the rates by the integrated states, by differences.
 
     Attributes
@@ -82,7 +82,9 @@ class Differences:
         """Row and column of each entry."""
         return self.columns.pattern
 
-    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], typical: np.ndarray) -> Bound:
+    def bind(
+        self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], typical: np.ndarray
+    ) -> BoundFunction:
         """Return it bound to vectors; ``typical`` are sizes of the states below which steps don't become smaller."""
         of, n = self.columns, len(self.columns.where)
         dx, before, step, where = np.zeros(n), np.zeros(n), np.zeros(n), of.where.astype(np.int64)
@@ -110,7 +112,7 @@ class Differences:
         )
         lists = list_vectors(arguments, 4), list_vectors(results, 1)
         structure = TickStructure(self.address, *map(ctypes.addressof, (*lists, group)), None)
-        return Bound(structure, arguments, results, [self, bound, group, lists, dx, before, step, where, sizes])
+        return BoundFunction(structure, arguments, results, [self, bound, group, lists, dx, before, step, where, sizes])
 
 
 def find_columns(part: PartProgram, continuous: np.ndarray) -> Columns:

@@ -15,7 +15,12 @@ import numpy as np
 from ...blocks.core import CompilerError
 from ...blocks.interrupts import INTERRUPTS
 from ..flat import bind_function
-from .machine import Program, make_program
+from .machine import MachineProgram, make_program
+
+CALL = ctypes.CFUNCTYPE(ctypes.c_int)
+"""Kind of a function without arguments whose result is an integer."""
+TICK = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4, ctypes.c_int)
+"""Kind of the function of a tick."""
 
 
 class TickStructure(ctypes.Structure):
@@ -25,7 +30,7 @@ class TickStructure(ctypes.Structure):
 
 
 @dataclass(frozen=True)
-class Bound:
+class BoundFunction:
     """A function bound to vectors: it as C knows it, and whatever must live as long as that."""
 
     structure: TickStructure
@@ -62,27 +67,29 @@ class CompiledFunction:
         rows, columns = self.function.sparsity_out(0).get_triplet()
         return np.array(rows, dtype=np.int64), np.array(columns, dtype=np.int64)
 
-    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Bound:
+    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> BoundFunction:
         """Return it bound to vectors, for one call at a time."""
         f = self.function
         return self._bind(arguments, results, np.zeros(f.sz_iw() + 1, dtype=np.int64), np.zeros(f.sz_w() + 1))
 
-    def _bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], iw: Any, w: np.ndarray) -> Bound:
+    def _bind(
+        self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], iw: Any, w: np.ndarray
+    ) -> BoundFunction:
         given = list_vectors(arguments, self.function.sz_arg())
         made = list_vectors(results, self.function.sz_res())
         first = at(iw) if isinstance(iw, np.ndarray) else ctypes.addressof(iw)
         structure = TickStructure(self.address, ctypes.addressof(given), ctypes.addressof(made), first, at(w))
-        return Bound(structure, arguments, results, [given, made, iw, w])
+        return BoundFunction(structure, arguments, results, [given, made, iw, w])
 
 
 @dataclass(frozen=True, eq=False)
 class MachineFunction(CompiledFunction):
     """A CasADi function as a program of the virtual machine, whose C function stands at the address."""
 
-    program: Program
-    _bound: list[tuple[Any, Bound]] = field(default_factory=list)
+    program: MachineProgram
+    _bound: list[tuple[Any, BoundFunction]] = field(default_factory=list)
 
-    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Bound:
+    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> BoundFunction:
         """Return it bound to vectors, for one call at a time."""
         program, values = self.program.bind()
         self._bound.append((program, self._bind(arguments, results, program, values)))
@@ -105,7 +112,7 @@ _Call = ctypes.CFUNCTYPE(ctypes.c_int, _Vectors, _Vectors, ctypes.c_void_p, ctyp
 class CalledFunction(CompiledFunction):
     """A CasADi function that C has Python evaluate: one of matrices, such as a table."""
 
-    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Bound:
+    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> BoundFunction:
         """Return it bound to vectors, for one call at a time."""
         f = self.function
         taken, made = (
@@ -132,7 +139,7 @@ class CalledFunction(CompiledFunction):
         structure = TickStructure(
             ctypes.cast(function, ctypes.c_void_p).value, *map(ctypes.addressof, lists), None, None
         )
-        return Bound(structure, arguments, results, [taken, made, bound, function, lists], failures)
+        return BoundFunction(structure, arguments, results, [taken, made, bound, function, lists], failures)
 
 
 def call_for_c(call: Callable[[], None]) -> None:
@@ -192,7 +199,7 @@ class Machine(CodeOfFunctions):
         raise CompilerError(f"{name} needs generated code.")
 
 
-_PROGRAMS: WeakKeyDictionary[Any, Program | None] = WeakKeyDictionary()
+_PROGRAMS: WeakKeyDictionary[Any, MachineProgram | None] = WeakKeyDictionary()
 
 
 @lru_cache(maxsize=4)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..flat import bind_function
-from .functions import Bound, TickStructure, at, call_for_c, list_vectors
+from .functions import BoundFunction, TickStructure, at, call_for_c, list_vectors
 from .grouping import BlockCalls, PartTables, PythonCall, TickTables
 from .kernels import Kernels
 from .machine import BlockProgramStructure
@@ -20,7 +20,7 @@ _AT, _INT = ctypes.c_void_p, ctypes.c_int64
 _Python = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, ctypes.c_int64)
 
 
-class _Calls(ctypes.Structure):
+class _GroupInC(ctypes.Structure):
     _fields_ = [
         *((name, _AT) for name in ("runs", "rows")),
         ("count", _INT),
@@ -31,7 +31,7 @@ class _Calls(ctypes.Structure):
 
 class _Tick(ctypes.Structure):
     _fields_ = [
-        ("calls", _Calls),
+        ("calls", _GroupInC),
         *((name, _INT) for name in ("states", "outside", "log", "next")),
         *((name, _AT) for name in ("inputs", "guards", "made", "taken")),
         *((name, _INT) for name in ("n_inputs", "n_guards", "n_loops", "residual")),
@@ -40,9 +40,9 @@ class _Tick(ctypes.Structure):
     ]
 
 
-class _Part(ctypes.Structure):
+class _PartInC(ctypes.Structure):
     _fields_ = [
-        ("calls", _Calls),
+        ("calls", _GroupInC),
         *((name, _INT) for name in ("states", "outside", "more")),
         ("where", _AT),
         ("lengths", _INT * 2),
@@ -66,21 +66,21 @@ class GroupedFunction(ABC):
     tables: TickTables | PartTables
     kernels: Kernels
     address: int
-    _bound: list[tuple[Any, np.ndarray, Bound]] = field(default_factory=list, kw_only=True)
+    _bound: list[tuple[Any, np.ndarray, BoundFunction]] = field(default_factory=list, kw_only=True)
 
     @property
     def calls_python(self) -> bool:
         """Whether Python evaluates some of the blocks."""
         return len(self.tables.calls.python) > 0
 
-    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Bound:
+    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> BoundFunction:
         """Return it bound to vectors, for one call at a time."""
         v, kept, failures = self.tables.memory.copy(), list[Any](), list[Exception]()
         structure = self._structure(arguments)
         structure.calls = _bind_calls(self.tables.calls, self.kernels, v, arguments[3], kept, failures)
         lists = list_vectors(arguments, 5), list_vectors(results, 4)
         evaluate = TickStructure(self.address, *map(ctypes.addressof, (*lists, structure)), at(v))
-        bound = Bound(evaluate, arguments, results, [self, v, structure, lists, kept], failures)
+        bound = BoundFunction(evaluate, arguments, results, [self, v, structure, lists, kept], failures)
         self._bound.append((structure, v, bound))
         return bound
 
@@ -141,7 +141,7 @@ class GroupedPart(GroupedFunction):
         return np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32)
 
     def _structure(self, arguments: Sequence[np.ndarray]) -> Any:
-        return _Part(
+        return _PartInC(
             states=arguments[1].size,
             outside=arguments[2].size,
             more=arguments[4].size if len(arguments) > 4 else 0,
@@ -152,13 +152,13 @@ class GroupedPart(GroupedFunction):
 
 def _bind_calls(
     calls: BlockCalls, kernels: Kernels, v: np.ndarray, p: np.ndarray, kept: list[Any], failures: list[Exception]
-) -> _Calls:
+) -> _GroupInC:
     """Return the calls of blocks as C knows them; what must live as long is added to ``kept``."""
     programs = [program.bind() for program in kernels.programs]
     array = (BlockProgramStructure * len(programs))(*(structure for structure, _ in programs))
     python = _Python(_python_calls([_bind_python(call, kernels.of_python, v, p) for call in calls.python], failures))
     kept += [calls, kernels, programs, array, python]
-    return _Calls(
+    return _GroupInC(
         runs=at(calls.runs),
         rows=at(calls.rows),
         count=len(calls.runs),

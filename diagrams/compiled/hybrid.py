@@ -12,14 +12,13 @@ import numpy as np
 
 from ..events import Domains
 from ..flat import NONE, FlatDiagram, StepTable, TickPattern
-from ..solvers import METHODS, Kind
-from .called_back import CALL
+from ..solvers import METHODS, MethodKind
 from .delays import NativeDelays, PastInputs
-from .differences import Differences
-from .functions import at
+from .differences import RateDifferences
+from .functions import CALL, at
 from .hybrid_code import Between, HybridCode
 from .hybrid_structures import HybridStructure, MethodStructure, ProblemStructure, SpanStructure
-from .library_method import Failure, LibraryMethod
+from .library_method import LibraryMethod, StepFailure
 from .loop import CompiledLoop, NewtonOptions, NewtonStructure, OutcomeStructure
 from .radau import radau_numbers
 from .runtime import load_runtime
@@ -33,7 +32,7 @@ _UNKNOWN = 20  # steps of the first call beside FMUs that may take any time
 
 
 class HybridReason(IntEnum):
-    """Reasons for which the loop returns: those of `Reason`, and more."""
+    """Reasons for which the loop returns: those of `ReturnReason`, and more."""
 
     DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED, SUSPENDED, ENDED, LOOK, OUTSIDE_FAILED = range(10)
     PILED_UP, BROKEN_OFF = range(10, 12)
@@ -271,7 +270,7 @@ class CompiledHybrid:
         self._libraries = {
             i: LibraryMethod(one.name, one.rtol, one.atol, one.longest, flat.continuous_labels, hybrid.p, method)
             for i, (one, method) in enumerate(zip(methods, self.methods, strict=True))
-            if METHODS[one.name].kind is Kind.LIBRARY
+            if METHODS[one.name].kind is MethodKind.LIBRARY
         }
         if self._libraries:
             loop.calls_python = True
@@ -346,7 +345,7 @@ class CompiledHybrid:
             assert typical is not None
             return self._exchange.bind_slopes(function, arguments, results, typical, self._solver)
         assert not isinstance(function, Staged | StagedSlopes)
-        if isinstance(function, Differences):
+        if isinstance(function, RateDifferences):
             assert typical is not None
             bound = function.bind(arguments, results, typical)
         else:
@@ -455,7 +454,7 @@ class CompiledHybrid:
         elif spent < 0.5 * _SECONDS:
             self._hybrid.budget = min(2 * self._hybrid.budget, self._largest_budget)
 
-    def take_failure(self) -> Failure | None:
+    def take_failure(self) -> StepFailure | None:
         """Return why a method of another library could not take the last step; None if nothing failed."""
         return next((failure for one in self._libraries.values() if (failure := one.take_failure())), None)
 
@@ -562,6 +561,6 @@ class CompiledHybrid:
 def _budget(flow: int, methods: Sequence[MethodOptions], n: int) -> int:
     """Return the steps of a call: an operation takes about 1 ns, and so does one of the factors of a Jacobian."""
     step = 100 + 15 * flow + (4 * n**3 if any(METHODS[m.name].uses_slope for m in methods) else 0)
-    if any(METHODS[m.name].kind is Kind.LIBRARY for m in methods):
+    if any(METHODS[m.name].kind is MethodKind.LIBRARY for m in methods):
         step += _LIBRARY_STEP
     return max(10, int(_SECONDS * 1e9 / step))

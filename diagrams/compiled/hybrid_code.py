@@ -21,7 +21,7 @@ from .code import (
     loop_functions,
     write_loops,
 )
-from .differences import Columns, Differences, find_columns
+from .differences import Columns, RateDifferences, find_columns
 from .functions import CodeOfFunctions, CompiledFunction, GeneratedCode, MachineFunction, address_of
 from .generated_text import write_functions
 from .grouped_functions import GroupedFunction, GroupedPart
@@ -36,7 +36,7 @@ from .step_outputs import may_fail_at_steps
 FUSING = ("-finline-functions", "-freciprocal-math", "-fno-tree-vectorize", "-fno-tree-slp-vectorize")
 """Flags of fused code: a parameter's inverse is computed once; vectors of few values cost more than they save."""
 
-Between = CompiledFunction | GroupedPart | Differences | Staged | StagedSlopes
+Between = CompiledFunction | GroupedPart | RateDifferences | Staged | StagedSlopes
 """A function between ticks that was compiled."""
 
 
@@ -80,7 +80,7 @@ def _hand_over(function: Any, to: Any) -> None:
                 _hand_over(one, other)
         case StagedEquations():
             _hand_over(function.mismatch, to.mismatch)
-        case StagedSlopes() | Differences():
+        case StagedSlopes() | RateDifferences():
             pass  # its rates are those between ticks
 
 
@@ -271,7 +271,7 @@ def _write_grouped(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *
         between: dict[str, Between] = {**found}
         if stiff:
             address = address_of(runtime, "loopwright_grouped_differences")
-            between["slope"] = Differences(found["flow"], columns(), address)
+            between["slope"] = RateDifferences(found["flow"], columns(), address)
         exact = blocks.exact or kernels.generated is None
         return HybridCode(TickCode(ticks.find(kernels), exact, libraries[0].library), between)
 

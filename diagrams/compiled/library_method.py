@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...blocks.called_back import CalledBack
 from ..solvers import METHODS, AcceptedStep, Problem, Solver, make_solver
-from .called_back import CalledBack
 from .hybrid_structures import MethodStructure, ProblemStructure
 from .runtime import load_runtime
 
@@ -21,7 +21,7 @@ _Library = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int32)
 
 
 @dataclass(frozen=True)
-class Failure:
+class StepFailure:
     """A step that a library could not take.
 
     Attributes
@@ -105,10 +105,10 @@ class LibraryMethod:
             self._atol = atol.copy()
             self._solver.set_absolute_tolerance(self._atol)
 
-    def take_failure(self) -> Failure | None:
+    def take_failure(self) -> StepFailure | None:
         """Return why the last step could not be taken; None if it could."""
         error = self._called.take_error()
-        return None if error is None else Failure(error, self._beyond, self._problem.edge, self._problem.left)
+        return None if error is None else StepFailure(error, self._beyond, self._problem.edge, self._problem.left)
 
     def _make_solver(self) -> Solver:
         longest = self._longest if np.isfinite(self._longest) else None

@@ -12,14 +12,14 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from ...blocks.called_back import CalledBack
 from ...blocks.core import SimulationError
 from ...blocks.interrupts import INTERRUPTS
 from ...fmus.calls import NEAR, FmuInstance, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
 from ..flat import TRUE, StepTable, TickPattern
-from .called_back import CALL, TICK, CalledBack
 from .code import CompiledTick, TickCode
-from .functions import TickStructure, at
+from .functions import CALL, TICK, TickStructure, at
 from .grouped_functions import GroupedTick
 from .remote import PythonStep, RemotePlants
 from .runtime import load_runtime
@@ -28,7 +28,7 @@ from .staged_functions import Staged, StagedEquations
 _SEEN = 1e-6  # least singular value, relative to 1 + the loop's gain, that differences surely tell from 0
 
 
-class Reason(IntEnum):
+class ReturnReason(IntEnum):
     """Reasons for which the loop returns: the end of its ticks, or the first tick that Python must look at."""
 
     DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED = range(6)
@@ -133,7 +133,7 @@ class Outcome(NamedTuple):
     ----------
     ticks, rows : int
         Ticks that were gone through, and samples that were written.
-    reason : Reason
+    reason : ReturnReason
         The reason.
     plant : int
         The FMU that it is about, by its place.
@@ -145,7 +145,7 @@ class Outcome(NamedTuple):
 
     ticks: int
     rows: int
-    reason: Reason
+    reason: ReturnReason
     plant: int
     stage: int
     status: int
@@ -454,7 +454,7 @@ class CompiledLoop:
                 ctypes.addressof(self._outcome),
             )
         found = self._outcome
-        return Outcome(found.ticks, found.rows, Reason(found.reason), found.plant, found.stage, found.status)
+        return Outcome(found.ticks, found.rows, ReturnReason(found.reason), found.plant, found.stage, found.status)
 
 
 def _take_step(plant: FmuInstance, t: float, h: float) -> bool:

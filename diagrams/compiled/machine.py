@@ -31,7 +31,7 @@ class BlockProgramStructure(ctypes.Structure):
 
 
 @dataclass(frozen=True, eq=False)
-class Program:
+class MachineProgram:
     """A function as a list of runs; see `machine.c`.
 
     Attributes
@@ -59,7 +59,7 @@ class BlockProgram:
 
     Attributes
     ----------
-    program : Program
+    program : MachineProgram
         The program; each value has ``width`` places.
     width : int
         Blocks at a time.
@@ -69,7 +69,7 @@ class BlockProgram:
         Number of arguments; the last one is the parameters.
     """
 
-    program: Program
+    program: MachineProgram
     width: int
     columns: np.ndarray
     arguments: int
@@ -89,7 +89,7 @@ class BlockProgram:
         return structure, values
 
 
-def make_program(function: Any, names: Sequence[str], width: int = 1) -> Program | None:
+def make_program(function: Any, names: Sequence[str], width: int = 1) -> MachineProgram | None:
     """Return a CasADi function of scalar operations as a program; None if it has one that the machine doesn't have.
 
     Every operation writes to a place that nothing else is written to. So operations may be done in any order in which
@@ -138,7 +138,7 @@ def make_program(function: Any, names: Sequence[str], width: int = 1) -> Program
         for i in members:
             first, *others = rows[i][1]
             code_of += [width * first, *(others if transfers else [width * place for place in others])]
-    return Program(len(runs), np.array(code_of, dtype=np.int32), np.repeat(start or [0.0], width))
+    return MachineProgram(len(runs), np.array(code_of, dtype=np.int32), np.repeat(start or [0.0], width))
 
 
 def _sort(

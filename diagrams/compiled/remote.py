@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from ...blocks.called_back import CalledBack
 from ...blocks.core import LoopwrightError
 from ...fmus.calls import ERROR, BoundCalls, ChildFace, ChildRequest, QuietStep, RemoteStep, SharedValues
-from .called_back import CalledBack
 from .functions import at
 from .runtime import load_runtime
 

@@ -9,14 +9,14 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from ...blocks.called_back import CalledBack
 from ...blocks.core import EvaluationVectors, Wanted
 from ...fmus.calls import BoundCalls, NativeAction, NativeLook
 from ...fmus.host_state import HostState
 from ..exchange import OWN_EVENTS
 from ..flat import JUMP, OpaqueStage
-from .called_back import CALL, CalledBack
 from .differences import color_columns
-from .functions import TickStructure, address_of, at, list_vectors
+from .functions import CALL, TickStructure, address_of, at, list_vectors
 from .loop import NewtonStructure
 from .remote import LateReplies, RemotePlants
 from .staged_functions import Staged, StagedEquations, StagedSlopes
@@ -42,7 +42,7 @@ class _Action(ctypes.Structure):
     ]
 
 
-class _Sequence(ctypes.Structure):
+class _ActionsInC(ctypes.Structure):
     _fields_ = [("count", _INT), ("actions", _AT)]
 
 
@@ -50,7 +50,7 @@ class _Exchanged(ctypes.Structure):
     _fields_ = [
         ("of", _AT),
         *_fields(_INT, "place states inputs events first"),
-        *_fields(_Sequence, "complete enter update leave"),
+        *_fields(_ActionsInC, "complete enter update leave"),
         *_fields(_AT, "again terminate nominals defined wants ends time"),
         *_fields(_INT, "width again_where"),
         *_fields(_AT, "u least relative low high discrete"),
@@ -83,7 +83,7 @@ class _Stage(ctypes.Structure):
         ("f", TickStructure),
         ("fmu", _AT),
         ("looks", _INT),
-        ("calls", _Sequence),
+        ("calls", _ActionsInC),
         ("by_python", _AT),
         *_fields(_AT, "t x u into"),
         ("made", _INT),
@@ -94,7 +94,7 @@ class _Schedule(ctypes.Structure):
     _fields_ = [("count", _INT), ("stages", _AT)]
 
 
-class _Slopes(ctypes.Structure):
+class _SlopesInC(ctypes.Structure):
     _fields_ = [
         *_fields(_AT, "rates loops x dx before step values typical"),
         *_fields(_INT, "n colors"),
@@ -249,7 +249,7 @@ class NativeExchange:
         rates = self.bind(slopes.rates, arguments, [dx])
         columns, first = color_columns(slopes.rows)
         ends = np.cumsum([0, *map(len, slopes.rows)])
-        found = _Slopes(
+        found = _SlopesInC(
             rates=ctypes.addressof(rates),
             loops=None if loops is None else ctypes.addressof(loops),
             values=self._own(np.zeros(0 if loops is None else loops.n)),
@@ -308,7 +308,7 @@ class NativeExchange:
         )
         fmu.discrete = self._own(look.discrete.astype(np.uint8))
 
-    def _sequence(self, path: str, actions: Sequence[NativeAction]) -> _Sequence:
+    def _sequence(self, path: str, actions: Sequence[NativeAction]) -> _ActionsInC:
         made = (_Action * len(actions))()
         for structure, action in zip(made, actions, strict=True):
             structure.kind, structure.function, structure.type = action.kind, action.function, action.type
@@ -325,7 +325,7 @@ class NativeExchange:
             self._names[ctypes.addressof(structure)] = action.names
         self._kept.append(made)
         self._actions.append((path, made, [*actions]))
-        return _Sequence(len(made), ctypes.addressof(made) if actions else None)
+        return _ActionsInC(len(made), ctypes.addressof(made) if actions else None)
 
     def _add_request(self, path: str, calls: BoundCalls) -> None:
         """Let C ask a process for calls."""

@@ -49,7 +49,7 @@ _AS_ONE = (ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT)
 
 
 @dataclass
-class _Traced:
+class _Computed:
     """The values that a function computes, by their place among all that are `known`."""
 
     suspects: set[int] = field(default_factory=set)
@@ -86,9 +86,9 @@ def may_fail_at_steps(flat: FlatDiagram) -> bool:
     return bool(suspects and suspects - _trace(flow, moves, known).carried())
 
 
-def _trace(function: Any, moves: Callable[[int, int], bool], known: dict[Any, int]) -> _Traced:
+def _trace(function: Any, moves: Callable[[int, int], bool], known: dict[Any, int]) -> _Computed:
     """Follow the operations of a function; equal ones of several functions get the same place in ``known``."""
-    made, slots = _Traced(), dict[int, tuple[int, bool, float | None]]()
+    made, slots = _Computed(), dict[int, tuple[int, bool, float | None]]()
     for k in range(function.n_instructions()):
         op, given, into = function.instruction_id(k), function.instruction_input(k), function.instruction_output(k)
         if op == ca.OP_OUTPUT:

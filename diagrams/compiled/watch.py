@@ -11,7 +11,7 @@ import numpy as np
 
 from ..events import Domains
 from ..flat import FlatDiagram
-from .differences import Differences
+from .differences import RateDifferences
 from .functions import TickStructure, at
 from .hybrid_code import Between
 from .staged import NativeExchange
@@ -164,7 +164,7 @@ class Watch:
     def _bind(
         self, name: str, function: Between, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
     ) -> None:
-        assert not isinstance(function, Differences | Staged | StagedSlopes)
+        assert not isinstance(function, RateDifferences | Staged | StagedSlopes)
         bound = function.bind(arguments, results)
         self._kept.append(bound)
         setattr(self.structure, name, bound.structure)

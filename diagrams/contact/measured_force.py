@@ -26,7 +26,7 @@ import numpy as np
 from ...blocks import ForceSensor
 from ...blocks.core import OptionError
 from ..linearization import Linearization, PlantEquations, Tap, find_signal, linearize
-from .ports import Ports, Source
+from .ports import DrivingPort, Ports
 
 if TYPE_CHECKING:
     from ..flat import FlatDiagram, WiredDiagram
@@ -42,7 +42,7 @@ def find_entry(
     point: OperatingPoint,
     ports: Ports,
     signal: Tap,
-    wires: Mapping[str, Source],
+    wires: Mapping[str, DrivingPort],
     opened: Sequence[str],
     options: Mapping[str, Any],
 ) -> Tap:

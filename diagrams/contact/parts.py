@@ -41,7 +41,7 @@ from ..linearization import (
     moves_between_ticks,
 )
 from .measured_force import Tool, find_entry, find_tool
-from .ports import Ports, Source, check_command, check_unit, force_wire_error
+from .ports import DrivingPort, Ports, check_command, check_unit, force_wire_error
 
 if TYPE_CHECKING:
     from ..flat import FlatDiagram, WiredDiagram
@@ -288,10 +288,10 @@ def take_apart(
     return parts, any(isinstance(f, UnusualStart) for f in model.findings)
 
 
-def _find_sources(flat: FlatDiagram, path: str) -> dict[str, Source]:
+def _find_sources(flat: FlatDiagram, path: str) -> dict[str, DrivingPort]:
     """Return the sources of a plant's inputs, by input; wires go through the delays of subsystems."""
     found = {
-        port: Source(wire.block, wire.port, wire.index)
+        port: DrivingPort(wire.block, wire.port, wire.index)
         for port in flat.table.blocks[path].inputs
         if (wire := flat.table.wires.get((path, port))) is not None
     }
@@ -341,7 +341,7 @@ def _cut_controller(
     matrices: FourMatrices,
     states: Sequence[str],
     path: str,
-    wires: Mapping[str, Source],
+    wires: Mapping[str, DrivingPort],
     flat: FlatDiagram,
     signal: Tap | None,
 ) -> StateMatrices:

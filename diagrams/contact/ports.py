@@ -86,7 +86,7 @@ class Ports:
         return cls(plant, port, *found)
 
 
-class Source(NamedTuple):
+class DrivingPort(NamedTuple):
     """Output port, or a part of it, that an input of the plant is wired to."""
 
     block: str
@@ -106,7 +106,7 @@ def check_unit(diagram: WiredDiagram, path: str, ports: Ports, signal: Tap) -> N
         )
 
 
-def check_command(flat: FlatDiagram, ports: Ports, signal: Tap, wires: Mapping[str, Source]) -> None:
+def check_command(flat: FlatDiagram, ports: Ports, signal: Tap, wires: Mapping[str, DrivingPort]) -> None:
     """Refuse a measured force that is a command of the plant: it drives another of its inputs."""
     for port, source in wires.items():
         if port == ports.force:

@@ -51,7 +51,7 @@ def trace_schedule(
 
 
 @dataclass
-class _Cut:
+class _StageCut:
     """Where a block is evaluated from outside, and what was made between that and the cut before.
 
     Attributes
@@ -80,7 +80,7 @@ class _Cuts:
     """Cuts an evaluation with symbols: called for each block that is evaluated from outside."""
 
     def __init__(self) -> None:
-        self.made: list[_Cut] = []
+        self.made: list[_StageCut] = []
 
     def __call__(
         self, instant: Instant, path: str, names: tuple[str, ...], states: Any, inputs: Sequence[Any]
@@ -100,7 +100,7 @@ class _Cuts:
         columns = [ca.MX(ca.DM(u)) if not isinstance(u, ca.MX) else u for u in inputs]
         instant.replace_columns(carry)
         self.made.append(
-            _Cut(
+            _StageCut(
                 path,
                 names,
                 states,
@@ -122,7 +122,7 @@ def _varies(instant: Instant, path: str, names: tuple[str, ...]) -> bool:
 
 
 def _in_stages(
-    name: str, names: tuple[str, ...], symbols: tuple[Any, ...], results: Mapping[str, Any], cuts: Sequence[_Cut]
+    name: str, names: tuple[str, ...], symbols: tuple[Any, ...], results: Mapping[str, Any], cuts: Sequence[_StageCut]
 ) -> Schedule:
     """Return the schedule of an evaluation that was cut: all that is carried gets its place in one vector c."""
     places: list[tuple[Any, slice]] = []
@@ -163,7 +163,7 @@ def _in_stages(
     return Schedule(name, names, tuple(results), tuple(stages), width)
 
 
-def _join_again(results: Mapping[str, Any], cuts: Sequence[_Cut]) -> dict[str, Any]:
+def _join_again(results: Mapping[str, Any], cuts: Sequence[_StageCut]) -> dict[str, Any]:
     """Return the results with whatever was carried over cuts that nothing needs; so do later cuts."""
     expressions = [*results.values()]
     for i, cut in reversed([*enumerate(cuts)]):
@@ -183,7 +183,7 @@ def _join_again(results: Mapping[str, Any], cuts: Sequence[_Cut]) -> dict[str, A
     return dict(zip(results, expressions, strict=True))
 
 
-def _drop_unused(results: Iterable[Any], cuts: Sequence[_Cut]) -> None:
+def _drop_unused(results: Iterable[Any], cuts: Sequence[_StageCut]) -> None:
     """Leave out what no later stage needs of what was made before a cut, and evaluations that nothing needs."""
     needed = _symbols_of(results)
     for cut in reversed(cuts):

@@ -24,7 +24,7 @@ _RESTS = 1e-9
 
 
 @dataclass
-class Step:
+class LinearStep:
     """A communication step about its operating point: derivatives of states, inputs and outputs, with their values.
 
     Attributes
@@ -82,7 +82,7 @@ class CoupledChain:
 
     def go(
         self,
-        step: Step,
+        step: LinearStep,
         model: Callable[[str, np.ndarray], PlantModel],
         flow_by_w: np.ndarray,
     ) -> dict[str, PlantModel]:
@@ -90,7 +90,7 @@ class CoupledChain:
 
         Parameters
         ----------
-        step : Step
+        step : LinearStep
             The step. Its ``x`` and ``z`` come with held outputs, its ``p`` are the FMUs' states before it.
         model : callable
             Returns the model of an FMU's step from its path and all inputs.
@@ -99,7 +99,7 @@ class CoupledChain:
         """
         return self._go_in_order(step, model) if self.order else self._iterate(step, model, flow_by_w)
 
-    def _go_in_order(self, step: Step, model: Callable[[str, np.ndarray], PlantModel]) -> dict[str, PlantModel]:
+    def _go_in_order(self, step: LinearStep, model: Callable[[str, np.ndarray], PlantModel]) -> dict[str, PlantModel]:
         """Step the FMUs one after the other; an input follows the outputs of those that have stepped already."""
         w, z, made = step.w_here.copy(), step.z_here.copy(), dict[str, PlantModel]()
         renewed = self.links.renewed_inputs(self.order)
@@ -121,7 +121,7 @@ class CoupledChain:
         return made
 
     def _iterate(
-        self, step: Step, model: Callable[[str, np.ndarray], PlantModel], flow_by_w: np.ndarray
+        self, step: LinearStep, model: Callable[[str, np.ndarray], PlantModel], flow_by_w: np.ndarray
     ) -> dict[str, PlantModel]:
         """Solve for the outputs at the end of the step, of which the inputs and the flow take the mean."""
         links, n_d = self.links, self.local.n_inputs
@@ -170,7 +170,7 @@ class CoupledChain:
                 port="coupling",
             )
 
-    def _check_rest(self, step: Step, made: dict[str, PlantModel], z_end: np.ndarray) -> None:
+    def _check_rest(self, step: LinearStep, made: dict[str, PlantModel], z_end: np.ndarray) -> None:
         """Refuse a point at which something moves: an iteration is linearized where it has nothing to do."""
         moved = {path: [m.f - m.x0, m.y_next - step.w_here[m.outputs]] for path, m in made.items()}
         where = {path: np.arange(len(z_end))[self.links.inputs[path]] for path in made}

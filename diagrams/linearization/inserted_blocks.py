@@ -28,7 +28,7 @@ from .block_slopes import slopes_of
 from .derivatives import find_signal
 from .findings import BlockFinding, CutFromTracking, InertConsumer
 from .kinks import read_arguments, read_log
-from .signal_paths import Node, SignalPaths
+from .signal_paths import PathNode, SignalPaths
 
 Port = tuple[str, str]
 
@@ -211,21 +211,21 @@ def find_cut_findings(
     on_loop = {
         (n.block, n.port)
         for n in after
-        if not n.is_output and any(Node(n.block, p, True) in before for p in flat.table.blocks[n.block].outputs)
+        if not n.is_output and any(PathNode(n.block, p, True) in before for p in flat.table.blocks[n.block].outputs)
     }
     told = {(f.block, f.source) for f in carried if isinstance(f, BlockFinding)}
     return (*_find_tracking(flat, ways, cut, on_loop, before), *_find_inert(flat, at, cut, on_loop - told))
 
 
 def _find_tracking(
-    flat: FlatDiagram, ways: SignalPaths, cut: Sequence[Port], on_loop: set[Port], before: set[Node]
+    flat: FlatDiagram, ways: SignalPaths, cut: Sequence[Port], on_loop: set[Port], before: set[PathNode]
 ) -> tuple[Finding, ...]:
     table, found = flat.table, list[Finding]()
     for path, port in sorted(on_loop):
         tracked = table.blocks[path].inputs[port].tracks
-        if tracked is None or Node(path, tracked, True) not in before:
+        if tracked is None or PathNode(path, tracked, True) not in before:
             continue
-        if Node(path, port, False) in ways.follow((path, tracked)):
+        if PathNode(path, port, False) in ways.follow((path, tracked)):
             continue  # it follows its output with the cut as well
         source = table.wires[path, port]
         others = [

@@ -12,7 +12,7 @@ from .block_slopes import slopes_of
 from .findings import BlockFinding, EventWithinPeriod, InexactDerivatives
 
 
-class Node(NamedTuple):
+class PathNode(NamedTuple):
     """An input or an output of a block."""
 
     block: str
@@ -38,49 +38,49 @@ class SignalPaths:
         self.flat, self.cut = flat, frozenset(cut)
 
     @cached_property
-    def _wires(self) -> dict[Node, set[Node]]:
+    def _wires(self) -> dict[PathNode, set[PathNode]]:
         """From outputs to the inputs of their consumers, and to what a subsystem's control acts on; none is cut."""
         table = self.flat.table
-        edges: dict[Node, set[Node]] = {}
+        edges: dict[PathNode, set[PathNode]] = {}
         for (block, port), wire in table.wires.items():
-            edges.setdefault(Node(wire.block, wire.port, True), set()).add(Node(block, port, False))
+            edges.setdefault(PathNode(wire.block, wire.port, True), set()).add(PathNode(block, port, False))
         for subsystem, wire in table.controls.items():
             inside = (p for p, s in table.subsystem_of.items() if f"{s}.".startswith(f"{subsystem}."))
-            edges.setdefault(Node(wire.block, wire.port, True), set()).update(
-                Node(path, port, True) for path in inside for port in table.blocks[path].outputs
+            edges.setdefault(PathNode(wire.block, wire.port, True), set()).update(
+                PathNode(path, port, True) for path in inside for port in table.blocks[path].outputs
             )
         return edges
 
     @cached_property
-    def _forward(self) -> dict[Node, set[Node]]:
+    def _forward(self) -> dict[PathNode, set[PathNode]]:
         traced = self.flat.checked.traced
         edges = {node: set(to) for node, to in self._wires.items() if (node.block, node.port) not in self.cut}
         for path, block in self.flat.table.blocks.items():
             for source in block.inputs:
                 for port in block.outputs:
                     if path not in traced or slopes_of(traced[path]).follows(port, source):
-                        edges.setdefault(Node(path, source, False), set()).add(Node(path, port, True))
+                        edges.setdefault(PathNode(path, source, False), set()).add(PathNode(path, port, True))
         return edges
 
     @cached_property
-    def _backward(self) -> dict[Node, set[Node]]:
-        found: dict[Node, set[Node]] = {}
+    def _backward(self) -> dict[PathNode, set[PathNode]]:
+        found: dict[PathNode, set[PathNode]] = {}
         for node, following in self._forward.items():
             for other in following:
                 found.setdefault(other, set()).add(node)
         return found
 
-    def after(self, ports: Iterable[tuple[str, str]]) -> set[Node]:
+    def after(self, ports: Iterable[tuple[str, str]]) -> set[PathNode]:
         """Return the inputs and outputs that follow what the consumers of ports get."""
-        return _reach(self._forward, {n for port in ports for n in self._wires.get(Node(*port, True), ())})
+        return _reach(self._forward, {n for port in ports for n in self._wires.get(PathNode(*port, True), ())})
 
-    def follow(self, port: tuple[str, str]) -> set[Node]:
+    def follow(self, port: tuple[str, str]) -> set[PathNode]:
         """Return the inputs and outputs that follow a port as far as nothing is cut."""
-        return _reach(self._forward, {Node(*port, True)})
+        return _reach(self._forward, {PathNode(*port, True)})
 
-    def before(self, ports: Iterable[tuple[str, str]]) -> set[Node]:
+    def before(self, ports: Iterable[tuple[str, str]]) -> set[PathNode]:
         """Return the ports, and the inputs and outputs that they follow."""
-        return _reach(self._backward, {Node(*port, True) for port in ports})
+        return _reach(self._backward, {PathNode(*port, True) for port in ports})
 
     def between(
         self, findings: Iterable[Finding], sources: Iterable[tuple[str, str]], sinks: Iterable[tuple[str, str]]
@@ -99,25 +99,25 @@ class SignalPaths:
             return True
         return bool(_reach(self._forward, ends[1]) & ends[0])
 
-    def _is_between(self, finding: Finding, after: set[Node], before: set[Node]) -> bool:
+    def _is_between(self, finding: Finding, after: set[PathNode], before: set[PathNode]) -> bool:
         ends = self._ends(finding)
         return ends is None or bool(ends[0] & after and ends[1] & before)
 
-    def _ends(self, finding: Finding) -> tuple[set[Node], set[Node]] | None:
+    def _ends(self, finding: Finding) -> tuple[set[PathNode], set[PathNode]] | None:
         """Return the inputs and the outputs of a block that a finding concerns; None where it concerns everything."""
         kinds = BlockFinding | EventWithinPeriod | InexactDerivatives
         if not isinstance(finding, kinds) or finding.block not in self.flat.table.blocks:
             return None
         path, block = finding.block, self.flat.table.blocks[finding.block]
-        inputs = {Node(path, port, False) for port in block.inputs}
-        outputs = {Node(path, port, True) for port in block.outputs}
+        inputs = {PathNode(path, port, False) for port in block.inputs}
+        outputs = {PathNode(path, port, True) for port in block.outputs}
         if isinstance(finding, BlockFinding):
-            inputs &= {Node(path, finding.source, False)} if finding.source in block.inputs else inputs
-            outputs &= {Node(path, finding.port, True)} if finding.port in block.outputs else outputs
+            inputs &= {PathNode(path, finding.source, False)} if finding.source in block.inputs else inputs
+            outputs &= {PathNode(path, finding.port, True)} if finding.port in block.outputs else outputs
         return inputs, outputs
 
 
-def _reach(edges: Mapping[Node, set[Node]], starts: Iterable[Node]) -> set[Node]:
+def _reach(edges: Mapping[PathNode, set[PathNode]], starts: Iterable[PathNode]) -> set[PathNode]:
     """Return the nodes that are reached from some, themselves among them."""
     found, todo = set(starts), list(starts)
     while todo:

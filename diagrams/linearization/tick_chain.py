@@ -20,7 +20,7 @@ from ...fmus.running import Derivation
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..frequency import FourMatrices
 from ..results import OperatingPoint
-from .coupled_chain import Step, coupling_at
+from .coupled_chain import LinearStep, coupling_at
 from .derivatives import LocalDerivatives, Numbers, slope_of
 from .exchanged import noise_of
 from .findings import EventWithinPeriod, UnusualStart
@@ -157,7 +157,7 @@ class Chain:
             before[:, nx : nx + n_p] = np.eye(n_p)
             x_all, z_all, w_all = (np.hstack(pair) for pair in ((x_of, x_by_d), (z_of, z_by_d), (W, W_by_d)))
             end = self._end_time(following)
-            step = Step(x_all, z_all, w_all, before, here.t, end, x1, here.w, tick["z"], dict(states.slices))
+            step = LinearStep(x_all, z_all, w_all, before, here.t, end, x1, here.w, tick["z"], dict(states.slices))
             self._models |= self._coupled.go(step, lambda path, z: self._model_plant(path, z, h), Ew)
             (x_of, x_by_d), (P, P_by_d), (z_of, z_by_d), (W_next, W_by_d) = (
                 (part[:, :n], part[:, n:]) for part in (step.x, step.p, step.z, step.w)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ...blocks.core import NonFiniteError, SimulationError
-from ..compiled import BrokenOff, CompiledHybrid, Failure, Lost, Pile
+from ..compiled import BrokenOff, CompiledHybrid, Lost, Pile, StepFailure
 from ..solvers import Method
 from .continuous import Continuous
 from .diagnosis import failure, forget_trials, opaque_failure
@@ -36,7 +36,7 @@ def explain(continuous: Continuous, broken: BrokenOff) -> BaseException:
     return _explain_step(continuous, _step_error(continuous.method, broken))
 
 
-def explain_library(continuous: Continuous, failed: Failure) -> BaseException:
+def explain_library(continuous: Continuous, failed: StepFailure) -> BaseException:
     """Return the error behind that of a library which C has asked for a step."""
     if not isinstance(failed.error, SimulationError):
         return failed.error

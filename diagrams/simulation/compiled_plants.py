@@ -17,7 +17,7 @@ from ..compiled import (
     HybridOutcome,
     Outcome,
     PythonStep,
-    Reason,
+    ReturnReason,
     compile_other_side,
 )
 from ..coupling import CoupledSteps, Plant, PlantSteps, end_all, runs_apart
@@ -145,7 +145,7 @@ class PlantsInC:
             else:
                 assert found.stage != UNDER_WAY
                 assert isinstance(plant, FmuInstance)
-                status = found.status if int(found.reason) == Reason.FMU_FAILED else 0
+                status = found.status if int(found.reason) == ReturnReason.FMU_FAILED else 0
                 rest.append(partial(_judge, plant, found.stage, status, *due[path]))
         if self.steps.apart:
             end_all(rest)

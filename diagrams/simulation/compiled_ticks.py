@@ -19,7 +19,7 @@ from ..compiled import (
     CompiledLoop,
     FusedPlant,
     Outcome,
-    Reason,
+    ReturnReason,
     TickCode,
     bind_call,
     compile_fused,
@@ -192,9 +192,9 @@ class CompiledTicks:
             if found.ticks:
                 k = int(window.ticks[at - 1])
                 self._plants.arrive(k, last)
-                if arrived(k, found.reason is Reason.FMU_FAILED):
+                if arrived(k, found.reason is ReturnReason.FMU_FAILED):
                     return True
-            if found.reason is Reason.HALTED and found.ticks:
+            if found.reason is ReturnReason.HALTED and found.ticks:
                 self._chunk = max(1, self._chunk // 2)
             elif at < stop or not found.ticks:  # Python looks at this tick
                 following = int(window.ticks[at])
@@ -247,10 +247,10 @@ class CompiledTicks:
         workspace, base = self._workspace, self._flat.base
         t = k * base.numerator / base.denominator
         try:
-            if found.reason is Reason.NOT_OK:
+            if found.reason is ReturnReason.NOT_OK:
                 self._plants.arrive(k, last)
                 forget_trials(self._flat)  # an interrupt of a block of Python is raised
-            elif found.reason in (Reason.FMU_FAILED, Reason.FMU_FLAGS):
+            elif found.reason in (ReturnReason.FMU_FAILED, ReturnReason.FMU_FLAGS):
                 assert self._loop is not None
                 self._plants.go_on(self._loop, found, before, k, last)
             else:

@@ -14,7 +14,7 @@ from ..events import Domains
 from ..exchange import ExchangedBlocks, OutsideEvents
 from ..flat import FlatDiagram, announcers
 from ..results import Occurrence
-from ..solvers import METHODS, Kind, Method, Problem
+from ..solvers import METHODS, Method, MethodKind, Problem
 from .diagnosis import state_values
 from .initialize import domains_from_left
 from .solver_setup import absolute_tolerances, find_late, longest_step, scales_of, time_scale_of
@@ -91,7 +91,7 @@ class Continuous:
             max_step=longest_step(flat, max_step, time_scale, shortest),
         )
         self.fixed = self.method.fixed
-        multistep = any(METHODS[name].kind is Kind.LIBRARY for name in self.method.names)
+        multistep = any(METHODS[name].kind is MethodKind.LIBRARY for name in self.method.names)
         self.lands = rtol < TIGHT and not (self.method.fixed or multistep)
         """Whether the method lands on every sample: the dense output is of lower order than the step."""
         if self.fixed and self.delays is not None and float(flat.base) > self.delays.shortest * (1 + 1e-12):

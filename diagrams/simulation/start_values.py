@@ -33,7 +33,7 @@ class StartValues:
         blocks = {path: flat.table.blocks[path] for path in flat.checked.traced}
         self._starting = [path for path, block in blocks.items() if block.starts_from_inputs]
         self._sources = [path for path, block in blocks.items() if not block.inputs]
-        self._bound: dict[tuple[Port, ...], _Functions] = {}
+        self._bound: dict[tuple[Port, ...], _StartFunctions] = {}
         self._left: tuple[list[Block], dict[Port, np.ndarray]] | None = None
         self._found: dict[str, tuple[Block, bytes, np.ndarray]] = {}
 
@@ -88,14 +88,14 @@ class StartValues:
             self._left = (sources, found)
         return self._left[1]
 
-    def _functions(self, left: dict[Port, np.ndarray]) -> _Functions:
+    def _functions(self, left: dict[Port, np.ndarray]) -> _StartFunctions:
         key = tuple(left)
         if key not in self._bound:
-            self._bound[key] = _Functions(self._workspace, trace_start(self._workspace.flat, left))
+            self._bound[key] = _StartFunctions(self._workspace, trace_start(self._workspace.flat, left))
         return self._bound[key]
 
 
-class _Functions:
+class _StartFunctions:
     """The functions of a start, bound to a run's vectors."""
 
     def __init__(self, workspace: Workspace, functions: StartFunctions):

@@ -1,6 +1,6 @@
 """The methods by name, the method of a run, and the multistep methods of libraries behind one interface."""
 
-from .base import FIXED, METHODS, SOLVERS, AcceptedStep, Kind, Polynomial, Problem, Solver, solver_name
+from .base import FIXED, METHODS, SOLVERS, AcceptedStep, MethodKind, Polynomial, Problem, Solver, solver_name
 from .choose import Method, make_solver
 
 __all__ = [
@@ -8,8 +8,8 @@ __all__ = [
     "METHODS",
     "SOLVERS",
     "AcceptedStep",
-    "Kind",
     "Method",
+    "MethodKind",
     "Polynomial",
     "Problem",
     "Solver",

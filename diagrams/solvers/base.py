@@ -224,7 +224,7 @@ class Solver(Integration, ABC):
         """Take one step of the method."""
 
 
-class Kind(IntEnum):
+class MethodKind(IntEnum):
     """Kinds of methods, as `fmus/runtime/problem.c` numbers them."""
 
     FIXED_STEP, EXPLICIT, EIGHT, RADAU, LIBRARY = range(5)
@@ -244,7 +244,7 @@ class MethodFacts:
     ----------
     title : str
         Its name in messages.
-    kind : Kind
+    kind : MethodKind
         How C takes its steps.
     library : Library, optional
         The library that it is one of.
@@ -255,28 +255,28 @@ class MethodFacts:
     """
 
     title: str
-    kind: Kind = Kind.EXPLICIT
+    kind: MethodKind = MethodKind.EXPLICIT
     library: Library | None = None
     stages: int = 0
     uses_slope: bool = False
 
 
 METHODS = {
-    "euler": MethodFacts("Euler", Kind.FIXED_STEP, stages=1),
-    "heun": MethodFacts("Heun", Kind.FIXED_STEP, stages=2),
-    "rk4": MethodFacts("Runge-Kutta 4", Kind.FIXED_STEP, stages=4),
+    "euler": MethodFacts("Euler", MethodKind.FIXED_STEP, stages=1),
+    "heun": MethodFacts("Heun", MethodKind.FIXED_STEP, stages=2),
+    "rk4": MethodFacts("Runge-Kutta 4", MethodKind.FIXED_STEP, stages=4),
     "RK23": MethodFacts("Bogacki-Shampine 3(2)"),
     "RK45": MethodFacts("Dormand-Prince 5(4)"),
-    "DOP853": MethodFacts("Dormand-Prince 8(5,3)", Kind.EIGHT),
-    "Radau": MethodFacts("Radau IIA 5", Kind.RADAU, uses_slope=True),
-    "BDF": MethodFacts("BDF", Kind.LIBRARY, Library.SCIPY, uses_slope=True),
-    "LSODA": MethodFacts("LSODA", Kind.LIBRARY, Library.SCIPY, uses_slope=True),
-    "CVODE_BDF": MethodFacts("CVODE_BDF", Kind.LIBRARY, Library.SUNDIALS, uses_slope=True),
-    "CVODE_Adams": MethodFacts("CVODE_Adams", Kind.LIBRARY, Library.SUNDIALS),
+    "DOP853": MethodFacts("Dormand-Prince 8(5,3)", MethodKind.EIGHT),
+    "Radau": MethodFacts("Radau IIA 5", MethodKind.RADAU, uses_slope=True),
+    "BDF": MethodFacts("BDF", MethodKind.LIBRARY, Library.SCIPY, uses_slope=True),
+    "LSODA": MethodFacts("LSODA", MethodKind.LIBRARY, Library.SCIPY, uses_slope=True),
+    "CVODE_BDF": MethodFacts("CVODE_BDF", MethodKind.LIBRARY, Library.SUNDIALS, uses_slope=True),
+    "CVODE_Adams": MethodFacts("CVODE_Adams", MethodKind.LIBRARY, Library.SUNDIALS),
 }
 """All methods, by the name that ``solver`` takes."""
 SOLVERS: tuple[str, ...] = ("auto", *METHODS)
-FIXED = tuple(name for name, facts in METHODS.items() if facts.kind is Kind.FIXED_STEP)
+FIXED = tuple(name for name, facts in METHODS.items() if facts.kind is MethodKind.FIXED_STEP)
 
 
 def solver_name(name: str) -> str:

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from ...blocks.called_back import CalledBack
 from ...blocks.core import NonFiniteError, OptionError
 from ...blocks.interrupts import INTERRUPTS
 from .base import AcceptedStep, Polynomial, Problem, Solver
@@ -58,11 +59,11 @@ _FUNCTIONS: dict[str, dict[str, tuple[Any, ...]]] = {  # library â†’ function â†
     "sundials_cvode": {
         "CVodeCreate": (c_void_p, c_int, c_void_p),
         "CVodeFree": (None, POINTER(c_void_p)),
-        "CVodeInit": (c_int, c_void_p, _RATE, c_double, c_void_p),
+        "CVodeInit": (c_int, c_void_p, c_void_p, c_double, c_void_p),
         "CVodeReInit": (c_int, c_void_p, c_double, c_void_p),
         "CVodeSVtolerances": (c_int, c_void_p, c_double, c_void_p),
         "CVodeSetLinearSolver": (c_int, c_void_p, c_void_p, c_void_p),
-        "CVodeSetJacFn": (c_int, c_void_p, _JACOBIAN),
+        "CVodeSetJacFn": (c_int, c_void_p, c_void_p),
         "CVodeSetNonlinearSolver": (c_int, c_void_p, c_void_p),
         "CVodeSetMaxStep": (c_int, c_void_p, c_double),
         "CVodeSetMaxErrTestFails": (c_int, c_void_p, c_int),
@@ -113,15 +114,16 @@ def _load_library() -> _Library:
     return library
 
 
-class _Calls:
-    """Callbacks for CVODE. Python's exceptions can't pass through C: they are kept, and raised afterwards."""
+class _CvodeCalls(CalledBack):
+    """What CVODE calls: the rates, their derivative, and where its messages go."""
 
     def __init__(self, problem: Problem, library: _Library):
+        super().__init__()
         self.problem, self.library = problem, library
         self.stop, self.message = 0.0, ""
-        self.error: BaseException | None = None
         self._views: dict[int, np.ndarray] = {}
-        self.rate, self.jacobian, self.say = _RATE(self._rate), _JACOBIAN(self._jacobian), _MESSAGE(self._say)
+        self.rate, self.jacobian = self.function(_RATE, self._rate, -1), self.function(_JACOBIAN, self._jacobian, -1)
+        self.say = _MESSAGE(self._say)
 
     def view(self, address: int, size: int) -> np.ndarray:
         """Return the memory at this address as an array."""
@@ -134,31 +136,15 @@ class _Calls:
         return self.view(self.library.N_VGetArrayPointer(handle), self.problem.size)
 
     def _rate(self, t: float, x: int, f: int, _: object) -> int:
-        try:
-            INTERRUPTS.heard = True
-            INTERRUPTS.check()
-            rates = self.vector(f)
-            rates[:] = self.problem.rate(min(t, self.stop), self.vector(x))
-            return 0 if np.isfinite(rates).all() else 1  # 1: try a shorter step
-        except BaseException as error:
-            self.error = error
-            return -1
-        finally:
-            INTERRUPTS.heard = False
+        rates = self.vector(f)
+        rates[:] = self.problem.rate(min(t, self.stop), self.vector(x))
+        return 0 if np.isfinite(rates).all() else 1  # 1: try a shorter step
 
     def _jacobian(self, t: float, x: int, f: int, matrix: int, *_: object) -> int:
-        try:
-            INTERRUPTS.heard = True
-            INTERRUPTS.check()
-            n = self.problem.size
-            columns = self.view(self.library.SUNDenseMatrix_Data(matrix), n * n).reshape(n, n)
-            columns.T[:] = self.problem.jacobian(min(t, self.stop), self.vector(x))
-            return 0 if np.isfinite(columns).all() else 1
-        except BaseException as error:
-            self.error = error
-            return -1
-        finally:
-            INTERRUPTS.heard = False
+        n = self.problem.size
+        columns = self.view(self.library.SUNDenseMatrix_Data(matrix), n * n).reshape(n, n)
+        columns.T[:] = self.problem.jacobian(min(t, self.stop), self.vector(x))
+        return 0 if np.isfinite(columns).all() else 1
 
     def _say(self, line: int, function: bytes, file: bytes, message: bytes, code: int, *_: object) -> None:
         self.message = message.decode("utf-8", "replace")
@@ -170,7 +156,7 @@ class Cvode(Solver):
     def __init__(self, name: str, problem: Problem, rtol: float, atol: float | np.ndarray, max_step: float):
         super().__init__(name, problem, rtol, atol, max_step)
         self._library = library = _load_library()
-        self._calls = calls = _Calls(problem, library)
+        self._calls = calls = _CvodeCalls(problem, library)
         context = c_void_p()
         library.SUNContext_Create(0, byref(context))
         library.SUNContext_ClearErrHandlers(context)
@@ -207,7 +193,8 @@ class Cvode(Solver):
         self._library.CVodeSVtolerances(self._memory, self.rtol, self._tolerances)
 
     def _start(self, t: float, x: np.ndarray) -> None:
-        self._calls.stop, self._calls.error, self._t, self._x_old = self.stop, None, t, x
+        self._calls.stop, self._t, self._x_old = self.stop, t, x
+        self._calls.take_error()
         self._calls.vector(self._x)[:] = x
         self._check(self._library.CVodeReInit(self._memory, t, self._x))
         self._check(self._library.CVodeSetStopTime(self._memory, self.stop))
@@ -233,9 +220,7 @@ class Cvode(Solver):
     def _check(self, code: int) -> None:
         if code >= 0:
             return
-        if self._calls.error is not None:
-            error, self._calls.error = self._calls.error, None
-            raise error
+        self._calls.check()
         if code <= _MEMORY:
             raise RuntimeError(f"CVODE: {self._calls.message} (code {code})")
         h = c_double()
@@ -247,7 +232,7 @@ class Cvode(Solver):
 
 
 def _free(
-    calls: _Calls, memory: int, solvers: tuple[int | None, ...], vectors: tuple[int, ...], context: c_void_p
+    calls: _CvodeCalls, memory: int, solvers: tuple[int | None, ...], vectors: tuple[int, ...], context: c_void_p
 ) -> None:
     library = calls.library  # the callbacks live until CVODE is gone
     library.CVodeFree(byref(c_void_p(memory)))

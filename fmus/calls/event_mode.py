@@ -20,7 +20,7 @@ _CHANGED = 2
 
 
 @dataclass
-class Clock:
+class InputClock:
     """Input clock that ticks at times known ahead; infinite ones never come."""
 
     variable: OtherVariable
@@ -76,7 +76,7 @@ class EventMode:
     ----------
     discrete : list of str
         Ports of the inputs that are set in Event Mode alone.
-    clocks : list of Clock
+    clocks : list of InputClock
         Input clocks whose ticks are known ahead.
     next_event : float
         Time in s of the next event of the FMU's own that it has told; infinite without one.
@@ -92,7 +92,7 @@ class EventMode:
         self._jumping = WatchedInputs(self.fmi, inputs, vector, by_clocks.pop((), []))
         self._clocked = [(names, WatchedInputs(self.fmi, inputs, vector, ports)) for names, ports in by_clocks.items()]
         self._triggered = {name: v for name, v in ours.items() if v.interval_variability == "triggered"}
-        self.clocks = [Clock(v) for v in ours.values() if v.interval_variability != "triggered"]
+        self.clocks = [InputClock(v) for v in ours.values() if v.interval_variability != "triggered"]
         self.next_event = math.inf
         self._is_fresh = True  # discrete inputs have not been set since the start
 
@@ -163,13 +163,13 @@ class EventMode:
             self._settle(t)
         return acts
 
-    def _due(self, t: float, h: float) -> list[Clock]:
+    def _due(self, t: float, h: float) -> list[InputClock]:
         return [clock for clock in self.clocks if clock.next <= t + ROUNDED * h]
 
     def _enter(self) -> None:
         self.fmu.call("entering Event Mode", self.fmi.enter_event_mode)
 
-    def _activate(self, t: float, due: list[Clock], triggered: set[str]) -> None:
+    def _activate(self, t: float, due: list[InputClock], triggered: set[str]) -> None:
         """Let clocks tick, and set the inputs that may be set at these ticks alone."""
         ticking = {clock.variable.name: clock.variable for clock in due}
         ticking |= {name: self._triggered[name] for name in sorted(triggered)}
@@ -204,7 +204,7 @@ class EventMode:
         self._read_intervals(t, [c for c in self.clocks if not c.variable.is_periodic])
         fmu.call("entering Step Mode", self.fmi.enter_step_mode)
 
-    def _read_intervals(self, t: float, clocks: list[Clock]) -> None:
+    def _read_intervals(self, t: float, clocks: list[InputClock]) -> None:
         """Ask the FMU for the intervals that its description does not state."""
         if not clocks:
             return

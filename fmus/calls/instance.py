@@ -11,7 +11,7 @@ from .fmu_block import FmuBlock
 from .loaded_library import MakeCalls
 from .native_step import NativeStep, RemoteStep
 from .saved_state import FmuState
-from .step import Step, StepMemory
+from .step import InstanceStep, StepMemory
 from .step_failures import StepFailures
 from .transfer import BoundStart
 
@@ -33,21 +33,21 @@ class FmuInstance(StepFailures):
     read: Callable[[float], None]
     """Get the outputs at a time in s (after `bind`)."""
     judge_native: Callable[[int, int, float, float], None]
-    """Judge a step that a loop in C has taken in this process; see `Step.judge_native`."""
+    """Judge a step that a loop in C has taken in this process; see `InstanceStep.judge_native`."""
     finish_remote: Callable[[float, float], None]
     """End a step from t over h, both in s, that a loop in C has begun in another process."""
 
     def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):
         super().__init__(block, wired, make_calls=make_calls)
         self._outputs = dict(block.output_variables)
-        self._step: Step | None = None
+        self._step: InstanceStep | None = None
         self.read = lambda t: None
         self._starts: dict[tuple[str, ...], BoundStart | None] = {}
 
     def bind(self, inputs: np.ndarray, outputs: np.ndarray) -> None:
         """Bind the vectors of the inputs to set and of the outputs to get, and get the outputs once."""
         self.vector = inputs
-        self._step = step = Step(self, self._outputs, inputs, outputs)
+        self._step = step = InstanceStep(self, self._outputs, inputs, outputs)
         self.step, self.start_step, self.finish_step = step.function(), step.start, step.finish
         self.judge_native, self.finish_remote = step.judge_native, step.finish_native
         self.exchange, self.read = step.exchange, step.read

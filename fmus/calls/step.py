@@ -46,7 +46,7 @@ class StepMemory:
     events: EventMemory | None
 
 
-class Step:
+class InstanceStep:
     """Steps of an instance, with all that belongs to them by its options.
 
     All calls of a step are bound once. A library in this process makes them one after the other; another process makes

@@ -17,7 +17,7 @@ _PERIOD = 0.2  # s between two looks at the host: a fork of it may hold the pipe
 _LONGEST = 10.0  # s for which the removal of folders is tried
 
 
-class Keeper:
+class KeeperProcess:
     """The keeper's process: its groups and folders."""
 
     def __init__(self, host: int):
@@ -109,7 +109,7 @@ def main() -> None:
     for name in ("SIGHUP", "SIGINT", "SIGQUIT", "SIGTERM", "SIGTSTP", "SIGUSR1", "SIGUSR2", "SIGBREAK"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)  # somebody may send them to the whole group
-    Keeper(int(sys.argv[1])).serve()
+    KeeperProcess(int(sys.argv[1])).serve()
     os._exit(0)
 
 

@@ -4,7 +4,7 @@ from .axes import AxisUnits
 from .contact_figures import DOTTED, contact_admittance, contact_map, draw_admittances, fill_growth
 from .drawings import with_drawing
 from .loop_figures import DrawnLoops, bode, gang, nyquist, response, sensitivities
-from .measured_figures import Measured, injected, measured
+from .measured_figures import MeasuredCurve, injected, measured
 from .sensitivity_figures import sensitivity_bars
 from .step_figures import step_responses
 
@@ -12,7 +12,7 @@ __all__ = [
     "DOTTED",
     "AxisUnits",
     "DrawnLoops",
-    "Measured",
+    "MeasuredCurve",
     "bode",
     "contact_admittance",
     "contact_map",

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 TEXTS = Texts(__package__, "figures")
 
 
-class Measured(NamedTuple):
+class MeasuredCurve(NamedTuple):
     """Measured points of a loop over its linear model: frequencies in rad/s and values of both."""
 
     title: str
@@ -31,7 +31,7 @@ class Measured(NamedTuple):
 
 
 def injected(
-    wire: str, curves: Mapping[str, Measured], axes: AxisUnits, looks: Mapping[str, dict[str, Any]], key: str
+    wire: str, curves: Mapping[str, MeasuredCurve], axes: AxisUnits, looks: Mapping[str, dict[str, Any]], key: str
 ) -> Plot:
     """Draw points that were measured in the running co-simulation over linear models, each in its variant's color."""
     with style():
@@ -44,7 +44,7 @@ def injected(
     return Plot(key, TEXTS.line("injected", wire=wire), figure)
 
 
-def measured(key: str, wire: str, curve: Measured, axes: AxisUnits) -> Plot:
+def measured(key: str, wire: str, curve: MeasuredCurve, axes: AxisUnits) -> Plot:
     """Draw points that were measured elsewhere, with their uncertainty, over the linear model in another color."""
     with style():
         figure = new_figure(2.3)
@@ -56,7 +56,7 @@ def measured(key: str, wire: str, curve: Measured, axes: AxisUnits) -> Plot:
 
 
 def _draw_measured(
-    left: Axes, right: Axes, curve: Measured, axes: AxisUnits, look: dict[str, Any], color: Any, measured: str = ""
+    left: Axes, right: Axes, curve: MeasuredCurve, axes: AxisUnits, look: dict[str, Any], color: Any, measured: str = ""
 ) -> None:
     """Draw a model as a line and measured points over it, the points' phase on the model's branch."""
     x, at = axes.frequency(curve.w), axes.frequency(curve.omega)

@@ -11,7 +11,7 @@ from ....blocks.core import print_unit
 from ...frequency import Number
 from .definitions import LOOP_TERMS, definition
 from .document import Document, Plot, Section, Table
-from .svg import Picture, embedded
+from .svg import EmbeddedFigure, embedded
 from .tables import Numbered, TableView, anchor
 from .values import cell, mark, reason, tolerance_text, value_text
 
@@ -28,7 +28,7 @@ class FigureView:
     number: int
     anchor: str
     caption: str
-    picture: Picture
+    picture: EmbeddedFigure
 
 
 @dataclass(frozen=True)

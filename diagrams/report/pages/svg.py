@@ -20,7 +20,7 @@ WIDE = 900.0
 
 
 @dataclass(frozen=True)
-class Picture:
+class EmbeddedFigure:
     """A figure as a page holds it: SVG for the screen, and another one for paper where it is turned there.
 
     Attributes
@@ -61,7 +61,7 @@ def _plots(section: Section) -> Iterator[Plot]:
         yield from _plots(inner)
 
 
-def embedded(figure: Any, key: str, caption: str = "") -> Picture:
+def embedded(figure: Any, key: str, caption: str = "") -> EmbeddedFigure:
     """Return a figure as a page holds it; a wide one twice, for the screen and, to be turned, for paper.
 
     ``key`` begins every id in it, so that the figures of a page don't share any; ``caption`` is its text for people who
@@ -74,12 +74,12 @@ def embedded(figure: Any, key: str, caption: str = "") -> Picture:
     svg = f'{head} role="img" aria-label="{escape(caption, quote=True)}"{rest}'
     found = re.search(r'<svg[^>]*?\bwidth="([\d.]+)(pt|px)?" height="([\d.]+)', svg)
     if found is None:
-        return Picture(_own_ids(svg, key))
+        return EmbeddedFigure(_own_ids(svg, key))
     factor = 4 / 3 if found[2] == "pt" else 1.0
     width, height = float(found[1]) * factor, float(found[3]) * factor
     if width <= WIDE or width < height:
-        return Picture(_own_ids(svg, key))
-    return Picture(_own_ids(svg, key), _own_ids(svg, f"{key}-paper"), width, height)
+        return EmbeddedFigure(_own_ids(svg, key))
+    return EmbeddedFigure(_own_ids(svg, key), _own_ids(svg, f"{key}-paper"), width, height)
 
 
 def _own_ids(svg: str, key: str) -> Markup:

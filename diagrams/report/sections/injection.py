@@ -137,8 +137,8 @@ def _measured(plan: InjectionPlan, wire: str) -> FrequencyResponse:
     )
 
 
-def _curve(title: str, found: FrequencyResponse, L: Linearization) -> figures.Measured:
+def _curve(title: str, found: FrequencyResponse, L: Linearization) -> figures.MeasuredCurve:
     """Return the measured points with the linear model's L."""
     w = np.geomspace(found.omega[0], found.omega[-1], 200)
     points = np.array([complex(np.ravel(v)[0]) for v in np.moveaxis(np.atleast_1d(found.L.frdata), -1, 0)])
-    return figures.Measured(title, w, figures.response(L, w), found.omega, points)
+    return figures.MeasuredCurve(title, w, figures.response(L, w), found.omega, points)

@@ -166,5 +166,5 @@ def _plot(case: Case, of: MeasuredLoop, L: Any, title: str) -> Plot:
     omega = np.asarray(of.data.omega, dtype=float)
     w = np.geomspace(omega[0], omega[-1], 300) if L is not None else np.empty(0)
     model = figures.response(L, w) if L is not None else np.empty(0)
-    curve = figures.Measured(f"model, {title}", w, model, omega, np.ravel(of.data.frdata), of.uncertainty)
+    curve = figures.MeasuredCurve(f"model, {title}", w, model, omega, np.ravel(of.data.frdata), of.uncertainty)
     return figures.measured(f"measured_{of.key}", of.wire, curve, case.axes)

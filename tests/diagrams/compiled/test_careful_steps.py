@@ -9,7 +9,7 @@ import pytest
 from loopwright.blocks import Block, Constant, FmuRuntimeError, Gain, Output, Ramp, Sine
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu, StepOptions
-from loopwright.fmus.calls.step import Step
+from loopwright.fmus.calls.step import InstanceStep
 from support.careful_fmus import (
     BETWEEN,
     BETWEEN_MODEL,
@@ -47,13 +47,13 @@ def events(folder):
 @pytest.fixture
 def by_python(monkeypatch):
     """Times in s of the steps that Python has taken or ended."""
-    found, end = [], Step._end
+    found, end = [], InstanceStep._end
 
     def noted(self, status):
         found.append(self._t)
         end(self, status)
 
-    monkeypatch.setattr(Step, "_end", noted)
+    monkeypatch.setattr(InstanceStep, "_end", noted)
     return found
 
 

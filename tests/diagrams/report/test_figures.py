@@ -9,7 +9,7 @@ import pytest
 from loopwright.blocks import Constant, Gain, Integrator, StateSpace, TransferFunction
 from loopwright.diagrams import Diagram, Number, Report, Section, Table, Verdict, analyse
 from loopwright.diagrams.report.case import Case
-from loopwright.diagrams.report.figures import AxisUnits, Measured, contact_admittance, contact_map, measured
+from loopwright.diagrams.report.figures import AxisUnits, MeasuredCurve, contact_admittance, contact_map, measured
 from loopwright.diagrams.report.figures.loop_figures import DrawnLoops, bode, nyquist
 from loopwright.diagrams.report.pages import Judged
 from loopwright.diagrams.report.pages.definitions import definition
@@ -115,7 +115,7 @@ def check_layout(figure):
 @pytest.mark.parametrize("span", [(30.0, 450.0), (1.0, 1.9)])
 def test_ticks_of_frequencies_do_not_overlap(span):
     w = np.geomspace(*span, 50)
-    figure = measured("m", "u", Measured("model", w, 1 / (1j * w), w, 1 / (1j * w)), AxisUnits()).figure
+    figure = measured("m", "u", MeasuredCurve("model", w, 1 / (1j * w), w, 1 / (1j * w)), AxisUnits()).figure
     check_layout(figure)
     assert all(len(ax.get_xticks()) >= 2 for ax in figure.axes)
 
@@ -146,7 +146,7 @@ def test_no_figure_of_a_report_has_overlapping_ticks_or_a_legend_over_its_curves
 
 def test_measured_points_and_the_model_have_two_colors_and_bars_of_their_uncertainty():
     w = np.geomspace(0.1, 10.0, 20)
-    data = Measured("model", w, 1 / (1j * w), w, 1.1 / (1j * w), np.full(20, 0.2))
+    data = MeasuredCurve("model", w, 1 / (1j * w), w, 1.1 / (1j * w), np.full(20, 0.2))
     left, right = measured("m", "u", data, AxisUnits()).figure.axes
     model, points = left.get_lines()
     assert model.get_color() != points.get_color()
@@ -189,7 +189,7 @@ def test_a_block_that_is_defined_at_samples_has_no_continuous_variant_and_the_re
 
 def test_a_figure_is_laid_out_once_and_drawn_once(monkeypatch):
     w = np.geomspace(1.0, 100.0, 9)
-    figure = measured("m", "u", Measured("model", w, 1 / (1j * w), w, 1 / (1j * w)), AxisUnits()).figure
+    figure = measured("m", "u", MeasuredCurve("model", w, 1 / (1j * w), w, 1 / (1j * w)), AxisUnits()).figure
     engine, draws, layouts = figure.get_layout_engine(), [], []
     whole, execute = type(figure).draw, type(engine).execute
     monkeypatch.setattr(type(figure), "draw", lambda self, renderer: draws.append(1) or whole(self, renderer))

@@ -6,7 +6,7 @@ import ctypes
 from collections.abc import Callable
 from typing import Any
 
-from ...blocks.interrupts import INTERRUPTS
+from .interrupts import INTERRUPTS
 
 
 class CalledBack:
@@ -66,9 +66,3 @@ class CalledBack:
         error = self.take_error()
         if error is not None:
             raise error
-
-
-CALL = ctypes.CFUNCTYPE(ctypes.c_int)
-"""Kind of a function without arguments whose result is an integer."""
-TICK = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4, ctypes.c_int)
-"""Kind of the function of a tick."""
