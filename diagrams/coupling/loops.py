@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+from weakref import WeakKeyDictionary
+
 from ..flat import FlatDiagram
 from ..wiring import Structure
 from .links import Links, direct_ports
 from .options import Coupling, Scheme
 
 
+_KNOWN: WeakKeyDictionary[FlatDiagram, bool] = WeakKeyDictionary()  # a tenth of the set-up of a run
+
+
 def note_loops(flat: FlatDiagram, coupling: Coupling) -> tuple[str, ...]:
     """Return a message for each loop of direct feedthrough that the coupling leaves with values of the last step."""
-    if coupling.scheme == Scheme.ITERATED or not _may_loop(flat):
+    if coupling.scheme == Scheme.ITERATED:
+        return ()
+    if flat not in _KNOWN:
+        _KNOWN[flat] = _may_loop(flat)
+    if not _KNOWN[flat]:
         return ()
     return tuple(
         f"{', '.join(ports)}: by their model structures these outputs follow one another at once, in a loop across "
