@@ -1,9 +1,13 @@
-"""Platforms and flags of the C compiler. It imports nothing of the package: an installation reads it, too."""
+"""The C compiler's command, platforms and flags. It imports nothing of the package: an installation reads it, too."""
 
 from __future__ import annotations
 
 import hashlib
+import importlib.util
+import os
 import platform
+import shlex
+import shutil
 import sys
 from pathlib import Path
 
@@ -30,6 +34,28 @@ DIAGRAM_FLAGS = ("-fno-math-errno", "-fno-trapping-math", "-fno-builtin-pow")
 stays a power in every bit."""
 RUNTIME_FLAGS = ("-fno-unroll-loops",)
 """Further flags of the runtime library: vectors are short; a sixth less for the compiler."""
+
+
+def find_command(python: str) -> tuple[tuple[str, ...], str] | None:
+    """Return the command of a C compiler, and where it is from; None without any.
+
+    Parameters
+    ----------
+    python : str
+        The interpreter that runs zig's package where its binary isn't found.
+
+    Returns
+    -------
+    tuple of (tuple of str, str)
+        The command, and ``"LOOPWRIGHT_CC"``, ``"ziglang"`` or ``"system"``, in this order.
+    """
+    if given := os.environ.get("LOOPWRIGHT_CC"):
+        return tuple(shlex.split(given, posix=os.name != "nt")), "LOOPWRIGHT_CC"
+    if (spec := importlib.util.find_spec("ziglang")) is not None and spec.origin is not None:
+        zig = Path(spec.origin).parent / ("zig.exe" if os.name == "nt" else "zig")
+        return ((str(zig), "cc") if zig.is_file() else (python, "-m", "ziglang", "cc")), "ziglang"
+    found = next((path for name in ("cc", "gcc", "clang") if (path := shutil.which(name)) is not None), None)
+    return None if found is None else ((found,), "system")
 
 
 def native_platform() -> str:

@@ -1,16 +1,14 @@
 """Builds the package by setuptools, with the runtime library of its runs compiled where there is a C compiler.
 
 An installation never fails for want of one: without the library, the first run that needs it compiles it, and where
-nothing can, runs are interpreted by Python.
+nothing can, its error says what to install.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import platform
 import runpy
-import shlex
 import shutil
 import subprocess
 import sys
@@ -27,16 +25,27 @@ RUNTIME = ROOT / "fmus" / "runtime"
 BUILT = RUNTIME / "built"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 COMPILER = PROJECT["optional-dependencies"]["build"]
+TOOLS = runpy.run_path(str(ROOT / "fmus" / "toolchain.py"))
 
 
 def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
     """Ask for zig where the machine has no compiler."""
-    return [*build_meta.get_requires_for_build_wheel(config_settings), *([] if find_compiler() else COMPILER)]
+    return [
+        *build_meta.get_requires_for_build_wheel(config_settings),
+        *([] if TOOLS["find_command"](sys.executable) else COMPILER),
+    ]
 
 
 def get_requires_for_build_editable(config_settings: Any = None) -> list[str]:
     """Ask for zig where the machine has no compiler."""
-    return [*build_meta.get_requires_for_build_editable(config_settings), *([] if find_compiler() else COMPILER)]
+    return [
+        *build_meta.get_requires_for_build_editable(config_settings),
+        *([] if TOOLS["find_command"](sys.executable) else COMPILER),
+    ]
+
+
+def _missing() -> list[str]:
+    return [] if TOOLS["find_command"](sys.executable) else COMPILER
 
 
 def build_wheel(wheel_directory: str, config_settings: Any = None, metadata_directory: str | None = None) -> str:
@@ -55,18 +64,6 @@ def build_editable(wheel_directory: str, config_settings: Any = None, metadata_d
     return str(build_meta.build_editable(wheel_directory, config_settings, metadata_directory))
 
 
-def find_compiler() -> tuple[list[str], bool] | None:
-    """Return the command of a C compiler, and whether it is zig: LOOPWRIGHT_CC, ziglang, else the system's."""
-    if given := os.environ.get("LOOPWRIGHT_CC"):
-        return shlex.split(given, posix=os.name != "nt"), False
-    if importlib.util.find_spec("ziglang") is not None:
-        return [sys.executable, "-m", "ziglang", "cc"], True
-    for name in ("cc", "gcc", "clang"):
-        if (path := shutil.which(name)) is not None:
-            return [path], False
-    return None
-
-
 def build_runtime() -> str:
     """Compile the runtime library into the package; return the wheel's platform, empty where there is none."""
     try:
@@ -78,14 +75,14 @@ def build_runtime() -> str:
 
 
 def _build() -> str:
-    tools = runpy.run_path(str(ROOT / "fmus" / "toolchain.py"))
-    found, native = find_compiler(), tools["native_platform"]()
+    found, native = TOOLS["find_command"](sys.executable), TOOLS["native_platform"]()
     shutil.rmtree(BUILT, ignore_errors=True)
     if found is None:
         return ""
-    (command, zig), source = found, tools["read_unit"](RUNTIME, "runtime.c")
-    flags = (*tools["flags"](native, zig=zig), *tools["DIAGRAM_FLAGS"], *tools["RUNTIME_FLAGS"])
-    name = tools["runtime_name"](source, native)
+    (command, of), source = found, TOOLS["read_unit"](RUNTIME, "runtime.c")
+    zig = of == "ziglang"
+    flags = (*TOOLS["flags"](native, zig=zig), *TOOLS["DIAGRAM_FLAGS"], *TOOLS["RUNTIME_FLAGS"])
+    name = TOOLS["runtime_name"](source, native)
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "code.c").write_text(source, encoding="utf-8", newline="\n")
         math = [] if native.endswith("windows") else ["-lm"]

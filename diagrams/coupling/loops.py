@@ -9,7 +9,6 @@ from ..wiring import Structure
 from .links import Links, direct_ports
 from .options import Coupling, Scheme
 
-
 _KNOWN: WeakKeyDictionary[FlatDiagram, bool] = WeakKeyDictionary()  # a tenth of the set-up of a run
 
 

@@ -30,7 +30,7 @@ from ...blocks.core import (
 from ..build_notes import tell_build
 from ..child_processes import find_python, folder_in, run_in_group
 from ..platform import OWN_CACHE, cache_folder, check_cache, native_platform
-from ..toolchain import TARGETS, flags
+from ..toolchain import TARGETS, find_command, flags
 
 TIMEOUT = 600.0
 """Seconds after which a compilation is stopped. The first one on a machine takes seconds, on a slow one a minute."""
@@ -65,19 +65,18 @@ def find_compiler() -> Compiler:
     CompilerError
         If there is none; the text says how to install one.
     """
-    if given := os.environ.get("LOOPWRIGHT_CC"):
-        command = tuple(shlex.split(given, posix=os.name != "nt"))
-        if not command or shutil.which(command[0]) is None:
-            raise CompilerError(f"LOOPWRIGHT_CC is {given!r}, but there is no such command. Correct it, or unset it.")
-        return Compiler(command, f"{given}\n{_version(command)}")
-    if (spec := importlib.util.find_spec("ziglang")) is not None and spec.origin is not None:
-        zig = Path(spec.origin).parent / ("zig.exe" if os.name == "nt" else "zig")
-        command = (str(zig), "cc") if zig.is_file() else (find_python(), "-m", "ziglang", "cc")
+    found = find_command(find_python())
+    if found is None:
+        raise CompilerError(f"no C compiler was found: neither the ziglang package nor cc, gcc or clang. {_INSTALL}")
+    command, source = found
+    if source == "ziglang":
         return Compiler(command, f"ziglang {importlib.metadata.version('ziglang')}", zig=True)
-    for name in ("cc", "gcc", "clang"):
-        if (path := shutil.which(name)) is not None:
-            return Compiler((path,), f"{path}\n{_version((path,))}")
-    raise CompilerError(f"no C compiler was found: neither the ziglang package nor cc, gcc or clang. {_INSTALL}")
+    if source == "system":
+        return Compiler(command, f"{command[0]}\n{_version(command)}")
+    given = os.environ["LOOPWRIGHT_CC"]
+    if not command or shutil.which(command[0]) is None:
+        raise CompilerError(f"LOOPWRIGHT_CC is {given!r}, but there is no such command. Correct it, or unset it.")
+    return Compiler(command, f"{given}\n{_version(command)}")
 
 
 @lru_cache(maxsize=8)
