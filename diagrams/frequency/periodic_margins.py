@@ -314,4 +314,4 @@ def _delay_by_a_renewal(r: Realization) -> Realization:
     B = np.vstack([r.B, r.D[-1:]])
     C = np.block([[np.zeros((1, n)), np.ones((1, 1))], [r.C[:-1], np.zeros((m - 1, 1))]])
     D = np.vstack([np.zeros((1, m)), r.D[:-1]])
-    return Realization(A, B, C, D, r.dt, r.hidden)
+    return Realization(A, B, C, D, r.dt, r.hidden, hidden_errors=r.hidden_errors, turned=r.turned)

@@ -38,7 +38,7 @@ class Features:
     @classmethod
     def of(cls, r: Realization) -> Features:
         """Return the features of a loop, found by eigenvalues."""
-        axis_poles, poles = split_axis_poles(r, np.linalg.eigvals(r.A), r.scale)
+        axis_poles, poles = split_axis_poles(r, np.linalg.eigvals(r.A), r.rounding_scale)
         zeros = transmission_zeros(r)
         axis_zeros, zeros = split_axis_poles(r, zeros, max(r.scale, float(np.abs(zeros).max(initial=0.0))))
         try:
@@ -65,12 +65,16 @@ class Features:
         return np.concatenate([self.poles, self.zeros, self.closed])
 
 
-def split_axis_poles(r: Realization, p: np.ndarray, scale: float) -> tuple[tuple[AxisPole, ...], np.ndarray]:
+def split_axis_poles(
+    r: Realization, p: np.ndarray, scale: float, errors: np.ndarray | None = None
+) -> tuple[tuple[AxisPole, ...], np.ndarray]:
     """Split poles into those on the limit of stability, with coinciding ones gathered, and the others, all as s.
 
-    m coinciding poles are computed with a scatter of ε^(1/m), ε the rounding; their mean is accurate to ε.
+    m coinciding poles are computed with a scatter of ε^(1/m), ε the rounding; their mean is accurate to ε. Where the
+    errors of the poles are known, each may be as far from the mean, since others may lie around a mean on the limit.
     """
     left, found = list(np.asarray(p, dtype=complex)), []
+    allowed = [np.inf] * len(left) if errors is None else list(errors)
     for m in range(min(len(left), 8), 0, -1):
         radius = 10 * scale * 1e-15 ** (1 / m)
         again = True
@@ -81,8 +85,9 @@ def split_axis_poles(r: Realization, p: np.ndarray, scale: float) -> tuple[tuple
                 group = np.array([left[k] for k in near])
                 mean = complex(group.mean())
                 spread = float(np.max(np.abs(group - mean)))
-                if spread <= radius and abs(float(r.growth(np.array(mean)))) <= 1e-11 * scale:
-                    left = [value for k, value in enumerate(left) if k not in near]
+                explained = all(abs(left[k] - mean) <= allowed[k] for k in near)
+                if spread <= radius and explained and abs(float(r.growth(np.array(mean)))) <= 1e-11 * scale:
+                    left, allowed = ([v for k, v in enumerate(of) if k not in near] for of in (left, allowed))
                     found.append((mean, m, spread))
                     again = True
                     break
@@ -144,6 +149,19 @@ def find_hidden_unstable(r: Realization) -> tuple[complex, ...]:
     """
     if not len(r.hidden):
         return ()
-    _, rest = split_axis_poles(r, r.hidden, max(r.scale, float(np.abs(r.hidden).max())))
+    scale = max(r.rounding_scale, float(np.abs(r.hidden).max()))
+    _, rest = split_axis_poles(r, r.hidden, scale, r.hidden_errors)
     beyond = rest[rest.real > 0]
-    return tuple(complex(p) for p in (np.exp(beyond * r.dt) if r.dt else beyond))
+    if r.dt:
+        beyond = np.exp(beyond * r.dt)
+        is_real = np.abs(beyond.imag) <= 1e-15 * np.abs(beyond)  # a negative one has the angle π, whose sine rounds
+        beyond = np.where(is_real, beyond.real, beyond)
+    return tuple(complex(p) for p in beyond)
+
+
+def tell_hidden_unstable(poles: tuple[complex, ...]) -> list[str]:
+    """Return the line of a text that names hidden unstable poles, as `find_hidden_unstable` returns them."""
+    if not poles:
+        return []
+    named = ", ".join(f"{p:.6g}" if p.imag else f"{p.real:.6g}" for p in poles)
+    return [f"hidden_unstable       {named}: not in this loop, and not moved by feedback around it"]

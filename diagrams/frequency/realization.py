@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -29,6 +29,8 @@ ROUNDOFF = 2e-15
 """Relative size of the rounding in a solution of linear equations: nine times that of a number."""
 LIGHTLY_DAMPED = 0.3
 """Damping ratio of a pole below which a response is drawn at more frequencies around it."""
+SCATTER = 1e-12
+"""Relative change of a matrix that may have moved the eigenvalues of a hidden part: some hundred roundings."""
 LARGE = 1e4
 """|L| above which a difference does not show in the closed loop."""
 
@@ -39,8 +41,10 @@ class Realization:
 
     The shift z − 1 keeps a loop accurate far below the sampling frequency, where several poles at z = 1 would cancel
     all digits. Frequencies and points of the contour are given as s in both cases: p = exp(s T) − 1. ``hidden`` are
-    the poles, in the plane of p, that the reduction has removed; ``coefficients`` those of the transfer function in z
-    that was realized. ``inexactness`` is the relative error of the entries as they were given.
+    the poles, in the plane of p, that the reduction has removed, and ``hidden_errors`` how far rounding may have moved
+    each. ``coefficients`` are those of the transfer function in z that was realized. ``inexactness`` is the relative
+    error of the entries as they were given. ``turned`` is the norm of the matrix that the reduction has turned into
+    this A and a hidden part, 0 where it has turned none: its rounding is in A, which may be much smaller.
     """
 
     A: np.ndarray
@@ -51,6 +55,8 @@ class Realization:
     hidden: np.ndarray
     coefficients: Coefficients | None = None
     inexactness: float = 0.0
+    hidden_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    turned: float = 0.0
 
     @classmethod
     def of(cls, loop: LinearSystem, *, delay: int = 0) -> Realization:
@@ -180,6 +186,11 @@ class Realization:
         """Frobenius norm of A."""
         return float(np.linalg.norm(self.A)) if self.order else 0.0
 
+    @property
+    def rounding_scale(self) -> float:
+        """Size to which the rounding of the poles is relative."""
+        return max(self.scale, self.turned)
+
     def delay_by(self, samples: int) -> Realization:
         """Return this sampled system with samples of delay in series."""
         A, B, C, D = self.A, self.B, self.C, self.D
@@ -196,7 +207,8 @@ class Realization:
                 whole = fewer
         part, first = _split_uncontrollable(whole)
         part, second = _split_uncontrollable(_transpose(part))
-        return whole._replace_by(_transpose(part), np.concatenate([first, second]))
+        part = replace(_transpose(part), turned=whole.rounding_scale)
+        return whole._replace_by(part, np.hstack([first, second]))
 
     def grid(self, low: float, high: float, count: int) -> np.ndarray:
         """Return frequencies in rad/s to draw a response at: ``count`` over the logarithm, and more at resonances."""
@@ -239,11 +251,15 @@ class Realization:
         return np.asarray(ROUNDOFF * size * x * y)
 
     def _replace_by(self, part: Realization, hidden: np.ndarray) -> Realization:
-        """Return a part of this system if its response is the same, with ``hidden`` added; else this system."""
+        """Return a part of this system if its response is the same, with ``hidden`` added; else this system.
+
+        ``hidden`` are poles and their errors, shape (2, n).
+        """
         if part.order == self.order:
             return self
         A, B, C = _scale(part.A, part.B, part.C)
-        part = replace(self, A=A, B=B, C=C, hidden=np.concatenate([self.hidden, hidden]))
+        poles, errors = np.append(self.hidden, hidden[0]), np.append(self.hidden_errors, hidden[1].real)
+        part = replace(self, A=A, B=B, C=C, hidden=poles, hidden_errors=errors, turned=part.turned)
         poles = self.logarithm(np.linalg.eigvals(self.A))
         size = np.abs(poles[np.isfinite(poles)])
         top = min(10 * size.max(initial=1.0), self.nyquist)
@@ -309,7 +325,7 @@ def _scale(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _keep_connected(r: Realization, tolerance: float) -> tuple[Realization, np.ndarray]:
-    """Return the states that couplings above a tolerance connect to input and output, and the poles of the others."""
+    """Return the states that couplings above a tolerance connect to input and output, and `_hidden_poles`."""
     A, B, C = _scale(r.A, r.B, r.C)
     n = len(A)
     whole = np.block([[A, B], [C, np.zeros((len(C), B.shape[1]))]])
@@ -320,15 +336,15 @@ def _keep_connected(r: Realization, tolerance: float) -> tuple[Realization, np.n
         reached, seen = reached | A[:, reached].any(axis=1), seen | A[seen].any(axis=0)
     keep = reached & seen
     if keep.all():
-        return r, np.zeros(0)
+        return r, np.zeros((2, 0))
     part = replace(r, A=r.A[np.ix_(keep, keep)], B=r.B[keep], C=r.C[:, keep])
-    return part, np.linalg.eigvals(r.A[np.ix_(~keep, ~keep)])
+    return part, _hidden_poles(r, r.A[np.ix_(~keep, ~keep)])
 
 
 def _split_uncontrollable(r: Realization) -> tuple[Realization, np.ndarray]:
-    """Return the controllable part and the poles of the rest, by a block Krylov staircase."""
+    """Return the controllable part and `_hidden_poles` of the rest, by a block Krylov staircase."""
     if not r.order:
-        return r, np.zeros(0)
+        return r, np.zeros((2, 0))
     size = np.linalg.norm(r.B, axis=0)
     hidden = max(HIDDEN, 10 * r.inexactness)
     new = _range(r.B / np.where(size > 0, size, 1.0), hidden)
@@ -340,11 +356,24 @@ def _split_uncontrollable(r: Realization) -> tuple[Realization, np.ndarray]:
         new = _range(reached, hidden * r.scale)
         Q = np.hstack([Q, new])
     if Q.shape[1] == r.order:
-        return r, np.zeros(0)
+        return r, np.zeros((2, 0))
     whole, _ = np.linalg.qr(np.hstack([Q, np.eye(r.order)]))
     rest = whole[:, Q.shape[1] :]
     part = replace(r, A=Q.T @ r.A @ Q, B=Q.T @ r.B, C=r.C @ Q)
-    return part, np.linalg.eigvals(rest.T @ r.A @ rest)
+    return part, _hidden_poles(r, rest.T @ r.A @ rest)
+
+
+def _hidden_poles(r: Realization, M: np.ndarray) -> np.ndarray:
+    """Return the poles of the hidden part M of a system and how far rounding may have moved each, shape (2, n).
+
+    A change E of M moves a simple eigenvalue by up to ‖E‖/|yᴴx|, x and y its unit eigenvectors (Golub and Van Loan,
+    Matrix Computations, 7.2.2). Of m coinciding ones, which scatter by δ = ‖E‖^(1/m), the bound is some δ/m as well.
+    """
+    from scipy.linalg import eig
+
+    poles, y, x = eig(M, left=True, right=True)
+    change = max(SCATTER, 10 * r.inexactness) * r.rounding_scale
+    return np.array([poles, change / np.maximum(np.abs(np.sum(y.conj() * x, axis=0)), 1e-300)])
 
 
 def _range(M: np.ndarray, least: float) -> np.ndarray:
