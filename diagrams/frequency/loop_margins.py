@@ -13,7 +13,7 @@ from .loop_scan import Crossing, LoopScan, Peak
 from .margin_analysis import EIGENVALUES, MarginFinder, StabilityMargins
 from .number import Confirmation, Number, carries_findings
 from .nyquist import count_encirclements, winding_number
-from .poles_and_zeros import Features, find_hidden_unstable
+from .poles_and_zeros import Features, find_hidden_unstable, tell_hidden_unstable
 from .realization import ROUNDOFF, Realization
 from .scan_refine_confirm import confirm_no_limit, number_of_limit
 from .sensitivity_peaks import confirm_peak, find_level_frequencies
@@ -116,10 +116,7 @@ class Margins(StabilityMargins):
         if not self.stable:
             lines += [f"gain_crossover        {c.frequency}" for c in self.gain_crossovers]
             lines += [f"phase_crossover       {c.frequency}, factor {c.gain_margin}" for c in self.phase_crossovers]
-        if self.hidden_unstable:
-            poles = ", ".join(f"{p:.6g}" for p in self.hidden_unstable)
-            lines.append(f"hidden_unstable       {poles}: not in this loop")
-        return lines
+        return [*lines, *tell_hidden_unstable(self.hidden_unstable)]
 
 
 @accepts(delay=kinds.finite, skew=kinds.number)

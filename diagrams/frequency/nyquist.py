@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, explain_calls, kinds
 from .loop_scan import make_grid
 from .number import carries_findings
-from .poles_and_zeros import Features
+from .poles_and_zeros import Features, find_hidden_unstable, tell_hidden_unstable
 from .realization import Realization
 
 if TYPE_CHECKING:
@@ -20,9 +20,12 @@ if TYPE_CHECKING:
 
 
 @explain_calls
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class NyquistCount:
     """Numbers of the Nyquist criterion Z = N + P.
+
+    P and Z are those of the realization that was given. A mode that input or output doesn't see is no part of L, and no
+    feedback around L moves it: where it is unstable it counts in P and in Z, and N doesn't depend on it.
 
     Parameters
     ----------
@@ -30,9 +33,11 @@ class NyquistCount:
         N, clockwise encirclements of −1: the winding number of 1 + L along a contour that passes poles on the axis on
         the right.
     open_loop : int
-        P, open-loop poles beyond the limit of stability.
+        P, open-loop poles beyond the limit of stability, the hidden ones among them.
     closed_loop : int
-        Z = N + P, closed-loop poles beyond the limit; the eigenvalues agree.
+        Z = N + P, closed-loop poles beyond the limit, the hidden ones among them; the eigenvalues agree.
+    hidden_unstable : tuple of complex
+        The hidden ones, in the s plane (continuous) or the z plane (sampled). One on the limit is not among them.
     findings : tuple of Finding
         Effects on the loop that its linear model leaves out.
     """
@@ -40,7 +45,15 @@ class NyquistCount:
     encirclements: int
     open_loop: int
     closed_loop: int
-    findings: tuple[Finding, ...] = field(default=(), repr=False)
+    hidden_unstable: tuple[complex, ...] = ()
+    findings: tuple[Finding, ...] = ()
+
+    def __repr__(self) -> str:
+        names = ("encirclements", "open_loop", "closed_loop", *(("hidden_unstable",) if self.hidden_unstable else ()))
+        return f"{type(self).__name__}({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"
+
+    def __str__(self) -> str:
+        return "\n".join([repr(self), *tell_hidden_unstable(self.hidden_unstable)])
 
 
 @accepts(delay=kinds.finite)
@@ -65,6 +78,12 @@ def nyquist_count(loop: LinearSystem, *, delay: int = 0) -> NyquistCount:
     >>> import control
     >>> nyquist_count(control.ss(control.tf([2.0], [1.0, -1.0])))
     NyquistCount(encirclements=-1, open_loop=1, closed_loop=0)
+
+    Two equal lags in parallel have a mode that the loop doesn't see:
+
+    >>> print(nyquist_count(control.ss([[1, 0], [0, 1]], [[1], [1]], [[1, 1]], 0)))
+    NyquistCount(encirclements=-1, open_loop=2, closed_loop=1, hidden_unstable=((1+0j),))
+    hidden_unstable       1: not in this loop, and not moved by feedback around it
     """
     r = Realization.of(loop, delay=delay)
     return count_encirclements(r, Features.of(r))
@@ -81,7 +100,8 @@ def count_encirclements(r: Realization, features: Features) -> NyquistCount:
             "the limit of stability.",
             block="nyquist",
         )
-    return NyquistCount(n, open_loop, eigenvalues)
+    hidden = find_hidden_unstable(r)
+    return NyquistCount(n, open_loop + len(hidden), eigenvalues + len(hidden), hidden)
 
 
 def winding_number(r: Realization, features: Features, *, delay: float = 0.0) -> int:
