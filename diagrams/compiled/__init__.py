@@ -2,6 +2,8 @@
 
 from .background import BackgroundCode
 from .code import LARGEST, TickCode, compile_ticks, find_obstacle, interpret_ticks, write_ticks
+from .compiled_libraries import load_compiled
+from .function_code import Code
 from .fused import FusedPlant, compile_fused, fuse
 from .grouping import make_tables
 from .handed_over import HandedOver
@@ -24,12 +26,10 @@ from .hybrid_code import (
     write_hybrid,
 )
 from .kernels import Kernel
-from .libraries import load_compiled
 from .library_method import StepFailure
 from .loop import CompiledLoop, NewtonOptions, Outcome, ReturnReason
 from .native_tick import bind_call
 from .remote import REFUSED, TOLD, UNDER_WAY, PythonStep, compile_other_side
-from .sources import Code
 from .staged import NativeExchange, OwnEvent
 from .watch import Fired, Pile
 

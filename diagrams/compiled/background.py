@@ -9,7 +9,7 @@ from typing import Any, Generic
 
 from ...blocks.core import LoopwrightError
 from ..flat import FlatDiagram
-from .sources import Code, Sources
+from .function_code import Code, Sources
 
 _WRITING = 3e-5  # s to write the C code of an operation
 _COMPILING = 1e-3  # s to compile it

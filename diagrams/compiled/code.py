@@ -12,15 +12,15 @@ from weakref import WeakKeyDictionary
 from ...blocks.core import CompilerError
 from ...fmus.runtime import read_sources
 from ..flat import EXACT_LOOP, FlatDiagram, TickPattern, TickProgram, share_terms
-from .functions import CodeOfFunctions, CompiledFunction, GeneratedCode, address_of
+from .bound_functions import CodeOfFunctions, CompiledFunction, GeneratedCode, address_of
+from .compiled_libraries import load_compiled
+from .function_code import Sources
 from .generated_text import write_functions
 from .grouped_functions import GroupedTick
 from .grouping import TickTables, make_tables
 from .kernels import BlockKinds, Kernels
-from .libraries import load_compiled
 from .reordered import put_in_order
 from .runtime import load_runtime
-from .sources import Sources
 from .staged_functions import Staged, StagedEquations
 
 LARGEST = 6_000

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from .functions import TickStructure, at
+from .bound_functions import TickStructure, at
 from .hybrid_structures import DelaysStructure
 
 

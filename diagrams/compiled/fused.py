@@ -12,6 +12,7 @@ from ...blocks.core import CompilerError, FmuError
 from ...fmus.export import describe_processor, inline_model, own_functions, processor_flags, tune
 from ...fmus.platform import is_built_here
 from ..flat import FlatDiagram, TickPattern, WiredDiagram, share_terms
+from .bound_functions import GeneratedCode
 from .code import (
     MASTER,
     TickCode,
@@ -19,10 +20,9 @@ from .code import (
     compile_ticks,
     master_source,
 )
-from .functions import GeneratedCode
+from .compiled_libraries import load_compiled
 from .generated_text import write_functions
 from .hybrid_code import FUSING
-from .libraries import load_compiled
 from .reordered import reorder
 
 _LIMIT = "0x1p20"  # LW_FAST_LIMIT

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..flat import bind_function
-from .functions import BoundFunction, TickStructure, at, call_for_c, list_vectors
+from .bound_functions import BoundFunction, TickStructure, at, call_for_c, list_vectors
 from .grouping import BlockCalls, PartTables, PythonCall, TickTables
 from .kernels import Kernels
 from .machine import BlockProgramStructure

@@ -13,14 +13,14 @@ import numpy as np
 from ..events import Domains
 from ..flat import NONE, FlatDiagram, StepTable, TickPattern
 from ..solvers import METHODS, MethodKind
+from .bound_functions import CALL, at
 from .delays import NativeDelays, PastInputs
-from .differences import RateDifferences
-from .functions import CALL, at
 from .hybrid_code import Between, HybridCode
 from .hybrid_structures import HybridStructure, MethodStructure, ProblemStructure, SpanStructure
 from .library_method import LibraryMethod, StepFailure
 from .loop import CompiledLoop, NewtonOptions, NewtonStructure, OutcomeStructure
 from .radau import radau_numbers
+from .rate_differences import RateDifferences
 from .runtime import load_runtime
 from .staged import NativeExchange
 from .staged_functions import Staged, StagedSlopes

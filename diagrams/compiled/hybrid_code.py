@@ -13,6 +13,7 @@ import casadi as ca
 
 from ...fmus.export import describe_processor, processor_flags
 from ..flat import NONE, FlatDiagram, OpaqueStage, PartProgram, Schedule, TickPattern, share_terms
+from .bound_functions import CodeOfFunctions, CompiledFunction, GeneratedCode, MachineFunction, address_of
 from .code import (
     GroupedTicks,
     TickCode,
@@ -21,15 +22,14 @@ from .code import (
     loop_functions,
     write_loops,
 )
-from .differences import Columns, RateDifferences, find_columns
-from .functions import CodeOfFunctions, CompiledFunction, GeneratedCode, MachineFunction, address_of
+from .function_code import Sources
 from .generated_text import write_functions
 from .grouped_functions import GroupedFunction, GroupedPart
 from .grouping import PartTables, make_part_tables
 from .kernels import BlockKinds, Kernels
+from .rate_differences import Columns, RateDifferences, find_columns
 from .runtime import load_runtime
 from .small_steps import STEPS, write_steps
-from .sources import Sources
 from .staged_functions import Staged, StagedEquations, StagedSlopes
 from .step_outputs import may_fail_at_steps
 

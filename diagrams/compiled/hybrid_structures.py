@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 from typing import Any
 
-from .functions import TickStructure
+from .bound_functions import TickStructure
 from .loop import LoopStructure
 from .watch import WatchStructure
 

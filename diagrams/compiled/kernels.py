@@ -16,7 +16,7 @@ import numpy as np
 
 from ...blocks.core import CompilerError
 from ..flat import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE, TRUE_OF, FlatDiagram, Program
-from .functions import CodeOfFunctions, Machine, operation_names
+from .bound_functions import CodeOfFunctions, Machine, operation_names
 from .generated_text import BODY, READ, WRITE
 from .machine import BlockProgram, make_program
 

@@ -18,8 +18,8 @@ from ...blocks.interrupts import INTERRUPTS
 from ...fmus.calls import NEAR, FmuInstance, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
 from ..flat import TRUE, StepTable, TickPattern
+from .bound_functions import CALL, TICK, TickStructure, at
 from .code import CompiledTick, TickCode
-from .functions import CALL, TICK, TickStructure, at
 from .grouped_functions import GroupedTick
 from .remote import PythonStep, RemotePlants
 from .runtime import load_runtime

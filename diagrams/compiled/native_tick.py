@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ...blocks.interrupts import INTERRUPTS
+from .bound_functions import TICK
 from .code import CompiledTick
-from .functions import TICK
 from .staged_functions import Staged
 
 

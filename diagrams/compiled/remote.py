@@ -12,7 +12,7 @@ import numpy as np
 from ...blocks.called_back import CalledBack
 from ...blocks.core import LoopwrightError
 from ...fmus.calls import ERROR, BoundCalls, ChildFace, ChildRequest, QuietStep, RemoteStep, SharedValues
-from .functions import at
+from .bound_functions import at
 from .runtime import load_runtime
 
 UNDER_WAY, REFUSED, TOLD = 3, 4, 5

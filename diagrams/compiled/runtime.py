@@ -7,7 +7,7 @@ from functools import lru_cache
 
 from ...fmus.runtime import installed_runtime, runtime_source
 from ...fmus.toolchain import RUNTIME_FLAGS
-from .libraries import is_kept, load_compiled
+from .compiled_libraries import is_kept, load_compiled
 
 
 @lru_cache(maxsize=1)

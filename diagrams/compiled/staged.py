@@ -15,9 +15,9 @@ from ...fmus.calls import BoundCalls, NativeAction, NativeLook
 from ...fmus.host_state import HostState
 from ..exchange import OWN_EVENTS
 from ..flat import JUMP, OpaqueStage
-from .differences import color_columns
-from .functions import CALL, TickStructure, address_of, at, list_vectors
+from .bound_functions import CALL, TickStructure, address_of, at, list_vectors
 from .loop import NewtonStructure
+from .rate_differences import color_columns
 from .remote import LateReplies, RemotePlants
 from .staged_functions import Staged, StagedEquations, StagedSlopes
 

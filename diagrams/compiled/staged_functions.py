@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..flat import Schedule
-from .functions import CompiledFunction
+from .bound_functions import CompiledFunction
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,9 +11,9 @@ import numpy as np
 
 from ..events import Domains
 from ..flat import FlatDiagram
-from .differences import RateDifferences
-from .functions import TickStructure, at
+from .bound_functions import TickStructure, at
 from .hybrid_code import Between
+from .rate_differences import RateDifferences
 from .staged import NativeExchange
 from .staged_functions import Staged, StagedSlopes
 

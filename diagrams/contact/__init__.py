@@ -3,13 +3,13 @@
 from .admittance import ContactAdmittance, compute_admittance
 from .confirmation import ContactConfirmation, ContactTrial, TrialMethod, try_limit
 from .contact import SIDES, Contact, find_sign, make_contact
+from .contact_ports import PortNames
+from .coupled_parts import restrict
 from .environment import UNITS, check_properties, check_property
 from .loop import close_loop, controller_rows, join_environment
 from .measured_force import Tool
 from .moored_plant import hold_sources
-from .parts import restrict
 from .passivity import LOWEST, Passivity, PassivityReason, PortPassivity
-from .ports import PortNames
 from .stability_limits import (
     PER_DECADE,
     ContactLimit,

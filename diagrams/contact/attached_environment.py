@@ -22,8 +22,8 @@ from ...blocks.core import AlgebraicLoopError, Array, Block, Input, OptionError,
 from ...fmus.running import Fmu
 from ..linearization import PlantEquations
 from ..wiring import Structure, SubsystemSettings, Wire
+from .contact_ports import Ports
 from .moored_plant import Mooring, copy_table, hold_beside, set_tool
-from .ports import Ports
 
 if TYPE_CHECKING:
     from ..flat import WiredDiagram

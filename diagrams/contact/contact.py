@@ -14,6 +14,8 @@ from ...blocks.core import Array, Finding, OptionError, UnknownNameError, accept
 from ...fmus.running import Derivation
 from ..linearization import check_options, operating_point
 from .admittance import ContactAdmittance, compute_admittance
+from .contact_ports import PortNames, Ports
+from .coupled_parts import ContactParts, take_apart
 from .environment import (
     A_FREQUENCY,
     check_properties,
@@ -23,7 +25,6 @@ from .environment import (
     read_vector,
 )
 from .loop import close_loop, join_environment
-from .parts import ContactParts, take_apart
 from .passivity import (
     CONTINUOUS,
     HIGHEST,
@@ -35,7 +36,6 @@ from .passivity import (
     find_negative,
     find_passivity,
 )
-from .ports import PortNames, Ports
 from .stability_limits import PER_DECADE, ContactLimit, ContactMap, CoupledLoop, find_limit, map_growth, read_scan
 
 if TYPE_CHECKING:

@@ -33,8 +33,8 @@ import numpy as np
 
 from ...blocks.core import Array
 from ..frequency import advance_held, hold_inputs
+from .coupled_parts import ContactParts, StateMatrices
 from .environment import check_environment
-from .parts import ContactParts, StateMatrices
 
 SLOW, SLOW_RATE = 1e-3, 1.0
 """Distance of |z| from 1, and rate in 1/s, within which a stable mode is looked at."""

@@ -26,7 +26,7 @@ import numpy as np
 from ...blocks import ForceSensor
 from ...blocks.core import OptionError
 from ..linearization import Linearization, PlantEquations, Tap, find_signal, linearize
-from .ports import DrivingPort, Ports
+from .contact_ports import DrivingPort, Ports
 
 if TYPE_CHECKING:
     from ..flat import FlatDiagram, WiredDiagram

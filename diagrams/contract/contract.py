@@ -22,11 +22,11 @@ from ...blocks.core import (
     near,
 )
 from ...blocks.tracing import trace
-from .events import check_events, check_smooth, find_instants
+from .event_rules import check_events, check_smooth, find_instants
 from .exercise import Bench, Exercise, kind_text, points
 from .runs import check_run
 from .traces import check_derivatives, check_feedthrough, check_guards, check_shapes, check_trace, find_swallowed
-from .values import check_ports, check_purity, check_values
+from .value_rules import check_ports, check_purity, check_values
 
 
 @explain_calls

@@ -9,7 +9,7 @@ import numpy as np
 from ...blocks.core import Block, SimulationError
 from ..results import Run
 from .exercise import Exercise, kind_text
-from .values import rule_error
+from .value_rules import rule_error
 
 
 def check_run(exercise: Exercise, sampled: bool) -> tuple[str, set[str]]:

@@ -8,7 +8,7 @@ import numpy as np
 from ...blocks.core import GuardError, ShapeError, TraceError, lay_out
 from ...blocks.tracing import GUARDS, NEXT, bundle
 from .exercise import Bench, Point
-from .values import rule_error
+from .value_rules import rule_error
 
 _STEP = 1e-6  # of differences, relative to 1 + |v|
 

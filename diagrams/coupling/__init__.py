@@ -1,13 +1,13 @@
 """Plants of a run: loaded, stepped between their communication points, and coupled with one another."""
 
+from .connection_delays import CoupledConnection, CouplingReport, HeldFrom, LinkKind, report_coupling
 from .coupled_steps import CoupledSteps, Effort, tells_slopes
+from .coupling_options import Coupling, Scheme, refuse_exchanged, to_coupling
 from .fixed_points import find_fixed_point
 from .links import Links
 from .loops import note_loops
-from .options import Coupling, Scheme, refuse_exchanged, to_coupling
 from .plant_steps import PlantSteps, end_all, runs_apart, step_all
 from .plants import Plant, load_plants, note_steps
-from .report import CoupledConnection, CouplingReport, HeldFrom, LinkKind, report_coupling
 from .rollback import accept_steps, try_steps
 from .search import Search
 

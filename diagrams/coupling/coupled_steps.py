@@ -10,8 +10,8 @@ import numpy as np
 
 from ...blocks.core import OptionError, SimulationError, left_of
 from ..flat import FlatDiagram, takes_any_step
+from .coupling_options import Coupling, Scheme
 from .links import Links
-from .options import Coupling, Scheme
 from .plant_steps import PlantSteps, step_all
 from .plants import Plant
 from .rest import Rest

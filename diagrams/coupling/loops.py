@@ -6,8 +6,8 @@ from weakref import WeakKeyDictionary
 
 from ..flat import FlatDiagram
 from ..wiring import Structure
+from .coupling_options import Coupling, Scheme
 from .links import Links, direct_ports
-from .options import Coupling, Scheme
 
 _KNOWN: WeakKeyDictionary[FlatDiagram, bool] = WeakKeyDictionary()  # a tenth of the set-up of a run
 

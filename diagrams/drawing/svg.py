@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ...blocks.core import OptionError, Sum, accepts, check_file, explain_calls, kinds, near, write_text
 from ..wiring import Structure, stepped_blocks
-from .layout import Net, arrange
+from .drawing_layout import Net, arrange
 from .nets import Border, Nets, PinPlace
 from .order import Node, Pin
 from .shapes import BORDER, GREY, INK, NAME, PLANT, WIRE, line, rect, seconds, text_at, width

@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from ..flat import FlatDiagram, FlatEvent
-from .limits import RECENT, EventLimits
+from .event_errors import RECENT, EventLimits
 
 LATEST = 9
 """Times of each event that are kept, by which Zeno behaviour is known."""

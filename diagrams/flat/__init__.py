@@ -7,9 +7,9 @@ from .clocks import EVERY, NONE, ClockSets, TickPattern, ticks_after
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator, sort_names
 from .fast_functions import share_terms, speed_up
 from .flat_diagram import EXACT_LOOP, FlatDiagram
+from .flat_functions import indicators_of
+from .flat_layout import FlatEvent, StateLayout
 from .flatten import renumber, write_numbers
-from .functions import indicators_of
-from .layout import FlatEvent, StateLayout
 from .logic import TRUE, is_true
 from .plant_ticks import StepTable, own_step, takes_any_step
 from .program import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE_OF, Ids, Operation, PartProgram, Program, TickProgram

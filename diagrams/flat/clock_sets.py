@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from .clocks import TickPattern
-from .layout import FlatLayout
+from .flat_layout import FlatLayout
 
 _EXACT = 2**53  # up to which every integer is a float64
 _MOST_TICKS, _MOST_SETS = 2**20, 256

@@ -1,7 +1,8 @@
 """A flattened diagram: its layout with its functions, each traced once, when it is first asked for.
 
-From the bottom up: `layout` says where everything is, `evaluate` evaluates all blocks at an instant, `functions`
-makes schedules of it (`stages`), and the `FlatDiagram` keeps them. They are what is run, differentiated and compiled.
+From the bottom up: `flat_layout` says where everything is, `evaluate` evaluates all blocks at an instant,
+`flat_functions` makes schedules of it (`stages`), and the `FlatDiagram` keeps them. They are what is run, differentiated
+and compiled.
 Nothing in it changes but these caches: a run has its own vectors, of parameters too.
 """
 
@@ -19,10 +20,10 @@ import numpy as np
 
 from ...blocks.core import Block, brief, count_of, explain_calls
 from ..wiring import Checked, Structure
-from . import functions
+from . import flat_functions
 from .block_functions import BlockFunctions
 from .clocks import NONE, TickPattern
-from .layout import FlatLayout, sample_time_of
+from .flat_layout import FlatLayout, sample_time_of
 from .program import Cells, PartProgram, TickProgram
 from .stages import Schedule
 from .total_derivative import Derivative
@@ -112,13 +113,15 @@ class FlatDiagram(FlatLayout):
     def at_tick(self, acting: frozenset[TickPattern]) -> Schedule:
         """Return what happens at a tick at which the given clocks act, with the blocks of continuous subsystems.
 
-        See `loopwright.diagrams.flat.functions.trace_tick`. Without any clock it is an instant between ticks, and gives
-        all outputs there.
+        See `loopwright.diagrams.flat.flat_functions.trace_tick`. Without any clock it is an instant between ticks, and
+        gives all outputs there.
         """
         if acting not in self._ticks:
             large = acting == NONE and self.by_block and not self.apart and self.continuous.size
             keep = self._rates.append if large and "flow" not in vars(self.origin) else None
-            self._ticks[acting] = functions.trace_tick(self, self.blocks, acting, by_block=self.by_block, keep=keep)
+            self._ticks[acting] = flat_functions.trace_tick(
+                self, self.blocks, acting, by_block=self.by_block, keep=keep
+            )
         return self._ticks[acting]
 
     def program_at(self, acting: frozenset[TickPattern]) -> TickProgram:
@@ -128,7 +131,7 @@ class FlatDiagram(FlatLayout):
         """
         found = self._programs.get(acting)
         if found is None:
-            found = self._programs[acting] = functions.trace_tick_program(self, self.blocks, acting)
+            found = self._programs[acting] = flat_functions.trace_tick_program(self, self.blocks, acting)
         return found
 
     @_shared
@@ -141,7 +144,7 @@ class FlatDiagram(FlatLayout):
             tick = self.program_at(NONE)
             assert tick.rates is not None
             return PartProgram.of(tick.program, Cells(tick.program, tick.rates))
-        return functions.trace_part_program(self, self.blocks, name)
+        return flat_functions.trace_part_program(self, self.blocks, name)
 
     @_shared
     def by_block(self) -> bool:
@@ -168,48 +171,48 @@ class FlatDiagram(FlatLayout):
         return {}
 
     @_shared
-    def _rates(self) -> list[functions.TracedRates]:
+    def _rates(self) -> list[flat_functions.TracedRates]:
         """Rates of a large diagram that a tick has made by the way, until `flow` takes them."""
         return []
 
     @_shared
     def flow(self) -> Schedule:
         """Return the rates of the continuous states between ticks, ``(t, x, w, p) -> dx``."""
-        return functions.trace_flow(self, self.blocks, self._rates.pop() if self._rates else None)
+        return flat_functions.trace_flow(self, self.blocks, self._rates.pop() if self._rates else None)
 
     @_shared
     def jacobian(self) -> Derivative:
         """Return the derivative of `flow` by the continuous states, ``(t, x, w, p) -> (n, n)``."""
-        return functions.differentiate_flow(self, self.flow)
+        return flat_functions.differentiate_flow(self, self.flow)
 
     @_shared
     def jacobian_with_loops(self) -> Derivative:
         """Return the derivatives of `flow` and of algebraic loops' mismatch, by continuous states and loops."""
-        return functions.differentiate_flow_with_loops(self, self.blocks)
+        return flat_functions.differentiate_flow_with_loops(self, self.blocks)
 
     @_shared
     def indicators(self) -> Schedule:
         """``(t, x, w, p) -> (g, open)``: indicators of `events`, and whether the subsystems around them are enabled."""
-        return functions.trace_indicators(self, self.blocks)
+        return flat_functions.trace_indicators(self, self.blocks)
 
     @_shared
     def jump(self) -> Schedule:
         """``(t, x, w, p, fired) -> x_next``: x after events."""
-        return functions.trace_jump(self, self.blocks)
+        return flat_functions.trace_jump(self, self.blocks)
 
     @_shared
     def driven(self) -> Schedule:
         """``(t, x, w, p) -> z`` between ticks: the inputs of transport delays, and of FMUs."""
-        return functions.trace_driven(self, self.blocks)
+        return flat_functions.trace_driven(self, self.blocks)
 
     @_shared
     def exchange(self) -> Schedule:
         """``(t, x, w, p, log) -> z`` between ticks: the inputs of plants, with outputs of sampled blocks from log."""
-        return functions.trace_exchange(self, self.blocks)
+        return flat_functions.trace_exchange(self, self.blocks)
 
     def output(self, port: tuple[str, str]) -> Schedule:
         """Return ``(t, x, w, p) -> y``: an output between ticks, without entries where nothing evaluates it then."""
-        return functions.trace_output(self, self.blocks, port)
+        return flat_functions.trace_output(self, self.blocks, port)
 
     def loop_equations(self, acting: frozenset[TickPattern]) -> Derivative | None:
         """Return ``(t, x, w, p) -> (r, J)``: the mismatch of the algebraic loops at the values in x, and ∂r/∂values.
@@ -217,7 +220,7 @@ class FlatDiagram(FlatLayout):
         None where no torn port acts.
         """
         if acting not in self._loops:
-            self._loops[acting] = functions.trace_loops(self, self.blocks, acting)
+            self._loops[acting] = flat_functions.trace_loops(self, self.blocks, acting)
         return self._loops[acting]
 
     @_shared
@@ -264,4 +267,4 @@ class FlatDiagram(FlatLayout):
 
     def symbols(self) -> dict[str, Any]:
         """Return fresh symbols of t, x, w and p, by these names: arguments of `evaluate`."""
-        return functions.make_symbols(self)
+        return flat_functions.make_symbols(self)

@@ -13,7 +13,7 @@ from ...blocks.core import Block, Layout, SampleTimeError, Shape, one_thread, wi
 from ..wiring import Checked, Order, Structure, join, stepped_blocks
 from .clocks import TickPattern
 from .flat_diagram import FlatDiagram
-from .layout import FlatEvent, StateLayout, sample_time_of
+from .flat_layout import FlatEvent, StateLayout, sample_time_of
 from .plant_ticks import own_step
 
 _MANY = 300

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...blocks.core import Layout
 from .evaluation import Instant, rows
-from .layout import FlatLayout
+from .flat_layout import FlatLayout
 from .program import Cells
 
 

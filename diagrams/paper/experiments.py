@@ -34,8 +34,8 @@ from ...fmus.models import gantry
 from ..diagram import Diagram
 from ..results import Run
 from ..simulation import RunKeywords, RunOptions, simulate
+from .experiment_options import DEFAULTS, ELLIPSE, merge
 from .fig3_diagram import fig3
-from .options import DEFAULTS, ELLIPSE, merge
 from .wires import IMPEDANCE_PAR, IMPEDANCE_PERP, Channel, Rig, check_plant
 
 if TYPE_CHECKING:

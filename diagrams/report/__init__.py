@@ -29,8 +29,8 @@ from .pages import (
     read_definitions,
     write_report,
 )
-from .parts import ReportKind, ReportPart
 from .points import point_of
+from .report_parts import ReportKind, ReportPart
 from .sections.loops import DISK_NUMBERS, disk_numbers, disk_range
 from .sections.not_modelled import LIMITS_TITLE
 from .sections.poles import POLES_TITLE, list_poles

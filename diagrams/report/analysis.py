@@ -18,8 +18,8 @@ from .case import Case, ReportedExperiment
 from .content_hash import content_hash
 from .figures import AxisUnits
 from .pages import DEFINITIONS, Report
-from .parts import ReportKind, ReportPart
 from .points import STEP
+from .report_parts import ReportKind, ReportPart
 from .review import review
 from .sections.contacts import contact_sections, contacts_on_first_page, read_contacts
 from .sections.injection import injected

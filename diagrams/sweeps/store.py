@@ -13,9 +13,9 @@ from zipfile import BadZipFile
 import numpy as np
 
 from ...blocks.core import OptionError, explain_disk_errors, replace_file, write_text
-from .differences import describe_differences
 from .outcome import WORKER_ENDED, Failure, SampleOutcome
 from .revision import Parts, digest_of
+from .sweep_differences import describe_differences
 
 HEAD = "sweep.json"
 _FORMAT = 2

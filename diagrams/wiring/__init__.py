@@ -10,8 +10,8 @@ from .order import Order, find_orders
 from .parameter_names import find_name, find_path, find_place, split_path
 from .structure import Structure, SubsystemSettings, Wire, join, stepped_blocks
 from .subsystems import Subsystem, exact_time, subsystem
-from .units import add_unit_conversions
 from .variants import apply_changes, change_parameter, change_parameters
+from .wire_units import add_unit_conversions
 
 __all__ = [
     "Checked",

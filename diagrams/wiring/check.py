@@ -22,7 +22,7 @@ from ...blocks.core import (
 from ...blocks.library import FixedSampleTime
 from ...blocks.tracing import Traced, describe_outside, start_shapes, trace, traced_parameters
 from .structure import Structure, Wire
-from .units import Unit, check_units
+from .wire_units import Unit, check_units
 
 Port = tuple[str, str]
 

@@ -1,5 +1,6 @@
 """FMU files: their archive and description, read, checked and unpacked."""
 
+from .archive_limits import ArchiveLimits
 from .binaries import check_binary, find_binary, missing_functions
 from .description import FmuDescription, read_description
 from .exchange import ExchangeInfo
@@ -7,7 +8,6 @@ from .faults import FmuFault, FmuFinding, FmuSeverity
 from .gathering import read_index
 from .joining import join_scalars
 from .library import SharedLibrary, read_library
-from .limits import ArchiveLimits
 from .model import read_model
 from .repair import repair
 from .unpacking import unpack, unpack_archive, write_files

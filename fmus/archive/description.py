@@ -16,18 +16,18 @@ import numpy as np
 from ...blocks.core import FmuFileError, Layout, accepts, brief, describe_disk_error, explain_calls, kinds
 from ..host_state import FOLDER
 from .aliases import find_aliases
+from .archive_limits import ArchiveLimits
 from .binaries import find_binary, judge_name
 from .exchange import ExchangeInfo, read_exchange
 from .faults import FmuFault, FmuFinding
 from .feedthrough import Feedthrough, feeds_through, read_feedthrough
 from .gathering import Elements, gather
-from .limits import ArchiveLimits
 from .model import read_model
 from .negated import judge_negated, read_negated
 from .rules import KNOWN_VERSIONS, check_dimensions, unknown_version
 from .sizes import resize
 from .states import find_states, read_derivatives
-from .units import FmuUnits
+from .unit_definitions import FmuUnits
 from .variables import WIRE_TYPES, FmuVariable, OtherVariable, fmi3_type, read_other, read_variable
 from .xml_text import parse_xml
 from .zip_file import DESCRIPTION, OTHER_PLACE, FmuArchive

@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ...blocks.core import FmuFileError
+from .archive_limits import ArchiveLimits
 from .faults import FmuFault, FmuFinding
-from .limits import ArchiveLimits
 
 _DRIVE = re.compile(r"[A-Za-z]:")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")

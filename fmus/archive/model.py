@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ...blocks.core import FmuFileError
+from .archive_limits import ArchiveLimits
 from .faults import FmuFault
-from .limits import ArchiveLimits
 from .repair import counts_from_zero, repair
 from .rules import check_schema, check_structure, check_variables, check_version
 from .zip_file import DESCRIPTION

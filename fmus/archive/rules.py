@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ...blocks.core import FmuFileError
+from .archive_limits import ArchiveLimits
 from .faults import FmuFault
-from .limits import ArchiveLimits
 from .zip_file import DESCRIPTION
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import explain_calls
-from .units import FmuUnits
+from .unit_definitions import FmuUnits
 
 _FMI2_TYPES = {"Real": "Float64", "Integer": "Int32"}
 _INTEGERS = {

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ...blocks.core import FmuFileError, describe_disk_error
+from .archive_limits import ArchiveLimits
 from .entries import check_entries
 from .faults import FmuFault, FmuFinding
 from .library import LFS_POINTER
-from .limits import ArchiveLimits
 from .xml_text import parse_xml
 
 DESCRIPTION = "modelDescription.xml"

@@ -23,7 +23,7 @@ from ..archive import (
 )
 from ..platform import native_platform
 from .diagnosis import FmuDiagnosis, FmuTrial, FmuVerdict
-from .functions import missing_promises
+from .exported_functions import missing_promises
 from .libraries import binaries_of, native_libraries, tuple_of
 from .summary import INTERFACES, summarize
 from .trial import FmuProblem, find_step, split_step, try_out

@@ -1,8 +1,8 @@
 """FMUs in processes of their own: the face of `fmus/calls`, with the library in a child."""
 
-from .limits import Isolation
 from .opening import find_limits, open_fmu
 from .pool import count_processes, end_idle
+from .process_limits import Isolation
 
 __all__ = [
     "Isolation",

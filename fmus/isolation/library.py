@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ..calls import ERROR
-from .limits import Isolation
 from .process import ChildProcess
+from .process_limits import Isolation
 
 _FUNCTION: Any = ctypes._CFuncPtr  # type: ignore[attr-defined]
 _CALLBACKS = {"fmi1CallbackFunctions": 1, "fmi2CallbackFunctions": 2}

@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 from ..archive import FmuDescription
 from ..calls import FmiCalls, FmuBlock, LoadedFmu
 from ..platform import is_built_here
-from .limits import Isolation, default_memory
 from .pool import take
+from .process_limits import Isolation, default_memory
 from .remote import make_remote_calls
 
 L = TypeVar("L", bound=LoadedFmu)

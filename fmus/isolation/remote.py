@@ -28,9 +28,9 @@ from ..calls import (
 from . import wire
 from .endings import describe_memory
 from .library import RemoteLibrary, describe_call, seconds_for
-from .limits import Isolation
 from .pool import give_back
 from .process import ChildProcess
+from .process_limits import Isolation
 
 
 class RemoteBoundCalls(BoundCalls):

@@ -19,7 +19,7 @@ from ...blocks.tracing import extrapolate
 from ..archive import FmuVariable
 from ..calls import FmuBlock, LoadedFmu, is_smooth
 from .derivation import Derivation, DerivativeMethod
-from .differences import Column, Differences, differentiate
+from .difference_quotients import Column, Differences, differentiate
 from .exchange import ExchangeMembers
 from .fmu_point import FmuLinearization, FmuPoint, initialize_at
 from .restored_point import RestoredPoint

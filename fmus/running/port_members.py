@@ -23,7 +23,7 @@ from ...blocks.core import (
     same_unit,
 )
 from ..archive import FmuDescription, FmuVariable, OtherVariable
-from .ports import FmuPorts, choose_ports, find_element, other_name
+from .fmu_ports import FmuPorts, choose_ports, find_element, other_name
 
 
 class PortMembers(Block):

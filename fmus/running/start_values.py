@@ -11,7 +11,7 @@ import numpy as np
 
 from ...blocks.core import FmuError, ParameterError, UnknownNameError, near
 from ..archive import ArchiveLimits, FmuDescription, FmuVariable, read_description
-from .ports import taken_apart
+from .fmu_ports import taken_apart
 
 
 def check_start(description: FmuDescription, start: Mapping[str, Any], label: str) -> dict[str, Any]:

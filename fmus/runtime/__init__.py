@@ -1,5 +1,5 @@
 """The loop over ticks and time in C, which knows no diagram: its sources, and the library of an installation."""
 
-from .sources import installed_runtime, read_sources, runtime_source
+from .c_files import installed_runtime, read_sources, runtime_source
 
 __all__ = ["installed_runtime", "read_sources", "runtime_source"]

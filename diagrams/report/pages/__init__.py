@@ -2,10 +2,10 @@
 
 from .definitions import DEFINITIONS, read_definitions
 from .document import Judged, Plot, Section, Table, TableForm
+from .printed_values import plain, quantity
 from .report import Report, check_files, write_report
 from .svg import draw_section, keep_drawings
 from .templating import Texts
-from .values import plain, quantity
 
 __all__ = [
     "DEFINITIONS",

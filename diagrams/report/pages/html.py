@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from .document import Document
 from .page import Page
+from .printed_values import with_power
 from .templating import environment
-from .values import with_power
 
 if TYPE_CHECKING:
     from jinja2 import Environment

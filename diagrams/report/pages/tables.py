@@ -11,7 +11,7 @@ from typing import Any
 from ....blocks.core import print_unit
 from ...frequency import MARK, Number, method_of
 from .document import Judged, Table
-from .values import cell, is_numeric, mark, quantity, reason, tolerance_text, value_text
+from .printed_values import cell, is_numeric, mark, quantity, reason, tolerance_text, value_text
 
 LONG, LONG_DETAILS = 14, 8
 """Rows above which a table, or one in the appendix, may go over to the next page."""

@@ -19,7 +19,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, Run, subsystem
-from loopwright.diagrams.compiled import background, libraries, runtime
+from loopwright.diagrams.compiled import background, compiled_libraries, runtime
 from loopwright.diagrams.simulation import RunOptions, change_over, compiled_ticks
 from loopwright.fmus import Fmu, dc_motor
 from support.both_forms import assert_same_bits
@@ -61,7 +61,7 @@ def eager(monkeypatch):
 @pytest.fixture
 def no_compiler(monkeypatch):
     """Whoever starts a compiler fails."""
-    libraries.load_compiled.cache_clear()
+    compiled_libraries.load_compiled.cache_clear()
     monkeypatch.setenv("LOOPWRIGHT_CC", "no-such-compiler")
 
 
@@ -149,7 +149,7 @@ def test_a_missing_compiler_is_told_once(eager, no_compiler):
 
 
 def test_a_cache_that_fails_leaves_the_run_interpreted_and_is_told(eager, monkeypatch, tmp_path):
-    libraries.load_compiled.cache_clear()
+    compiled_libraries.load_compiled.cache_clear()
     runtime.load_runtime.cache_clear()
     (tmp_path / "file").touch()
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "file"))

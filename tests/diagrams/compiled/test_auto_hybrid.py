@@ -18,7 +18,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, Run, subsystem
-from loopwright.diagrams.compiled import background, libraries
+from loopwright.diagrams.compiled import background, compiled_libraries
 from loopwright.diagrams.simulation import change_over, compiled_ticks
 from loopwright.fmus import Fmu, dc_motor
 from support.both_forms import assert_same_bits
@@ -114,7 +114,7 @@ def test_changes_of_the_method_that_are_left_out_are_told_once():
 
 def test_the_instant_of_the_change_depends_on_no_cache(eager):
     bits = {thermostat().simulate(5.0, step=0.05, **QUIET).data.tobytes() for _ in range(2)}
-    libraries.load_compiled.cache_clear()
+    compiled_libraries.load_compiled.cache_clear()
     bits.add(thermostat().simulate(5.0, step=0.05, **QUIET).data.tobytes())
     assert len(bits) == 1
 
@@ -160,9 +160,9 @@ def test_a_stop_condition_ends_it_in_c_at_its_event(eager):
 
 
 def test_without_a_compiler_the_virtual_machine_goes_on(eager, monkeypatch):
-    from loopwright.diagrams.compiled import sources
+    from loopwright.diagrams.compiled import function_code
 
-    monkeypatch.setattr(sources, "load_compiled", _fail)
+    monkeypatch.setattr(function_code, "load_compiled", _fail)
     runs = [thermostat().simulate(10.0, step=0.05, **QUIET) for _ in range(2)]
     assert [len(run.messages) for run in runs] == [1, 0]
     assert "no such compiler" in runs[0].messages[0]

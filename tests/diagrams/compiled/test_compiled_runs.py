@@ -18,7 +18,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, Interrupted, Run, experiments, subsystem
-from loopwright.diagrams.compiled import libraries
+from loopwright.diagrams.compiled import compiled_libraries
 from loopwright.fmus import Fmu, dc_motor
 from loopwright.fmus.runtime import runtime_source
 from support.random_cases import random_cases
@@ -227,7 +227,7 @@ def test_tables_are_compiled_and_may_differ_in_signs_of_zeros():
 @pytest.fixture
 def fresh():
     """No library that this process has loaded counts."""
-    libraries.load_compiled.cache_clear()
+    compiled_libraries.load_compiled.cache_clear()
 
 
 def test_a_run_without_a_compiler_is_interpreted_and_says_so(monkeypatch, fresh):
@@ -266,13 +266,13 @@ def test_a_folder_that_others_can_write_is_not_trusted(tmp_path, monkeypatch, fr
 def test_a_library_that_was_cut_off_is_compiled_again(tmp_path, monkeypatch, fresh):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path))
     source = runtime_source()
-    library = libraries._library_of(source)
-    libraries.load_compiled(source)
+    library = compiled_libraries._library_of(source)
+    compiled_libraries.load_compiled(source)
     part = library.read_bytes()[: library.stat().st_size // 2]
     library.unlink()  # it is loaded, and must not change under this process
     library.write_bytes(part)
-    assert not libraries.is_kept(source)
-    libraries.load_compiled.cache_clear()
-    assert libraries.load_compiled(source)["loopwright_run"].__name__ == "loopwright_run"
+    assert not compiled_libraries.is_kept(source)
+    compiled_libraries.load_compiled.cache_clear()
+    assert compiled_libraries.load_compiled(source)["loopwright_run"].__name__ == "loopwright_run"
     assert library.stat().st_size > len(part)
-    assert libraries.is_kept(source)
+    assert compiled_libraries.is_kept(source)

@@ -22,7 +22,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, Interrupted, subsystem
-from loopwright.diagrams.compiled import grouped_functions, libraries
+from loopwright.diagrams.compiled import compiled_libraries, grouped_functions
 from loopwright.diagrams.flat import flat_diagram
 from support.both_forms import assert_same_bits, both
 from support.hybrid_blocks import counting
@@ -94,10 +94,10 @@ def test_a_large_diagram_is_never_traced_as_a_whole(monkeypatch):
 
 def test_the_code_knows_neither_the_number_of_blocks_nor_their_parameters(monkeypatch, tmp_path):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path))
-    libraries.load_compiled.cache_clear()
+    compiled_libraries.load_compiled.cache_clear()
     loops(70).simulate(0.1, compile=True, **QUIET)
     built = sorted((tmp_path / "compiled").iterdir())
-    libraries.load_compiled.cache_clear()
+    compiled_libraries.load_compiled.cache_clear()
     loops(80).replace({"box.pid7.kp": 3.5}).simulate(0.1, compile=True, **QUIET)
     assert sorted((tmp_path / "compiled").iterdir()) == built
 

@@ -19,7 +19,7 @@ from loopwright.blocks import (
 from loopwright.blocks.core import SimulationError
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.compiled import write_hybrid
-from loopwright.diagrams.compiled.differences import find_columns
+from loopwright.diagrams.compiled.rate_differences import find_columns
 from loopwright.diagrams.flat import NONE, flat_diagram
 
 QUIET = {"progress": False}

@@ -9,7 +9,7 @@ import pytest
 
 from loopwright.blocks import CompilerError, Constant, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.compiled import libraries
+from loopwright.diagrams.compiled import compiled_libraries
 
 SOURCE = '__attribute__((visibility("default"))) int seven(void) { return 7; }'
 posix = pytest.mark.skipif(os.name != "posix", reason="owners, modes and links are those of POSIX")
@@ -18,9 +18,9 @@ posix = pytest.mark.skipif(os.name != "posix", reason="owners, modes and links a
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "cache"))
-    libraries.load_compiled.cache_clear()
+    compiled_libraries.load_compiled.cache_clear()
     yield tmp_path / "cache"
-    libraries.load_compiled.cache_clear()
+    compiled_libraries.load_compiled.cache_clear()
 
 
 @posix
@@ -31,7 +31,7 @@ def test_a_link_to_another_folder_is_refused_and_the_folder_stays_as_it_is(cache
     cache.mkdir()
     (cache / "compiled").symlink_to(elsewhere)
     with pytest.raises(CompilerError, match=r"compiled' is a link to another one; expected a folder"):
-        libraries.load_compiled(SOURCE)
+        compiled_libraries.load_compiled(SOURCE)
     assert mine.exists()
     assert elsewhere.stat().st_mode & 0o777 == 0o777
 
@@ -45,7 +45,7 @@ def test_a_folder_that_was_open_loses_libraries_and_no_other_files(cache):
     for name in names:
         (folder / name).touch()
     folder.chmod(0o775)
-    library = libraries._library_of(SOURCE)
+    library = compiled_libraries._library_of(SOURCE)
     assert sorted(file.name for file in folder.iterdir()) == ["mine.so", "notes.txt"]
     assert library.parent == folder
     assert folder.stat().st_mode & 0o777 == 0o700
@@ -55,27 +55,27 @@ def test_a_folder_that_was_open_loses_libraries_and_no_other_files(cache):
 def test_a_cache_is_its_users_own_whatever_the_umask(cache):
     before = os.umask(0)
     try:
-        libraries._library_of(SOURCE)
+        compiled_libraries._library_of(SOURCE)
     finally:
         os.umask(before)
     assert [folder.stat().st_mode & 0o777 for folder in (cache, cache / "compiled")] == [0o700, 0o700]
 
 
 def test_a_length_is_noted_by_two_at_once(cache, monkeypatch):
-    library = libraries._library_of(SOURCE)
+    library = compiled_libraries._library_of(SOURCE)
     library.write_bytes(b"12345")
     replace, nested = os.replace, []
 
     def interrupted(source, target):
         if not nested:
             nested.append(True)
-            libraries._note_size(library)  # another thread, which has just come here
+            compiled_libraries._note_size(library)  # another thread, which has just come here
         replace(source, target)
 
-    monkeypatch.setattr(libraries.os, "replace", interrupted)
-    libraries._note_size(library)
+    monkeypatch.setattr(compiled_libraries.os, "replace", interrupted)
+    compiled_libraries._note_size(library)
     assert nested
-    assert libraries._is_whole(library)
+    assert compiled_libraries._is_whole(library)
     assert sorted(file.suffix for file in library.parent.iterdir()) == sorted([".size", library.suffix])
 
 
@@ -83,7 +83,7 @@ def test_a_run_without_room_for_its_code_is_interpreted_and_says_so(cache, monke
     def fail(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(libraries, "_note_size", fail)
+    monkeypatch.setattr(compiled_libraries, "_note_size", fail)
 
     @subsystem(sample_time=0.1, name="box")
     def box(u):

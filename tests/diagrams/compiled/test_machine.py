@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import erfinv
 
-from loopwright.diagrams.compiled.functions import Machine, operation_names
+from loopwright.diagrams.compiled.bound_functions import Machine, operation_names
 from loopwright.diagrams.compiled.machine import make_program
 from loopwright.diagrams.compiled.runtime import load_runtime
 
@@ -89,7 +89,7 @@ def test_an_error_within_such_a_function_is_no_result(monkeypatch):
         def call(self):
             raise RuntimeError("no value")
 
-    monkeypatch.setattr("loopwright.diagrams.compiled.functions.bind_function", lambda *_: Failing())
+    monkeypatch.setattr("loopwright.diagrams.compiled.bound_functions.bind_function", lambda *_: Failing())
     made = np.array([7.0])
     bound = Machine(load_runtime()).find(f).bind([np.array([1.5])], [made])
     call = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4, ctypes.c_int)(bound.structure.evaluate)

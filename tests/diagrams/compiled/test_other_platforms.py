@@ -7,7 +7,7 @@ import pytest
 
 from loopwright.blocks import Constant, Gain, Integrator, Product, PythonFunction, Relay, Sine, Sum, TransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.diagrams.compiled import fused, libraries, write_hybrid, write_ticks
+from loopwright.diagrams.compiled import compiled_libraries, fused, write_hybrid, write_ticks
 from loopwright.diagrams.lanes import lane_code
 from loopwright.diagrams.simulation.compiled_ticks import kinds_of
 from loopwright.fmus.export.compiler import TARGETS
@@ -73,7 +73,7 @@ def written_for_this_processor(monkeypatch):
 
     def note(source, flags=(), processor="", *, of):
         found[of] = source, flags
-        return libraries.load_compiled(source, flags, processor)
+        return compiled_libraries.load_compiled(source, flags, processor)
 
     diagram = experiments.EXPERIMENTS["C"]().diagram
     monkeypatch.setattr(fused, "load_compiled", lambda *given: note(*given, of="fused"))

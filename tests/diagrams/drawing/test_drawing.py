@@ -12,7 +12,7 @@ import pytest
 
 from loopwright.blocks import Gain, Integrator, OptionError, Sine, Sum
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.diagrams.drawing.layout import Net, _assign_tracks, _draw, _Part, arrange
+from loopwright.diagrams.drawing.drawing_layout import Net, _assign_tracks, _draw, _Part, arrange
 from loopwright.diagrams.drawing.order import Node, cut_loops
 from loopwright.fmus import Fmu, dc_motor
 

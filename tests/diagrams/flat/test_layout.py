@@ -4,7 +4,7 @@ import numpy as np
 
 from loopwright.blocks import Array, Block, Constant, Input, Integrator, State, UnitDelay, parameter
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.flat.layout import StateLayout
+from loopwright.diagrams.flat.flat_layout import StateLayout
 
 
 class Mixed(Block):

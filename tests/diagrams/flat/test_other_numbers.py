@@ -6,7 +6,7 @@ import pytest
 
 from loopwright.blocks import Gain, Integrator, Pulse, Relay, Sine, Step, TransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.diagrams.flat import functions
+from loopwright.diagrams.flat import flat_functions
 from loopwright.fmus import StepOptions
 
 QUIET = {"progress": False}
@@ -77,7 +77,7 @@ def test_functions_are_traced_once(monkeypatch):
     diagram = thermostat()
     diagram.simulate(0.2, **QUIET)
     for name in ("trace_tick", "trace_flow", "trace_indicators", "trace_jump"):
-        monkeypatch.setattr(functions, name, lambda *_, **__: pytest.fail("traced again"))
+        monkeypatch.setattr(flat_functions, name, lambda *_, **__: pytest.fail("traced again"))
     variant, _ = renumbered(diagram, CHANGES)
     variant.simulate(0.2, **QUIET)
     again = variant.of_wired(variant.wired.renumbered({"room": variant["room"].replace(initial_value=0.9)}))
@@ -91,7 +91,7 @@ def test_functions_that_a_variant_asks_for_first_belong_to_all(monkeypatch):
     variant, _ = renumbered(diagram, CHANGES)
     variant.simulate(0.2, **QUIET)
     for name in ("trace_tick", "trace_flow", "trace_indicators", "trace_jump"):
-        monkeypatch.setattr(functions, name, lambda *_, **__: pytest.fail("traced again"))
+        monkeypatch.setattr(flat_functions, name, lambda *_, **__: pytest.fail("traced again"))
     diagram.simulate(0.2, **QUIET)
 
 

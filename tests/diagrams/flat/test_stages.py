@@ -25,7 +25,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.flat.clocks import NONE
-from loopwright.diagrams.flat.layout import FlatLayout
+from loopwright.diagrams.flat.flat_layout import FlatLayout
 from loopwright.diagrams.flat.stages import OpaqueStage, TracedStage
 from loopwright.diagrams.flat.total_derivative import Derivative
 from loopwright.diagrams.linearization.derivatives import LocalDerivatives, find_signal

@@ -14,8 +14,8 @@ from loopwright.blocks import OptionError
 from loopwright.diagrams import experiments
 from loopwright.diagrams.cli import options as _cli_options
 from loopwright.diagrams.cli.command_line import main
+from loopwright.diagrams.paper.experiment_options import LIMITS
 from loopwright.diagrams.paper.experiments import EXPERIMENTS, compliance, force_tracking, path_following
-from loopwright.diagrams.paper.options import LIMITS
 
 PROC = Path("/proc")
 LINUX = pytest.mark.skipif(not PROC.is_dir(), reason="needs a folder to which nobody can write")

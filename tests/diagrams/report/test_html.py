@@ -22,8 +22,7 @@ from loopwright.diagrams.report.pages.definitions import definition
 from loopwright.diagrams.report.pages.document import Plot, Section, Table
 from loopwright.diagrams.report.pages.html import marked, to_html
 from loopwright.diagrams.report.pages.json import to_json
-from loopwright.diagrams.report.pages.report import Report, check_files, write_report
-from loopwright.diagrams.report.pages.values import (
+from loopwright.diagrams.report.pages.printed_values import (
     cell,
     is_numeric,
     plain,
@@ -31,6 +30,7 @@ from loopwright.diagrams.report.pages.values import (
     tolerance_text,
     value_text,
 )
+from loopwright.diagrams.report.pages.report import Report, check_files, write_report
 
 BY_EIGENVALUES, BY_GRID = "closed-loop eigenvalues <both> sides", "a grid ten times as fine"
 

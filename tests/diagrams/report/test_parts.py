@@ -12,7 +12,7 @@ from loopwright.diagrams import Diagram, Fig3Diagram, Section, analyse, experime
 from loopwright.diagrams.paper.fig3_report import FIG3
 from loopwright.diagrams.report.analysis import ANY_DIAGRAM, SUBJECT
 from loopwright.diagrams.report.case import Case
-from loopwright.diagrams.report.parts import ReportKind, ReportPart
+from loopwright.diagrams.report.report_parts import ReportKind, ReportPart
 
 ROOM = Path(loopwright.diagrams.report.__file__).parent
 

@@ -53,7 +53,7 @@ def test_a_run_says_that_it_compiles_where_progress_is_shown(show, monkeypatch):
             said.append("stop")
 
     monkeypatch.setattr("rich.console.Console.status", lambda console, text: Status())
-    monkeypatch.setattr("loopwright.diagrams.compiled.libraries._is_whole", lambda library: False)
+    monkeypatch.setattr("loopwright.diagrams.compiled.compiled_libraries._is_whole", lambda library: False)
     Diagram("d", box(Sine(frequency=0.1 + show)())).simulate(0.2, compile=True, progress=show)
     assert said[1:3] == (["start", "stop"] if show else [])
     assert not show or "compiling C code" in said[0]

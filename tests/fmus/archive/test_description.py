@@ -20,7 +20,7 @@ from loopwright.blocks import (
 from loopwright.diagrams import Diagram
 from loopwright.diagrams.cli import main
 from loopwright.fmus import Fmu
-from loopwright.fmus.archive.units import FmuUnits
+from loopwright.fmus.archive.unit_definitions import FmuUnits
 from loopwright.fmus.models import mass_spring_damper
 from loopwright.fmus.platform import native_platform
 from support.small_fmus import small_fmu

@@ -7,7 +7,7 @@ from scipy.linalg import expm
 from loopwright.blocks import Constant
 from loopwright.diagrams import CoarseValues, Diagram
 from loopwright.fmus import Fmu
-from loopwright.fmus.running.differences import find_slopes
+from loopwright.fmus.running.difference_quotients import find_slopes
 from support.closed_form import closed_form_fmu
 
 WAYS = ("model_exchange", "co_simulation")

@@ -40,8 +40,8 @@ from ..linearization import (
     model_ticks,
     moves_between_ticks,
 )
+from .contact_ports import DrivingPort, Ports, check_command, check_unit, force_wire_error
 from .measured_force import Tool, find_entry, find_tool
-from .ports import DrivingPort, Ports, check_command, check_unit, force_wire_error
 
 if TYPE_CHECKING:
     from ..flat import FlatDiagram, WiredDiagram

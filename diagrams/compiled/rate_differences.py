@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..flat import Operation, PartProgram
-from .functions import BoundFunction, TickStructure, at, list_vectors
+from .bound_functions import BoundFunction, TickStructure, at, list_vectors
 from .grouped_functions import GroupedPart
 
 _AT, _INT = ctypes.c_void_p, ctypes.c_int64

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Generic, TypeVar
 
-from .functions import CodeOfFunctions, GeneratedCode, Machine
-from .libraries import is_kept, load_compiled
+from .bound_functions import CodeOfFunctions, GeneratedCode, Machine
+from .compiled_libraries import is_kept, load_compiled
 from .runtime import load_runtime, runtime_is_kept
 
 Code = TypeVar("Code")

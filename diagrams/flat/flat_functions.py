@@ -22,7 +22,7 @@ from ...blocks.core import without_collection
 from .block_functions import BlockFunctions
 from .clocks import NONE, TickPattern
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, rows
-from .layout import FlatLayout
+from .flat_layout import FlatLayout
 from .logic import above_true, choose, is_true, logic_and, logic_not, logic_or, to_number
 from .program import Cells, PartProgram, Program, TickProgram
 from .stages import Schedule

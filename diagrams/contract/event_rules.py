@@ -13,7 +13,7 @@ from ...blocks.core import Block, LoopwrightError, is_before, left_of, right_of
 from ...blocks.library import Clock
 from ...blocks.tracing import bundle, switching_times
 from .exercise import Bench, Columns, Point
-from .values import rule_error
+from .value_rules import rule_error
 
 N = TypeVar("N", float, np.ndarray)
 

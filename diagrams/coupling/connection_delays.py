@@ -11,8 +11,8 @@ import numpy as np
 from ...blocks.core import brief, explain_calls
 from ..flat import FlatDiagram
 from ..wiring import join
+from .coupling_options import Coupling, Scheme
 from .links import Links
-from .options import Coupling, Scheme
 
 
 class LinkKind(StrEnum):
