@@ -1,9 +1,8 @@
 """A flattened diagram: its layout with its functions, each traced once, when it is first asked for.
 
 From the bottom up: `flat_layout` says where everything is, `evaluate` evaluates all blocks at an instant,
-`flat_functions` makes schedules of it (`stages`), and the `FlatDiagram` keeps them. They are what is run, differentiated
-and compiled.
-Nothing in it changes but these caches: a run has its own vectors, of parameters too.
+`flat_functions` makes schedules of it (`stages`), and the `FlatDiagram` keeps them. They are what is run,
+differentiated and compiled. Nothing in it changes but these caches: a run has its own vectors, of parameters too.
 """
 
 from __future__ import annotations
