@@ -9,6 +9,7 @@ import platform
 import shlex
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 #: FMI 3.0 platform tuples (2.5.1.4) of the platforms to build for, and zig's name of each with the oldest system:
@@ -36,13 +37,13 @@ RUNTIME_FLAGS = ("-fno-unroll-loops",)
 """Further flags of the runtime library: vectors are short; a sixth less for the compiler."""
 
 
-def find_command(python: str) -> tuple[tuple[str, ...], str] | None:
+def find_command(find_python: Callable[[], str]) -> tuple[tuple[str, ...], str] | None:
     """Return the command of a C compiler, and where it is from; None without any.
 
     Parameters
     ----------
-    python : str
-        The interpreter that runs zig's package where its binary isn't found.
+    find_python : callable
+        Returns the interpreter that runs zig's package where its binary isn't found.
 
     Returns
     -------
@@ -53,7 +54,7 @@ def find_command(python: str) -> tuple[tuple[str, ...], str] | None:
         return tuple(shlex.split(given, posix=os.name != "nt")), "LOOPWRIGHT_CC"
     if (spec := importlib.util.find_spec("ziglang")) is not None and spec.origin is not None:
         zig = Path(spec.origin).parent / ("zig.exe" if os.name == "nt" else "zig")
-        return ((str(zig), "cc") if zig.is_file() else (python, "-m", "ziglang", "cc")), "ziglang"
+        return ((str(zig), "cc") if zig.is_file() else (find_python(), "-m", "ziglang", "cc")), "ziglang"
     found = next((path for name in ("cc", "gcc", "clang") if (path := shutil.which(name)) is not None), None)
     return None if found is None else ((found,), "system")
 

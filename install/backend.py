@@ -32,7 +32,7 @@ def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
     """Ask for zig where the machine has no compiler."""
     return [
         *build_meta.get_requires_for_build_wheel(config_settings),
-        *([] if TOOLS["find_command"](sys.executable) else COMPILER),
+        *([] if TOOLS["find_command"](lambda: sys.executable) else COMPILER),
     ]
 
 
@@ -40,12 +40,12 @@ def get_requires_for_build_editable(config_settings: Any = None) -> list[str]:
     """Ask for zig where the machine has no compiler."""
     return [
         *build_meta.get_requires_for_build_editable(config_settings),
-        *([] if TOOLS["find_command"](sys.executable) else COMPILER),
+        *([] if TOOLS["find_command"](lambda: sys.executable) else COMPILER),
     ]
 
 
 def _missing() -> list[str]:
-    return [] if TOOLS["find_command"](sys.executable) else COMPILER
+    return [] if TOOLS["find_command"](lambda: sys.executable) else COMPILER
 
 
 def build_wheel(wheel_directory: str, config_settings: Any = None, metadata_directory: str | None = None) -> str:
@@ -75,7 +75,7 @@ def build_runtime() -> str:
 
 
 def _build() -> str:
-    found, native = TOOLS["find_command"](sys.executable), TOOLS["native_platform"]()
+    found, native = TOOLS["find_command"](lambda: sys.executable), TOOLS["native_platform"]()
     shutil.rmtree(BUILT, ignore_errors=True)
     if found is None:
         return ""

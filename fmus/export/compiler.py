@@ -65,7 +65,7 @@ def find_compiler() -> Compiler:
     CompilerError
         If there is none; the text says how to install one.
     """
-    found = find_command(find_python())
+    found = find_command(find_python)
     if found is None:
         raise CompilerError(f"no C compiler was found: neither the ziglang package nor cc, gcc or clang. {_INSTALL}")
     command, source = found

@@ -88,7 +88,7 @@ def test_a_large_diagram_is_never_traced_as_a_whole(monkeypatch):
         raise AssertionError("traced as a whole")
 
     expected = loops(70).simulate(0.2, compile=False, **QUIET)
-    monkeypatch.setattr(flat_diagram.functions, "trace_tick", refused)
+    monkeypatch.setattr(flat_diagram.flat_functions, "trace_tick", refused)
     assert_same_bits(expected, loops(70).simulate(0.2, compile=True, **QUIET))
 
 

@@ -161,9 +161,11 @@ def test_the_rates_of_a_grouped_run_are_not_traced_as_a_whole(grouped):
 
 def test_all_blocks_are_gone_through_once_for_the_instants_between_ticks(grouped, monkeypatch):
     made = []
-    evaluate = flat_diagram.functions.evaluate
+    evaluate = flat_diagram.flat_functions.evaluate
     monkeypatch.setattr(
-        flat_diagram.functions, "evaluate", lambda *given, **more: (made.append(given[2]), evaluate(*given, **more))[1]
+        flat_diagram.flat_functions,
+        "evaluate",
+        lambda *given, **more: (made.append(given[2]), evaluate(*given, **more))[1],
     )
     flat = ring(12)[0].flatten(0.1)
     sources = write_hybrid(flat, [NONE], stiff=False)
@@ -176,9 +178,11 @@ def test_all_blocks_are_gone_through_once_for_the_instants_between_ticks(grouped
 def test_all_blocks_are_gone_through_once_for_an_interpreted_run(grouped, monkeypatch):
     """Instants between ticks and rates are traced together; a run is the matrix exponential, to the error of rk4."""
     made = []
-    evaluate = flat_diagram.functions.evaluate
+    evaluate = flat_diagram.flat_functions.evaluate
     monkeypatch.setattr(
-        flat_diagram.functions, "evaluate", lambda *given, **more: (made.append(given[2]), evaluate(*given, **more))[1]
+        flat_diagram.flat_functions,
+        "evaluate",
+        lambda *given, **more: (made.append(given[2]), evaluate(*given, **more))[1],
     )
     diagram, names = ring(12)
     run = diagram.simulate(1.0, step=0.01, solver="rk4", compile=False, **QUIET)

@@ -219,7 +219,7 @@ def test_a_run_traces_no_function_of_the_whole_diagram(monkeypatch):
         raise AssertionError("traced as a whole")
 
     for name in ("trace_tick", "trace_flow"):
-        monkeypatch.setattr(flat_diagram.functions, name, refused)
+        monkeypatch.setattr(flat_diagram.flat_functions, name, refused)
     parallel(20).simulate(2.0, **QUIET)
     ring(20)[0].simulate(1.0, step=0.01, solver="rk4", **QUIET)
 
