@@ -26,9 +26,14 @@ def pi_loop(plant):
     return Diagram("loop", plant(force=controller(plant.position)))
 
 
+def held(duration):
+    """The matrix that takes position, velocity and a held force to position and velocity a duration in s later."""
+    return expm(duration * np.block([[A, B], [np.zeros((1, 3))]]))[:2]
+
+
 def exact_loop(n):
     """Positions in that loop at n ticks, by the exponential of a matrix."""
-    step = expm(T * np.block([[A, B], [np.zeros((1, 3))]]))[:2]
+    step = held(T)
     x, integral, found = np.array([START, 0.0]), 0.0, []
     for _ in range(n):
         found.append(x[0])

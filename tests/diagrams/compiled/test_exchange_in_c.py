@@ -1,8 +1,13 @@
-"""FMUs in model exchange in compiled runs: closed forms, matrix exponentials, and the numbers of interpreted runs."""
+"""FMUs in model exchange in C's loop: closed forms, matrix exponentials and SciPy, in both forms of a diagram's functions.
+
+Both forms go in one loop, so that their agreement says nothing of it: each test has an oracle beside it.
+"""
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from scipy.optimize import brentq
 
 from loopwright.blocks import (
     Block,
@@ -19,11 +24,12 @@ from loopwright.blocks import (
     Step,
     StopCondition,
     TransferFunction,
+    UnitDelay,
 )
 from loopwright.diagrams import Diagram, Interrupted, subsystem
 from loopwright.fmus import Fmu, bouncing_ball, build, mass_spring_damper
-from support.controlled_mass import START, A, B, T, exact_loop, pi_loop
-from support.eventful import eventful_fmu
+from support.controlled_mass import START, A, B, T, exact_loop, held, pi_loop
+from support.eventful import eventful_fmu, exact
 
 
 class Car(Block):
@@ -96,8 +102,13 @@ def test_a_plant_under_a_sampled_controller_is_that_of_the_matrix_exponential(fi
     np.testing.assert_allclose(run["plant.position"], exact_loop(len(run.t)), rtol=0.0, atol=1e-9)
 
 
-def test_events_of_inputs_at_every_tick_are_those_of_an_interpreted_run(files):
-    same(*both(lambda: pi_loop(mass(files)), 0.05))
+def driven(frequency, amplitude=1.0):
+    """The matrix of position and velocity, and of a sine as their force in N and its cosine, frequency in Hz."""
+    w = 2.0 * np.pi * frequency
+    return np.block([[A, amplitude * B, np.zeros((2, 1))], [np.zeros((2, 2)), np.array([[0.0, w], [-w, 0.0]])]])
+
+
+FROM_START = [START, 0.0, 0.0, 1.0]
 
 
 def test_euler_and_heun_have_their_order(files):
@@ -107,8 +118,7 @@ def test_euler_and_heun_have_their_order(files):
             1.0, step=step, solver=solver, compile=True, progress=False
         )
         assert made.tier == "compiled"
-        fine = Diagram("driven", mass(files)(force=wave)).simulate(1.0, step=0.1, rtol=1e-10, progress=False)
-        return abs(made["plant.position"][-1] - fine["plant.position"][-1])
+        return abs(made["plant.position"][-1] - (expm(driven(0.5)) @ FROM_START)[0])
 
     for solver, order in (("euler", 1), ("heun", 2)):
         assert np.log2(error(solver, 0.002) / error(solver, 0.001)) == pytest.approx(order, abs=0.2)
@@ -121,8 +131,8 @@ def test_feedback_in_continuous_time_through_the_fmu(files):
 
     interpreted, compiled = both(make, 1.0, step=0.1)
     closed = A - 5.0 * B @ [[1.0, 0.0]]
-    exact = [(expm(closed * t) @ [START, 0.0])[0] for t in compiled.t]
-    np.testing.assert_allclose(compiled["plant.position"], exact, atol=1e-7)
+    expected = [(expm(closed * t) @ [START, 0.0])[0] for t in compiled.t]
+    np.testing.assert_allclose(compiled["plant.position"], expected, atol=1e-7)
     same(interpreted, compiled)
 
 
@@ -162,8 +172,8 @@ def test_impacts_fall_at_the_times_of_the_closed_form(files):
         found.append(t)
         v *= 0.8
         t += 2.0 * v / g
-    impacts = [event.t for event in compiled.events]
-    np.testing.assert_allclose(impacts, found, atol=1e-8)
+    for run in (interpreted, compiled):
+        np.testing.assert_allclose([event.t for event in run.events], found, atol=1e-8)
 
 
 def relay_loop(files):
@@ -174,9 +184,62 @@ def relay_loop(files):
 
 @pytest.mark.parametrize("solver", ["RK45", "Radau", "rk4"])
 def test_events_of_other_blocks_whose_jumps_are_inputs_of_an_fmu(files, solver):
-    interpreted, compiled = both(lambda: relay_loop(files), 1.0, step=0.02, solver=solver)
-    assert len(compiled.events) >= 3
-    same(interpreted, compiled)
+    """The force is −5 N from the start, as the mass is above 0.02 m, and 5 N below −0.02 m: matrix exponentials."""
+    x, force, level, begun, switches, expected = np.array([START, 0.0]), -5.0, -0.02, 0.0, [], []
+    grid = np.arange(51) * 0.02
+    while begun < 1.0:
+        looks = 0.005 * np.arange(1, 200)
+        beyond = [np.sign(force) * ((held(s) @ [*x, force])[0] - level) > 0.0 for s in looks]
+        end = looks[beyond.index(True)]
+        length = brentq(lambda s, x=x, f=force, at=level: (held(s) @ [*x, f])[0] - at, end - 0.005, end, xtol=1e-14)
+        here = grid[(grid >= begun) & (grid < begun + length)]
+        expected += [(held(t - begun) @ [*x, force])[0] for t in here]
+        begun, x, force, level = begun + length, held(length) @ [*x, force], -force, -level
+        switches.append(begun)
+    bound = 2e-5 if solver == "rk4" else 1e-7  # rk4: (10 · 0.02)⁵ / 120 of 0.1 m in each of 50 steps, at most
+    for run in both(lambda: relay_loop(files), 1.0, step=0.02, solver=solver):
+        assert len(run.events) == len(switches) - 1 >= 3
+        assert [e.event for e in run.events] == ["fall", "rise", "fall", "rise"][: len(run.events)]
+        np.testing.assert_allclose([e.t for e in run.events], switches[:-1], atol=10 * bound)
+        np.testing.assert_allclose(run["plant.position"], expected, rtol=0.0, atol=bound)
+
+
+def braked(end):
+    """Times and names of the events of the anti-lock brake up to an end in s, and v there, by SciPy at tight tolerance."""
+    torque, valve = 1e7, "rise"  # the rate of the torque in N m/s, and the event of the valve that is next
+
+    def slip(x):
+        return 1.0 - 0.3 * x[1] / x[0]
+
+    def rates(t, x):
+        s = slip(x)
+        force = 400.0 * 9.81 * 2 * 0.9 * 0.15 * s / (0.15**2 + s**2)
+        return [-force / 400.0, 0.3 * force - x[2], torque]
+
+    def switches(t, x):
+        return slip(x) - (0.1701 if valve == "rise" else 0.1699)
+
+    def is_empty(t, x):
+        return x[2] if torque < 0.0 else 1.0
+
+    switches.terminal = is_empty.terminal = True
+    t, x, told = 0.0, np.array([25.0, 25.0 / 0.3, 0.0]), []
+    while True:
+        switches.direction, is_empty.direction = (1.0 if valve == "rise" else -1.0), -1.0
+        done = solve_ivp(rates, (t, end), x, "DOP853", events=[switches, is_empty], rtol=1e-12, atol=1e-12)
+        t, x = done.t[-1], done.y[:, -1]
+        if done.status == 0:
+            return told, x[0]
+        if len(done.t_events[1]):
+            told.append((t, "torque", "reached"))
+            x[2] = torque = 0.0
+        elif valve == "rise":
+            told.append((t, "valve", "rise"))
+            torque, valve = -1e7, "fall"
+        else:
+            told.append((t, "valve", "fall"))
+            told += [(t, "torque", "released")] if torque == 0.0 else []
+            torque, valve = 1e7, "rise"
 
 
 def test_an_anti_lock_brake_whose_car_is_an_fmu(cache, tmp_path, isolate):
@@ -192,11 +255,12 @@ def test_an_anti_lock_brake_whose_car_is_an_fmu(cache, tmp_path, isolate):
         slip = Function(lambda v, omega: 1.0 - 0.3 * omega / v, name="slip")(car.v, car.omega)
         return Diagram("antilock", car(torque(valve(slip))))
 
-    interpreted, compiled = both(make, 0.03, step=0.01)
-    assert len(compiled.events) > 50
-    assert [e.event for e in interpreted.events] == [e.event for e in compiled.events]
-    np.testing.assert_allclose([e.t for e in interpreted.events], [e.t for e in compiled.events], atol=1e-6)
-    np.testing.assert_allclose(interpreted["car.v"], compiled["car.v"], rtol=1e-6)
+    told, v = braked(0.03)
+    assert len(told) > 50
+    for run in both(make, 0.03, step=0.01, rtol=1e-10, atol=1e-12):
+        assert [(e.block, e.event) for e in run.events] == [(block, event) for _, block, event in told]
+        np.testing.assert_allclose([e.t for e in run.events], [t for t, _, _ in told], rtol=0.0, atol=1e-9)
+        assert run["car.v"][-1] == pytest.approx(v, rel=1e-9)
 
 
 def test_an_fmu_of_co_simulation_beside_one_of_model_exchange(files):
@@ -214,30 +278,55 @@ def test_an_fmu_of_co_simulation_beside_one_of_model_exchange(files):
 
         return Diagram("two", plant(force=controller(sampled.position)), sampled(force=other(plant.position)))
 
-    same(*both(make, 0.1))
+    step, x, y, expected = held(T), np.array([START, 0.0]), np.zeros(2), []
+    for _ in range(101):
+        expected.append((x[0], y[0]))
+        x, y = step @ [*x, -20.0 * y[0]], step @ [*y, 2.0 * x[0]]
+    for run in both(make, 0.1):
+        found = np.transpose([run["plant.position"], run["sampled.position"]])
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
 
 
-def test_stop_conditions_at_ticks_and_between_them(files):
-    def make(sampled):
+@pytest.mark.parametrize("place", ["continuous", "between ticks", "at a tick"])
+def test_stop_conditions_at_ticks_and_between_them(files, place):
+    """The position reaches 0.15 m, under a force that is a sine, or a sine that is held over 0.01 s."""
+
+    def make():
         plant = mass(files)
         force = Sine(frequency=1.0, amplitude=20.0, name="wave")
 
+        def stop(y):
+            return StopCondition(name="stop")(
+                Compare(relation=">", name="above")(y, Constant(value=0.15, name="limit"))
+            )
+
         @subsystem(sample_time=0.01, name="hold")
-        def hold(u):
+        def hold(u, y):
+            if place == "at a tick":
+                stop(y)
             return Gain(gain=1.0, name="gain")(u)
 
-        above = Compare(relation=">", name="above")(plant.position, Constant(value=0.15, name="limit"))
-        return Diagram("stops", plant(force=hold(force) if sampled else force), StopCondition(name="stop")(above))
+        driven_plant = plant(force=force if place == "continuous" else hold(force, plant.position))
+        return Diagram("stops", driven_plant, *([] if place == "at a tick" else [stop(plant.position)]))
 
-    for sampled in (True, False):
-        interpreted, compiled = both(lambda s=sampled: make(s), 3.0, step=0.01 if sampled else 0.5)
-        assert compiled.stopped is not None
-        assert compiled.stopped.t == pytest.approx(interpreted.stopped.t, abs=1e-9)
-        assert compiled["plant.position"][-1] == pytest.approx(0.15, abs=1e-2 if sampled else 1e-6)
+    def position(t):
+        if place == "continuous":
+            return (expm(driven(1.0, 20.0) * t) @ FROM_START)[0]
+        x, ticks = np.array([START, 0.0]), int(t / 0.01 + 1e-9)
+        forces = 20.0 * np.sin(0.02 * np.pi * np.arange(ticks + 1))
+        for force in forces[:-1]:
+            x = held(0.01) @ [*x, force]
+        return (held(t - 0.01 * ticks) @ [*x, forces[-1]])[0]
+
+    end = 0.01 * next(k for k in range(300) if position(0.01 * k) > 0.15)
+    if place != "at a tick":
+        end = brentq(lambda t: position(t) - 0.15, end - 0.01, end, xtol=1e-14)
+    for run in both(make, 3.0, step=0.5 if place == "continuous" else 0.01):
+        assert run.stopped.t == run.t[-1] == pytest.approx(end, abs=1e-8)
+        assert run["plant.position"][-1] == pytest.approx(position(end), abs=1e-7)
 
 
 def test_states_are_saved_in_one_tier_and_restored_in_the_other(files):
-    whole = pi_loop(mass(files)).simulate(0.1, compile=False, rtol=1e-8, atol=1e-10, progress=False)
     options = {"rtol": 1e-8, "atol": 1e-10}
     for first, second in ((False, True), (True, False)):
         with pi_loop(mass(files)).simulation(compile=first, **options) as simulation:
@@ -249,7 +338,7 @@ def test_states_are_saved_in_one_tier_and_restored_in_the_other(files):
                 simulation.advance(0.05)
             rest = simulation.run()
         assert (rest.tier == "compiled") is second
-        np.testing.assert_allclose(rest["plant.position"][-50:], whole["plant.position"][-50:], atol=1e-9)
+        np.testing.assert_allclose(rest["plant.position"][-50:], exact_loop(101)[-50:], atol=1e-9)
 
 
 def test_a_run_to_disk_and_an_interrupt(files, tmp_path):
@@ -279,6 +368,25 @@ def eventful(request, cache, tmp_path_factory):
     return eventful_fmu(tmp_path_factory.mktemp("eventful"), request.param)
 
 
+def test_an_input_that_jumps_at_every_tick_is_one_event_at_each(eventful, isolate):
+    """u is k at tick k: it takes the FMU through Event Mode after the start's, and after its own at 0.25 s."""
+
+    def make():
+        @subsystem(sample_time=0.01, name="counter")
+        def counter():
+            memory = UnitDelay(initial_value=0.0, name="count")
+            return memory(memory.y + 1.0)
+
+        plant = Fmu(eventful, name="plant", isolate=isolate)
+        return Diagram("counted", plant(u=counter(), n=Constant(value=0.0, name="n")))
+
+    k = np.arange(31)
+    for run in both(make, 0.3):
+        np.testing.assert_array_equal(run["plant.events"], 1 + k + (k >= 25))
+        np.testing.assert_allclose(run["plant.x"], 0.01 * k * (k - 1) / 2 + exact(run.t, 0.0), rtol=0.0, atol=1e-12)
+        assert [(e.t, e.event) for e in run.events] == [(0.25, "time_event")]
+
+
 def test_every_kind_of_event_of_an_fmu(eventful, isolate):
     """ẋ = u + k with k = ⌊4 t⌋; x falls to 0 after a step that ends above 1, and n is taken over in Event Mode."""
 
@@ -287,13 +395,22 @@ def test_every_kind_of_event_of_an_fmu(eventful, isolate):
         wanted = Step(times=0.333, values=3.0, name="wanted")
         return Diagram("d", plant(u=Constant(value=1.0, name="u"), n=wanted))
 
-    interpreted, compiled = both(lambda: make(0), 0.8, step=0.05)
-    same(interpreted, compiled)
-    np.testing.assert_array_equal(compiled["plant.m"], np.where(compiled.t >= 0.333, 3.0, 0.0))
-    assert [e.t for e in compiled.events if e.event == "time_event"] == [0.25, 0.5, 0.75]
-    interpreted, compiled = both(lambda: make(1), 1.0, step=0.05, solver="rk4")
-    assert any(e.event == "step_event" for e in compiled.events)
-    same(interpreted, compiled)
+    for run in both(lambda: make(0), 0.8, step=0.05):
+        np.testing.assert_array_equal(run["plant.m"], np.where(run.t >= 0.333, 3.0, 0.0))
+        assert [(e.t, e.event) for e in run.events] == [(t, "time_event") for t in (0.25, 0.5, 0.75)]
+        np.testing.assert_allclose(run["plant.x"], exact(run.t, 1.0), rtol=0.0, atol=1e-12)
+        assert run["plant.events"][-1] == 5.0  # at the start, and of n
+    x, expected, falls = 0.0, [0.0], []
+    for k in range(20):
+        x += 0.05 * (1 + k // 5)
+        if x > 1.0:
+            falls.append(0.05 * (k + 1))
+            x = 0.0
+        expected.append(x)
+    for run in both(lambda: make(1), 1.0, step=0.05, solver="rk4"):
+        assert [e.t for e in run.events if e.event == "step_event"] == pytest.approx(falls, abs=1e-12)
+        assert [e.t for e in run.events if e.event == "time_event"] == [0.25, 0.5, 0.75, 1.0]
+        np.testing.assert_allclose(run["plant.x"], expected, rtol=0.0, atol=1e-12)
 
 
 def test_an_fmu_ends_a_compiled_run(eventful, isolate):
@@ -322,12 +439,7 @@ def test_a_failure_in_c_is_told_as_interpreted(cache, tmp_path, fault, told, iso
     assert error.value.block == "plant"
     assert error.value.t == pytest.approx(0.3, abs=0.1)
     assert error.value.run.t[-1] >= 0.2
-    np.testing.assert_allclose(error.value.run["plant.x"], 0.5 * error.value.run.t + _risen(error.value.run.t))
-
-
-def _risen(t):
-    k = np.floor(4.0 * t)
-    return 0.25 * k * (k - 1) / 2 + k * (t - 0.25 * k)
+    np.testing.assert_allclose(error.value.run["plant.x"], exact(error.value.run.t, 0.5), rtol=0.0, atol=1e-12)
 
 
 def test_a_discard_beyond_a_wall_makes_steps_smaller(cache, tmp_path, isolate):

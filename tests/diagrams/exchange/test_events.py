@@ -19,7 +19,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu
-from support.eventful import eventful_fmu
+from support.eventful import eventful_fmu, exact
 
 
 @pytest.fixture(scope="module", params=[2, 3])
@@ -33,12 +33,6 @@ def named(events, name):
 
 def plant(file, **start):
     return Fmu(file, name="plant", start=start)
-
-
-def exact(t, u=0.0):
-    """x with ẋ = u + k, k = ⌊4 t⌋."""
-    k = np.floor(4.0 * t)
-    return u * t + 0.25 * k * (k - 1) / 2 + k * (t - 0.25 * k)
 
 
 RADAU = pytest.param("Radau", marks=pytest.mark.one_tier)  # its output `steps` counts the solver's, one less in C
