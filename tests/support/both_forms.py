@@ -1,14 +1,26 @@
 """Runs in both forms, interpreted and compiled."""
 
-from unittest import mock
+import pytest
 
+from loopwright.diagrams.simulation.compiled_hybrid import HybridTicks
 from loopwright.diagrams.simulation.compiled_ticks import CompiledTicks
+
+
+def refuse_ticks_by_python(patch):
+    """Let a run fail in which Python goes through a tick that C's loop could not; ``patch`` undoes it."""
+
+    def refused(*_, **__):
+        raise AssertionError("Python had to look at a tick")
+
+    patch.setattr(CompiledTicks, "_take_tick", refused)
+    patch.setattr(HybridTicks, "_take_rare_tick", refused)
 
 
 def both(made, duration, **options):
     """Run a diagram interpreted and compiled, and return both runs; all ticks of the second one are done in C."""
     interpreted = made.simulate(duration, compile=False, progress=False, **options)
-    with mock.patch.object(CompiledTicks, "_take_tick", side_effect=AssertionError("Python had to look at a tick")):
+    with pytest.MonkeyPatch.context() as patch:
+        refuse_ticks_by_python(patch)
         compiled = made.simulate(duration, compile=True, progress=False, **options)
     assert not any(message.startswith("Interpreted") for message in compiled.messages)
     return interpreted, compiled

@@ -21,25 +21,12 @@ from loopwright.diagrams import Diagram, Interrupted, Run, experiments, subsyste
 from loopwright.diagrams.compiled import compiled_libraries
 from loopwright.fmus import Fmu, dc_motor
 from loopwright.fmus.runtime import runtime_source
+from support.both_forms import assert_same_bits, both
 from support.random_cases import random_cases
 from support.random_linear import BASE, PERIOD, Matrices, diagram, specs
 from support.zoo import zoo_fmu
 
 QUIET = {"progress": False}
-
-
-def both(made, duration, **options):
-    """Run a diagram interpreted and compiled, and return both runs."""
-    interpreted = made.simulate(duration, **QUIET, **options)
-    compiled = made.simulate(duration, compile=True, **QUIET, **options)
-    assert not any(message.startswith("Interpreted") for message in compiled.messages)
-    return interpreted, compiled
-
-
-def assert_same_bits(first, second):
-    assert first.t.tobytes() == second.t.tobytes()
-    assert first.data.tobytes() == second.data.tobytes()
-    assert first.stopped == second.stopped
 
 
 def sums(every=0.01, offset=0.0, name="box"):

