@@ -95,7 +95,8 @@ class Run:
     elapsed : float
         Elapsed time of the loop in s.
     tier : str
-        Form of the loop over ticks: "interpreted", "compiled", or "both", where C has taken over within the run.
+        Form of the diagram's functions: "interpreted", "compiled" for generated code, or "both", where that has taken
+        over within the run. The loop over time is in C whichever it is.
 
     Examples
     --------

@@ -172,7 +172,7 @@ class Engine:
 
     @property
     def can_begin_anew(self) -> bool:
-        """Whether `begin_anew` leaves nothing of the run before: no solver in Python, coupling or outside blocks."""
+        """Whether `begin_anew` leaves nothing of a run: generated code between ticks, no coupling, no outside block."""
         plain = (self.continuous is None or self.is_compiled) and self.coupled is None and not self.exchanged
         return plain and all(isinstance(p, FmuInstance) and p.native is not None for p in self.plants.values())
 

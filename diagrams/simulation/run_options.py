@@ -88,8 +88,8 @@ class RunOptions:
     start : RunState or OperatingPoint, optional
         State to go on from: ``run.final_state``, that of `Simulation.save`, or an operating point, such as
         `trim` finds one, with the parameters that belong to it. Where ticks end the solver's steps, the run has the
-        bits of one in one go with ``compile=True`` or False; with continuous states under "auto", C may take over
-        elsewhere, and long runs differ by rounding, within the tolerances.
+        bits of one in one go; else the solver would have stepped over that instant, and values differ within the
+        tolerances.
     coupling : str or Coupling
         Exchange of values between FMUs in a communication step: "jacobi", all step at once with the inputs of its
         beginning; "gauss_seidel", one after the other; "iterated", until they agree; or a `Coupling` with its options,
@@ -98,13 +98,12 @@ class RunOptions:
         Exchange of values with FMUs while they initialize: until inputs and outputs agree, one pass, or none, where
         inputs keep their start values until the first step. Tools differ in this.
     compile : {"auto", True, False}
-        Generate C code of the diagram. Runs go from tick to tick in C whatever this says, where C has all that they
-        need; a virtual machine evaluates the diagram's functions unless there is generated code of them, to the same
-        bits. "auto": a run begins with the machine; a compiler works beside it if the run is long enough, and its code
-        takes over. False: no code is generated, and no compiler is started. True: code is generated before the first
-        tick. That needs a compiler (the extra ``build``), and that C has all that the run needs. Where one of these
-        fails, the run is interpreted, and ``run.messages`` says why. ``run.tier`` says what was done. Diagrams of more
-        than 2000 operations a tick are interpreted by Python until there is code of them.
+        Generate C code of the diagram. Runs go in C whatever this says; a virtual machine evaluates the diagram's
+        functions unless there is generated code of them, to the same bits. "auto": a run begins with the machine; a
+        compiler works beside it if the run is long enough, and its code takes over. False: no code is generated, and
+        no compiler is started. True: code is generated before the first tick. That needs a compiler (the extra
+        ``build``), and a diagram of which there can be code. Where one of these fails, the run is interpreted, and
+        ``run.messages`` says why. ``run.tier`` says what was done.
     fuse : bool
         Compile the ticks, the loop over them and the equations of FMUs that Loopwright has built on this machine
         together, for its processor, with products and sums fused (FMA): faster, and values differ by rounding, as

@@ -105,7 +105,9 @@ class BoundRun:
         for path, plant in engine.plants.items():
             if not (isinstance(plant, FmuInstance) and plant.native is not None):
                 return f"{path} takes more calls than one for a step, and is loaded for each of them"
-        return f"Python's solver goes between their ticks ({' '.join(engine.messages) or 'compile=True'})"
+        return (
+            f"there is no generated code of what is between their ticks ({' '.join(engine.messages) or 'compile=True'})"
+        )
 
     def fits(self, numbers: Numbers) -> bool:
         """Whether a run with the numbers of a sample can follow: the solver has the same tolerances and step limits."""
@@ -119,7 +121,7 @@ class BoundRun:
 
     @property
     def is_compiled(self) -> bool:
-        """Whether it goes from tick to tick in C."""
+        """Whether it goes by generated code."""
         return self.engine.is_compiled
 
     @property

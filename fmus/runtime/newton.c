@@ -1,4 +1,4 @@
-/* Compiled functions with their vectors, and algebraic loops by Newton's method, as an interpreted run solves them.
+/* Compiled functions with their vectors, and algebraic loops by Newton's method.
 
    Python helps with a loop that is not solved, is not surely determined, or meets a value that is not finite. */
 

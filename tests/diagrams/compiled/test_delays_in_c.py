@@ -73,7 +73,7 @@ def test_pulses_keep_their_edges_through_two_delays():
         assert np.max(np.abs(run["i.y"] - expected)) < 1e-12
 
 
-def test_a_relay_behind_a_delay_switches_as_in_pythons_loop():
+def test_a_relay_behind_a_delay_switches_at_the_times_of_its_exponentials():
     """A lag of 0.5 s is switched at 0.3 and 0.7, 0.2 s late: times of a way follow from its overshoot."""
     lag = TransferFunction(numerator=1.0, denominator=[0.5, 1.0], name="lag")
     relay = Relay(on_point=0.7, off_point=0.3, name="relay")

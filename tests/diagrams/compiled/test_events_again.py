@@ -1,4 +1,4 @@
-"""The tests of events in interpreted runs once more, with every run in C."""
+"""The tests of events once more, with generated code in every run."""
 
 import importlib.util
 from pathlib import Path
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(autouse=True)
 def in_c(monkeypatch):
-    """Runs are compiled where they can be."""
+    """Runs have generated code where there can be some."""
     make = run_options.RunOptions.__init__
 
     def made(self, *arguments, **options):

@@ -151,7 +151,7 @@ def test_the_output_that_an_open_subsystem_will_hold_is_recorded(form, mode, sol
 
 
 def test_the_rates_of_a_grouped_run_are_not_traced_as_a_whole(grouped):
-    """Tracing takes seconds with 10,000 blocks, and only Python's solver would ask for them."""
+    """Tracing takes seconds with 10,000 blocks; C evaluates a function for each kind of block."""
     made, _ = ring(6)
     with made.simulation(step=0.05, solver="rk4", compile=True) as simulation:
         simulation.advance(1.0)
