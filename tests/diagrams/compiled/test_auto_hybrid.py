@@ -125,6 +125,14 @@ def test_code_takes_over_beside_an_fmu(eager):
     made = Diagram("loop", plant(voltage=lag(Sine(frequency=2.0, name="source")), load_torque=0.0))
     run = made.simulate(0.4, step=T, **QUIET)
     assert run.tier == "both"
+    R, L, K, J, b, w = 1.2, 2e-3, 0.05, 2e-5, 1e-5, 4.0 * np.pi
+    step = expm(T * np.array([[-R / L, -K / L, 1.0 / L], [K / J, -b / J, 0.0], [0.0, 0.0, 0.0]]))[:2]
+    lagged = expm(T * np.array([[-100.0, 100.0, 0.0], [0.0, 0.0, w], [0.0, -w, 0.0]]))  # of the lag, sine and cosine
+    x, voltage, expected = np.zeros(2), np.array([0.0, 0.0, 1.0]), []
+    for _ in range(401):
+        expected.append(x[1])
+        x, voltage = step @ [*x, voltage[0]], lagged @ voltage
+    assert np.max(np.abs(run["plant.speed"] - expected)) < 1e-5  # the FMU's own steps of 0.1 ms
     interpreted = made.simulate(0.4, step=T, compile=False, **QUIET)
     assert np.array_equal(run.t, interpreted.t)
     assert np.max(np.abs(run["plant.speed"] - interpreted["plant.speed"])) < 1e-9

@@ -1,4 +1,7 @@
-"""Grouped code: one C function for each kind of block, with the bits of the blocks evaluated one by one."""
+"""Grouped code: one C function for each kind of block, with the bits of the blocks evaluated one by one.
+
+Interpreted runs go by the same tables of blocks, so that loops by hand stand beside the equality of bits.
+"""
 
 import os
 import signal
@@ -27,7 +30,7 @@ from loopwright.diagrams.flat import flat_diagram
 from support.both_forms import assert_same_bits, both
 from support.hybrid_blocks import counting
 from support.random_cases import random_cases
-from support.random_linear import BASE, PERIOD, diagram, specs
+from support.random_linear import BASE, PERIOD, Matrices, diagram, specs
 
 QUIET = {"progress": False}
 
@@ -60,7 +63,7 @@ def loops(n):
     def inside(signal):
         for i in range(n):
             lag = TransferFunction(numerator=1.0, denominator=[0.05 + 1e-3 * i, 1.0], name=f"lag{i}")
-            signal = lag(PID(kp=2.0, ki=1.0, kd=0.1, filter_time=0.01, name=f"pid{i}")(signal, lag.y))
+            signal = lag(PID(kp=2.0, ki=1.0, kd=0.01, filter_time=0.01, name=f"pid{i}")(signal, lag.y))
         return signal
 
     return boxed(inside)
@@ -74,6 +77,27 @@ def test_a_chain_of_800_blocks_has_the_bits_of_numpy():
         for i in range(last + 1):
             expected = np.concatenate([[0.0], expected[:-1]]) if i % 2 else (1.0 - 1e-3 * i) * expected
         assert np.array_equal(run[f"box.b{last}.y"], expected)
+
+
+def test_many_controllers_are_those_of_a_loop_by_hand():
+    """Lags are exact for an input that is held, and so is the filter of the derivative."""
+    made, n, T, tau = loops(70), 70, 0.01, 0.01
+    assert made.wired.flattened(None).by_block
+    runs = both(made, 1.0)
+    times = 0.05 + 1e-3 * np.arange(n)
+    decay, forget = np.exp(-T / times), np.exp(-T / tau)
+    y, integral, filtered, expected = np.zeros(n), np.zeros(n), np.zeros(n), []
+    for k in range(101):
+        expected.append(y)
+        r = np.concatenate([[np.sin(0.06 * np.pi * k)], y[:-1]])
+        u = 2.0 * (r - y) + integral - 0.01 * (y - filtered) / tau
+        integral, filtered = integral + T * (r - y), forget * filtered + (1.0 - forget) * y
+        y = decay * y + (1.0 - decay) * u
+    expected = np.array(expected)
+    for run in runs:
+        for i in (0, 1, 35, 69):
+            size = np.max(np.abs(expected[:, i]))  # each lag damps: 1e-27 behind seventy
+            np.testing.assert_allclose(run[f"box.lag{i}.y"], expected[:, i], rtol=0.0, atol=1e-10 * size)
 
 
 @pytest.mark.parametrize(("make", "n"), [(chain, 600), (loops, 70), pytest.param(loops, 600, marks=pytest.mark.slow)])
@@ -117,10 +141,16 @@ def test_terms_that_cancel_across_blocks_are_rounded_block_by_block(grouped):
 
 
 @random_cases(2, 30, specs(least=12, continuous=False))
-def test_random_linear_diagrams_have_the_same_bits(spec):
+def test_random_linear_diagrams_have_the_same_bits_and_the_product_of_matrices(spec):
+    small = spec.scaled(0.1)
+    ticks, expected = Matrices(small).run(PERIOD)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(flat_diagram, "LARGEST", 0)
-        assert_same_bits(*both(diagram(spec.scaled(0.1)), PERIOD * BASE, step=BASE))
+        interpreted, compiled = both(diagram(small), PERIOD * BASE, step=BASE)
+    assert_same_bits(interpreted, compiled)
+    rows = np.searchsorted(compiled.t, np.array(ticks) / 100)
+    found = np.hstack([np.reshape(compiled[f"b{i}.y"], (len(compiled.t), -1)) for i in range(len(small.nodes))])
+    assert np.max(np.abs(found[rows] - expected)) < 1e-10 * max(1.0, np.max(np.abs(expected)))
 
 
 @pytest.mark.parametrize("mode", ["reset", pytest.param("held", marks=pytest.mark.slow)])
@@ -133,12 +163,17 @@ def test_enabled_boxes_count_while_they_are_enabled(grouped, mode):
 
 
 @pytest.mark.parametrize("edge", ["both", *(pytest.param(e, marks=pytest.mark.slow) for e in ("rising", "falling"))])
-def test_triggered_boxes_have_the_same_bits(grouped, edge):
+def test_triggered_boxes_count_edges_with_the_same_bits(grouped, edge):
     @subsystem(sample_time=0.02, name="outer")
     def outer(u):
         return counting(name="inner", triggered=edge)(trigger=Compare(">")(u, 0.3))
 
-    assert_same_bits(*both(Diagram("d", outer(Sine(frequency=2.0)).named("n")), 3.0))
+    interpreted, compiled = both(Diagram("d", outer(Sine(frequency=2.0)).named("n")), 3.0)
+    assert_same_bits(interpreted, compiled)
+    above = np.sin(0.08 * np.pi * np.arange(151)) > 0.3
+    change = np.diff(np.concatenate([[False], above]).astype(int))
+    edges = {"both": change != 0, "rising": change > 0, "falling": change < 0}[edge]
+    assert compiled["n"].tolist() == np.maximum(np.cumsum(edges), 1).tolist()  # 1 before the first one, too
 
 
 def test_nested_gates_of_several_rates_with_delays_have_the_same_bits(grouped):
@@ -162,7 +197,14 @@ def test_parts_of_vectors_and_matrices_have_the_same_bits(grouped):
         delay(0.1 * back(y) + drive(u))
         return Product(name="p")(y[0], y[2]) + y[1]
 
-    assert_same_bits(*both(boxed(inside), 1.0))
+    interpreted, compiled = both(boxed(inside), 1.0)
+    assert_same_bits(interpreted, compiled)
+    m, n = np.array([[1.0, 2.0], [3.0, -1.0], [0.5, 0.0]]), np.array([[1.0, 2.0, 0.1], [0.0, 1.0, 3.0]])
+    x = np.zeros(2)
+    for u, product in zip(compiled["source.y"], compiled["box.p.y"], strict=True):
+        y = m @ x
+        assert product == pytest.approx(y[0] * y[2], abs=1e-12)
+        x = 0.1 * n @ y + np.array([1.0, -2.0]) * u
 
 
 def test_tables_beside_other_blocks_have_the_same_values(grouped):

@@ -1,4 +1,4 @@
-"""Runs with continuous states in C: closed forms, matrix exponentials, and the numbers of interpreted runs."""
+"""Runs with continuous states in C: closed forms and matrix exponentials, in both forms of a diagram's functions."""
 
 import numpy as np
 import pytest
@@ -129,21 +129,33 @@ def test_an_fmu_steps_at_ticks_beside_continuous_states():
     lag = TransferFunction(numerator=1.0, denominator=[0.01, 1.0], name="lag")
     made = Diagram("loop", plant(voltage=lag(controller(plant.speed)), load_torque=0.02))
     run, interpreted = compiled(made, 0.3, solver="RK45"), made.simulate(0.3, solver="RK45", **QUIET)
+    R, L, K, J, b = 1.2, 2e-3, 0.05, 2e-5, 1e-5
+    motor = np.array([[-R / L, -K / L, 1.0 / L, 0.0], [K / J, -b / J, 0.0, -1.0 / J], [0.0] * 4, [0.0] * 4])
+    step, decay, x, held, expected = expm(T * motor), np.exp(-T / 0.01), np.zeros(2), 0.0, []
+    for _ in range(301):
+        expected.append((x[1], held))
+        x, held = (step @ [*x, held, 0.02])[:2], decay * held + (1.0 - decay) * 0.05 * (10.0 - x[1])
+    for found in (run, interpreted):
+        assert np.max(np.abs(found["plant.speed"] - [speed for speed, _ in expected])) < 1e-5  # the FMU's own steps
+        assert np.max(np.abs(found["lag.y"] - [voltage for _, voltage in expected])) < 1e-6
     assert run.t.tobytes() == interpreted.t.tobytes()
     assert np.max(np.abs(run.data - interpreted.data)) < 1e-12 * np.max(np.abs(interpreted.data))
 
 
 def test_a_stop_condition_ends_it_at_a_sample_between_steps():
     made = Diagram("d", StopCondition(name="stop")(Compare(">")(Integrator(name="x")(Sine(frequency=0.2)), 0.5)))
-    interpreted = made.simulate(3.0, solver="rk4", step=0.01, **QUIET)
-    run = made.simulate(3.0, solver="rk4", step=0.01, compile=True, **QUIET)
-    assert run.stopped == interpreted.stopped
-    assert run.t.tobytes() == interpreted.t.tobytes()
+    w = 0.4 * np.pi
+    end = np.arccos(1.0 - 0.5 * w) / w  # of x = (1 − cos w t) / w
+    for form in (False, True):
+        run = made.simulate(3.0, solver="rk4", step=0.01, compile=form, **QUIET)
+        assert run.stopped.t == run.t[-1] == pytest.approx(end, abs=1e-9)
+        assert np.max(np.abs(run["x.y"] - (1.0 - np.cos(w * run.t)) / w)) < 1e-9
 
 
 def test_a_run_goes_on_is_saved_and_branches_between_both_forms():
     made = loop_with_lags()
     whole = made.simulate(0.4, **QUIET)
+    assert np.max(np.abs(whole["y"] - exact_lags(400))) < 1e-9
     with made.simulation(compile=True) as simulation:
         simulation.advance(0.1)
         simulation.advance(0.1)
