@@ -54,7 +54,7 @@ _FLAT = 20.0
 _ROUNDING = 1e-12
 """Relative rounding error of Brent's method."""
 _UNIT, _CHANGES, _SAFETY = 2e-15, 4, 10.0
-"""Relative change of entries, how often it is tried, and the factor on the spread of what comes out."""
+"""Relative change of an entry, or of the largest beside it, how often it is tried, and the factor on the spread."""
 _SMALL = 1e-6
 """Growth rate, relative to the largest of a scan, below which its rounding is looked at."""
 _MORE = 1e3
@@ -62,24 +62,39 @@ _MORE = 1e3
 Growth = Callable[[float], float]
 
 
-def growth_rounding(rates: Callable[[np.ndarray], np.ndarray], A: np.ndarray) -> float:
+def growth_rounding(modes: Modes, rates: Callable[[np.ndarray], np.ndarray], A: np.ndarray) -> float:
     """Return a bound of the rounding error of a growth rate in 1/s, infinite where the matrix is not finite.
 
-    The growth rate is computed again with every entry changed by some roundings. Its eigenvalues answer as they do to
-    the rounding of any machine: one that stands alone by as much, several in one place by far more.
+    The growth rate is computed again with every entry of the matrix changed by some roundings. Where the fixed modes
+    are split off, every entry, zeros too, is changed by some roundings of the largest one beside it, as LAPACK's
+    transformations do. The eigenvalues answer as they do to the rounding of any machine: one that stands alone by as
+    much, several in one place by far more.
 
     Parameters
     ----------
+    modes : Modes
+        The modes that the environment can move.
     rates : callable
-        From a stack of matrices to their growth rates.
+        From a stack of their matrices to growth rates.
     A : ndarray, shape (n, n)
         Matrix of the loop.
     """
     if not np.isfinite(A).all():
         return math.inf
-    changes = 1.0 + _UNIT * np.random.default_rng(0).uniform(-1.0, 1.0, (_CHANGES, *A.shape))
-    found = rates(np.concatenate([A[None], A * changes]))
-    return float(_SAFETY * np.ptp(found))
+    draws, reduced = np.random.default_rng(0), modes.reduce(A)
+    changed = modes.reduce(A * (1.0 + _UNIT * draws.uniform(-1.0, 1.0, (_CHANGES, *A.shape))))
+    changed += _UNIT * draws.uniform(-1.0, 1.0, changed.shape) * _sizes_beside(reduced)
+    return float(_SAFETY * np.ptp(rates(np.concatenate([reduced[None], changed]))))
+
+
+def _sizes_beside(A: np.ndarray) -> np.ndarray:
+    """Return the largest entry in each one's row or column, whichever is less, of the balanced matrix."""
+    from scipy.linalg.lapack import dgebal
+
+    balanced, _, _, scale, _ = dgebal(A, scale=1, permute=0)
+    sizes = np.abs(balanced)
+    least = np.minimum(sizes.max(axis=1, initial=0.0)[:, None], sizes.max(axis=0, initial=0.0))
+    return np.asarray(least * scale[:, None] / scale)
 
 
 class FoundLimit(NamedTuple):
@@ -161,7 +176,7 @@ def find_first_limit(
     confirmed = _confirm(name, value, step, growth_by_control, rounding_at)
     slope = (growth_at((1.0 + step) * value) - growth_at((1.0 - step) * value)) / (2.0 * step)  # of σ over ln value
     apart = 10.0 * abs(growth_by_control(value)) + abs(model_error(value)) + rounding_at(value)
-    error = apart / abs(slope) + _ROUNDING
+    error = apart / abs(slope) + _ROUNDING if slope else math.inf
     below, above = (growth_at(x * value) for x in (1.0 - GROWTH_AT, 1.0 + GROWTH_AT))
     return FoundLimit(value, tuple(later), below, above, value * error, confirmed)
 
@@ -387,8 +402,11 @@ class CoupledLoop:
 
     def _find_rates(self, A: np.ndarray) -> np.ndarray:
         solvable = np.isfinite(A).all(axis=(-1, -2))
-        poles = np.linalg.eigvals(self.modes.reduce(np.where(solvable[..., None, None], A, 0.0)))
-        return np.where(solvable, np.max(to_rates(self.parts, poles).real, axis=-1), np.inf)
+        reduced = self.modes.reduce(np.where(solvable[..., None, None], A, 0.0))
+        return np.where(solvable, self._rates_of(reduced), np.inf)
+
+    def _rates_of(self, reduced: np.ndarray) -> np.ndarray:
+        return np.asarray(np.max(to_rates(self.parts, np.linalg.eigvals(reduced)).real, axis=-1))
 
     def growth_at(self, value: float) -> float:
         """Return σ in 1/s at one value."""
@@ -396,7 +414,7 @@ class CoupledLoop:
 
     def rounding_at(self, value: float) -> float:
         """Return a bound of the rounding error of σ at one value, in 1/s."""
-        return growth_rounding(self._find_rates, self.close(np.float64(value)).A)
+        return growth_rounding(self.modes, self._rates_of, self.close(np.float64(value)).A)
 
     def fastest_mode(self, value: float) -> tuple[float, tuple[float, ...]]:
         """Return the frequency of the mode that grows fastest, in rad/s, and the direction in which it moves."""

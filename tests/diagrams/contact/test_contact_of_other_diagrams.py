@@ -18,6 +18,8 @@ from loopwright.blocks import (
     TransferFunction,
 )
 from loopwright.diagrams import Diagram, TrialMethod, subsystem
+from loopwright.diagrams.contact.loop import Modes
+from loopwright.diagrams.contact.stability_limits import growth_rounding
 from loopwright.fmus import Fmu, build, scara
 from support.carts import DRAG, SHARE, TAU, Cart, M, cart_contact, cart_diagram
 
@@ -66,6 +68,35 @@ def test_a_cart_without_friction_bounces_on_any_spring_for_ever():
     assert "the motion does not decay" in found.confirmed_by
     # (τ s + 1)(M s² + b s + k) + DRAG s = 0 with DRAG = 0 and any damper is stable
     assert here.stability_limit("damping", stiffness=100.0).value == math.inf
+
+
+def test_the_least_growth_of_such_a_cart_is_no_rounding():
+    """M s² − c s + k = 0 grows by c/2M: 5e-9 of the least frequency of the scan, 5e-14 of the largest."""
+    cart, hand = Cart(name="cart"), Constant(value=0.0, unit="N", name="hand")
+    felt = Gain(gain=0.0, name="sensor")(hand).named("felt")
+    here = Diagram("cart", cart(motor=Gain(gain=1e-9, name="pump")(cart.velocity) + felt, push=hand)).contact(
+        "cart.push", direction=[1.0], position="cart.position", velocity="cart.velocity", force="felt"
+    )
+    found = here.stability_limit()
+    assert found.value == 0.0
+    assert found.growth_above == pytest.approx(0.5e-9 / M, rel=1e-6)
+
+
+@pytest.mark.parametrize("k", [1e-6, 1e-2, 1.0, 37.0, 1e4, 1e8])
+def test_the_rounding_of_a_growth_rate_covers_that_of_any_machine(k):
+    """An undamped mode beside a faster and a slower one, with errors of 1e-15 of what stands beside each entry."""
+    ω = math.sqrt(k)
+    A = np.array([[0.0, 1.0, 0.0, 0.0], [-k, 0.0, 0.0, 0.0], [0.3 * k, 0.0, -40 * ω, 0.0], [0.0, ω, 0.0, -0.01 * ω]])
+    modes = Modes(np.eye(4), np.eye(4), np.zeros(0), np.zeros(0, dtype=bool))
+    bound = growth_rounding(modes, lambda B: np.linalg.eigvals(B).real.max(axis=-1), A)
+    scale = np.array([1.0, ω, 1.0, 1.0])  # of states that make it ω times numbers
+    sizes = ω * np.where(A != 0.0, 1.0, 0.0)
+    sizes[:2, :2] = ω
+    draws = np.random.default_rng(1).uniform(-1.0, 1.0, (500, 4, 4))
+    machines = A + 1e-15 * draws * sizes * scale[:, None] / scale
+    found = np.abs(np.linalg.eigvals(machines).real.max(axis=-1))
+    assert found.max() < bound < 1e-12 * ω
+    assert found.max() > 3e-16 * ω
 
 
 def test_without_damping_a_spring_breaks_the_loop_where_the_admittance_is_no_longer_passive():
