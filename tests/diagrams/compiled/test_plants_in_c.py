@@ -542,6 +542,7 @@ def test_coupled_plants_are_saved_and_go_on_in_every_form(cache, coupling):
             assert again.data.tobytes() == whole.data[-len(again.t) :].tobytes()
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("coupling", SCHEMES, ids=NAMES)
 def test_coupled_plants_step_beside_continuous_states(folder, coupling, compiled):

@@ -46,6 +46,7 @@ def review(contact, contacts=None, **asked):
     return analyse(made, only=(), contacts=contacts, requirements=Requirements(contact=contact, **asked))
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize(
     ("limit", "verdict", "distance"),
     [

@@ -47,6 +47,7 @@ def said(name):
     return " ".join(report(name).sections[0].text)
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize(
     ("name", "keys"),
     [

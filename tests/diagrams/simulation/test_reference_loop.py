@@ -140,6 +140,7 @@ def check(family, seeds, compiled):
     assert compared > 0.7 * len(seeds), f"only {compared} of {len(seeds)} diagrams are well conditioned"
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_random_diagrams_are_what_the_reference_loop_says(family):
     check(family, range(1000, 1005), "auto")

@@ -89,6 +89,7 @@ def test_entries_of_an_array_are_ranges_by_the_names_that_sensitivity_gives():
     assert found.diagram.blocks["motor"].denominator[0] == 0.05
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("quantity", ["phase_margin_deg", "delay_margin_s", "gain_margin_high"])
 def test_an_infinite_margin_is_as_good_as_can_be(quantity):
     """L = k/(s + 1) has no crossover below k = 1, and never a limit of its gain."""

@@ -79,6 +79,7 @@ JUMPING = {
 }
 
 
+@pytest.mark.drawn(4)
 @pytest.mark.parametrize("solver", GROWTH)
 @pytest.mark.parametrize("kind", JUMPING)
 def test_a_source_that_jumps_at_ticks_reaches_a_lag_behind_them_up_to_the_last_one(kind, solver):

@@ -123,6 +123,7 @@ CASES = {
 }
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize("case", CASES)
 def test_runs_that_follow_each_other_in_one_thread_have_the_bits_of_single_ones(case, monkeypatch):
     make, parameters, duration, options = CASES[case]

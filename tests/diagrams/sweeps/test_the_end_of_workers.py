@@ -10,7 +10,7 @@ from support.waiting import wait_for
 from support.zoo import zoo_fmu
 
 pytestmark = ON_LINUX
-SIGNALS = pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+SIGNALS = pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 TESTS = str(Path(__file__).parents[2])
 
 HELD = f"""

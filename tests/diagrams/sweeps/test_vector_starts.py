@@ -103,6 +103,7 @@ CASES = {
 }
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "arm" else n for n in CASES])
 def test_runs_start_together_as_each_does_by_itself(name):
     make, table = CASES[name]

@@ -256,7 +256,7 @@ def test_a_trial_run_may_crash(tmp_path, fault):
         assert diagnosis.headline.startswith("runs here")
 
 
-@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("fmi", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_a_trial_run_that_hangs_is_announced(tmp_path, monkeypatch, capsys, fmi):
     monkeypatch.setattr("loopwright.fmus.checks.trial.PATIENCE", 1.5)
     monkeypatch.setattr("loopwright.fmus.checks.trial.NOTICE", 0.01)

@@ -178,6 +178,7 @@ def test_the_functions_of_fused_code_err_by_a_few_units_in_the_last_place_of_1(t
         assert np.isnan(fast(name, [math.nan])).all()
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize("function", [np.sin, np.cos, np.tanh, np.exp, np.expm1, np.log, np.log1p, np.log10])
 def test_a_plant_with_any_of_them_is_exported(function, tmp_path):
     class Plant(Block):

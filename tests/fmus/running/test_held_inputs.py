@@ -74,6 +74,7 @@ def test_all_elements_of_an_array_must_be_given(file, cache):
         Diagram("d", Fmu(file, name="plant", rename=RENAME, start={"inflow": INFLOW})())
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("name", ["plant.start.pump", "plant.pump"])
 @TIERS
 def test_a_sweep_and_a_variant_change_it(file, name, compiled):
