@@ -12,7 +12,9 @@ import os
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,8 +62,8 @@ class Keeper:
         self.kept: set[int | str] = set()
         """Groups and folders."""
 
-    def tell(self, request: str, subject: int | str) -> None:
-        """Write a request.
+    def tell(self, request: str, folder: str) -> None:
+        """Write a request about a folder.
 
         Raises
         ------
@@ -69,8 +71,7 @@ class Keeper:
             If the keeper has ended.
         """
         assert self._process.stdin is not None
-        text = os.fsencode(subject).hex() if isinstance(subject, str) else f"{subject}"
-        self._process.stdin.write(f"{request} {text}\n".encode())
+        self._process.stdin.write(f"{request} {os.fsencode(folder).hex()}\n".encode())
 
     def make_group(self) -> int:
         """Return the number of a new group of processes.
@@ -80,15 +81,30 @@ class Keeper:
         OSError
             If the keeper has ended, or can't make one.
         """
+        group = self._ask("group")
+        if not group:
+            raise BlockingIOError("no room for one more process")
+        return group
+
+    def end_group(self, group: int) -> None:
+        """End a group of processes; the first one of it is gone at the return.
+
+        Raises
+        ------
+        OSError
+            If the keeper has ended.
+        """
+        self._ask("end", group)
+
+    def _ask(self, request: str, *subject: int) -> int:
+        assert self._process.stdin is not None
         assert self._process.stdout is not None
         number = next(self._numbers)
-        self.tell("group", number)
+        self._process.stdin.write(f"{' '.join(map(str, (request, number, *subject)))}\n".encode())
         while line := self._process.stdout.readline():
-            answered, group = map(int, line.split())
+            answered, result = map(int, line.split())
             if answered == number:  # else the caller of that one was interrupted
-                if not group:
-                    raise BlockingIOError("no room for one more process")
-                return group
+                return result
         raise ProcessLookupError("the process that keeps them has ended")
 
     def has_ended(self) -> bool:
@@ -142,11 +158,11 @@ def _keep_folder(folder: str) -> None:
     keeper.tell("folder", folder)
 
 
-def _release(keeper: Keeper, request: str, subject: int | str) -> None:
+def _release(keeper: Keeper, subject: int | str, tell: Callable[[], None]) -> None:
     """Tell a keeper that it keeps something no longer; the last one lets it end."""
     keeper.kept.discard(subject)
     with suppress(OSError, ValueError):  # one that was ended by somebody else keeps nothing
-        keeper.tell(request, subject)
+        tell()
     if not keeper.kept and keeper in _KEEPERS:
         _KEEPERS.remove(keeper)
         keeper.end()
@@ -176,7 +192,7 @@ def make_group() -> tuple[Keeper, int]:
 def release_group(keeper: Keeper, group: int) -> None:
     """End a group of processes, and forget it."""
     with _LOCKS[0]:
-        _release(keeper, "end", group)
+        _release(keeper, group, partial(keeper.end_group, group))
 
 
 def keep_folder(folder: str | os.PathLike[str]) -> None:
@@ -190,7 +206,7 @@ def release_folder(folder: str | os.PathLike[str]) -> None:
     path = os.path.abspath(folder)
     with _LOCKS[0]:
         for keeper in [keeper for keeper in _KEEPERS if path in keeper.kept]:
-            _release(keeper, "removed", path)
+            _release(keeper, path, partial(keeper.tell, "removed", path))
 
 
 def end_all() -> None:

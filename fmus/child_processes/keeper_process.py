@@ -48,14 +48,15 @@ class KeeperProcess:
                     return b""
         return os.read(0, 1 << 16)
 
-    def _answer(self, request: str, subject: str) -> None:
+    def _answer(self, request: str, subject: str, of: str = "") -> None:
         if request == "group":
-            os.write(1, f"{subject} {self._make_group()}\n".encode())
+            reply(subject, self._make_group())
         elif request == "end":
-            group = int(subject)
+            group = int(of)
             self.groups.remove(group)
             kill(group)
             os.waitpid(group, 0)
+            reply(subject, group)
         elif request == "folder":
             self.folders[bytes.fromhex(subject)] = None
         elif request == "removed":
@@ -82,6 +83,14 @@ class KeeperProcess:
         os.setpgid(first, first)
         self.groups.add(first)
         return first
+
+
+def reply(number: str, group: int) -> None:
+    """Answer a request; nobody reads it where the host has just ended."""
+    try:
+        os.write(1, f"{number} {group}\n".encode())
+    except OSError:
+        return
 
 
 def kill(group: int) -> None:

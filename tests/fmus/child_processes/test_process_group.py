@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -86,6 +87,17 @@ def test_a_fork_of_the_host_neither_ends_its_children_nor_keeps_them():
         host.process.kill()
         host.process.wait()
         assert wait_for(lambda: [*host.others()], [int(other)], GONE) == [int(other)]
+
+
+def test_nothing_of_a_group_is_left_when_it_has_ended(tmp_path):
+    """Not even a zombie: the process that keeps it, here for another group, too, says when it is gone."""
+    with ProcessGroup():
+        for _ in range(20):
+            with ProcessGroup() as group:
+                run_in_group([sys.executable, "-c", ""], seconds=60)
+                (number,) = [one for _, one in group._groups]
+                assert Path(f"/proc/{number}").exists()
+            assert not Path(f"/proc/{number}").exists()
 
 
 def test_the_end_of_a_group_is_that_of_all_its_processes():
