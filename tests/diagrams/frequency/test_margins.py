@@ -353,7 +353,10 @@ def check(loop):
         return False
     assert stable(1.0)
     low, high, phase = found.gain_margin_low.value, found.gain_margin_high.value, found.phase_margin_deg.value
-    for k in np.concatenate([np.geomspace(max(low, 1e-3) * 1.001, 1, 9), np.geomspace(1, min(high, 1e3) * 0.999, 9)]):
+    within = 0.999  # of the way from 1 to a limit, by factors: margins may be nearer to 1 than that
+    for k in np.concatenate(
+        [np.geomspace(max(low, 1e-3) ** within, 1, 9), np.geomspace(1, min(high, 1e3) ** within, 9)]
+    ):
         assert stable(k), k
     for phi in np.linspace(0, min(phase, 180) * 0.999, 9):
         assert stable(np.exp(-1j * np.radians(phi))), phi
@@ -378,6 +381,12 @@ def check(loop):
         if name != "disk_margin" and np.isfinite(at := getattr(found, f"{name}_frequency").value) and at > 0:
             assert size(response(at)) == pytest.approx(largest, rel=1e-6), name
     return True
+
+
+def test_margins_that_are_nearer_than_a_thousandth_are_confirmed():
+    A = [[-534.80729627, 648.78480916, 0.0], [-648.78480916, 749.78662587, 0.0], [0.0, 0.0, 0.95122942]]
+    C = [[786.211415, -670.492397, 1.81214844e-05]]
+    assert check(control.ss(A, [[1.23693659], [1.12977513], [0.04877058]], C, 0.0, 0.05))
 
 
 @random_cases(6, 200, open_loops(sampled=False), reaching=0.1)
