@@ -156,12 +156,13 @@ def pytest_unconfigure(config):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def cache(tmp_path_factory, pytestconfig):
+def cache(tmp_path_factory):
     """Folder of this worker's cache. The compiler's own, 50 MB that are the same for all, is shared by the workers.
 
-    So are compiled libraries, which stay in pytest's cache from run to run (`support.kept_libraries`).
+    So are compiled libraries, which stay in this user's cache folder for all checkouts (`support.kept_libraries`).
     """
     from support import kept_libraries
+    from support.kept import kept_folder
 
     folder = tmp_path_factory.mktemp("cache")
     base = tmp_path_factory.getbasetemp()
@@ -171,8 +172,9 @@ def cache(tmp_path_factory, pytestconfig):
         patch.setenv("ZIG_GLOBAL_CACHE_DIR", str(shared / "zig"))
         patch.setenv("ZIG_LOCAL_CACHE_DIR", str(shared / "zig"))
         patch.delenv("LOOPWRIGHT_CC", raising=False)
-        if hasattr(pytestconfig, "cache") and importlib.util.find_spec("ziglang") is not None:
-            kept_libraries.install(patch, pytestconfig.cache.mkdir("compiled"), shared / "zig")
+        kept = kept_folder("compiled") if importlib.util.find_spec("ziglang") is not None else None
+        if kept is not None:
+            kept_libraries.install(patch, kept, shared / "zig")
         yield folder
 
 

@@ -17,6 +17,7 @@ import pytest
 import loopwright.blocks
 import loopwright.diagrams
 import loopwright.fmus
+from support.kept import kept_folder, kept_tree
 
 ROOT = Path(__file__).parent.parent
 ROOMS = {"blocks": set(), "fmus": {"blocks"}, "diagrams": {"blocks", "fmus"}}
@@ -72,18 +73,19 @@ def test_deprecations_are_errors_where_our_code_or_a_users_causes_them(module, e
         warnings.warn_explicit("changes in version 3", FutureWarning, "file.py", 1, module=module)
 
 
-def test_types(pytestconfig):
-    """Mypy's cache stays from run to run, as it does for people: an entry counts only for the file's very content."""
-    folder = pytestconfig.cache.mkdir("types")
-    (folder / "loopwright").mkdir(exist_ok=True)
+def test_types(tmp_path):
+    """Mypy's cache stays for all checkouts: an entry counts only for the file's very content, wherever it is."""
+    (tmp_path / "loopwright").mkdir()
     for room in ROOMS:
-        if not (folder / "loopwright" / room).exists():
-            (folder / "loopwright" / room).symlink_to(ROOT / room)
+        (tmp_path / "loopwright" / room).symlink_to(ROOT / room)
     packages = [argument for room in ROOMS for argument in ("-p", f"loopwright.{room}")]
-    environment = {**os.environ, "MYPYPATH": str(folder)}
+    environment = {**os.environ, "MYPYPATH": str(tmp_path)}
     here = ".".join(map(str, sys.version_info[:2]))  # NumPy's stubs may need it, where it is newer than the lowest
-    options = ("--python-version", here, "--cache-dir", str(folder / "cache"))
-    done = call(sys.executable, "-m", "mypy", *packages, *options, env=environment)
+    kept = kept_folder("types")
+    archive = kept and kept / f"mypy-{importlib.metadata.version('mypy')}-python-{here}.tar"
+    with kept_tree(archive, tmp_path / "cache") as cache:
+        options = ("--python-version", here, "--cache-dir", str(cache))
+        done = call(sys.executable, "-m", "mypy", *packages, *options, env=environment)
     assert done.returncode == 0, done.stdout + done.stderr
 
 

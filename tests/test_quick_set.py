@@ -1,10 +1,11 @@
-"""The part of a product of cases that the quick set takes."""
+"""The part of a product of cases that the quick set takes, and what it keeps for later sessions."""
 
 from itertools import product
 
 import pytest
 
 from support.drawn import draw
+from support.kept import kept_folder, kept_tree
 
 
 @pytest.mark.parametrize("sizes", [(7,), (3, 3), (2, 5), (4, 3, 2), (1, 6)])
@@ -25,3 +26,24 @@ def test_so_many_as_asked_for_are_drawn_evenly(count, expected):
 @pytest.mark.parametrize("first", "ab")
 def test_what_is_not_drawn_is_slow(first, second, request):
     assert (request.node.get_closest_marker("slow") is None) == (first + second == "ax")
+
+
+def test_a_folder_that_is_kept_is_the_same_for_all_and_none_where_nothing_can_be_written(tmp_path):
+    (tmp_path / "a_file").write_text("")
+    assert kept_folder("types", tmp_path) == kept_folder("types", tmp_path) == tmp_path / "types"
+    assert kept_folder("types", tmp_path / "a_file") is None
+
+
+def test_a_kept_tree_comes_back_with_what_the_last_session_has_added(tmp_path):
+    archive = tmp_path / "kept.tar"
+    for session in range(3):
+        with kept_tree(archive, tmp_path / str(session)) as folder:
+            assert sorted(file.name for file in folder.iterdir()) == [f"of_{i}" for i in range(session)]
+            (folder / f"of_{session}").write_text("")
+    with pytest.raises(ZeroDivisionError), kept_tree(archive, tmp_path / "failed") as folder:
+        (folder / "half").write_text(str(1 / 0))
+    with kept_tree(archive, tmp_path / "last") as folder:
+        assert sorted(file.name for file in folder.iterdir()) == ["of_0", "of_1", "of_2"]
+    with kept_tree(None, tmp_path / "nothing") as folder:
+        assert list(folder.iterdir()) == []
+    assert sorted(tmp_path.glob("*.tar")) == [archive]

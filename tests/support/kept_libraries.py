@@ -1,4 +1,4 @@
-"""Compiled libraries that stay from session to session, and are shared by its workers.
+"""Compiled libraries that stay from session to session, for all checkouts, and are shared by a session's workers.
 
 The compiler would take a third of the quick set's time for a thousand small libraries, nearly all of which are the same
 in every session. An entry counts only for the very same sources, headers, command and version of zig, so that a change
