@@ -35,68 +35,107 @@ CLOSE = 1e-9
 """Difference of two runs, relative to the signal's size, up to which they agree."""
 MARKS = "<!-- written by benchmarks/foreign_fmus.py -->", "<!-- up to here -->"
 REASONS = (
-    ("rollback-", "",
-     ("it wants its state of before restored before a shorter step; Loopwright goes on from its "
-     "`lastSuccessfulTime`")),
-    ("cannot open shared object file", "",
-     ("shared libraries of another system are missing (`libgfortran.so.3` or `.so.4`, `libpython3.7m.so.1.0`, "
-     "`libpython3.9.so.1.0`); the error and `loopwright doctor` name them")),
-    ("ModuleNotFoundError", "",
-     "it is a Python program whose modules are not in it; the error names them"),
-    ("Cannot find shared library", "CoSimulation",
-     "the library is not named for the model identifier; it is the only one in its folder"),
-    ("uart", "",
-     "the library lacks `fmi2DeSerializeFMUstate`, which no run calls"),
-    ("FMI4j.*BouncingBall", "",
-     ("a variable is parameter and constant at once: a rule broken, and no reason not to run; `run.messages` "
-     "tells it")),
-    ("only outputs that no wire carries", "CoSimulation",
-     "its outputs are binary data and clocks: no signal of a diagram"),
-    ("altairengineering", "CoSimulation",
-     "it wants Event Mode, which Loopwright uses where an FMU has clocks"),
-    ("FMPy/.*(Controller|Drivetrain)", "ModelExchange",
-     "nominal values of 0; 1 stands in for them, and `run.messages` tells it"),
-    ("Reference-FMUs.*Roberts", "ModelExchange",
-     "stiff: Loopwright changes to an implicit method of its own accord"),
-    ("MassSpringDamper|[Tt]hreetank|[Tt]hreewatertank", "CoSimulation",
-     ("the FMU compares sums of rounded times, and takes an internal step more or less in some steps, at other "
-     "places for each importer")),
-    ("(Consumer|ECS_HW|FS_OPSC)[.]fmu", "CoSimulation",
-     ("its own solver, at a tolerance of 1e-4, follows the last bits of the times: FMPy's calls at Loopwright's "
-     "communication points give Loopwright's bits, those at FMPy's give FMPy's")),
-    ("watertankController-Standalone", "CoSimulation",
-     ("it counts a step in whole nanoseconds, cut off, and discards those of FMPy that end a bit below; FMPy repeats "
-     "them without end, while Loopwright's steps are of one length")),
-    ("PumpAndValve", "",
-     "its output `CPUtime` is the time that it took"),
-    ("OSMP", "CoSimulation",
-     "its outputs are addresses in memory"),
-    ("Sensor_Block", "CoSimulation",
-     "an output in 255 steps differs by one of them: its rounding follows the last bits of the times"),
-    ("FMI4j.*VanDerPol|periodic_clock", "ModelExchange",
-     ("two solvers at a tolerance of 1e-8: against a run at 1e-12 Loopwright is off by 7e-8, CVODE in FMPy by "
-      "2.4e-6")),
-    ("Feedthrough", "ModelExchange",
-     "it refuses the start value of an input ahead of Initialization Mode"),
-    ("periodic_clock", "CoSimulation",
-     "it wants Event Mode, which Loopwright uses where an FMU has clocks"),
-    ("fmi3functiontest", "",
-     "FMI 3.0-beta.3"),
-    ("ModelicaGym_CartPole", "",
-     "it crashes in its instantiation: it requires a licence"),
-    ("DYMOLA_RUNTIME_LICENSE", "",
-     "it requires a licence"),
-    ("LBNL71T_Emulation_Dymola|WeatherProcessor_Dymola", "",
-     "it requires a licence"),
-    ("fuelrail.* runs runs$", "CoSimulation",
-     "its own solver follows the last bits of the times, as those of OMSimulator's FMUs do"),
-    ("fuelrail", "CoSimulation",
-     "slow: 23 s of processor time with either importer, so the load of the machine decides"),
-    ("OSOM", "CoSimulation",
-     "slow with either importer: 0.04 s of processor time for 0.5 s of 3500 s"),
-    ("Roberts", "CoSimulation",
-     "slow with either importer: its own step is 1e-3 s, its default stop time 1e8 s"),
-)  # fmt: skip
+    (
+        "rollback-",
+        "",
+        (
+            "it wants its state of before restored before a shorter step; Loopwright goes on from its "
+            "`lastSuccessfulTime`"
+        ),
+    ),
+    (
+        "cannot open shared object file",
+        "",
+        (
+            "shared libraries of another system are missing (`libgfortran.so.3` or `.so.4`, `libpython3.7m.so.1.0`, "
+            "`libpython3.9.so.1.0`); the error and `loopwright doctor` name them"
+        ),
+    ),
+    ("ModuleNotFoundError", "", "it is a Python program whose modules are not in it; the error names them"),
+    (
+        "Cannot find shared library",
+        "CoSimulation",
+        "the library is not named for the model identifier; it is the only one in its folder",
+    ),
+    ("uart", "", "the library lacks `fmi2DeSerializeFMUstate`, which no run calls"),
+    (
+        "FMI4j.*BouncingBall",
+        "",
+        (
+            "a variable is parameter and constant at once: a rule broken, and no reason not to run; `run.messages` "
+            "tells it"
+        ),
+    ),
+    (
+        "only outputs that no wire carries",
+        "CoSimulation",
+        "its outputs are binary data and clocks: no signal of a diagram",
+    ),
+    ("altairengineering", "CoSimulation", "it wants Event Mode, which Loopwright uses where an FMU has clocks"),
+    (
+        "FMPy/.*(Controller|Drivetrain)",
+        "ModelExchange",
+        "nominal values of 0; 1 stands in for them, and `run.messages` tells it",
+    ),
+    ("Reference-FMUs.*Roberts", "ModelExchange", "stiff: Loopwright changes to an implicit method of its own accord"),
+    (
+        "MassSpringDamper|[Tt]hreetank|[Tt]hreewatertank",
+        "CoSimulation",
+        (
+            "the FMU compares sums of rounded times, and takes an internal step more or less in some steps, at other "
+            "places for each importer"
+        ),
+    ),
+    (
+        "(Consumer|ECS_HW|FS_OPSC)[.]fmu",
+        "CoSimulation",
+        (
+            "its own solver, at a tolerance of 1e-4, follows the last bits of the times: FMPy's calls at Loopwright's "
+            "communication points give Loopwright's bits, those at FMPy's give FMPy's"
+        ),
+    ),
+    (
+        "watertankController-Standalone",
+        "CoSimulation",
+        (
+            "it counts a step in whole nanoseconds, cut off, and discards those of FMPy that end a bit below; FMPy "
+            "repeats them without end, while Loopwright's steps are of one length"
+        ),
+    ),
+    ("PumpAndValve", "", "its output `CPUtime` is the time that it took"),
+    ("OSMP", "CoSimulation", "its outputs are addresses in memory"),
+    (
+        "Sensor_Block",
+        "CoSimulation",
+        "an output in 255 steps differs by one of them: its rounding follows the last bits of the times",
+    ),
+    (
+        "FMI4j.*VanDerPol|periodic_clock",
+        "ModelExchange",
+        (
+            "two solvers at a tolerance of 1e-8: against a run at 1e-12 Loopwright is off by 7e-8, CVODE in FMPy by "
+            "2.4e-6"
+        ),
+    ),
+    ("Feedthrough", "ModelExchange", "it refuses the start value of an input ahead of Initialization Mode"),
+    ("periodic_clock", "CoSimulation", "it wants Event Mode, which Loopwright uses where an FMU has clocks"),
+    ("fmi3functiontest", "", "FMI 3.0-beta.3"),
+    ("ModelicaGym_CartPole", "", "it crashes in its instantiation: it requires a licence"),
+    ("DYMOLA_RUNTIME_LICENSE", "", "it requires a licence"),
+    ("LBNL71T_Emulation_Dymola|WeatherProcessor_Dymola", "", "it requires a licence"),
+    (
+        "fuelrail.* runs runs$",
+        "CoSimulation",
+        "its own solver follows the last bits of the times, as those of OMSimulator's FMUs do",
+    ),
+    (
+        "fuelrail",
+        "CoSimulation",
+        "slow: 23 s of processor time with either importer, so the load of the machine decides",
+    ),
+    ("OSOM", "CoSimulation", "slow with either importer: 0.04 s of processor time for 0.5 s of 3500 s"),
+    ("Roberts", "CoSimulation", "slow with either importer: its own step is 1e-3 s, its default stop time 1e8 s"),
+)
 """Reasons of differences: a pattern for source, file and outcomes, an interface or none, and the reason."""
 INTERFACES = {"CoSimulation": "co_simulation", "ModelExchange": "model_exchange"}
 
@@ -178,9 +217,18 @@ def run_fmpy(file: str, interface: str) -> dict[str, np.ndarray]:
     start = {name: text == "true" if types[name] == "Boolean" else text for name, text in facts.inputs.items()}
     options = {"relative_tolerance": 1e-8} if interface == "ModelExchange" else {}
     result = fmpy.simulate_fmu(
-        file, validate=False, start_time=0.0, stop_time=facts.stop, output_interval=facts.step, fmi_type=interface,
-        output=facts.names, record_events=False, start_values=start, model_description=about, **options,
-    )  # fmt: skip
+        file,
+        validate=False,
+        start_time=0.0,
+        stop_time=facts.stop,
+        output_interval=facts.step,
+        fmi_type=interface,
+        output=facts.names,
+        record_events=False,
+        start_values=start,
+        model_description=about,
+        **options,
+    )
     return {"time_": result["time"], **{name: result[name] for name in result.dtype.names[1:]}}
 
 
@@ -278,8 +326,17 @@ def study(file: Path, seconds: float) -> list[dict[str, object]]:
         ours, mine = outcome("Loopwright", interface, file, seconds)
         fmpy_says, other = outcome("FMPy", interface, file, seconds)
         gap, where = compare(mine, other) if mine and other else (None, "")
-        rows.append({"fmi": facts.fmi, "tool": facts.tool, "interface": interface,
-                     "ours": ours, "fmpy": fmpy_says, "gap": gap, "where": where})  # fmt: skip
+        rows.append(
+            {
+                "fmi": facts.fmi,
+                "tool": facts.tool,
+                "interface": interface,
+                "ours": ours,
+                "fmpy": fmpy_says,
+                "gap": gap,
+                "where": where,
+            }
+        )
     return rows
 
 
@@ -303,8 +360,10 @@ def as_table(rows: list[dict[str, object]]) -> str:
         difference = "" if row["gap"] is None else f"{row['gap']:.1e} ({row['where']})"
         kind = {"CoSimulation": "CS", "ModelExchange": "ME"}.get(str(row["interface"]), "?")
         said = (shorten(str(row[k])) for k in ("ours", "fmpy"))
-        lines.append(f"| {row['source']}: {row['file']} | {short_name(str(row['tool']))} | {row['fmi']} {kind} "
-                     f"| {' | '.join(said)} | {difference} |")  # fmt: skip
+        lines.append(
+            f"| {row['source']}: {row['file']} | {short_name(str(row['tool']))} | {row['fmi']} {kind} "
+            f"| {' | '.join(said)} | {difference} |"
+        )
     return "\n".join(lines) + "\n"
 
 
@@ -411,8 +470,11 @@ def main() -> None:
         source = file.relative_to(given.folder).parts[0].replace("+", "/")
         for row in study(file, given.seconds):
             rows.append({"source": source, "file": file.name.split("__")[-1], "path": str(file), **row})
-            print(f"{file.name[-50:]:50} {row['interface'][:5]} {row['fmi']:4} {str(row['ours'])[:60]!r:62} "
-                  f"{str(row['fmpy'])[:40]!r:42} {row['gap']}", flush=True)  # fmt: skip
+            print(
+                f"{file.name[-50:]:50} {row['interface'][:5]} {row['fmi']:4} {str(row['ours'])[:60]!r:62} "
+                f"{str(row['fmpy'])[:40]!r:42} {row['gap']}",
+                flush=True,
+            )
         if given.json:
             given.json.write_text(json.dumps(rows, indent=1))
         if given.table:

@@ -94,9 +94,15 @@ def over_lanes() -> dict[str, list[float]]:
     def sweep(lanes: int, workers: int, count: int) -> float:
         started = time.perf_counter()
         diagram.sweep(
-            parameters, 2.0, samples="latin", count=count, reduce={"xi": final("xi")}, workers=workers,
-            lanes=lanes if lanes > 1 else False, progress=False,
-        )  # fmt: skip
+            parameters,
+            2.0,
+            samples="latin",
+            count=count,
+            reduce={"xi": final("xi")},
+            workers=workers,
+            lanes=lanes if lanes > 1 else False,
+            progress=False,
+        )
         return time.perf_counter() - started
 
     found = {}

@@ -184,8 +184,11 @@ def _collected(command: list[str | Path], *options: str) -> int:
     """Return the instructions of a program that valgrind has counted."""
     told = subprocess.run(
         ["valgrind", "--tool=callgrind", "--callgrind-out-file=/dev/null", *options, *command],
-        capture_output=True, text=True, check=True, env={**os.environ, "PYTHONHASHSEED": "0"},
-    ).stderr  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONHASHSEED": "0"},
+    ).stderr
     found = re.search(r"Collected\s*:\s*(\d+)", told)
     assert found is not None, told
     return int(found.group(1))

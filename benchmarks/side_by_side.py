@@ -70,15 +70,23 @@ def beside_interpreted(wrong: list[str]) -> Iterator[Row]:
         if not same:
             wrong.append(f"the bits of experiment {letter}")
         yield Row(
-            f"Fig. 3, experiment {letter}", "compiled", statistics.median(fast), "tick", "interpreted",
+            f"Fig. 3, experiment {letter}",
+            "compiled",
+            statistics.median(fast),
+            "tick",
+            "interpreted",
             ratios(slow, fast),
-        )  # fmt: skip
+        )
     for solver in compiled.SOLVERS:
         slow, fast, _ = compiled.measure_lags(solver)
         yield Row(
-            "PI, 1 kHz, two lags", f"compiled, {solver}", statistics.median(fast), "tick", "interpreted",
+            "PI, 1 kHz, two lags",
+            f"compiled, {solver}",
+            statistics.median(fast),
+            "tick",
+            "interpreted",
             ratios(slow, fast),
-        )  # fmt: skip
+        )
 
 
 def sweeps(found: sweep.Measured, samples: int) -> Iterator[Row]:
@@ -105,8 +113,14 @@ def brake(turns: int) -> Row:
     run(True)
     slow = run(False)
     fast = [run(True) for _ in range(turns)]
-    return Row("anti-lock brake", "compiled", statistics.median(fast), "run", "interpreted, once",
-               [slow / took for took in fast])  # fmt: skip
+    return Row(
+        "anti-lock brake",
+        "compiled",
+        statistics.median(fast),
+        "run",
+        "interpreted, once",
+        [slow / took for took in fast],
+    )
 
 
 def beside_tools() -> Iterator[Row | str]:

@@ -73,9 +73,15 @@ def measure(samples: int, *, told: bool = True) -> Measured:
 
     def sweep(duration: float, workers: int, lanes: bool | int, count: int = samples):
         return diagram.sweep(
-            PARAMETERS, duration, samples="latin", count=count, reduce=KEPT, workers=workers, lanes=lanes,
+            PARAMETERS,
+            duration,
+            samples="latin",
+            count=count,
+            reduce=KEPT,
+            workers=workers,
+            lanes=lanes,
             progress=False,
-        )  # fmt: skip
+        )
 
     for lanes in LANES.values():  # the compiler has its turn
         sweep(0.002, 1, lanes, 2)

@@ -203,17 +203,25 @@ def cases() -> list[Case]:
     swing: tuple[list[float], Rates] = [1.0, 0.0], lambda t, x: [x[1], -25.0 * x[0]]
     return [
         Case(
-            "oscillator", Diagram("oscillator", block(*swing, "Swing")), "system.x",
-            lambda t: np.array([np.cos(5.0 * t), -5.0 * np.sin(5.0 * t)]).T, 10.0, 0.05, ("RK23", *EXPLICIT, "Radau"),
+            "oscillator",
+            Diagram("oscillator", block(*swing, "Swing")),
+            "system.x",
+            lambda t: np.array([np.cos(5.0 * t), -5.0 * np.sin(5.0 * t)]).T,
+            10.0,
+            0.05,
+            ("RK23", *EXPLICIT, "Radau"),
             plain=swing,
         ),
         system("van der Pol, 1", [2.0, 0.0], van_der_pol(1.0), 20.0, EXPLICIT, "DOP853"),
         system("van der Pol, 1000", [2.0, 0.0], van_der_pol(1000.0), 2000.0, STIFF, "Radau"),
         system("Robertson", [1.0, 0.0, 0.0], robertson, 1000.0, STIFF, "Radau", atol=1e-6),
         system(
-            "Brusselator", [1.5, 3.0],
+            "Brusselator",
+            [1.5, 3.0],
             lambda t, x: [1.0 + x[0] ** 2 * x[1] - 4.0 * x[0], 3.0 * x[0] - x[0] ** 2 * x[1]],
-            20.0, EXPLICIT, "DOP853",
+            20.0,
+            EXPLICIT,
+            "DOP853",
         ),
         Case(
             "two bodies", Diagram("bodies", block(*body, "Body")), "system.x", kepler, 20.0, 0.1, EXPLICIT, plain=body
@@ -223,7 +231,7 @@ def cases() -> list[Case]:
         Case("bouncing ball", Diagram("ball", Ball(name="ball")), "ball.x", bouncing, 10.0, 0.05, ("RK45", "Radau")),
         Case("thermostat", thermostat(), "room.y", heated, 40.0, 0.1, ("RK45", "Radau")),
         Case("PI loop at 1 kHz", pi_loop(), "second.y", controlled, 0.5, None, ("rk4", "RK45", "Radau")),
-    ]  # fmt: skip
+    ]
 
 
 @dataclass(frozen=True)

@@ -89,8 +89,13 @@ def _build() -> str:
         environment = {"ZIG_GLOBAL_CACHE_DIR": folder, "ZIG_LOCAL_CACHE_DIR": folder, **os.environ}
         subprocess.run(
             [*command, *flags, "-o", name, "code.c", *math],
-            cwd=folder, env=environment, check=True, capture_output=True, text=True, timeout=600,
-        )  # fmt: skip
+            cwd=folder,
+            env=environment,
+            check=True,
+            capture_output=True,
+            text=True,
+            timeout=600,
+        )
         BUILT.mkdir()
         shutil.copyfile(Path(folder) / name, BUILT / name)
     return _tag(native, zig=zig)

@@ -12,9 +12,20 @@ ROOT = Path(__file__).parent.parent
 SOURCES = sorted(path for room in ("blocks", "fmus", "diagrams") for path in (ROOT / room).rglob("*.py"))
 
 SEARCHES = {
-    "count", "endswith", "find", "index", "partition", "removeprefix", "removesuffix", "rfind", "rindex", "rpartition",
-    "rsplit", "split", "startswith",
-}  # fmt: skip
+    "count",
+    "endswith",
+    "find",
+    "index",
+    "partition",
+    "removeprefix",
+    "removesuffix",
+    "rfind",
+    "rindex",
+    "rpartition",
+    "rsplit",
+    "split",
+    "startswith",
+}
 PATTERNS = {"compile", "findall", "finditer", "fullmatch", "match", "search", "split"}
 TEXTS = {"args", "confirmed_by", "how", "message", "note", "notes", "title"}
 """Attributes that hold texts for people."""
@@ -226,3 +237,10 @@ def test_tests_share_nothing_but_what_stands_in_support():
         if isinstance(node, ast.ImportFrom) and (node.level or (node.module or "").split(".")[0] == "tests")
     ]
     assert not wrong
+
+
+def test_the_formatter_lays_out_every_line():
+    exempt = re.compile(r"# *fmt: *(?:skip|off)")
+    folders = ("benchmarks", "blocks", "diagrams", "docs", "fmus", "install", "tests")
+    files = (file for folder in folders for file in (ROOT / folder).rglob("*.py"))
+    assert [file for file in files if exempt.search(file.read_text(encoding="utf-8"))] == []

@@ -153,8 +153,11 @@ def test_the_page_on_export_tells_the_flags_as_they_are(fmi, model, tmp_path, un
     text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(\w+)`(?: \(2\.0: `(\w+)`\))? \|(.*)\|$", text.split("## Integrators")[0], re.MULTILINE)
     with_events = "true" if model == "bouncing_ball" else "false"
-    spelling = {"canGetAndSetFMUState": "canGetAndSetFMUstate", "canSerializeFMUState": "canSerializeFMUstate",
-                "providesDirectionalDerivatives": "providesDirectionalDerivative"}  # fmt: skip
+    spelling = {
+        "canGetAndSetFMUState": "canGetAndSetFMUstate",
+        "canSerializeFMUState": "canSerializeFMUstate",
+        "providesDirectionalDerivatives": "providesDirectionalDerivative",
+    }
     for column, interface in enumerate(("CoSimulation", "ModelExchange"), 0 if fmi == 3 else 2):
         told = {}
         for name, name2, cells in rows:
@@ -244,8 +247,11 @@ def test_the_notebooks_run(path):
 @pytest.mark.slow
 def test_the_figures_of_the_pages_are_made(tmp_path):
     done = subprocess.run(
-        [sys.executable, ROOT / "docs" / "figures.py", tmp_path], capture_output=True, text=True, check=False,
+        [sys.executable, ROOT / "docs" / "figures.py", tmp_path],
+        capture_output=True,
+        text=True,
+        check=False,
         env=os.environ,
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stderr
     assert {file.name for file in tmp_path.iterdir()} == {"C_path.png", "frequency.png", "loop.png", "sweep.png"}

@@ -99,11 +99,25 @@ def test_every_subpackage_is_listed_for_the_wheel():
 def test_the_root_holds_what_belongs_there():
     kept = call("git", "ls-files").stdout.splitlines()
     assert {path for path in kept if "/" not in path} == {
-        ".gitignore", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in", "README.md", "pyproject.toml",
-    }  # fmt: skip
+        ".gitignore",
+        "CHANGELOG.md",
+        "CONTRIBUTING.md",
+        "LICENSE",
+        "MANIFEST.in",
+        "README.md",
+        "pyproject.toml",
+    }
     assert {path.partition("/")[0] for path in kept if "/" in path} == {
-        ".ci", "benchmarks", "blocks", "diagrams", "docs", "fmus", "install", "notebooks", "tests",
-    }  # fmt: skip
+        ".ci",
+        "benchmarks",
+        "blocks",
+        "diagrams",
+        "docs",
+        "fmus",
+        "install",
+        "notebooks",
+        "tests",
+    }
 
 
 def test_every_file_that_is_no_code_is_listed_for_the_wheel():

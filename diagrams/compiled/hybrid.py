@@ -487,10 +487,20 @@ class CompiledHybrid:
         )
         clocks = next((clocks for clocks, kind in self.kinds.items() if kind == hybrid.lost_at), None)
         return BrokenOff(
-            lost, clocks, self._names[hybrid.active], method.t_old, method.t, x_old, x,
-            float(self._trial[0][0]), self._trial[1][self._where].copy(),
-            None if beyond is None else (beyond, self._beyond.copy()), step, problem.edge, problem.left,
-        )  # fmt: skip
+            lost,
+            clocks,
+            self._names[hybrid.active],
+            method.t_old,
+            method.t,
+            x_old,
+            x,
+            float(self._trial[0][0]),
+            self._trial[1][self._where].copy(),
+            None if beyond is None else (beyond, self._beyond.copy()),
+            step,
+            problem.edge,
+            problem.left,
+        )
 
     @property
     def coupled(self) -> bool:

@@ -21,11 +21,19 @@ class ProblemStructure(ctypes.Structure):
     """A differential equation, as C knows it."""
 
     _fields_ = [
-        *_fields(_INT, "n width"), ("where", _AT), ("flow", TickStructure), ("slope", TickStructure),
-        *_fields(_AT, "t x slopes"), ("entries", _INT), *_fields(_AT, "row column"),
-        *_fields(_REAL, "stop edge left at late"), *_fields(_AT, "loops here by_loops delays"),
-        *_fields(_INT, "rates jacobians lost noting"), ("beyond_t", _REAL), ("beyond", _AT),
-    ]  # fmt: skip
+        *_fields(_INT, "n width"),
+        ("where", _AT),
+        ("flow", TickStructure),
+        ("slope", TickStructure),
+        *_fields(_AT, "t x slopes"),
+        ("entries", _INT),
+        *_fields(_AT, "row column"),
+        *_fields(_REAL, "stop edge left at late"),
+        *_fields(_AT, "loops here by_loops delays"),
+        *_fields(_INT, "rates jacobians lost noting"),
+        ("beyond_t", _REAL),
+        ("beyond", _AT),
+    ]
 
 
 class DelaysStructure(ctypes.Structure):
@@ -69,19 +77,33 @@ class HybridStructure(ctypes.Structure):
     """The loop with continuous states, as C knows it."""
 
     _fields_ = [
-        ("l", LoopStructure), ("p", ProblemStructure), ("w", WatchStructure), ("methods", _AT * 2),
+        ("l", LoopStructure),
+        ("p", ProblemStructure),
+        ("w", WatchStructure),
+        ("methods", _AT * 2),
         *_fields(_INT, "active automatic accepts between budget inside begun stepped"),
-        *_fields(_REAL, "t to counts_as"), *_fields(_INT, "found hits misses easy outputs"),
-        *_fields(_AT, "taken taken_first taken_states before"), ("switched", _INT), ("solved", _AT),
-        ("looked_at", _REAL), ("o", _AT), ("jump", _REAL), ("drain", _AT), *_fields(_INT, "coupled lost_at"),
+        *_fields(_REAL, "t to counts_as"),
+        *_fields(_INT, "found hits misses easy outputs"),
+        *_fields(_AT, "taken taken_first taken_states before"),
+        ("switched", _INT),
+        ("solved", _AT),
+        ("looked_at", _REAL),
+        ("o", _AT),
+        ("jump", _REAL),
+        ("drain", _AT),
+        *_fields(_INT, "coupled lost_at"),
         ("looked", _REAL),
-    ]  # fmt: skip
+    ]
 
 
 class SpanStructure(ctypes.Structure):
     """Ticks and instants of a call, as C knows them."""
 
     _fields_ = [
-        ("count", _INT), *_fields(_AT, "times widths kinds lands"), ("beyond", _REAL), ("edges", _INT),
-        *_fields(_AT, "edge late"), *_fields(_INT, "room stays"),
-    ]  # fmt: skip
+        ("count", _INT),
+        *_fields(_AT, "times widths kinds lands"),
+        ("beyond", _REAL),
+        ("edges", _INT),
+        *_fields(_AT, "edge late"),
+        *_fields(_INT, "room stays"),
+    ]

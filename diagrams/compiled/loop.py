@@ -346,10 +346,14 @@ class CompiledLoop:
         if isinstance(step, RemoteStep):
             far = self._far[-1] = self._remote.add(step)
             return _Plant(
-                now=step.now, width=step.width, flags=step.flags, reached=step.reached, far=far,
+                now=step.now,
+                width=step.width,
+                flags=step.flags,
+                reached=step.reached,
+                far=far,
                 quiet=None if step.quiet is None else self._remote.add_quiet(step.quiet),
                 by_python=self._remote.add_python(place, take, far) if step.is_careful else None,
-            )  # fmt: skip
+            )
         return self._native(step)
 
     def begun(self) -> list[bool]:
@@ -377,9 +381,18 @@ class CompiledLoop:
             self._watched.append((step.host, ctypes.c_bool()))
             changed = ctypes.addressof(self._watched[-1][1])
         return _Plant(
-            step.version, step.instance, step.step, inputs, outputs, step.now, step.width, step.final, step.flags,
-            step.reached, changed,
-        )  # fmt: skip
+            step.version,
+            step.instance,
+            step.step,
+            inputs,
+            outputs,
+            step.now,
+            step.width,
+            step.final,
+            step.flags,
+            step.reached,
+            changed,
+        )
 
     def set_steps(self, steps: StepTable | None) -> None:
         """Take the steps to the ticks of the next call; None where all plants step at each of them."""

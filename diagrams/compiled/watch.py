@@ -30,16 +30,22 @@ class WatchStructure(ctypes.Structure):
     """The events as C knows them."""
 
     _fields_ = [
-        ("m", _INT), ("indicators", TickStructure), ("jump", TickStructure),
+        ("m", _INT),
+        ("indicators", TickStructure),
+        ("jump", TickStructure),
         *_fields(_AT, "z open fired rising falling hysteretic hysteresis own own_first"),
         *_fields(_REAL, "spacing finest step"),
         *_fields(_AT, "domain low high slack size rounding largest counts latest fresh"),
-        *_fields(_AT, "side stuck briefs brief_at recent recent_fired"), ("fired_times", _INT),
-        ("log", _AT), *_fields(_INT, "logged capacity"),
+        *_fields(_AT, "side stuck briefs brief_at recent recent_fired"),
+        ("fired_times", _INT),
+        ("log", _AT),
+        *_fields(_INT, "logged capacity"),
         *_fields(_AT, "times seen gates domains x x_before now strict values motion later fires following"),
-        *_fields(_AT, "gate inside inside_first start"), *_fields(_INT, "sliding switched"), ("slid", _AT),
+        *_fields(_AT, "gate inside inside_first start"),
+        *_fields(_INT, "sliding switched"),
+        ("slid", _AT),
         *_fields(_INT, "pile culprit piled"),
-    ]  # fmt: skip
+    ]
 
 
 class Pile(IntEnum):

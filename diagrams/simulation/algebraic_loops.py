@@ -262,9 +262,14 @@ def _text(values: np.ndarray) -> str:
 
 
 def loop_solver(
-    flat: FlatDiagram, clocks: frozenset[TickPattern], t: np.ndarray, x: np.ndarray, call: Callable[[], None],
-    r: np.ndarray, J: np.ndarray,
-) -> LoopSolver:  # fmt: skip
+    flat: FlatDiagram,
+    clocks: frozenset[TickPattern],
+    t: np.ndarray,
+    x: np.ndarray,
+    call: Callable[[], None],
+    r: np.ndarray,
+    J: np.ndarray,
+) -> LoopSolver:
     """Return the solver of the algebraic loops at a tick at which some clocks act; see `LoopSolver`."""
     where = flat.active_loops(clocks)
     names = {

@@ -33,9 +33,14 @@ _MOST_EDGES = 100_000  # discontinuities of sources in a call
 
 
 def bind_loop(
-    workspace: Workspace, plants: PlantsInC, code: TickCode, recorder: Recorder, stops: Sequence[int],
-    exchange: NativeExchange | None = None, rest: Callable[[], int] | None = None,
-) -> CompiledLoop:  # fmt: skip
+    workspace: Workspace,
+    plants: PlantsInC,
+    code: TickCode,
+    recorder: Recorder,
+    stops: Sequence[int],
+    exchange: NativeExchange | None = None,
+    rest: Callable[[], int] | None = None,
+) -> CompiledLoop:
     """Return the loop over ticks in C, bound to the numbers of a run, its plants, and the samples that it keeps."""
     entries, here = recorder.entries, workspace.here
     return CompiledLoop(
@@ -89,7 +94,12 @@ def bind_hybrid(
     always = bool(plants.entries) or workspace.looped or remembers(flat) or has_guards(flat)
     judged = code.judged and not continuous.fixed
     loop = CompiledHybrid(
-        code, flat, ticks, [here.t, here.x, here.w, here.p], workspace.x_next, methods,
+        code,
+        flat,
+        ticks,
+        [here.t, here.x, here.w, here.p],
+        workspace.x_next,
+        methods,
         step=float(flat.base) if continuous.fixed else None,
         domains=domains,
         accepts=1 if always or (judged and native is None) else 2 if judged else 0,
@@ -99,7 +109,7 @@ def bind_hybrid(
         tolerances=continuous.resolution,
         drain=drain,
         coupled=plants.are_coupled,
-    )  # fmt: skip
+    )
     return loop, handed
 
 

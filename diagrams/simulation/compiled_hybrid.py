@@ -309,9 +309,16 @@ class HybridTicks:
     def _bind(self, recorder: Recorder) -> CompiledHybrid:
         if self._loop is None or recorder is not self._recorder:
             self._loop, self._handed = bind_hybrid(
-                self._code, self._workspace, self._continuous, self._plants, recorder, self._stops,
-                methods_of(self._continuous), rest=self._take_rare_tick, drain=self._tell,
-            )  # fmt: skip
+                self._code,
+                self._workspace,
+                self._continuous,
+                self._plants,
+                recorder,
+                self._stops,
+                methods_of(self._continuous),
+                rest=self._take_rare_tick,
+                drain=self._tell,
+            )
             self._recorder = recorder
             self._kinds = ClockSets(self._flat.distinct, self._loop.kinds, len(self._loop.kinds))
         return self._loop

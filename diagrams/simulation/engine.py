@@ -85,9 +85,15 @@ class Engine:
         self._tell = on_event
         if flat.hybrid:
             self.continuous = Continuous(
-                self.workspace, name, options.solver, options.rtol, options.atol, options.max_step,
-                self._on_event, self.exchanged,
-            )  # fmt: skip
+                self.workspace,
+                name,
+                options.solver,
+                options.rtol,
+                options.atol,
+                options.max_step,
+                self._on_event,
+                self.exchanged,
+            )
         elif options.solver != "auto":
             solver_name(options.solver)  # an unknown one is an error here, too
         self.every_tick = every_tick or (self.continuous is not None and self.continuous.fixed)
@@ -96,17 +102,29 @@ class Engine:
         self.coupled: CoupledSteps | None = None
         """Steps of the plants by another scheme than the default."""
         self.steps = PlantSteps(
-            flat, self.plants, self.workspace.z, self.workspace.here.w, self.position.time_of,
-            every_tick=self.every_tick, coupled=is_coupled,
-        )  # fmt: skip
+            flat,
+            self.plants,
+            self.workspace.z,
+            self.workspace.here.w,
+            self.position.time_of,
+            every_tick=self.every_tick,
+            coupled=is_coupled,
+        )
         self._change_over = ChangeOver(self.position)
         self._part = ContinuousPart(self.workspace, self.continuous, self.exchanged) if is_coupled else None
         if self._part is not None:
             refuse_exchanged(self.coupling, {path: flat.table.blocks[path] for path in flat.outside})
             self.coupled = CoupledSteps(
-                flat, name, self.plants, self.coupling, self.steps, self.workspace.z, self.workspace.here.w,
-                self.workspace.bind_exchange(), self._part,
-            )  # fmt: skip
+                flat,
+                name,
+                self.plants,
+                self.coupling,
+                self.steps,
+                self.workspace.z,
+                self.workspace.here.w,
+                self.workspace.bind_exchange(),
+                self._part,
+            )
 
     def load(self, stack: ExitStack, start_time: float) -> None:
         """Load the plants for a run from a time in s on; ``stack`` unloads them."""

@@ -156,8 +156,10 @@ class _Start:
         if self.passes > 1:
             self._changing = [known | new for known, new in zip(self._changing, changed, strict=True)]
         with np.errstate(invalid="ignore", divide="ignore"):
-            parts = [np.abs(after - before)[new] / np.maximum(np.abs(before), np.abs(after))[new]
-                     for before, after, new in zip(self._at, now, changed, strict=True)]  # fmt: skip
+            parts = [
+                np.abs(after - before)[new] / np.maximum(np.abs(before), np.abs(after))[new]
+                for before, after, new in zip(self._at, now, changed, strict=True)
+            ]
         self._lengths.append(float(np.max(np.concatenate(parts), initial=0.0)))
         if self.passes < self._few:
             return True

@@ -181,9 +181,15 @@ class FmuDescription:
         reference = v.references[int(np.ravel_multi_index(index, v.shape))]
         start = None if v.start is None else np.array(v.start[index])
         return replace(
-            v, name=name, references=(reference,), shape=(), start=start, minimum=at(v.minimum), maximum=at(v.maximum),
+            v,
+            name=name,
+            references=(reference,),
+            shape=(),
+            start=start,
+            minimum=at(v.minimum),
+            maximum=at(v.maximum),
             nominal=at(v.nominal),
-        )  # fmt: skip
+        )
 
     @property
     def structural(self) -> dict[str, FmuVariable]:
@@ -302,10 +308,20 @@ def _read(
         ) from error
     findings = (*archive.findings, *judge_name(binary, identifier), *judge_negated(found["other"].values()))
     return FmuDescription(
-        version, path, archive.digest, model.modelName, identifier, model.instantiationToken or "",
-        binary, complaints=complaints, limits=limits, findings=findings,
-        generation_tool=root.get("generationTool", ""), model_version=root.get("version", ""), **found,
-    )  # fmt: skip
+        version,
+        path,
+        archive.digest,
+        model.modelName,
+        identifier,
+        model.instantiationToken or "",
+        binary,
+        complaints=complaints,
+        limits=limits,
+        findings=findings,
+        generation_tool=root.get("generationTool", ""),
+        model_version=root.get("version", ""),
+        **found,
+    )
 
 
 def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dict[str, Any]:

@@ -76,9 +76,10 @@ def _check(
     for variable, index in pairs:
         if variable.shape:
             raise refuse(
-                f"{variable.name!r} of shape {variable.shape} as its element {element(index)}", "a scalar",
+                f"{variable.name!r} of shape {variable.shape} as its element {element(index)}",
+                "a scalar",
                 "Give an array a name without an index, or name its elements.",
-            )  # fmt: skip
+            )
     first, its_index = pairs[0]
     for (a, i), (b, j) in itertools.pairwise(pairs):
         if i == j:
@@ -86,8 +87,10 @@ def _check(
     if len({len(index) for _, index in pairs}) > 1:
         other = next(index for _, index in pairs if len(index) != len(its_index))
         raise refuse(
-            f"{element(its_index)} and {element(other)}", "as many indices for each element", "Give them alike.",
-        )  # fmt: skip
+            f"{element(its_index)} and {element(other)}",
+            "as many indices for each element",
+            "Give them alike.",
+        )
     base = min(min(index) for _, index in pairs)
     indices = [index for _, index in pairs]
     ends = np.max(indices, axis=0)
@@ -96,9 +99,10 @@ def _check(
     if missing:
         shown = ", ".join(element(i) for i in missing[:3]) + (", …" if len(missing) > 3 else "")
         raise refuse(
-            f"no variable that is renamed to {shown}", f"all of its elements from {element((start,) * len(ends))} to "
-            f"{element(tuple(map(int, ends)))}", "Rename those, too, or count without gaps.",
-        )  # fmt: skip
+            f"no variable that is renamed to {shown}",
+            f"all of its elements from {element((start,) * len(ends))} to {element(tuple(map(int, ends)))}",
+            "Rename those, too, or count without gaps.",
+        )
     for variable, _ in pairs[1:]:
         for what, mine, its in (
             ("type", first.type, variable.type),
@@ -111,8 +115,10 @@ def _check(
             if mine != its:
                 raise refuse(
                     f"{first.name!r} with the {what} {mine or '(none)'} and {variable.name!r} with the {what} "
-                    f"{its or '(none)'}", f"one {what}", "Give them ports of their own, by names without an index.",
-                )  # fmt: skip
+                    f"{its or '(none)'}",
+                    f"one {what}",
+                    "Give them ports of their own, by names without an index.",
+                )
     return tuple((variable, tuple(k - start for k in index)) for variable, index in pairs)
 
 
@@ -130,6 +136,13 @@ def _gather(base: FmuDescription, joins: Mapping[str, Join], rename: Mapping[str
     known = {*variables, *elements, *base.other}
     spelled = {rename[name]: name for name in members if rename[name] not in known}
     return replace(
-        base, variables=variables, elements=elements, states=states, state_order=order, aliases=aliases, joined=joined,
-        members=members, spelled=spelled,
-    )  # fmt: skip
+        base,
+        variables=variables,
+        elements=elements,
+        states=states,
+        state_order=order,
+        aliases=aliases,
+        joined=joined,
+        members=members,
+        spelled=spelled,
+    )

@@ -94,13 +94,21 @@ def _settings(spec: ModelSpec) -> list[tuple[Kind, Variable, str]]:
         "v", "parameter", "tunable", description=_STEP_DESCRIPTION, start=spec.internal_step, unit="s", minimum=0.0
     )
     integrator = Variable(
-        *("v", "parameter", "fixed"), description=_INTEGRATOR_DESCRIPTION, start=INTEGRATORS[spec.integrator],
-        unit="1", minimum=1.0, maximum=3.0,
-    )  # fmt: skip
+        *("v", "parameter", "fixed"),
+        description=_INTEGRATOR_DESCRIPTION,
+        start=INTEGRATORS[spec.integrator],
+        unit="1",
+        minimum=1.0,
+        maximum=3.0,
+    )
     tolerance = Variable(
-        *("v", "parameter", "tunable"), description=_TOLERANCE_DESCRIPTION, start=spec.tolerance,
-        unit="1", minimum=1e-14, maximum=0.1,
-    )  # fmt: skip
+        *("v", "parameter", "tunable"),
+        description=_TOLERANCE_DESCRIPTION,
+        start=spec.tolerance,
+        unit="1",
+        minimum=1e-14,
+        maximum=0.1,
+    )
     return [
         ("tunable", step, "internal_step"),
         ("fixed", integrator, "integrator"),

@@ -168,8 +168,14 @@ def _circle_tables() -> str:
     )
 
 
-_TABLES = {"circle": _circle_tables, "tanh": _tanh_tables, "exp": _exp_tables, "expm1": _expm1_tables,
-           "log": _log_tables, "series": _log_series}  # fmt: skip
+_TABLES = {
+    "circle": _circle_tables,
+    "tanh": _tanh_tables,
+    "exp": _exp_tables,
+    "expm1": _expm1_tables,
+    "log": _log_tables,
+    "series": _log_series,
+}
 _OF = {
     "sin": ("circle",),
     "cos": ("circle",),

@@ -206,9 +206,13 @@ def _values(block: Block, name: str, kind: str) -> dict[str, dict[str, Any]]:
     for key, state in block.states.items():
         put(key, "state", state.start_value(block, shapes), state)
     x, u = (
-        {k: float(v["start"][0]) if not v["shape"] else np.reshape(v["start"], v["shape"])
-         for k, v in found.items() if v["kind"] == role} for role in ("state", "input")
-    )  # fmt: skip
+        {
+            k: float(v["start"][0]) if not v["shape"] else np.reshape(v["start"], v["shape"])
+            for k, v in found.items()
+            if v["kind"] == role
+        }
+        for role in ("state", "input")
+    )
     outputs = {k: p for k, p in block.outputs.items() if k not in block.states}
     if outputs and not hasattr(block, "output"):
         raise DefinitionError(

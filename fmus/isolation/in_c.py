@@ -114,9 +114,14 @@ class Server:
         self._serve = ctypes.CDLL(library)["loopwright_serve"]
         self._serve.restype = ctypes.c_bool
         self._server = _Server(
-            words=words, commands=commands, replies=replies, ordered=ordered, most=looks,
-            left=wire.FEWEST, pause=wire.FEWEST,
-        )  # fmt: skip
+            words=words,
+            commands=commands,
+            replies=replies,
+            ordered=ordered,
+            most=looks,
+            left=wire.FEWEST,
+            pause=wire.FEWEST,
+        )
         self._kept: list[Any] = []
         self._sequences = (_Sequence * 0)()
 

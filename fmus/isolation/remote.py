@@ -229,9 +229,13 @@ class RemoteCalls(FmiCalls):
 
         arguments = [self.fmu.component, list(references), [len(v) for v in values]]
         status = self.process.request(
-            "set_bytes", "fmi3SetBinary", arguments, blobs=list(values), call="fmi3SetBinary",
+            "set_bytes",
+            "fmi3SetBinary",
+            arguments,
+            blobs=list(values),
+            call="fmi3SetBinary",
             seconds=self.limits.step_time,
-        )[0]  # fmt: skip
+        )[0]
         if status > WARNING:
             raise FMICallException("fmi3SetBinary", status)
 

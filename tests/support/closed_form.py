@@ -80,9 +80,22 @@ int fmi2DoStep(void *p, double t, double h, int final) {
 
 
 def closed_form_fmu(
-    folder, fmi, equations, states=1, inputs=1, outputs=1, *, number="double", attributes="", of_input="continuous",
-    dependencies=None, check="", name="small", changes=(), description=(),
-):  # fmt: skip
+    folder,
+    fmi,
+    equations,
+    states=1,
+    inputs=1,
+    outputs=1,
+    *,
+    number="double",
+    attributes="",
+    of_input="continuous",
+    dependencies=None,
+    check="",
+    name="small",
+    changes=(),
+    description=(),
+):
     """Build it into a folder, for a version of FMI, and return its path.
 
     Parameters

@@ -203,12 +203,16 @@ ARCHIVES = {
         adding(special("resources/link", stat.S_IFLNK, b"/tmp"), ("resources/link/escaped.txt", b"x")), FmuFault.LINK
     ),
     "device": Case(adding(special("resources/device", stat.S_IFCHR)), FmuFault.LINK),
-    "large": Case(adding(("resources/a", bytes(9000)), ("resources/b", bytes(2**20))), FmuFault.TOO_LARGE,
-                  limits=ArchiveLimits(size=10**6)),
+    "large": Case(
+        adding(("resources/a", bytes(9000)), ("resources/b", bytes(2**20))),
+        FmuFault.TOO_LARGE,
+        limits=ArchiveLimits(size=10**6),
+    ),
     "large file": Case(lambda files: packed(files), FmuFault.TOO_LARGE, limits=ArchiveLimits(size=1000)),
     "bomb": Case(adding(("resources/zeros", bytes(120_000_000))), FmuFault.RATIO),
-    "many files": Case(adding(*((f"resources/{k}", b"") for k in range(99))), FmuFault.TOO_MANY,
-                       limits=ArchiveLimits(entries=50)),
+    "many files": Case(
+        adding(*((f"resources/{k}", b"") for k in range(99))), FmuFault.TOO_MANY, limits=ArchiveLimits(entries=50)
+    ),
     "overlapping files": Case(overlapping, FmuFault.OVERLAP),
     "encrypted": Case(
         lambda files: patched(packed(files), XML, central=8, local=6, form="<H", value=1), FmuFault.ENCRYPTED
@@ -235,7 +239,7 @@ ARCHIVES = {
     "in lower case": Case(
         lambda files: packed({n.lower() if n == XML else n: d for n, d in files.items()}), FmuFault.NO_DESCRIPTION
     ),
-}  # fmt: skip
+}
 
 DESCRIPTIONS = {
     "no XML": Case(text(b"no XML"), FmuFault.XML),
@@ -255,7 +259,9 @@ DESCRIPTIONS = {
     "version 3.9": Case(described((r'fmiVersion="[^"]*"', 'fmiVersion="3.9"')), FmuFault.VERSION),
     "version 4": Case(described((r'fmiVersion="[^"]*"', 'fmiVersion="4.0"')), FmuFault.VERSION),
     "no interface": Case(
-        described((r"(?s)<CoSimulation.*?(/>|</CoSimulation>)", ""), (r"(?s)<ModelExchange.*?(/>|</ModelExchange>)", "")),
+        described(
+            (r"(?s)<CoSimulation.*?(/>|</CoSimulation>)", ""), (r"(?s)<ModelExchange.*?(/>|</ModelExchange>)", "")
+        ),
         FmuFault.INTERFACE,
     ),
     "no variables": Case(described((r"(?s)<ModelVariables>.*</ModelVariables>", "")), FmuFault.DESCRIPTION),
@@ -265,13 +271,19 @@ DESCRIPTIONS = {
     ),
     "a name twice among locals": Case(
         described(
-            (r"</ModelVariables>", r'<Float64 name="v" valueReference="77"/><Float64 name="v" valueReference="78"/>\g<0>')
+            (
+                r"</ModelVariables>",
+                r'<Float64 name="v" valueReference="77"/><Float64 name="v" valueReference="78"/>\g<0>',
+            )
         ),
         None,
     ),
     "a reference of another type": Case(
         described(
-            (r"</ModelVariables>", r'<Int32 name="n" valueReference="0" causality="local" variability="discrete"/>\g<0>')
+            (
+                r"</ModelVariables>",
+                r'<Int32 name="n" valueReference="0" causality="local" variability="discrete"/>\g<0>',
+            )
         ),
         FmuFault.DUPLICATE_REFERENCE,
     ),
@@ -282,20 +294,52 @@ DESCRIPTIONS = {
         described((r'(name="velocity" valueReference=)"\d+"', r'\1"4294967296"')), FmuFault.DUPLICATE_REFERENCE
     ),
     "a huge dimension": Case(
-        described((r"</ModelVariables>", (r'<Float64 name="v" valueReference="77" start="0"><Dimension start="99999999999"/>'
-                   r'<Dimension start="99999999999"/></Float64>\g<0>'))), FmuFault.DIMENSION
+        described(
+            (
+                r"</ModelVariables>",
+                (
+                    r'<Float64 name="v" valueReference="77" start="0"><Dimension start="99999999999"/>'
+                    r'<Dimension start="99999999999"/></Float64>\g<0>'
+                ),
+            )
+        ),
+        FmuFault.DIMENSION,
     ),
     "a negative dimension": Case(
-        described((r"</ModelVariables>", (r'<Float64 name="v" valueReference="77" start="0"><Dimension start="-3"/>'
-                   r'</Float64>\g<0>'))), FmuFault.DIMENSION
+        described(
+            (
+                r"</ModelVariables>",
+                (
+                    r'<Float64 name="v" valueReference="77" start="0"><Dimension start="-3"/>'
+                    r"</Float64>\g<0>"
+                ),
+            )
+        ),
+        FmuFault.DIMENSION,
     ),
     "a dimension without a variable": Case(
-        described((r"</ModelVariables>", (r'<Float64 name="v" valueReference="77" start="0"><Dimension '
-                   r'valueReference="999"/></Float64>\g<0>'))), FmuFault.DIMENSION
+        described(
+            (
+                r"</ModelVariables>",
+                (
+                    r'<Float64 name="v" valueReference="77" start="0"><Dimension '
+                    r'valueReference="999"/></Float64>\g<0>'
+                ),
+            )
+        ),
+        FmuFault.DIMENSION,
     ),
     "an illegal combination": Case(
-        described((r"</ModelVariables>", (r'<Float64 name="v" valueReference="77" causality="parameter" '
-                   r'variability="constant" start="0"/>\g<0>'))), None
+        described(
+            (
+                r"</ModelVariables>",
+                (
+                    r'<Float64 name="v" valueReference="77" causality="parameter" '
+                    r'variability="constant" start="0"/>\g<0>'
+                ),
+            )
+        ),
+        None,
     ),
     "an unknown type": Case(
         described((r"</ModelVariables>", r'<Float64 name="v" valueReference="77" declaredType="None"/>\g<0>')), None
@@ -307,7 +351,7 @@ DESCRIPTIONS = {
     "an unknown dependency": Case(
         described((r'<Output valueReference="(\d+)"[^/]*/>', r'<Output valueReference="\1" dependencies="999"/>')), None
     ),
-}  # fmt: skip
+}
 
 LIBRARIES = {
     "none": Case(lambda files: packed(without_library(files)), FmuFault.NO_BINARY),
@@ -326,14 +370,13 @@ LIBRARIES = {
     "for another machine": Case(library(machine(0xB7)), FmuFault.OTHER_PLATFORM),
     "for 32 bits": Case(library(machine(0x03)), FmuFault.OTHER_PLATFORM),
     "for Windows": Case(
-        library(lambda data: b"MZ" + bytes(58) + b"\x40\0\0\0" + b"PE\0\0\x64\x86" + bytes(500)), FmuFault.OTHER_PLATFORM
+        library(lambda data: b"MZ" + bytes(58) + b"\x40\0\0\0" + b"PE\0\0\x64\x86" + bytes(500)),
+        FmuFault.OTHER_PLATFORM,
     ),
     "for macOS": Case(library(lambda data: b"\xcf\xfa\xed\xfe\x0c\x00\x00\x01" + bytes(500)), FmuFault.OTHER_PLATFORM),
     "cut off in the header": Case(library(lambda data: data[:40]), FmuFault.TRUNCATED),
     "cut off in the segments": Case(library(lambda data: data[: len(data) // 2]), FmuFault.TRUNCATED),
-    "an object file": Case(
-        library(lambda data: data[:16] + b"\1\0" + data[18:]), FmuFault.TRUNCATED
-    ),
+    "an object file": Case(library(lambda data: data[:16] + b"\1\0" + data[18:]), FmuFault.TRUNCATED),
     "without a function": Case(
         library(lambda data: data.replace(b"fmi3EnterInitializationMode\0", b"fmi3enterInitializationMode\0")),
         FmuFault.MISSING_SYMBOL,
@@ -341,7 +384,7 @@ LIBRARIES = {
     "of another version": Case(
         library(lambda data: re.sub(rb"fmi3(\w+)\0", rb"fmi2\1\0", data)), FmuFault.MISSING_SYMBOL
     ),
-}  # fmt: skip
+}
 
 CASES = {
     **{f"archive: {name}": case for name, case in ARCHIVES.items()},

@@ -73,7 +73,7 @@ def three_plants():
             (dc_motor, 2, {"load_torque": 0.01}, ["voltage", "speed", "angle", "torque"]),
             (mass_spring_damper, 3, {}, None),
         )
-    )  # fmt: skip
+    )
 
     @subsystem(sample_time=T, name="box")
     def box(angle, speed, position, reference):

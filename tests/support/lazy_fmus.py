@@ -45,8 +45,10 @@ def lazy_fmu(folder, fmi, kind, equations, *, source=(), **options):
         ("int NAME(EnterEventMode)", f"{first}{noted}int NAME(EnterEventMode)"),
         ("((instance *)p)->t = t; return 0; }", "note(p, &((instance *)p)->t, t); return 0; }"),
         ("c->x[i] = (number)x[i];", "note(c, &c->x[i], x[i]);"),
-        ("(r[i] < 10 ? c->x : c->u)[r[i] % 10 - 1] = (number)v[i];",
-         "note(c, &(r[i] < 10 ? c->x : c->u)[r[i] % 10 - 1], v[i]);"),
+        (
+            "(r[i] < 10 ? c->x : c->u)[r[i] % 10 - 1] = (number)v[i];",
+            "note(c, &(r[i] < 10 ? c->x : c->u)[r[i] % 10 - 1], v[i]);",
+        ),
         *source,
-    ]  # fmt: skip
+    ]
     return closed_form_fmu(folder, fmi, equations, changes=changes, **options)

@@ -128,7 +128,13 @@ CASES = [
     (Recorded(times=(0.1, 0.4, 0.7), values=(0.0, 1.0, -1.0), interpolation="previous"), {}, BOTH),
     (BandLimitedNoise(sample_time=0.07, variance=2.0, seed=3), {}, BOTH),
     (Clock(), {}, BOTH),
-    (HandProfile(start_time=0.1, hold_time=0.2, rise_time=0.2, release_time=0.1, peak_force=5.0, direction=(1.0, 1.0)), {}, BOTH),
+    (
+        HandProfile(
+            start_time=0.1, hold_time=0.2, rise_time=0.2, release_time=0.1, peak_force=5.0, direction=(1.0, 1.0)
+        ),
+        {},
+        BOTH,
+    ),
     # algebra
     (Sum(signs="+-"), {}, BOTH),
     (Sum(signs="+-+"), {"shapes": {"u1": (2,), "u2": (2,), "u3": (2,)}}, BOTH),
@@ -144,7 +150,13 @@ CASES = [
     (Function(lambda a, b: a * b, name="product"), {}, BOTH),
     (PythonFunction(by_hand, arguments={"u": (2,)}), {}, BOTH),
     (Lookup1D(breakpoints=(-1.0, 0.5, 2.0), values=(1.0, 0.0, 3.0)), {}, BOTH),
-    (Lookup1D(breakpoints=(-1.0, 0.5, 2.0, 2.5), values=(1.0, 0.0, 3.0, 1.0), interpolation="cubic", beyond="extrapolate"), {}, BOTH),
+    (
+        Lookup1D(
+            breakpoints=(-1.0, 0.5, 2.0, 2.5), values=(1.0, 0.0, 3.0, 1.0), interpolation="cubic", beyond="extrapolate"
+        ),
+        {},
+        BOTH,
+    ),
     (Lookup2D(rows=(0.0, 1.0), columns=(0.0, 1.0, 2.0), values=((0.0, 1.0, 2.0), (3.0, 1.0, 0.0))), {}, BOTH),
     (UnitConversion(from_unit="degC", to_unit="K"), {}, BOTH),
     (UnitConversion(from_unit="mm", to_unit="m"), VECTOR, BOTH),
@@ -221,19 +233,27 @@ CASES = [
     (AdmittanceFilter(mass=0.5, damping_ratio=0.6, stiffness=10.0), {}, BOTH),
     (AdmittanceFilter(mass=0.5, damping_ratio=0.6, stiffness=10.0, acceleration_limit=2.0), {}, BOTH),
     (AdmittanceFilter(mass=0.5, damping_ratio=0.6, stiffness=10.0, velocity_limit=0.5), {}, BOTH),
-    (AdmittanceFilter(mass=0.5, damping_ratio=0.6, stiffness=10.0, velocity_limit=0.5, acceleration_limit=2.0), {}, BOTH),
+    (
+        AdmittanceFilter(mass=0.5, damping_ratio=0.6, stiffness=10.0, velocity_limit=0.5, acceleration_limit=2.0),
+        {},
+        BOTH,
+    ),
     # what the robot meets
     (HandForce(Circle(radius=0.5)), {"inputs": PLANE}, BOTH),
     (PathSpring(Circle(radius=0.5), stiffness=100.0, cubic_stiffness=50.0), {"inputs": PLANE}, BOTH),
     (SpringDamper(stiffness=10.0, damping=1.0, rest=0.1), {}, BOTH),
     (Wall(stiffness=100.0, point=0.2, normal=-1.0), {}, BOTH),
-    (Wall(stiffness=100.0, damping=5.0, point=(0.2, 0.0), normal=(-1.0, 0.5)), {"shapes": {"position": (2,), "velocity": (2,)}}, BOTH),
+    (
+        Wall(stiffness=100.0, damping=5.0, point=(0.2, 0.0), normal=(-1.0, 0.5)),
+        {"shapes": {"position": (2,), "velocity": (2,)}},
+        BOTH,
+    ),
     # plants as equations
     (gantry.nominal, {}, BOTH),
     (dc_motor.nominal, {}, BOTH),
     (mass_spring_damper.nominal, {}, BOTH),
     (bouncing_ball.nominal, {}, CONTINUOUS),
-]  # fmt: skip
+]
 
 
 def is_base(cls):

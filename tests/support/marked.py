@@ -51,9 +51,11 @@ class Host:
     def __init__(self, script, *arguments, **environment):
         self.mark = uuid4().hex
         self.process = subprocess.Popen(
-            [sys.executable, "-c", script, *arguments], stdout=subprocess.PIPE, text=True,
+            [sys.executable, "-c", script, *arguments],
+            stdout=subprocess.PIPE,
+            text=True,
             env={**os.environ, **environment, MARK: self.mark},
-        )  # fmt: skip
+        )
 
     def others(self):
         """Return the command lines of its descendants, by number."""

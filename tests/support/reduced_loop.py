@@ -170,8 +170,9 @@ def stability_limit(loop, over="stiffness", **environment):
 
     grid = np.geomspace(*ENDS[over], 1001)
     grows = growth_rate(loop, **{over: grid}, **environment) > 1e-9
-    changes = [brentq(growth, grid[i], grid[i + 1], xtol=1e-300, rtol=1e-14)
-               for i in np.flatnonzero(grows[1:] != grows[:-1])]  # fmt: skip
+    changes = [
+        brentq(growth, grid[i], grid[i + 1], xtol=1e-300, rtol=1e-14) for i in np.flatnonzero(grows[1:] != grows[:-1])
+    ]
     if grows[0] or not changes:
         return Limit(0.0 if grows[0] else np.inf, tuple(changes), np.nan)
     poles = np.linalg.eigvals(close_loop(loop, **{over: changes[0]}, **environment)).astype(complex)
@@ -189,8 +190,10 @@ def negative_intervals(loop, low, high):
 
     grid = np.geomspace(low, high, 2001)
     negative = real(grid) < 0.0
-    edges = [float(brentq(real, grid[i], grid[i + 1], xtol=1e-300, rtol=1e-13))
-             for i in np.flatnonzero(negative[1:] != negative[:-1])]  # fmt: skip
+    edges = [
+        float(brentq(real, grid[i], grid[i + 1], xtol=1e-300, rtol=1e-13))
+        for i in np.flatnonzero(negative[1:] != negative[:-1])
+    ]
     edges = [low] * bool(negative[0]) + edges + [high] * bool(negative[-1])
     return list(zip(edges[::2], edges[1::2], strict=True))
 

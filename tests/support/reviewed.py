@@ -36,8 +36,9 @@ CART, LOAD, ROPE, G = 500.0, 300.0, 6.0, 9.81
 def crane_model(rope=1.0):
     """Cart position and speed, rope angle and its rate; the cart's force in kN pushes."""
     length = ROPE * rope
-    A = np.array([[0, 1, 0, 0], [0, 0, LOAD * G / CART, 0], [0, 0, 0, 1],
-                  [0, 0, -(CART + LOAD) * G / (CART * length), 0]])  # fmt: skip
+    A = np.array(
+        [[0, 1, 0, 0], [0, 0, LOAD * G / CART, 0], [0, 0, 0, 1], [0, 0, -(CART + LOAD) * G / (CART * length), 0]]
+    )
     B = 1e3 * np.array([[0], [1 / CART], [0], [-1 / (CART * length)]])
     return A, B, np.array([[1.0, 0, 0, 0], [0, 0, 1, 0]])
 
@@ -50,8 +51,12 @@ def crane(*, gain=1.0, delay=0, rope=1.0):
     estimate, _, _ = control.dlqr(nominal.A.T, nominal.C.T, np.diag([1e-2, 1.0, 1e-2, 1.0]), 1e-3 * np.eye(2))
     M, plant = estimate.T, crane_model(rope)
     law = DiscreteStateSpace(
-        A=nominal.A - nominal.B @ K - M @ nominal.C, B=M, C=-K[0] * gain, dt=CRANE_T, name="observer",
-    )  # fmt: skip
+        A=nominal.A - nominal.B @ K - M @ nominal.C,
+        B=M,
+        C=-K[0] * gain,
+        dt=CRANE_T,
+        name="observer",
+    )
     body = StateSpace(A=plant[0], B=plant[1][:, 0], C=plant[2], name="crane")
 
     @subsystem(sample_time=CRANE_T, delay=delay)

@@ -39,15 +39,24 @@ int fmi1DoStep(void *p, double t, double h, char f) { return advance(p, h); }
 """,
 }
 NAMES = {
-    "u": ("F_my", "F_mz"), "f": ("F_ey", "F_ez"), "s": ("s_Y", "s_Z"), "v": ("v_Y", "v_Z"), "a": ("a_Y", "a_Z"),
-}  # fmt: skip
+    "u": ("F_my", "F_mz"),
+    "f": ("F_ey", "F_ez"),
+    "s": ("s_Y", "s_Z"),
+    "v": ("v_Y", "v_Z"),
+    "a": ("a_Y", "a_Z"),
+}
 PORTS = {"u": "motor_force", "f": "external_force", "s": "position", "v": "velocity", "a": "acceleration"}
 RENAME = {name: f"{PORTS[k]}[{i + 1}]" for k, pair in NAMES.items() for i, name in enumerate(pair)}
 """FMU's names → elements of the ports of Fig. 3."""
 _UNITS = {
-    "N": 'kg="1" m="1" s="-2"', "m": 'm="1"', "m/s": 'm="1" s="-1"', "m/s2": 'm="1" s="-2"',
-    "mm": 'm="1" factor="0.001"', "mm/s": 'm="1" s="-1" factor="0.001"', "mm/s2": 'm="1" s="-2" factor="0.001"',
-}  # fmt: skip
+    "N": 'kg="1" m="1" s="-2"',
+    "m": 'm="1"',
+    "m/s": 'm="1" s="-1"',
+    "m/s2": 'm="1" s="-2"',
+    "mm": 'm="1" factor="0.001"',
+    "mm/s": 'm="1" s="-1" factor="0.001"',
+    "mm/s2": 'm="1" s="-2" factor="0.001"',
+}
 
 
 def scalar_gantry(folder, prefix="fmi2", *, length="m", names=None, name="gantry", units=None):

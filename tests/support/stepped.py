@@ -61,9 +61,16 @@ class Alone:
             while True:  # one segment between events
                 fire = [self._event(i, u, above[i], stop) for i in range(len(events))]
                 step = solve_ivp(
-                    lambda s, z, stop=stop: self.call(s, z, u(min(s, np.nextafter(stop, -1))))[1], (t, stop), x,
-                    method="DOP853", rtol=1e-12, atol=1e-13, max_step=0.1, dense_output=True, events=fire or None,
-                )  # fmt: skip
+                    lambda s, z, stop=stop: self.call(s, z, u(min(s, np.nextafter(stop, -1))))[1],
+                    (t, stop),
+                    x,
+                    method="DOP853",
+                    rtol=1e-12,
+                    atol=1e-13,
+                    max_step=0.1,
+                    dense_output=True,
+                    events=fire or None,
+                )
                 t_end = step.t[-1]
                 rows += [(s, self.call(s, step.sol(s), u(s))[0]) for s in times if t <= s < t_end]
                 t, x = t_end, step.y[:, -1]

@@ -13,10 +13,18 @@ from loopwright.fmus.export.compiler import compile_shared
 from loopwright.fmus.platform import native_platform
 
 _C3 = {
-    "Float64": "double", "Float32": "float", "Int8": "int8_t", "UInt8": "uint8_t", "Int16": "int16_t",
-    "UInt16": "uint16_t", "Int32": "int32_t", "UInt32": "uint32_t", "Int64": "int64_t", "UInt64": "uint64_t",
+    "Float64": "double",
+    "Float32": "float",
+    "Int8": "int8_t",
+    "UInt8": "uint8_t",
+    "Int16": "int16_t",
+    "UInt16": "uint16_t",
+    "Int32": "int32_t",
+    "UInt32": "uint32_t",
+    "Int64": "int64_t",
+    "UInt64": "uint64_t",
     "Boolean": "bool",
-}  # fmt: skip
+}
 _C2 = {"Real": "double", "Integer": "int", "Boolean": "int"}
 _OTHER3 = ("Clock", "Binary")
 
@@ -92,16 +100,23 @@ def source(fmi, complete=False):
     follow = " ".join(f"for (int i = 0; i < 40; i++) c->v{t}[i + 50] = c->v{t}[i];" for t in types)
     follow += " c->vInt64[91] = INT64_C(9007199254740993);" if fmi == 3 else ""
     head = _HEAD.replace("MEMBERS", members).replace("FOLLOW", follow)
-    functions = "".join(values.replace(" C ", f" {c} ").replace("vT", f"v{t}").replace(f"fmi{fmi}GetT", f"fmi{fmi}Get{t}")
-                        .replace(f"fmi{fmi}SetT", f"fmi{fmi}Set{t}") for t, c in types.items())  # fmt: skip
+    functions = "".join(
+        values.replace(" C ", f" {c} ")
+        .replace("vT", f"v{t}")
+        .replace(f"fmi{fmi}GetT", f"fmi{fmi}Get{t}")
+        .replace(f"fmi{fmi}SetT", f"fmi{fmi}Set{t}")
+        for t, c in types.items()
+    )
     text = head + functions + rest
     if complete:
         kind = fmpy.fmi3.FMU3Slave if fmi == 3 else fmpy.fmi2.FMU2Slave
         names = [n for n in dir(kind) if n.startswith(f"fmi{fmi}") and f"{n}(" not in text]
         text += "".join(f"int {name}() {{ return 3; }}\n" for name in names)
-    return text.replace("\nint fmi", '\n__attribute__((visibility("default"))) int fmi').replace(
-        "\nvoid", '\n__attribute__((visibility("default"))) void'
-    ).replace("\nconst char", '\n__attribute__((visibility("default"))) const char')  # fmt: skip
+    return (
+        text.replace("\nint fmi", '\n__attribute__((visibility("default"))) int fmi')
+        .replace("\nvoid", '\n__attribute__((visibility("default"))) void')
+        .replace("\nconst char", '\n__attribute__((visibility("default"))) const char')
+    )
 
 
 _NAMES3 = [*_C3, "Enumeration"]
@@ -121,8 +136,10 @@ def description3(more=""):
             kind = "continuous" if t.startswith("Float") else "discrete"
             declared = ' declaredType="Level"' if t == "Enumeration" else ""
             limit = ' max="200"' * (t == "UInt8")
-            rows.append(f'<{t} name="{prefix}_{t}" valueReference="{k}" causality="{causality}" variability="{kind}"'
-                        f'{declared}{limit}{start}/>')  # fmt: skip
+            rows.append(
+                f'<{t} name="{prefix}_{t}" valueReference="{k}" causality="{causality}" variability="{kind}"'
+                f"{declared}{limit}{start}/>"
+            )
     # value references are unique over all types, but storage is by type: these go beside those of the loop
     rows += [
         '<UInt64 name="n" valueReference="99" causality="structuralParameter" variability="fixed" start="3"/>',
@@ -150,11 +167,17 @@ def description2():
     rows = []
 
     def add(name, k, causality, variability, inner, more=""):
-        rows.append(f'<ScalarVariable name="{name}" valueReference="{k}" causality="{causality}" '
-                    f'variability="{variability}"{more}>{inner}</ScalarVariable>')  # fmt: skip
+        rows.append(
+            f'<ScalarVariable name="{name}" valueReference="{k}" causality="{causality}" '
+            f'variability="{variability}"{more}>{inner}</ScalarVariable>'
+        )
 
-    kinds = {"Real": ("continuous", "", "0"), "Integer": ("discrete", "", "0"), "Boolean": ("discrete", "", "false"),
-             "Enumeration": ("discrete", ' declaredType="Level"', "1")}  # fmt: skip
+    kinds = {
+        "Real": ("continuous", "", "0"),
+        "Integer": ("discrete", "", "0"),
+        "Boolean": ("discrete", "", "false"),
+        "Enumeration": ("discrete", ' declaredType="Level"', "1"),
+    }
     for i, (t, (kind, declared, start)) in enumerate(kinds.items()):
         add(f"u_{t}", i, "input", kind, f'<{t}{declared} start="{start}"/>')
         add(f"y_{t}", i + 50, "output", kind, f"<{t}{declared}/>")

@@ -257,15 +257,27 @@ def test_what_an_error_says_to_write_can_be_built():
 def test_arrays_and_numpys_numbers_work_with_signals_from_either_side():
     a, w = Constant(value=(6.0, 8.0), name="a"), np.array([1.0, 2.0])
     made = {
-        "sum": w + a, "difference": w - a, "other": a.y - w, "product": w * a, "scaled": np.float64(2.0) * a,
-        "added": np.add(a, w), "half": a / np.float64(2.0), "matrix": np.diag(w) @ a,
-    }  # fmt: skip
+        "sum": w + a,
+        "difference": w - a,
+        "other": a.y - w,
+        "product": w * a,
+        "scaled": np.float64(2.0) * a,
+        "added": np.add(a, w),
+        "half": a / np.float64(2.0),
+        "matrix": np.diag(w) @ a,
+    }
     run = Diagram("d", *(signal.named(name) for name, signal in made.items())).simulate(1.0, step=1.0, progress=False)
     x = np.array([6.0, 8.0])
     want = {
-        "sum": w + x, "difference": w - x, "other": x - w, "product": w * x, "scaled": 2 * x,
-        "added": x + w, "half": x / 2, "matrix": w * x,
-    }  # fmt: skip
+        "sum": w + x,
+        "difference": w - x,
+        "other": x - w,
+        "product": w * x,
+        "scaled": 2 * x,
+        "added": x + w,
+        "half": x / 2,
+        "matrix": w * x,
+    }
     assert {name: run[name][-1].tolist() for name in made} == {name: value.tolist() for name, value in want.items()}
     for act in (lambda: w > a.y, lambda: w <= a(), lambda: w == a.y, lambda: a.y != w):
         with pytest.raises(WiringError, match="has no value to compare while the diagram is wired"):

@@ -72,7 +72,16 @@ def test_a_ramp_rises_from_its_start_on():
 @pytest.mark.parametrize("sweep", ["linear", "logarithmic"])
 def test_the_phase_of_a_chirp_is_the_integral_of_its_frequency(sweep):
     f0, f1, D, start = 0.5, 8.0, 4.0, 0.5
-    source = Chirp(amplitude=2.0, start_frequency=f0, end_frequency=f1, duration=D, sweep=sweep, start_time=start, phase=0.3, bias=-1.0)  # fmt: skip
+    source = Chirp(
+        amplitude=2.0,
+        start_frequency=f0,
+        end_frequency=f1,
+        duration=D,
+        sweep=sweep,
+        start_time=start,
+        phase=0.3,
+        bias=-1.0,
+    )
 
     def frequency(tau):
         inside = min(max(tau, 0), D)
@@ -319,8 +328,13 @@ def test_the_output_at_an_instant_is_already_the_new_one_and_left_of_it_the_old_
 @pytest.mark.parametrize("frame", [True, False], ids=["sampled", "continuous"])
 def test_every_source_stands_in_both_kinds_of_frames(frame):
     for source in (
-        Clock(), Ramp(slope=1.0), Chirp(start_frequency=1.0, end_frequency=2.0, duration=1.0), PulseTrain(period=1.0),
-        PiecewiseLinear(times=TIMES, values=VALUES), Recorded(times=TIMES, values=VALUES), NOISE,
-    ):  # fmt: skip
+        Clock(),
+        Ramp(slope=1.0),
+        Chirp(start_frequency=1.0, end_frequency=2.0, duration=1.0),
+        PulseTrain(period=1.0),
+        PiecewiseLinear(times=TIMES, values=VALUES),
+        Recorded(times=TIMES, values=VALUES),
+        NOISE,
+    ):
         assert trace(source, {}, sampled=frame).advance == "none"
         assert source.replace(name="other") == source

@@ -98,9 +98,16 @@ def test_a_pid_at_ticks_tracks_its_set_point_through_a_saturated_actuator():
     @subsystem(sample_time=0.01)
     def own_limits(r, y):
         pid = PID(
-            kp=4.0, ki=3.0, kd=3.0, filter_time=0.05, lower=-1.0, upper=1.0, tracking_time=0.5, initial_output=0.0,
+            kp=4.0,
+            ki=3.0,
+            kd=3.0,
+            filter_time=0.05,
+            lower=-1.0,
+            upper=1.0,
+            tracking_time=0.5,
+            initial_output=0.0,
             name="pid",
-        )  # fmt: skip
+        )
         return pid(r, y)
 
     runs = []

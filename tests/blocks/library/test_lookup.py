@@ -169,15 +169,30 @@ def test_what_is_no_number_passes_through():
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: Lookup1D(breakpoints=(0.0, 0.0), values=(1.0, 2.0)), r"breakpoints: found \[0\.0, 0\.0\]; expected at least two"),
+        (
+            lambda: Lookup1D(breakpoints=(0.0, 0.0), values=(1.0, 2.0)),
+            r"breakpoints: found \[0\.0, 0\.0\]; expected at least two",
+        ),
         (lambda: Lookup1D(breakpoints=(0.0,), values=(1.0,)), r"breakpoints: found \[0\.0\]; expected at least two"),
-        (lambda: Lookup1D(breakpoints=(0.0, 1.0), values=(1.0, 2.0, 3.0)), r"values: found shape \(3,\) for 2 breakpoints"),
-        (lambda: Lookup1D(interpolation="spline", **TABLE), r"interpolation: found 'spline'; expected 'linear', 'cubic' or"),
+        (
+            lambda: Lookup1D(breakpoints=(0.0, 1.0), values=(1.0, 2.0, 3.0)),
+            r"values: found shape \(3,\) for 2 breakpoints",
+        ),
+        (
+            lambda: Lookup1D(interpolation="spline", **TABLE),
+            r"interpolation: found 'spline'; expected 'linear', 'cubic' or",
+        ),
         (lambda: Lookup1D(beyond="holds", **TABLE), r"beyond: found 'holds'; expected 'hold', .*Did you mean 'hold'\?"),
-        (lambda: FLAT.replace(values=GRID.T), r"values: found shape \(4, 3\); expected \(3, 4\), a row for each of rows"),
-        (lambda: FLAT.replace(columns=(3.0, 2.0, 1.0, 0.0)), r"columns: found \[3\.0, 2\.0, 1\.0, 0\.0\]; expected at least"),
+        (
+            lambda: FLAT.replace(values=GRID.T),
+            r"values: found shape \(4, 3\); expected \(3, 4\), a row for each of rows",
+        ),
+        (
+            lambda: FLAT.replace(columns=(3.0, 2.0, 1.0, 0.0)),
+            r"columns: found \[3\.0, 2\.0, 1\.0, 0\.0\]; expected at least",
+        ),
     ],
-)  # fmt: skip
+)
 def test_tables_that_are_none_are_refused(make, text):
     with pytest.raises(ParameterError, match=text):
         make()

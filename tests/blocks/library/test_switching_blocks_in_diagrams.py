@@ -181,7 +181,15 @@ def test_a_body_comes_off_a_damped_wall_as_scipy_says():
         return k * y[0] + d * y[1]
 
     lost.terminal, lost.direction = True, -1.0
-    made = solve_ivp(lambda t, y: [y[1], -k * y[0] - d * y[1]], (0.0, 1.0), [0.0, 1.0], events=lost, rtol=1e-13, atol=1e-14, method="DOP853")  # fmt: skip
+    made = solve_ivp(
+        lambda t, y: [y[1], -k * y[0] - d * y[1]],
+        (0.0, 1.0),
+        [0.0, 1.0],
+        events=lost,
+        rtol=1e-13,
+        atol=1e-14,
+        method="DOP853",
+    )
     out, (depth, speed) = 0.5 + made.t[-1], made.y[:, -1]
     assert run["body.velocity"][-1] == pytest.approx(speed, abs=1e-9)
     assert run["body.position"][-1] == pytest.approx(0.5 + depth + speed * (1.5 - out), abs=1e-9)

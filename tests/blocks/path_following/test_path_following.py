@@ -139,8 +139,10 @@ class Spline:
         i = next((i for i in range(len(self.cubics)) if theta < self.pieces[i + 1]), len(self.cubics) - 1)
         u = theta - self.pieces[i]
         factor = [[1, 1, 1, 1], [0, 1, 2, 3], [0, 0, 2, 6], [0, 0, 0, 6]][order]
-        return [mp.fsum(f * c * u ** (k - order) for k, (f, c) in enumerate(zip(factor, cs, strict=True)) if f)
-                for cs in self.cubics[i]]  # fmt: skip
+        return [
+            mp.fsum(f * c * u ** (k - order) for k, (f, c) in enumerate(zip(factor, cs, strict=True)) if f)
+            for cs in self.cubics[i]
+        ]
 
 
 def exact(path):
@@ -302,8 +304,10 @@ def arm_acceleration(x, v, torque, force):
 
     def kinetic(x, v):
         w1, w2 = v[0], v[0] + v[1]
-        second = [-l1 * mp.sin(x[0]) * w1 - c2 * mp.sin(x[0] + x[1]) * w2,
-                  l1 * mp.cos(x[0]) * w1 + c2 * mp.cos(x[0] + x[1]) * w2]  # fmt: skip
+        second = [
+            -l1 * mp.sin(x[0]) * w1 - c2 * mp.sin(x[0] + x[1]) * w2,
+            l1 * mp.cos(x[0]) * w1 + c2 * mp.cos(x[0] + x[1]) * w2,
+        ]
         return (m1 * (c1 * w1) ** 2 + m2 * (second[0] ** 2 + second[1] ** 2) + i1 * w1**2 + i2 * w2**2) / 2
 
     def potential(x):
@@ -376,9 +380,9 @@ def test_the_linearization_is_exact(kind, model):
         force, v_par, v_perp = rng.uniform(-20, 20, 2), *rng.uniform(-10, 10, 2)
         y = plant.h(x_c)
         theta = foot_of(path, y, theta0)
-        u = evaluate(
-            law, theta=theta, position=x_c, velocity=x_v, force=force, v_par=v_par, v_perp=v_perp
-        )["motor_force"]  # fmt: skip
+        u = evaluate(law, theta=theta, position=x_c, velocity=x_v, force=force, v_par=v_par, v_perp=v_perp)[
+            "motor_force"
+        ]
         x, v = numbers(x_c), numbers(x_v)
         a = acceleration(x, v, numbers(u), numbers(force))
         (eta2, eta_dd), (xi2, xi_dd) = rates(

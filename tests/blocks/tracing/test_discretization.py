@@ -83,8 +83,12 @@ def test_both_are_of_first_order(method):
     torque, errors, steps = 0.8, [], (0.02, 0.01, 0.005)
     exact = solve_ivp(
         lambda t, x: (x[1], -9.0 * np.sin(x[0]) - 0.4 * x[1] + (1.0 + 0.5 * t) * torque),
-        (0.0, 1.0), (1.2, -0.5), method="DOP853", rtol=1e-12, atol=1e-12,
-    ).y[:, -1]  # fmt: skip
+        (0.0, 1.0),
+        (1.2, -0.5),
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-12,
+    ).y[:, -1]
     for h in steps:
         run = run_of(Pendulum(name="p"), Constant(value=torque), method, h, round(1.0 / h))
         errors.append(np.abs(states(run, "p.angle", "p.rate")[-1] - exact).max())

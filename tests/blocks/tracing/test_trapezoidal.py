@@ -39,8 +39,10 @@ def test_states_that_are_vectors_are_solved_together():
         a, b = wave(k * T)
         x = solved_by_iteration(
             lambda t, x, a=a, b=b: np.array([0.7 * x[1] * x[2] + a, -0.9 * x[2] * x[0] + b, 0.3 * x[0] * x[1]]),
-            x, k * T, T,
-        )  # fmt: skip
+            x,
+            k * T,
+            T,
+        )
     np.testing.assert_allclose(states(run, "r.across", "r.along"), rows, rtol=1e-11, atol=1e-11)
 
 
@@ -88,8 +90,12 @@ def test_it_is_of_second_order(stiffness):
     torque, errors, steps = 0.8, [], np.array([0.02, 0.01, 0.005, 0.0025]) * 3.0 / np.sqrt(stiffness)
     exact = solve_ivp(
         lambda t, x: (x[1], -stiffness * np.sin(x[0]) - 0.4 * x[1] + (1.0 + 0.5 * t) * torque),
-        (0.0, 0.6), (1.2, -0.5), method="DOP853", rtol=1e-12, atol=1e-12,
-    ).y[:, -1]  # fmt: skip
+        (0.0, 0.6),
+        (1.2, -0.5),
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-12,
+    ).y[:, -1]
     for h in steps:
         h = float(f"{h:.6g}")
         run = run_of(Pendulum(name="p", stiffness=stiffness), Constant(value=torque), "trapezoidal", h, round(0.6 / h))

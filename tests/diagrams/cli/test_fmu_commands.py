@@ -173,9 +173,13 @@ def test_a_model_of_ones_own_goes_all_the_way(here, capsys):
     u = np.array([(0.0, 3.0, -1.0)], dtype=[("time", float), ("u[1]", float), ("u[2]", float)])
     assert main(["build", "mine.py:fast", "--no-arrays"]) == 0
     result = fmpy.simulate_fmu(
-        str(file), stop_time=1.0, output_interval=0.1, input=u, output=["y[1]", "y[2]", "total"],
+        str(file),
+        stop_time=1.0,
+        output_interval=0.1,
+        input=u,
+        output=["y[1]", "y[2]", "total"],
         fmi_type="CoSimulation",
-    )  # fmt: skip
+    )
     for t, *values in result:
         y = [3.0 - 2.0 * np.exp(-4 * t), -1.0 + 3.0 * np.exp(-4 * t)]
         assert values == pytest.approx([*y, sum(y) + 10.0], abs=1e-11)  # (4e-3)⁵ / 120 a step, 1000 steps
@@ -284,23 +288,35 @@ def test_python_inside(here, capsys):
         (["gantri"], "The plants: bouncing_ball, dc_motor, gantry, "),
         (["zzz"], "there is no model 'zzz'. Known: bouncing_ball, "),
         (["nothing.py:Lag"], "MODEL: there is no file 'nothing.py'. Check the path."),
-        (["mine.py"], "expected FILE.py:Name. Its models: Lag, Needs, Branches, Static, Unlucky, fast. Write mine.py:Lag."),
+        (
+            ["mine.py"],
+            "expected FILE.py:Name. Its models: Lag, Needs, Branches, Static, Unlucky, fast. Write mine.py:Lag.",
+        ),
         (["mine.py:lag"], "there is no 'lag' in it. Did you mean 'Lag'?"),
         (["constants.py:Lag"], "there is no 'Lag' in it. There is no Block in it."),
         (["mine.py:number"], "found int for 'number'; expected a Block"),
-        (["mine.py:Needs"], "Needs needs mass and length. Make an instance in the file, needs = Needs(mass=…, length=…), and give mine.py:needs."),
+        (
+            ["mine.py:Needs"],
+            "Needs needs mass and length. Make an instance in the file, needs = Needs(mass=…, length=…), and give mine.py:needs.",
+        ),
         (["mine.py:Lag", "--fmi", "1"], "invalid choice: 1 (choose from 2, 3)"),
-        (["mine.py:Lag", "--platform", "x86_64-linx"], "--platform: there is no platform 'x86_64-linx'. Did you mean 'x86_64-linux'"),
+        (
+            ["mine.py:Lag", "--platform", "x86_64-linx"],
+            "--platform: there is no platform 'x86_64-linx'. Did you mean 'x86_64-linux'",
+        ),
         (["mine.py:Lag", "--internal-step", "0"], "--internal-step: found '0'; expected a positive number"),
         (["mine.py:Lag", "--tolerance", "nan"], "--tolerance: found 'nan'; expected a positive number"),
         (["mine.py:Lag", "--integrator", "euler"], "invalid choice: 'euler'"),
         (["mine.py:Lag", "--name", "a b"], "--name: found 'a b'; expected letters, digits and _"),
-        (["mine.py:Lag", "--out", "mine.py"], "--out: found the file 'mine.py'; expected a folder, or a file that ends in .fmu."),
+        (
+            ["mine.py:Lag", "--out", "mine.py"],
+            "--out: found the file 'mine.py'; expected a folder, or a file that ends in .fmu.",
+        ),
         (["mine.py:Lag", "--python", "--fmi", "3"], "--fmi: found 3; an FMU with Python inside is one of FMI 2.0."),
         (["mine.py:Lag", "--python", "--no-arrays"], "--no-arrays: it can't be chosen with --python."),
         (["mine.py:Lag", "--python", "--platform", "all"], "--platform: it can't be chosen with --python."),
     ],
-)  # fmt: skip
+)
 def test_wrong_usage_of_build(arguments, text, here, capsys):
     assert main(["build", *arguments]) == 2
     out, err = capsys.readouterr()
@@ -312,12 +328,15 @@ def test_wrong_usage_of_build(arguments, text, here, capsys):
 @pytest.mark.parametrize(
     ("content", "text"),
     [
-        ("x = 1\nimport no_such_module\n", "in line 2: ModuleNotFoundError: No module named 'no_such_module'. Correct it"),
+        (
+            "x = 1\nimport no_such_module\n",
+            "in line 2: ModuleNotFoundError: No module named 'no_such_module'. Correct it",
+        ),
         ("def f(:\n", "SyntaxError: invalid syntax. Correct it"),
         ("import sys\nsys.exit(3)\n", 'in line 2: SystemExit: 3. Put its script behind if __name__ == "__main__".'),
         ("import mine\nmine.nothing\n", "in line 2: AttributeError: module 'mine' has no attribute 'nothing'"),
     ],
-)  # fmt: skip
+)
 def test_a_file_that_cant_be_imported(content, text, here, capsys):
     (here / "broken.py").write_text(content)
     assert main(["build", "broken.py:Lag"]) == 1
@@ -663,12 +682,15 @@ def test_binaries_and_their_folders(lag, altered, capsys):
         (b"MZ" + bytes(58) + b"\x40\0\0\0" + b"NE\0\0\x64\x86", set()),
         (b"MZ" + bytes(58) + b"\xff\xff\xff\x7f", set()),
         (b"\xcf\xfa\xed\xfe\x0c\x00\x00\x01", {"aarch64-darwin"}),
-        (b"\xca\xfe\xba\xbe\0\0\0\x02\x01\0\0\x07" + bytes(16) + b"\x01\0\0\x0c" + bytes(16), {"x86_64-darwin", "aarch64-darwin"}),
+        (
+            b"\xca\xfe\xba\xbe\0\0\0\x02\x01\0\0\x07" + bytes(16) + b"\x01\0\0\x0c" + bytes(16),
+            {"x86_64-darwin", "aarch64-darwin"},
+        ),
         (b"\xca\xfe\xba\xbe\xff\xff\xff\xff", set()),
         (b"\x7fELF", set()),
         (b"", set()),
     ],
-)  # fmt: skip
+)
 def test_headers_of_libraries(header, platforms):
     assert set(read_library(header).platforms) == platforms
 

@@ -153,9 +153,14 @@ def test_a_mass_of_another_tool_is_damped_late(solver, isolate):
     for n in range(7):
         begin = n * delay
         found = solve_ivp(
-            lambda t, x, of=pieces[-1]: A @ x - B * k * of(t - delay), (begin, begin + delay), x,
-            method="DOP853", rtol=1e-12, atol=1e-14, dense_output=True,
-        )  # fmt: skip
+            lambda t, x, of=pieces[-1]: A @ x - B * k * of(t - delay),
+            (begin, begin + delay),
+            x,
+            method="DOP853",
+            rtol=1e-12,
+            atol=1e-14,
+            dense_output=True,
+        )
         pieces.append(lambda t, of=found.sol: of(t)[1])
         mine = grid[(grid >= begin) & (grid < begin + delay)]
         expected += [*found.sol(mine).T]

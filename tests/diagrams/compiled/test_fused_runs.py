@@ -140,8 +140,10 @@ def test_continuous_states_stay_within_the_bound_and_as_near_to_the_exact_ones(s
     options = {"solver": solver, "rtol": 1e-10, "atol": 1e-12, **QUIET}
     plain, fused = made.simulate(1.0, compile=True, **options), made.simulate(1.0, fuse=True, **options)
     assert differ(plain, fused) < BOUND
-    assert any("rates are compiled for this processor; values differ by rounding, which some motions magnify." in m
-               for m in fused.messages)  # fmt: skip
+    assert any(
+        "rates are compiled for this processor; values differ by rounding, which some motions magnify." in m
+        for m in fused.messages
+    )
     y, decay = 0.0, np.exp(-0.2)
     for value in fused["lag.y"]:
         assert value == pytest.approx(y, abs=1e-5 if solver == "rk4" else 1e-9)  # rk4: (0.2)^5/120 of a step

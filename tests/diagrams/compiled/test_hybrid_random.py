@@ -19,9 +19,14 @@ def check(spec, solver, tolerance):
         assume(False)
     ticks, expected = oracle.run(PERIOD)
     run = diagram(spec).simulate(
-        PERIOD * BASE, step=BASE if oracle.quiet else None, solver=solver, rtol=tolerance, atol=0.1 * tolerance,
-        compile=True, progress=False,
-    )  # fmt: skip
+        PERIOD * BASE,
+        step=BASE if oracle.quiet else None,
+        solver=solver,
+        rtol=tolerance,
+        atol=0.1 * tolerance,
+        compile=True,
+        progress=False,
+    )
     assert not any(message.startswith("Interpreted") for message in run.messages)
     rows = np.searchsorted(run.t, np.array(ticks) / 100)
     assert np.array_equal(run.t[rows], np.array(ticks) / 100)

@@ -13,8 +13,35 @@ from loopwright.diagrams.compiled.runtime import load_runtime
 
 SPECIAL = [0.0, -0.0, 1.0, -1.0, 0.5, -2.5, 1e-310, 1e300, -1e300, np.inf, -np.inf, np.nan, 3.0, 1e16, np.pi]
 EXACT = {"ASSIGN", "LIFT", "INPUT", "OUTPUT"}  # no operation of their own on numbers
-UNARY = {"NEG", "SQ", "TWICE", "INV", "SQRT", "FABS", "SIGN", "FLOOR", "CEIL", "NOT", "EXP", "EXPM1", "LOG", "LOG1P", "SIN",
-         "COS", "TAN", "ASIN", "ACOS", "ATAN", "SINH", "COSH", "TANH", "ASINH", "ACOSH", "ATANH", "ERF"}  # fmt: skip
+UNARY = {
+    "NEG",
+    "SQ",
+    "TWICE",
+    "INV",
+    "SQRT",
+    "FABS",
+    "SIGN",
+    "FLOOR",
+    "CEIL",
+    "NOT",
+    "EXP",
+    "EXPM1",
+    "LOG",
+    "LOG1P",
+    "SIN",
+    "COS",
+    "TAN",
+    "ASIN",
+    "ACOS",
+    "ATAN",
+    "SINH",
+    "COSH",
+    "TANH",
+    "ASINH",
+    "ACOSH",
+    "ATANH",
+    "ERF",
+}
 
 
 def evaluate(function, *arguments):

@@ -39,8 +39,12 @@ def swapped(request, monkeypatch):
 def oscillator():
     """An oscillator of 3 rad/s with a damping of 0.1, from 1."""
     A = [[0.0, 1.0], [-9.0, -0.6]]
-    return Diagram("d", StateSpace(A=A, B=[0.0, 1.0], C=np.eye(2), D=[0.0, 0.0], initial_state=[1.0, 0.0],
-                                   name="x")(Sine(frequency=0.0, name="u")))  # fmt: skip
+    return Diagram(
+        "d",
+        StateSpace(A=A, B=[0.0, 1.0], C=np.eye(2), D=[0.0, 0.0], initial_state=[1.0, 0.0], name="x")(
+            Sine(frequency=0.0, name="u")
+        ),
+    )
 
 
 def exact(t):

@@ -125,9 +125,18 @@ def test_it_works_where_memory_is_not_written_in_order(folder, monkeypatch):
 
 
 FAULTS = [
-    "step segfault", "step divide_trapped", "step exit0", "step deaf_hang", "get segfault", "step log_hang",
-    "step error", "step discard", "step fatal", "step minus", "step no_memory",
-]  # fmt: skip
+    "step segfault",
+    "step divide_trapped",
+    "step exit0",
+    "step deaf_hang",
+    "get segfault",
+    "step log_hang",
+    "step error",
+    "step discard",
+    "step fatal",
+    "step minus",
+    "step no_memory",
+]
 
 
 @pytest.mark.parametrize("beside", [False, True], ids=["alone", "beside"])
@@ -177,9 +186,20 @@ class Late(Block):
 
 
 LAST = {
-    "Float64": 0.1, "Float32": 0.1, "Int8": -128, "UInt8": 200, "Int16": -32768, "UInt16": 65535, "Int32": -(2**31),
-    "UInt32": 2**32 - 1, "Int64": -(2**53), "UInt64": 2**53, "Boolean": 0, "Real": -1e300, "Integer": 2**31 - 1,
-}  # fmt: skip
+    "Float64": 0.1,
+    "Float32": 0.1,
+    "Int8": -128,
+    "UInt8": 200,
+    "Int16": -32768,
+    "UInt16": 65535,
+    "Int32": -(2**31),
+    "UInt32": 2**32 - 1,
+    "Int64": -(2**53),
+    "UInt64": 2**53,
+    "Boolean": 0,
+    "Real": -1e300,
+    "Integer": 2**31 - 1,
+}
 
 
 def typed(folder, fmi, isolate=None, **values):
@@ -202,9 +222,16 @@ def test_numbers_of_every_type_pass_through(folder, fmi):
 
 
 @pytest.mark.parametrize(
-    ("port", "value"), [("u_Int8", 0.5), ("u_Int8", 128.0), ("u_Int64", 2.0**53 + 2.0), ("u_Boolean", 2.0),
-                        ("u_Float32", 1e39), ("u_UInt16", -1.0)]
-)  # fmt: skip
+    ("port", "value"),
+    [
+        ("u_Int8", 0.5),
+        ("u_Int8", 128.0),
+        ("u_Int64", 2.0**53 + 2.0),
+        ("u_Boolean", 2.0),
+        ("u_Float32", 1e39),
+        ("u_UInt16", -1.0),
+    ],
+)
 @pytest.mark.drawn(3)
 def test_an_input_that_does_not_fit_is_told_as_in_an_interpreted_run(folder, port, value):
     made, _ = typed(folder, 3, **{port: value})

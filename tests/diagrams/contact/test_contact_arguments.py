@@ -20,8 +20,11 @@ class Thing:
         return "a thing"
 
 
-@pytest.mark.parametrize("value", [None, "x", [math.nan], [0.0], [], ["a"], [1.0, 0.0], [1j], {"a": 1}, Thing(), True,
-                                   [[1], [1, 2]], [math.inf]], ids=repr)  # fmt: skip
+@pytest.mark.parametrize(
+    "value",
+    [None, "x", [math.nan], [0.0], [], ["a"], [1.0, 0.0], [1j], {"a": 1}, Thing(), True, [[1], [1, 2]], [math.inf]],
+    ids=repr,
+)
 def test_a_direction_is_a_vector(value):
     with pytest.raises(OptionError, match="direction: found .*; expected .*vector"):
         cart_diagram().contact("cart.push", direction=value, **PORTS)
@@ -70,15 +73,20 @@ def test_points_in_a_decade_are_a_whole_number(value):
 @pytest.mark.parametrize("value", [3, None, ["stiffness"], "spring", 1.0], ids=repr)
 def test_properties_have_names(value):
     here = cart_contact()
-    calls = [lambda: here.stability_limit(value), lambda: here.loop(value),
-             lambda: here.stability_map([1.0, 2.0], [1.0], x=value), lambda: here.stability_map([1.0, 2.0], [1.0], y=value)]  # fmt: skip
+    calls = [
+        lambda: here.stability_limit(value),
+        lambda: here.loop(value),
+        lambda: here.stability_map([1.0, 2.0], [1.0], x=value),
+        lambda: here.stability_map([1.0, 2.0], [1.0], y=value),
+    ]
     for call in calls:
         with pytest.raises(OptionError, match="an environment has no "):
             call()
 
 
-@pytest.mark.parametrize("value", ["a", None, 3.0, [], [[1.0, 2.0]], [1.0, math.nan], [1.0, math.inf], [1j], [Thing()]],
-                         ids=repr)  # fmt: skip
+@pytest.mark.parametrize(
+    "value", ["a", None, 3.0, [], [[1.0, 2.0]], [1.0, math.nan], [1.0, math.inf], [1j], [Thing()]], ids=repr
+)
 def test_values_of_a_map_are_rows(value):
     with pytest.raises(OptionError, match=r"stiffness: found .*; expected a row of finite values in N/m"):
         cart_contact().stability_map(value, [1.0])

@@ -93,8 +93,10 @@ def growth(k, b=0.0, m=0.0, **rates):
 
 
 @pytest.mark.drawn
-@pytest.mark.parametrize(("vary", "held"), [("stiffness", {}), ("stiffness", {"damping": 10.0}),
-                                            ("stiffness", {"mass": 0.5}), ("mass", {"stiffness": 50.0})])  # fmt: skip
+@pytest.mark.parametrize(
+    ("vary", "held"),
+    [("stiffness", {}), ("stiffness", {"damping": 10.0}), ("stiffness", {"mass": 0.5}), ("mass", {"stiffness": 50.0})],
+)
 @pytest.mark.parametrize("slow", [0.01, 0.02])
 def test_limits_in_two_rates_are_those_of_the_monodromy_matrix(vary, held, slow):
     found = contact(slow=slow).stability_limit(vary, **held)
@@ -148,8 +150,12 @@ def test_the_admittance_in_two_rates_is_the_fundamental_of_the_steady_state():
             for j in range(5):
                 u, t = KV * (wanted - x[1]), j * fast
                 if part:
-                    total += quad_vec(lambda q, x=x, u=u, t=t: motion(x, u, t, q)[1] * np.exp(-1j * w * (t + q)),
-                                      0.0, fast, epsabs=1e-14)[0]  # fmt: skip
+                    total += quad_vec(
+                        lambda q, x=x, u=u, t=t: motion(x, u, t, q)[1] * np.exp(-1j * w * (t + q)),
+                        0.0,
+                        fast,
+                        epsabs=1e-14,
+                    )[0]
                 x = motion(x, u, t, fast)
             return total / slow if part else np.array([*x, decay * wanted + (1 - decay) / DRAG * felt])
 
@@ -273,8 +279,9 @@ def test_ports_of_an_fmu_whose_names_have_dots_are_those_of_a_contact():
 
     torque = joints(arm.joint_angle, arm.joint_velocity, push)
     made = Diagram("arm", arm(motor_torque=torque, **{"tool.force": push}))
-    here = made.contact("arm.tool.force", position="arm.tool.position", velocity="arm.tool.velocity", force=None,
-                        direction=(0.6, 0.8))  # fmt: skip
+    here = made.contact(
+        "arm.tool.force", position="arm.tool.position", velocity="arm.tool.velocity", force=None, direction=(0.6, 0.8)
+    )
     assert here.ports.plant == "arm"
     assert here.ports.force == "tool.force"
     with pytest.raises(UnknownNameError, match="found no block with the input 'leg.tool.force'"):
@@ -282,8 +289,9 @@ def test_ports_of_an_fmu_whose_names_have_dots_are_those_of_a_contact():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{"stepping": 5e-4}, {"stepping": 2e-3}, {"offset": 5e-4}, {"slow": 2e-3, "at": 0.013}],
-                         ids=str)  # fmt: skip
+@pytest.mark.parametrize(
+    "options", [{"stepping": 5e-4}, {"stepping": 2e-3}, {"offset": 5e-4}, {"slow": 2e-3, "at": 0.013}], ids=str
+)
 def test_communication_steps_of_their_own_and_offsets_hold_in_the_run(options):
     options = dict(options)
     at = options.pop("at", None)

@@ -38,8 +38,11 @@ def test_a_function_without_values_around_is_searched_where_it_has_some():
     assert min(abs(found - np.roots([0.81, -1.0, 0.2]))) < 1e-12
 
 
-@pytest.mark.parametrize("function", [lambda y: y + 1.0, lambda y: y + 1.0 + y * y, lambda y: np.full(1, np.nan)],
-                         ids=["parallel", "above", "undefined"])  # fmt: skip
+@pytest.mark.parametrize(
+    "function",
+    [lambda y: y + 1.0, lambda y: y + 1.0 + y * y, lambda y: np.full(1, np.nan)],
+    ids=["parallel", "above", "undefined"],
+)
 def test_no_solution_is_none(function):
     count = []
     assert find_fixed_point(lambda y: count.append(1) or function(y), np.zeros(1), most=400) is None

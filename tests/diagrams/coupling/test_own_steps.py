@@ -16,9 +16,13 @@ TRUNCATES = "{ double n = floor(20.0 * h / 0.01 + 1e-9); h = n * 0.01 / 20.0; }"
 @pytest.mark.parametrize("step", [None, "T"])
 def test_steps_that_are_no_multiples_of_the_fmus_own_are_told(tmp_path, T, fits, step):
     file = closed_form_fmu(
-        tmp_path, 3, "dx[0] = -3*x[0] + 2*u[0]; y[0] = 4*x[0];", attributes=' fixedInternalStepSize="0.01"',
-        check=TRUNCATES, dependencies={"y1": "x1", "dx1": "x1 u1"},
-    )  # fmt: skip
+        tmp_path,
+        3,
+        "dx[0] = -3*x[0] + 2*u[0]; y[0] = 4*x[0];",
+        attributes=' fixedInternalStepSize="0.01"',
+        check=TRUNCATES,
+        dependencies={"y1": "x1", "dx1": "x1 u1"},
+    )
 
     @subsystem(sample_time=T)
     def controller(y):

@@ -71,9 +71,12 @@ def test_an_output_that_moves_late_is_compared_then(cache, make):
 # A step that is not final is kept as if it were to be rejected, and taken back when the next one begins.
 TAKING_BACK = (
     SOURCE.replace("double t, u, y; }", "double t, u, y, before; int open; }")
-    .replace("instance *c = p; c->y =", "instance *c = p; if (c->open) c->y = c->before;\n    c->before = c->y; c->open = !no; c->y =")
+    .replace(
+        "instance *c = p; c->y =",
+        "instance *c = p; if (c->open) c->y = c->before;\n    c->before = c->y; c->open = !no; c->y =",
+    )
     .replace("RESTORE", "*c = *o; c->open = 0;")
-)  # fmt: skip
+)
 
 
 def in_a_loop(file):

@@ -115,9 +115,12 @@ def test_adaptive_steps_follow_the_allowed_error(cache, scheme):
     found = []
     for error in (1e-3, 1e-4):
         off, run = largest_error(
-            two_masses(), two_masses_exactly, ("a.position", "b.position"), step=0.05,
+            two_masses(),
+            two_masses_exactly,
+            ("a.position", "b.position"),
+            step=0.05,
             coupling=Coupling(scheme=scheme, error=error),
-        )  # fmt: skip
+        )
         steps = int(run.messages[0].split(": ")[1].split()[0])
         found.append((off, steps))
         assert len(run.t) == 11  # samples stay where they are

@@ -137,7 +137,10 @@ def test_the_closed_form_for_two_channels_is_what_scaling_by_scipy_finds(entries
         d = np.array([np.exp(x[0]), 1.0])
         return np.linalg.svd(d[:, None] * M / d, compute_uv=False)[0]
 
-    found = min(minimize(scaled, [x0], method="Nelder-Mead", options={"xatol": 1e-12, "fatol": 1e-14, "maxiter": 4000}).fun for x0 in (-3, 0, 3))  # fmt: skip
+    found = min(
+        minimize(scaled, [x0], method="Nelder-Mead", options={"xatol": 1e-12, "fatol": 1e-14, "maxiter": 4000}).fun
+        for x0 in (-3, 0, 3)
+    )
     assert disk.mu_bound(M) <= found * (1 + 1e-9) + 1e-12
     if min(abs(M[0, 1]), abs(M[1, 0])) <= 1e-3:  # the best scaling is at infinity
         return False
@@ -249,7 +252,9 @@ def test_whole_samples_of_delayed_hold_are_the_delay_of_the_loop():
     p, T = 20.0, 1e-3
     for n in (0, 1, 4):
         late = margins(controller(p, T) * delayed_hold(AXIS, T, n * T))
-        assert late.phase_margin_deg.value == pytest.approx(margins(sampled_triple(p), delay=n).phase_margin_deg.value, abs=1e-8)  # fmt: skip
+        assert late.phase_margin_deg.value == pytest.approx(
+            margins(sampled_triple(p), delay=n).phase_margin_deg.value, abs=1e-8
+        )
 
 
 def test_a_delay_between_the_ticks_is_borne_a_little_differently_than_the_response_says():

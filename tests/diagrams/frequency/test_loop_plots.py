@@ -188,9 +188,15 @@ def test_interconnected_systems_of_several_signals_in_any_sample_time_come_in_an
     from loopwright.blocks import DiscreteStateSpace
 
     plant = control.ss(
-        [[0.5, 0.1], [0.0, 0.8]], [[1.0, 0.0], [0.0, 0.2]], [[1.0, 1.0], [0.0, 1.0]], 0, True,
-        name="P", inputs=["u1", "u2"], outputs=["y1", "y2"],
-    )  # fmt: skip
+        [[0.5, 0.1], [0.0, 0.8]],
+        [[1.0, 0.0], [0.0, 0.2]],
+        [[1.0, 1.0], [0.0, 1.0]],
+        0,
+        True,
+        name="P",
+        inputs=["u1", "u2"],
+        outputs=["y1", "y2"],
+    )
     gains = control.ss([], [], [], np.diag([0.3, 0.4]), True, name="C", inputs=["e1", "e2"], outputs=["u1", "u2"])
     errors = control.summing_junction(["r", "-y"], "e", dimension=2, dt=True)
     closed = control.interconnect(

@@ -235,9 +235,16 @@ def test_only_numbers_that_depend_on_a_finding_carry_it():
     assert clean.phase_margin_deg.as_dict().keys() == {"value", "unit", "tolerance", "confirmed_by"}
     (fact,) = bent.as_dict()["phase_margin_deg"]["findings"]
     assert fact == {
-        "kind": "Kink", "block": "block", "port": "y", "source": "e", "below": kink.below, "above": kink.above,
-        "jump": 0.0, "slope": kink.slope, "text": str(kink),
-    }  # fmt: skip
+        "kind": "Kink",
+        "block": "block",
+        "port": "y",
+        "source": "e",
+        "below": kink.below,
+        "above": kink.above,
+        "jump": 0.0,
+        "slope": kink.slope,
+        "text": str(kink),
+    }
     assert json.dumps(fact)
 
 

@@ -234,9 +234,12 @@ def test_a_cut_wire_keeps_the_motion_of_the_closed_diagram_at_every_tick_of_a_pe
 def hybrid():
     """A plant with two inputs and outputs, and a sampled controller: vector wires."""
     plant = StateSpace(
-        A=[[0, 1, 0], [-4, -0.4, 1], [0.5, 0, -2]], B=[[0, 0], [1, 0.2], [0, 3]], C=[[1, 0, 0], [0, 0, 1]],
-        D=np.zeros((2, 2)), name="plant",
-    )  # fmt: skip
+        A=[[0, 1, 0], [-4, -0.4, 1], [0.5, 0, -2]],
+        B=[[0, 0], [1, 0.2], [0, 3]],
+        C=[[1, 0, 0], [0, 0, 1]],
+        D=np.zeros((2, 2)),
+        name="plant",
+    )
 
     @subsystem(sample_time=T)
     def controller(y):

@@ -11,10 +11,17 @@ from support.agreement import assert_agrees
 from support.scalar_gantry import scalar_gantry
 
 ARRAYS = {
-    "F_my": "motor_force[1]", "F_mz": "motor_force[2]", "F_ey": "external_force[1]", "F_ez": "external_force[2]",
-    "s_Y": "position[1]", "s_Z": "position[2]", "v_Y": "velocity[1]", "v_Z": "velocity[2]",
-    "a_Y": "acceleration[1]", "a_Z": "acceleration[2]",
-}  # fmt: skip
+    "F_my": "motor_force[1]",
+    "F_mz": "motor_force[2]",
+    "F_ey": "external_force[1]",
+    "F_ez": "external_force[2]",
+    "s_Y": "position[1]",
+    "s_Z": "position[2]",
+    "v_Y": "velocity[1]",
+    "v_Z": "velocity[2]",
+    "a_Y": "acceleration[1]",
+    "a_Z": "acceleration[2]",
+}
 
 
 @pytest.fixture(scope="module")

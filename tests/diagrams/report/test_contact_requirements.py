@@ -143,8 +143,16 @@ def test_a_file_that_makes_no_contact_is_refused_with_its_line(tmp_path, text, w
 
 
 def test_a_file_of_contacts_has_the_numbers_of_the_diagrams_own(tmp_path):
-    file = write(tmp_path / "c.toml", TABLE, "[contact.requirements]", "stiffness = 3.0", TABLE.replace("hand", "blind")
-                 .replace('"felt"', "false"), "[contact.blind.requirements]", "stiffness = 4", "with = {damping = 2}")  # fmt: skip
+    file = write(
+        tmp_path / "c.toml",
+        TABLE,
+        "[contact.requirements]",
+        "stiffness = 3.0",
+        TABLE.replace("hand", "blind").replace('"felt"', "false"),
+        "[contact.blind.requirements]",
+        "stiffness = 4",
+        "with = {damping = 2}",
+    )
     task = ContactTask.read(file)
     found = task.find(cart_diagram().wired)
     assert found["hand"].stability_limit().value == pytest.approx(SOFT, rel=1e-9)

@@ -230,9 +230,14 @@ def test_a_limit_that_acts_fails_a_step_that_the_linear_model_passes():
 
 def test_the_command_line_rounds_as_the_page_does():
     small = RequirementResult(
-        "stable", "", "continuous", Limit(-math.inf, -1.0), Verdict.FAILED, Reason.UNSTABLE,
+        "stable",
+        "",
+        "continuous",
+        Limit(-math.inf, -1.0),
+        Verdict.FAILED,
+        Reason.UNSTABLE,
         number=Number(-1.38778e-16, "1/s", 1e-12, "eigenvalues"),
-    )  # fmt: skip
+    )
     rough = replace(small, number=Number(12.3456789, "1/s", 0.02, "a run"))
     told = verdict_text(Review((small, rough)))
     assert "found 0 1/s," in told

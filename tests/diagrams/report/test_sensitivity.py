@@ -74,8 +74,10 @@ def test_a_stable_and_a_failed_worst_case_stand_on_the_first_page():
     assert "not analysed. No point of rest." in "\n".join(map(str, report.sections[0].text))
     (result,) = report.review.results
     assert (result.verdict, result.reason, result.detail) == (
-        Verdict.UNDECIDED, Reason.NOT_ANALYSED, "No point of rest.",
-    )  # fmt: skip
+        Verdict.UNDECIDED,
+        Reason.NOT_ANALYSED,
+        "No point of rest.",
+    )
 
 
 def test_a_worst_case_that_no_run_confirms_is_told_on_the_first_page(monkeypatch):

@@ -16,10 +16,20 @@ def response(outputs, y, linear, before=None, wire_before=0.0):
     v, t = -np.ones(N), 0.1 * np.arange(N)
     y, linear = (np.outer(np.ones(N), np.atleast_1d(values)) for values in (y, linear))
     return StepResponse(
-        wire="u", size=1.0, t=t, d=np.ones(N), v=v, outputs=outputs, y=y,
-        before=np.zeros(len(outputs)) if before is None else np.asarray(before), wire_before=wire_before, moved=0.0,
-        dt=0.1, held=True, prediction=np.column_stack([v, linear]),
-    )  # fmt: skip
+        wire="u",
+        size=1.0,
+        t=t,
+        d=np.ones(N),
+        v=v,
+        outputs=outputs,
+        y=y,
+        before=np.zeros(len(outputs)) if before is None else np.asarray(before),
+        wire_before=wire_before,
+        moved=0.0,
+        dt=0.1,
+        held=True,
+        prediction=np.column_stack([v, linear]),
+    )
 
 
 @pytest.mark.parametrize(

@@ -130,14 +130,20 @@ def test_the_step_of_a_loop_replaces_the_general_one_and_steps_between_wires_sta
             {"step": {"overshoot": 0.1, "output": "z"}},
             "step.output: found the output 'z' without an input; expected neither",
         ),
-        ({"loops": {"u": {"step": {"rise": 0.1, "input": "z"}}}}, "loops.u.step.input: found an input; expected neither"),
-        ({"variants": {"sampled_d1": {"step": {"rise": 0.1, "output": "z"}}}}, "variants.sampled_d1.step.output: found"),
+        (
+            {"loops": {"u": {"step": {"rise": 0.1, "input": "z"}}}},
+            "loops.u.step.input: found an input; expected neither",
+        ),
+        (
+            {"variants": {"sampled_d1": {"step": {"rise": 0.1, "output": "z"}}}},
+            "variants.sampled_d1.step.output: found",
+        ),
         ({"loops": {"u": 3}}, "loops.u: found 3; expected limits by name"),
         ({"loops": {"u": {"mss": 3}}}, "loops.u.mss: there is no requirement 'mss'. Did you mean 'ms'"),
         ({"numbers": {"poles.sampled_d0.slowest": -1.0}}, "found -1.0; expected two numbers, low and high"),
         ({"stable": 1}, "stable: found 1; expected true or false"),
     ],
-)  # fmt: skip
+)
 def test_wrong_requirements_are_refused_with_the_next_step(wrong, said):
     with pytest.raises(OptionError) as caught:
         Requirements(**wrong)

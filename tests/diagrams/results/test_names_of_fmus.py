@@ -14,8 +14,13 @@ typedef struct { double t, u, w; } instance;
 int fmi2DoStep(void *p, double t, double h, int f) { instance *c = p; c->w += h * c->u; return 0; }
 """
 EXPRESSIONS = {1: "c->u", 2: "c->w", 3: "2 * c->w", 4: "c->u", 5: "3 * c->w"}
-ROWS = {"u": 'causality="input"', "w": 'causality="output"', "inertia1.w": 'causality="output"', "inertia1.a": "",
-        "inertia2.w": ""}  # fmt: skip
+ROWS = {
+    "u": 'causality="input"',
+    "w": 'causality="output"',
+    "inertia1.w": 'causality="output"',
+    "inertia1.a": "",
+    "inertia2.w": "",
+}
 
 
 @pytest.fixture(scope="module")

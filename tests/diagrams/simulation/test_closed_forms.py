@@ -263,8 +263,12 @@ def drive(anti_windup="back_calculation"):
 def motor_matrices():
     m = MOTOR
     A = np.array(
-        [[-m.resistance / m.inductance, -m.motor_constant / m.inductance, 0], [m.motor_constant / m.inertia, -m.friction / m.inertia, 0], [0, 1, 0]]
-    )  # fmt: skip
+        [
+            [-m.resistance / m.inductance, -m.motor_constant / m.inductance, 0],
+            [m.motor_constant / m.inertia, -m.friction / m.inertia, 0],
+            [0, 1, 0],
+        ]
+    )
     return A, np.array([[1 / m.inductance, 0], [0, -1 / m.inertia], [0, 0]])
 
 

@@ -340,9 +340,15 @@ def test_a_delayed_logistic_growth_is_that_of_scipy_piece_by_piece():
     y, rows = 0.5, [0.5]
     for i in range(10):
         piece = solve_ivp(
-            lambda t, y, past: r * y * (1 - past(t - tau)[0]), (i, i + 1.0), [y], "DOP853", args=(before,),
-            rtol=1e-13, atol=1e-14, dense_output=True,
-        )  # fmt: skip
+            lambda t, y, past: r * y * (1 - past(t - tau)[0]),
+            (i, i + 1.0),
+            [y],
+            "DOP853",
+            args=(before,),
+            rtol=1e-13,
+            atol=1e-14,
+            dense_output=True,
+        )
         rows += list(piece.sol(i + 0.1 * np.arange(1, 11))[0])
         y, before = piece.y[0, -1], piece.sol
     assert np.max(np.abs(run["n.y"] - rows)) < 1e-7

@@ -80,8 +80,11 @@ def test_a_delay_with_its_own_output_at_its_input_begins_at_rest():
     assert run["delay.y"][0] == pytest.approx(1.0 / 3.0, rel=1e-12)
 
 
-@pytest.mark.parametrize("f", [lambda u: u + np.exp(-u), pytest.param(lambda u: 1.0 + u * u + u, marks=pytest.mark.slow)],
-                         ids=["approaches", "runs away"])  # fmt: skip
+@pytest.mark.parametrize(
+    "f",
+    [lambda u: u + np.exp(-u), pytest.param(lambda u: 1.0 + u * u + u, marks=pytest.mark.slow)],
+    ids=["approaches", "runs away"],
+)
 def test_a_loop_without_a_solution_is_named(through, f):
     with pytest.raises(
         SimulationError, match=r"plant.u, t = 0 s: its value at the start depends on the FMU's own outputs"

@@ -130,8 +130,14 @@ def test_start_values_of_an_fmu_in_model_exchange_are_varied():
     """Without its default in the block, an FMU's parameter has that of its description."""
     motor = Fmu(dc_motor.build(), name="motor", interface="model_exchange")
     made = Diagram("loop", motor(voltage=Gain(gain=-3.0, name="kp")(motor.speed).named("u"), load_torque=0.0))
-    found = made.worst_case({"motor.inertia": [1e-5, 5e-5], "motor.start.inductance": [2e-3, 4e-3]}, "u",
-                            quantity="phase_margin_deg", samples="grid", starts=1, steps=2)  # fmt: skip
+    found = made.worst_case(
+        {"motor.inertia": [1e-5, 5e-5], "motor.start.inductance": [2e-3, 4e-3]},
+        "u",
+        quantity="phase_margin_deg",
+        samples="grid",
+        starts=1,
+        steps=2,
+    )
     k, b, R = dc_motor.nominal.motor_constant, dc_motor.nominal.friction, dc_motor.nominal.resistance
     for case in found.cases:
         J = case.parameters.get("motor.start.inertia", dc_motor.nominal.inertia)

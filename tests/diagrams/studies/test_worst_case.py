@@ -209,9 +209,13 @@ def test_a_point_that_no_longer_rests_says_so():
 
 def test_several_operating_points_are_tried():
     found = make_tank().worst_case(
-        {"k.gain": (1.0, 2.0)}, "u", quantity="bandwidth", count=2, starts=0,
+        {"k.gain": (1.0, 2.0)},
+        "u",
+        quantity="bandwidth",
+        count=2,
+        starts=0,
         points=[lambda d: d.trim(), lambda d: d.replace({"inflow.value": 2.0}).trim()],
-    )  # fmt: skip
+    )
     assert {case.point for case in found.cases} == {0, 1}
     assert len(found.nominal) == 2
 

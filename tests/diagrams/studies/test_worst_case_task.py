@@ -70,17 +70,41 @@ def test_ranges_are_pairs_or_tables_and_keys_may_be_dotted(tmp_path):
         ('"phase_margin_deg"', '"phase_margin"', r"line 3: worst_case.quantity: a loop has no number 'phase_margin'"),
         ('samples = "grid"', "samples = 20", r"line 4: worst_case.samples: found 20; .* Write count = 20"),
         ('samples = "grid"', 'samples = "gird"', r"line 4: worst_case.samples: found samples='gird'"),
-        ('samples = "grid"', "count = 20", r"line 8: worst_case.ranges.p.gain: found \[0.5, 1.0, 2.0\]; .* Write \[low, high\]"),
+        (
+            'samples = "grid"',
+            "count = 20",
+            r"line 8: worst_case.ranges.p.gain: found \[0.5, 1.0, 2.0\]; .* Write \[low, high\]",
+        ),
         ("starts = 0", "start = 0", r"line 5: worst_case.start: \[worst_case\] has no 'start'. Did you mean 'starts'"),
         ("starts = 0", "starts = -1", r"line 5: worst_case.starts: found starts=-1; expected an integer from 0 on"),
         ("starts = 0", "seed = 1.5", r"line 5: worst_case.seed: found seed=1.5"),
-        ("starts = 0", "requirements = {mss = 1.6}", r"line 5: worst_case.requirements.mss: there is no requirement 'mss'"),
-        ("starts = 0", "requirements = {ms = 1.6}", r"line 1: worst_case: found quantity='phase_margin_deg' and requirem"),
-        ("[0.5, 1.0, 2.0]", "{low = 2.0, high = 1.0}", r"line 8: worst_case.ranges.p.gain: found a range from 2.0 to 1.0"),
-        ("[0.5, 1.0, 2.0]", "{low = 1, hihg = 5}", r"line 8: worst_case.ranges.p.gain: a range has no 'hihg'. .*'high'"),
-        ("[0.5, 1.0, 2.0]", "{low = 1}", r"line 8: worst_case.ranges.p.gain: found a range without 'high'; expected both"),
+        (
+            "starts = 0",
+            "requirements = {mss = 1.6}",
+            r"line 5: worst_case.requirements.mss: there is no requirement 'mss'",
+        ),
+        (
+            "starts = 0",
+            "requirements = {ms = 1.6}",
+            r"line 1: worst_case: found quantity='phase_margin_deg' and requirem",
+        ),
+        (
+            "[0.5, 1.0, 2.0]",
+            "{low = 2.0, high = 1.0}",
+            r"line 8: worst_case.ranges.p.gain: found a range from 2.0 to 1.0",
+        ),
+        (
+            "[0.5, 1.0, 2.0]",
+            "{low = 1, hihg = 5}",
+            r"line 8: worst_case.ranges.p.gain: a range has no 'hihg'. .*'high'",
+        ),
+        (
+            "[0.5, 1.0, 2.0]",
+            "{low = 1}",
+            r"line 8: worst_case.ranges.p.gain: found a range without 'high'; expected both",
+        ),
     ],
-)  # fmt: skip
+)
 def test_errors_name_the_line_and_the_entry(old, new, message, tmp_path):
     file = write(tmp_path, TABLE.replace(old, new))
     with pytest.raises(OptionError, match=message):

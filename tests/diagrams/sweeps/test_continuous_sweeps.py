@@ -173,9 +173,14 @@ def test_lags_of_all_gains_end_at_their_exponentials():
 
 
 def test_a_run_that_fails_between_ticks_harms_no_other():
-    made = Diagram("root", Integrator(name="x", initial_value=0.0)(
-        Function(lambda v: np.sqrt(v), name="root")(Gain(gain=1.0, name="k")(Sine(frequency=0.25, phase=1.0, name="s")))
-    ).named("y"))  # fmt: skip
+    made = Diagram(
+        "root",
+        Integrator(name="x", initial_value=0.0)(
+            Function(lambda v: np.sqrt(v), name="root")(
+                Gain(gain=1.0, name="k")(Sine(frequency=0.25, phase=1.0, name="s"))
+            )
+        ).named("y"),
+    )
     found = made.sweep({"k.gain": (1.0, -1.0, 2.0)}, 0.2, step=0.05, signals="y", workers=1, **QUIET)
     assert [failure.index for failure in found.failures] == [1]
     for i in (0, 2):

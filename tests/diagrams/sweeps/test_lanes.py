@@ -67,10 +67,14 @@ def test_runs_are_those_of_the_closed_form_with_other_parameters_in_every_lane()
         {"plant.gain": 0.9, "plant.lag": 0.25, "kp.gain": 0.5},
     ]
     reduce = {
-        "end": final("x"), "top": maximum("x"), "bottom": minimum("u"), "mean": mean("x"),
-        "settled": settling_time("x", band=0.02), "late": settling_time("x", band=0.02, since=0.1),
+        "end": final("x"),
+        "top": maximum("x"),
+        "bottom": minimum("u"),
+        "mean": mean("x"),
+        "settled": settling_time("x", band=0.02),
+        "late": settling_time("x", band=0.02, since=0.1),
         "mine": lambda run: [run["x"][10], run.t[10]],
-    }  # fmt: skip
+    }
     found = loop().sweep(
         None, 1.0, samples=table, signals=["x", "mixed", "shifted"], reduce=reduce, lanes=LANES, **QUIET
     )
@@ -143,8 +147,10 @@ def test_runs_that_stop_end_at_their_own_ticks_and_rates_are_kept(every):
 def test_runs_of_other_structure_or_other_steps_go_side_by_side_with_their_like():
     table = [
         {"plant.internal_step": h, "kp.gain": k, "plant.gain": g}
-        for h in (STEP, 5e-3) for k in (0.0, 2.0) for g in (1.0, 1.2, 1.4)
-    ]  # fmt: skip
+        for h in (STEP, 5e-3)
+        for k in (0.0, 2.0)
+        for g in (1.0, 1.2, 1.4)
+    ]
     diagram = loop()
     found = diagram.sweep(None, 0.2, samples=table, signals="x", lanes=LANES, **QUIET)
     assert ran_in_lanes(found)

@@ -98,14 +98,21 @@ def test_results_are_those_of_the_closed_form_for_every_gain_and_time_constant()
     table = [{"lag.numerator": (gain,), "lag.denominator": (lag, 1.0)} for gain in gains for lag in lags]
     duration = 4.0
     found = sampled_lag().sweep(
-        None, duration, samples=table, signals="y",
+        None,
+        duration,
+        samples=table,
+        signals="y",
         reduce={
-            "end": final("y"), "top": maximum("y"), "bottom": minimum("y"), "mean": mean("y"),
-            "settled": settling_time("y", band=0.02), "late": settling_time("y", band=0.02, since=0.1),
+            "end": final("y"),
+            "top": maximum("y"),
+            "bottom": minimum("y"),
+            "mean": mean("y"),
+            "settled": settling_time("y", band=0.02),
+            "late": settling_time("y", band=0.02, since=0.1),
             "mine": lambda run: [run["y"][10], run.t[10]],
         },
         **INTERPRETED,
-    )  # fmt: skip
+    )
     for i, sample in enumerate(found.samples):
         (gain,), (lag, _) = sample.parameters["box.lag.numerator"], sample.parameters["box.lag.denominator"]
         exact = gain * (1.0 - np.exp(-found.t / lag))
@@ -131,10 +138,14 @@ def test_settling_is_zero_within_the_band_nan_outside_at_the_end_and_reckoned_to
 
     diagram = Diagram("ramp", box(Ramp(slope=1.0, name="ramp")).named("y"))
     found = diagram.sweep(
-        {"gain.gain": (1.0, 0.1)}, 4.0,
-        reduce={"to_three": settling_time("y", band=0.6, target=3.6), "never": settling_time("y", band=0.1, target=9.0)},
+        {"gain.gain": (1.0, 0.1)},
+        4.0,
+        reduce={
+            "to_three": settling_time("y", band=0.6, target=3.6),
+            "never": settling_time("y", band=0.1, target=9.0),
+        },
         **INTERPRETED,
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(found["to_three"], [3.0, np.nan])  # y = t enters 3.6 ± 0.6 at 3 s; 0.1 t never does
     assert np.isnan(found["never"]).all()
     wide = diagram.sweep({"gain.gain": (1.0,)}, 4.0, reduce={"s": settling_time("y", band=9.0)}, **INTERPRETED)
@@ -260,9 +271,11 @@ def test_a_run_that_fails_is_data_with_its_samples_and_harms_no_other(workers):
 
 def test_a_value_that_a_parameter_refuses_and_a_reduction_that_fails_are_data_too():
     found = sampled_lag().sweep(
-        {"step.values": (1.0, 2.0)}, 0.1,
-        reduce={"odd": lambda run: 1 / 0 if run["y"][-1] > 0.6 else 1.0}, **INTERPRETED,
-    )  # fmt: skip
+        {"step.values": (1.0, 2.0)},
+        0.1,
+        reduce={"odd": lambda run: 1 / 0 if run["y"][-1] > 0.6 else 1.0},
+        **INTERPRETED,
+    )
     np.testing.assert_array_equal(found["odd"], [1.0, np.nan])
     (failure,) = found.failures
     assert failure.message.startswith("lag.odd, t = 0.1 s: the reduction 'odd' failed: ZeroDivisionError")
@@ -309,9 +322,12 @@ def _counted(name, calls):
 def test_the_data_set_of_a_grid_has_the_parameters_as_dimensions():
     diagram = sampled_lag()
     grid = diagram.sweep(
-        {"step.times": (0.0, 0.02), "step.values": (1.0, 2.0, 3.0)}, 0.05, signals="y",
-        reduce={"end": final("y"), "two": lambda run: run["y"][:2]}, **INTERPRETED,
-    )  # fmt: skip
+        {"step.times": (0.0, 0.02), "step.values": (1.0, 2.0, 3.0)},
+        0.05,
+        signals="y",
+        reduce={"end": final("y"), "two": lambda run: run["y"][:2]},
+        **INTERPRETED,
+    )
     data = grid.dataset
     first, second = grid.samples.names
     assert data["y"].dims == (first, second, "t")

@@ -49,12 +49,15 @@ def nothing(e):
         (lambda: margins(drive().linearize()), r"found a Linearization; .*Give model\.loop"),
         (lambda: Diagram("t", Tank()(STEP)), r"has no attribute 'flw'\. Did you mean 'flow'\? Correct"),
         (lambda: Diagram("t", Vessel()(STEP)), r"read it in an equation as u\.flow\. Correct"),
-        (lambda: Diagram("t", Gain(gain=1.0)(nothing(STEP))), r"nothing: its function returns no signal. End it with return"),
+        (
+            lambda: Diagram("t", Gain(gain=1.0)(nothing(STEP))),
+            r"nothing: its function returns no signal. End it with return",
+        ),
         (lambda: Diagram("t", Leak()(STEP)).trim(), r"derivative of the diagram's equations that is not finite"),
         (lambda: build(Leak, "leak.fmu"), r"found the class Leak; expected a block, such as Leak\(…\)"),
         (lambda: drive().simulate(0.1, dt=0.01), r"no argument 'dt'\. Known: atol, .*step"),
     ],
-)  # fmt: skip
+)
 def test_a_natural_mistake_is_told_with_what_to_write(ask, said):
     with pytest.raises(LoopwrightError, match=said):
         ask()

@@ -112,8 +112,12 @@ def test_an_fmu_whose_outputs_are_all_of_other_types_is_refused(file, tmp_path):
     ],
 )
 def test_a_unit_is_read_as_the_fmu_defines_it(name, base, expected, complaints):
-    unit = BaseUnit(**{k: float(v) if "." in v or k in ("factor", "offset") else int(v)
-                       for k, v in re.findall(r'(\w+)="([^"]+)"', base)})  # fmt: skip
+    unit = BaseUnit(
+        **{
+            k: float(v) if "." in v or k in ("factor", "offset") else int(v)
+            for k, v in re.findall(r'(\w+)="([^"]+)"', base)
+        }
+    )
     units = FmuUnits({name: UnitDefinition(name=name, baseUnit=unit)})
     found = units.find(name)
     assert found == expected

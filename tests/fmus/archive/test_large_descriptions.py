@@ -47,8 +47,9 @@ def description(count, outputs, fmi=2):
 
 
 @pytest.mark.parametrize(
-    ("fmi", "count"), [(2, 2_000), pytest.param(2, 100_000, marks=pytest.mark.slow), pytest.param(3, 100_000, marks=pytest.mark.slow)]
-)  # fmt: skip
+    ("fmi", "count"),
+    [(2, 2_000), pytest.param(2, 100_000, marks=pytest.mark.slow), pytest.param(3, 100_000, marks=pytest.mark.slow)],
+)
 def test_a_large_description_has_the_variables_that_fmpy_finds(tmp_path, fmi, count):
     path = tmp_path / "large.fmu"
     head = 'fmiVersion="2.0" guid="x"' if fmi == 2 else 'fmiVersion="3.0" instantiationToken="x"'

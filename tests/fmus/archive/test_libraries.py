@@ -68,13 +68,25 @@ def test_any_header_is_read_or_told(data, count):
         (b"\x7fELF", (), "it is cut off within its header, after 4 bytes"),
         (b"text", (), "it is no shared library: it starts with b'text'"),
         (b"\xcf\xfa\xed\xfe\x07\0\0\x01", ("x86_64-darwin",), ""),
-        (b"\xca\xfe\xba\xbe\0\0\0\1\x01\0\0\x0c\0\0\0\0\0\0\x10\0\0\0\x20\0" + bytes(4), ("aarch64-darwin",),
-         "it is cut off: it has 28 bytes; expected at least 12288"),
-        (b"MZ" + bytes(58) + b"\x40\0\0\0PE\0\0\x64\x86\1\0" + bytes(12) + b"\0\0\0\0" + bytes(16)
-         + struct.pack("<II", 512, 1024) + bytes(20), ("x86_64-windows",),
-         "it is cut off: it has 132 bytes; expected at least 1536"),
+        (
+            b"\xca\xfe\xba\xbe\0\0\0\1\x01\0\0\x0c\0\0\0\0\0\0\x10\0\0\0\x20\0" + bytes(4),
+            ("aarch64-darwin",),
+            "it is cut off: it has 28 bytes; expected at least 12288",
+        ),
+        (
+            b"MZ"
+            + bytes(58)
+            + b"\x40\0\0\0PE\0\0\x64\x86\1\0"
+            + bytes(12)
+            + b"\0\0\0\0"
+            + bytes(16)
+            + struct.pack("<II", 512, 1024)
+            + bytes(20),
+            ("x86_64-windows",),
+            "it is cut off: it has 132 bytes; expected at least 1536",
+        ),
     ],
-)  # fmt: skip
+)
 def test_headers_of_other_systems(data, platforms, damage):
     found = read_library(data)
     assert (found.platforms, found.damage) == (platforms, damage)

@@ -73,9 +73,14 @@ def test_outputs_follow_the_inputs_in_event_mode(instance):
 
 def test_event_mode_in_fmpy(ball_fmu):
     result = fmpy.simulate_fmu(
-        str(ball_fmu), fmi_type="CoSimulation", stop_time=2.2, output_interval=0.02, use_event_mode=True,
-        early_return_allowed=True, start_values={"integrator": 2},
-    )  # fmt: skip
+        str(ball_fmu),
+        fmi_type="CoSimulation",
+        stop_time=2.2,
+        output_interval=0.02,
+        use_event_mode=True,
+        early_return_allowed=True,
+        start_values={"integrator": 2},
+    )
     errors = [abs(height - ball(t)[0]) for t, height in zip(result["time"], result["height"], strict=True)]
     assert max(errors) < 1e-11
     assert len(errors) > 110

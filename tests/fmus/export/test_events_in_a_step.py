@@ -245,7 +245,11 @@ def test_a_tunable_parameter_acts_between_steps(ball_fmu, instance):
         (lambda: Variable("y", "output", "discrete"), DefinitionError, ["y is discrete, but neither input nor state"]),
         (lambda: Variable("tolerance"), DefinitionError, ["'tolerance' is reserved"]),
         (lambda: replace(bouncing_ball(), events=()), DefinitionError, ["found indicators and jump, but no events"]),
-        (lambda: bouncing_ball(events=(EventSpec("a"), EventSpec("b"))), DefinitionError, ["bouncing_ball.indicators", "column of 2"]),
+        (
+            lambda: bouncing_ball(events=(EventSpec("a"), EventSpec("b"))),
+            DefinitionError,
+            ["bouncing_ball.indicators", "column of 2"],
+        ),
         (lambda: replace(bouncing_ball(), jump=None), DefinitionError, ["bouncing_ball.jump", "(t, x, u, p, fired)"]),
         (
             lambda: replace(thermostat(), states=thermostat().states[::-1]),
@@ -253,18 +257,28 @@ def test_a_tunable_parameter_acts_between_steps(ball_fmu, instance):
             ["the states on, temperature", "the discrete ones (on) after all others"],
         ),
         (
-            lambda: replace(mass_spring_damper(), states=(*mass_spring_damper().states, Variable("d", "local", "discrete", unit="1", start=0, state=True))),
+            lambda: replace(
+                mass_spring_damper(),
+                states=(
+                    *mass_spring_damper().states,
+                    Variable("d", "local", "discrete", unit="1", start=0, state=True),
+                ),
+            ),
             DefinitionError,
             ["found discrete states, but no events"],
         ),
         (
-            lambda: replace(bouncing_ball(), events=(EventSpec("bounce"),), outputs=(Variable("bounce.indicator", "output", unit="m"),),
-                            output=bouncing_ball().indicators),
+            lambda: replace(
+                bouncing_ball(),
+                events=(EventSpec("bounce"),),
+                outputs=(Variable("bounce.indicator", "output", unit="m"),),
+                output=bouncing_ball().indicators,
+            ),
             DefinitionError,
             ["'bounce.indicator' names 2 variables"],
         ),
     ],
-)  # fmt: skip
+)
 def test_bad_models_are_refused(make, error, parts):
     with pytest.raises(error) as caught:
         make()

@@ -228,8 +228,13 @@ def test_shared_expressions_have_names_of_their_own():
 
 def test_numbers_are_in_full():
     assert [number(v) for v in (2.0, 0.1, 1e-6, 1 / 3, 1e300, -4)] == [
-        "2", "0.1", "1e-06", "0.3333333333333333", "1e+300", "-4",
-    ]  # fmt: skip
+        "2",
+        "0.1",
+        "1e-06",
+        "0.3333333333333333",
+        "1e+300",
+        "-4",
+    ]
 
 
 def test_an_open_bound_is_shown_as_one():

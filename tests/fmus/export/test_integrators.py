@@ -39,7 +39,10 @@ def errors_by_step(item, counts, horizon, reference, **start):
     return found
 
 
-@pytest.mark.parametrize(("integrator", "order", "counts"), [(RK4, 4, (8, 12, 16, 24, 32)), (DOPRI5, 5, (8, 12, 16, 24)), (RODAS, 4, (16, 24, 32, 48))])  # fmt: skip
+@pytest.mark.parametrize(
+    ("integrator", "order", "counts"),
+    [(RK4, 4, (8, 12, 16, 24, 32)), (DOPRI5, 5, (8, 12, 16, 24)), (RODAS, 4, (16, 24, 32, 48))],
+)
 def test_order_on_a_linear_model(instance, integrator, order, counts):
     item = instance(build_fmu(unbound(mass_spring_damper())))
     errors = errors_by_step(item, counts, 2.0, lambda x0: exact(2.0, x0, 5.0), integrator=integrator, force=5.0)
@@ -80,9 +83,13 @@ def test_a_stiff_model_against_radau(instance, tolerance, end):
     item.initialize(tolerance=tolerance)
     times = np.arange(0.0, end + 50.0, 100.0)
     reference = truth(
-        lambda t, x: [x[1], 1000.0 * (1.0 - x[0] ** 2) * x[1] - x[0]], [2.0, 0.0], times, "Radau", 1e-10,
+        lambda t, x: [x[1], 1000.0 * (1.0 - x[0] ** 2) * x[1] - x[0]],
+        [2.0, 0.0],
+        times,
+        "Radau",
+        1e-10,
         jac=lambda t, x: [[0.0, 1.0], [-2000.0 * x[0] * x[1] - 1.0, 1000.0 * (1.0 - x[0] ** 2)]],
-    )  # fmt: skip
+    )
     for t, (x, v) in zip(times[:-1], reference[1:], strict=True):
         item.step(t, 100.0)
         scale = 1.0 + 1000.0 * abs(1.0 / (1.0 - x**2))  # an error in time moves x by its rate

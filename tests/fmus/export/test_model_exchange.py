@@ -411,9 +411,13 @@ def test_fmpy_agrees_with_scipy(build, interface):
         return [-x[0] * x[1] + np.sin(3 * t) + 0.3, x[0] - x[1] ** 3 - 0.5 * x[1] * np.cos(t)]
 
     result = fmpy.simulate_fmu(
-        str(build(driven(integrator="dopri5"))), fmi_type=interface, stop_time=5.0, output_interval=0.1,
-        relative_tolerance=1e-10, start_values={"u": 0.3},
-    )  # fmt: skip
+        str(build(driven(integrator="dopri5"))),
+        fmi_type=interface,
+        stop_time=5.0,
+        output_interval=0.1,
+        relative_tolerance=1e-10,
+        start_values={"u": 0.3},
+    )
     truth = solve_ivp(rhs, (0.0, 5.0), [1.0, 0.5], "DOP853", result["time"], rtol=1e-12, atol=1e-13).y
     bound = {"ModelExchange": 1e-7, "CoSimulation": 1e-9}[interface]  # CVode's error is some hundred tolerances
     assert np.abs(np.array([result["x"], result["y"]]) - truth).max() < bound
@@ -422,22 +426,34 @@ def test_fmpy_agrees_with_scipy(build, interface):
 @pytest.mark.slow
 def test_a_stiff_model_under_cvode(build):
     result = fmpy.simulate_fmu(
-        str(build(van_der_pol())), fmi_type="ModelExchange", stop_time=200.0, output_interval=10.0,
+        str(build(van_der_pol())),
+        fmi_type="ModelExchange",
+        stop_time=200.0,
+        output_interval=10.0,
         relative_tolerance=1e-8,
-    )  # fmt: skip
+    )
     truth = solve_ivp(
-        lambda t, x: [x[1], 1000.0 * (1.0 - x[0] ** 2) * x[1] - x[0]], (0.0, 200.0), [2.0, 0.0], "Radau",
-        result["time"], rtol=1e-10, atol=1e-12,
-    ).y  # fmt: skip
+        lambda t, x: [x[1], 1000.0 * (1.0 - x[0] ** 2) * x[1] - x[0]],
+        (0.0, 200.0),
+        [2.0, 0.0],
+        "Radau",
+        result["time"],
+        rtol=1e-10,
+        atol=1e-12,
+    ).y
     assert np.abs(result["x"] - truth[0]).max() < 300.0 * 1e-8
 
 
 def test_bounces_under_cvode(build):
     """The event comes a hysteresis of 1e-10 m late: 1e-10 / 4 s at the first bounce, 1e-10 / 0.7 s at the sixth."""
     result = fmpy.simulate_fmu(
-        str(build(bouncing_ball())), fmi_type="ModelExchange", stop_time=2.3, output_interval=0.01,
-        relative_tolerance=1e-10, record_events=True,
-    )  # fmt: skip
+        str(build(bouncing_ball())),
+        fmi_type="ModelExchange",
+        stop_time=2.3,
+        output_interval=0.01,
+        relative_tolerance=1e-10,
+        record_events=True,
+    )
     times, heights, velocities = (result[name] for name in ("time", "height", "velocity"))
     up = np.flatnonzero((velocities[1:] - velocities[:-1] > 0.1) & (velocities[:-1] < 0.0)) + 1
     found = list(zip(times[up], velocities[up], strict=True))
@@ -452,9 +468,13 @@ def test_bounces_under_cvode(build):
 
 def test_a_hysteresis_under_cvode(build):
     result = fmpy.simulate_fmu(
-        str(build(thermostat())), fmi_type="ModelExchange", stop_time=20.0, output_interval=0.5,
-        relative_tolerance=1e-10, record_events=False,
-    )  # fmt: skip
+        str(build(thermostat())),
+        fmi_type="ModelExchange",
+        stop_time=20.0,
+        output_interval=0.5,
+        relative_tolerance=1e-10,
+        record_events=False,
+    )
     assert len(result) == 41
     for t, temperature, on, _ in result:
         assert (temperature, on) == (pytest.approx(heating(t)[0], abs=5e-7), heating(t)[1])

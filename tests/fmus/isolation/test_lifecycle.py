@@ -82,9 +82,13 @@ def check_flat(cycle, temporary, count, warm=3, growth=8.0):
 @ON_LINUX
 @pytest.mark.parametrize(
     ("isolate", "count"),
-    [(False, 5), (True, 5), pytest.param(False, 2000, marks=pytest.mark.slow),
-     pytest.param(True, 2000, marks=pytest.mark.slow)],
-)  # fmt: skip
+    [
+        (False, 5),
+        (True, 5),
+        pytest.param(False, 2000, marks=pytest.mark.slow),
+        pytest.param(True, 2000, marks=pytest.mark.slow),
+    ],
+)
 def test_cycles_of_one_fmu_leave_nothing_behind(folder, temporary, isolate, count):
     plant = Fmu(zoo_fmu(folder, 3), name="plant", isolate=isolate)
 

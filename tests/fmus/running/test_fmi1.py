@@ -152,16 +152,13 @@ def test_its_failures_are_told(file):
         Fmu(file, start={"gain": 10.0})
 
 
-NEGATED = (
-    MODEL.replace('name="x" valueReference="1"', 'name="x" valueReference="1" alias="noAlias"')
-    .replace(
-        "</ModelVariables>",
-        """<ScalarVariable name="fall" valueReference="1" causality="output" alias="negatedAlias"><Real/></ScalarVariable>
+NEGATED = MODEL.replace('name="x" valueReference="1"', 'name="x" valueReference="1" alias="noAlias"').replace(
+    "</ModelVariables>",
+    """<ScalarVariable name="fall" valueReference="1" causality="output" alias="negatedAlias"><Real/></ScalarVariable>
 <ScalarVariable name="pull" valueReference="2" causality="input" alias="negatedAlias"><Real start="0"/></ScalarVariable>
 <ScalarVariable name="loss" valueReference="3" variability="parameter" alias="negatedAlias"><Real start="-1"/></ScalarVariable>
 <ScalarVariable name="again" valueReference="1" causality="output" alias="alias"><Real/></ScalarVariable></ModelVariables>""",
-    )
-)  # fmt: skip
+)
 
 
 def test_negated_aliases_are_left_out_and_told(cache, tmp_path):

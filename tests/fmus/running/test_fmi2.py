@@ -69,9 +69,14 @@ def test_fmpy_steps_to_the_same_numbers(file):
     names = ["position[1]", "position[2]", "velocity[1]", "acceleration[2]"]
     start = {"motor_force[1]": force[0], "motor_force[2]": force[1]}
     theirs = fmpy.simulate_fmu(
-        str(file), stop_time=n * T, output_interval=T, step_size=T, start_values=start, output=names,
+        str(file),
+        stop_time=n * T,
+        output_interval=T,
+        step_size=T,
+        start_values=start,
+        output=names,
         set_stop_time=False,
-    )  # fmt: skip
+    )
     mine = [ours["position"][:, 0], ours["position"][:, 1], ours["velocity"][:, 0], ours["acceleration"][:, 1]]
     for name, values in zip(names, mine, strict=True):
         assert np.abs(values[1:] - theirs[name][1:]).max() < 1e-12
@@ -325,14 +330,24 @@ def test_an_fmu_of_which_a_process_can_have_one_instance_is_refused_a_second(msd
     ("text", "arguments", "expected"),
     [
         (b"plain", [], "plain"),
-        (b"50 %% of %s at t=%g (%d, 0x%lx)", [ctypes.c_char_p(b"this"), ctypes.c_double(0.25), ctypes.c_int(-3),
-                                             ctypes.c_long(255)], "50 % of this at t=0.25 (-3, 0xff)"),
-        (b"%-6s|%5.2f|%c|%u", [ctypes.c_char_p(b"ab"), ctypes.c_double(2.0), ctypes.c_int(65), ctypes.c_uint(7)],
-         "ab    | 2.00|A|7"),
+        (
+            b"50 %% of %s at t=%g (%d, 0x%lx)",
+            [ctypes.c_char_p(b"this"), ctypes.c_double(0.25), ctypes.c_int(-3), ctypes.c_long(255)],
+            "50 % of this at t=0.25 (-3, 0xff)",
+        ),
+        (
+            b"%-6s|%5.2f|%c|%u",
+            [ctypes.c_char_p(b"ab"), ctypes.c_double(2.0), ctypes.c_int(65), ctypes.c_uint(7)],
+            "ab    | 2.00|A|7",
+        ),
         (b"%s%n", [ctypes.c_void_p(8)], "?%n"),
-        (b"%999999999d|%*d|%.3s", [ctypes.c_int(1), ctypes.c_int(4), ctypes.c_int(2), ctypes.c_char_p(b"abcdef")], "1".rjust(200) + "|   2|abc"),
+        (
+            b"%999999999d|%*d|%.3s",
+            [ctypes.c_int(1), ctypes.c_int(4), ctypes.c_int(2), ctypes.c_char_p(b"abcdef")],
+            "1".rjust(200) + "|   2|abc",
+        ),
     ],
-)  # fmt: skip
+)
 def test_printf_formats_of_messages_are_filled_in(text, arguments, expected):
     if platform.system() != "Linux":
         pytest.skip("arguments are read on Linux only")

@@ -60,10 +60,13 @@ def test_a_run_in_model_exchange_is_the_closed_form(file, isolate, rest):
 @pytest.mark.parametrize(
     "start",
     [
-        {"level": (2.0, -3.0)}, {"low": 2.0, "high": -3.0}, {"level[1]": 2.0, "level[2]": -3.0},
-        {"level": (7.0, -3.0), "low": 2.0}, {"low": 2.0, "level[2]": -3.0},
+        {"level": (2.0, -3.0)},
+        {"low": 2.0, "high": -3.0},
+        {"level[1]": 2.0, "level[2]": -3.0},
+        {"level": (7.0, -3.0), "low": 2.0},
+        {"low": 2.0, "level[2]": -3.0},
     ],
-)  # fmt: skip
+)
 def test_start_values_by_all_names(file, start):
     run = driven(file, start=start).simulate(0.5, step=0.1, progress=False)
     np.testing.assert_allclose(run["plant.level"], levels(run.t, FLOW, (2.0, -3.0)), rtol=1e-13, atol=1e-13)
@@ -173,14 +176,21 @@ def test_what_is_no_array_is_said_by_name(file, rename, text):
 @pytest.mark.parametrize(
     ("row", "text"),
     [
-        (('causality="output" initial="exact"', '<Real unit="m3/s" start="0"/>'), "the unit m3 and 'high' with the unit m3/s"),
+        (
+            ('causality="output" initial="exact"', '<Real unit="m3/s" start="0"/>'),
+            "the unit m3 and 'high' with the unit m3/s",
+        ),
         (('causality="output" initial="exact"', '<Real start="0"/>'), r"the unit m3 and 'high' with the unit \(none\)"),
-        (('causality="output" variability="discrete" initial="exact"', '<Integer start="0"/>'),
-         "the type Float64 and 'high' with the type Int32"),
-        (('causality="output" variability="discrete" initial="exact"', '<Real unit="m3" start="0"/>'),
-         "the variability continuous and 'high' with the variability discrete"),
+        (
+            ('causality="output" variability="discrete" initial="exact"', '<Integer start="0"/>'),
+            "the type Float64 and 'high' with the type Int32",
+        ),
+        (
+            ('causality="output" variability="discrete" initial="exact"', '<Real unit="m3" start="0"/>'),
+            "the variability continuous and 'high' with the variability discrete",
+        ),
     ],
-)  # fmt: skip
+)
 def test_elements_that_are_not_alike_are_said_by_name(cache, tmp_path, row, text):
     with pytest.raises(ParameterError, match=f"fmu.rename: found 'low' with {text}"):
         Fmu(scalar_ports(tmp_path, high=row), rename={"low": "x[1]", "high": "x[2]"})
@@ -256,9 +266,12 @@ def test_replace_offers_the_names_that_are_unique(gantries, cache, tmp_path):
     with pytest.raises(UnknownNameError) as e:
         diagram.replace(plant=Fmu(other))
     rename = {
-        "external.1": "external_force[1]", "external.2": "external_force[2]", "motor_y": "motor_force[1]",
-        "motor_z": "motor_force[2]", **found,
-    }  # fmt: skip
+        "external.1": "external_force[1]",
+        "external.2": "external_force[2]",
+        "motor_y": "motor_force[1]",
+        "motor_z": "motor_force[2]",
+        **found,
+    }
     assert str(e.value).endswith(f"Perhaps only names differ: Fmu({str(other)!r}, rename={rename!r}).")
     run = diagram.replace(plant=Fmu(other, rename=rename)).simulate(0.01, progress=False)
     assert np.isfinite(run["plant.position"]).all()

@@ -112,11 +112,18 @@ int NAME(EnterEventMode)"""
 def test_directional_derivatives_are_those_of_the_point(cache, tmp_path, kind):
     """They are computed from values that the FMU keeps, and agree with the differences that they are held against."""
     file = lazy_fmu(
-        tmp_path, 3, kind, "dx[0] = u[0]; y[1] = x[0] + u[0]; y[0] = y[1] * y[1];",
+        tmp_path,
+        3,
+        kind,
+        "dx[0] = u[0]; y[1] = x[0] + u[0]; y[0] = y[1] * y[1];",
         source=[("int NAME(EnterEventMode)", _DIRECTIONAL)],
-        description=[('<ModelExchange modelIdentifier="small"/>',
-                      '<ModelExchange modelIdentifier="small" providesDirectionalDerivatives="true"/>')],
-    )  # fmt: skip
+        description=[
+            (
+                '<ModelExchange modelIdentifier="small"/>',
+                '<ModelExchange modelIdentifier="small" providesDirectionalDerivatives="true"/>',
+            )
+        ],
+    )
     state, inputs = {"x1": 0.7}, {"u1": 0.4}
     made = Fmu(file).linear_model(0.0, state=state, inputs=inputs, interface="model_exchange")
     np.testing.assert_allclose(np.block([[made.A, made.B], [made.C, made.D]]), [[0, 1], [2.2, 2.2]], rtol=1e-14)
@@ -144,11 +151,17 @@ def test_an_indicator_of_a_value_that_is_kept_crosses_in_time(cache, tmp_path, k
     """The getter of the indicators computes the derivatives at most, as those of the tools with such getters do."""
     more = "settle(c, false);" if kind != "derivatives" else ""
     file = lazy_fmu(
-        tmp_path, 3, kind, "dx[0] = 1.0; y[0] = x[0] * x[0];", inputs=0,
+        tmp_path,
+        3,
+        kind,
+        "dx[0] = 1.0; y[0] = x[0] * x[0];",
+        inputs=0,
         source=[("int NAME(EnterEventMode)", _INDICATOR.replace("INDICATOR", more))],
-        description=[("</ModelVariables>", '<Float64 name="z" valueReference="39"/></ModelVariables>'),
-                     ("</ModelStructure>", '<EventIndicator valueReference="39"/></ModelStructure>')],
-    )  # fmt: skip
+        description=[
+            ("</ModelVariables>", '<Float64 name="z" valueReference="39"/></ModelVariables>'),
+            ("</ModelStructure>", '<EventIndicator valueReference="39"/></ModelStructure>'),
+        ],
+    )
     plant = Fmu(file, interface="model_exchange", name="plant")
     run = Diagram("alone", plant()).simulate(1.0, step=0.05, rtol=1e-9, compile=in_c, progress=False)
     assert run.tier == ("compiled" if in_c else "interpreted"), run.messages

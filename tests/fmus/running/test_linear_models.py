@@ -353,10 +353,15 @@ def test_a_stiff_step_by_an_adaptive_solver_is_within_its_own_uncertainty(cache)
 def test_a_start_on_a_bound_is_moved_to_one_side(cache):
     t, x, u, p = (ca.SX.sym(c, n) for c, n in (("t", 1), ("x", 1), ("u", 1), ("p", 0)))
     spec = ModelSpec(
-        "tank", "", (Variable("q", "input", minimum=0.0, maximum=1.0),), (), (),
+        "tank",
+        "",
+        (Variable("q", "input", minimum=0.0, maximum=1.0),),
+        (),
+        (),
         (Variable("level", "output", start=1.0, state=True, minimum=0.0),),
-        ca.Function("f", [t, x, u, p], [u**2 - ca.sqrt(x + 1.0)]), ca.Function("g", [t, x, u, p], [ca.SX(0, 1)]),
-    )  # fmt: skip
+        ca.Function("f", [t, x, u, p], [u**2 - ca.sqrt(x + 1.0)]),
+        ca.Function("g", [t, x, u, p], [ca.SX(0, 1)]),
+    )
     plant = Fmu(build_fmu(spec))
     for q in (0.0, 1.0):
         for exact in (True, False):

@@ -203,19 +203,25 @@ print("done", 1 / 3 + 1 / 7)
 @pytest.mark.skipif(sys.platform != "linux", reason="modes are kept on Linux alone")
 @pytest.mark.parametrize(
     ("compiled", "traps"),
-    [(False, "FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW"), (True, "FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW"),
-     (False, "FE_ALL_EXCEPT"), (True, "FE_ALL_EXCEPT")],
+    [
+        (False, "FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW"),
+        (True, "FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW"),
+        (False, "FE_ALL_EXCEPT"),
+        (True, "FE_ALL_EXCEPT"),
+    ],
     ids=["interpreted", "compiled", "all traps", "all traps, compiled"],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
 @pytest.mark.parametrize("fmi", [2, 3])
 @pytest.mark.drawn
 def test_nothing_is_computed_with_the_traps_of_an_fmu(cache, tmp_path, fmi, traps, interface, compiled):
     """A process of its own, as a trap that is set off ends it: in FMI 2.0 a step's end is compared with no number."""
-    ends = [("return 0; }\n#if FMI == 3\nint fmi3DoStep", "trap(); return 0; }\n#if FMI == 3\nint fmi3DoStep"),
-            ("c->step++; c->t = t + 20 * h; return 0; }", "c->step++; c->t = t + 20 * h; trap(); return 0; }"),
-            ("for (size_t i = 0; i < n; i++) dx[i] = d[i];", "for (size_t i = 0; i < n; i++) dx[i] = d[i]; trap();"),
-            ("int NAME(EnterEventMode)", TRAPPED.replace("TRAPS", traps) + "int NAME(EnterEventMode)")]  # fmt: skip
+    ends = [
+        ("return 0; }\n#if FMI == 3\nint fmi3DoStep", "trap(); return 0; }\n#if FMI == 3\nint fmi3DoStep"),
+        ("c->step++; c->t = t + 20 * h; return 0; }", "c->step++; c->t = t + 20 * h; trap(); return 0; }"),
+        ("for (size_t i = 0; i < n; i++) dx[i] = d[i];", "for (size_t i = 0; i < n; i++) dx[i] = d[i]; trap();"),
+        ("int NAME(EnterEventMode)", TRAPPED.replace("TRAPS", traps) + "int NAME(EnterEventMode)"),
+    ]
     file = closed_form_fmu(tmp_path, fmi, "dx[0] = u[0] - x[0]; y[0] = x[0];", changes=ends)
     arguments = [sys.executable, "-c", _RUN, str(file), interface, str(compiled)]
     done = subprocess.run(arguments, capture_output=True, text=True, timeout=300, check=False)

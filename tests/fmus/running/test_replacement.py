@@ -51,8 +51,12 @@ def test_other_names_are_said_with_the_rename_that_helps(diagram, file, tmp_path
         diagram.replace(plant=Fmu(other, name="p"))
     text = str(e.value)
     assert text.startswith(f"plant: FMU {other.name} does not fit the wires of FMU gantry.fmu:\n")
-    for line in ("input motor_force [2] in N is missing", "input F_motor [2] in N is extra, and nothing is wired to it",
-                 "output position [2] in m is missing", "output pos [2] in m is extra"):  # fmt: skip
+    for line in (
+        "input motor_force [2] in N is missing",
+        "input F_motor [2] in N is extra, and nothing is wired to it",
+        "output position [2] in m is missing",
+        "output pos [2] in m is extra",
+    ):
         assert f"- {line}\n" in text
     rename = {"F_motor": "motor_force", "pos": "position"}
     assert text.endswith(f"Perhaps only names differ: Fmu({str(other)!r}, rename={rename!r}).")
@@ -88,8 +92,14 @@ def test_another_shape_is_said(diagram, file, tmp_path):
 
 
 def test_an_extra_input_needs_a_value(diagram, file, tmp_path):
-    other = edited(file, tmp_path, (r'(name="friction_width".*?)causality="parameter" variability="\w+"(?: initial="exact")?',
-                                    r'\1causality="input" variability="continuous"'))  # fmt: skip
+    other = edited(
+        file,
+        tmp_path,
+        (
+            r'(name="friction_width".*?)causality="parameter" variability="\w+"(?: initial="exact")?',
+            r'\1causality="input" variability="continuous"',
+        ),
+    )
     with pytest.raises(UnwiredInputError, match=r"- input friction_width.* is extra, and nothing is wired to it"):
         diagram.replace(plant=Fmu(other))
     diagram.replace(plant=Fmu(other, start={"friction_width": 0.01}))

@@ -499,9 +499,15 @@ def test_added_times_cost_no_requests_of_their_own(cache, tmp_path, monkeypatch,
     plant = Fmu(small_fmu(tmp_path, "fmi2", *TOLD), name="plant", isolate=isolate, stepping=StepOptions(time="added"))
     diagram = Diagram("d", plant(Gain(gain=1.0, name="k")(Constant(value=1.0))))
     found = diagram.sweep(
-        None, 2.0, samples=[{"k.gain": 1.0}, {"k.gain": 2.0}], step=0.1, compile=compiled, workers=1, progress=False,
+        None,
+        2.0,
+        samples=[{"k.gain": 1.0}, {"k.gain": 2.0}],
+        step=0.1,
+        compile=compiled,
+        workers=1,
+        progress=False,
         signals=["plant.told"],
-    )  # fmt: skip
+    )
     want, t = [0.0], 0.0
     for _ in range(20):
         want.append(t)

@@ -12,11 +12,22 @@ from loopwright.fmus import Fmu
 from support.typed_fmus import description2, description3, typed_fmu
 
 EXTREMES = {
-    "Float64": (-1e300, 0.1), "Float32": (-1.5, 0.1), "Int8": (-128, 127), "UInt8": (0, 200), "Int16": (-32768, 32767),
-    "UInt16": (0, 65535), "Int32": (-(2**31), 2**31 - 1), "UInt32": (0, 2**32 - 1), "Int64": (-(2**53), 2**53),
-    "UInt64": (0, 2**53), "Boolean": (0, 1), "Enumeration": (1, 3), "vector": (-7, 9),
-    "Real": (-1e300, 0.1), "Integer": (-(2**31), 2**31 - 1),
-}  # fmt: skip
+    "Float64": (-1e300, 0.1),
+    "Float32": (-1.5, 0.1),
+    "Int8": (-128, 127),
+    "UInt8": (0, 200),
+    "Int16": (-32768, 32767),
+    "UInt16": (0, 65535),
+    "Int32": (-(2**31), 2**31 - 1),
+    "UInt32": (0, 2**32 - 1),
+    "Int64": (-(2**53), 2**53),
+    "UInt64": (0, 2**53),
+    "Boolean": (0, 1),
+    "Enumeration": (1, 3),
+    "vector": (-7, 9),
+    "Real": (-1e300, 0.1),
+    "Integer": (-(2**31), 2**31 - 1),
+}
 WRONG = [
     ("u_Int8", 0.5, "found 0.5; expected an integer, as it is of type Int8"),
     ("u_Int8", 128.0, "found 128; expected -128 to 127, as it is of type Int8"),
@@ -136,8 +147,9 @@ def test_a_wire_refuses_what_is_out_of_the_stated_range(folder, ports, port, mos
 
 def test_an_integer_that_no_signal_holds_is_an_error_with_its_port(folder):
     huge = '<Int64 name="huge" valueReference="91" causality="output" variability="discrete"/>'
-    text = description3(huge).replace('<Output valueReference="90"/>', '<Output valueReference="90"/>'
-                                      '<Output valueReference="91"/>')  # fmt: skip
+    text = description3(huge).replace(
+        '<Output valueReference="90"/>', '<Output valueReference="90"/><Output valueReference="91"/>'
+    )
     plant = Fmu(typed_fmu(folder, 3, text), name="plant")
     with pytest.raises(
         FmuRuntimeError, match=r"^plant\.huge, t = 0 s: found 9007199254740993; expected at most 2\*\*53"
@@ -198,8 +210,10 @@ def test_start_values_of_every_type_arrive(file, fmi):
     assert run["plant.length"].tolist() == [len("a longer text")] * 2
 
 
-FORGETS = ("fmi2EnterInitializationMode() { return 0; }",
-           "fmi2EnterInitializationMode(void *p) { ((instance *)p)->vReal[30] = 2.5; return 0; }")  # fmt: skip
+FORGETS = (
+    "fmi2EnterInitializationMode() { return 0; }",
+    "fmi2EnterInitializationMode(void *p) { ((instance *)p)->vReal[30] = 2.5; return 0; }",
+)
 IGNORES = ("if (!c->running) follow(c);", "c->vReal[30] = 2.5; if (!c->running) follow(c);")
 
 

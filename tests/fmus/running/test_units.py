@@ -9,11 +9,20 @@ from loopwright.fmus import Fmu, mass_spring_damper
 from support.typed_fmus import typed_fmu
 
 UNITS = {
-    "K": 'K="1"', "degF": 'K="1" factor="0.5555555555555556" offset="255.37222222222223"', "N": 'kg="1" m="1" s="-2"',
-    "lbf": 'kg="1" m="1" s="-2" factor="4.4482216152605"', "degC": 'K="1" offset="273.15"', "rad": 'rad="1"',
-}  # fmt: skip
-PORTS = [("T", "K", ""), ("F", "degF", ""), ("rise", "degC", ' relativeQuantity="true"'), ("force", "lbf", ""),
-         ("angle", "rad", "")]  # fmt: skip
+    "K": 'K="1"',
+    "degF": 'K="1" factor="0.5555555555555556" offset="255.37222222222223"',
+    "N": 'kg="1" m="1" s="-2"',
+    "lbf": 'kg="1" m="1" s="-2" factor="4.4482216152605"',
+    "degC": 'K="1" offset="273.15"',
+    "rad": 'rad="1"',
+}
+PORTS = [
+    ("T", "K", ""),
+    ("F", "degF", ""),
+    ("rise", "degC", ' relativeQuantity="true"'),
+    ("force", "lbf", ""),
+    ("angle", "rad", ""),
+]
 """Each input u_<name>, and the output y_<name> that is equal to it after a step."""
 
 

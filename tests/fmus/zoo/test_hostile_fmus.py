@@ -42,9 +42,13 @@ class Host:
         for place in (self.work, self.temporary):
             place.mkdir()
         self.process = subprocess.Popen(
-            [sys.executable, zoo_host.__file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=self.work,
+            [sys.executable, zoo_host.__file__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=self.work,
             env=os.environ | {"TMPDIR": str(self.temporary)},
-        )  # fmt: skip
+        )
 
     def run(self, file, *, read=False, **options):
         """Run an FMU with options of its block; ``read`` wires a block to its output."""
@@ -163,9 +167,14 @@ def test_a_fault_in_a_step_ends_the_run_and_nothing_else(host, place, fmi, fault
 
 
 BEFORE = {
-    "load": "loading its library", "version": "GetVersion", "instantiate": "Instantiate", "set": "SetFloat64",
-    "enter": "EnterInitializationMode", "exit": "ExitInitializationMode", "get": "GetFloat64",
-}  # fmt: skip
+    "load": "loading its library",
+    "version": "GetVersion",
+    "instantiate": "Instantiate",
+    "set": "SetFloat64",
+    "enter": "EnterInitializationMode",
+    "exit": "ExitInitializationMode",
+    "get": "GetFloat64",
+}
 AFTER = {"terminate": "Terminate", "free": "FreeInstance", "unload": "unloading"}
 
 
@@ -211,10 +220,25 @@ def test_output_without_end_is_told_as_such(host, place):
 # --- faults that stay in the FMU's process ---------------------------------------------------------------------------
 
 CONTAINED = [
-    quick("chdir"), slow("rounding"), slow("traps"), slow("sigmask"), slow("sigint"), slow("umask"), slow("environment"),
-    slow("limits"), slow("file"), slow("close_stdout"), slow("close_all"), quick("fork"), slow("fork_exit"),
-    slow("thread"), slow("thread_on"), slow("leak"), slow("handles"), slow("slow"),
-]  # fmt: skip
+    quick("chdir"),
+    slow("rounding"),
+    slow("traps"),
+    slow("sigmask"),
+    slow("sigint"),
+    slow("umask"),
+    slow("environment"),
+    slow("limits"),
+    slow("file"),
+    slow("close_stdout"),
+    slow("close_all"),
+    quick("fork"),
+    slow("fork_exit"),
+    slow("thread"),
+    slow("thread_on"),
+    slow("leak"),
+    slow("handles"),
+    slow("slow"),
+]
 
 
 @pytest.mark.parametrize("fmi", [3, pytest.param(2, marks=pytest.mark.slow)])
@@ -254,9 +278,12 @@ def test_messages_are_kept_within_bounds_and_can_be_printed(host, place, fmi, fa
 # --- wrong returns ---------------------------------------------------------------------------------------------------
 
 RETURNS = [
-    quick("error", "fmi{}Error", "this is an error"), slow("fatal", "fmi{}Fatal", "this is fatal"),
-    slow("discard", "fmi{}Discard", "no solution here"), slow("status17", "status 17", "zoo"), slow("minus", "status -1", "zoo"),
-]  # fmt: skip
+    quick("error", "fmi{}Error", "this is an error"),
+    slow("fatal", "fmi{}Fatal", "this is fatal"),
+    slow("discard", "fmi{}Discard", "no solution here"),
+    slow("status17", "status 17", "zoo"),
+    slow("minus", "status -1", "zoo"),
+]
 
 
 @pytest.mark.parametrize("fmi", [3, pytest.param(2, marks=pytest.mark.slow)])
@@ -287,8 +314,12 @@ def test_an_initialization_that_fails_says_so(host, place, fmi, where, fault):
 @pytest.mark.parametrize("fmi", [3, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("fault", "word"),
-    [slow("null", "instantiate"), quick("licence", "Licence checkout failed: no seat is free"), slow("error", "this is an error")],
-)  # fmt: skip
+    [
+        slow("null", "instantiate"),
+        quick("licence", "Licence checkout failed: no seat is free"),
+        slow("error", "this is an error"),
+    ],
+)
 def test_an_instance_that_can_t_be_had_says_so(host, place, fmi, fault, word):
     answer = host.run(zoo_fmu(place, fmi, f"instantiate {fault}"))
     fail(answer, "FmuFileError", 0, word, "loopwright doctor")
@@ -305,9 +336,15 @@ def test_an_output_that_is_no_number_and_is_read_names_the_port(host, place, fmi
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("fmi", "flag", "words"),
-    [(2, "terminate", "terminateSimulation"), (3, "terminate", "terminateSimulation"), (3, "early", "earlyReturn"),
-     (3, "beyond", "lastSuccessfulTime"), (3, "negative", "lastSuccessfulTime"), (3, "nan", "lastSuccessfulTime")],
-)  # fmt: skip
+    [
+        (2, "terminate", "terminateSimulation"),
+        (3, "terminate", "terminateSimulation"),
+        (3, "early", "earlyReturn"),
+        (3, "beyond", "lastSuccessfulTime"),
+        (3, "negative", "lastSuccessfulTime"),
+        (3, "nan", "lastSuccessfulTime"),
+    ],
+)
 def test_a_step_that_does_not_end_where_it_should_is_told(host, place, fmi, flag, words):
     answer = host.run(zoo_fmu(place, fmi, f"flags {flag} {T}"))
     if flag in ("negative", "nan"):  # told, and no error: FMUs leave it as it is
@@ -367,7 +404,9 @@ def test_a_library_that_is_cut_off_is_refused(host, place, fmi, keep):
 @pytest.mark.slow
 @pytest.mark.parametrize("fmi", [2, 3])
 @pytest.mark.parametrize("where", ["derivative", "states", "time", "indicators"])
-@pytest.mark.parametrize(("fault", "kind"), [("segfault", "FmuProcessError"), ("hang", "FmuProcessError"), ("error", "FmuRuntimeError")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("fault", "kind"), [("segfault", "FmuProcessError"), ("hang", "FmuProcessError"), ("error", "FmuRuntimeError")]
+)
 def test_a_fault_in_an_evaluation_ends_the_run_and_nothing_else(host, place, fmi, where, fault, kind):
     answer = host.run(zoo_fmu(place, fmi, f"{where} {fault} {T}"), isolate=limits(fault), interface="model_exchange")
     fail(answer, kind, len(answer["t"]))

@@ -16,13 +16,17 @@ def large(folder, fmi, n_locals, n_outputs):
     local, output = (
         ('<Float64 name="{}" valueReference="{}"/>', '<Float64 name="{}" valueReference="{}" causality="output"/>')
         if fmi == 3
-        else ('<ScalarVariable name="{}" valueReference="{}"><Real/></ScalarVariable>',
-              '<ScalarVariable name="{}" valueReference="{}" causality="output"><Real/></ScalarVariable>')
-    )  # fmt: skip
+        else (
+            '<ScalarVariable name="{}" valueReference="{}"><Real/></ScalarVariable>',
+            '<ScalarVariable name="{}" valueReference="{}" causality="output"><Real/></ScalarVariable>',
+        )
+    )
     rows = [local.format(f"part.b{k}.c", 100 + k) for k in range(n_locals)]
     rows += [output.format(f"o{k}", 10**6 + k) for k in range(n_outputs)]
-    entries = [f'<Output valueReference="{10**6 + k}"/>' if fmi == 3 else f'<Unknown index="{5 + n_locals + k}"/>'
-               for k in range(n_outputs)]  # fmt: skip
+    entries = [
+        f'<Output valueReference="{10**6 + k}"/>' if fmi == 3 else f'<Unknown index="{5 + n_locals + k}"/>'
+        for k in range(n_outputs)
+    ]
     first = '<Output valueReference="2"/>' if fmi == 3 else '<Outputs><Unknown index="2"/>'
     small, path = zoo_fmu(folder, fmi), folder / f"large{fmi}.fmu"
     with zipfile.ZipFile(small) as old, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as new:
