@@ -190,6 +190,11 @@ class Block(Value, Wireable):
         return type(self).__name__
 
     @property
+    def absent_states(self) -> Mapping[str, str]:
+        """Reason, and a next step, for each state that other parameters give the block, and its own leave out."""
+        return {}
+
+    @property
     def starts_from_inputs(self) -> bool:
         """Whether the initial state is computed from the inputs at the start, by ``initial``."""
         return hasattr(self, "initial")

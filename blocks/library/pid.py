@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -25,6 +25,9 @@ class PID(Block):
     - back-calculation, a = (u − v) / T_t. With ``tracking``, a = (actual − v) / T_t: the input ``actual`` is the true
       control signal, of the actuator or of another controller that is in charge;
     - or clamping: İ = 0 while v is beyond a limit and ki (r − y) drives it further.
+
+    With ki = 0, a P or PD controller, there is no state ``integral``: it would stay 0. It is kept where something else
+    moves it or sets it: back-calculation with a ``tracking_time``, or ``initial_output``.
 
     The integral gain is under the integral, so a change of it makes no bump. In a sampled subsystem P, D and the limits
     are those of the tick, and I[k + 1] = I[k] + T ki (r − y) + (1 − α)(u − v). The subsystem's method gives the filter
@@ -71,7 +74,7 @@ class PID(Block):
     actual = Input(description="true control signal, in the unit of u; with tracking only", tracks="u")
     u = Output(description="control signal")
     excess = Output(secondary=True, description="the part that the limits cut off, v − u")
-    integral = State(start=lambda block: block.initial_output or 0.0, description="I")
+    integral = State(start=lambda block: block.initial_output or 0.0, description="I; where ki or another way moves it")
     filtered = State(description="x_f; with filter_time")
     clamped = State(discrete=True, description="1 while the integral is held; with clamping")
     clamp = Event("rising", "v is beyond a limit and the integral drives it further; with clamping")
@@ -134,7 +137,7 @@ class PID(Block):
             text = "found none; expected a filter for the derivative. Give filter_time, such as kd / (10 kp) in s."
             refuse("filter_time", text)
         check_limits(self, None if self.tracking else "initial_output")
-        if self.clamps and (self.lower is None or self.upper is None):
+        if self.anti_windup == "clamping" and self.has_limits and (self.lower is None or self.upper is None):
             text = "found clamping without both limits; give lower and upper, or use 'back_calculation'."
             refuse("anti_windup", text)
         if self.tracking and self.anti_windup != "back_calculation":
@@ -151,9 +154,15 @@ class PID(Block):
         return self.lower is not None or self.upper is not None
 
     @property
+    def has_integral(self) -> bool:
+        """Whether anything moves the integral, or sets it to another value than 0."""
+        moved = self.ki != 0.0 or (self.tracks and self.tracking_time is not None)
+        return moved or self.initial_output is not None
+
+    @property
     def clamps(self) -> bool:
         """Whether the integral is clamped."""
-        return self.anti_windup == "clamping" and self.has_limits
+        return self.anti_windup == "clamping" and self.has_limits and self.has_integral
 
     @property
     def tracks(self) -> bool:
@@ -168,10 +177,25 @@ class PID(Block):
 
     @property
     def states(self) -> Mapping[str, State]:  # type: ignore[override]
-        """``integral``, with a filter ``filtered``, with clamping ``clamped``."""
-        cls = type(self)
-        more = {"filtered": cls.filtered} if self.filter_time is not None else {}
-        return {"integral": cls.integral, **more, **({"clamped": cls.clamped} if self.clamps else {})}
+        """With anything that moves it ``integral``, with a filter ``filtered``, with clamping ``clamped``."""
+        cls, absent = type(self), self.absent_states
+        declared = {"integral": cls.integral, "filtered": cls.filtered, "clamped": cls.clamped}
+        return {name: port for name, port in declared.items() if name not in absent}
+
+    @property
+    def absent_states(self) -> Mapping[str, str]:
+        """The states that its parameters leave out, with the reason."""
+        absent = {}
+        if not self.has_integral:
+            absent["integral"] = (
+                "with ki = 0, without initial_output and without back-calculation by a tracking_time its integral is "
+                "0 at all times, so it is no state; give ki a value"
+            )
+        if self.filter_time is None:
+            absent["filtered"] = "without filter_time it has no derivative, so no filter's state; give filter_time"
+        if not self.clamps:
+            absent["clamped"] = "nothing clamps an integral, so no state says so; give anti_windup='clamping' and ki"
+        return absent
 
     @property
     def events(self) -> Mapping[str, Event]:  # type: ignore[override]
@@ -181,7 +205,7 @@ class PID(Block):
     @property
     def starts_from_inputs(self) -> bool:
         """Whether `initial` computes the states."""
-        return not self.tracking and (len(self.states) > 1 or self.initial_output is not None)
+        return not self.tracking and (bool(self.states.keys() - {"integral"}) or self.initial_output is not None)
 
     def initial(self, u: Any) -> tuple[float, ...] | float:
         """Return the states at the start."""
@@ -189,8 +213,7 @@ class PID(Block):
         integral = 0.0 if self.initial_output is None else self.initial_output - proportional
         start = {"integral": integral, "filtered": self.c * u.r - u.y}
         start["clamped"] = float(self.clamps and self.outward_excess(proportional + integral, u) > 0.0)
-        made = tuple(float(start[name]) for name in self.states)
-        return made if len(made) > 1 else made[0]
+        return _together(start, self.states)
 
     def tracking_rate(self) -> Array:
         """Return 1 / T_t."""
@@ -209,8 +232,10 @@ class PID(Block):
 
     def unlimited_output(self, x: Any, u: Any) -> Array:
         """Return v."""
-        v = self.kp * (self.b * u.r - u.y) + x.integral
-        if self.filter_time is None:
+        v = self.kp * (self.b * u.r - u.y)
+        if "integral" in x._fields:  # where the equations are symbols, ki is one, too
+            v = v + x.integral
+        if "filtered" not in x._fields:
             return v
         return v + self.kd * (self.c * u.r - u.y - x.filtered) / self.filter_time
 
@@ -237,14 +262,16 @@ class PID(Block):
 
     def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, ...] | Array:
         """Return the rates of the integral and the filter."""
-        rate = self.ki * (u.r - u.y)
-        if self.tracks:
-            rate = rate + self.tracking_rate() * self.correction(x, u)
-        if self.clamps:
-            rate = np.where(x.clamped > 0.5, 0.0, rate)
-        if self.filter_time is None:
-            return rate
-        return rate, (self.c * u.r - u.y - x.filtered) / self.filter_time
+        rates: dict[str, Array] = {}
+        if "integral" in x._fields:
+            rates["integral"] = self.ki * (u.r - u.y)
+            if self.tracks:
+                rates["integral"] = rates["integral"] + self.tracking_rate() * self.correction(x, u)
+        if "clamped" in x._fields:
+            rates["integral"] = np.where(x.clamped > 0.5, 0.0, rates["integral"])
+        if "filtered" in x._fields:
+            rates["filtered"] = (self.c * u.r - u.y - x.filtered) / self.filter_time
+        return _together(rates, rates)
 
     def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
         """Return the distances of v beyond a limit, and inside by more than the clearance."""
@@ -259,16 +286,22 @@ class PID(Block):
 
     def update(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, ...] | Array:
         """Return the states at the next tick."""
-        step = T * self.ki * (u.r - u.y)
         new: dict[str, Array] = {}
-        if self.tracks:
-            step = step + self.tracking_share * self.correction(x, u)
-        if self.clamps:
-            new["clamped"] = np.where(self.outward_excess(self.unlimited_output(x, u), u) > 0.0, 1.0, 0.0)
-            step = np.where(new["clamped"] > 0.5, 0.0, step)
-        new["integral"] = x.integral + step
-        if self.filter_time is not None:
+        if "integral" in x._fields:
+            step = T * self.ki * (u.r - u.y)
+            if self.tracks:
+                step = step + self.tracking_share * self.correction(x, u)
+            if "clamped" in x._fields:
+                new["clamped"] = np.where(self.outward_excess(self.unlimited_output(x, u), u) > 0.0, 1.0, 0.0)
+                step = np.where(new["clamped"] > 0.5, 0.0, step)
+            new["integral"] = x.integral + step
+        if "filtered" in x._fields:
             goal = (self.c * u.r - u.y) / self.filter_time
             new["filtered"] = self.filter_decay * x.filtered + self.filter_gain * goal
-        made = tuple(new[name] for name in self.states)
-        return made if len(made) > 1 else made[0]
+        return _together(new, x._fields)
+
+
+def _together(values: Mapping[str, Any], names: Iterable[str]) -> Any:
+    """Return the values of some states as an equation returns them: one alone, several as a tuple."""
+    made = tuple(values[name] for name in names)
+    return made[0] if len(made) == 1 else made

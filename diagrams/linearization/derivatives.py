@@ -38,7 +38,7 @@ from ..flat import (
 )
 from ..results import OperatingPoint, resolve
 from ..simulation import Workspace
-from ..wiring import Wire, index_of, join, split_entry
+from ..wiring import Wire, explain_absent_state, index_of, join, split_entry
 from .exchanged import evaluators_at
 from .mean_stairs import NO_STAIRS, Stairs
 from .plant_models import EQUILIBRIUM, PlantModel, model_equations, model_step
@@ -100,7 +100,9 @@ def find_signal(flat: FlatDiagram, name: str) -> Tap:
         if error.candidates:
             raise
         known = {n.rpartition(".")[2] for n in (*wires, *ports)} | {*wires, *ports}
-        raise UnknownNameError(f"there is no signal {name!r} in this diagram. {near(name, known)}") from None
+        reason = explain_absent_state(flat.table.blocks, name)
+        step = f"{reason[0].upper()}{reason[1:]}" if reason else near(name, known)
+        raise UnknownNameError(f"there is no signal {name!r} in this diagram. {step}") from None
     wire = wires[full] if full in wires else Wire(*flat.ports[full])
     shape = flat.checked.shapes[wire.block, wire.port]
     index = np.arange(size(shape)).reshape(shape)

@@ -17,7 +17,7 @@ import numpy as np
 from ...blocks.core import LoopwrightError, ParameterError
 from ..flat import FlatDiagram, WiredDiagram
 from ..frequency import FourMatrices
-from ..results import OperatingPoint
+from ..results import OperatingPoint, layout_of
 from ..wiring import join
 from .derivatives import LocalDerivatives, find_signal, join_slope, slope_of
 from .exchanged import evaluators_at
@@ -368,6 +368,13 @@ class _Traced:
             locate(free, self.diagram, self.flat)
         else:
             self.diagram, flat = diagram, diagram.flatten_like(model.point)
+            if layout_of(flat) != layout_of(cut.flat):
+                raise ParameterError(
+                    "found 0, which is structure of the block: with another value it has other states; expected a "
+                    f"number. Look at small ones: diagram.replace({{{free.name!r}: …}}).",
+                    block=free.path,
+                    port=".".join(keys),
+                )
             p = flat.p.copy()
             locate(free, diagram, flat)
             assert free.where is not None

@@ -12,7 +12,7 @@ from ...blocks.core import Block, OptionError, ParameterError, UnknownNameError,
 from ...blocks.tracing import extrapolate, traced_parameters
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, PointOrigin
-from ..wiring import change_parameter, find_place, index_of, split_entry
+from ..wiring import change_parameter, explain_absent_state, find_place, index_of, split_entry
 from .derivatives import find_signal
 from .plant_models import plant_layout
 
@@ -162,7 +162,7 @@ def index_states(flat: FlatDiagram, at: OperatingPoint) -> dict[str, np.ndarray]
     return {name: layout.index(name) for layout in states for name in layout.slices}
 
 
-def _find_state(name: str, known: Mapping[str, np.ndarray], argument: str) -> str:
+def _find_state(flat: FlatDiagram, name: str, known: Mapping[str, np.ndarray], argument: str) -> str:
     """Return the full name of a state; ``argument`` is that of the user's call."""
     if name in known:
         return name
@@ -173,7 +173,9 @@ def _find_state(name: str, known: Mapping[str, np.ndarray], argument: str) -> st
         raise UnknownNameError(
             f"{name!r} stands for several states: {', '.join(found)}. Write more of the path.", port=argument
         )
-    raise UnknownNameError(f"there is no state {name!r}. {near(str(name), known)}", port=argument)
+    reason = explain_absent_state(flat.table.blocks, str(name))
+    step = f"{reason[0].upper()}{reason[1:]}" if reason else near(str(name), known)
+    raise UnknownNameError(f"there is no state {name!r}. {step}", port=argument)
 
 
 def _spread_value(value: Any, where: np.ndarray, name: str, argument: str) -> np.ndarray:
@@ -213,14 +215,14 @@ def read_targets(
         signals.append((signal.port, signal.entries))
         labels += signal.labels
         wanted.append(_spread_value(value, np.zeros(len(signal.entries)), name, "targets"))
-    held = {int(i) for name in fixed for i in np.ravel(known[_find_state(name, known, "fixed")])}
+    held = {int(i) for name in fixed for i in np.ravel(known[_find_state(flat, name, known, "fixed")])}
     asked: dict[int, float] = {}
     for name, value in rates.items():
-        where = known[_find_state(name, known, "rates")]
+        where = known[_find_state(flat, name, known, "rates")]
         asked |= zip(np.ravel(where).tolist(), _spread_value(value, where, name, "rates").tolist(), strict=True)
     within: dict[int, tuple[float, float]] = {}
     for name, given in bounds.items():
-        where = known[_find_state(name, known, "free")]
+        where = known[_find_state(flat, name, known, "free")]
         low, high = _read_bounds(given, where.shape, name)
         within |= dict(zip(np.ravel(where).tolist(), zip(low.tolist(), high.tolist(), strict=True), strict=True))
     return Target(held, within, signals, labels, np.concatenate([*wanted, np.zeros(0)]), asked)
@@ -248,7 +250,7 @@ def set_states(flat: FlatDiagram, at: OperatingPoint, states: Mapping[str, Any])
     known, x = index_states(flat, at), at.x.copy()
     plants = {path: {**point, "state": dict(point["state"])} for path, point in at.plants.items()}
     for name, value in states.items():
-        full = _find_state(name, known, "states")
+        full = _find_state(flat, name, known, "states")
         where, numbers = known[full], _spread_value(value, known[full], name, "states")
         if np.ravel(where)[0] < flat.width:
             x[np.ravel(where)] = numbers

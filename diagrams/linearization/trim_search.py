@@ -40,9 +40,9 @@ from ..flat import (
     trace_schedule,
 )
 from ..frequency import first_largest
-from ..results import FreeDirection, OperatingPoint, PointOrigin
+from ..results import FreeDirection, OperatingPoint, PointOrigin, layout_of
 from .exchanged import evaluators_at
-from .operating_points import PointLike, operating_point, with_residual
+from .operating_points import PointLike, copy_point, operating_point, with_residual
 from .trim_plants import ExchangedPlants, Plants, check_drift
 from .trim_request import Free, Target, free_parameters, index_states, read_targets, set_states
 
@@ -355,8 +355,12 @@ def trim(
     base = diagram.replace(guess.parameters) if guess.parameters else diagram
     flat = base.flatten_like(guess)
     states = index_states(flat, guess)
-    parameters, base = free_parameters(base, {n: b for n, b in asked.items() if n not in states})
-    flat = base.flatten_like(guess)
+    parameters, searched = free_parameters(base, {n: b for n, b in asked.items() if n not in states})
+    flat, known = searched.flatten_like(guess), layout_of(flat)
+    if layout_of(flat) != known:  # a freed zero was structure, and its block has other states without it
+        guess = copy_point(base, guess, searched)
+        flat, states = searched.flatten_like(guess), index_states(flat, guess)
+    base = searched
     bounds = {n: b for n, b in asked.items() if n in states}
     target = read_targets(flat, states, targets, rates, [fixed] if isinstance(fixed, str) else fixed, bounds)
     return _solve_trim(base, diagram, flat, guess, parameters, target, tolerance, PointOrigin.TRIM)
@@ -410,6 +414,14 @@ def _solve_trim(
         )
     values = {f.name: f.shape_value(v) for f, v in zip(parameters, q, strict=True)}
     final = diagram.replace({**guess.parameters, **values})
+    if layout_of(final.flatten_like(guess)) != layout_of(flat):
+        raise SimulationError(
+            f"no operating point was found: {', '.join(n for n, v in values.items() if not np.all(v))} came out as 0, "
+            "which is structure: the block has other states with it. Give bounds without 0, such as "
+            "free={…: (1e-6, 10)}, or free other parameters.",
+            block=diagram.name,
+            t=guess.t,
+        )
     changed = equations.plants.change_blocks(parameters, q)
     plants = equations.plants.points(xp, equations.residual_at(unknown)[2], changed)
     drift = equations.plants.drift(plants, changed) if how is PointOrigin.TRIM else {}

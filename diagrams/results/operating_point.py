@@ -12,6 +12,7 @@ import numpy as np
 
 from ...blocks.core import Finding, OptionError, brief, count_of, enumerate_some, explain_calls, same_unit, shorten
 from ..flat import FlatDiagram
+from ..wiring import explain_absent_state
 from .saved_state import StateLayout, layout_of
 
 
@@ -125,9 +126,13 @@ class OperatingPoint:
         needed = (flat.width, flat.plant_outputs.total, flat.plant_inputs.total)
         if sizes == needed and (not self.layout or self.layout == layout_of(flat)):
             return
+        blocks = flat.table.blocks
+        here, there = (dict(layout[0]) if layout else {} for layout in (layout_of(flat), self.layout))
+        reasons = [f" Here {r}" for name in there if name not in here and (r := explain_absent_state(blocks, name))]
+        lacking = [f" It lacks the state {name!r}." for name in here if there and name not in there]
         raise OptionError(
-            "found the operating point of a diagram with other blocks or wires; expected one of this diagram. Make it "
-            "with diagram.operating_point(t), or linearize(t).",
+            "found the operating point of a diagram with other blocks or wires; expected one of this diagram."
+            f"{next(iter((*reasons, *lacking)), '')} Make it with diagram.operating_point(t), or linearize(t).",
             block=name,
             port="operating point",
         )

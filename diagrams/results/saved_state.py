@@ -11,9 +11,10 @@ import numpy as np
 
 from ...blocks.core import OptionError, brief, explain_calls, shorten
 from ..flat import FlatDiagram
+from ..wiring import explain_absent_state
 from .stored import Stopped, own_version
 
-VERSION = 2
+VERSION = 3
 """Version of a state's vectors and their layout."""
 
 StateLayout = tuple[tuple[tuple[str, object], ...], ...]
@@ -66,8 +67,11 @@ class RunState:
 
 
 def layout_of(flat: FlatDiagram) -> StateLayout:
-    """Return the layout of a saved state: two diagrams with equal layouts can exchange states."""
-    layouts = (flat.states, flat.held, flat.gates, flat.starts, flat.loops, flat.log, flat.plant_inputs)
+    """Return the layout of a saved state: two diagrams with equal layouts can exchange states.
+
+    A block's states count by their names, since its parameters may leave some out.
+    """
+    layouts = (flat.states.each, flat.held, flat.gates, flat.starts, flat.loops, flat.log, flat.plant_inputs)
     names = tuple(tuple((n, layout.shapes[n]) for n in layout.slices) for layout in layouts)
     return (*names, tuple((e.path, e.name) for e in flat.events))
 
@@ -108,9 +112,11 @@ def check_fits(state: RunState, flat: FlatDiagram, name: str) -> None:
         for missing, whose in ((set(theirs) - set(mine), "it has"), (set(mine) - set(theirs), "it lacks")):
             if missing:
                 first = min(map(str, (m[0] for m in missing)))
+                reason = explain_absent_state(flat.table.blocks, first)
                 raise OptionError(
                     f"found the state of a run of {state.diagram!r} with other blocks: {whose} the {kind} of "
-                    f"{first!r}. Go on with the same blocks and wires; a branch may change parameters.",
+                    f"{first!r}.{reason and f' Here {reason}'} Go on with the same blocks and wires; a branch may "
+                    "change parameters.",
                     block=name,
                     port="start",
                 )

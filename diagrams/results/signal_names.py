@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Layout, UnknownNameError, near
-from ..wiring import Wire, index_of, split_entry
+from ..wiring import Wire, explain_absent_state, index_of, split_entry
 
 _COMPUTED = ("local", "output", "calculatedParameter")
 Place = tuple[tuple[int, ...], slice | np.ndarray]
@@ -78,6 +78,8 @@ def resolve(
             f"no signal {name!r} was recorded: {variable!r} is a variable of the FMU {path!r}, and no port of its. "
             f"Make it one, beside those that are needed: Fmu(…, ports=[…, {variable!r}])."
         )
+    if reason := explain_absent_state(blocks or {}, name):
+        raise UnknownNameError(f"no signal {name!r} was recorded: {reason}")
     short = {n.rpartition(".")[2] for n in (*wires, *ports)}
     raise UnknownNameError(f"no signal {name!r} was recorded. {near(name, short | set(wires) | set(ports))}")
 

@@ -74,8 +74,8 @@ def _settable(diagram: WiredDiagram, point: OperatingPoint) -> Iterator[tuple[st
 
 def copy_states(values: np.ndarray, old: FlatDiagram, new: FlatDiagram, into: np.ndarray) -> None:
     """Write a vector x of one diagram into that of another, whatever stands under the same name in both."""
-    for name in ("states", "held", "gates", "starts", "loops"):
-        theirs, mine = getattr(old, name), getattr(new, name)
+    others = [(getattr(old, name), getattr(new, name)) for name in ("held", "gates", "starts", "loops")]
+    for theirs, mine in ((old.states.each, new.states.each), *others):
         for key, where in theirs.slices.items():
             if key in mine.slices and mine.shapes[key] == theirs.shapes[key]:
                 into[mine.slices[key]] = values[where]

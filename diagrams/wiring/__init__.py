@@ -1,5 +1,6 @@
 """Structure of a diagram: blocks, wires, subsystems, checks and the order of evaluation."""
 
+from .absent_states import explain_absent_state
 from .check import Checked, check
 from .collector import Collector
 from .cycles import find_cyclic_parts
@@ -29,6 +30,7 @@ __all__ = [
     "change_parameters",
     "check",
     "exact_time",
+    "explain_absent_state",
     "find_cyclic_parts",
     "find_name",
     "find_orders",

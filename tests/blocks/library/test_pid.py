@@ -110,6 +110,47 @@ def test_without_a_gain_there_is_no_state_for_it():
     assert "actual" in PID(kp=1.0, ki=1.0, tracking=True).inputs
 
 
+@pytest.mark.parametrize(
+    ("parameters", "states"),
+    [
+        ({}, []),
+        ({"ki": -0.0}, []),
+        ({"ki": 1e-300}, ["integral"]),
+        ({"kd": 0.1, "filter_time": 0.05}, ["filtered"]),
+        ({"lower": -1.0, "upper": 1.0}, []),
+        ({"lower": -1.0, "upper": 1.0, "anti_windup": "clamping"}, []),
+        ({"lower": -1.0, "upper": 1.0, "tracking_time": 0.2}, ["integral"]),
+        ({"tracking_time": 0.2}, []),
+        ({"lower": -1.0, "upper": 1.0, "tracking_time": 0.2, "anti_windup": "none"}, []),
+        ({"tracking": True}, []),
+        ({"tracking": True, "tracking_time": 0.2}, ["integral"]),
+        ({"initial_output": 0.0}, ["integral"]),
+    ],
+    ids=str,
+)
+def test_without_an_integral_gain_the_integral_is_a_state_where_something_else_moves_it(parameters, states):
+    block = PID(kp=4.0, **parameters)
+    assert list(block.states) == states
+    assert {"integral", "filtered", "clamped"} - block.states.keys() == block.absent_states.keys()
+
+
+@pytest.mark.parametrize("T", [None, 0.02], ids=["continuous", "sampled"])
+@pytest.mark.parametrize("anti_windup", ["back_calculation", "clamping"])
+def test_a_p_controller_without_a_state_is_a_limited_gain(T, anti_windup):
+    alone = Alone(PID(kp=4.0, b=0.5, lower=-3.0, upper=2.0, anti_windup=anti_windup), T=T)
+    for r, y in RNG.standard_normal((50, 2)):
+        found, after = alone.call(0.0, alone.start({"r": r, "y": y}), {"r": r, "y": y})
+        v = 4.0 * (0.5 * r - y)
+        assert (found["u"], found["excess"]) == (min(max(v, -3.0), 2.0), v - min(max(v, -3.0), 2.0))
+        assert after.size == 0
+
+
+def test_a_pd_controller_starts_without_a_kick():
+    alone = Alone(PID(kp=3.0, kd=0.4, b=0.7, c=0.2, filter_time=0.05), T=0.1)
+    u = {"r": 2.0, "y": 0.5}
+    assert alone.call(0.0, alone.start(u), u)[0]["u"] == pytest.approx(3.0 * (0.7 * 2.0 - 0.5))
+
+
 # --- the start --------------------------------------------------------------------------------------------------------
 
 
