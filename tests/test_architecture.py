@@ -3,6 +3,7 @@
 import ast
 import importlib
 import re
+import runpy
 from collections import defaultdict
 from functools import cache
 from pathlib import Path
@@ -235,3 +236,18 @@ def test_public_names_are_those_that_users_know(room):
     assert all(hasattr(module, name) for name in module.__all__)
     stub = ast.parse((ROOT / room / "__init__.pyi").read_text(encoding="utf-8"))
     assert module.__all__ == ast.literal_eval(stub.body[-1].value)  # what type checkers see
+
+
+def test_the_table_of_sizes_has_every_sub_package_and_counts_its_lines():
+    sizes = runpy.run_path(str(ROOT / "docs" / "sizes.py"))
+    rows = sizes["table"]()
+    assert {str(file.parent) for file in FILES} <= set(rows)
+    files, python, code, c, names = rows["fmus/models"]
+    texts = [p.read_text(encoding="utf-8") for p in (ROOT / "fmus" / "models").iterdir() if p.suffix in {".py", ".pyi"}]
+    assert (files, python, c) == (len(texts), sum(text.count("\n") for text in texts), 0)
+    assert 0 < code < python - 200
+    assert names == len(importlib.import_module("loopwright.fmus.models").__all__)
+    assert rows["all"][1] == sum(row[1] for name, row in rows.items() if name != "all")
+    assert (
+        sizes["count_code"]('"""Text."""\n\n# why\nx = """a\nb"""\n\n\ndef f():\n    """Text."""\n    return x\n') == 4
+    )
