@@ -19,13 +19,14 @@ from .findings import (
 )
 from .kinks import find_kinks_between
 from .linear_model import Linearization, linearize, linearize_batch
-from .operating_points import PointLike, capture, check_options, copy_point, operating_point, run_to
+from .operating_points import RUN_OPTIONS, PointLike, capture, check_options, copy_point, operating_point, run_to
 from .over_a_period import TickModel, model_ticks, ticks_between_renewals, ticks_to_renewal
 from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop, loop_of_variant
 from .plant_models import PlantEquations, linearize_plant
 from .trim_search import point_from_states, trim
 
 __all__ = [
+    "RUN_OPTIONS",
     "BlockFinding",
     "CoarseValues",
     "CutFromTracking",

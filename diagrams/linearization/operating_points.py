@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 PointLike: TypeAlias = OperatingPoint | Snapshot | float | None
 """Values that give an operating point: one, a recorded instant, a time in s, or None for the start."""
-OPTIONS = ("step", "solver", "rtol", "atol", "max_step", "start", "coupling", "start_exchange")
+RUN_OPTIONS = ("step", "solver", "rtol", "atol", "max_step", "start", "coupling", "start_exchange")
 """Options of a run to an operating point."""
 AGAIN = 1e-3
 """Largest deviation of a repeated run, whose solver takes other steps, relative to 1 + the size of a state."""
@@ -102,8 +102,8 @@ def check_options(diagram: WiredDiagram, options: Mapping[str, Any], caller: str
         If there is such an option.
     """
     for name in options:
-        if name not in OPTIONS:
-            raise UnknownArgumentError(name, (*OPTIONS, *MORE.get(caller, ())), block=caller)
+        if name not in RUN_OPTIONS:
+            raise UnknownArgumentError(name, (*RUN_OPTIONS, *MORE.get(caller, ())), block=caller)
 
 
 def operating_point(diagram: WiredDiagram, point: PointLike, options: Mapping[str, Any]) -> OperatingPoint:

@@ -15,6 +15,7 @@ from ..linearization import Tap
 from ..results import OperatingPoint
 from ..simulation import RunOptions, Simulation, copy_states
 from ..wiring import SubsystemSettings, Wire
+from .beginning import can_start_at, check_reached
 
 NEVER = 1e12
 """Time in s that no run reaches."""
@@ -163,10 +164,17 @@ class InjectionRun:
         Port to which the test signal is added.
     outputs : iterable of Tap
         Other signals to measure.
-    point : OperatingPoint or None
-        Beginning of the run; the start of the diagram without it.
+    begins : OperatingPoint or float
+        Beginning of the measurement: an operating point, or a time in s to which the diagram is run. To a point that a
+        run has reached it is run as well where its states are not all that has to be known, or an FMU does not let
+        them be set.
     options : mapping
         Options of the run; see `RunOptions`.
+
+    Raises
+    ------
+    OptionError
+        If the diagram, run again, is elsewhere than at the operating point.
     """
 
     def __init__(
@@ -175,16 +183,21 @@ class InjectionRun:
         made: InjectedDiagram,
         signal: Tap,
         outputs: Iterable[Tap],
-        point: OperatingPoint | None,
+        begins: OperatingPoint | float,
         options: Mapping[str, Any],
     ):
         self.made, self.signal, self.outputs = made, signal, list(outputs)
         ports = [signal.port, *(o.port for o in self.outputs)]
         record = sorted({f"{b}.{p}" for b, p in ports} | {f"{made.sum}.y", f"{made.source}.y"})
         start: dict[str, Any] = {}
-        if point is not None:
-            before = diagram.replace(point.parameters) if point.parameters else diagram
-            start["start"] = _translate_point(point, before.flatten_like(point), made, signal)
+        self.runs_to: Any = begins
+        self.point: OperatingPoint | None = None
+        if isinstance(begins, OperatingPoint):
+            before = diagram.replace(begins.parameters) if begins.parameters else diagram
+            self.point = _translate_point(begins, before.flatten_like(begins), made, signal)
+            self.runs_to = begins.tick * begins.base
+            if can_start_at(made.diagram, begins):
+                self.runs_to, start["start"] = 0, self.point
         self.simulation = Simulation(
             made.diagram,
             RunOptions.of({**options, **start, "record": record, "states": False}, block=made.diagram.name),
@@ -194,7 +207,16 @@ class InjectionRun:
         """Whether the signal has not changed at any tick between two recorded samples."""
 
     def __enter__(self) -> InjectionRun:
-        self.simulation.__enter__()
+        simulation = self.simulation
+        simulation.__enter__()
+        try:
+            if self.runs_to:
+                simulation.advance(self.runs_to)
+                if self.point is not None:
+                    check_reached(simulation, self.point)
+        except BaseException as error:
+            simulation.__exit__(type(error), error, error.__traceback__)
+            raise
         return self
 
     def __exit__(self, *exc: object) -> None:

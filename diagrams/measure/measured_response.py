@@ -35,6 +35,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,9 +44,11 @@ from numpy.typing import ArrayLike
 
 from ...blocks.core import OptionError, accepts, brief, explain_calls, kinds
 from ..flat import FlatDiagram, WiredDiagram
-from ..linearization import PointLike, find_signal, operating_point, ticks_to_renewal
+from ..linearization import RUN_OPTIONS, PointLike, find_signal, operating_point, ticks_to_renewal
 from ..results import OperatingPoint, PointOrigin, Snapshot
 from ..solvers import FIXED
+from ..wiring import exact_time
+from .beginning import with_ticks
 from .injection import InjectionRun, inject_signal
 from .measurement import Measurement, measure_part, refine_tolerances
 from .waveforms import KINDS, Part, choose_step, plan_signal
@@ -56,6 +60,8 @@ if TYPE_CHECKING:
 
 HALF = 0.5
 """Factor of the amplitude in the second measurement."""
+EXACT = MappingProxyType({"rtol": 1e-9, "atol": 1e-12})
+"""Tolerances of a solver."""
 GROWN = 1e9
 """Growth of a signal, relative to the test signal and to the states before it, that no stable loop makes."""
 
@@ -261,11 +267,12 @@ def frequency_response(
 ) -> FrequencyResponse:
     """Measure a frequency response; see `Diagram.frequency_response`."""
     omega, amplitude = np.unique(np.atleast_1d(np.asarray(frequencies, dtype=float))), float(amplitude)
-    chosen, point, t0 = _find_beginning(diagram, at, dict(options))
-    variant = diagram.replace(point.parameters) if point is not None and point.parameters else diagram
     discrete = diagram.has_clock or diagram.has_fmu
-    if not discrete and chosen.get("step") is None:
-        chosen["step"] = choose_step(omega)
+    if discrete:
+        chosen, point, t0 = _find_beginning(diagram, at, dict(options))
+    else:
+        chosen, point, t0 = _find_continuous_beginning(diagram, at, dict(options), choose_step(omega))
+    variant = diagram.replace(point.parameters) if point is not None and point.parameters else diagram
     flat = variant.flatten(chosen.get("step", None if point is None or diagram.has_clock else point.base))
     every = math.lcm(*(clock.every for clock in flat.distinct)) if flat.distinct else 1
     period = flat.base * every
@@ -280,7 +287,7 @@ def frequency_response(
     signal = find_signal(flat, wire)
     measured = [find_signal(flat, name) for name in ([outputs] if isinstance(outputs, str) else outputs)]
     if flat.hybrid:
-        chosen = {"rtol": 1e-9, "atol": 1e-12, **chosen}
+        chosen = {**EXACT, **chosen}
         if chosen.get("solver", "auto") not in FIXED:
             chosen.setdefault("max_step", 0.5 * np.pi / omega[-1])
     plan = list(plan_signal(kind, omega, dt, amplitude))
@@ -293,9 +300,7 @@ def frequency_response(
     def measure(plan: Sequence[Part], order: Iterable[int], chosen: Mapping[str, Any], amplitude: float) -> Measurement:
         found = Measurement(len(lines), len(signal.entries), sum(len(o.entries) for o in measured))
         for j, entry in enumerate(signal.entries):
-            with InjectionRun(diagram, made, signal, measured, point, chosen) as run:
-                if point is None and t0 > 0:
-                    run.simulation.advance(t0)
+            with InjectionRun(diagram, made, signal, measured, t0 if point is None else point, chosen) as run:
                 if wait:
                     run.go(wait, 1)
                 before, began = run.read_states(), run.t
@@ -346,8 +351,7 @@ def _find_beginning(
         if "start" not in options:
             return options, None, at.t
     if isinstance(at, OperatingPoint) and at.how == PointOrigin.RUN and "start" not in options:
-        free = not (diagram.has_clock or diagram.has_fmu) and at.t == 0.0  # any step begins there
-        return {**options, "step": options.get("step") or (None if free else at.base)}, None, at.t
+        return {**options, "step": options.get("step") or at.base}, None, at.t
     if at is None or (isinstance(at, int | float) and not isinstance(at, bool) and "start" not in options):
         return options, None, float(at or 0.0)
     point = operating_point(diagram, at, options)
@@ -355,6 +359,27 @@ def _find_beginning(
     if not diagram.has_clock and options.get("step") is None and diagram.has_fmu:
         options["step"] = point.base
     return options, point, point.t
+
+
+def _find_continuous_beginning(
+    diagram: WiredDiagram, at: PointLike, options: dict[str, Any], longest: Fraction
+) -> tuple[dict[str, Any], OperatingPoint | None, float]:
+    """Return what `_find_beginning` does, for a diagram without sampling: ticks of any length have its point's time.
+
+    They are ``step`` apart, where that is among the options, or else ``longest``, or less so that one is at the point.
+    """
+    if isinstance(at, Snapshot):
+        recipe = getattr(at.run, "recipe", {}) or {}
+        options = {**{name: value for name, value in recipe.items() if name != "step"}, **options}
+    if options.get("step") is not None:
+        longest = exact_time(options["step"], block=diagram.name)
+    is_start = at is None or (isinstance(at, OperatingPoint) and at.how == PointOrigin.RUN and at.t == 0.0)
+    if "start" not in options and (is_start or (isinstance(at, int | float) and at == 0.0)):
+        return {**options, "step": longest}, None, 0.0
+    run = {name: value for name, value in options.items() if name in RUN_OPTIONS and name != "step"}
+    point = with_ticks(operating_point(diagram, at, {**EXACT, **run}), longest)
+    options.pop("start", None)
+    return {**options, "step": point.base}, point, point.t
 
 
 def _changes_between_ticks(flat: FlatDiagram, port: tuple[str, str]) -> bool:

@@ -27,7 +27,7 @@ from ..linearization import (
     ticks_between_renewals,
     ticks_to_renewal,
 )
-from ..results import PointOrigin
+from .beginning import with_ticks
 from .injection import InjectionRun, inject_signal
 from .step_measures import ExpectedStep
 
@@ -210,8 +210,11 @@ def step_response(
     point = operating_point(diagram, at, {})
     variant = diagram.replace(point.parameters) if point.parameters else diagram
     sampled = diagram.has_clock or diagram.has_fmu
-    base = point.base if sampled else Fraction(max(1, round(length / SAMPLES * 1e9)), 10**9)
-    flat = variant.flatten_like(point) if sampled else variant.flatten(base)
+    begins, longest = point, Fraction(max(1, round(length / SAMPLES * 1e9)), 10**9)
+    if not sampled:
+        begins = with_ticks(point, longest)
+    base = begins.base
+    flat = variant.flatten_like(begins)
     signal = find_signal(flat, wire)
     if len(signal.entries) != 1:
         raise OptionError(
@@ -222,6 +225,8 @@ def step_response(
     names = list(outputs)
     taps = [find_signal(flat, name) for name in names]
     every = math.lcm(*(clock.every for clock in flat.distinct)) if sampled and flat.distinct else 1
+    if not sampled:
+        every = int(longest / base)
     own = ticks_between_renewals(flat, [signal.port]) if sampled and every > 1 else None
     slow = every // own if own and every % own == 0 else 1  # the wire's renewals in the period of all clocks
     every //= slow
@@ -236,12 +241,8 @@ def step_response(
         if sampled and count * every >= LONG:
             options["compile"] = True
 
-    begins = point if sampled or point.how is not PointOrigin.RUN else None
-
     def run_with(height: float) -> tuple[np.ndarray, np.ndarray, bool]:
         with InjectionRun(variant, made, signal, taps, begins, options) as run:
-            if begins is None and point.t > 0:
-                run.simulation.advance(point.t)
             if wait:
                 run.go(wait, 1)
             first = run.record(1, every)

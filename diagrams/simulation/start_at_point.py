@@ -9,7 +9,7 @@ import numpy as np
 
 from ...blocks.core import FmuError, LoopwrightError, OptionError
 from ..flat import FlatDiagram, TickPattern, WiredDiagram
-from ..results import OperatingPoint
+from ..results import OperatingPoint, PointOrigin
 from .workspace import Workspace
 
 SAME = 1e-9
@@ -41,9 +41,11 @@ def apply_point(diagram: WiredDiagram, point: OperatingPoint) -> WiredDiagram:
             if there is not None:
                 blocks[path] = there
                 continue
+            reached = point.how is PointOrigin.RUN
+            step = "Leave start out, and run from t = 0." if reached else "Let a run settle there, and give its time."
             raise FmuError(
                 f"a run can't start at this operating point, because a state can't be set at the FMU's start: "
-                f"{error.message} Run to it instead: diagram.operating_point(t).",
+                f"{error.message} {step}",
                 block=path,
             ) from error
     return variant.replace(blocks) if blocks else variant

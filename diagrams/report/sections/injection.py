@@ -10,6 +10,7 @@ from ....blocks.core import LoopwrightError, PeriodicLoopError
 from ...frequency import Confirmation, Number
 from ...linearization import Linearization
 from ...measure import FrequencyResponse, frequency_response
+from ...results import PointOrigin
 from .. import figures
 from ..case import Case, InjectionPlan
 from ..pages import Section, TableForm, Texts
@@ -131,10 +132,9 @@ def _moving(v: Variant) -> dict[str, Any]:
 
 
 def _measured(plan: InjectionPlan, wire: str) -> FrequencyResponse:
-    excited = plan.variant
-    return frequency_response(
-        excited.diagram, wire, plan.frequencies, amplitude=plan.amplitude, at=excited.point.t, compile=True
-    )
+    excited, point = plan.variant, plan.variant.point
+    at = point.t if point.how is PointOrigin.RUN else point
+    return frequency_response(excited.diagram, wire, plan.frequencies, amplitude=plan.amplitude, at=at, compile=True)
 
 
 def _curve(title: str, found: FrequencyResponse, L: Linearization) -> figures.MeasuredCurve:
