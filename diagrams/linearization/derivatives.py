@@ -39,6 +39,7 @@ from ..flat import (
 from ..results import OperatingPoint, resolve
 from ..simulation import Workspace
 from ..wiring import Wire, explain_absent_state, index_of, join, split_entry
+from .delay_channels import delay_channels
 from .exchanged import evaluators_at
 from .mean_stairs import NO_STAIRS, Stairs
 from .plant_models import EQUILIBRIUM, PlantModel, model_equations, model_step
@@ -197,6 +198,17 @@ class LocalDerivatives:
             return made.is_constant("dx", "t") and made.is_constant("dx", "x", continuous)
 
         return not self.varies and self._kept("linear", NONE, is_constant)
+
+    @cached_property
+    def has_constant_slopes(self) -> bool:
+        """Whether the derivatives between ticks of the rates and of what delays take in are constants there."""
+        made, places = self._trace_derivative(NONE), self.flat.continuous.tolist()
+
+        def is_constant() -> bool:
+            every = [made.is_constant(result, "t") and made.is_constant(result, "w") for result in ("dx", "z")]
+            return all(every) and all(made.is_constant(result, "x", places) for result in ("dx", "z"))
+
+        return self._workspace is None and self._kept("constant", NONE, is_constant)
 
     def _kept(self, name: str, acting: frozenset[TickPattern], make: Callable[[], T]) -> T:
         """Return a function of these taps, made once for all diagrams with the same functions.
@@ -496,16 +508,21 @@ def _check_finite(derivatives: Iterable[np.ndarray], t: float) -> None:
 
 def find_moving(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) -> tuple[str, ...]:
     """Return the names of injected signals that change between ticks and that continuous blocks use there."""
-    if not flat.continuous.size:
+    late = delay_channels(flat).inputs
+    if not flat.continuous.size and not late.size:
         return ()
-    by_d = local.differentiate(NONE, at.t, at.x, at.w)["dx", "d"]
+    J = local.differentiate(NONE, at.t, at.x, at.w)
+    by_d = np.vstack([J["dx", "d"], J["z", "d"][late]])
     injected = zip(local.inputs, local.injected, strict=True)
     return tuple(signal.name for signal, where in injected if np.any(by_d[:, where]) and is_moving(flat, signal))
 
 
 def is_moving(flat: FlatDiagram, signal: Tap) -> bool:
     """Whether a signal follows continuous states between two ticks."""
-    return bool(flat.output(signal.port).depends("y", "x")[:, flat.continuous].any())
+    output, late = flat.output(signal.port), delay_channels(flat).outputs
+    if output.depends("y", "x")[:, flat.continuous].any():
+        return True
+    return bool(late.size and output.depends("y", "w")[:, late].any())
 
 
 def moves_between_ticks(diagram: WiredDiagram, at: OperatingPoint, outputs: list[str], inputs: list[str]) -> str:

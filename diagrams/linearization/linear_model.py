@@ -348,7 +348,8 @@ def _linearize(
     names = [_as_list(n) for n in (inputs, outputs, openings)]
     flat = diagram.flatten_like(at)
     at.check_fits(flat, diagram.name)
-    _refuse_transport_delays(flat)
+    if not (diagram.has_clock or (diagram.has_fmu and step is not None)):
+        _refuse_transport_delays(flat)
     found = [[find_signal(flat, n) for n in group] for group in names]
     for signal in found[2]:
         _check_opening(flat, signal)

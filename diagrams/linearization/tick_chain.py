@@ -15,12 +15,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...blocks.core import Finding, Layout
+from ...blocks.core import Finding, Layout, OptionError
 from ...fmus.running import Derivation
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..frequency import FourMatrices
 from ..results import OperatingPoint
 from .coupled_chain import LinearStep, coupling_at
+from .delay_channels import delay_channels
+from .delayed_flow import DelayedFlow, DelayLine, find_steady_slopes
 from .derivatives import LocalDerivatives, Numbers, slope_of
 from .exchanged import noise_of
 from .findings import EventWithinPeriod, UnusualStart
@@ -88,6 +90,10 @@ class Chain:
         if self._coupled is not None:
             self._coupled.check_ticks(self._holds or any(not self._steps_at(path, at.tick) for path in self.paths))
             self._holds = bool(self._straight)
+        self._channels = delay_channels(flat)
+        self._line: DelayLine | None = None
+        if len(self._channels):
+            self._check_delays()
         self._models: dict[str, PlantModel] = {}
         self.derivations: dict[str, Derivation] = {}
         self.uncertainty, self.n_p = 0.0, 0
@@ -119,12 +125,16 @@ class Chain:
         kept = [*self._straight, *(i for path in mid_step for i in self._models[path].outputs)]
         models = self.models
         Ap, Bp, Cp, Dp = (join_matrices(flat, models, which) for which in "ABCD")
+        line = self._begin_line(tick["x"])
         nx, nz, n_p, nw = flat.width, flat.plant_inputs.total, len(Ap), flat.plant_outputs.total
-        n = nx + n_p + nz + (nw if self._holds else 0)
-        W = np.zeros((nw, n), dtype=Cp.dtype)  # the FMUs' outputs before the tick
+        n = nx + n_p + nz + (nw if self._holds else 0) + (len(line) if line else 0)
+        W = np.zeros((nw, n), dtype=np.result_type(Cp, tick["x", "x"]))  # outputs of FMUs and delays before the tick
         W[:, nx : nx + n_p], W[:, nx + n_p : nx + n_p + nz] = Cp, Dp
         W[kept] = 0.0
         W[kept, [nx + n_p + nz + i for i in kept]] = 1.0
+        place = len(self.steps)
+        if line:
+            W[self._channels.outputs, n - len(line) :] = line.outputs(place)
 
         def eliminate_w(quantity: str) -> tuple[np.ndarray, np.ndarray]:
             by_state = tick[quantity, "w"] @ W
@@ -138,11 +148,14 @@ class Chain:
             z_of[mine], z_by_d[mine] = 0.0, 0.0
             z_of[mine, [nx + n_p + i for i in mine]] = 1.0
         x1 = tick["x"]
+        signals = line.signals((x_of, x_by_d), W) if line else None
         if flat.continuous.size:
             E, Ew, Ed, x1 = self._differentiate_flow(x1, h)
             x_of, x_by_d = E @ x_of + Ew @ W, E @ x_by_d + Ed
         else:
             Ew = np.zeros((nx, nw), dtype=W.dtype)
+        if line and signals:
+            x_of[flat.continuous], x_by_d[flat.continuous] = line.flow_over(place, signals)
         P, P_by_d = Bp @ z_of, Bp @ z_by_d
         P[:, nx : nx + n_p] += Ap
         W_next, states = W, Layout.of({m.path: (len(m.A),) for m in models})
@@ -165,10 +178,43 @@ class Chain:
         M, N = np.vstack([x_of, P, z_of]), np.vstack([x_by_d, P_by_d, z_by_d])
         if self._holds:
             M, N = np.vstack([M, W_next]), np.vstack([N, W_by_d])
+        if line and signals:
+            past = line.move(place, signals)
+            M, N = np.vstack([M, past[0]]), np.vstack([N, past[1]])
         if not self.steps:
             self.n_p, self._first_tick = n_p, tick
         self.steps.append((M, N, *eliminate_w("y")))
         self._move(following, h, x1, tick["z"])
+
+    def _check_delays(self) -> None:
+        """Refuse transport delays next to FMUs that are coupled within a step."""
+        if self._coupled is not None:
+            raise OptionError(
+                "found a transport delay next to FMUs with a coupling that acts within a step; expected "
+                "coupling='jacobi'. Linearize with it, or put the delay into a sampled subsystem.",
+                block=self._channels.paths[0],
+            )
+
+    def _begin_line(self, x1: np.ndarray) -> DelayLine | None:
+        """Return the line of what transport delays keep, from the derivatives after the first tick; None without any.
+
+        Raises
+        ------
+        OptionError
+            If these derivatives change from tick to tick, or between two.
+        """
+        if not len(self._channels):
+            return None
+        flat, here = self.flat, self.here
+        J = find_steady_slopes(flat, self.local, self._channels, here.t, x1, here.w)
+        if self._line is None:
+            start, base = self.first.tick, flat.base
+            times = [base * (k - start) for k, _ in self.ticks]
+            flow = DelayedFlow(self._channels, flat.continuous, J, times, base * (self._end - start))
+            self._line = DelayLine(flow, flat, [label for s in self.local.inputs for label in s.labels])
+        else:
+            self._line.flow.check_same(J)
+        return self._line
 
     def _begin_steps(self, k: int, z: np.ndarray) -> list[str]:
         """Begin the steps of the FMUs that stand at a tick; return those that keep the inputs that they hold."""
@@ -239,7 +285,7 @@ class Chain:
         """Names of the model's states: of blocks, of FMUs, and of the inputs and outputs that FMUs hold."""
         ports = self.flat.plant_inputs.labels + (self.flat.plant_outputs.labels if self._holds else [])
         held = [f"held({label})" for label in ports]
-        return self.flat.labels + states_of(self.models) + held
+        return self.flat.labels + states_of(self.models) + held + (self._line.labels if self._line else [])
 
     def affine(self) -> np.ndarray:
         """Return the change of the states over the period at the operating point itself."""
@@ -247,7 +293,14 @@ class Chain:
         inputs = [inputs_before(self.flat, point) for point in (first, last)]
         states = [_plant_states(self.flat, point, self.models) for point in (first, last)]
         outputs = [last.w - first.w] if self._holds else []
-        return np.concatenate([last.x - first.x, states[1] - states[0], inputs[1] - inputs[0], *outputs])
+        late = [np.resize(self._delay_changes(), len(self._line))] if self._line else []
+        return np.concatenate([last.x - first.x, states[1] - states[0], inputs[1] - inputs[0], *outputs, *late])
+
+    def _delay_changes(self) -> np.ndarray:
+        """Return what the outputs of the transport delays still have to change by until they are their inputs."""
+        last = self.here
+        z = self.local.differentiate(NONE, last.t, last.x, last.w)["z"]
+        return np.asarray(z[self._channels.inputs] - last.w[self._channels.outputs])
 
     def findings(self, last: int) -> list[Finding]:
         """Return the events within the period, and a start whose tick is unlike the tick ``last``."""
