@@ -34,7 +34,9 @@ from .values import Array, Value
 SOLVED = "trapezoidal step"
 """Name of the guard of a block's trapezoidal step, which fails if Newton's steps don't solve it."""
 
-_ABSENT = frozenset({"output", "derivative", "update", "indicators", "jump", "guards", "initial", "constants"})
+_ABSENT = frozenset(
+    {"output", "derivative", "update", "indicators", "jump", "guards", "initial", "constants", "after_start"}
+)
 _ABSENT |= {"inputs", "outputs", "states", "events"}
 
 
@@ -83,6 +85,11 @@ class Block(Value, Wireable):
         Expressions by name that must stay positive, else the run stops with `guard_error`.
     initial(u)
         Initial states from the inputs at the start: plain Python, not traced.
+    after_start(x, u, T)
+        States for a block whose equations have a branch of their start, by a state or by ``t > 0``: the states after
+        that branch, with which its outputs are those of the start. Plain Python, not traced; T is None in a continuous
+        subsystem. Operating points take these states. Linear models take the equations just after t, so that they have
+        the slopes of all later ticks. A block without such a branch doesn't have it.
     constants(T, method)
         Numbers computed from the parameters in plain Python, which the equations then read as attributes.
     next_instant(t)

@@ -66,8 +66,8 @@ class Hold(Block):
 class Encoder(Block):
     """Position encoder: quantized positions, velocities by differences.
 
-    p = Δ ⌊position / Δ + ½⌋, v = (p[k] − p[k − 1]) / T; at the first tick v is the true velocity. The derivative is
-    zero almost everywhere, so it linearizes to zero. The block is part of the rig (docs/experiments.md), not of the
+    p = Δ ⌊position / Δ + ½⌋, v = (p[k] − p[k − 1]) / T; at the first tick v is the true velocity. An operating point at
+    the start is past that tick: p[k − 1] = p[k] − T v. The block is part of the rig (docs/experiments.md), not of the
     paper.
 
     Raises
@@ -93,12 +93,17 @@ class Encoder(Block):
         """Keep the measured position."""
         return self.quantum * np.floor(u.position / self.quantum + 0.5), 1.0 + 0.0 * t
 
+    def after_start(self, x: Any, u: Any, T: float) -> tuple[Array, Array]:
+        """Return the states as after the first tick: with them the measured velocity is the true one."""
+        p = self.quantum * np.floor(u.position / self.quantum + 0.5)
+        return np.where(x.running > 0.5, x.last, p - T * u.velocity), np.ones(())
+
 
 class ForceSensor(Block):
     """Force sensor between the robot and its tool, which also measures the tool's inertia (E25).
 
     F = force + contact force − m_tool · acceleration; the gravity part is tared. At t = 0 the acceleration counts as
-    zero, since no force has acted yet.
+    zero in a run, since no force has acted yet; linear models at t = 0 have the tool's inertia.
     """
 
     tool_mass: float = parameter(default=0.0, unit="kg", minimum=0.0, description="mass on the far side of the sensor")
@@ -110,3 +115,7 @@ class ForceSensor(Block):
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the measured force."""
         return u.force + u.contact_force - self.tool_mass * np.where(t > 0.0, u.acceleration, 0.0)
+
+    def after_start(self, x: Any, u: Any, T: float | None) -> tuple[()]:
+        """Return no states: the branch of the start is ``t > 0``."""
+        return ()

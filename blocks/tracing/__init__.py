@@ -2,7 +2,7 @@
 
 from .differences import differentiate, extrapolate
 from .discretization import check_method, find_hold, hold
-from .equations import initial_state, start_shapes, start_values
+from .equations import initial_state, start_shapes, start_values, state_after_start
 from .numpy_check import GUARDS, NEXT, evaluate
 from .opaque_equations import raise_failure
 from .outside import describe_outside
@@ -37,6 +37,7 @@ __all__ = [
     "size",
     "start_shapes",
     "start_values",
+    "state_after_start",
     "structure",
     "switching_times",
     "trace",

@@ -281,13 +281,30 @@ def initial_state(block: Any, states: Mapping[str, Shape], u: Any) -> np.ndarray
     TraceError, ShapeError
         If there is not one value for each state, or one has another shape.
     """
+    return _flat_states(block.initial(u), states, "initial")
+
+
+def state_after_start(block: Any, states: Mapping[str, Shape], x: Any, u: Any, T: float | None) -> np.ndarray:
+    """Return the state that ``after_start`` gives, flat; ``T`` is the sample time in s, None in continuous time.
+
+    Raises
+    ------
+    TraceError, ShapeError
+        If there is not one value for each state, or one has another shape.
+    """
+    return _flat_states(block.after_start(x, u, T), states, "after_start") if states else np.zeros(0)
+
+
+def _flat_states(made: Any, states: Mapping[str, Shape], equation: str) -> np.ndarray:
     names = list(states)
     columns = [np.zeros(0)]
-    for name, part in zip(names, parts_of(block.initial(u), names, "initial"), strict=True):
+    for name, part in zip(names, parts_of(made, names, equation), strict=True):
         shape = _shape(part)
         if shape is None:
-            raise TraceError(f"its initial returned {_describe(part)} for {name}; expected numbers.", port=name)
+            raise TraceError(f"its {equation} returned {_describe(part)} for {name}; expected numbers.", port=name)
         if size(shape) != size(states[name]):
-            raise ShapeError(f"its initial gives shape {shape}; expected {states[name]}, as the state has.", port=name)
+            raise ShapeError(
+                f"its {equation} gives shape {shape}; expected {states[name]}, as the state has.", port=name
+            )
         columns.append(np.ravel(np.asarray(part, dtype=float)))
     return np.concatenate(columns)

@@ -66,6 +66,10 @@ class Environment(Block):
         force, inertia = d * f, -self.mass * along(d, u.acceleration) * d
         return u.push + d * u.kick + force + inertia, force, np.where(t > 0.0, inertia, 0.0 * inertia)
 
+    def after_start(self, x: Any, u: Any, T: float | None) -> tuple[()]:
+        """Return no states: the branch of the start is ``t > 0``."""
+        return ()
+
 
 class HeldEnvironment(Block):
     """The environment at communication points: its force is held between them.

@@ -47,8 +47,6 @@ if TYPE_CHECKING:
 
 SIDES = ("par", "perp")
 """Directions of a path: along it and across it."""
-SOON = 1e-9
-"""Time in s just behind the start of a continuous diagram."""
 
 
 @explain_calls
@@ -321,10 +319,8 @@ def make_contact(
     point = operating_point(diagram, at, options)
     diagram = diagram.replace(point.parameters) if point.parameters else diagram  # parameters that a trim has found
     ports = Ports.find(diagram, diagram.flatten_like(point), names)
-    if not diagram.has_clock and point.t == 0.0:  # a sensor's first value lacks its tool; at rest, a later one does not
-        point = _move_on(point, 0, SOON)
     parts, unusual = take_apart(diagram, ports, force, point, taken)
-    if unusual:  # so does its first sample; the next tick has the same states
+    if unusual:  # a block has a first tick of its own; at rest, the next tick has the same states
         count = round(parts.sample_time / float(point.base))
         point = _move_on(point, count, float(point.base * count))
         parts, _ = take_apart(diagram, ports, force, point, taken)

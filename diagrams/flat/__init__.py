@@ -4,11 +4,11 @@ from ...blocks.core import Layout
 from .announced import Announcer, Times, announcers
 from .clock_sets import kinds_of, times_of
 from .clocks import EVERY, NONE, ClockSets, TickPattern, ticks_after
-from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator, sort_names
+from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, just_after, no_evaluator, sort_names
 from .fast_functions import share_terms, speed_up
 from .flat_diagram import EXACT_LOOP, FlatDiagram
 from .flat_functions import indicators_of
-from .flat_layout import FlatEvent, StateLayout
+from .flat_layout import FlatEvent, StateLayout, sample_time_of
 from .flatten import renumber, write_numbers
 from .logic import TRUE, is_true
 from .plant_ticks import StepTable, own_step, takes_any_step
@@ -63,6 +63,7 @@ __all__ = [
     "indicators_of",
     "is_true",
     "join_columns",
+    "just_after",
     "kinds_of",
     "loop_mismatch",
     "next_x",
@@ -71,6 +72,7 @@ __all__ = [
     "plant_inputs",
     "rates",
     "renumber",
+    "sample_time_of",
     "share_terms",
     "size_of_motion",
     "sort_names",

@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import Layout, SimulationError, Wanted
+from ...blocks.core import Block, Layout, SimulationError, Wanted
 from ...blocks.tracing import GUARDS, NEXT, size
 from ..wiring import OrderStep, Wire, join
 from .block_functions import BlockFunctions, call_block
@@ -24,6 +24,9 @@ from .program import Cells
 
 INDICATORS, JUMP = "indicators", "jump"
 """Names of the equations of a block's events, next to its outputs, `NEXT` and `GUARDS`."""
+
+SMALLEST = float(np.finfo(float).tiny)
+"""Time in s that is above 0, and that no other time of a run is changed by."""
 
 Apart = Callable[["Instant", str, tuple[str, ...], Any, Sequence[Any]], list[Any]]
 """Evaluates a block from outside: called with the instant, the block's path, the names of the equations that are
@@ -41,6 +44,7 @@ def evaluate(
     *,
     fired: Any = None,
     opened: bool = False,
+    begun: bool = False,
     order: Iterable[OrderStep] | None = None,
     before: Callable[[str, dict[str, Any]], None] | None = None,
     visit: Callable[[Instant, str, dict[str, Any], dict[str, Any]], None] | None = None,
@@ -64,6 +68,8 @@ def evaluate(
         Which of the diagram's events fire; without it none does.
     opened : bool
         Evaluate every subsystem as if it acted.
+    begun : bool
+        Evaluate blocks with a branch of their start (`after_start`) just after t, as linear models take them.
     order : iterable of OrderStep, optional
         Another order than that of a tick.
     before, visit : callable, optional
@@ -76,7 +82,7 @@ def evaluate(
     kept : column, optional
         Outputs at the last tick, as `FlatLayout.log` lays them out: those of blocks that do not act.
     """
-    instant = Instant(layout, functions, acting, t, x, w, p, fired, opened, taps or {}, apart, kept)
+    instant = Instant(layout, functions, acting, t, x, w, p, fired, opened, taps or {}, apart, kept, begun)
     instant.run(layout.order.steps if order is None else order, before, visit)
     return instant
 
@@ -120,7 +126,9 @@ class Instant:
         taps: Mapping[tuple[str, str], Callable[[Any], Any]],
         apart: Apart | None,
         kept: Any = None,
+        begun: bool = False,
     ):
+        self.begun = begun
         self.layout, self.functions, self.acting = layout, functions, acting
         self.t, self.x, self.w, self.p, self.fired = t, x, w, p, fired
         self.opened, self.taps, self.apart, self.kept = opened, taps, apart, kept
@@ -248,7 +256,10 @@ class Instant:
         """
         shapes = self.functions.traced[path].inputs
         columns = [np.zeros(size(s)) if inputs[q] is None else inputs[q] for q, s in shapes.items()]
-        return self.t, self._state(path), columns, rows(self.p, self.layout.parameters.slices[path])
+        return self._time(path), self._state(path), columns, rows(self.p, self.layout.parameters.slices[path])
+
+    def _time(self, path: str) -> Any:
+        return just_after(self.t, self.layout.table.blocks[path]) if self.begun else self.t
 
     def _call_apart(self, path: str, names: tuple[str, ...], state: Any, inputs: Sequence[Any]) -> list[Any]:
         if self.apart is None:
@@ -359,6 +370,11 @@ class Instant:
             made.update({name: change(column) for name, column in made.items()})
         self.guards = [change(column) for column in self.guards]
         self.mismatch = [(change(made), change(taken)) for made, taken in self.mismatch]
+
+
+def just_after(t: Any, block: Block) -> Any:
+    """Return the time at which linear models evaluate a block: past its branch of the start, where it has one."""
+    return t + SMALLEST if hasattr(block, "after_start") else t
 
 
 def sort_names(names: Sequence[str]) -> Wanted:

@@ -264,7 +264,7 @@ class LocalDerivatives:
             flat, symbols = self.flat, self.flat.symbols()
 
             def results(apart: Apart) -> Mapping[str, Any]:
-                instant = evaluate(flat, flat.blocks, acting, **symbols, apart=apart)
+                instant = evaluate(flat, flat.blocks, acting, **symbols, apart=apart, begun=True)
                 columns = [ca.densify(ca.MX(instant.values[port])) for port in self.cut]
                 return {"c": ca.vertcat(*columns) if columns else ca.MX(0, 1), "r": loop_mismatch(instant)}
 
@@ -300,6 +300,7 @@ class LocalDerivatives:
                     **symbols,
                     taps=self._make_taps(d, c),
                     apart=apart,
+                    begun=True,
                     visit=lambda here, path, inputs, made: self.stairs.add(here, path, made, e),
                 )
                 found = {"x_next": next_x(instant), "z": plant_inputs(instant), "y": self._read_outputs(instant)}

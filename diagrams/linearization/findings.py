@@ -226,7 +226,10 @@ class UnusualStart(Finding):
     """A start at which the diagram behaves in another way than at every later tick."""
 
     def __str__(self) -> str:
-        return "the start is unlike every later tick, as a block has a first tick of its own; linearize at a later time"
+        return (
+            "the start is unlike every later tick, as a block has a first tick of its own; linearize at a later time, "
+            "or give that block an after_start(x, u, T)"
+        )
 
 
 @explain_calls

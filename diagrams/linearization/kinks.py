@@ -27,7 +27,7 @@ import numpy as np
 from ...blocks.core import Block, Finding, Output, State
 from ...fmus.calls import is_smooth
 from ...fmus.running import Fmu
-from ..flat import FlatDiagram, WiredDiagram
+from ..flat import FlatDiagram, WiredDiagram, just_after
 from ..results import OperatingPoint
 from ..wiring import join
 from .block_slopes import BlockSlopes, slopes_of
@@ -148,7 +148,7 @@ class _BlockAtPoint:
                 span[where] = given
         used = frozenset(w.port for w in (*flat.table.wires.values(), *flat.table.names.values()) if w.block == path)
         numbers = ca.DM(p) if slopes.is_large else p  # converted once
-        return cls(path, block, slopes, at.t, z, numbers, span, wired, used)
+        return cls(path, block, slopes, just_after(at.t, block), z, numbers, span, wired, used)
 
     def find(self) -> Iterator[Finding]:
         """Yield the kinks and zero slopes of the block."""

@@ -13,6 +13,7 @@ from ...blocks.core import Layout, OptionError, UnknownArgumentError, accepts, k
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, PointOrigin, Snapshot, layout_of, units_of
 from ..solvers import FIXED
+from .start_branches import leave_start
 
 if TYPE_CHECKING:
     from ..simulation import Simulation
@@ -48,7 +49,7 @@ def capture(simulation: Simulation, how: PointOrigin = PointOrigin.RUN) -> Opera
                 port="operating point",
                 t=view.t,
             )
-    values = {name: view.log[s].reshape(flat.log.shapes[name]).copy() for name, s in flat.log.slices.items()}
+    values = values_of(flat, view.log)
     point = OperatingPoint(
         view.t,
         view.tick,
@@ -106,8 +107,12 @@ def check_options(diagram: WiredDiagram, options: Mapping[str, Any], caller: str
             raise UnknownArgumentError(name, (*RUN_OPTIONS, *MORE.get(caller, ())), block=caller)
 
 
-def operating_point(diagram: WiredDiagram, point: PointLike, options: Mapping[str, Any]) -> OperatingPoint:
+def operating_point(
+    diagram: WiredDiagram, point: PointLike, options: Mapping[str, Any], *, begun: bool = True
+) -> OperatingPoint:
     """Return an operating point: as it is, or by a run to a recorded instant, to a time in s or to the start (None).
+
+    It is past the branches of the start that blocks have, unless ``begun`` is False.
 
     Raises
     ------
@@ -119,14 +124,14 @@ def operating_point(diagram: WiredDiagram, point: PointLike, options: Mapping[st
     if isinstance(point, Snapshot):
         _check_run(diagram, point)
         recipe = dict(getattr(point.run, "recipe", {}) or {})
-        found = run_to(diagram, point.t, {**recipe, **options})
+        found = run_to(diagram, point.t, {**recipe, **options}, begun=begun)
         _check_found_again(diagram, point, found)
         return found
     if point is None:
         start = options.get("start")
-        return run_to(diagram, 0.0 if start is None else start.t, options)
+        return run_to(diagram, 0.0 if start is None else start.t, options, begun=begun)
     if isinstance(point, int | float | np.floating | np.integer) and not isinstance(point, bool):
-        return run_to(diagram, float(point), options)
+        return run_to(diagram, float(point), options, begun=begun)
     raise OptionError(
         f"found {point!r}; expected an operating point. Give run.at(t), a time in s, diagram.operating_point(…), "
         "diagram.trim(…), or None for the start.",
@@ -167,8 +172,8 @@ def _check_found_again(diagram: WiredDiagram, given: Snapshot, found: OperatingP
 
 
 @accepts("operating_point", t=kinds.real)
-def run_to(diagram: WiredDiagram, t: float, options: Mapping[str, Any]) -> OperatingPoint:
-    """Run a diagram to a time in s, and return the operating point there."""
+def run_to(diagram: WiredDiagram, t: float, options: Mapping[str, Any], *, begun: bool = True) -> OperatingPoint:
+    """Run a diagram to a time in s, and return the operating point there; see `operating_point`."""
     from ..simulation import RunOptions, Simulation
 
     check_options(diagram, options, "operating_point")
@@ -206,7 +211,17 @@ def run_to(diagram: WiredDiagram, t: float, options: Mapping[str, Any]) -> Opera
                 block=diagram.name,
                 port="operating point",
             )
+        if begun:
+            view = simulation.view
+            x = leave_start(simulation.flat, view.x, values_of(simulation.flat, view.log))
+            if x is not view.x:
+                simulation.take_over(x, simulation.flat)
         return capture(simulation)
+
+
+def values_of(flat: FlatDiagram, log: np.ndarray) -> dict[str, np.ndarray]:
+    """Return all signals by the paths of their ports."""
+    return {name: log[s].reshape(flat.log.shapes[name]).copy() for name, s in flat.log.slices.items()}
 
 
 def _keeps_step(options: Mapping[str, Any], t: float, has_fmu: bool) -> bool:
@@ -266,7 +281,7 @@ def copy_point(diagram: WiredDiagram, point: OperatingPoint, other: WiredDiagram
 
     point.check_units(other.blocks, other.name)
     old = diagram.flatten_like(point)
-    guess = operating_point(other, None, {} if other.has_base else {"step": point.base})
+    guess = operating_point(other, None, {} if other.has_base else {"step": point.base}, begun=False)
     flat = other.flatten_like(guess)
     tick = point.tick * point.base / flat.base
     if tick.denominator != 1:
@@ -291,16 +306,17 @@ def copy_point(diagram: WiredDiagram, point: OperatingPoint, other: WiredDiagram
             group[path] = {**group[path], "t": point.t, "state": {name: own[name] for name in group[path]["state"]}}
     for path in exchanged.keys() & states.keys():
         _copy_state(flat.states.of_block[path], states[path], x)
+    values = {**guess.values, **{name: v for name, v in point.values.items() if name in guess.values}}
     return replace(
         guess,
         t=point.t,
         tick=int(tick),
-        x=x,
+        x=leave_start(flat, x, values),
         w=w,
         z=z,
         plants=plants,
         exchanged=exchanged,
-        values={**guess.values, **{name: v for name, v in point.values.items() if name in guess.values}},
+        values=values,
         residual=point.residual,
         largest=point.largest,
         how=point.how,

@@ -42,7 +42,8 @@ from ..flat import (
 from ..frequency import first_largest
 from ..results import FreeDirection, OperatingPoint, PointOrigin, layout_of
 from .exchanged import evaluators_at
-from .operating_points import PointLike, copy_point, operating_point, with_residual
+from .operating_points import PointLike, copy_point, operating_point, values_of, with_residual
+from .start_branches import leave_start
 from .trim_plants import ExchangedPlants, Plants, check_drift
 from .trim_request import Free, Target, free_parameters, index_states, read_targets, set_states
 
@@ -87,7 +88,7 @@ class _Equations:
         flat, symbols = self.flat, self.flat.symbols()
 
         def results(apart: Apart) -> Mapping[str, Any]:
-            instant = evaluate(flat, flat.blocks, self.acting, **symbols, apart=apart)
+            instant = evaluate(flat, flat.blocks, self.acting, **symbols, apart=apart, begun=True)
             change = (next_x(instant) - symbols["x"])[self.sampled] if self.sampled else ca.MX(0, 1)
             y = join_columns([instant.values[port][list(entries)] for port, entries in self.target.signals])
             loop, z = loop_mismatch(instant), plant_inputs(instant)
@@ -374,13 +375,19 @@ def point_from_states(
 
     Signals and the FMUs' outputs follow from the states. See `Diagram.operating_point`.
     """
-    guess = operating_point(diagram, t, options)
+    guess = operating_point(diagram, t, options, begun=False)
     flat = diagram.flatten_like(guess)
     guess = set_states(flat, guess, states)
     known = index_states(flat, guess)
     target = read_targets(flat, known, {}, {}, list(known), {})
     target.rest = False
-    return _solve_trim(diagram, diagram, flat, guess, [], target, TOLERANCE, PointOrigin.GIVEN)
+
+    def solve_signals(guess: OperatingPoint) -> OperatingPoint:
+        return _solve_trim(diagram, diagram, flat, guess, [], target, TOLERANCE, PointOrigin.GIVEN)
+
+    found = solve_signals(guess)
+    begun = leave_start(flat, found.x, found.values)  # it depends on the signals
+    return found if begun is found.x else solve_signals(set_states(flat, replace(guess, x=begun), states))
 
 
 def _solve_trim(
@@ -456,7 +463,7 @@ def _complete_point(
     flat = diagram.flatten_like(guess)
     at_tick = flat.at_tick(frozenset(flat.clocks.values()))
     x_next, z, log, _ = at_tick(guess.t, x, w, flat.p, evaluators=evaluators_at(flat, guess))
-    values = {name: log[s].reshape(flat.log.shapes[name]).copy() for name, s in flat.log.slices.items()}
+    values = values_of(flat, log)
     x = x.copy()
     for name, where in flat.held.slices.items():
         x[where] = np.ravel(values[name])

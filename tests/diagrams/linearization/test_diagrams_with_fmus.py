@@ -401,10 +401,12 @@ def test_friction_that_the_controller_does_not_know_couples_and_damps():
     assert np.abs(poles).max() > 180  # against 40
 
 
-def test_the_tool_needs_a_point_after_the_start():
+def test_the_start_has_the_tool_as_every_later_tick():
     diagram = at_rest(tool_mass=2.0)
-    assert diagram.linearize().notes[-1].startswith("the start is unlike every later tick")
-    assert diagram.linearize(T).notes == ()
+    first, later = diagram.linearize(), diagram.linearize(T)
+    assert first.notes == later.notes == ()
+    assert pytest.approx(later.A, abs=1e-9) == first.A
+    assert {*at_rest().linearize().states} < {*first.states}  # the tool feels the force that was held
     rough = at_rest(encoder=1e-5).linearize(T)
     assert "sensors.encoder.measured_position follows 'position' in steps only: it linearizes to zero" in rough.notes
 
