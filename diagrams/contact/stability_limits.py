@@ -356,7 +356,7 @@ class ContactMap:
     x_values, y_values : ndarray
         Values of the properties.
     growth : ndarray, shape (len(y_values), len(x_values))
-        σ in 1/s, negative where the loop is stable.
+        σ in 1/s, negative where the loop is stable, −∞ where the environment moves no mode.
     limits : tuple of ContactLimit
         Limit of x at each value of y.
     """
@@ -397,7 +397,7 @@ class CoupledLoop:
         return close_loop(self.parts, join_environment(self.parts, self.direction, **{**self.held, self.vary: value}))
 
     def growth(self, value: Any) -> np.ndarray:
-        """Return σ in 1/s of the fastest mode that the environment can move; infinite without a solution."""
+        """Return σ in 1/s of the fastest mode that the environment can move, −∞ where it moves none, ∞ unsolvable."""
         return self._find_rates(self.close(value).A)
 
     def _find_rates(self, A: np.ndarray) -> np.ndarray:
@@ -406,7 +406,8 @@ class CoupledLoop:
         return np.where(solvable, self._rates_of(reduced), np.inf)
 
     def _rates_of(self, reduced: np.ndarray) -> np.ndarray:
-        return np.asarray(np.max(to_rates(self.parts, np.linalg.eigvals(reduced)).real, axis=-1))
+        rates = to_rates(self.parts, np.linalg.eigvals(reduced)).real
+        return np.asarray(np.max(rates, axis=-1, initial=-np.inf))
 
     def growth_at(self, value: float) -> float:
         """Return σ in 1/s at one value."""
@@ -514,6 +515,8 @@ def find_limit(
         rate, frequency, moved = fixed
         grows = f"a mode that no such environment moves grows by {rate:.4g} 1/s"
         found = FoundLimit(0.0, (), math.nan, rate, 0.0, grows)
+    elif not loop.modes.right.shape[1]:
+        found = FoundLimit(math.inf, (), math.nan, math.nan, 0.0, "no mode of the loop is moved by such an environment")
     else:
         found = find_first_limit(
             vary,

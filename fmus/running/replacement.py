@@ -135,12 +135,13 @@ def _find_misfits(
             pair = ports[name], before[name], variables[name], _variable(old, side, name)
             misfits += _compare(side, name, *pair, converts=fmu.convert_units)
         wanted, free = {n: before[n] for n in missing}, {n: ports[n] for n in spare if n not in before}
-        pairs = _match(wanted, free)
+        pairs = _match(wanted, free, converts=fmu.convert_units)
         rename |= {variables[new].name: name for name, new in pairs.items()}
         elements |= _match_elements(
             {n: p for n, p in wanted.items() if n not in pairs},
             {n: p for n, p in free.items() if n not in pairs.values()},
             variables,
+            converts=fmu.convert_units,
         )
     return misfits, rename, elements
 
@@ -162,12 +163,13 @@ def suggest_names(fmu: _WithVariables, inputs: Mapping[str, Input], outputs: Map
     ):
         missing = {n: p for n, p in wanted.items() if n not in ports}
         free = {n: p for n, p in ports.items() if n not in wanted}
-        pairs = _match(missing, free)
+        pairs = _match(missing, free, converts=fmu.convert_units)
         found |= {variables[new].name: name for name, new in pairs.items()}
         found |= _match_elements(
             {n: p for n, p in missing.items() if n not in pairs},
             {n: p for n, p in free.items() if n not in pairs.values()},
             variables,
+            converts=fmu.convert_units,
         )
     return found
 
@@ -197,11 +199,7 @@ def _compare(
     if old.shape is not None and new.shape != old.shape:
         found.append(_Misfit(ShapeError, f"{side} {name}: found shape {new.shape}; expected {old.shape}"))
     one, other = new.unit, old.unit
-    if (
-        isinstance(one, str)
-        and isinstance(other, str)
-        and not (same_unit(one, other) or (converts and same_dimension(one, other)))
-    ):
+    if isinstance(one, str) and isinstance(other, str) and not _fits(one, other, converts=converts):
         way = (other, one) if side == "input" else (one, other)
         text = f"{side} {name}: found the unit {one}; expected {other}: {describe_mismatch(*way)}"
         found.append(_Misfit(UnitError, text))
@@ -227,14 +225,15 @@ def _kind(variable: FmuVariable) -> str:
 
 
 def _match(
-    missing: Mapping[str, Input | Output | State], spare: Mapping[str, Input | Output | State]
+    missing: Mapping[str, Input | Output | State], spare: Mapping[str, Input | Output | State], *, converts: bool
 ) -> dict[str, str]:
     """Return ports that may be meant by those that are missing: of their shape and unit, and the most alike by name.
 
-    A port without one that is alike by name gets the only one of its shape and unit, if it is the only one for it, too.
+    An FMU that ``converts`` units may have one of the same dimension. A port without one that is alike by name gets the
+    only one of its shape and unit, if it is the only one for it, too.
     """
     fits = {
-        name: [other for other, q in spare.items() if q.shape == p.shape and _same(q.unit, p.unit)]
+        name: [other for other, q in spare.items() if q.shape == p.shape and _fits(q.unit, p.unit, converts=converts)]
         for name, p in missing.items()
     }
     found: dict[str, str] = {}
@@ -254,6 +253,8 @@ def _match_elements(
     missing: Mapping[str, Input | Output | State],
     spare: Mapping[str, Input | Output | State],
     variables: Mapping[str, FmuVariable],
+    *,
+    converts: bool,
 ) -> dict[str, str]:
     """Return elements of missing array ports by the FMU's names of the scalars that may be these.
 
@@ -263,11 +264,12 @@ def _match_elements(
     families: dict[str, list[tuple[str, ...]]] = {}
     for name, port in missing.items():
         size = math.prod(port.shape or ())
-        fitting = [n for n, q in spare.items() if not q.shape and _same(q.unit, port.unit)]
+        fitting = [n for n, q in spare.items() if not q.shape and _fits(q.unit, port.unit, converts=converts)]
         known = _families(fitting, size)
         if len(fitting) == size and not known:
             known = [tuple(fitting)]
-        families[name] = [f for f in known if port.shape and len({_likeness(variables[n]) for n in f}) == 1]
+        like = {n: (spare[n].unit, *_likeness(variables[n])) for n in fitting}
+        families[name] = [f for f in known if port.shape and len({like[n] for n in f}) == 1]
     found: dict[str, tuple[str, ...]] = {}
     ranked = sorted((-_alike(name, _common_part(f)), name, f) for name, known in families.items() for f in known)
     for value, name, family in ranked:
@@ -310,8 +312,10 @@ def _likeness(v: FmuVariable) -> tuple[object, ...]:
     return v.type, v.causality, v.variability, v.clocks, tuple(v.items.items())
 
 
-def _same(a: object, b: object) -> bool:
-    return same_unit(a, b) if isinstance(a, str) and isinstance(b, str) else True
+def _fits(a: object, b: object, *, converts: bool) -> bool:
+    if not (isinstance(a, str) and isinstance(b, str)):
+        return True
+    return same_unit(a, b) or (converts and same_dimension(a, b))
 
 
 def _alike(a: str, b: str) -> float:

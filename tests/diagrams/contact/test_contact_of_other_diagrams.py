@@ -70,6 +70,22 @@ def test_a_cart_without_friction_bounces_on_any_spring_for_ever():
     assert here.stability_limit("damping", stiffness=100.0).value == math.inf
 
 
+def test_a_mass_moves_no_mode_of_a_free_cart():
+    # (M + m) s² = 0: a drift for every mass, which is no growth
+    cart, hand = Cart(name="cart"), Constant(value=0.0, unit="N", name="hand")
+    off = Constant(value=0.0, unit="N", name="off")
+    here = Diagram("cart", cart(motor=off, push=hand)).contact(
+        "cart.push", direction=[1.0], position="cart.position", velocity="cart.velocity", force="hand.y"
+    )
+    for vary, held in (("mass", {}), ("tool_mass", {}), ("mass", {"tool_mass": 1.0})):
+        found = here.stability_limit(vary, **held)
+        assert found.value == math.inf
+        assert found.confirmed_by == "no mode of the loop is moved by such an environment"
+    assert here.stability_limit("mass", damping=1.0).value == math.inf
+    grid = here.stability_map([0.1, 1.0], [0.5, 2.0], x="mass", y="tool_mass")
+    assert (grid.growth == -math.inf).all()
+
+
 def test_the_least_growth_of_such_a_cart_is_no_rounding():
     """M s² − c s + k = 0 grows by c/2M: 5e-9 of the least frequency of the scan, 5e-14 of the largest."""
     cart, hand = Cart(name="cart"), Constant(value=0.0, unit="N", name="hand")

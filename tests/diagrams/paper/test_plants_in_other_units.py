@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import OptionError, UnitError, UnknownNameError
+from loopwright.blocks import OptionError, UnitError, UnknownNameError, WiringError
 from loopwright.diagrams import experiments
 from loopwright.fmus import Fmu
 from support import oracle
@@ -60,6 +60,21 @@ def test_an_option_that_is_given_twice_is_compared_in_one_unit(file):
     assert experiments.path_following(plant=plant, friction_width=0.03).options["friction_width"] == 0.03
     with pytest.raises(OptionError, match=r"friction_width: found 20 mm/s, and 30 mm/s in the plant's start values"):
         experiments.path_following(plant=plant, friction_width=0.02)
+
+
+def test_names_of_scalars_in_another_unit_are_offered_where_they_are_converted(tmp_path):
+    scalars = scalar_gantry(tmp_path, length="mm")
+    moved = {name: port for name, port in ARRAYS.items() if not name.startswith("F_")}
+    plant = Fmu(scalars, convert_units=True)
+    with pytest.raises(UnknownNameError) as e:
+        experiments.path_following(plant=plant)
+    assert f"Fmu(file, rename={moved!r})" in str(e.value)
+    with pytest.raises(WiringError) as e:
+        experiments.path_following().diagram.replace(plant=plant)
+    assert f"rename={moved!r}); name the others that are missing, too." in str(e.value)
+    with pytest.raises(WiringError) as e:
+        experiments.path_following().diagram.replace(plant=Fmu(scalars))
+    assert "rename=" not in str(e.value)
 
 
 def test_a_plant_that_does_not_convert_is_refused_for_its_unit(file):
