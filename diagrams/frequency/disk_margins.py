@@ -234,7 +234,13 @@ def _compute_disk_margin(r: Realization, skew: float) -> DiskMargin:
     n = len(r.D)
     if r.D.shape != (n, n):
         raise ParameterError(f"found a loop of shape {r.D.shape}; expected a square one.", block="disk_margin")
-    if not r.order or not r.is_stable():
+    if not r.order:
+        raise ParameterError(
+            "found a constant loop: no state is controllable and observable; expected dynamics. Look at the wire at "
+            "which the loop is opened.",
+            block="disk_margin",
+        )
+    if not r.is_stable():
         raise ParameterError(
             f"found {r.count_unstable()} of {r.order} closed-loop poles that are not stable; expected a stable closed "
             "loop: this one has no margin. Look at margins(loop).closed_loop_poles.",

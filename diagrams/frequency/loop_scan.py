@@ -15,8 +15,6 @@ Function = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """From L and dL/d(log ω) to a value and its slope over log ω."""
 PER_DECADE = 40
 """Frequencies of a scan, besides those around poles and zeros."""
-GAP = 2e-9
-"""Relative distance that a scan keeps from a pole or zero on the axis."""
 POLISHED = 20
 """Number of candidates of a peak that are refined."""
 
@@ -217,14 +215,14 @@ def make_grid(r: Realization, features: Features, *, delay: float = 0.0) -> list
     grid.extend(a.omega * (1 + np.concatenate([-close, close])) for a in on_axis)
     omega = np.concatenate(grid)
     omega = np.unique(omega[(omega >= low) & (omega <= high)])
-    cuts = sorted({a.omega for a in on_axis if low < a.omega})
+    cuts = sorted((a.omega, a.gap) for a in on_axis if low < a.omega)
     segments, start = [], low
-    for cut in [*cuts, np.inf]:
-        end = cut * (1 - GAP) if np.isfinite(cut) else high
+    for cut, gap in [*cuts, (np.inf, 0.0)]:
+        end = cut * (1 - gap) if np.isfinite(cut) else high
         inside = omega[(omega > start) & (omega < min(end, high))]
         if start < min(end, high):
             segments.append(_bisect(r, np.array([start, *inside, min(end, high)]), delay))
-        start = cut * (1 + GAP)
+        start = max(start, cut * (1 + gap))
     return segments
 
 

@@ -90,7 +90,7 @@ class StabilityMargins(MarginTable):
             return ()
         poles = np.array(self.closed_loop_poles)
         growth = np.abs(poles) - 1.0 if self.dt else poles.real
-        limit = min(0.0, float(growth.max(initial=0.0))) - NEAR * float(np.abs(poles).max(initial=0.0))
+        limit = min(0.0, float(growth.max(initial=-np.inf))) - NEAR * float(np.abs(poles).max(initial=0.0))
         return tuple(complex(p) for p, g in zip(poles, growth, strict=True) if g >= limit)
 
 

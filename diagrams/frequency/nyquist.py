@@ -71,7 +71,8 @@ def nyquist_count(loop: LinearSystem, *, delay: int = 0) -> NyquistCount:
     Raises
     ------
     ConfirmationError
-        If the winding number and the eigenvalues disagree.
+        If the winding number and the eigenvalues disagree, or a closed-loop pole is on the limit of stability up to
+        rounding: the curve passes through −1.
 
     Examples
     --------
@@ -92,6 +93,14 @@ def nyquist_count(loop: LinearSystem, *, delay: int = 0) -> NyquistCount:
 def count_encirclements(r: Realization, features: Features) -> NyquistCount:
     """Count the encirclements of a realization; see `nyquist_count`."""
     eigenvalues, open_loop = r.count_unstable(), features.unstable_poles()
+    if len(marginal := r.find_marginal()):
+        pole = complex(marginal[0]) + (1.0 if r.dt else 0.0)
+        raise ConfirmationError(
+            f"found a closed-loop pole on the limit of stability, {'z' if r.dt else 's'} = {pole:.6g}, at which the "
+            "curve passes through −1; expected none, since rounding decides on which side it passes. Change the gain "
+            "a little, or look at margins(loop).closed_loop_poles.",
+            block="nyquist",
+        )
     n = winding_number(r, features)
     if n + open_loop != eigenvalues:
         raise ConfirmationError(

@@ -10,6 +10,8 @@ from .realization import Realization
 
 SIDES = np.array([-10, -3, -1, -0.3, 0.0, 0.3, 1, 3, 10])
 """Distances from a pole or zero, in parts of its distance from the axis, at which a scan has frequencies."""
+GAP = 2e-9
+"""Relative distance that a scan keeps from a single pole or zero on the axis."""
 
 
 @dataclass(frozen=True)
@@ -20,6 +22,16 @@ class AxisPole:
     multiplicity: int
     scatter: float
     """Largest distance of a computed eigenvalue from their mean, rad/s."""
+
+    @property
+    def gap(self) -> float:
+        """Relative distance that a scan keeps from them where they are not at s = 0.
+
+        The matrix s I − A of m coinciding poles is singular but for rounding within ε^(1/m) of them.
+        """
+        if self.multiplicity == 1:
+            return GAP
+        return max(GAP, 30.0 * self.scatter / self.omega, 3.0 * 1e-15 ** (1.0 / self.multiplicity))
 
 
 @dataclass(frozen=True, eq=False)

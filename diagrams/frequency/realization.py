@@ -24,7 +24,7 @@ STRUCTURE = 1e-14
 ROUNDING = (1e-8, 1e-10, 1e-12)
 """Sizes below which an entry may be such a zero; each is tried, and kept if the response stays the same."""
 MARGINAL = 1e-13
-"""Distance from the limit of stability, relative to the largest pole, below which a pole counts as on it."""
+"""Distance from the limit of stability, relative to the largest pole of open and closed loop, that counts as none."""
 ROUNDOFF = 2e-15
 """Relative size of the rounding in a solution of linear equations: nine times that of a number."""
 LIGHTLY_DAMPED = 0.3
@@ -174,8 +174,20 @@ class Realization:
     def count_unstable(self, factor: complex | np.ndarray = 1.0) -> int:
         """Return the number of closed-loop poles that are not stable; poles on the limit, up to rounding, count."""
         poles = self.eigenvalues(factor)
-        rounding = MARGINAL * float(np.abs(poles).max(initial=0.0))
-        return int(np.sum(self.growth(poles) >= -rounding))
+        return int(np.sum(self.growth(poles) >= -self._marginal(poles)))
+
+    def find_marginal(self) -> np.ndarray:
+        """Return the closed-loop poles on the limit of stability, up to rounding, in the plane of p."""
+        poles = self.eigenvalues()
+        return np.asarray(poles[np.abs(self.growth(poles)) <= self._marginal(poles)])
+
+    @cached_property
+    def _largest_pole(self) -> float:
+        return float(np.abs(np.linalg.eigvals(self.A)).max(initial=0.0))
+
+    def _marginal(self, poles: np.ndarray) -> float:
+        """Return the rounding of closed-loop poles: they are differences of numbers as large as the open-loop poles."""
+        return MARGINAL * max(self._largest_pole, float(np.abs(poles).max(initial=0.0)))
 
     def is_stable(self, factor: complex | np.ndarray = 1.0) -> bool:
         """Whether all closed-loop poles are stable."""

@@ -275,3 +275,8 @@ def test_a_plant_that_can_not_be_held_is_refused():
         delayed_hold(AXIS, 1e-3, -1.0)
     with pytest.raises(ParameterError, match="without any delay"):
         delayed_hold_margin(AXIS, -1.0 * controller(20.0, 1e-3))
+
+
+def test_a_constant_loop_is_named_as_such():
+    with pytest.raises(ParameterError, match="found a constant loop"):
+        disk_margin(control.tf([1.0, 0.0, 1.0], [1.0, 0.0, 1.0]))

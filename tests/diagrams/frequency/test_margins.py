@@ -495,3 +495,46 @@ def test_rounding_beside_an_undamped_pole_is_no_crossing(w, seed, disturbance):
         found = margins(L)
     assert found.phase_crossovers == ()
     assert (found.gain_margin_low.value, found.gain_margin_high.value) == (0.0, np.inf)
+
+
+@pytest.mark.parametrize("w0", [1.0, 2.0, 37.3])
+def test_two_undamped_poles_in_one_place(w0):
+    """L = 4 s (s² + s + 1)/(s² + 1)² closes to (s + 1)⁴, and to a stable loop with every gain; s in parts of w0."""
+    numerator = np.array([4.0, 4.0, 4.0, 0.0]) * w0 ** np.arange(1, 5)
+    loop = control.tf(numerator, np.array([1.0, 0.0, 2.0, 0.0, 1.0]) * w0 ** np.arange(5))
+    found = margins(loop)
+    assert found.stable
+    assert (found.gain_margin_low.value, found.gain_margin_high.value) == (0.0, np.inf)
+    assert found.ms.value == pytest.approx(1.0, abs=1e-9)
+    # |L| = 1 with w = ω²: (1 − w)⁴ = 16 w (w + (1 − w)²)
+    one = np.array([-1.0, 1.0])
+    square = np.polymul(one, one)
+    w = np.roots(np.polysub(np.polymul(square, square), np.polymul([16.0, 0.0], np.polyadd(square, [1.0, 0.0]))))
+    omega = np.sqrt(np.sort(w.real[(abs(w.imag) < 1e-9) & (w.real > 0)]))
+    assert [c.frequency.value for c in found.gain_crossovers] == pytest.approx(w0 * omega, rel=1e-9)
+    phases = np.degrees(np.angle(-1.0 / (4j * omega * (1 - omega**2 + 1j * omega) / (1 - omega**2) ** 2)))
+    assert found.phase_margin_deg.value == pytest.approx(abs(phases).min(), rel=1e-9)
+    assert nyquist_count(loop).closed_loop == 0
+
+
+@pytest.mark.parametrize("gain", [1.0, 2.0, 0.7])
+def test_encirclements_of_a_curve_through_minus_one_are_not_counted(gain):
+    """s² + 1 + k = 0: rounding alone decides on which side of −1 the curve passes."""
+    for denominator in ([1.0, 0.0, 1.0], [1.0, 0.0, 0.0]):
+        with pytest.raises(ConfirmationError, match=r"a closed-loop pole on the limit of stability, s = "):
+            nyquist_count(control.tf([gain], denominator))
+    sampled = control.tf([gain], [1.0, -1.0 - gain], 0.1)  # closes to z = 1
+    with pytest.raises(ConfirmationError, match=r"a closed-loop pole on the limit of stability, z = 1\+0j"):
+        nyquist_count(sampled)
+
+
+@pytest.mark.parametrize(("pole", "gain"), [(0.3, 0.1 + 0.2), (0.1 + 0.2, 0.3), (0.3, 0.3)])
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_a_closed_loop_pole_that_is_the_rounding_of_a_difference_is_on_the_limit(pole, gain, dt):
+    """L = k/(s − a), closed at s = a − k, which is 0 or 6e-17 to either side."""
+    loop = control.ss([[1.0 + pole if dt else pole]], [[1.0]], [[gain]], 0.0, dt)
+    found = margins(loop)
+    assert not found.stable
+    assert found.unstable_poles == found.closed_loop_poles
+    with pytest.raises(ConfirmationError, match="a closed-loop pole on the limit of stability"):
+        nyquist_count(loop)
