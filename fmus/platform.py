@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from contextlib import AbstractContextManager, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ def cache_folder() -> Path:
     """
     given = os.environ.get("LOOPWRIGHT_CACHE")
     try:
-        folder = Path(given).expanduser() if given else Path(platformdirs.user_cache_dir("loopwright", appauthor=False))
+        folder = Path(given).expanduser() if given else _user_cache(*map(os.environ.get, _USER))
     except RuntimeError:  # "~", for a user whom the system doesn't know
         folder = Path("~")
     if folder.parts[:1] == ("~",):
@@ -39,6 +40,16 @@ def cache_folder() -> Path:
         )
     with explain_disk_errors(f"the cache folder {str(folder)!r} can't be found", folder, OWN_CACHE, FmuError):
         return folder.absolute()
+
+
+_USER = "HOME", "XDG_CACHE_HOME", "LOCALAPPDATA"
+"""Environment variables by which a user's cache folder is found."""
+
+
+@lru_cache(maxsize=16)
+def _user_cache(*found_by: str | None) -> Path:
+    """Return the user's cache folder, which is looked for again when one of `_USER` has another value."""
+    return Path(platformdirs.user_cache_dir("loopwright", appauthor=False))
 
 
 def explain_cache_errors(
@@ -65,8 +76,9 @@ def record_build(digest: str) -> None:
 def is_built_here(digest: str) -> bool:
     """Return whether Loopwright has built a file with this digest, by a note that only this user can have written."""
     try:
-        folder = cache_folder() / "built"
-        stats = [(folder / digest).stat(), folder.stat(), folder.parent.stat()]
+        folder = str(cache_folder())
+        built = os.path.join(folder, "built")
+        stats = [os.stat(place) for place in (os.path.join(built, digest), built, folder)]
     except (OSError, FmuError):
         return False
     if os.name != "posix":

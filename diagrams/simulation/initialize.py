@@ -338,9 +338,7 @@ def _initial(path: str, block: Any, u: Any, states: Mapping[str, tuple[int, ...]
 def values_from_left(workspace: Workspace) -> Taps:
     """Return, as the taps of `evaluate`, the values just before t = 0 of the sources that announce an instant there."""
     flat = workspace.flat
-    early = {
-        path for path, block in flat.table.blocks.items() if path in flat.checked.traced and _jumps_at_start(block)
-    }
+    early = _sources_that_jump(flat)
     if not early:
         return {}
     here, apart = workspace.here, evaluate_apart(workspace.evaluators)
@@ -358,6 +356,16 @@ def values_from_left(workspace: Workspace) -> Taps:
 
 def _replace(value: np.ndarray, _: Any) -> np.ndarray:
     return value
+
+
+def _sources_that_jump(flat: FlatDiagram) -> set[str]:
+    """Return the paths of the sources that announce an instant at t = 0; a block is asked in its first run only."""
+    known: dict[str, tuple[Block, bool]] = flat.keep("sources that jump at the start", dict)
+    for path in flat.checked.traced:
+        block = flat.table.blocks[path]
+        if path not in known or known[path][0] is not block:
+            known[path] = block, _jumps_at_start(block)
+    return {path for path, (_, jumps) in known.items() if jumps}
 
 
 def _jumps_at_start(block: Block) -> bool:

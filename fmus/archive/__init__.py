@@ -2,7 +2,7 @@
 
 from .archive_limits import ArchiveLimits
 from .binaries import check_binary, find_binary, missing_functions
-from .description import FmuDescription, read_description
+from .description import FmuDescription, find_description, read_description
 from .exchange import ExchangeInfo
 from .faults import FmuFault, FmuFinding, FmuSeverity
 from .gathering import read_index
@@ -30,6 +30,7 @@ __all__ = [
     "SharedLibrary",
     "check_binary",
     "find_binary",
+    "find_description",
     "inexact",
     "join_scalars",
     "missing_functions",

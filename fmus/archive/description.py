@@ -243,7 +243,16 @@ def read_description(
         If the file is missing, is no FMU, has neither co-simulation nor model exchange of FMI 1.0 to 3.0, or no binary
         for this platform; if its archive is unsafe, damaged or beyond the limits. Its ``fault`` is an `FmuFault`.
     """
-    path = os.path.expanduser(os.fspath(file))  # blocks ask often: pathlib would take most of the time
+    return find_description(file, sizes, limits)
+
+
+def find_description(
+    file: str | os.PathLike[str], sizes: Mapping[str, int] | None, limits: ArchiveLimits | None
+) -> FmuDescription:
+    """Return what `read_description` returns, in a fraction of the time: a run's blocks ask often, and rightly."""
+    path = os.fspath(file)  # pathlib would take most of the time
+    if path.startswith("~"):
+        path = os.path.expanduser(path)
     if not os.path.isabs(path):
         with FOLDER:  # another thread may load a library, which takes place in its folder
             try:
@@ -261,7 +270,7 @@ def read_description(
         found = f"{shown!r} is a folder" if os.path.isdir(path) else f"there is no file {shown!r}"
         raise FmuFileError(f"{found}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
     identity = (status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size)
-    return _read(os.path.abspath(path), identity, limits or _USUAL, tuple(sorted(sizes.items())) if sizes else ())
+    return _read(path, identity, limits or _USUAL, tuple(sorted(sizes.items())) if sizes else ())
 
 
 def _unreadable(path: str, error: OSError) -> FmuFileError:

@@ -5,7 +5,7 @@ from .exchange_instance import ExchangeInstance
 from .fmi_calls import ERROR, WARNING, FmiCalls, Log
 from .fmu_block import FmuBlock
 from .instance import FmuInstance
-from .library_functions import bind_functions, exported_name, list_prototypes
+from .library_functions import LibraryFunctions, exported_name, list_prototypes
 from .loaded_library import CALLS, LoadedFmu, MakeCalls
 from .model_structure import is_smooth
 from .native_actions import NativeAction, NativeLook
@@ -29,6 +29,7 @@ __all__ = [
     "FmuBlock",
     "FmuInstance",
     "FmuState",
+    "LibraryFunctions",
     "LoadedFmu",
     "Log",
     "MakeCalls",
@@ -40,7 +41,6 @@ __all__ = [
     "SharedValues",
     "StepOptions",
     "StepTime",
-    "bind_functions",
     "check_offered",
     "exported_name",
     "is_kept",

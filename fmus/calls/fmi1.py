@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 from pathlib import Path
+from typing import Any
 
 from .event_calls import AnswersAt, EventCalls, EventUpdate
 from .fmi_calls import FmiCalls, FmiVersion, Log, TypeCalls, make_callbacks
@@ -13,6 +14,12 @@ _NO_STATUS = {
     *("GetVersion", "GetTypesPlatform", "GetModelTypesPlatform", "InstantiateSlave", "FreeSlaveInstance"),
     *("InstantiateModel", "FreeModelInstance"),
 }
+
+
+def _return_status(name: str, function: Any) -> None:
+    """Let a function return its status; FMPy takes the statuses of some for texts."""
+    if name.removeprefix("fmi1") not in _NO_STATUS:
+        function.restype = ctypes.c_int
 
 
 class Fmi1Calls(FmiCalls):
@@ -49,9 +56,7 @@ class Fmi1Calls(FmiCalls):
     def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
         super().__init__(name=name, token=token, folder=folder, library=library, model_exchange=model_exchange)
         self.freeing = "FreeModelInstance" if model_exchange else "FreeSlaveInstance"
-        for kind, function in self.fmu._functions.items():  # FMPy takes the statuses of some for texts
-            if kind.removeprefix("fmi1") not in _NO_STATUS:
-                function.restype = ctypes.c_int
+        self._functions.change_each(_return_status)
 
     def instantiate(self, log: Log) -> None:
         """Make the instance; its messages go to ``log``. Memory is the C library's (3.2)."""

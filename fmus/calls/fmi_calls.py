@@ -21,7 +21,7 @@ import numpy as np
 from ...blocks.core import FmuProcessError
 from .bound_calls import DISCARD, ERROR, FATAL, PENDING, STATUS, WARNING, BoundCalls, Call
 from .event_calls import EventCalls, EventUpdate
-from .library_functions import allow_missing, exported_name
+from .library_functions import LibraryFunctions, allow_missing, exported_name
 from .printf import Logger, format_message
 
 __all__ = ["DISCARD", "ERROR", "FATAL", "PENDING", "STATUS", "WARNING", "FmiCalls"]
@@ -160,6 +160,11 @@ class FmiCalls(ABC):
         """Return an object of FMPy's class, with its library loaded; see `allow_missing`."""
         return allow_missing(kind, self.prefix, required)(**arguments)
 
+    @property
+    def _functions(self) -> LibraryFunctions:
+        functions: LibraryFunctions = self.fmu._functions
+        return functions
+
     # ---- memory and calls that are bound once ----
 
     lose: Callable[[FmuProcessError], FmuProcessError] = staticmethod(lambda error: error)
@@ -246,7 +251,7 @@ class FmiCalls(ABC):
 
     def lacks(self, function: str) -> bool:
         """Whether the library does not export a function, such as "GetString", so that its calls return an error."""
-        return f"{self.prefix}{function}" in self.fmu.missing_functions
+        return self._functions.lack(f"{self.prefix}{function}")
 
     # ---- values ----
 
@@ -323,8 +328,8 @@ class FmiCalls(ABC):
         Its status is unsigned, so that a negative one, which the standard doesn't have, is no success.
         """
         name = f"{self.prefix}{name}"
-        if name in self.fmu.missing_functions:  # what stands in for it returns an error
-            return getattr(self.fmu.dll, self.exported(name))  # type: ignore[no-any-return]
+        if self._functions.lack(name):
+            return self._functions[name]  # type: ignore[no-any-return]
         function = self.fmu.dll[self.exported(name)]
         function.restype = ctypes.c_uint
         if self._after is not None:
@@ -335,9 +340,12 @@ class FmiCalls(ABC):
 
     def settle_by(self, after: Callable[..., Any]) -> None:
         """Let ctypes call a function after each function of the library, with what that has returned."""
-        self._after = after
-        for function in self.fmu._functions.values():
+
+        def settle(name: str, function: Any) -> None:
             function.errcheck = after
+
+        self._after = after
+        self._functions.change_each(settle)
 
     # ---- steps ----
 

@@ -6,6 +6,7 @@ import ctypes
 import inspect
 import types
 import typing
+from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -27,16 +28,9 @@ def allow_missing(kind: Any, prefix: str, required: tuple[str, ...]) -> Any:
     required : tuple of str
         Ends of the names of functions without which an FMU can't run.
     """
-    needed = {f"{prefix}{name}" for name in required}
 
     def load(fmu: Any) -> None:
-        fmu.missing_functions = set()
-        for name, *_ in list_prototypes(kind, prefix):
-            shown = exported_name(name, prefix, fmu.modelIdentifier)
-            if name not in needed and not hasattr(fmu.dll, shown):
-                fmu.missing_functions.add(name)
-                setattr(fmu.dll, shown, ctypes.CFUNCTYPE(ctypes.c_int)(lambda: ERROR))
-        bind_functions(fmu, kind, prefix)
+        fmu._functions = LibraryFunctions(fmu.dll, kind, prefix, fmu.modelIdentifier, required)
 
     return type(kind.__name__, (kind,), {"_loadFunctions": load})
 
@@ -69,12 +63,55 @@ def list_prototypes(kind: Any, prefix: str) -> tuple[Prototype, ...]:
     return tuple(found)
 
 
-def bind_functions(fmu: Any, kind: Any, prefix: str) -> None:
-    """Give the functions of a loaded library their types, and the object of FMPy's class these functions."""
-    for name, arguments, c_types, result in list_prototypes(kind, prefix):
-        function = getattr(fmu.dll, exported_name(name, prefix, fmu.modelIdentifier))
-        function.argnames, function.argtypes, function.restype = list(arguments), list(c_types), result
-        fmu._functions[name] = function
+class LibraryFunctions(dict[str, Any]):
+    """Functions of a loaded library by their names in FMPy; one gets its types when it is first asked for.
+
+    A run calls a third of them, and to bind all takes longer than to load the library.
+
+    Parameters
+    ----------
+    library : object
+        The library, with its functions as attributes.
+    kind, prefix, required
+        As `allow_missing` has them. One of these that is missing is an `AttributeError`.
+    identifier : str
+        The model identifier, with which names begin in FMI 1.0.
+    """
+
+    def __init__(self, library: Any, kind: Any, prefix: str, identifier: str, required: tuple[str, ...]):
+        super().__init__()
+        self._library, self._prefix, self._identifier = library, prefix, identifier
+        self._prototypes = {prototype.name: prototype for prototype in list_prototypes(kind, prefix)}
+        self._needed = {name for name in map(prefix.__add__, required) if name in self._prototypes}
+        self._changes: list[Callable[[str, Any], None]] = []
+        for name in sorted(self._needed):
+            self[name]
+
+    def lack(self, name: str) -> bool:
+        """Whether the library does not export a function, so that its calls return an error."""
+        return name in self._prototypes and not hasattr(self._library, self._exported(name))
+
+    def change_each(self, change: Callable[[str, Any], None]) -> None:
+        """Call ``change(name, function)`` with each function that is bound, and with others when they are."""
+        self._changes.append(change)
+        for name, function in self.items():
+            change(name, function)
+
+    def __missing__(self, name: str) -> Any:
+        prototype = self._prototypes[name]
+        if name not in self._needed and self.lack(name):
+            function: Any = ctypes.CFUNCTYPE(ctypes.c_int)(lambda: ERROR)
+        else:
+            function = getattr(self._library, self._exported(name))
+        function.argnames, function.argtypes = list(prototype.arguments), list(prototype.types)
+        function.restype = prototype.result
+        for change in self._changes:
+            change(name, function)
+        self[name] = function
+        return function
+
+    def _exported(self, name: str) -> str:
+        return exported_name(name, self._prefix, self._identifier)
 
 
 def exported_name(name: str, prefix: str, identifier: str) -> str:

@@ -20,8 +20,8 @@ from ..calls import (
     Call,
     ChildRequest,
     FmiCalls,
+    LibraryFunctions,
     Log,
-    bind_functions,
     exported_name,
     list_prototypes,
 )
@@ -159,21 +159,15 @@ class RemoteCalls(FmiCalls):
     def _open(self, kind: Any, required: tuple[str, ...], **arguments: Any) -> Any:
         """Return an object of FMPy's class whose library is in the child."""
         process, limits, path, prefix = self.process, self.limits, self._path, self.prefix
-        needed = {f"{prefix}{name}" for name in required}
 
         def initialize(fmu: Any, **given: Any) -> None:
             fmu.guid, fmu.modelIdentifier = given["guid"], given["modelIdentifier"]
             fmu.unzipDirectory, fmu.instanceName = given["unzipDirectory"], given["instanceName"]
-            fmu.fmiCallLogger, fmu.requireFunctions, fmu._functions = None, True, {}
+            fmu.fmiCallLogger, fmu.requireFunctions = None, True
             names = [name for name, *_ in list_prototypes(kind, prefix)]
             shown = [exported_name(name, prefix, given["modelIdentifier"]) for name in names]
             fmu.dll = RemoteLibrary(process, path, shown, limits)
-            fmu.missing_functions = set()
-            for name, export in zip(names, shown, strict=True):
-                if name not in needed and not hasattr(fmu.dll, export):
-                    fmu.missing_functions.add(name)
-                    setattr(fmu.dll, export, ctypes.CFUNCTYPE(ctypes.c_int)(lambda: ERROR))
-            bind_functions(fmu, kind, prefix)
+            fmu._functions = LibraryFunctions(fmu.dll, kind, prefix, given["modelIdentifier"], required)
             fmu.component = fmu.callbacks = None
 
         def unload(fmu: Any) -> None:

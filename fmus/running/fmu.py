@@ -16,7 +16,7 @@ from ...blocks.core import (
     kinds,
     parameter,
 )
-from ..archive import ArchiveLimits, FmuDescription, join_scalars, read_description
+from ..archive import ArchiveLimits, FmuDescription, find_description, join_scalars
 from ..calls import FmuInstance, StepOptions, check_offered
 from ..isolation import Isolation, open_fmu
 from .exchange import DEPENDENCIES, INTERFACES, ExchangeMembers, choose_interface
@@ -168,7 +168,7 @@ class Fmu(ExchangeMembers):
             If the file is missing, or has changed since the block was made.
         """
         try:
-            found = read_description(self.file, self.__dict__["_sizes"], limits=self.limits)
+            found = find_description(self.file, self.__dict__["_sizes"], self.limits)
         except FmuError as error:
             error.at(block=self.label)
             raise
