@@ -3,7 +3,7 @@
 from . import arguments as kinds
 from . import arithmetic, source
 from .arguments import Kind, accepts, check_argument, shorten
-from .arithmetic import Gain, Product, Sum, check_shapes, shape_of
+from .arithmetic import Gain, Product, Stack, Sum, check_shapes, shape_of
 from .block import SOLVED, Block
 from .brief import brief, count_of, enumerate_some
 from .collection import without_collection
@@ -119,6 +119,7 @@ __all__ = [
     "Signal",
     "SimulationError",
     "Source",
+    "Stack",
     "State",
     "Sum",
     "TraceError",

@@ -1,9 +1,11 @@
-"""Blocks that operators on signals make: sum, gain and product."""
+"""Blocks that operators on signals make: sum, gain and product, and the stack that a list of signals makes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
+
+import numpy as np
 
 from . import arguments as kinds
 from .block import Block
@@ -128,3 +130,35 @@ class Product(Block):
         """Return the product."""
         check_shapes(**u._asdict())
         return u.u1 * u.u2
+
+
+@register_operator_block("stack")
+class Stack(Block):
+    """Vector of the entries of its inputs, in a row.
+
+    A tuple or a list of signals in a call makes one: ``observer((u, y))`` is ``observer(Stack()(u, y))``.
+
+    Inputs ``u1``, ``u2``, … are scalars or vectors. The output ``y`` has as many entries as all of them together.
+
+    Raises
+    ------
+    ShapeError
+        For a matrix as input, when the diagram is built.
+    """
+
+    count: int = parameter(default=2, minimum=1, description="number of inputs")
+    y = Output(shape=None, description="the entries of all inputs")
+
+    @property
+    def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
+        """The numbered inputs."""
+        return number_inputs(self.count)
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the vector."""
+        for name, value in u._asdict().items():
+            if len(shape_of(value)) > 1:
+                raise ShapeError(
+                    f"found shape {shape_of(value)}; expected a scalar or a vector. Wire a part of it.", port=name
+                )
+        return np.concatenate([value if shape_of(value) else np.stack([value]) for value in u])

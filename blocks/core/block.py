@@ -338,7 +338,10 @@ def _bind(block: Block, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[s
     """
     inputs, who = block.inputs, block.label
     if len(args) > len(inputs):
-        raise WiringError(f"{len(args)} signals for {len(inputs)} inputs ({', '.join(inputs) or 'none'}).", block=who)
+        step = f" For one vector of them give a tuple: {who}((…, …))." if len(inputs) == 1 else ""
+        raise WiringError(
+            f"{len(args)} signals for {len(inputs)} inputs ({', '.join(inputs) or 'none'}).{step}", block=who
+        )
     required = [name for name, port in inputs.items() if port.default is None and name not in kwargs]
     # as many signals as inputs need are theirs, wherever inputs with a default stand
     given = dict(zip(required if len(args) == len(required) else inputs, args, strict=False))

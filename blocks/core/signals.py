@@ -31,9 +31,10 @@ _OPERATOR_BLOCKS: dict[str, Callable[..., Any]] = {}
 
 
 def register_operator_block(name: str) -> Callable[[type[B]], type[B]]:
-    """Register the class of the blocks that an operator on signals makes: ``sum``, ``gain``, ``product``, ``constant``.
+    """Register the class of the blocks that an operator on signals makes.
 
-    Blocks need signals, and operators on signals make blocks: registering keeps the imports one way.
+    The names are ``sum``, ``gain``, ``product``, ``stack`` and ``constant``. Blocks need signals, and operators on
+    signals make blocks: registering keeps the imports one way.
     """
 
     def register(cls: type[B]) -> type[B]:
@@ -274,6 +275,8 @@ def check_name(name: Any) -> str:
 def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
     """Return the signal that ``value`` stands for: a signal, a call or block with one output, or a number.
 
+    A tuple, a list or an array of these, as `np.stack` and `np.hstack` make it, is one signal: their entries in a row.
+
     Raises
     ------
     WiringError
@@ -281,13 +284,39 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
     """
     if isinstance(value, Wireable):
         return value._signal()
+    if _has_signals(value):
+        return _stack(value, block, port)
     if isinstance(value, int | float | np.number | np.ndarray | list | tuple) and not isinstance(value, bool):
         with suppress(ValueError):
             constant: Signal = _OPERATOR_BLOCKS["constant"](value=value)._signal()
             return constant
     raise WiringError(
-        f"found {value!r}; expected a signal, a call, a block with one output, or numbers.", block=block, port=port
+        f"found {value!r}; expected a signal, a call, a block with one output, numbers, or a list of these.",
+        block=block,
+        port=port,
     )
+
+
+def _has_signals(value: Any) -> bool:
+    """Return whether a value is a collection with a signal in it."""
+    if isinstance(value, np.ndarray):
+        return value.dtype == object and any(isinstance(entry, Wireable) for entry in value.flat)
+    return isinstance(value, list | tuple) and any(isinstance(v, Wireable) or _has_signals(v) for v in value)
+
+
+def _stack(values: Any, block: str, port: str) -> Signal:
+    """Return the signal with the entries of signals and numbers in a row."""
+    parts = list(values)
+    if any(_has_signals(part) for part in parts):
+        raise WiringError(
+            "found a list of lists with signals in it; expected one list, as a signal is a vector. Write the signals "
+            "one after the other.",
+            block=block,
+            port=port,
+        )
+    signals = [as_signal(part, block=block, port=port) for part in parts]
+    name = "_and_".join(_operand(part, "constant") for part in parts)
+    return _operate("stack", name, *signals, count=len(signals))
 
 
 def _operand(value: Any, default: str) -> str:

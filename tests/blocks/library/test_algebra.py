@@ -5,16 +5,22 @@ import pytest
 
 from loopwright.blocks import (
     Block,
+    Constant,
     DeadZone,
     Gain,
     Input,
+    Integrator,
     Maximum,
     Minimum,
     Output,
     ParameterError,
     Product,
     Saturation,
+    ShapeError,
+    Stack,
+    StateSpace,
     Sum,
+    WiringError,
 )
 from loopwright.blocks.tracing.traced import trace
 from loopwright.diagrams import Diagram
@@ -106,6 +112,43 @@ def test_a_product_multiplies_element_by_element(shape):
 
 def test_a_scalar_factor_scales_a_vector():
     assert result(Product(), -2.0, (1.0, 3.0)).tolist() == [-2.0, -6.0]
+
+
+# --- stacks -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_stack_has_the_entries_of_its_inputs_in_a_row():
+    assert result(Stack(), 1.0, 2.0).tolist() == [1.0, 2.0]
+    assert result(Stack(count=3), 1.0, (2.0, 3.0), 4.0).tolist() == [1.0, 2.0, 3.0, 4.0]
+    assert result(Stack(count=1), 5.0).tolist() == [5.0]
+
+
+@pytest.mark.parametrize("make", [tuple, list, np.stack, np.hstack, lambda signals: np.array(signals)])
+def test_several_signals_are_wired_to_a_vector_input_as_one(make):
+    """x' = −x + u entry by entry, with u = 2 and the other block's e^(−t): 2 (1 − e^(−t)) and t e^(−t)."""
+    other = Integrator(initial_value=1.0, name="other")
+    decay = other(-other.y)
+    lags = StateSpace(A=-np.eye(2), B=np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), name="lags")
+    diagram = Diagram("lags", lags(make([Constant(value=2.0, name="two"), decay])).named("y"))
+    run = diagram.simulate(2.0, rtol=1e-10, atol=1e-12, progress=False)
+    want = np.column_stack([2.0 * (1.0 - np.exp(-run.t)), run.t * np.exp(-run.t)])
+    np.testing.assert_allclose(run["y"], want, atol=1e-8)
+    assert "two_and_other" in diagram.blocks
+
+
+def test_a_signal_and_numbers_are_one_vector():
+    diagram = Diagram("mixed", Gain(gain=1.0, name="gain")((1.5, Constant(value=2.0, name="two"), 3.0)).named("y"))
+    assert diagram.simulate(0.1, step=0.1, progress=False)["y"][-1].tolist() == [1.5, 2.0, 3.0]
+
+
+def test_lists_of_lists_and_matrices_are_no_vector():
+    one = Constant(value=1.0, name="one")
+    with pytest.raises(WiringError, match=r"gain\.u: found a list of lists with signals in it; expected one list"):
+        Gain(gain=1.0, name="gain")([[one, 2.0], [3.0, one]])
+    with pytest.raises(ShapeError, match=r"stack\.u2: found shape \(2, 2\); expected a scalar or a vector"):
+        Diagram("matrix", Stack(name="stack")(one, np.eye(2)))
+    with pytest.raises(WiringError, match=r"lag: 2 signals for 1 inputs \(u\)\. For one vector of them give a tuple"):
+        Gain(gain=1.0, name="lag")(one, one)
 
 
 # --- saturation -------------------------------------------------------------------------------------------------------

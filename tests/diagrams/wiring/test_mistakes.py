@@ -116,7 +116,8 @@ def test_too_many_signals():
 
 def test_something_that_is_no_signal():
     with pytest.raises(
-        WiringError, match=r"gain\.u: found 'speed'; expected a signal, a call, a block with one output, or numbers"
+        WiringError,
+        match=r"gain\.u: found 'speed'; expected a signal, a call, a block with one output, numbers, or a list",
     ):
         Gain(gain=1)("speed")
 
