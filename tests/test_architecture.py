@@ -201,7 +201,7 @@ PUBLIC = {
         PadeDelay ParameterError Path PathDomainError PathProjection PathSpring PathTracking PeriodicLoopError PiecewiseLinear
         PlanarModel Product Pulse PulseTrain PythonFunction Quantizer Ramp RateLimiter Recorded Reference Relay
         Requirement ResettableIntegrator SampleTimeError Saturation ShapeError Signal SimulationError Sine
-        SmoothStep SpringDamper State StateMachine StateSpace Step StopCondition Sum Switch TraceError
+        SmoothStep SpringDamper Stack State StateMachine StateSpace Step StopCondition Sum Switch TraceError
         TransferFunction TransportDelay TransverseTransform Unit UnitConversion UnitDelay UnitError UnknownNameError
         UnwiredInputError Value Wall WiringError ZeroPoleGain hold parameter parse_unit
     """,

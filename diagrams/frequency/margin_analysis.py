@@ -71,7 +71,8 @@ class StabilityMargins(MarginTable):
                 "unstable: the closed loop has no margins",
                 f"unstable_poles        {plane} = {poles} (stable: {limit})",
             ]
-        return "\n".join([*lines, *self._further_lines(), *(f"{MARK} {finding}" for finding in self.findings)])
+        said = (f"{MARK if finding.limits_numbers else '–'} {finding}" for finding in self.findings)
+        return "\n".join([*lines, *self._further_lines(), *said])
 
     def _title(self) -> str:
         return "margins"

@@ -172,7 +172,7 @@ def _add(value: Any, findings: tuple[Finding, ...]) -> Any:
     from control import StateSpace
 
     if isinstance(value, Number):
-        return replace(value, findings=_join(value.findings, findings))
+        return replace(value, findings=_join(value.findings, tuple(f for f in findings if f.limits_numbers)))
     if isinstance(value, StateSpace):
         value.findings = _join(findings_of(value), findings)
         return value

@@ -12,7 +12,9 @@ from .findings import (
     InexactDerivatives,
     Kink,
     MeanSlope,
+    ParallelWays,
     RefutedDerivatives,
+    SharedCut,
     StepsOnly,
     UnusualStart,
     ZeroSlope,
@@ -23,6 +25,7 @@ from .operating_points import RUN_OPTIONS, PointLike, capture, check_options, co
 from .over_a_period import TickModel, model_ticks, ticks_between_renewals, ticks_to_renewal
 from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop, loop_of_variant
 from .plant_models import PlantEquations, linearize_plant
+from .shared_wires import WaysBack, find_ways_back
 from .trim_search import point_from_states, trim
 
 __all__ = [
@@ -38,14 +41,17 @@ __all__ = [
     "Linearization",
     "LoopSlope",
     "MeanSlope",
+    "ParallelWays",
     "PlantEquations",
     "PointFinder",
     "PointLike",
     "RefutedDerivatives",
+    "SharedCut",
     "StepsOnly",
     "Tap",
     "TickModel",
     "UnusualStart",
+    "WaysBack",
     "ZeroSlope",
     "capture",
     "check_options",
@@ -53,6 +59,7 @@ __all__ = [
     "differentiate_loop",
     "find_kinks_between",
     "find_signal",
+    "find_ways_back",
     "linearize",
     "linearize_batch",
     "linearize_block",

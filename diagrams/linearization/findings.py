@@ -144,12 +144,64 @@ class CutFromTracking(Finding):
     to: tuple[str, ...]
 
     def __str__(self) -> str:
-        to = repr(self.to[0]) if len(self.to) == 1 else repr(self.to)
-        step = f" For the loop without it take loop({self.offered!r}, to={to})." if self.to else ""
+        step = f" For the loop without it take loop({self.offered!r}, to={_shown(self.to)})." if self.to else ""
         return (
             f"the cut at {self.wire!r} separates {self.block}.{self.port} from {self.block}.{self.output}, which it "
             f"follows in the closed loop: L contains the controller's own tracking.{step}"
         )
+
+
+@dataclass(frozen=True)
+class SharedCut(Finding):
+    """A cut that also takes the controller's own way back, such as the model of a Smith predictor or an observer.
+
+    Attributes
+    ----------
+    wire : str
+        The cut wire.
+    to : tuple of str
+        Inputs of the plant: ``loop(wire, to=to)`` is the loop there.
+    own : tuple of str
+        The other consumers, from which the wire is reached again without the plant.
+    """
+
+    wire: str
+    to: tuple[str, ...]
+    own: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return (
+            f"the cut at {self.wire!r} also takes {', '.join(self.own)}, the controller's own way back: L is not the "
+            f"loop at the plant's input. For that take loop({self.wire!r}, to={_shown(self.to)})"
+        )
+
+
+@dataclass(frozen=True)
+class ParallelWays(Finding):
+    """A cut wire with several ways back, of which nothing says which one is the plant's.
+
+    Attributes
+    ----------
+    wire : str
+        The cut wire.
+    to : tuple of str
+        Its consumers that lead back to it.
+    """
+
+    limits_numbers: ClassVar[bool] = False
+    wire: str
+    to: tuple[str, ...]
+
+    def __str__(self) -> str:
+        each = " or ".join(f"to={_shown((one,))}" for one in self.to)
+        return (
+            f"{self.wire!r} is cut for {', '.join(self.to)}, which all lead back to it. If one of them is a model "
+            f"of the controller's own, the loop at the plant's input is loop({self.wire!r}, {each})"
+        )
+
+
+def _shown(to: tuple[str, ...]) -> str:
+    return repr(to[0]) if len(to) == 1 else repr(to)
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,12 @@
 An input port becomes a place of injection, of measurement or of a cut in this way, and a wire can be cut at some of its
 consumers only.
 
-A cut behind a port changes the signal of all its consumers. Two kinds of inputs deserve a word then:
+A cut behind a port changes the signal of all its consumers. Three kinds of inputs deserve a word then:
 
 - *Tracking.* An input with ``tracks``, such as `PID.actual`, gets the true value of its own block's output, for
   anti-windup or bumpless transfer. In the closed loop it follows that output. A cut between the two separates them: L
   then contains the controller's own correction, which the running loop never makes.
+- *Ways of the controller itself.* A model in it that the wire feeds, too (`shared_wires`).
 - *Inert inputs.* At the operating point nothing follows from them, as from a saturation's excess within the limits.
 
 The loop to one consumer is cut at an inserted block that passes the signal on.
@@ -17,20 +18,44 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Finding, Gain, OptionError, UnknownNameError, WiringError, elements, near
+from ...blocks.core import (
+    Array,
+    Block,
+    Finding,
+    Input,
+    OptionError,
+    Output,
+    UnknownNameError,
+    WiringError,
+    elements,
+    near,
+)
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, layout_of
-from ..wiring import Wire, join
+from ..wiring import Structure, Wire, join
 from .block_slopes import slopes_of
 from .derivatives import find_signal
 from .findings import BlockFinding, CutFromTracking, InertConsumer
 from .kinks import read_arguments, read_log
+from .shared_wires import find_shared_cuts
 from .signal_paths import PathNode, SignalPaths
 
 Port = tuple[str, str]
+
+
+class Passage(Block):
+    """Passes a signal on."""
+
+    u = Input(shape=None, description="signal")
+    y = Output(like="u", description="the same signal")
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the signal."""
+        return u.u
 
 
 def split_inputs(
@@ -104,19 +129,39 @@ def insert_ahead(
         Its entries that are.
     """
     table = diagram.structure.copy()
+    path = _insert(table, inputs)
+    split = diagram.with_structure(table)
+    value = read_log(flat, point)[flat.log.slices[join(*source)]][list(entries)]
+    return split, _carry_point(flat, split.flatten_like(point), point, path, value), f"{path}.y"
+
+
+def _insert(table: Structure, inputs: Sequence[Port]) -> str:
+    """Insert a block ahead of inputs of one source, all in one subsystem, and return its path."""
     subsystem = table.subsystem_of[inputs[0][0]]
     path = join(subsystem, "_".join(["to", *(f"{b.rpartition('.')[2]}_{p}" for b, p in inputs)]).replace(".", "_"))
     while path in table.blocks:
         path += "_"
-    table.blocks[path] = Gain(gain=1.0, name=path.rpartition(".")[2])
+    table.blocks[path] = Passage(name=path.rpartition(".")[2])
     table.subsystem_of[path] = subsystem
     table.wires[path, "u"] = table.wires[inputs[0]]
     for each in inputs:
         table.wires[each] = Wire(path, "y")
         table.handed.pop(each, None)
-    split = diagram.with_structure(table)
-    value = read_log(flat, point)[flat.log.slices[join(*source)]][list(entries)]
-    return split, _carry_point(flat, split.flatten_like(point), point, path, value), f"{path}.y"
+    return path
+
+
+def name_wire_to(diagram: WiredDiagram, name: str, inputs: Sequence[Port]) -> WiredDiagram:
+    """Return the diagram with a block ahead of some consumers of a wire; the wire between them has a name.
+
+    Raises
+    ------
+    WiringError
+        If consumers stand in several subsystems.
+    """
+    table = diagram.structure.copy()
+    _check_one_subsystem(diagram, inputs)
+    table.names[name] = Wire(_insert(table, inputs), "y")
+    return diagram.with_structure(table)
 
 
 def _carry_point(
@@ -178,7 +223,12 @@ def split_consumers(
                 block=block,
                 port=port,
             )
-    subsystems = {table.subsystem_of[block] for block, _ in inputs}
+    _check_one_subsystem(diagram, inputs)
+    return insert_ahead(diagram, flat, point, inputs, signal.port, signal.entries)
+
+
+def _check_one_subsystem(diagram: WiredDiagram, inputs: Sequence[Port]) -> None:
+    subsystems = {diagram.structure.subsystem_of[block] for block, _ in inputs}
     if len(subsystems) != 1:
         shown = ", ".join(repr(s or diagram.name) for s in sorted(subsystems))
         raise WiringError(
@@ -186,7 +236,6 @@ def split_consumers(
             block=inputs[0][0],
             port=inputs[0][1],
         )
-    return insert_ahead(diagram, flat, point, inputs, signal.port, signal.entries)
 
 
 def _find_input(diagram: WiredDiagram, name: str) -> Port:
@@ -214,7 +263,9 @@ def find_cut_findings(
         if not n.is_output and any(PathNode(n.block, p, True) in before for p in flat.table.blocks[n.block].outputs)
     }
     told = {(f.block, f.source) for f in carried if isinstance(f, BlockFinding)}
-    return (*_find_tracking(flat, ways, cut, on_loop, before), *_find_inert(flat, at, cut, on_loop - told))
+    inert = _find_inert(flat, at, cut, on_loop - told)
+    tracking = _find_tracking(flat, ways, cut, on_loop, before)
+    return (*tracking, *find_shared_cuts(flat, cut, lambda port: _name_of(flat, port)), *inert)
 
 
 def _find_tracking(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from typing import NamedTuple
 
@@ -77,6 +77,14 @@ class SignalPaths:
     def follow(self, port: tuple[str, str]) -> set[PathNode]:
         """Return the inputs and outputs that follow a port as far as nothing is cut."""
         return _reach(self._forward, {PathNode(*port, True)})
+
+    def reach(self, start: PathNode, avoiding: Callable[[str], bool]) -> set[PathNode]:
+        """Return the inputs and outputs that follow one through blocks that are not to be avoided, by their paths."""
+        open_ways = {
+            node: {other for other in following if not avoiding(other.block)}
+            for node, following in self._forward.items()
+        }
+        return _reach(open_ways, {start})
 
     def before(self, ports: Iterable[tuple[str, str]]) -> set[PathNode]:
         """Return the ports, and the inputs and outputs that they follow."""
