@@ -848,7 +848,8 @@ class Diagram:
         pdf, json : bool
             Write ``.pdf`` (which needs ``pip install 'loopwright[pdf]'``) and ``.json`` beside it, too.
         paper : {"A4", "letter"}
-            Paper of the PDF. ``options`` are those of `analyse`, such as ``requirements``, ``at`` and ``loops``.
+            Paper of the PDF. ``options`` are those of `analyse`, such as ``requirements``, ``at`` and ``loops``; with
+            ``summary=True`` the page is two sheets, with ``appendix=False`` it ends with its chapters.
 
         Returns
         -------

@@ -94,6 +94,8 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     report.add_argument("--check", action="store_true", help="say by the exit status whether they are met")
     for name in ABOUT:
         report.add_argument(f"--{name}", metavar="TEXT", help=f"the {name} in the report's heading")
+    report.add_argument("--summary", action="store_true", help="write the summary alone: two pages")
+    report.add_argument("--no-appendix", action="store_true", help="leave out the appendix: all numbers, definitions")
     report.add_argument("--db", action="store_true", help="draw magnitudes in dB")
     report.add_argument("--hz", action="store_true", help="draw frequency responses over Hz in place of rad/s")
     report.add_argument("--paper", choices=["A4", "letter"], default="A4", help="paper of the PDF (default: A4)")
@@ -267,6 +269,8 @@ def _analyse(
         measured=measured,
         worst_case=searched,
         contacts=touched,
+        summary=arguments.summary,
+        appendix=not arguments.no_appendix,
         _written=True,
     )
     return with_drawing(made, diagram.wired)

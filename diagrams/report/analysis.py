@@ -30,7 +30,7 @@ from .sections.poles import closed_loops, memory
 from .sections.sensitivity import sensitivity
 from .sections.step_responses import steps
 from .sections.subject import operating_points, remarks, subject, versions
-from .sections.summary import summary
+from .sections.summary import all_requirements, summarize
 from .sections.worst_case import find_reported, read_task, worst_case_of
 
 _HEADING = ("title", "author", "project", "date", "revision")  # lines of ``about``
@@ -80,6 +80,8 @@ _REPORTED = Kind(
     decibels=kinds.flag,
     hertz=kinds.flag,
     progress=kinds.function,
+    summary=kinds.flag,
+    appendix=kinds.flag,
     measured=kinds.mapping,
     contacts=kinds.either(kinds.mapping, kinds.one_of_class(ContactTask, "a ContactTask"), kinds.path),
 )
@@ -103,6 +105,8 @@ def analyse(
     worst_case: WorstCase | WorstCaseTask | str | os.PathLike[str] | None = None,
     contacts: Mapping[str, Any] | ContactTask | str | os.PathLike[str] | None = None,
     workers: int | None = None,
+    summary: bool = False,
+    appendix: bool = True,
     _written: bool = False,  # the report is written next: its figures are drawn
 ) -> Report:
     """Analyse a diagram, and return the content of its report.
@@ -155,6 +159,11 @@ def analyse(
     workers : int, optional
         1 makes all sections in this process; with 2, a second process makes some of a diagram with FMUs. The report is
         the same. Without it there are two where the report is written, and two processors.
+    summary : bool
+        Whether the page, the PDF and the notebook show the summary alone: two pages. All numbers are computed, and
+        stand in the JSON.
+    appendix : bool
+        Whether they show the appendix: all numbers, definitions and details.
 
     Returns
     -------
@@ -191,7 +200,7 @@ def analyse(
         asked = Requirements(stable=False)  # a robot that yields to a force may drift, and has a pole on the limit
     task = read_task(wired, worst_case, file, asked)
     axes, names = AxisUnits(decibels, hertz), tuple(measured or ())
-    how: dict[str, Any] = {"workers": check_workers(workers, _written), "drawn": _written}
+    how: dict[str, Any] = {"workers": check_workers(workers, _written), "drawn": _written and not summary}
     case, sections = kind.sections(wired, point, experiment, wires, only, tell, stairs, asked, axes, names, **how)
     loops_measured = read_measured(case, measured) if measured else ()
     if loops_measured:
@@ -204,9 +213,10 @@ def analyse(
         sections = (*sections, contact_sections(touched))
     made = Report("", sections).numbers()
     reviewed = None if asked is None else review(case, asked, made, loops_measured, searched, touched)
-    if only is None or asked is not None:
+    if only is None or asked is not None or summary:
         more = [] if touched is None or not touched.contacts else [contacts_on_first_page(touched)]
-        sections = (summary(case, reviewed, made, searched, more), *sections)
+        first = summarize(case, reviewed, made, searched, more, sections), all_requirements(case, reviewed)
+        sections = (*(section for section in first if section is not None), *sections)
     name = wired.name if experiment is None else f"Experiment {experiment.letter}: {wired.name}"
     lines = {str(key): str(text) for key, text in (about or {}).items()}
     title = lines.pop("title", f"Design report: {name}")
@@ -220,4 +230,4 @@ def analyse(
         "definitions": dict(kind.definitions),
         "fmus": {path: b.description.digest for path, b in wired.blocks.items() if isinstance(b, Fmu)},
     }
-    return Report(title, sections, meta, reviewed)
+    return Report(title, sections, meta, reviewed, summary, appendix)

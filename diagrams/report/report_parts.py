@@ -188,4 +188,5 @@ def joined(sections: list[Section]) -> Section:
         tuple(chain.from_iterable(s.plots for s in sections)),
         {path: number for s in sections for path, number in s.numbers.items()},
         tuple(chain.from_iterable(s.sections for s in sections)),
+        tuple(chain.from_iterable(s.overview for s in sections)),
     )

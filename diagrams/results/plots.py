@@ -121,17 +121,17 @@ def _bare_figure() -> Figure:
     return kind.__new__(kind)
 
 
-def new_figure(height: float) -> Figure:
-    """Return an empty figure of the usual width; heights are in inches."""
+def new_figure(height: float, width: float = WIDTH) -> Figure:
+    """Return an empty figure of the usual width, or another one; both are in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    figure = _figure_class()(figsize=(WIDTH, height), layout="constrained")
+    figure = _figure_class()(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 LETTERS = 118
-"""Letters of a legend that fit above a figure, side by side."""
+"""Letters of a legend that fit above a figure of the usual width, side by side."""
 
 
 def legend_above(figure: Figure, axes: Axes) -> None:
@@ -139,7 +139,8 @@ def legend_above(figure: Figure, axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if len(labels) < 2:
         return
-    columns = max(1, min(len(labels), LETTERS // (max(map(len, labels)) + 6)))
+    fitting = LETTERS * figure.get_figwidth() / WIDTH
+    columns = max(1, min(len(labels), int(fitting) // (max(map(len, labels)) + 6)))
     figure.legend(handles, labels, loc="outside upper left", ncols=columns)
 
 

@@ -5,11 +5,13 @@ from .contact_figures import DOTTED, contact_admittance, contact_map, draw_admit
 from .drawings import with_drawing
 from .loop_figures import DrawnLoops, bode, gang, nyquist, response, sensitivities
 from .measured_figures import MeasuredCurve, injected, measured
+from .overview_figures import HEIGHTS, fit_overview, overview_bode, overview_step
 from .sensitivity_figures import sensitivity_bars
 from .step_figures import step_responses
 
 __all__ = [
     "DOTTED",
+    "HEIGHTS",
     "AxisUnits",
     "DrawnLoops",
     "MeasuredCurve",
@@ -18,10 +20,13 @@ __all__ = [
     "contact_map",
     "draw_admittances",
     "fill_growth",
+    "fit_overview",
     "gang",
     "injected",
     "measured",
     "nyquist",
+    "overview_bode",
+    "overview_step",
     "response",
     "sensitivities",
     "sensitivity_bars",

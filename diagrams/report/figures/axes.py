@@ -46,15 +46,15 @@ class AxisUnits(NamedTuple):
         return with_unit(name, "dB" if self.decibels else "1")
 
 
-def set_magnitudes(ax: Axes, axes: AxisUnits) -> None:
+def set_magnitudes(ax: Axes, axes: AxisUnits, most: int = 6) -> None:
     """Set the scale of a magnitude's axis, with few ticks."""
     from matplotlib.ticker import MaxNLocator
 
     if axes.decibels:
-        ax.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 4, 5, 10]))
+        ax.yaxis.set_major_locator(MaxNLocator(most, steps=[1, 2, 4, 5, 10]))
     else:
         ax.set_yscale("log")
-        set_powers(ax.yaxis, ax.get_ylim(), 6)
+        set_powers(ax.yaxis, ax.get_ylim(), most)
 
 
 def set_powers(axis: Axis, ends: tuple[float, float], most: int) -> None:

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ....blocks.core import with_unit
-from ...results import DARK, GREY, legend_above, new_figure, style
+from ...results import DARK, GREY, WIDTH, legend_above, new_figure, style
 from ..pages import Plot, Texts
 from .axes import AxisUnits, set_frequencies, set_magnitudes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     from ...frequency import Margins
 
@@ -70,9 +71,15 @@ def _response(L: Any, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
 
 def bode(key: str, of: DrawnLoops) -> Plot:
     """Draw L over frequency, with the margins marked."""
+    return Plot(key, TEXTS.line("bode", wire=of.wire), draw_bode(of, 3.0, WIDTH))
+
+
+def draw_bode(of: DrawnLoops, height: float, width: float) -> Figure:
+    """Return a figure of L over frequency, with the margins marked; its height and width are in inches."""
     low, high = _span(of.loops, of.found)
+    is_small = width < WIDTH
     with style():
-        figure = new_figure(3.0)
+        figure = new_figure(height, width)
         top, bottom = figure.subplots(2, 1, sharex=True)
         for name, L in of.loops.items():
             look = of.looks[name]
@@ -94,25 +101,24 @@ def bode(key: str, of: DrawnLoops) -> Plot:
             if L.dt:
                 for ax in (top, bottom):
                     ax.axvline(of.axes.frequency(np.pi / L.dt), color=GREY, linewidth=0.6, linestyle=":")
-        set_magnitudes(top, of.axes)
+        set_magnitudes(top, of.axes, 3 if is_small else 6)
         top.axhline(of.axes.magnitude(1.0), color=DARK, linewidth=0.6)
         bottom.axhline(-180, color=DARK, linewidth=0.6)
-        _degrees(bottom)
-        set_frequencies(bottom, 9)
+        _degrees(bottom, few=is_small)
+        set_frequencies(bottom, 5 if is_small else 9)
         top.set_ylabel(of.axes.magnitude_label("|L|"))
-        bottom.set_ylabel(with_unit("phase of L", "deg"))
+        bottom.set_ylabel(with_unit("phase" if is_small else "phase of L", "deg"))
         bottom.set_xlabel(of.axes.frequency_label)
         legend_above(figure, top)
-    caption = TEXTS.line("bode", wire=of.wire)
-    return Plot(key, caption, figure)
+    return figure
 
 
-def _degrees(ax: Axes) -> None:
-    """Set ticks of a phase at multiples of 45° or 90°."""
+def _degrees(ax: Axes, *, few: bool) -> None:
+    """Set ticks of a phase at multiples of 45° or 90°; at few of them in a small figure."""
     from matplotlib.ticker import MultipleLocator
 
     low, high = ax.get_ylim()
-    steps = {300: 45, 600: 90, 1400: 180}
+    steps = {200: 90, 600: 180} if few else {300: 45, 600: 90, 1400: 180}
     step = next((step for span, step in steps.items() if high - low < span), 360)
     ax.yaxis.set_major_locator(MultipleLocator(step, 180 if step == 360 else 0))  # −180° has a tick
 

@@ -1,7 +1,7 @@
 """A report as a document: sections, tables and numbers, written as HTML, PDF and JSON."""
 
 from .definitions import DEFINITIONS, read_definitions
-from .document import Judged, Plot, Section, Table, TableForm
+from .document import SUMMARY, Judged, Plot, Section, Table, TableForm
 from .printed_values import plain, quantity
 from .report import Report, check_files, write_report
 from .svg import draw_section, keep_drawings
@@ -9,6 +9,7 @@ from .templating import Texts
 
 __all__ = [
     "DEFINITIONS",
+    "SUMMARY",
     "Judged",
     "Plot",
     "Report",

@@ -10,6 +10,9 @@ from ....blocks.core import brief, explain_calls
 from ...frequency import Number
 from ...requirements import Review, Verdict
 
+SUMMARY = "summary"
+"""Key of the section that begins a report and can stand alone."""
+
 
 @explain_calls
 @dataclass(frozen=True)
@@ -18,7 +21,8 @@ class Table:
 
     One of ``details`` stands in the appendix. Numbers have ``digits`` significant digits at most, fewer where their
     tolerance bears no more. Columns without a single entry are not shown. ``terms`` names the definitions of numbers
-    that have no dotted path, by their columns; ``numbers`` has those with a path within the section.
+    that have no dotted path, by their columns; ``numbers`` has those with a path within the section. A ``brief`` table
+    repeats numbers of other tables: of their confirmations it has only those that say less than "confirmed".
     """
 
     title: str
@@ -29,6 +33,7 @@ class Table:
     digits: int = 6
     terms: Mapping[str, str] = field(default_factory=dict)
     numbers: Mapping[str, Number] = field(default_factory=dict)
+    brief: bool = False
 
     def __repr__(self) -> str:
         facts = f"{len(self.rows)} rows", ", ".join(map(str, self.columns))
@@ -84,7 +89,7 @@ class Judged(str):
 class Plot:
     """A figure: a key for its file, a caption, the matplotlib figure or SVG text; ``ahead`` of the tables or not.
 
-    One of ``details`` stands in the appendix.
+    One of ``details`` stands in the appendix. Figures with the same ``group`` are small and stand side by side.
     """
 
     key: str
@@ -92,6 +97,7 @@ class Plot:
     figure: Any
     ahead: bool = False
     details: bool = False
+    group: str = ""
 
     def __repr__(self) -> str:
         return brief(f"figure {self.key!r}", self.caption[:80], then=".figure")
@@ -110,6 +116,8 @@ class Section:
     numbers: Mapping[str, Number] = field(default_factory=dict)
     """By path within the section, such as ``par.sampled_d0.phase_margin_deg``; those of the tables are among them."""
     sections: tuple[Section, ...] = ()
+    overview: tuple[Plot, ...] = ()
+    """Small figures of it that stand in the summary."""
 
     def __post_init__(self) -> None:
         of_tables = {path: number for table in self.tables for path, number in table.numbers.items()}
@@ -140,12 +148,18 @@ class Document:
         Subject of the analysis, its time, and the versions of the libraries.
     review : Review, optional
         Verdicts on the requirements; None where none were given.
+    summary : bool
+        Whether its page has the summary alone. Its numbers are the same.
+    appendix : bool
+        Whether its page has the appendix: all numbers, definitions and details.
     """
 
     title: str
     sections: tuple[Section, ...]
     meta: Mapping[str, Any] = field(default_factory=dict)
     review: Review | None = None
+    summary: bool = False
+    appendix: bool = True
 
     def __repr__(self) -> str:
         verdict = "" if self.review is None else self.review.verdict.value

@@ -1,4 +1,4 @@
-"""Pages of a PDF without large gaps: figures set smaller, and tables that go over, where that fills a page."""
+"""Pages of a PDF: a summary of two sheets, and no large gaps: figures set smaller, and tables that go over."""
 
 from __future__ import annotations
 
@@ -25,6 +25,12 @@ TOP, BOTTOM = 18.0 / 25.4 * 72, 18.0 / 25.4 * 72
 MARK = 2.0
 """Height of a mark in points; marks stand in the text's left edge ahead of each figure and table."""
 
+SHEETS = 2
+"""Sheets of a summary."""
+SMALLER, SMALLEST = 0.9, 0.6
+"""Factor by which the figures of a summary are set smaller at once, and the smallest of all."""
+_SMALL, _END = '<div class="picture">', '<nav aria-label="Contents">'
+"""Beginning of a small figure's picture, and what follows the summary."""
 _PLACE = re.compile(
     r"""<figure\sid="[^"]*"[^>]*>(?:\s*<div\sclass="scroll">\s*<svg)?|(?:<div\sclass="keep">\s*<h\d.*?</h\d>\s*)?<div\sclass="table(\slong)?">"""
 )
@@ -51,6 +57,21 @@ class PagePlace:
 
     index: int
     begin: float
+
+
+def fit_summary(html: str, lay_out: Any) -> str:
+    """Return a page for print whose summary has `SHEETS` sheets at most, if smaller figures there suffice for that."""
+    end = html.find(_END)
+    summary, rest = (html, "") if end < 0 else (html[:end], html[end:])
+    if _SMALL not in summary:
+        return html
+    factor, fitted = 1.0, summary
+    while lay_out(f"{fitted}</main></body></html>").get_page_count() > SHEETS:
+        factor *= SMALLER
+        if factor < SMALLEST:
+            return html
+        fitted = summary.replace(_SMALL, f'<div class="picture" style="max-width:{100 * factor:.0f}%">')
+    return fitted + rest
 
 
 def fill_pages(html: str, lay_out: Any, canvas: Any) -> str:

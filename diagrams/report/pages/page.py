@@ -10,7 +10,7 @@ from typing import Any
 from ....blocks.core import print_unit
 from ...frequency import Number
 from .definitions import LOOP_TERMS, definition
-from .document import Document, Plot, Section, Table
+from .document import SUMMARY, Document, Plot, Section, Table
 from .printed_values import cell, mark, reason, tolerance_text, value_text
 from .svg import EmbeddedFigure, embedded
 from .tables import Numbered, TableView, anchor
@@ -63,6 +63,8 @@ class SectionView:
     tables: tuple[TableView, ...]
     figures: tuple[FigureView, ...]
     sections: tuple[SectionView, ...]
+    groups: tuple[tuple[FigureView, ...], ...] = ()
+    """Small figures that stand side by side."""
     details: tuple[LinkView, ...] = ()
     """Tables of it that stand in the appendix."""
 
@@ -111,7 +113,10 @@ class Page:
     title: str
     about: tuple[tuple[str, str], ...]
     """Names and values of the lines below the title."""
+    summary: SectionView | None
+    """The section that can stand alone; None where the report has none."""
     sections: tuple[SectionView, ...]
+    """The chapters: all other sections; none where the summary stands alone."""
     numbers: tuple[tuple[NumberView, ...], ...]
     """All numbers, by the sections that they stand in."""
     reasons: tuple[str, ...]
@@ -122,10 +127,16 @@ class Page:
     details: tuple[DetailsView, ...] = ()
     """Tables of the appendix, by the sections that they belong to."""
 
+    @property
+    def contents(self) -> tuple[SectionView, ...]:
+        """The summary and the chapters, as the table of contents lists them."""
+        return (*(() if self.summary is None else (self.summary,)), *self.sections)
+
     @classmethod
     def of(cls, report: Document) -> Page:
-        """Return the page of a report."""
+        """Return the page of a report: all of it, without the appendix, or the summary alone."""
         numbers = report.numbers()
+        with_appendix = report.appendix and not report.summary
         more: Mapping[str, str] = report.meta.get("definitions") or {}
         reasons = list(dict.fromkeys(map(reason, numbers.values())))
         known = {path: _term(path, more) for path in numbers}
@@ -142,15 +153,22 @@ class Page:
             for path, number in numbers.items()
         ]
         tops = dict.fromkeys(path.partition(".")[0] for path in numbers)
-        numbering = _Numbering(numbers)
-        sections = numbering.sections(report.sections, "", "")
+        numbering = _Numbering(numbers, with_appendix=with_appendix)
+        begins = 1 if report.sections and report.sections[0].key == SUMMARY else 0
+        first = numbering.sections(report.sections[:begins], "", "")
+        chapters = () if report.summary else numbering.sections(report.sections[begins:], "", "", begins + 1)
+        summary = first[0] if first else None
+        about = tuple(_about(report.meta))
+        if not with_appendix:
+            return cls(report.title, about, summary, chapters, (), (), (), defines_loop=False)
         details = numbering.details()
         of_tables = (_term(term, more) for term in numbering.tables.terms)
         terms = tuple(dict.fromkeys(term for term in (*known.values(), *of_tables) if term is not None))
         return cls(
             report.title,
-            tuple(_about(report.meta)),
-            sections,
+            about,
+            summary,
+            chapters,
             tuple(tuple(line for line in lines if line.path.partition(".")[0] == top) for top in tops),
             tuple(reasons),
             terms,
@@ -162,8 +180,8 @@ class Page:
 class _Numbering:
     """Sections, tables and figures of a page, numbered in the order in which they are shown."""
 
-    def __init__(self, numbers: Mapping[str, Number]):
-        self.tables = Numbered(numbers)
+    def __init__(self, numbers: Mapping[str, Number], *, with_appendix: bool):
+        self.tables, self.with_appendix = Numbered(numbers, linked=with_appendix), with_appendix
         self.figures: dict[str, None] = {}
         self.left: list[tuple[str, str, tuple[Table, ...], tuple[Plot, ...]]] = []
         """Titles and anchors of sections with their tables and figures for the appendix."""
@@ -175,14 +193,16 @@ class _Numbering:
             for title, name, tables, plots in self.left
         )
 
-    def sections(self, sections: Sequence[Section], prefix: str, number: str) -> tuple[SectionView, ...]:
-        """Return sections that stand side by side."""
-        return tuple(self._section(s, prefix + s.key, f"{number}{i}") for i, s in enumerate(sections, 1))
+    def sections(
+        self, sections: Sequence[Section], prefix: str, number: str, first: int = 1
+    ) -> tuple[SectionView, ...]:
+        """Return sections of one level, numbered from the first one's number."""
+        return tuple(self._section(s, prefix + s.key, f"{number}{i}") for i, s in enumerate(sections, first))
 
     def _section(self, section: Section, key: str, number: str) -> SectionView:
         ahead = tuple(self._figure(plot) for plot in section.plots if plot.ahead and not plot.details)
-        later = tuple(table for table in section.tables if table.details)
-        drawn = tuple(plot for plot in section.plots if plot.details)
+        later = tuple(table for table in section.tables if table.details and self.with_appendix)
+        drawn = tuple(plot for plot in section.plots if plot.details and self.with_appendix)
         if later or drawn:
             self.left.append((f"{number} {section.title}", anchor("x", key), later, drawn))
         return SectionView(
@@ -193,8 +213,12 @@ class _Numbering:
             tuple((listed, tuple(texts)) for listed, texts in _grouped(section.text)),
             ahead,
             tuple(self.tables.view(table) for table in section.tables if not table.details),
-            tuple(self._figure(plot) for plot in section.plots if not (plot.ahead or plot.details)),
+            tuple(self._figure(plot) for plot in section.plots if not (plot.ahead or plot.details or plot.group)),
             self.sections(section.sections, f"{key}.", f"{number}."),
+            tuple(
+                tuple(map(self._figure, group))
+                for _, group in groupby((plot for plot in section.plots if plot.group), lambda plot: plot.group)
+            ),
             tuple(LinkView(text, anchor("x", key)) for text in (*(t.title for t in later), *_titles(drawn))),
         )
 

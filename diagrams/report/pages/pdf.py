@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ....blocks.core import OptionError, accepts, kinds
-from .filled_pages import fill_pages
+from .filled_pages import fill_pages, fit_summary
 
 
 def printer() -> Any:
@@ -38,6 +38,6 @@ def write_pdf(html: str, path: str | os.PathLike[str], paper: str = "A4") -> int
         book.load_html(page, base_url="file:///report.html")
         return book
 
-    book = lay_out(fill_pages(html, lay_out, library.ImageCanvas))
+    book = lay_out(fill_pages(fit_summary(html, lay_out), lay_out, library.ImageCanvas))
     book.write_to_pdf(str(Path(path)))
     return int(book.get_page_count())

@@ -29,6 +29,10 @@ class Report(Document):
         Subject of the analysis, its time, and the versions of the libraries.
     review : Review, optional
         Verdicts on the requirements; None where none were given.
+    summary : bool
+        Whether its page has the summary alone. Its numbers are the same.
+    appendix : bool
+        Whether its page has the appendix: all numbers, definitions and details.
     """
 
     def _repr_html_(self) -> str:

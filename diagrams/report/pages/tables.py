@@ -80,10 +80,12 @@ class Numbered:
     ----------
     numbers : mapping
         The report's numbers by path, which those in tables lead to.
+    linked : bool
+        Whether the page has the appendix that they lead to.
     """
 
-    def __init__(self, numbers: Mapping[str, Number]):
-        self.count = 0
+    def __init__(self, numbers: Mapping[str, Number], *, linked: bool = True):
+        self.count, self.linked = 0, linked
         self.terms: dict[str, None] = {}
         """Terms that numbers without a path lead to."""
         self.paths: dict[int, str] = {}
@@ -101,7 +103,8 @@ class Numbered:
         right = [is_numeric([row[i] for row in table.rows if i < len(row)]) for i in columns]
         heads = zip(table.columns, units, right, strict=True)
         headings = [_heading(str(text), unit, flush) for text, unit, flush in heads]
-        reasons = _grouped(v for row in table.rows for v in row if isinstance(v, Number))
+        shown = (v for row in table.rows for v in row if isinstance(v, Number))
+        reasons = _grouped(v for v in shown if not (table.brief and _is_confirmed(v)))
         letters = {method: _letter(i) for i, method in enumerate(reasons)} if len(reasons) > 1 else {}
         rows = []
         for above, row in zip([(), *table.rows], table.rows, strict=False):
@@ -136,7 +139,7 @@ class Numbered:
         letter = letters.get(_method(value), "")
         if term and not path:
             self.terms[term] = None
-        place = anchor("n", path) if path else anchor("d", term) if term else ""
+        place = "" if not self.linked else anchor("n", path) if path else anchor("d", term) if term else ""
         return CellView(text, kind, False, True, place, about, letter)
 
 
@@ -159,6 +162,10 @@ def anchor(kind: str, key: str) -> str:
 def _method(number: Number) -> str:
     """Return how a number was confirmed, or why there is none, without what only its single case has."""
     return _whole(number, method_of(number.confirmed_by))
+
+
+def _is_confirmed(number: Number) -> bool:
+    return not math.isnan(number.value) and (number.given or bool(number.confirmed_by))
 
 
 def _grouped(numbers: Iterable[Number]) -> dict[str, tuple[Number, str]]:

@@ -31,6 +31,7 @@ from ...linearization import StepsOnly, linearize
 from .. import figures
 from ..case import Case
 from ..pages import Plot, Section, Table, Texts
+from ..same_loops import find_same
 from ..variant import Cut, Variant, in_s
 from ..wires import blocks_on_loops
 from .poles import list_poles
@@ -65,18 +66,41 @@ WHOLE = 1e-6
 
 def inner(case: Case) -> Section | None:
     """Return the section about the loops, one part for each wire; None where nothing is to be said of any."""
-    text, parts = [*TEXTS.paragraphs("margins")], []
-    for key, wire in case.loop_wires().items():
+    text, parts = [*TEXTS.paragraphs("margins")], dict[str, LoopPart]()
+    wires = case.loop_wires()
+    for key, wire in wires.items():
         part = _wire(case, key, wire)
         if part is None:
             text += left_out(case, wire, blocks_on_loops(case.diagram))
         else:
-            parts.append(widened(wire, part))
+            parts[key] = part
     if not parts:
         text = text[len(TEXTS.paragraphs("margins")) :]  # they are about the numbers
         if not text:
             return None
-    return Section("inner", LOOPS_TITLE, tuple(text), sections=tuple(parts))
+    shown = find_same({key: part.by_path for key, part in parts.items()})
+    sections = []
+    for key, part in parts.items():
+        made = widened(wires[key], part)
+        if key in shown:
+            made = replace(made, text=(TEXTS.line("same", wire=wires[shown[key]]), *made.text))
+        elif part.drawn is not None:
+            made = _with_figures(case, key, made, part.drawn)
+        sections.append(made)
+    return Section("inner", LOOPS_TITLE, tuple(text), sections=tuple(sections))
+
+
+def _with_figures(case: Case, key: str, section: Section, drawn: figures.DrawnLoops) -> Section:
+    """Return the section of a loop with its figures, and the small one of the diagram as it is."""
+    plots = (
+        figures.bode(f"inner_{key}_bode", drawn),
+        figures.nyquist(f"inner_{key}_nyquist", drawn),
+        figures.sensitivities(f"inner_{key}_sensitivities", drawn),
+        *gang_of_four(case, key, drawn.wire),
+    )
+    actual = {at: L for at, L in drawn.loops.items() if case.variants[at.partition(".")[0]].is_actual}
+    overview = (figures.overview_bode(key, drawn._replace(loops=actual)),) if actual else ()
+    return replace(section, plots=plots, overview=overview)
 
 
 def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
@@ -172,13 +196,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
     plain = {at: loops[at] for at in designs}
     looks = {at: case.looks[at.partition(".")[0]] for at in designs}
     drawn = figures.DrawnLoops(wire, plain, found, titles, looks, case.axes)
-    plots = (
-        figures.bode(f"inner_{key}_bode", drawn),
-        figures.nyquist(f"inner_{key}_nyquist", drawn),
-        figures.sensitivities(f"inner_{key}_sensitivities", drawn),
-        *gang_of_four(case, key, wire),
-    )
-    return LoopPart(Section(key, f"Loop at {wire}", tuple(notes), tuple(tables), plots, numbers), own)
+    return LoopPart(Section(key, f"Loop at {wire}", tuple(notes), tuple(tables), (), numbers), own, drawn)
 
 
 def _numbers(m: Margins) -> dict[str, Number]:
@@ -281,10 +299,18 @@ class LoopPart:
         The section.
     numbers : mapping of (Variant, Cut) to mapping of str to Number
         Those of its numbers that come from each variant's loop, by path behind the key of `cut_key`.
+    drawn : DrawnLoops, optional
+        What its figures draw; None for several channels.
     """
 
     section: Section
     numbers: Mapping[tuple[Variant, Cut], Mapping[str, Number]]
+    drawn: figures.DrawnLoops | None = None
+
+    @property
+    def by_path(self) -> dict[str, Number]:
+        """The numbers of all variants' loops by their paths behind the loop's key."""
+        return {f"{cut_key(*at)}.{name}": number for at, own in self.numbers.items() for name, number in own.items()}
 
 
 def cut_key(v: Variant, cut: Cut) -> str:
@@ -407,8 +433,8 @@ def several(case: Case, key: str, wire: str) -> LoopPart | None:
     table = Table(
         f"MIMO disk margin at {wire}", ("variant", "α", "at", "gains and phase of all entries at once"), tuple(rows)
     )
-    numbers = {f"{cut_key(*at)}.{name}": number for at, mine in own.items() for name, number in mine.items()}
-    return LoopPart(Section(key, f"Loops at {wire}", tuple(notes), (table,), (), numbers), own)
+    part = LoopPart(Section(key, f"Loops at {wire}", tuple(notes), (table,)), own)
+    return replace(part, section=replace(part.section, numbers=part.by_path))
 
 
 DISK_NUMBERS = ("disk_margin", "frequency", "gain_low", "gain_high", "phase_deg")

@@ -133,8 +133,9 @@ def steps(case: Case) -> Section | None:
             )
         )
     plots = [_plot(case, test, curves) for test, curves in found.items()]
+    overview = tuple(plot for test, curves in found.items() for plot in _overview(case, test, curves))
     whole = (*TEXTS.paragraphs("responses"), *dict.fromkeys(text))
-    return Section("steps", TITLE, whole, tuple(tables), tuple(plots), numbers)
+    return Section("steps", TITLE, whole, tuple(tables), tuple(plots), numbers, overview=overview)
 
 
 def _said(test: StepTest) -> str:
@@ -337,3 +338,10 @@ def _plot(case: Case, test: StepTest, curves: Mapping[str, StepResponse]) -> Plo
     return Plot(
         f"steps_{test.key}", caption, figures.step_responses(curves, titles, case.looks, to_output=bool(test.output))
     )
+
+
+def _overview(case: Case, test: StepTest, curves: Mapping[str, StepResponse]) -> Iterator[Plot]:
+    """Yield the small figure of the diagram as it is."""
+    actual = {key: got for key, got in curves.items() if case.variants[key].is_actual}
+    if actual:
+        yield figures.overview_step(test.key, _said(test), actual, case.looks, to_output=bool(test.output))

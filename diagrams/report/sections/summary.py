@@ -7,13 +7,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ....blocks.core import LoopwrightError, print_unit
-from ...frequency import Number, Realization, find_disk_frequency
+from ...frequency import Number, Realization, find_disk_frequency, order_key
 from ...linearization import Linearization, find_signal
 from ...requirements import Limit, RequirementResult, Review, Verdict
 from ...studies import CaseState
 from ..case import Case
-from ..pages import Judged, Section, Table, Texts
+from ..figures import HEIGHTS, fit_overview
+from ..pages import SUMMARY, Judged, Plot, Section, Table, Texts
 from ..review import weakest
+from ..same_loops import find_same
 from ..variant import Cut, Implementation, Variant
 from .contacts import KEY as CONTACT
 from .loops import ROWS
@@ -25,6 +27,8 @@ from .worst_case import MissingWorstCase, ReportedWorstCase
 
 TEXTS = Texts(__package__, "summary")
 TITLE = "Summary"
+MOST_REQUIREMENTS = 20
+"""Requirements that the summary shows at most."""
 LOOP_NUMBERS = (
     "phase_margin_deg",
     "gain_margin_low",
@@ -42,14 +46,15 @@ ALIKE = 0.05
 ORDER = (Verdict.FAILED, Verdict.UNDECIDED, Verdict.PASSED)
 
 
-def summary(
+def summarize(
     case: Case,
     reviewed: Review | None,
     numbers: Mapping[str, Number],
     worst_case: ReportedWorstCase | MissingWorstCase | None = None,
     more: Sequence[Table] = (),
+    sections: Sequence[Section] = (),
 ) -> Section:
-    """Return the first section of a report."""
+    """Return the first section of a report, which can stand alone; ``sections`` are the others, with small figures."""
     unstable = unstable_first(case)
     text = [*(unstable.text if unstable is not None else ())]
     tables = []
@@ -59,25 +64,74 @@ def summary(
         counts = {verdict.name.lower(): len(reviewed.of(verdict)) for verdict in Verdict}
         said = TEXTS.line("verdict", verdict=reviewed.verdict.name, total=len(reviewed.results), **counts)
         text.append(Judged(said, reviewed.verdict))
-        tables.append(_requirements(case, reviewed))
+        tables.append(_requirements(case, reviewed, MOST_REQUIREMENTS))
     text += _weakest(case, numbers)
     text += [_worst_case(worst_case)] if worst_case is not None else []
     loops = _loops(case, numbers)
     tables += [*([loops] if loops is not None else []), *more]
+    plots, left_out = _overview(case, numbers, sections)
     missing = list(dict.fromkeys([*_not_analysed(case, numbers), *_not_confirmed(worst_case)]))
     if missing:
         text += [TEXTS.line("not_analysed"), *(f"- {line}" for line in missing)]
-    return Section("summary", TITLE, tuple(text), tuple(tables))
+    text += [TEXTS.line("loops_left_out", wires=left_out)] if left_out else []
+    return Section(SUMMARY, TITLE, tuple(text), tuple(tables), plots)
 
 
-def _requirements(case: Case, reviewed: Review) -> Table:
-    """Return the table of requirements: those that fail first, then those that are not decided."""
+def all_requirements(case: Case, reviewed: Review | None) -> Section | None:
+    """Return the chapter with all requirements, None where the summary has them all."""
+    if reviewed is None or len(reviewed.results) <= MOST_REQUIREMENTS:
+        return None
+    return Section("requirements", "Requirements", (), (_requirements(case, reviewed, len(reviewed.results)),))
+
+
+def _requirements(case: Case, reviewed: Review, most: int) -> Table:
+    """Return the table of so many requirements: those that fail first, then those that are not decided."""
     ranked = sorted(reviewed.results, key=lambda r: (ORDER.index(r.verdict), _relative(r)))
-    rows = tuple(_row(case, result) for result in ranked)
+    rows = tuple(_row(case, result) for result in ranked[:most])
     columns = ("verdict", "requirement", "at", "variant", "required", "found", "distance")
-    return Table(
-        "Requirements", columns, rows, TEXTS.line("distance"), digits=DIGITS, terms={"distance": "distance_to_limit"}
-    )
+    note = TEXTS.line("distance")
+    if len(ranked) > most:
+        note = TEXTS.line("more_requirements", shown=most, total=len(ranked)) + f" {note}"
+    terms = {"distance": "distance_to_limit"}
+    return Table("Requirements", columns, rows, note, digits=DIGITS, terms=terms, brief=True)
+
+
+def _overview(
+    case: Case, numbers: Mapping[str, Number], sections: Sequence[Section]
+) -> tuple[tuple[Plot, ...], list[str]]:
+    """Return the small figures of each loop, side by side, and the wires of loops for which there is no room.
+
+    A loop that another one shows has none. Those with the smallest disk margins are shown, then required steps.
+    """
+    groups: dict[str, list[Plot]] = {}
+    for plot in _small_figures(sections):
+        groups.setdefault(plot.group, []).append(plot)
+    wires = case.loop_wires()
+    by_loop: dict[str, dict[str, Number]] = {key: {} for key in wires}
+    for path, number in numbers.items():
+        first, _, rest = path.partition(".")
+        key, _, end = rest.partition(".")
+        if first == "inner" and key in by_loop and ".control." not in path:
+            by_loop[key][end] = number
+    hidden = find_same(by_loop)
+    loops = [key for key in wires if key in groups and key not in hidden]
+    shown = set(sorted(loops, key=lambda key: _smallest_margin(case, key, by_loop[key]))[: len(HEIGHTS)])
+    others = [key for key in groups if key not in wires][: len(HEIGHTS) - len(shown)]
+    kept = [*(key for key in loops if key in shown), *others]
+    return fit_overview([groups[key] for key in kept]), [wires[key] for key in loops if key not in shown]
+
+
+def _smallest_margin(case: Case, key: str, numbers: Mapping[str, Number]) -> float:
+    """Return the smallest disk margin of a loop of the diagram as it is, for an order that rounding doesn't change."""
+    actual = [] if case.actual is None else [case.actual.key]
+    found = weakest({f"inner.{key}.{end}": number for end, number in numbers.items()}, actual)
+    return math.inf if found is None else order_key(found[1].value)
+
+
+def _small_figures(sections: Sequence[Section]) -> Iterator[Plot]:
+    for section in sections:
+        yield from section.overview
+        yield from _small_figures(section.sections)
 
 
 def _relative(result: RequirementResult) -> float:
@@ -235,7 +289,7 @@ def _loops(case: Case, numbers: Mapping[str, Number]) -> Table | None:
         return None
     all_rows = ((ROWS[name], *(values[i] for values in found.values())) for i, name in enumerate(LOOP_NUMBERS))
     rows = tuple(row for row in all_rows if any(number is not None for number in row[1:]))
-    return Table(TEXTS.line("loops"), ("", *found), rows, digits=DIGITS)
+    return Table(TEXTS.line("loops"), ("", *found), rows, TEXTS.line("confirmed"), digits=DIGITS, brief=True)
 
 
 def _not_analysed(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:

@@ -71,6 +71,16 @@ def test_fig_3_is_analysed_without_an_argument(folder, asked, capsys):
     assert "plant" in (folder / "fig3.html").read_text(encoding="utf-8")  # the drawing
 
 
+@pytest.mark.parametrize(
+    ("flags", "summary", "appendix"),
+    [([], False, True), (["--summary"], True, True), (["--no-appendix"], False, False)],
+)
+def test_flags_choose_the_pages(folder, asked, flags, summary, appendix):
+    assert main(["report", "loop.py:loop", *flags]) == 0
+    ((_, options),) = asked
+    assert (options["summary"], options["appendix"]) == (summary, appendix)
+
+
 def test_options_reach_the_experiment(folder, asked):
     assert main(["report", "c", "--option", "delay=1", "--out", "c.html"]) == 0
     ((_, options),) = asked
