@@ -190,7 +190,7 @@ def small(height):
     return figure
 
 
-@pytest.mark.parametrize("rows", [22, 34])
+@pytest.mark.parametrize("rows", [30, 48])
 def test_a_summary_has_two_sheets_where_smaller_figures_suffice_and_is_whole(rows, tmp_path):
     plots = tuple(Plot(f"p{i}{k}", f"Caption {i}{k}.", small(1.4), group=str(i)) for i in range(6) for k in "ab")
     table = Table("T", ("name", "value"), tuple((f"row{i}", float(i)) for i in range(rows)))
