@@ -140,6 +140,9 @@ class _Start:
             self._first = (workspace.here.w.copy(), workspace.here.x.copy())
         if self.moved:
             return False
+        if not np.array_equal(self._at[0], workspace.here.w, equal_nan=True):
+            self.set_start(workspace)  # the states that begin with values of before
+            workspace.evaluate(self.acting)
         x, z, before = workspace.here.x, workspace.z, self._before
         self._solved = not workspace.looped or np.allclose(self._last, x, rtol=START_SETTLED, atol=START_SETTLED)
         agreed = self.passes_on != "agree" or bool((before == z).all())

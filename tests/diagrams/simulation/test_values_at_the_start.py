@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from loopwright.blocks import Function, SimulationError, TransportDelay
+from loopwright.blocks import PID, Constant, Function, SimulationError, TransportDelay
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu
 from support.small_fmus import small_fmu, values
@@ -78,6 +78,21 @@ def test_a_delay_with_its_own_output_at_its_input_begins_at_rest():
     diagram = Diagram("d", delay(Function(lambda u: 1.0 - 2.0 * u, name="f")(delay.y)))
     run = diagram.simulate(0.01, step=0.01, progress=False)
     assert run["delay.y"][0] == pytest.approx(1.0 / 3.0, rel=1e-12)
+
+
+def test_an_initial_state_behind_a_delay_begins_with_the_input_at_the_start():
+    """PID with a given first output: I = 40 − kp (r − y), whatever stands between y and its source."""
+    duct = TransportDelay(delay=25.0, initial_value=None, name="duct")
+    control = PID(kp=1.44, ki=0.008, initial_output=40.0, name="control")
+    diagram = Diagram("d", control(Constant(value=120.0), duct(Constant(value=115.0, name="oven"))))
+    assert diagram.simulate(1.0, step=1.0, progress=False)["control.u"][0] == pytest.approx(40.0, abs=1e-12)
+
+
+def test_an_initial_state_behind_an_fmu_begins_with_the_output_that_its_input_makes(through):
+    plant = Fmu(through, name="plant")
+    control = PID(kp=1.44, ki=0.008, initial_output=40.0, name="control")
+    diagram = Diagram("d", control(Constant(value=120.0), plant(u=Constant(value=115.0, name="oven"))["y"]))
+    assert diagram.simulate(1.0, step=1.0, progress=False)["control.u"][0] == pytest.approx(40.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(
