@@ -47,6 +47,8 @@ from .frequency import (
 )
 from .linearization import (
     CoarseValues,
+    FreeMotion,
+    FreeMotions,
     InexactDerivatives,
     Kink,
     Linearization,
@@ -120,6 +122,8 @@ __all__ = [
     "Failure",
     "Fig3Diagram",
     "FlatDiagram",
+    "FreeMotion",
+    "FreeMotions",
     "FrequencyResponse",
     "GainCrossover",
     "GangOfFour",

@@ -19,6 +19,7 @@ from .findings import (
     UnusualStart,
     ZeroSlope,
 )
+from .free_motions import FreeMotion, FreeMotions, deflate
 from .kinks import find_kinks_between
 from .linear_model import Linearization, linearize, linearize_batch
 from .operating_points import RUN_OPTIONS, PointLike, capture, check_options, copy_point, operating_point, run_to
@@ -35,6 +36,8 @@ __all__ = [
     "CutFromTracking",
     "EntryTaken",
     "EventWithinPeriod",
+    "FreeMotion",
+    "FreeMotions",
     "InertConsumer",
     "InexactDerivatives",
     "Kink",
@@ -56,6 +59,7 @@ __all__ = [
     "capture",
     "check_options",
     "copy_point",
+    "deflate",
     "differentiate_loop",
     "find_kinks_between",
     "find_signal",

@@ -284,30 +284,69 @@ class LocalDerivatives:
             self._closed_slopes[acting] = self._kept("closed slopes", acting, make)
         return self._closed_slopes[acting]
 
+    def _trace_parts(self, acting: frozenset[TickPattern], *, with_stairs: bool = False) -> Schedule:
+        """Return the values at an instant by (t, x, w, p, d, e, c); with the stairs' own values where asked for."""
+        flat, symbols = self.flat, self.flat.symbols()
+        d, e = ca.MX.sym("d", self.n_inputs), ca.MX.sym("e", self.stairs.e.total)
+        c = ca.MX.sym("c", sum(size(flat.checked.shapes[port]) for port in self.cut))
+
+        def results(apart: Apart) -> Mapping[str, Any]:
+            own: dict[int, Any] = {}
+            instant = evaluate(
+                flat,
+                flat.blocks,
+                acting,
+                **symbols,
+                taps=self._make_taps(d, c),
+                apart=apart,
+                begun=True,
+                visit=lambda here, path, inputs, made: own.update(self.stairs.add(here, path, made, e)),
+            )
+            found = {"x_next": next_x(instant), "z": plant_inputs(instant), "y": self._read_outputs(instant)}
+            found |= {"dx": rates(instant), "v": self.stairs.read(instant), "r": loop_mismatch(instant)}
+            if with_stairs:
+                found["s"] = self.stairs.join(own)
+            return found
+
+        return trace_schedule("parts", {**symbols, "d": d, "e": e, "c": c}, results)
+
+    def evaluate(
+        self,
+        acting: frozenset[TickPattern],
+        t: float,
+        x: np.ndarray,
+        w: np.ndarray,
+        beside: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> Numbers:
+        """Return the values of `differentiate` without their derivatives, and more of stairs that are replaced.
+
+        Parameters
+        ----------
+        acting, t, x, w
+            As of `differentiate`.
+        beside : tuple of ndarray, optional
+            Inputs v and own values s of the stairs at another instant, from which they go on by their mean slope.
+            Without it they have their own values.
+        """
+        names, zeros = (*_RESULTS, "s"), np.zeros(self.n_inputs)
+        x = self._solve_loops(acting, t, x, w)
+        at = t, x, w, self.flat.p
+        c = self._trace_closed(acting)(*at, evaluators=self.evaluators)[0] if self.cut else np.zeros(0)
+        schedule = self._kept("values", acting, lambda: self._trace_parts(acting, with_stairs=True))
+        e = np.zeros(self.stairs.e.total)
+        for _ in range(len(self.stairs.stairs) + 1):  # a stair may follow another one
+            found: Numbers = dict(zip(names, schedule(*at, zeros, e, c, evaluators=self.evaluators), strict=True))
+            new = e if beside is None else self.stairs.K @ (found["v"] - beside[0]) - (found["s"] - beside[1])
+            if np.array_equal(new, e):
+                break
+            e = new
+        return found
+
     def _trace_derivative(self, acting: frozenset[TickPattern]) -> Derivative:
         """Return values and derivatives by (x, w, d) at an instant; ``NONE`` is one between ticks."""
 
         def make() -> Derivative:
-            flat, symbols = self.flat, self.flat.symbols()
-            d, e = ca.MX.sym("d", self.n_inputs), ca.MX.sym("e", self.stairs.e.total)
-            c = ca.MX.sym("c", sum(size(flat.checked.shapes[port]) for port in self.cut))
-
-            def results(apart: Apart) -> Mapping[str, Any]:
-                instant = evaluate(
-                    flat,
-                    flat.blocks,
-                    acting,
-                    **symbols,
-                    taps=self._make_taps(d, c),
-                    apart=apart,
-                    begun=True,
-                    visit=lambda here, path, inputs, made: self.stairs.add(here, path, made, e),
-                )
-                found = {"x_next": next_x(instant), "z": plant_inputs(instant), "y": self._read_outputs(instant)}
-                return {**found, "dx": rates(instant), "v": self.stairs.read(instant), "r": loop_mismatch(instant)}
-
-            schedule = trace_schedule("parts", {**symbols, "d": d, "e": e, "c": c}, results)
-            return Derivative(schedule, [(name, None) for name in _ARGUMENTS])
+            return Derivative(self._trace_parts(acting), [(name, None) for name in _ARGUMENTS])
 
         if acting not in self._derivatives:
             self._derivatives[acting] = self._kept("parts", acting, make)

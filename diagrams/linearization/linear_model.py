@@ -39,6 +39,7 @@ from .derivatives import LocalDerivatives, Tap, find_moving, find_signal
 from .exchanged import derivations_at, evaluators_at, findings_on
 from .findings import EntryTaken
 from .flow_model import Model, model_continuous, relative_error
+from .free_motions import FreeMotions, find_free_motions
 from .inserted_blocks import find_cut_findings, name_inputs, split_consumers, split_inputs
 from .kinks import find_kinks
 from .mean_stairs import replace_stairs
@@ -182,8 +183,42 @@ class Linearization:
     def poles(self) -> np.ndarray:
         """Poles of the model without those of `memory`, the largest first."""
         keep = [i for i, name in enumerate(self.states) if name not in self.memory]
-        poles = np.linalg.eigvals(self.A[np.ix_(keep, keep)]) if keep else np.zeros(0)
-        return poles[np.lexsort((poles.imag, poles.real, -np.abs(poles)))]
+        return _sorted_poles(self.A[np.ix_(keep, keep)])
+
+    @accepts(None, required=kinds.names)
+    def free_motions(self, required: str | Iterable[str] = ()) -> FreeMotions:
+        """Return the motions that nothing notices, such as that of an angle that nothing feeds back.
+
+        Such a motion has a pole at s = 0, or z = 1, and is no instability: no derivative, no wire on a loop, no event
+        and no required signal changes along it, at any distance and at any instant of the period.
+
+        Parameters
+        ----------
+        required : str or iterable of str
+            Wires and ports on which something is required: a motion that changes one of them is not free.
+
+        Returns
+        -------
+        FreeMotions
+            The motions, and the coordinates in which A falls apart into them and the rest.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such wire or port.
+        """
+        names = tuple(dict.fromkeys(_as_list(required)))
+        if names not in self._free:
+            self._free[names] = find_free_motions(self, names)
+        return self._free[names]
+
+    @cached_property
+    def _free(self) -> dict[tuple[str, ...], FreeMotions]:
+        return {}
+
+    def poles_without(self, free: FreeMotions) -> np.ndarray:
+        """Return the poles without those of some free motions, as `poles` does."""
+        return _sorted_poles(free.reduce(self.A)) if free else self.poles
 
     @property
     def is_equilibrium(self) -> bool:
@@ -282,6 +317,12 @@ class Linearization:
             cut = Model((made.A, made.B, made.C, made.D), made.dt, [], made.affine, uncertainty=known)
             confirm_loop(cut, closed.A, wires, self.wired.name)
         return made
+
+
+def _sorted_poles(A: np.ndarray) -> np.ndarray:
+    """Return the eigenvalues of a matrix, the largest first."""
+    poles = np.linalg.eigvals(A) if A.size else np.zeros(0)
+    return poles[np.lexsort((poles.imag, poles.real, -np.abs(poles)))]
 
 
 def linearize(

@@ -7,7 +7,7 @@ mean slope, as theirs depends on the amplitude: a relay stays as it is.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,20 +71,31 @@ class Stairs:
                 found += [Stair(path, row, source[2:], K) for row, source, K in mean_slopes(slopes, at.t, z, p)]
         return cls([s for s in found if (s.path, s.source) in flat.table.wires])
 
-    def add(self, instant: Instant, path: str, made: dict[str, Any], e: Any) -> None:
-        """Add e to what a block has made."""
+    def add(self, instant: Instant, path: str, made: dict[str, Any], e: Any) -> dict[int, Any]:
+        """Add e to what a block has made; return what it was without, by the number of the stair."""
+        own = {}
         for i, stair in enumerate(self.stairs):
             kind, name = stair.row.split(" ", 1)
             if stair.path != path:
                 continue
             part = e[self.e.slices[str(i)]]
             if kind == "u" and name in made:
+                own[i] = made[name]
                 made[name] = made[name] + part
             elif kind == "x" and NEXT in made:
                 where = instant.layout.states.of_block[path].slices[name]
                 above = where.start - instant.layout.states.slices[path].start
                 below = made[NEXT].numel() - above - part.numel()
+                own[i] = made[NEXT][above : above + part.numel()]
                 made[NEXT] = made[NEXT] + ca.vertcat(ca.MX.zeros(above), part, ca.MX.zeros(below))
+
+        return own
+
+    def join(self, own: Mapping[int, Any]) -> Any:
+        """Return the stairs' own values as one column; zeros for a block that has made none."""
+        sizes = {i: len(stair.slope) for i, stair in enumerate(self.stairs)}
+        columns = [ca.densify(ca.MX(own[i])) if i in own else ca.MX.zeros(n) for i, n in sizes.items()]
+        return ca.vertcat(*columns) if columns else ca.MX(0, 1)
 
     def read(self, instant: Instant) -> Any:
         """Return v at an instant."""

@@ -142,7 +142,7 @@ def plant_changes(flat: FlatDiagram, at: OperatingPoint) -> dict[str, np.ndarray
         block = fmu_at(flat, path)
         if not block.description.states:
             continue
-        now = {**at.plants[path], "inputs": _inputs(flat, at, path, at.z)}
+        now = {**at.plants[path], "inputs": point_inputs(flat, at, path, at.z)}
         try:
             m = linearize_fmu(block, **now)
             change = m.f
@@ -253,7 +253,7 @@ def model_step(
         return _identify_model(flat, at, path, z, h)
     else:
         try:
-            now = {**at.plants[path], "inputs": _inputs(flat, at, path, z)}
+            now = {**at.plants[path], "inputs": point_inputs(flat, at, path, z)}
             step = linearize_fmu(block, h=h, **now)
         except FmuError as error:
             if way == "step":
@@ -273,7 +273,7 @@ def model_step(
     following = {
         "t": at.plants[path]["t"] + h,
         "state": _states_after(block, at, path, m.f),
-        "inputs": _inputs(flat, at, path, z),
+        "inputs": point_inputs(flat, at, path, z),
     }
     return PlantModel(
         path=path,
@@ -296,7 +296,7 @@ def model_step(
 
 def _identify_model(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray, h: float) -> PlantModel:
     mine, w, wired = plant_entries(flat, path)
-    now = {**at.plants[path], "inputs": _inputs(flat, at, path, z)}
+    now = {**at.plants[path], "inputs": point_inputs(flat, at, path, z)}
     m = identify_step(fmu_at(flat, path), now, h, at.w[w])
     n, rest, names = len(m.A), {**now, "t": now["t"] + h}, _prefix_names(path, m.states)
     D = np.zeros((len(w), len(wired)))
@@ -354,7 +354,7 @@ def _hold_at_rest(
     held, block = _hold_inputs(m, h), fmu_at(flat, path)
     if way is not None or is_built_here(block.description.digest):
         return held
-    point = {**at.plants[path], "inputs": _inputs(flat, at, path, z)}
+    point = {**at.plants[path], "inputs": point_inputs(flat, at, path, z)}
     try:
         gap, error = step_gap(block, h=h, A=held.A, B=held.B, **point)
     except FmuError:
@@ -409,10 +409,10 @@ def _outputs_before(
 def linearize_equations(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray) -> FmuLinearization:
     """Return the linear model of an FMU's equations under the inputs z."""
     point = at.plants[path]
-    return linearize_fmu(fmu_at(flat, path), t=point["t"], state=point["state"], inputs=_inputs(flat, at, path, z))
+    return linearize_fmu(fmu_at(flat, path), t=point["t"], state=point["state"], inputs=point_inputs(flat, at, path, z))
 
 
-def _inputs(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray) -> dict[str, Any]:
+def point_inputs(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray) -> dict[str, Any]:
     """Return an FMU's inputs by port: wired ones from z, the others from the operating point."""
     given = dict(at.plants[path]["inputs"])
     for port in flat.table.blocks[path].inputs:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from ...blocks.core import Finding
 from ..flat import FlatDiagram
+from ..wiring import find_cyclic_parts
 from .block_slopes import slopes_of
 from .findings import BlockFinding, EventWithinPeriod, InexactDerivatives
 
@@ -100,6 +101,24 @@ class SignalPaths:
     def on_loops(self, findings: Iterable[Finding]) -> tuple[Finding, ...]:
         """Return the findings that limit numbers about all loops together, such as the poles."""
         return tuple(f for f in findings if f.limits_numbers and self._is_on_loop(f))
+
+    def wires_on_loops(self) -> list[tuple[PathNode, PathNode]]:
+        """Return the wires that are part of a loop, as pairs of an output and an input, in order of their paths.
+
+        The control of a subsystem leads to the outputs of its blocks.
+        """
+        nodes = {*self._forward, *(node for to in self._forward.values() for node in to)}
+        keys = {"\0".join((n.block, n.port, str(n.is_output))): n for n in sorted(nodes)}
+        key_of = {node: key for key, node in keys.items()}
+        pairs = [(key_of[a], key_of[b]) for a, to in self._forward.items() for b in to]
+        part_of = {keys[key]: i for i, part in enumerate(find_cyclic_parts(list(keys), pairs)) for key in part}
+        return [
+            (node, other)
+            for node in keys.values()
+            if node.is_output and node in part_of
+            for other in sorted(self._forward.get(node, ()))
+            if part_of.get(other) == part_of[node]
+        ]
 
     def _is_on_loop(self, finding: Finding) -> bool:
         ends = self._ends(finding)

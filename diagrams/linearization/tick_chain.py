@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,6 +57,37 @@ def ticks_of_period(flat: FlatDiagram, first: int, period: int) -> Iterator[tupl
     yield from zip(ticks, [*ticks[1:], first + period], strict=True)
 
 
+@dataclass(frozen=True, eq=False)
+class Visit:
+    """A tick of a chain with what its linear model was made of.
+
+    Attributes
+    ----------
+    acting : frozenset of TickPattern
+        Clocks that act.
+    point : OperatingPoint
+        The operating point just before the tick.
+    h : float
+        Time to the next tick in s.
+    numbers : mapping
+        Values and derivatives at the tick, as `LocalDerivatives.differentiate` returns them.
+    W : ndarray
+        Derivatives of the FMUs' outputs before the tick by the chain's state.
+    x : ndarray
+        The vector x after the tick.
+    begun : tuple of PlantModel
+        Models of the FMUs' steps that begin at the tick.
+    """
+
+    acting: frozenset[TickPattern]
+    point: OperatingPoint
+    h: float
+    numbers: Numbers
+    W: np.ndarray
+    x: np.ndarray
+    begun: tuple[PlantModel, ...]
+
+
 class Chain:
     """Linear models of the ticks of a period, one after the other.
 
@@ -100,6 +131,7 @@ class Chain:
         self._known_plants: dict[str, tuple[float, np.ndarray, np.ndarray, PlantModel]] = {}
         self._known_flow: tuple[float, np.ndarray, np.ndarray, FourMatrices] | None = None
         self.steps: list[FourMatrices] = []
+        self.visits: list[Visit] = []
         self._fired: list[Finding] = []
         self._first_tick: Numbers = {}
 
@@ -119,7 +151,8 @@ class Chain:
     def go(self, k: int, following: int) -> None:
         """Go from tick ``k`` to the next one."""
         flat, here, h = self.flat, self.here, float(self.flat.base * (following - k))
-        tick = self.local.differentiate(flat.acting(k) - self.frozen, here.t, here.x, here.w)
+        acting = flat.acting(k) - self.frozen
+        tick = self.local.differentiate(acting, here.t, here.x, here.w)
         mid_step = [path for path in self.paths if self._until[path] != k]
         held = self._begin_steps(k, tick["z"])
         kept = [*self._straight, *(i for path in mid_step for i in self._models[path].outputs)]
@@ -149,6 +182,8 @@ class Chain:
             z_of[mine, [nx + n_p + i for i in mine]] = 1.0
         x1 = tick["x"]
         signals = line.signals((x_of, x_by_d), W) if line else None
+        begun = tuple(self._models[path] for path in self.paths if path not in mid_step)
+        self.visits.append(Visit(acting, here, h, tick, W, x1, begun))
         if flat.continuous.size:
             E, Ew, Ed, x1 = self._differentiate_flow(x1, h)
             x_of, x_by_d = E @ x_of + Ew @ W, E @ x_by_d + Ed

@@ -7,6 +7,7 @@ from .known_models import linearize_fmu, step_gap
 from .linearization import check_exchange_slopes, find_exchange_slopes
 from .replacement import suggest_names
 from .restored_point import RestoredPoint
+from .shifted_steps import take_shifted_steps
 
 __all__ = [
     "Derivation",
@@ -19,4 +20,5 @@ __all__ = [
     "linearize_fmu",
     "step_gap",
     "suggest_names",
+    "take_shifted_steps",
 ]

@@ -1,0 +1,639 @@
+"""Free motions of a diagram: integrators that nothing feeds back, and linear models without them.
+
+The angle of a speed drive runs on, and its pole at 0 is no instability. A motion is free along an eigenvector v of the
+eigenvalue 0, or of z = 1, if nothing notices a shift along it:
+
+- v has no Jordan chain: an angle with its integral is a ramp;
+- finite shifts along v, to both sides and of several sizes, change no derivative, no other next state, no indicator of
+  an event, no wire on a loop of the port graph and no required signal. The diagram's own functions are evaluated at
+  every tick of the period, and between the ticks. Their slopes may not change either: a loop that is stable at one
+  angle alone is not stable at all of them.
+
+The linear model alone would not do: an actuator at its limit, a dead zone, x³ at 0 or stuck friction hide a feedback at
+one point. An oscillation with the frequency 2π/T has z = 1 as well, but it changes derivatives between the ticks.
+
+Free motions are deflated: in coordinates of which the first ones are along them, A is block triangular, and the rest is
+the model of everything else. No pole is left out because it is near 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...blocks.core import FmuError, Layout, LoopwrightError, enumerate_some, explain_calls
+from ...blocks.tracing import size
+from ...fmus.platform import is_built_here
+from ...fmus.running import take_shifted_steps
+from ..flat import NONE, FlatDiagram, TickPattern
+from ..results import OperatingPoint
+from ..wiring import join
+from .derivatives import LocalDerivatives, Numbers, Tap, find_signal
+from .exchanged import evaluators_at, noise_of
+from .mean_stairs import replace_stairs
+from .over_a_period import find_needed, own_states
+from .plant_models import PlantModel, fmu_at, join_matrices, linearize_equations, plant_entries, point_inputs
+from .signal_paths import SignalPaths
+from .tick_chain import Chain, Visit, period_of
+
+if TYPE_CHECKING:
+    from .linear_model import Linearization
+
+NULL = 1e-12
+"""Largest singular value of a direction that counts as an eigenvector of 0, relative to the largest one."""
+NOISE = 1e-12
+"""Part of a signal, relative to that of all states in balanced units, that is rounding of a direction."""
+UNSEEN = 1e-9
+"""Relative size of an entry, or of a row, of directions that counts as none."""
+CHAIN = 1e-9
+"""Share of a direction outside of the range of A below which it counts as the end of a Jordan chain."""
+ROUNDING = 1e-10
+"""Rounding of a diagram's function, relative to the sizes of what is summed in it: some 1e5 roundings."""
+SLOPES = 1e-7
+"""Relative difference up to which slopes count as the same."""
+SIZES = (7.390851e-7, 7.390851e-4, 7.390851e-2, 0.7390851, 7.390851, 7.390851e2, 7.390851e5)
+"""Sizes of shifts, in units of a state's nominal value. No period of a periodic function fits into all of them."""
+PLANT_SIZES = (7.390851e-2, 0.7390851, 7.390851)
+"""The same of an FMU's states, whose solver may follow their size."""
+PART = 0.37
+"""Part of an FMU's step after which its states are looked at, too."""
+SOLVED = 1e-6
+"""Relative error of the steps of another tool's FMU."""
+
+
+@explain_calls
+@dataclass(frozen=True)
+class FreeMotion:
+    """A motion that nothing in a diagram notices, such as that of an angle that nothing feeds back.
+
+    Attributes
+    ----------
+    state : str
+        The state that integrates, such as ``"motor.angle"``.
+    entries : tuple of (str, float)
+        All states that are shifted together, with their shares; that of ``state`` is 1.
+    by_model_alone : tuple of str
+        FMUs whose states can't be set to other values: the linear model alone says that the motion is free.
+    """
+
+    state: str
+    entries: tuple[tuple[str, float], ...]
+    by_model_alone: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        text = f"{self.state} drifts: nothing feeds it back"
+        if self.by_model_alone:
+            who = enumerate_some(self.by_model_alone)
+            text += f" (by the linear model alone: the states of {who} can't be shifted)"
+        return text
+
+
+@explain_calls
+@dataclass(frozen=True, eq=False)
+class FreeMotions:
+    """The free motions of a linear model, and the model without them.
+
+    Attributes
+    ----------
+    motions : tuple of FreeMotion
+        The motions; none for a diagram whose eigenvalues at 0 are all noticed by something.
+    V : ndarray, shape (n, m)
+        Their directions in the model's states: A V = 0, or A V = V of a sampled model.
+    Q : ndarray, shape (n, n − m)
+        Coordinates of the rest, orthonormal to V in balanced states.
+    P : ndarray, shape (n − m, n)
+        Inverse of Q on the rest: P Q = 1 and P V = 0.
+    """
+
+    motions: tuple[FreeMotion, ...]
+    V: np.ndarray = field(repr=False)
+    Q: np.ndarray = field(repr=False)
+    P: np.ndarray = field(repr=False)
+
+    def __bool__(self) -> bool:
+        return bool(self.motions)
+
+    def reduce(self, A: np.ndarray) -> np.ndarray:
+        """Return a model's A without the free motions: its eigenvalues are those of A, less one 0 for each of them."""
+        return np.asarray(self.P @ A @ self.Q) if self.motions else A
+
+    def reduce_inputs(self, B: np.ndarray) -> np.ndarray:
+        """Return B of the reduced model."""
+        return np.asarray(self.P @ B) if self.motions else B
+
+    def reduce_outputs(self, C: np.ndarray) -> np.ndarray:
+        """Return C of the reduced model, for outputs that don't see the free motions (C V = 0)."""
+        return np.asarray(C @ self.Q) if self.motions else C
+
+
+def deflate(A: np.ndarray, V: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return Q and P of `FreeMotions` for eigenvectors V of a matrix: the rest of it is P A Q.
+
+    With x = V a + Q b the matrix is block triangular, so P A Q has its other eigenvalues. Both are orthonormal in the
+    states that balance A: the eigenvalues of the rest are as accurate as those of A.
+    """
+    d = _scales(A)
+    whole, _ = np.linalg.qr(V / d[:, None], mode="complete")
+    rest = whole[:, V.shape[1] :]
+    return d[:, None] * rest, rest.T / d
+
+
+def find_free_motions(model: Linearization, required: Iterable[str] = ()) -> FreeMotions:
+    """Return the free motions of a linear model.
+
+    Parameters
+    ----------
+    model : Linearization
+        Linear model of a diagram.
+    required : iterable of str
+        Wires and ports on which something is required: a motion that changes one of them is not free.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such wire or port.
+    """
+    none = FreeMotions((), np.zeros((len(model.A), 0)), np.eye(len(model.A)), np.eye(len(model.A)))
+    kept = [i for i, name in enumerate(model.states) if name not in model.memory]
+    A = model.A[np.ix_(kept, kept)]
+    M = A - np.eye(len(A)) if model.dt else A
+    uncertainty = 0.0 if np.isnan(model.uncertainty) else model.uncertainty
+    right, left, rest = _null_spaces(M, uncertainty)
+    if not right.shape[1]:
+        return none
+    noise = max(NOISE, 100.0 * uncertainty / (float(np.max(np.abs(A))) or 1.0))
+    look = _Look.of(model, required, kept, noise)
+    V = _localize(right, M, rest)
+    V = _localize(V @ _null(look.seen(V, _scales(M))), M, rest)
+    found: list[tuple[np.ndarray, tuple[str, ...]]] = []
+    for v in V.T:
+        holds, alone = look.holds(v)
+        if holds:
+            found.append((v, alone))
+    if len(found) > 1:  # two motions may act together: on a product of two angles, say
+        weights = np.random.default_rng(0).uniform(0.5, 1.5, len(found))
+        if not look.holds(np.column_stack([v for v, _ in found]) @ weights)[0]:
+            return none
+    found = _without_chains(found, left, _scales(M))
+    if not found:
+        return none
+    V = np.column_stack([v for v, _ in found])
+    names = [model.states[i] for i in kept]
+    motions = tuple(_describe(v, left, names, alone) for v, alone in found)
+    Q, P = deflate(M, V)
+    return FreeMotions(motions, *(_spread(X, kept, model, axis) for X, axis in ((V, 0), (Q, 0), (P, 1))))
+
+
+def _spread(X: np.ndarray, kept: list[int], model: Linearization, axis: int) -> np.ndarray:
+    """Return a matrix for all states of a model from one for those that are no memory."""
+    n = len(model.states)
+    if axis:
+        return _spread(X.T, kept, model, 0).T
+    whole = np.zeros((n, X.shape[1]))
+    whole[kept] = X
+    return whole
+
+
+def _describe(v: np.ndarray, left: np.ndarray, names: Sequence[str], alone: tuple[str, ...]) -> FreeMotion:
+    """Return a motion with its states: the one that integrates has the largest participation."""
+    weight = np.abs(v) * np.linalg.norm(left, axis=1)
+    first = int(np.argmax(weight >= 0.5 * np.max(weight)))
+    shares = v / v[first]
+    entries = tuple((names[i], float(shares[i])) for i in np.flatnonzero(v))
+    return FreeMotion(names[first], tuple(sorted(entries, key=lambda e: e[0] != names[first])), alone)
+
+
+# --- eigenvectors of 0 -----------------------------------------------------------------------------------------------
+
+
+def _scales(M: np.ndarray) -> np.ndarray:
+    """Return the factors, powers of two, that balance a matrix."""
+    from scipy.linalg import matrix_balance
+
+    with np.errstate(invalid="ignore"):
+        _, (d, _) = matrix_balance(M, permute=False, separate=True)
+    return np.asarray(d)
+
+
+def _null_spaces(M: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return bases of the right and left null space of a matrix whose entries have an error, by columns.
+
+    The third result is the size of singular values that count as none, relative to the largest one.
+    """
+    if not len(M):
+        return np.zeros((0, 0)), np.zeros((0, 0)), NULL
+    d = _scales(M)
+    U, sigma, Wt = np.linalg.svd(M * d / d[:, None])
+    moved = error * float(np.max(np.outer(1.0 / d, d))) if error else 0.0
+    rest = max(NULL, 10.0 * moved / (float(sigma[0]) or 1.0))
+    first = len(M) - int(np.sum(sigma <= rest * sigma[0]))
+    return d[:, None] * Wt[first:].T, U[:, first:] / d[:, None], rest
+
+
+def _null(S: np.ndarray) -> np.ndarray:
+    """Return a basis of the directions in which all rows of a matrix of relative sizes are 0."""
+    if not S.size:
+        return np.eye(S.shape[1])
+    _, sigma, Wt = np.linalg.svd(S, full_matrices=True)
+    count = int(np.sum(sigma > UNSEEN))
+    return np.asarray(Wt[count:].T)
+
+
+def _localize(V: np.ndarray, M: np.ndarray, rest: float) -> np.ndarray:
+    """Return the basis of a space of null vectors in which each one has a state of its own.
+
+    Zeros that rounding moved are 0. ``rest`` is the relative size of singular values that count as none.
+    """
+    from scipy.linalg import qr
+
+    if not V.shape[1]:
+        return V
+    d = _scales(M)
+    scaled = V / d[:, None]
+    _, _, order = qr(scaled.T, pivoting=True, mode="economic")
+    own = order[: V.shape[1]]
+    made, balanced = scaled @ np.linalg.inv(scaled[own]), M * d / d[:, None]
+    for _ in range(2):  # a slow pole beside them turns singular vectors by the rounding over its size
+        made = made - np.linalg.lstsq(balanced, balanced @ made, rcond=rest)[0]
+    made[np.abs(made) <= UNSEEN * np.max(np.abs(made), axis=0)] = 0.0
+    return np.asarray(d[:, None] * made)
+
+
+def _without_chains(
+    found: list[tuple[np.ndarray, tuple[str, ...]]], left: np.ndarray, d: np.ndarray
+) -> list[tuple[np.ndarray, tuple[str, ...]]]:
+    """Return the directions that together reach out of the range of the matrix: no Jordan chain ends in them.
+
+    Directions are orthogonal to the left null vectors exactly where they are in the range.
+    """
+    L, _ = np.linalg.qr(left * d[:, None])
+    kept: list[tuple[np.ndarray, tuple[str, ...]]] = []
+    basis = np.zeros((L.shape[1], 0))
+    for v, alone in found:
+        scaled = v / d
+        part = L.T @ (scaled / np.linalg.norm(scaled))
+        part = part - basis @ (basis.T @ part)
+        size = float(np.linalg.norm(part))
+        if size > CHAIN:
+            basis = np.column_stack([basis, part / size])
+            kept.append((v, alone))
+    return kept
+
+
+# --- shifts ----------------------------------------------------------------------------------------------------------
+
+
+def _watched(flat: FlatDiagram, model: Linearization, required: Iterable[str]) -> list[Tap]:
+    """Return the signals that a free motion does not change: wires on loops, and those on which something is required.
+
+    A block with a guard, and one that ends a run, requires its inputs.
+    """
+    cut = [find_signal(flat, wire).port for wire in model.openings]
+    table, found = flat.table, dict[Port, set[int]]()
+    for source, reader in SignalPaths(flat, cut).wires_on_loops():
+        wire = table.wires.get((reader.block, reader.port))
+        _add_entries(flat, found, (source.block, source.port), None if reader.is_output or wire is None else wire.index)
+    for (path, _), wire in table.wires.items():
+        block = table.blocks[path]
+        if hasattr(block, "guards") or block.stops:
+            _add_entries(flat, found, (wire.block, wire.port), wire.index)
+    taps = [Tap(join(*port), port, tuple(sorted(entries)), ()) for port, entries in sorted(found.items())]
+    return [*taps, *(find_signal(flat, name) for name in dict.fromkeys(required))]
+
+
+Port = tuple[str, str]
+
+
+def _add_entries(flat: FlatDiagram, found: dict[Port, set[int]], port: Port, index: Any) -> None:
+    """Add the entries of a port that a wire takes; all without an index."""
+    shape = flat.checked.shapes[port]
+    whole = np.arange(size(shape)).reshape(shape)
+    found.setdefault(port, set()).update(np.ravel(whole if index is None else whole[index]).tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class _Instant:
+    """An instant of a period at which functions are evaluated with shifted states.
+
+    ``Vx`` and ``Vw`` lead from the model's states at the beginning to the shifts of x and w here, ``rows`` are the
+    entries of each result that count.
+    """
+
+    acting: frozenset[TickPattern]
+    t: float
+    x: np.ndarray
+    w: np.ndarray
+    Vx: np.ndarray
+    Vw: np.ndarray
+    numbers: Numbers
+    rows: Mapping[str, np.ndarray]
+
+    def slope(self, name: str) -> np.ndarray:
+        """Return the derivative of a result's rows by the model's states."""
+        by_x, by_w = (self.numbers[name, a][self.rows[name]] for a in "xw")
+        return np.asarray(by_x @ self.Vx + by_w @ self.Vw)
+
+    def follows(self, name: str) -> np.ndarray:
+        """Return what `slope` is along a free motion: rates and signals stay, states keep their shift.
+
+        Inputs of FMUs may follow a shift: their steps say what comes of it.
+        """
+        if name == "z":
+            return self.slope(name)
+        return self.Vx[self.rows[name]] if name == "x" else np.zeros((len(self.rows[name]), self.Vx.shape[1]))
+
+    def size(self, name: str) -> np.ndarray:
+        """Return the sums of the sizes of which `slope` and `follows` are made."""
+        by_x, by_w = (np.abs(self.numbers[name, a][self.rows[name]]) for a in "xw")
+        return np.asarray(by_x @ np.abs(self.Vx) + by_w @ np.abs(self.Vw) + np.abs(self.follows(name)))
+
+
+@dataclass(frozen=True, eq=False)
+class _PlantStep:
+    """A step of an FMU in a period, with the shifts of its states and inputs by the model's states.
+
+    ``equations`` are A and B of its equations where it gives them, ``outputs`` the entries that something depends on.
+    """
+
+    path: str
+    point: OperatingPoint
+    z: np.ndarray
+    h: float
+    model: PlantModel
+    Vp: np.ndarray
+    Vz: np.ndarray
+    equations: tuple[np.ndarray, np.ndarray] | None
+    outputs: np.ndarray
+
+
+class _Look:
+    """Evaluates a diagram's functions with states shifted along directions of its linear model."""
+
+    def __init__(
+        self,
+        flat: FlatDiagram,
+        local: LocalDerivatives,
+        instants: Sequence[_Instant],
+        plants: Sequence[_PlantStep],
+        nominals: np.ndarray,
+        noise: float,
+    ):
+        self.flat, self.local, self.instants, self.plants = flat, local, instants, plants
+        self.nominals, self.noise = nominals, noise
+        self.error, noise_of_slopes = noise_of(local.evaluators)
+        self.slopes = max(SLOPES, 10.0 * noise_of_slopes)
+        self.sizes, self.rounding = (PLANT_SIZES, SOLVED) if _has_foreign(flat) else (SIZES, ROUNDING)
+
+    @classmethod
+    def of(cls, model: Linearization, required: Iterable[str], kept: list[int], noise: float) -> _Look:
+        """Return the look at a linear model's diagram; ``kept`` are the states that are no memory."""
+        flat, at = model.wired.flatten_like(model.point), model.point
+        watched, cut = _watched(flat, model, required), [find_signal(flat, wire) for wire in model.openings]
+        means = replace_stairs(model.wired, flat, at, model.stairs)
+        local = LocalDerivatives(flat, (), watched, cut, evaluators_at(flat, at), means)
+        make = _look_at_period if model.dt else _look_at_flow
+        instants, plants = make(model, flat, local, kept)
+        return cls(flat, local, instants, plants, _nominals(flat, model, kept), noise)
+
+    def seen(self, directions: np.ndarray, balance: np.ndarray) -> np.ndarray:
+        """Return what the linear model sees of some directions: rows of size 1, of which rounding is left out.
+
+        ``balance`` are the sizes of the states in balanced units.
+        """
+        found = [np.zeros((0, directions.shape[1]))]
+        large = np.max(np.abs(directions) / balance[:, None], axis=0) * balance[:, None]
+
+        def add(slope: np.ndarray, size: np.ndarray) -> None:
+            rows = self._clean(slope @ directions, size @ large)
+            rows = rows[np.any(rows, axis=1)]
+            found.append(rows / np.linalg.norm(rows, axis=1)[:, None])
+
+        for instant in self.instants:
+            for name in instant.rows:
+                add(instant.slope(name) - instant.follows(name), instant.size(name))
+        for plant in self.plants:
+            if plant.equations is not None:
+                A, B = plant.equations
+                size = np.abs(A) @ np.abs(plant.Vp) + np.abs(B) @ np.abs(plant.Vz)
+                add(A @ plant.Vp + B @ plant.Vz, size)
+        return np.vstack(found)
+
+    def _clean(self, values: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+        """Return values without those that are rounding of what they are made of."""
+        return np.where(np.abs(values) <= self.noise * sizes, 0.0, values)
+
+    def _shift(self, V: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return V v without rounding."""
+        return self._clean(V @ v, np.abs(V) @ np.full(len(v), np.max(np.abs(v))))
+
+    def holds(self, v: np.ndarray) -> tuple[bool, tuple[str, ...]]:
+        """Return whether nothing notices shifts along a direction, and the FMUs whose states could not be shifted."""
+        unit = 1.0 / float(np.max(np.abs(v) / self.nominals))
+        alone: dict[str, None] = {}
+        try:
+            if not all(self._holds_at(instant, v, unit) for instant in self.instants):
+                return False, ()
+        except LoopwrightError:  # a shifted state that a block refuses
+            return False, ()
+        for plant in self.plants:
+            held = self._holds_in_step(plant, v, unit)
+            if held is None:
+                alone[plant.path] = None
+            elif not held:
+                return False, ()
+        return True, tuple(alone)
+
+    def _holds_at(self, instant: _Instant, v: np.ndarray, unit: float) -> bool:
+        vx, vw = self._shift(instant.Vx, v), self._shift(instant.Vw, v)
+        if not (vx.any() or vw.any()):
+            return True
+        t, acting, evaluate = instant.t, instant.acting, self.local.evaluate
+        before = evaluate(acting, t, instant.x, instant.w)
+        stairs = before["v"], before["s"]
+        for far in (sign * unit * s for s in self.sizes for sign in (1.0, -1.0)):
+            x, w = instant.x + far * vx, instant.w + far * vw
+            after = evaluate(acting, t, x, w, beside=stairs)
+            for name, rows in instant.rows.items():
+                follows = far * self._shift(instant.follows(name), v)
+                by_x, by_w = (np.abs(instant.numbers[name, a][rows]) for a in "xw")
+                large = by_x @ (np.abs(instant.x) + np.abs(far * vx)) + by_w @ (np.abs(instant.w) + np.abs(far * vw))
+                large = large + np.abs(before[name][rows]) + np.abs(follows)
+                if not np.all(np.abs(after[name][rows] - before[name][rows] - follows) <= self.rounding * large):
+                    return False
+            if not self._has_same_events(t, instant, x, w):
+                return False
+        return self._has_same_slopes(instant, vx, vw, unit)
+
+    def _has_same_slopes(self, instant: _Instant, vx: np.ndarray, vw: np.ndarray, unit: float) -> bool:
+        """Return whether the linear model is the same after a shift to either side."""
+        for far in (0.7390851 * unit, -7.390851 * unit):
+            x, w = instant.x + far * vx, instant.w + far * vw
+            after = self.local.differentiate(instant.acting, instant.t, x, w)
+            for name, rows in instant.rows.items():
+                for a in "xw":
+                    old, new = instant.numbers[name, a][rows], after[name, a][rows]
+                    allowed = self.slopes * np.max(np.abs(old), axis=1, initial=0.0)[:, None] + 10.0 * self.error
+                    if not np.all(np.abs(new - old) <= allowed):
+                        return False
+        return True
+
+    def _has_same_events(self, t: float, instant: _Instant, x: np.ndarray, w: np.ndarray) -> bool:
+        """Return whether the indicators of all events are the same after a shift."""
+        flat = self.flat
+        if not flat.events or instant.acting:
+            return True
+        (g, _), (moved, _) = (
+            flat.indicators(t, *at, flat.p, evaluators=self.local.evaluators) for at in ((instant.x, instant.w), (x, w))
+        )
+        large = max(float(np.max(np.abs(part), initial=0.0)) for part in (x, w))
+        return bool(np.all(np.abs(moved - g) <= self.rounding * (np.abs(g) + large)))
+
+    def _holds_in_step(self, plant: _PlantStep, v: np.ndarray, unit: float) -> bool | None:
+        """Return whether a shift stays as it is over an FMU's step; None if its states can't be shifted."""
+        vp, vz, m = self._shift(plant.Vp, v), self._shift(plant.Vz, v), plant.model
+        if not (vp.any() or vz.any()):
+            return True
+        block = fmu_at(self.flat, plant.path)
+        if m.identified or not block.description.states:
+            return None
+        _, _, wired = plant_entries(self.flat, plant.path)
+        inputs = Layout.of({port: spec.shape or () for port, spec in block.inputs.items()})
+        u = np.zeros(inputs.total)
+        u[wired] = vz
+        sizes = [sign * unit * s for s in PLANT_SIZES for sign in (1.0, -1.0)]
+        now = {**plant.point.plants[plant.path], "inputs": point_inputs(self.flat, plant.point, plant.path, plant.z)}
+        rounding = ROUNDING if is_built_here(block.description.digest) else SOLVED
+        to_outputs = m.y_by_states @ plant.Vp + m.y_by_inputs @ plant.Vz
+        follows = np.concatenate([vp, self._shift(to_outputs[plant.outputs], v)])
+        for h in (plant.h, PART * plant.h):
+            try:
+                steps = take_shifted_steps(block, h=h, shifts=[(s * vp, s * u) for s in sizes], **now)
+            except FmuError:
+                if h == plant.h:
+                    return None
+                continue  # an FMU of one step length; its equations have been looked at
+            ends = [np.concatenate([states, outputs[plant.outputs]]) for states, outputs in steps]
+            for s, end in zip(sizes, ends[1:], strict=True):
+                large = np.abs(ends[0]) + np.abs(s * follows) + np.max(np.abs(s * vp), initial=0.0)
+                if not np.all(np.abs(end - ends[0] - s * follows) <= rounding * large):
+                    return False
+        return True
+
+
+def _has_foreign(flat: FlatDiagram) -> bool:
+    """Whether an FMU of another tool is evaluated in the diagram's functions."""
+    blocks: list[Any] = [flat.table.blocks[path] for path in flat.outside]
+    return not all(is_built_here(block.description.digest) for block in blocks if hasattr(block, "description"))
+
+
+def _nominals(flat: FlatDiagram, model: Linearization, kept: list[int]) -> np.ndarray:
+    """Return the nominal values of a model's states, 1 where none is declared."""
+    known: dict[str, float] = {}
+    for path, layout in flat.states.of_block.items():
+        ports = flat.table.blocks[path].states
+        for name in layout.slices:
+            nominal = getattr(ports.get(name), "nominal", None)
+            for label in Layout.of({f"{path}.{name}": layout.shapes[name]}).labels:
+                known[label] = 1.0 if nominal is None else float(np.max(np.abs(nominal)))
+    return np.array([known.get(model.states[i], 1.0) or 1.0 for i in kept])
+
+
+def _look_at_flow(
+    model: Linearization, flat: FlatDiagram, local: LocalDerivatives, kept: list[int]
+) -> tuple[list[_Instant], list[_PlantStep]]:
+    """Return the one instant of a diagram without sampling, and steps of its FMUs from there."""
+    at = model.point
+    J = local.differentiate(NONE, at.t, at.x, at.w)
+    models = local.model_equations(at, model.plants)
+    nc, n = len(flat.continuous), len(model.states)
+    Vx, Vp = np.zeros((flat.width, n)), np.eye(n)[nc:]
+    Vx[flat.continuous, np.arange(nc)] = 1.0
+    Cp, Dp = (join_matrices(flat, models, which) for which in "CD")
+    loop = np.eye(len(at.w)) - Dp @ J["z", "w"]
+    Vw = np.linalg.solve(loop, Dp @ J["z", "x"] @ Vx + Cp @ Vp)
+    Vx, Vw, Vp = Vx[:, kept], Vw[:, kept], Vp[:, kept]
+    rows = {name: np.arange(len(J[name])) for name in ("dx", "y", "z")}
+    instants = [_Instant(NONE, at.t, at.x, at.w, Vx, Vw, J, rows)]
+    needed = np.any(np.vstack([J[name, "w"] != 0.0 for name in rows]), axis=0)
+    Vz = J["z", "x"] @ Vx + J["z", "w"] @ Vw
+    plants, first = [], 0
+    for m in models:
+        own, first = Vp[first : first + len(m.A)], first + len(m.A)
+        outputs = np.flatnonzero(needed[m.outputs])
+        plants.append(_PlantStep(m.path, at, at.z, float(flat.base), m, own, Vz[m.inputs], (m.A, m.B), outputs))
+    return instants, plants
+
+
+def _look_at_period(
+    model: Linearization, flat: FlatDiagram, local: LocalDerivatives, kept: list[int]
+) -> tuple[list[_Instant], list[_PlantStep]]:
+    """Return the instants at the ticks of a period and between them, and the steps of FMUs."""
+    chain = Chain(flat, local, model.point, model.plants, period_of(flat))
+    chain.go_on()
+    names, nx, n_p = chain.labels, flat.width, chain.n_p
+    place = {name: i for i, name in enumerate(names)}
+    own = [place[model.states[i]] for i in kept]
+    needed = np.array(find_needed(chain.steps, own_states(flat, chain)), dtype=int)
+    memory = {place[name] for name in model.memory if name in place}
+    needed = np.array([i for i in needed if i not in memory], dtype=int)
+    V = np.zeros((len(names), len(own)))
+    V[own, np.arange(len(own))] = 1.0
+    others = np.setdiff1d(np.arange(len(names)), own)
+    whole = np.eye(len(names))
+    for M, *_ in chain.steps:
+        whole = M @ whole
+    for _ in range(2):  # what nothing of the model depends on follows its states
+        V[others] = (whole @ V)[others]
+    rows = {"x": needed[needed < nx], "z": np.arange(flat.plant_inputs.total), "y": np.arange(_count(local))}
+    between = {"dx": np.arange(len(flat.continuous)), "y": rows["y"]}
+    instants, plants = list[_Instant](), list[_PlantStep]()
+    equations: dict[tuple[str, int], tuple[np.ndarray, np.ndarray] | None] = {}
+    ends = [*(visit.point.x for visit in chain.visits[1:]), chain.here.x]
+    for visit, (M, *_), end in zip(chain.visits, chain.steps, ends, strict=True):
+        point, tick = visit.point, visit.numbers
+        Vx, Vw = V[:nx], visit.W @ V
+        instants.append(_Instant(visit.acting, point.t, point.x, point.w, Vx, Vw, tick, rows))
+        Vx, Vz = tick["x", "x"] @ Vx + tick["x", "w"] @ Vw, tick["z", "x"] @ Vx + tick["z", "w"] @ Vw
+        if flat.continuous.size:
+            for t, x in ((point.t, visit.x), (point.t + visit.h, end)):
+                numbers = local.differentiate(NONE, t, x, point.w)
+                instants.append(_Instant(NONE, t, x, point.w, Vx, Vw, numbers, between))
+        plants += _begun_steps(flat, visit, V[nx : nx + n_p], Vz, equations, rows, chain)
+        V = M @ V
+    return instants, plants
+
+
+def _count(local: LocalDerivatives) -> int:
+    return sum(len(tap.entries) for tap in local.outputs)
+
+
+def _begun_steps(
+    flat: FlatDiagram,
+    visit: Visit,
+    Vp: np.ndarray,
+    Vz: np.ndarray,
+    equations: dict[tuple[str, int], tuple[np.ndarray, np.ndarray] | None],
+    rows: Mapping[str, np.ndarray],
+    chain: Chain,
+) -> list[_PlantStep]:
+    """Return the steps of the FMUs that begin at a tick."""
+    needed = [visit.numbers[name, "w"][rows[name]] != 0.0 for name in rows]
+    needed = [np.any(np.vstack(needed), axis=0), np.any(visit.numbers["dx", "w"] != 0.0, axis=0)]
+    found, slices = [], Layout.of({m.path: (len(m.A),) for m in chain.models}).slices
+    for m in visit.begun:
+        key = m.path, id(m.A)
+        z = visit.numbers["z"]
+        if key not in equations:
+            try:
+                made = linearize_equations(flat, visit.point, m.path, z)
+                equations[key] = (made.A, made.B[:, plant_entries(flat, m.path)[2]])
+            except LoopwrightError:
+                equations[key] = None
+        outputs = np.flatnonzero((needed[0] | needed[1])[m.outputs])
+        h = float(m.next["t"] - visit.point.plants[m.path]["t"])
+        step = _PlantStep(m.path, visit.point, z, h, m, Vp[slices[m.path]], Vz[m.inputs], equations[key], outputs)
+        found.append(step)
+    return found

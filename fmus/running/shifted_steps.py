@@ -1,0 +1,73 @@
+"""Communication steps of an FMU from states and inputs beside an operating point."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import FmuError
+from ..calls import FmuBlock
+from .fmu_point import FmuPoint, initialize_at
+
+
+def take_shifted_steps(
+    block: FmuBlock, h: float, t: float, state: Any, inputs: Any, shifts: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return states and outputs at the end of a step: from an operating point, then from each shifted point.
+
+    Parameters
+    ----------
+    block : Fmu
+        The FMU.
+    h, t, state, inputs
+        As of `Fmu.step_difference`.
+    shifts : sequence of (ndarray, ndarray)
+        Shifts of all states and all inputs, as `FmuPoint.states` and `FmuPoint.inputs` lay them out.
+
+    Returns
+    -------
+    list of (ndarray, ndarray)
+        States and outputs at the end of the step.
+
+    Raises
+    ------
+    FmuError
+        If a state can't be set at the start, or the FMU can't take the steps.
+    """
+    point = FmuPoint(block, t, state, inputs)
+    about = point.about
+    names = [*point.states, *point.inputs]
+    layout = about.layout(names)
+    moved = {n for n in names if any(np.any(_part_of(layout, n, shift)) for shift in shifts)}
+    for name in point.states:
+        if about.find(name).initial != "exact":
+            raise FmuError(
+                "its state has no exact start value, so co-simulation can't set it to another one. Judge it by its "
+                "linear model.",
+                block=block.label,
+                port=name,
+            )
+    with initialize_at(point, exchange=False) as instance:
+        at = np.concatenate([instance.values(point.states), instance.values(point.inputs)])
+
+        def step(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            parts = layout.split(values)
+            begin: dict[str, Any] = {**point.given, **{n: parts[n] for n in names if n in moved}}
+            instance.reset()
+            settable = {n: v for n, v in begin.items() if about.find(n).initial == "exact"}
+            instance.initialize(None, start_time=point.t, values=settable)
+            instance.begin()
+            now: Mapping[str, Any] = {n: parts[n] for n in point.inputs if n in moved}
+            instance.call("setting its inputs", instance.set_values, now)
+            if instance.call(f"a step by {h:g} s", instance.fmi.do_step, point.t, h, True):
+                raise FmuError("it ends its step early, so steps can't be compared.", block=block.label)
+            return instance.values(point.states), instance.values(point.outputs)
+
+        return [step(at + np.concatenate(shift)) for shift in ((0.0 * at, np.zeros(0)), *shifts)]
+
+
+def _part_of(layout: Any, name: str, shift: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return the part of a shift that belongs to a state or an input."""
+    return np.concatenate(shift)[layout.slices[name]]

@@ -1,0 +1,384 @@
+"""Free motions: the integrators that nothing feeds back, and everything that looks like one at a point and is none."""
+
+from fractions import Fraction
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from loopwright.blocks import (
+    PID,
+    Block,
+    Constant,
+    DeadZone,
+    Encoder,
+    Gain,
+    Input,
+    Integrator,
+    LimitedIntegrator,
+    Output,
+    Saturation,
+    Sine,
+    State,
+    StateSpace,
+    StopCondition,
+    TransferFunction,
+    parameter,
+)
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.fmus import Fmu, dc_motor
+
+T = 0.01
+
+
+def sorted_poles(values):
+    return np.array(sorted(values, key=lambda s: (np.real(s), np.imag(s))))
+
+
+def assert_poles(found, wanted, atol=1e-9):
+    np.testing.assert_allclose(sorted_poles(found), sorted_poles(wanted), rtol=0, atol=atol)
+
+
+def control(body, sample_time):
+    return body if sample_time is None else subsystem(sample_time=sample_time)(body)
+
+
+def states_of(diagram, required=(), at=None, **options):
+    return tuple(m.state for m in diagram.linearize(at, **options).free_motions(required).motions)
+
+
+# --- drives -----------------------------------------------------------------------------------------------------------
+
+
+def speed_drive(sample_time=None, *, more=lambda angle: [], name="drive", kp=2.0, ki=5.0):
+    """A motor 1/(s + 1) under a PI controller of its speed; its angle runs on."""
+    motor = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name=f"{name}_motor")
+    angle = Integrator(name=f"{name}_angle")
+
+    def controller(speed):
+        return PID(kp=kp, ki=ki, name=f"{name}_pi")(Constant(value=1.0, name=f"{name}_r"), speed)
+
+    voltage = control(controller, sample_time)(motor.y)
+    return [angle(motor(voltage)), *more(angle.y)]
+
+
+@pytest.mark.parametrize("sample_time", [None, T], ids=["continuous", "sampled"])
+def test_the_angle_of_a_speed_drive_is_free_and_the_other_poles_are_those_without_it(sample_time):
+    model = Diagram("d", *speed_drive(sample_time)).linearize()
+    free = model.free_motions()
+    (motion,) = free.motions
+    assert (motion.state, motion.by_model_alone) == ("drive_angle.y", ())
+    assert str(motion) == "drive_angle.y drifts: nothing feeds it back"
+    A = np.array([[-1.0 - 2.0, 1.0], [-5.0, 0.0]])  # speed and integral
+    if sample_time is not None:
+        whole = expm(np.array([[-1.0, 1.0], [0.0, 0.0]]) * T)  # the motor with a held voltage
+        a, b = whole[0]
+        A = np.array([[a - 2.0 * b, b], [-5.0 * T, 1.0]])
+    assert_poles(model.poles_without(free), np.linalg.eigvals(A))
+    assert_poles(np.linalg.eigvals(free.reduce(model.A)), np.linalg.eigvals(A))
+    np.testing.assert_allclose(free.P @ free.Q, np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(free.P @ free.V, 0.0, atol=1e-12)
+
+
+def test_two_drives_side_by_side_are_two_free_angles():
+    drives = [*speed_drive(name="left"), *speed_drive(name="right", kp=3.0)]
+    model = Diagram("d", *drives).linearize()
+    free = model.free_motions()
+    assert {m.state for m in free.motions} == {"left_angle.y", "right_angle.y"}
+    A = [np.array([[-1.0 - kp, 1.0], [-5.0, 0.0]]) for kp in (2.0, 3.0)]
+    assert_poles(model.poles_without(free), np.concatenate([np.linalg.eigvals(a) for a in A]))
+
+
+def test_what_is_computed_from_an_angle_and_acts_on_nothing_follows_it():
+    # a lag follows with slope 1; its state belongs to the direction
+    drive = speed_drive(
+        more=lambda angle: [TransferFunction(numerator=[2.0], denominator=[0.5, 1.0], name="lag")(angle)]
+    )
+    model = Diagram("d", *drive).linearize()
+    (motion,) = model.free_motions().motions
+    assert motion.state == "drive_angle.y"
+    assert len(motion.entries) == 2
+    assert_poles(model.poles_without(model.free_motions()), [-2.0, *np.linalg.eigvals([[-3.0, 1.0], [-5.0, 0.0]])])
+
+
+def test_a_required_angle_is_not_free():
+    diagram = Diagram("d", *speed_drive())
+    assert states_of(diagram) == ("drive_angle.y",)
+    assert states_of(diagram, "drive_angle.y") == ()
+    assert states_of(diagram, ["drive_motor.y"]) == ("drive_angle.y",)
+
+
+def test_a_condition_on_the_angle_requires_it():
+    sampled = control(lambda angle: StopCondition(name="stop")(angle - 5.0), T)
+    for more in (lambda angle: [StopCondition(name="stop")(angle - 5.0)], lambda angle: [sampled(angle)]):
+        assert states_of(Diagram("d", *speed_drive(more=more))) == ()
+
+
+def test_an_angle_with_limits_is_not_free():
+    motor = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="motor")
+    angle = LimitedIntegrator(name="angle", lower=-1.0, upper=1.0)
+    u = PID(kp=2.0, ki=5.0, name="pi")(Constant(value=0.0, name="r"), motor.y)
+    assert states_of(Diagram("d", angle(motor(u)))) == ()
+
+
+def encoder_drive(rates):
+    motor = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="motor")
+    angle = Integrator(name="angle")
+
+    @subsystem(sample_time=rates[1])
+    def encoder(position, velocity):
+        return Encoder(quantum=1e-3, name="encoder")(position, velocity).measured_velocity
+
+    @subsystem(sample_time=rates[0])
+    def controller(speed):
+        return PID(kp=2.0, ki=5.0, name="pi")(Constant(value=0.0, name="r"), speed)
+
+    return Diagram("d", angle(motor(controller(encoder(angle.y, motor.y)))))
+
+
+@pytest.mark.parametrize("rates", [(1e-2, 1e-2), (1e-2, 1e-3)], ids=["one rate", "two rates"])
+def test_an_angle_that_an_encoder_feeds_back_is_on_a_loop(rates):
+    # its speed is a difference of angles, so that no speed shows a shift; the wire of the angle does
+    assert states_of(encoder_drive(rates), at=0.02, stairs="gain") == ()
+
+
+@pytest.mark.parametrize("rates", [(1e-2, 1e-2), (1e-2, 1e-3)], ids=["one rate", "two rates"])
+def test_an_encoder_that_only_shows_an_angle_moves_with_it(rates):
+    @subsystem(sample_time=rates[1])
+    def shown(position, velocity):
+        return Encoder(quantum=1e-3, name="encoder")(position, velocity).measured_velocity
+
+    drive = speed_drive(rates[0], more=lambda angle: [shown(angle, Constant(value=0.0, name="none"))])
+    model = Diagram("d", *drive).linearize(0.02, stairs="gain")
+    free = model.free_motions()
+    (motion,) = free.motions
+    assert motion.state == "drive_angle.y"
+    assert {name for name, _ in motion.entries} == {"drive_angle.y", "shown.encoder.last"}
+    assert {round(share, 9) for _, share in motion.entries} == {1.0}
+    assert np.sum(np.abs(model.poles_without(free) - 1.0) < 1e-9) == np.sum(np.abs(model.poles - 1.0) < 1e-9) - 1
+
+
+def test_entries_of_a_wire_that_nobody_on_the_loop_takes_may_move():
+    plant = StateSpace(A=[[0.0, 1.0], [0.0, -1.0]], B=[0.0, 1.0], C=np.eye(2), D=[0.0, 0.0], name="plant")
+    by_entry = Diagram("d", plant(Gain(gain=-2.0, name="gain")(plant.y[1])))
+    assert states_of(by_entry) == ("plant.x[1]",)
+    both = Diagram("d", plant(Gain(gain=np.array([[0.0, -2.0]]), name="gain")(plant.y)[0]))
+    assert states_of(both) == ()
+
+
+# --- motors that are FMUs ---------------------------------------------------------------------------------------------
+
+
+def fmu_drive(**options):
+    motor = Fmu(dc_motor.build(), name="motor", **options)
+
+    @subsystem(sample_time=1e-3)
+    def speed_loop(reference, speed):
+        return PID(kp=0.05, ki=0.8, lower=-3.0, upper=3.0)(reference, speed).named("current_reference")
+
+    @subsystem(sample_time=1e-4)
+    def current_loop(reference, current):
+        return PID(kp=1.0, ki=400.0, lower=-24.0, upper=24.0)(reference, current).named("voltage")
+
+    voltage = current_loop(speed_loop(Constant(value=100.0, unit="rad/s"), motor.speed), motor.current)
+    return Diagram("drive", motor(voltage=voltage, load_torque=Constant(value=0.0, unit="N.m")))
+
+
+@pytest.mark.parametrize("at", [0.0, 0.4], ids=["standing", "running"])
+@pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
+def test_the_angle_of_a_motor_that_is_an_fmu_is_free(interface, at):
+    model = fmu_drive(interface=interface).linearize(at)
+    free = model.free_motions()
+    assert [m.state for m in free.motions] == ["motor.angle"]
+    assert free.motions[0].by_model_alone == ()
+    assert np.max(np.abs(model.poles_without(free))) < 1.0 - 1e-4
+    assert len(model.poles_without(free)) == len(model.poles) - 1
+
+
+# --- what must not pass -----------------------------------------------------------------------------------------------
+
+
+def test_an_angle_and_its_integral_are_a_ramp():
+    drive = speed_drive(more=lambda angle: [Integrator(name="integral")(angle)])
+    assert states_of(Diagram("d", *drive)) == ()
+
+
+def test_a_drive_beside_a_ramp_is_free_and_the_ramp_is_not():
+    ramp = speed_drive(name="left", more=lambda angle: [Integrator(name="integral")(angle)])
+    model = Diagram("d", *ramp, *speed_drive(name="right")).linearize()
+    free = model.free_motions()
+    assert len(free.motions) == 1
+    left = np.sort(np.abs(model.poles_without(free)))
+    assert left[1] < 1e-6 < left[2]  # the double pole of the ramp stays
+
+
+def test_a_cart_under_a_pendulum_without_position_feedback_is_a_ramp():
+    # x'' = u - φ, φ'' = 11 φ - u (all masses and lengths 1, g = 10); u = 60 φ + 12 φ'
+    A = np.array([[0.0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1], [0, 0, 11, 0]])
+    plant = StateSpace(A=A, B=[0.0, 1.0, 0.0, -1.0], C=np.eye(4), D=np.zeros(4), name="plant")
+    u = Gain(gain=60.0, name="k1")(plant.y[2]) + Gain(gain=12.0, name="k2")(plant.y[3])
+    diagram = Diagram("d", plant(u))
+    assert states_of(diagram) == ()
+    poles = np.sort(np.abs(diagram.linearize().poles))
+    assert poles[1] < 1e-6 < poles[2]
+
+
+class Hidden(Block):
+    """A speed with a PI-controlled lag, and more states inside that no output shows."""
+
+    growth: float = parameter(default=0.0)
+    frequency: float = parameter(default=0.0)
+    u = Input()
+    y = State(output=True)
+    angle = State()
+    a = State()
+    b = State()
+
+    def derivative(self, t, x, u):
+        return (
+            u.u - x.y,
+            x.y,
+            self.growth * x.a + self.frequency * x.b,
+            self.growth * x.b - self.frequency * x.a,
+        )
+
+
+@pytest.mark.parametrize(
+    "hidden",
+    [{"growth": 0.5}, {"frequency": 4.0 * np.pi / 3.0}, {"growth": 1e-3, "frequency": 4.0 * np.pi / 3.0}],
+    ids=str,
+)
+@pytest.mark.parametrize("sample_time", [None, T, Fraction(3, 2)], ids=["continuous", "sampled", "at 2π/T"])
+def test_hidden_states_count_as_ever(sample_time, hidden):
+    plant = Hidden(**hidden, name="plant")
+    gain = control(lambda y: Gain(gain=-0.2, name="gain")(y), sample_time)
+    model = Diagram("d", plant(gain(plant.y))).linearize()
+    free = model.free_motions()
+    assert [m.state for m in free.motions] == ["plant.angle"]
+    s = complex(hidden.get("growth", 0.0), hidden.get("frequency", 0.0))
+    wanted = [s, s.conjugate()] if s.imag else [s, s]
+    left = model.poles_without(free)
+    for value in wanted if sample_time is None else np.exp(np.array(wanted) * float(sample_time)):
+        assert np.min(np.abs(left - value)) < 1e-8
+    assert len(left) == 3
+
+
+def test_a_discrete_oscillation_over_the_whole_period_is_not_free():
+    # a rotation by 2π/10 a tick of 1 ms, in a period of 10 ms: z = 1 over the period
+    c, s = np.cos(0.2 * np.pi), np.sin(0.2 * np.pi)
+
+    def build(body):
+        drive = speed_drive(1e-2)
+        return Diagram("d", *drive, body(Constant(value=0.0, name="zero")))
+
+    class Rotation(Block):
+        u = Input()
+        y = Output()
+        a = State()
+        b = State()
+
+        def output(self, t, x, u):
+            return u.u
+
+        def update(self, t, x, u, T):
+            return c * x.a - s * x.b, s * x.a + c * x.b
+
+    rotation = subsystem(sample_time=1e-3)(lambda y: Rotation(name="rotation")(y))
+    model = build(rotation).linearize()
+    assert model.dt == 1e-2
+    assert np.sum(np.abs(model.poles - 1.0) < 1e-9) == 3
+    free = model.free_motions()
+    assert [m.state for m in free.motions] == ["drive_angle.y"]
+    assert np.sum(np.abs(model.poles_without(free) - 1.0) < 1e-9) == 2
+
+
+def position_loop(link, reference=0.0):
+    """A motor 1/(s (s + 1)) whose angle goes through something into a P controller."""
+    motor = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="motor")
+    angle = Integrator(name="angle")
+    error = Constant(value=reference, name="r") - angle.y
+    return Diagram("d", angle(motor(link(error))))
+
+
+@pytest.mark.parametrize(
+    ("link", "reference"),
+    [
+        (Saturation(lower=-1.0, upper=1.0, name="link"), 10.0),
+        (DeadZone(lower=-1e-3, upper=1e-3, name="link"), 0.0),
+        (lambda error: Cube(name="link")(error), 0.0),
+    ],
+    ids=["saturated actuator", "dead zone", "cube"],
+)
+def test_a_feedback_that_is_zero_at_this_point_alone_is_no_free_motion(link, reference):
+    diagram = position_loop(link, reference)
+    model = diagram.linearize()
+    assert np.min(np.abs(model.poles)) < 1e-12
+    assert model.free_motions().motions == ()
+
+
+class Cube(Block):
+    u = Input()
+    y = Output()
+
+    def output(self, t, x, u):
+        return u.u**3
+
+
+class Inside(Block):
+    """A speed loop with a torque inside that follows the angle, or hides it at one point."""
+
+    kind: str = parameter(default="none")
+    u = Input()
+    y = State(output=True)
+    angle = State()
+
+    def torque(self, x, u):
+        a = x.angle
+        if self.kind == "cube":
+            return -(a**3)
+        if self.kind == "play":
+            return -1e3 * (np.maximum(a - 0.01, 0.0) + np.minimum(a + 0.01, 0.0))
+        if self.kind == "cogging":
+            return 1e-3 * (1.0 - np.cos(2.0 * np.pi * a))
+        if self.kind == "commutation":  # the torque constant follows the angle
+            return u.u * (np.cos(a) - 1.0)
+        if self.kind == "stuck":  # stiction holds up to 1, whatever spring pulls
+            pull = -0.2 * a
+            return pull - np.clip(pull, -1.0, 1.0)
+        return 0.0 * a
+
+    def derivative(self, t, x, u):
+        return u.u - x.y + self.torque(x, u), x.y
+
+
+@pytest.mark.parametrize("kind", ["none", "cube", "play", "cogging", "commutation", "stuck"])
+@pytest.mark.parametrize("sample_time", [None, T], ids=["continuous", "sampled"])
+def test_a_torque_that_is_zero_at_this_angle_alone_is_found_by_finite_shifts(sample_time, kind):
+    plant = Inside(kind=kind, name="plant")
+    gain = control(lambda y: Gain(gain=-2.0, name="gain")(y), sample_time)
+    found = states_of(Diagram("d", plant(gain(plant.y))))
+    assert found == (("plant.angle",) if kind == "none" else ())
+
+
+def test_two_angles_that_act_together_are_not_free():
+    class Product(Block):
+        u = Input()
+        y = State(output=True)
+        left = State()
+        right = State()
+
+        def derivative(self, t, x, u):
+            return u.u - x.y + x.left**2 * x.right**2, 0.0 * x.y, 0.0 * x.y
+
+    plant = Product(name="plant")
+    assert states_of(Diagram("d", plant(Gain(gain=-2.0, name="gain")(plant.y)))) == ()
+
+
+def test_a_slow_pole_is_none_at_zero():
+    lag = partial(TransferFunction, numerator=[1.0], name="leak")
+    drive = speed_drive(more=lambda angle: [])
+    slow = Diagram("d", *drive, lag(denominator=[1e7, 1.0])(Sine(amplitude=1.0, frequency=1.0, name="sine")))
+    model = slow.linearize()
+    assert [m.state for m in model.free_motions().motions] == ["drive_angle.y"]
+    assert np.min(np.abs(model.poles_without(model.free_motions()) + 1e-7)) < 1e-15
