@@ -213,7 +213,7 @@ PUBLIC = {
     """,
     "diagrams": """
         AdmittanceLoop BlockReport Box Channel CoarseValues Comparison Contact ContactAdmittance ContactConfirmation ContactLimit ContactMap
-        ContactTrial Coupling CouplingReport Diagram DiskMargin Drawing Failure Fig3Diagram FlatDiagram FrequencyResponse
+        ContactTrial Coupling CouplingReport Diagram DiskMargin Drawing Failure Fig3Diagram FlatDiagram FreeMotion FreeMotions FrequencyResponse
         GainCrossover GangOfFour InexactDerivatives Interrupted InterruptedSweep Kink Layout Linearization Margins MeanSlope MeasuredMargins Number
         NyquistCount Occurrence OperatingPoint Passivity PassivityReason PeriodicMargins PhaseCrossover Plot PortPassivity Reduction RefutedDerivatives Report Requirements Review
         Rig Run RunConfirmation RunOptions RunState Sample SampledDesign Samples Section Sensitivities Sensitivity Simulation SimulationView Snapshot StabilityLimit

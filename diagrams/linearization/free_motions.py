@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from ...blocks.core import FmuError, Layout, LoopwrightError, enumerate_some, ex
 from ...blocks.tracing import size
 from ...fmus.platform import is_built_here
 from ...fmus.running import take_shifted_steps
-from ..flat import NONE, FlatDiagram, TickPattern
+from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
 from .derivatives import LocalDerivatives, Numbers, Tap, find_signal
@@ -38,9 +38,6 @@ from .over_a_period import find_needed, own_states
 from .plant_models import PlantModel, fmu_at, join_matrices, linearize_equations, plant_entries, point_inputs
 from .signal_paths import SignalPaths
 from .tick_chain import Chain, Visit, period_of
-
-if TYPE_CHECKING:
-    from .linear_model import Linearization
 
 NULL = 1e-12
 """Largest singular value of a direction that counts as an eigenvector of 0, relative to the largest one."""
@@ -62,6 +59,22 @@ PART = 0.37
 """Part of an FMU's step after which its states are looked at, too."""
 SOLVED = 1e-6
 """Relative error of the steps of another tool's FMU."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedModel:
+    """A linear model with what it was made of; its attributes are those of a `Linearization`."""
+
+    wired: WiredDiagram
+    point: OperatingPoint
+    A: np.ndarray
+    dt: float
+    states: tuple[str, ...]
+    memory: tuple[str, ...] = ()
+    openings: tuple[str, ...] = ()
+    uncertainty: float = 0.0
+    plants: str | None = None
+    stairs: str | None = None
 
 
 @explain_calls
@@ -141,12 +154,12 @@ def deflate(A: np.ndarray, V: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return d[:, None] * rest, rest.T / d
 
 
-def find_free_motions(model: Linearization, required: Iterable[str] = ()) -> FreeMotions:
+def find_free_motions(model: ClosedModel, required: Iterable[str] = ()) -> FreeMotions:
     """Return the free motions of a linear model.
 
     Parameters
     ----------
-    model : Linearization
+    model : ClosedModel
         Linear model of a diagram.
     required : iterable of str
         Wires and ports on which something is required: a motion that changes one of them is not free.
@@ -187,7 +200,7 @@ def find_free_motions(model: Linearization, required: Iterable[str] = ()) -> Fre
     return FreeMotions(motions, *(_spread(X, kept, model, axis) for X, axis in ((V, 0), (Q, 0), (P, 1))))
 
 
-def _spread(X: np.ndarray, kept: list[int], model: Linearization, axis: int) -> np.ndarray:
+def _spread(X: np.ndarray, kept: list[int], model: ClosedModel, axis: int) -> np.ndarray:
     """Return a matrix for all states of a model from one for those that are no memory."""
     n = len(model.states)
     if axis:
@@ -286,7 +299,7 @@ def _without_chains(
 # --- shifts ----------------------------------------------------------------------------------------------------------
 
 
-def _watched(flat: FlatDiagram, model: Linearization, required: Iterable[str]) -> list[Tap]:
+def _watched(flat: FlatDiagram, model: ClosedModel, required: Iterable[str]) -> list[Tap]:
     """Return the signals that a free motion does not change: wires on loops, and those on which something is required.
 
     A block with a guard, and one that ends a run, requires its inputs.
@@ -388,7 +401,7 @@ class _Look:
         self.sizes, self.rounding = (PLANT_SIZES, SOLVED) if _has_foreign(flat) else (SIZES, ROUNDING)
 
     @classmethod
-    def of(cls, model: Linearization, required: Iterable[str], kept: list[int], noise: float) -> _Look:
+    def of(cls, model: ClosedModel, required: Iterable[str], kept: list[int], noise: float) -> _Look:
         """Return the look at a linear model's diagram; ``kept`` are the states that are no memory."""
         flat, at = model.wired.flatten_like(model.point), model.point
         watched, cut = _watched(flat, model, required), [find_signal(flat, wire) for wire in model.openings]
@@ -529,7 +542,7 @@ def _has_foreign(flat: FlatDiagram) -> bool:
     return not all(is_built_here(block.description.digest) for block in blocks if hasattr(block, "description"))
 
 
-def _nominals(flat: FlatDiagram, model: Linearization, kept: list[int]) -> np.ndarray:
+def _nominals(flat: FlatDiagram, model: ClosedModel, kept: list[int]) -> np.ndarray:
     """Return the nominal values of a model's states, 1 where none is declared."""
     known: dict[str, float] = {}
     for path, layout in flat.states.of_block.items():
@@ -542,7 +555,7 @@ def _nominals(flat: FlatDiagram, model: Linearization, kept: list[int]) -> np.nd
 
 
 def _look_at_flow(
-    model: Linearization, flat: FlatDiagram, local: LocalDerivatives, kept: list[int]
+    model: ClosedModel, flat: FlatDiagram, local: LocalDerivatives, kept: list[int]
 ) -> tuple[list[_Instant], list[_PlantStep]]:
     """Return the one instant of a diagram without sampling, and steps of its FMUs from there."""
     at = model.point
@@ -568,7 +581,7 @@ def _look_at_flow(
 
 
 def _look_at_period(
-    model: Linearization, flat: FlatDiagram, local: LocalDerivatives, kept: list[int]
+    model: ClosedModel, flat: FlatDiagram, local: LocalDerivatives, kept: list[int]
 ) -> tuple[list[_Instant], list[_PlantStep]]:
     """Return the instants at the ticks of a period and between them, and the steps of FMUs."""
     chain = Chain(flat, local, model.point, model.plants, period_of(flat))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
@@ -39,7 +39,7 @@ from .derivatives import LocalDerivatives, Tap, find_moving, find_signal
 from .exchanged import derivations_at, evaluators_at, findings_on
 from .findings import EntryTaken
 from .flow_model import Model, model_continuous, relative_error
-from .free_motions import FreeMotions, find_free_motions
+from .free_motions import ClosedModel, FreeMotions, find_free_motions
 from .inserted_blocks import find_cut_findings, name_inputs, split_consumers, split_inputs
 from .kinks import find_kinks
 from .mean_stairs import replace_stairs
@@ -209,7 +209,8 @@ class Linearization:
         """
         names = tuple(dict.fromkeys(_as_list(required)))
         if names not in self._free:
-            self._free[names] = find_free_motions(self, names)
+            own = {f.name: getattr(self, f.name) for f in fields(ClosedModel)}
+            self._free[names] = find_free_motions(ClosedModel(**own), names)
         return self._free[names]
 
     @cached_property
