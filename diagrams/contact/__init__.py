@@ -8,7 +8,6 @@ from .coupled_parts import restrict
 from .environment import UNITS, check_properties, check_property
 from .loop import close_loop, controller_rows, join_environment
 from .measured_force import Tool
-from .moored_plant import hold_sources
 from .passivity import LOWEST, Passivity, PassivityReason, PortPassivity
 from .stability_limits import (
     PER_DECADE,
@@ -45,7 +44,6 @@ __all__ = [
     "find_limit",
     "find_poles",
     "find_sign",
-    "hold_sources",
     "join_environment",
     "make_contact",
     "restrict",

@@ -17,12 +17,12 @@ import numpy as np
 
 from ...blocks.core import ConfirmationError, OptionError, accepts, explain_calls, kinds, near
 from ...fmus.running import Fmu
-from ..linearization import PlantEquations, copy_point, find_signal, linearize, linearize_plant
+from ..linearization import PlantEquations, copy_point, find_signal, hold_sources, linearize, linearize_plant
 from ..simulation import RunOptions, simulate
 from .attached_environment import attach_environment
 from .contact_ports import Ports
 from .coupled_parts import ContactParts
-from .moored_plant import Mooring, hold_sources, library_class, moored_diagram
+from .moored_plant import Mooring, library_class, moored_diagram
 from .stability_limits import GROWTH_AT, ContactLimit, CoupledLoop, to_rates
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks import Constant, Hold, Reference, Sum
-from ...blocks.core import Array, Block, OptionError, Output, Source, parameter
+from ...blocks import Hold, Sum
+from ...blocks.core import Array, Block, OptionError, Output, parameter
 from ...fmus.export import build
 from ...fmus.models import gantry, gantry_elastic, gantry_stiction, scara
 from ...fmus.running import Fmu
@@ -268,17 +268,3 @@ def _own_start(block: Fmu, cls: type[Block]) -> Mapping[str, Any]:
 
 def _states(cls: type[Block]) -> tuple[str, ...]:
     return tuple(cls().states)
-
-
-def hold_sources(diagram: WiredDiagram, values: Mapping[str, Any]) -> WiredDiagram:
-    """Return a diagram whose sources stand still, at their values at an operating point."""
-    changes: dict[str, Any] = {}
-    for path, block in diagram.blocks.items():
-        if isinstance(block, Source) and not isinstance(block, Constant | Reference) and f"{path}.y" in values:
-            value = np.asarray(values[f"{path}.y"], dtype=float)
-            name = path.rpartition(".")[2]
-            if type(block).y.shape == (3,):
-                changes[path] = Reference(float(value[0]), unit=block.unit, name=name)
-            else:
-                changes[path] = Constant(value=value, unit=block.unit, name=name)
-    return diagram.replace(changes) if changes else diagram

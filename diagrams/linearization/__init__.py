@@ -22,14 +22,24 @@ from .findings import (
 from .free_motions import FreeMotion, FreeMotions, deflate
 from .kinks import find_kinks_between
 from .linear_model import Linearization, linearize, linearize_batch
-from .operating_points import RUN_OPTIONS, PointLike, capture, check_options, copy_point, operating_point, run_to
+from .operating_points import (
+    RUN_OPTIONS,
+    PointLike,
+    capture,
+    check_options,
+    copy_point,
+    hold_sources,
+    operating_point,
+    run_to,
+)
 from .over_a_period import TickModel, model_ticks, ticks_between_renewals, ticks_to_renewal
 from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop, loop_of_variant
-from .plant_models import PlantEquations, linearize_plant
+from .plant_models import EQUILIBRIUM, PlantEquations, linearize_plant
 from .shared_wires import WaysBack, find_ways_back
 from .trim_search import point_from_states, trim
 
 __all__ = [
+    "EQUILIBRIUM",
     "RUN_OPTIONS",
     "BlockFinding",
     "CoarseValues",
@@ -64,6 +74,7 @@ __all__ = [
     "find_kinks_between",
     "find_signal",
     "find_ways_back",
+    "hold_sources",
     "linearize",
     "linearize_batch",
     "linearize_block",

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from ...blocks.core import Layout, OptionError, UnknownArgumentError, accepts, kinds
+from ...blocks import Constant, Reference
+from ...blocks.core import Layout, OptionError, Source, UnknownArgumentError, accepts, kinds
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, PointOrigin, Snapshot, layout_of, units_of
 from ..solvers import FIXED
@@ -321,6 +322,20 @@ def copy_point(diagram: WiredDiagram, point: OperatingPoint, other: WiredDiagram
         largest=point.largest,
         how=point.how,
     )
+
+
+def hold_sources(diagram: WiredDiagram, values: Mapping[str, Any]) -> WiredDiagram:
+    """Return a diagram whose sources keep their values at an operating point, given by the paths of ports."""
+    changes: dict[str, Any] = {}
+    for path, block in diagram.blocks.items():
+        if isinstance(block, Source) and not isinstance(block, Constant | Reference) and f"{path}.y" in values:
+            value = np.asarray(values[f"{path}.y"], dtype=float)
+            name = path.rpartition(".")[2]
+            if type(block).y.shape == (3,):
+                changes[path] = Reference(float(value[0]), unit=block.unit, name=name)
+            else:
+                changes[path] = Constant(value=value, unit=block.unit, name=name)
+    return diagram.replace(changes) if changes else diagram
 
 
 def _copy(values: np.ndarray, old: Layout, new: Layout, into: np.ndarray) -> None:

@@ -1,8 +1,9 @@
 """Responses of the running diagram to a step that is added to a wire, beside those of its linear model.
 
 The consumers of the wire get its signal v plus a step d, as `frequency_response` adds sines: from the point on, and
-held between the samples where the diagram is sampled. A second run without the step is subtracted, so that a diagram
-which moves by itself, such as one with a reference that turns, gives the step's part only.
+held between the samples where the diagram is sampled. At an equilibrium the sources keep their values, so that a step
+of the diagram's own doesn't meet the added one. A second run without the step is subtracted, so that a diagram which
+moves by itself, such as one with a reference that turns, gives the step's part only.
 """
 
 from __future__ import annotations
@@ -19,15 +20,17 @@ from ...blocks.core import LoopwrightError, OptionError, SimulationError, accept
 from ..flat import FlatDiagram, WiredDiagram
 from ..frequency import advance_held
 from ..linearization import (
+    EQUILIBRIUM,
     Linearization,
     PointLike,
     find_signal,
+    hold_sources,
     linearize,
     operating_point,
     ticks_between_renewals,
     ticks_to_renewal,
 )
-from .beginning import with_ticks
+from .beginning import can_start_at, with_ticks
 from .injection import InjectionRun, inject_signal
 from .step_measures import ExpectedStep
 
@@ -209,6 +212,8 @@ def step_response(
     """
     point = operating_point(diagram, at, {})
     variant = diagram.replace(point.parameters) if point.parameters else diagram
+    if point.residual <= EQUILIBRIUM and can_start_at(variant, point):
+        variant = hold_sources(variant, point.values)
     sampled = diagram.has_clock or diagram.has_fmu
     begins, longest = point, Fraction(max(1, round(length / SAMPLES * 1e9)), 10**9)
     if not sampled:

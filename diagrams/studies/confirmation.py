@@ -20,10 +20,9 @@ from ...blocks.core import (
     explain_calls,
     kinds,
 )
-from ..contact import hold_sources
 from ..flat import WiredDiagram
 from ..frequency import Confirmation, Margins, Number, Realization, disk_margin, margins, mimo_disk_margin, mu_bound
-from ..linearization import Linearization, find_signal, linearize, loop_of_variant, trim
+from ..linearization import Linearization, find_signal, hold_sources, linearize, loop_of_variant, trim
 from ..measure import frequency_response, step_response
 from .numbers import numbers_of
 from .parameters import changed_entry

@@ -13,6 +13,7 @@ from loopwright.blocks import (
     Saturation,
     SimulationError,
     Sine,
+    Step,
     Sum,
     TransferFunction,
 )
@@ -144,7 +145,8 @@ def test_a_diagram_that_moves_by_itself_gives_the_steps_part_alone():
     def controller(y):
         return Gain(gain=3.0, name="gain")(Sine(frequency=2.0, name="wish") - y).named("u")
 
-    moving = step_response(Diagram("moving", lag(controller(lag.y))).wired, "controller.u", size=0.1, length=1.0)
+    diagram = Diagram("moving", lag(controller(lag.y))).wired
+    moving = step_response(diagram, "controller.u", size=0.1, length=1.0, at=0.3)
     resting = step_response(sampled().wired, "controller.u", size=0.1, length=1.0)
     np.testing.assert_allclose(moving.v, resting.v, atol=1e-13)
     assert moving.moved > 0.1
@@ -295,3 +297,15 @@ def test_held_signals_have_no_peak_between_the_samples():
     assert got.steady.tolist() == [True, False, True]
     found = measure_step(got.t, got.v, held=got.is_steady(0), expected=got.expected(0))["peak"]
     assert found.tolerance <= 0.1 * 0.97 ** (len(got.t) - 2) + 1e-9  # what is still to come
+
+
+def test_a_step_of_the_diagrams_own_source_does_not_meet_the_added_one():
+    """y' = 10 (r − y) within ±1 from rest, with a step of 0.5 at r: y = t to 0.4, then 0.5 − 0.1 e^(−10 (t − 0.4))."""
+    place = Integrator(name="place")
+    wanted = Step(times=0.1, values=2.0, name="wanted")
+    pull = Saturation(lower=-1.0, upper=1.0, name="limits")(Gain(gain=10.0, name="kp")(wanted.y - place.y))
+    found = step_response(Diagram("slide", place(pull)).wired, "wanted.y", size=0.5, length=1.0, outputs=["place.y"])
+    t = found.t - found.t[0]
+    expected = np.where(t < 0.4, t, 0.5 - 0.1 * np.exp(-10.0 * (t - 0.4)))
+    np.testing.assert_allclose(found.y[:, 0], expected, atol=2e-8)
+    assert found.moved == 0.0
