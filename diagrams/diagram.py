@@ -537,8 +537,9 @@ class Diagram:
         plants : {"equations", "step", "identified"}, optional
             Linear model of an FMU's step: its equations' Jacobian and a matrix exponential, the default at equilibria;
             differences of the step, elsewhere; or its pulse responses from rest, where it allows neither.
-        stairs : {"gain"}, optional
-            "gain" takes stairs, as of quantizers and encoders, as their mean slope, not as zero. A relay has none.
+        stairs : {"gain", "zero"}, optional
+            "zero" takes stairs by their slope of zero, "gain" all by their mean slope, also rounding of your own.
+            Without it those of `Quantizer` and `Encoder` have their mean slope. A relay has none.
         **options
             Options of the run to a time, as of `operating_point`. With ``step`` a diagram that is continuous but for an
             FMU is linearized over its communication step.

@@ -108,6 +108,9 @@ class Block(Value, Wireable):
     """True where the states are only a warm start for the outputs, such as a projection's last foot point."""
     opaque: ClassVar[bool] = False
     """True where the equations are not traced: any Python, called with numbers, differentiated by differences."""
+    quanta: ClassVar[Mapping[str, str]] = {}
+    """Inputs that outputs follow in equal steps, as of a converter or an encoder, each with the parameter that holds
+    the step's size. Linear models take such a block by its mean slope; other rounding only where it is asked for."""
     same_units: ClassVar[bool] = False
     """True where all inputs must be in one unit, as in a sum."""
     converts_units: ClassVar[bool | None] = None

@@ -23,6 +23,16 @@ class Finding:
     limits_numbers: ClassVar[bool] = True
 
     @property
+    def puts_in_doubt(self) -> bool:
+        """Whether a number that is made from the result, and lies within its limits, doesn't meet a requirement."""
+        return True
+
+    @property
+    def remedy(self) -> str:
+        """What to do where the result says nothing because of it, with the argument; "" where nothing is known."""
+        return ""
+
+    @property
     def leaves_error_unknown(self) -> bool:
         """Whether the error of numbers that are made from the result is not known: their tolerance is NaN."""
         return False

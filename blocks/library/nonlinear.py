@@ -7,6 +7,7 @@ a continuous one their jumps are events, so that the outputs are smooth in betwe
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -30,8 +31,8 @@ from .branching import expect_scalar
 class Quantizer(Block):
     """Quantizer: y = q ⌊u / q + ½⌋, the nearest multiple of q; a tie goes to the upper one. NaN passes through.
 
-    The derivative is zero, so it linearizes to zero. In a continuous subsystem it steps by events, where u crosses the
-    middle between two multiples; at a tie it keeps its level.
+    Linear models have its mean slope, 1, which holds for motions of many steps. In a continuous subsystem it steps by
+    events, where u crosses the middle between two multiples; at a tie it keeps its level.
 
     Raises
     ------
@@ -40,6 +41,7 @@ class Quantizer(Block):
         built.
     """
 
+    quanta = MappingProxyType({"u": "interval"})
     interval: Array = parameter(above=0.0, description="distance q of two levels, a number or one for each element")
     u = Input(shape=None, description="signal to quantize, of any shape")
     y = Output(like="u", description="the quantized signal")

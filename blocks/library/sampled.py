@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -67,8 +68,9 @@ class Encoder(Block):
     """Position encoder: quantized positions, velocities by differences.
 
     p = Δ ⌊position / Δ + ½⌋, v = (p[k] − p[k − 1]) / T; at the first tick v is the true velocity. An operating point at
-    the start is past that tick: p[k − 1] = p[k] − T v. The block is part of the rig (docs/experiments.md), not of the
-    paper.
+    the start is past that tick: p[k − 1] = p[k] − T v. Linear models have the mean slopes of the stairs, 1 and, from
+    one tick to the next, 1/T, which hold for motions of many quanta. The block is part of the rig
+    (docs/experiments.md), not of the paper.
 
     Raises
     ------
@@ -76,6 +78,7 @@ class Encoder(Block):
         In a continuous subsystem, when the diagram is built.
     """
 
+    quanta = MappingProxyType({"position": "quantum"})
     quantum: float = parameter(unit="m", above=0.0, description="smallest step of the position, Δ")
     position = Input(shape=None, description="true position")
     velocity = Input(shape=None, description="true velocity, used at the first tick only")

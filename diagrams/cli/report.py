@@ -101,7 +101,10 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     report.add_argument("--paper", choices=["A4", "letter"], default="A4", help="paper of the PDF (default: A4)")
     report.add_argument("--plant", metavar="FILE.fmu", help="another plant in place of the gantry")
     report.add_argument(
-        "--stairs", choices=["gain"], help="take stairs, as of quantizers and encoders, as their mean slope"
+        "--stairs",
+        choices=["gain", "zero"],
+        help="take all stairs as their mean slope, or by their slope of zero (default: those of quantizers and "
+        "encoders as their mean slope)",
     )
     report.add_argument(
         "--option",

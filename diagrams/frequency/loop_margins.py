@@ -17,6 +17,7 @@ from .poles_and_zeros import Features, find_hidden_unstable, tell_hidden_unstabl
 from .realization import ROUNDOFF, Realization
 from .scan_refine_confirm import confirm_no_limit, number_of_limit
 from .sensitivity_peaks import confirm_peak, find_level_frequencies
+from .state_space import findings_of
 
 if TYPE_CHECKING:
     from .state_space import LinearSystem
@@ -159,11 +160,7 @@ def margins(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Margins
             block="margins",
         )
     if not r.order:
-        raise ParameterError(
-            f"found a loop that is the constant {r.D[0, 0]:.6g}: no state is controllable and observable; expected "
-            "dynamics. Look at the wire at which the loop is opened.",
-            block="margins",
-        )
+        raise _constant_loop_error(float(r.D[0, 0]), findings_of(loop))
     if abs(1 + r.D[0, 0]) < 1e-12:
         raise ParameterError(
             "found L = −1 at infinite frequency: the closed loop is ill-posed; expected another value. Look at the "
@@ -171,6 +168,17 @@ def margins(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Margins
             block="margins",
         )
     return _LoopMarginFinder(r, skew).find_margins()
+
+
+def _constant_loop_error(value: float, findings: tuple[Finding, ...]) -> ParameterError:
+    """Return the error of a loop without dynamics; its findings name the blocks that have no slope."""
+    found = "".join(f"; {finding}" for finding in findings if finding.remedy)
+    steps = " ".join(dict.fromkeys(finding.remedy for finding in findings if finding.remedy))
+    return ParameterError(
+        f"found a loop that is the constant {value:.6g}: no state is controllable and observable{found}; expected "
+        f"dynamics. {steps or 'Look at the wire at which the loop is opened.'}",
+        block="margins",
+    )
 
 
 class _LoopMarginFinder(MarginFinder[Margins]):

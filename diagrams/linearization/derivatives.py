@@ -213,11 +213,9 @@ class LocalDerivatives:
     def _kept(self, name: str, acting: frozenset[TickPattern], make: Callable[[], T]) -> T:
         """Return a function of these taps, made once for all diagrams with the same functions.
 
-        Stairs that are replaced depend on the operating point: functions with them are not kept.
+        The slopes of stairs that are replaced depend on the operating point, their places don't.
         """
-        if self.stairs.stairs:
-            return make()
-        return self.flat.keep((name, acting, self._taps), make)
+        return self.flat.keep((name, acting, self._taps, self.stairs.places), make)
 
     def _make_taps(self, d: ca.MX, c: ca.MX) -> dict[tuple[str, str], Any]:
         """Return a function for each port with an injection or a cut, from its signal to that of the consumers."""

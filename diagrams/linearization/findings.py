@@ -8,10 +8,16 @@ loop, and by every number that is made from it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 from ...blocks.core import Finding, explain_calls
+
+MEASURE = (
+    "Linearize where it has a slope, linearize(point), or measure the loop with the amplitude that is meant: "
+    "frequency_response(wire, …, amplitude=…)."
+)
+"""What to do where a block has no slope at a point."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +40,20 @@ class BlockFinding(Finding):
 @explain_calls
 @dataclass(frozen=True)
 class StepsOnly(BlockFinding):
-    """An output or a state that depends on an input only in steps, such as a quantizer's: its slope is zero."""
+    """An output or a state that depends on an input only in steps, such as a quantizer's: its slope is zero.
+
+    Attributes
+    ----------
+    rounds : bool
+        Whether the steps come from rounding, which has a mean slope.
+    """
+
+    rounds: bool = field(default=False, compare=False)
+
+    @property
+    def remedy(self) -> str:
+        """Take rounding by its mean slope; measure a relay."""
+        return 'Take the mean slope of rounding: linearize(…, stairs="gain").' if self.rounds else MEASURE
 
     def __str__(self) -> str:
         return f"{self.block}.{self.port} follows {self.source!r} in steps only: it linearizes to zero"
@@ -61,9 +80,17 @@ class MeanSlope(BlockFinding):
     ----------
     slope : float
         Largest entry of the mean slope.
+    asked : bool
+        Whether it was asked for, as the block is no `Quantizer` or `Encoder`: its steps may be as large as the motion.
     """
 
     slope: float
+    asked: bool = False
+
+    @property
+    def puts_in_doubt(self) -> bool:
+        """Whether the mean slope was asked for: that of a converter or an encoder holds for motions of many steps."""
+        return self.asked
 
     def __str__(self) -> str:
         return f"{self.block}.{self.port} follows {self.source!r} in stairs: taken as their mean slope {self.slope:.6g}"
@@ -89,6 +116,11 @@ class Kink(BlockFinding):
     jump: float = 0.0
     slope: float | None = None
 
+    @property
+    def remedy(self) -> str:
+        """Take another point, or measure."""
+        return MEASURE
+
     def __str__(self) -> str:
         where = f"{self.block}.{self.port} is at a kink of its dependence on {self.source!r}"
         if self.jump:
@@ -112,6 +144,11 @@ class ZeroSlope(BlockFinding):
 
     span: float
     change: float
+
+    @property
+    def remedy(self) -> str:
+        """Take another point, or measure."""
+        return MEASURE
 
     def __str__(self) -> str:
         return (

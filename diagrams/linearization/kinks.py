@@ -153,7 +153,8 @@ class _BlockAtPoint:
     def find(self) -> Iterator[Finding]:
         """Yield the kinks and zero slopes of the block."""
         steps = set(self.slopes.steps)
-        yield from (StepsOnly(self.path, r[2:], c[2:]) for r, c in self.slopes.steps if self._steps_count(r, c))
+        rounds = self.slopes.has_stairs
+        yield from (StepsOnly(self.path, r[2:], c[2:], rounds) for r, c in self.slopes.steps if self._steps_count(r, c))
         kinks, zeros = dict[tuple[str, str], Kink](), dict[tuple[str, str], ZeroSlope]()
         f0, J0 = self._slopes(0, 0.0)
         for column in range(self.slopes.columns.total):

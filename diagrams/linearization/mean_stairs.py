@@ -1,5 +1,8 @@
 """Stairs as their mean slope: rounding taken out of a block's equations, and the slopes that are left.
 
+Blocks that name their steps (`Block.quanta`), as of a converter or an encoder, are taken so in every linear model;
+stairs of other blocks where they are asked for.
+
 The mean of ⌊v⌋ is v − ½, that of ⌈v⌉ is v + ½. In equations whose slope by an input is zero everywhere, every rounding
 is replaced by its mean; the slope of the result is the mean slope of the stairs, 1 for a quantizer. Comparisons have no
 mean slope, as theirs depends on the amplitude: a relay stays as it is.
@@ -38,12 +41,15 @@ class Stair:
         Its output (``u y``) or state (``x level``), and the input.
     slope : ndarray
         Mean slope, shape (entries of the row, entries of the input).
+    asked : bool
+        Whether it is taken because all stairs were asked for: the block does not name the steps of this input.
     """
 
     path: str
     row: str
     source: str
     slope: np.ndarray
+    asked: bool = False
 
 
 class Stairs:
@@ -61,15 +67,24 @@ class Stairs:
             self.K[self.e.slices[str(i)], self.v.slices[str(i)]] = stair.slope
 
     @classmethod
-    def of(cls, flat: FlatDiagram, at: OperatingPoint) -> Stairs:
-        """Return the stairs of all blocks, with their mean slopes at an operating point."""
+    def of(cls, flat: FlatDiagram, at: OperatingPoint, *, every: bool) -> Stairs:
+        """Return the stairs with their mean slopes at an operating point: of all blocks, or of those that name them."""
         found = []
         for path in sorted(set(flat.checked.traced).difference(flat.outside)):
+            named = flat.table.blocks[path].quanta
+            if not every and not named:
+                continue
             slopes = slopes_of(flat.checked.traced[path])
             if slopes.has_stairs:
                 z, p = read_arguments(flat, at, path, slopes)
-                found += [Stair(path, row, source[2:], K) for row, source, K in mean_slopes(slopes, at.t, z, p)]
-        return cls([s for s in found if (s.path, s.source) in flat.table.wires])
+                for row, source, K in mean_slopes(slopes, at.t, z, p):
+                    found.append(Stair(path, row, source[2:], K, asked=source[2:] not in named))
+        return cls([s for s in found if (s.path, s.source) in flat.table.wires and (every or not s.asked)])
+
+    @property
+    def places(self) -> tuple[Any, ...]:
+        """The places of the stairs, without their slopes: functions with the signals e and v depend on them alone."""
+        return tuple((s.path, s.row, s.source, s.slope.shape) for s in self.stairs)
 
     def add(self, instant: Instant, path: str, made: dict[str, Any], e: Any) -> dict[int, Any]:
         """Add e to what a block has made; return what it was without, by the number of the stair."""
@@ -114,15 +129,11 @@ class Stairs:
 
     def replace_findings(self, findings: Sequence[Finding]) -> tuple[Finding, ...]:
         """Return findings with the mean slopes in place of the stairs that they replace."""
-        slopes: dict[tuple[str, str, str], float] = {}
+        means: dict[tuple[str, str, str], MeanSlope] = {}
         for s in self.stairs:
-            slopes[s.path, s.row[2:], s.source] = float(s.slope.flat[int(np.argmax(np.abs(s.slope)))])
-        return tuple(
-            MeanSlope(f.block, f.port, f.source, slopes[f.block, f.port, f.source])
-            if isinstance(f, StepsOnly) and (f.block, f.port, f.source) in slopes
-            else f
-            for f in findings
-        )
+            steepest = float(s.slope.flat[int(np.argmax(np.abs(s.slope)))])
+            means[s.path, s.row[2:], s.source] = MeanSlope(s.path, s.row[2:], s.source, steepest, s.asked)
+        return tuple(means.get((f.block, f.port, f.source), f) if isinstance(f, StepsOnly) else f for f in findings)
 
 
 def mean_slopes(slopes: BlockSlopes, t: float, z: np.ndarray, p: np.ndarray) -> list[tuple[str, str, np.ndarray]]:
@@ -179,18 +190,23 @@ def _means(f: Any, arguments: Sequence[Any]) -> list[Any]:
     return results
 
 
+STAIRS = ("gain", "zero")
+"""Treatments of stairs that can be asked for."""
 NO_STAIRS = Stairs()
 """No stairs are replaced."""
 
 
 def replace_stairs(diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, stairs: str | None) -> Stairs:
-    """Return the stairs that are replaced by their mean slopes."""
-    if stairs is None:
-        return NO_STAIRS
-    if not isinstance(stairs, str) or stairs != "gain":
+    """Return the stairs that are replaced by their mean slopes.
+
+    These are those of blocks that name their steps, with "gain" those of all blocks, and with "zero" none.
+    """
+    if stairs is not None and (not isinstance(stairs, str) or stairs not in STAIRS):
         raise OptionError(
-            f'found stairs={stairs!r}; expected "gain", which takes stairs as their mean slope, or None. Choose one.',
+            f'found stairs={stairs!r}; expected "gain", which takes all stairs as their mean slope, "zero", which '
+            "takes all by their slope of zero, or None, which takes those of quantizers and encoders as their mean "
+            "slope. Choose one.",
             block=diagram.name,
             port="stairs",
         )
-    return Stairs.of(flat, at)
+    return NO_STAIRS if stairs == "zero" else Stairs.of(flat, at, every=stairs == "gain")

@@ -200,7 +200,7 @@ def step_response(
         Beginning; the start without it.
     outputs : iterable of str
         Further wires or ports.
-    stairs : {"gain"}, optional
+    stairs : {"gain", "zero"}, optional
         Treatment of stairs in the linear model, as of `Diagram.linearize`.
 
     Raises

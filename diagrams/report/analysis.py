@@ -130,9 +130,9 @@ def analyse(
         Where the diagram comes from, for the report's heading.
     only : tuple of str, optional
         The sections that are made, by their keys; all without it.
-    stairs : {"gain"}, optional
-        "gain" takes the stairs of quantizers and encoders as their mean slope in all linear models; without it their
-        slope is zero.
+    stairs : {"gain", "zero"}, optional
+        Treatment of stairs in all linear models, as of `Diagram.linearize`. Without it those of quantizers and encoders
+        have their mean slope.
     requirements : Requirements or path, optional
         Requirements on the design, or a TOML file of them. `Report.review` has the verdicts, which the first page and
         the JSON show.

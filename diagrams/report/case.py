@@ -103,7 +103,7 @@ class Case:
         Where the diagram comes from.
     wires : tuple of str, optional
         Wires at which loops are looked at, instead of all named ones on loops.
-    stairs : {"gain"}, optional
+    stairs : {"gain", "zero"}, optional
         Treatment of stairs in the linear models, as of `Diagram.linearize`.
 
     Attributes

@@ -18,6 +18,7 @@ from ..requirements import (
     Review,
     StepLimits,
     Verdict,
+    is_doubtful,
     judge,
     judge_interval,
 )
@@ -186,7 +187,7 @@ def _stable(v: Variant, state: _State, numbers: Mapping[str, Number]) -> Require
         return replace(result, verdict=Verdict.FAILED, reason=Reason.UNSTABLE)
     if stability is Stability.ON_THE_LIMIT:
         return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.ON_THE_LIMIT)
-    if number is not None and number.findings:
+    if number is not None and is_doubtful(number):
         return replace(result, reason=Reason.FINDINGS)
     if state.verdict is not None:
         return replace(result, verdict=state.verdict, reason=state.reason, detail=state.detail)

@@ -98,7 +98,7 @@ class Variant:
         The diagram of an operating point that is taken over.
     inputs, outputs : tuple of str
         Inputs and outputs of the linear model.
-    stairs : {"gain"}, optional
+    stairs : {"gain", "zero"}, optional
         Treatment of stairs in the linear model.
     """
 

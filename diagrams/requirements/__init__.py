@@ -1,7 +1,7 @@
 """Requirements on a design, and the verdicts on its numbers."""
 
 from .contact_limits import ContactLimits, read_contact_limits
-from .number_limits import SENSES, Limit, Reason, Sense, Verdict, judge, judge_interval
+from .number_limits import SENSES, Limit, Reason, Sense, Verdict, is_doubtful, judge, judge_interval
 from .requirements import LoopLimits, Requirements, StepLimits
 from .results import RequirementResult, Review
 from .toml_file import REQUIRED, STUDIES, TomlFile, read_requirements
@@ -21,6 +21,7 @@ __all__ = [
     "StepLimits",
     "TomlFile",
     "Verdict",
+    "is_doubtful",
     "judge",
     "judge_interval",
     "read_contact_limits",

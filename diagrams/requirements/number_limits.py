@@ -153,11 +153,21 @@ def judge_interval(value: float, low: float, high: float, limit: Limit) -> tuple
     return Verdict.UNDECIDED, Reason.WITHIN_TOLERANCE, distance
 
 
+def is_doubtful(number: Number) -> bool:
+    """Whether a finding puts a number in doubt, so that it meets no requirement.
+
+    A kink, a slope of zero, stairs by their slope of zero, an event within the period and inexact derivatives do. The
+    mean slope of a converter or an encoder (†) does not: the loop is the one that is meant, for motions of many quanta.
+    """
+    return any(finding.puts_in_doubt for finding in number.findings)
+
+
 def judge(number: Number, limit: Limit) -> tuple[Verdict, Reason, float]:
     """Return the verdict on a number, its reason, and the distance to the nearest limit, negative beyond it.
 
     A number is passed only if it is confirmed, or a given, and within the limits by its tolerance. One whose linear
-    model leaves something out (†) is not passed either; beyond a limit it fails, where its error is known.
+    model leaves something out that puts it in doubt (`is_doubtful`) is not passed either; beyond a limit it fails,
+    where its error is known.
     """
     distance = limit.distance(number.value)
     if math.isfinite(number.value) and math.isnan(number.tolerance) and number.findings:
@@ -170,6 +180,6 @@ def judge(number: Number, limit: Limit) -> tuple[Verdict, Reason, float]:
         return Verdict.FAILED, Reason.COMPARED, distance
     if distance - number.tolerance < 0.0:
         return Verdict.UNDECIDED, Reason.WITHIN_TOLERANCE, distance
-    if number.findings:
+    if is_doubtful(number):
         return Verdict.UNDECIDED, Reason.FINDINGS, distance
     return Verdict.PASSED, Reason.COMPARED, distance

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
@@ -102,9 +102,11 @@ class RunConfirmation:
 
 
 def confirm_case(
-    diagram: WiredDiagram, case: StudyCase, at: Any, amplitude: float | None, delay: int
+    diagram: WiredDiagram, case: StudyCase, at: Any, amplitude: float | None, delay: int, options: Mapping[str, Any]
 ) -> RunConfirmation:
     """Return the confirmation of a case by a run of the diagram with its parameters.
+
+    ``options`` are those of the linear models.
 
     Raises
     ------
@@ -124,10 +126,10 @@ def confirm_case(
             block=diagram.name,
         )
     point = at(diagram.facade) if callable(at) else at
-    model = linearize(diagram, point)
+    model = linearize(diagram, point, **options)
     still = hold_sources(diagram, model.point.values)  # references that move would move the point
     if still is not diagram:
-        diagram, model = still, linearize(still, model.point)
+        diagram, model = still, linearize(still, model.point, plants=model.plants, stairs=model.stairs)
     if case.quantity:
         size = amplitude if amplitude is not None else _size_at(model, case.loop[0])
         return _measure_margin(diagram, model, case, size)
@@ -249,7 +251,7 @@ def _measure_growth(
     if dt:
         length = min(max(length, 40 * dt), MANY * dt)
     try:
-        found = step_response(diagram, wire, size=size, length=length, at=model.point)
+        found = step_response(diagram, wire, size=size, length=length, at=model.point, stairs=model.stairs)
     except SimulationError:
         return RunConfirmation(ConfirmationKind.GROWTH, wire, math.nan, case.growth, math.inf, agrees=True)
     measured = _read_growth(found.v, found.t)

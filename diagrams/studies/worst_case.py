@@ -142,8 +142,9 @@ class WorstCase:
         if self.measure is not None:
             point, diagram = self.points[self.worst.point], self._worst_wired
             return self.measure.confirm(diagram, point(diagram.facade) if callable(point) else point)
+        options = {name: value for name, value in self.options.items() if name != "delay"}
         return confirm_case(
-            self._worst_wired, self.worst, self.points[self.worst.point], amplitude, self.options["delay"]
+            self._worst_wired, self.worst, self.points[self.worst.point], amplitude, self.options["delay"], options
         )
 
     def __str__(self) -> str:

@@ -27,7 +27,7 @@ from ...frequency import (
     periodic_margins,
     with_findings,
 )
-from ...linearization import StepsOnly, linearize
+from ...linearization import linearize
 from .. import figures
 from ..case import Case
 from ..pages import Plot, Section, Table, Texts
@@ -285,8 +285,9 @@ def _zero(v: Variant, wire: str, on_cycles: Collection[str]) -> str:
     block = names[wire].block if wire in names else wire.rpartition(".")[0]
     if block not in on_cycles:
         return TEXTS.line("off_loops", wire=wire)
-    steps = [str(finding) for finding in v.model.findings if isinstance(finding, StepsOnly)]
-    return TEXTS.line("slope_is_zero", wire=wire, steps=steps)
+    flat = [finding for finding in v.model.findings if finding.remedy]
+    remedies = dict.fromkeys(finding.remedy for finding in flat)
+    return TEXTS.line("slope_is_zero", wire=wire, flat=[*map(str, flat)], remedies=[*remedies])
 
 
 @dataclass(frozen=True)

@@ -160,7 +160,7 @@ def test_the_first_sample_of_a_force_sensor_is_no_model_of_it():
 
 def test_stairs_are_taken_as_asked():
     made = experiments.compliance(encoder=1e-6).diagram
-    blind, mean = made.contact(at=0.01), made.contact(at=0.01, stairs="gain")
+    blind, mean = made.contact(at=0.01, stairs="zero"), made.contact(at=0.01)
     assert any(isinstance(finding, StepsOnly) for finding in blind.findings)
     assert any(isinstance(finding, MeanSlope) for finding in mean.stability_limit(damping=10.0).findings)
     # velocities from differences come half a sample late, which costs some of the limit

@@ -407,7 +407,7 @@ def test_the_start_has_the_tool_as_every_later_tick():
     assert first.notes == later.notes == ()
     assert pytest.approx(later.A, abs=1e-9) == first.A
     assert {*at_rest().linearize().states} < {*first.states}  # the tool feels the force that was held
-    rough = at_rest(encoder=1e-5).linearize(T)
+    rough = at_rest(encoder=1e-5).linearize(T, stairs="zero")
     assert "sensors.encoder.measured_position follows 'position' in steps only: it linearizes to zero" in rough.notes
 
 

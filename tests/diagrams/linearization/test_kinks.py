@@ -1,6 +1,8 @@
 """Kinks, stairs and slopes of zero: found at the point, and carried to the numbers that depend on them."""
 
 import json
+import math
+from dataclasses import replace
 
 import control
 import numpy as np
@@ -17,6 +19,7 @@ from loopwright.blocks import (
     Integrator,
     Lookup1D,
     OptionError,
+    ParameterError,
     PythonFunction,
     Quantizer,
     RateLimiter,
@@ -39,7 +42,8 @@ from loopwright.diagrams import (
     nyquist_count,
     subsystem,
 )
-from loopwright.diagrams.frequency import with_findings
+from loopwright.diagrams.frequency import Number, with_findings
+from loopwright.diagrams.requirements import Limit, Reason, Requirements, Verdict, judge
 
 T = 0.01
 
@@ -162,7 +166,7 @@ STEPS = {
 
 @pytest.mark.parametrize("case", STEPS)
 def test_steps_and_events_are_told(case):
-    lin = STEPS[case].linearize()
+    lin = STEPS[case].linearize(stairs="zero")
     path = "block" if "." not in lin.findings[0].block else "box.block"
     assert lin.findings == (StepsOnly(path, "y", "u"),)
     assert lin.loop("v").findings == lin.findings
@@ -271,7 +275,9 @@ def test_a_switched_path_is_told_only_on_the_loop_through_the_switch():
 
 @pytest.mark.slow
 def test_a_report_marks_the_numbers_and_its_json_has_the_facts(tmp_path):
-    report = servo().report(tmp_path / "servo.html", json=True, point=2 * T, only=("poles", "inner", "limits"))
+    report = servo().report(
+        tmp_path / "servo.html", json=True, point=2 * T, only=("poles", "inner", "limits"), stairs="zero"
+    )
     numbers = report.numbers()
     margin = numbers["inner.u.sampled_d0.phase_margin_deg"]
     steps = StepsOnly("controller.encoder", "measured_position", "position")
@@ -282,7 +288,7 @@ def test_a_report_marks_the_numbers_and_its_json_has_the_facts(tmp_path):
     assert f"†</sup> Limit of the linear model: {steps}.".replace("'", "&#39;") in html
     leaf = json.loads((tmp_path / "servo.json").read_text("utf-8"))["inner"]["u"]["sampled_d0"]["phase_margin_deg"]
     assert leaf["findings"][0]["kind"] == "StepsOnly"
-    answered = servo().report(point=2 * T, only=("inner",), stairs="gain").numbers()
+    answered = servo().report(point=2 * T, only=("inner",)).numbers()
     assert answered["inner.u.sampled_d0.phase_margin_deg"].value == pytest.approx(by_hand(), abs=1e-6)
 
 
@@ -291,9 +297,9 @@ def test_a_report_marks_the_numbers_and_its_json_has_the_facts(tmp_path):
 KP, KD = 25.0, 8.0
 
 
-def servo():
+def servo(start=0.3):
     """A double integrator under −kp q(x) − kd v, with an encoder of 1 µm for x."""
-    v, x = Integrator(name="v"), Integrator(name="x", initial_value=0.3)
+    v, x = Integrator(name="v"), Integrator(name="x", initial_value=start)
 
     @subsystem(sample_time=T)
     def controller(x, v):
@@ -316,7 +322,7 @@ def test_the_margin_of_an_encoder_as_a_gain_is_that_of_the_loop_without_it():
     assert MeanSlope("controller.encoder", "measured_position", "position", 1.0) in found.findings
     A = [[1.0 - KP * T * T / 2, T - KD * T * T / 2], [-KP * T, 1.0 - KD * T]]
     assert np.sort_complex(lin.poles)[-2:] == pytest.approx(np.sort_complex(np.linalg.eigvals(A)), rel=1e-12)
-    without = margins(servo().linearize(2 * T).loop("u"))
+    without = margins(servo().linearize(2 * T, stairs="zero").loop("u"))
     assert without.phase_margin_deg.value == pytest.approx(87.7076, abs=1e-4)  # of the velocity alone
 
 
@@ -344,8 +350,8 @@ def test_a_quantizer_in_continuous_time_is_a_gain_wherever_the_loop_is_cut():
     x = Integrator(name="x", initial_value=0.32)
     held = Quantizer(interval=0.1, name="quantizer")(x.y).named("q")
     diagram = Diagram("d", x(Gain(gain=-2.0, name="back")(held).named("u")))
-    assert diagram.linearize().A.tolist() == [[0.0]]
-    lin = diagram.linearize(stairs="gain")
+    assert diagram.linearize(stairs="zero").A.tolist() == [[0.0]]
+    lin = diagram.linearize()
     assert pytest.approx(np.array([[-2.0]]), rel=1e-14) == lin.A
     assert lin.findings == (MeanSlope("quantizer", "y", "u", pytest.approx(1.0, rel=1e-14)),)
     for wire in ("q", "u"):
@@ -357,7 +363,9 @@ def test_the_mean_slope_is_that_of_differences_over_many_steps():
     def stairs(u):
         return 0.3 * np.floor(4.0 * u + 0.2) - np.ceil(u)
 
+    assert around(on(stairs)).linearize().findings == (StepsOnly("block", "y", "u"),)  # a gear has no slope by itself
     (found,) = around(on(stairs)).linearize(stairs="gain").findings
+    assert found.asked
     far = 1e6
     assert found.slope == pytest.approx((stairs(far) - stairs(-far)) / (2 * far), rel=1e-5)
 
@@ -372,8 +380,60 @@ def test_a_relay_has_no_mean_slope_and_wrapping_is_not_stairs():
         assert lin.findings == ()
 
 
+def test_encoders_and_quantizers_have_their_mean_slope_without_being_asked():
+    lin = servo().linearize(2 * T)
+    assert margins(lin.loop("u")).phase_margin_deg.value == pytest.approx(by_hand(), abs=1e-6)
+    assert lin.notes == servo().linearize(2 * T, stairs="gain").notes
+    assert sampled(Quantizer(interval=0.1, name="block"), 0.32).linearize().findings == (
+        MeanSlope("box.block", "y", "u", pytest.approx(1.0, rel=1e-14)),
+    )
+
+
+def test_a_mean_slope_of_a_converter_meets_requirements_and_one_that_was_asked_for_does_not():
+    def verdict(stairs, **limits):
+        asked = Requirements(**limits)
+        found = servo(0.0).report(only=("inner", "poles"), stairs=stairs, requirements=asked)
+        return {r.quantity: (r.verdict, r.reason) for r in found.review.results}
+
+    margin = float(by_hand())
+    for stairs in (None, "gain"):
+        found = verdict(stairs, phase_margin_deg=margin - 1.0)
+        assert found == dict.fromkeys(("stable", "phase_margin_deg"), (Verdict.PASSED, Reason.COMPARED))
+        found = verdict(stairs, phase_margin_deg=margin + 1.0)
+        assert found["phase_margin_deg"] == (Verdict.FAILED, Reason.COMPARED)
+    found = verdict("zero", phase_margin_deg=margin - 1.0)
+    assert found["phase_margin_deg"] == (Verdict.UNDECIDED, Reason.FINDINGS)
+    gear = Number(50.0, "deg", 1e-9, "eigenvalues", findings=(MeanSlope("gear", "y", "u", 1.0, asked=True),))
+    encoder = replace(gear, findings=(MeanSlope("encoder", "measured_position", "position", 1.0),))
+    kink = replace(gear, findings=(*encoder.findings, Kink("limit", "y", "u", 0.0, 1.0)))
+    found = [judge(number, Limit(45.0, math.inf))[0] for number in (gear, encoder, kink)]
+    assert found == [Verdict.UNDECIDED, Verdict.PASSED, Verdict.UNDECIDED]
+
+
+FLAT = {
+    "relay": (Relay(on_point=0.5, off_point=-0.5, name="block"), "frequency_response(wire, …, amplitude=…)"),
+    "dead zone": (DeadZone(limit=0.5, name="block"), "linearize(point)"),
+    "sign": (on(np.sign), "frequency_response(wire, …, amplitude=…)"),
+    "abs": (on(np.abs), "linearize(point)"),
+    "gear": (on(lambda u: np.floor(u / 10.0)), 'linearize(…, stairs="gain")'),
+    "quantizer": (Quantizer(interval=0.1, name="block"), 'linearize(…, stairs="gain")'),
+}
+
+
+@pytest.mark.parametrize("case", FLAT)
+def test_a_loop_without_a_slope_names_the_block_and_the_argument(case):
+    block, argument = FLAT[case]
+    loop = sampled(block).linearize(stairs="zero").loop("v")
+    with pytest.raises(ParameterError, match=r"the constant 0: .*; box\.block\.y .*; expected dynamics") as error:
+        margins(loop)
+    assert argument in str(error.value)
+    assert "Look at the wire" not in str(error.value)
+
+
 def test_an_unknown_treatment_of_stairs_is_refused():
-    with pytest.raises(OptionError, match="found stairs='round'; expected \"gain\", which takes stairs as their mean"):
+    with pytest.raises(
+        OptionError, match="found stairs='round'; expected \"gain\", which takes all stairs as their mean"
+    ):
         servo().linearize(stairs="round")
 
 

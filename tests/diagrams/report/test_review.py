@@ -156,7 +156,9 @@ def test_a_margin_on_a_kink_is_not_decided():
 
 
 def test_a_loop_without_a_slope_has_no_margin_and_is_not_decided():
-    report = analyse(loop(encoder=0.01), only=PARTS, requirements=Requirements(phase_margin_deg=45, stable=False))
+    report = analyse(
+        loop(encoder=0.01), only=PARTS, requirements=Requirements(phase_margin_deg=45, stable=False), stairs="zero"
+    )
     found = by_quantity(report)["phase_margin_deg"]
     assert (found.verdict, found.reason) == (Verdict.UNDECIDED, Reason.NO_NUMBER)
     assert verdicts(report) == ("not decided", "not decided")

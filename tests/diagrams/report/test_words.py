@@ -120,7 +120,7 @@ def test_a_loop_through_an_encoder_is_there_with_slope_zero():
         return PID(kp=5.0)(reference, Encoder(quantum=1e-3)(angle, speed).measured_position).named("u")
 
     diagram = Diagram("enc", motor(voltage=control(Constant(value=1.0), motor.angle, motor.speed), load_torque=0.0))
-    said = " ".join(texts(analyse(diagram, only=("inner",)).sections[0]))
+    said = " ".join(texts(analyse(diagram, only=("inner",), stairs="zero").sections[0]))
     assert "control.u lies on a loop, but the loop's slope is zero" in said
     assert "control.encoder.measured_position follows 'position' in steps only" in said
     assert "No wire of this diagram" not in said
