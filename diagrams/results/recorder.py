@@ -121,11 +121,14 @@ class Recorder:
         outputs : mapping
             Their entries in the vector of a sample, by dotted path.
         """
+        column = None if self._pick is None else {entry: k for k, entry in enumerate(self._pick.tolist(), 1)}
+        watched = dict(self._watched)
         for name, where in outputs.items():
-            entries = np.arange(where.start, where.stop)
-            kept = entries if self._pick is None else np.flatnonzero(np.isin(self._pick, entries))
-            if kept.size:
-                self._watched = {**self._watched, name: 1 + kept}
+            entries = range(where.start, where.stop)
+            kept = [1 + k for k in entries] if column is None else [column[k] for k in entries if k in column]
+            if kept:
+                watched[name] = np.array(kept)
+        self._watched = watched
 
     def describe_lost(self) -> tuple[str, ...]:
         """Return the message of a run on the outputs that were watched and are no finite numbers in its samples."""
