@@ -20,8 +20,10 @@ Harmless: half the load, 4 Ω.
 import numpy as np
 import pytest
 
+from loopwright.blocks import PID, Block, Input, Output, State, Step, parameter
+from loopwright.diagrams import Diagram, subsystem
 from support.by_hand import SampledLoop, run, step_numbers
-from support.everyday import VARIANTS, Project, check_by_hand, of
+from support.everyday import VARIANTS, Project, check_by_hand, check_report, check_run, check_stability, of, reports
 
 SUPPLY, INDUCTANCE, WINDING, ESR = 24.0, 22e-6, 0.02, 0.01
 CURRENT, VOLTAGE, T, SIZE = (0.0576, 288.0), (2.0, 3000.0), 5e-6, 0.5
@@ -30,10 +32,12 @@ NAMES = ["current_wanted", "voltage_integral", "current_integral", "late"]
 
 def by_hand(capacitance=220e-6, load=2.0):
     share = load / (load + ESR)
-    A = np.array([
-        [-(WINDING + share * ESR) / INDUCTANCE, -share / INDUCTANCE],
-        [share / capacitance, -1.0 / ((load + ESR) * capacitance)],
-    ])  # fmt: skip
+    A = np.array(
+        [
+            [-(WINDING + share * ESR) / INDUCTANCE, -share / INDUCTANCE],
+            [share / capacitance, -1.0 / ((load + ESR) * capacitance)],
+        ]
+    )
     B = np.array([SUPPLY / INDUCTANCE, 0.0])
     C = np.array([share * ESR, share])
     drawn = np.array([share * ESR / INDUCTANCE, -share / capacitance])
@@ -67,6 +71,46 @@ def by_hand(capacitance=220e-6, load=2.0):
     )
 
 
+class Buck(Block):
+    """Averaged buck converter: L i' = d V - r i - v, C v_c' = i - v / R - i_x, v = v_c + ESR (i - v / R - i_x)."""
+
+    capacitance: float = parameter(unit="F", above=0.0)
+    load: float = parameter(unit="Ohm", above=0.0)
+    duty = Input(description="duty cycle, 0 to 1")
+    extra_load = Input(unit="A", description="current drawn next to the load")
+    current = State(start=lambda block: 12.0 / block.load, unit="A", output=True)
+    stored = State(start=12.0, unit="V", description="voltage of the capacitor")
+    voltage = Output(unit="V")
+
+    def output(self, t, x, u):
+        return (x.stored + ESR * (x.current - u.extra_load)) / (1.0 + ESR / self.load)
+
+    def derivative(self, t, x, u):
+        v = self.output(t, x, u)
+        inductor = u.duty * SUPPLY - WINDING * x.current - v
+        return inductor / INDUCTANCE, (x.current - v / self.load - u.extra_load) / self.capacitance
+
+
+def diagram(capacitance=220e-6, load=2.0, delay=0):
+    buck = Buck(capacitance=capacitance, load=load, name="buck")
+    drawn = 12.0 / load
+
+    @subsystem(sample_time=4 * T, delay=delay)
+    def voltage_loop(wanted, voltage):
+        pi = PID(kp=VOLTAGE[0], ki=VOLTAGE[1], lower=0.0, upper=15.0, initial_output=drawn)
+        return pi(wanted, voltage).named("current_wanted")
+
+    @subsystem(sample_time=T, delay=1)
+    def current_loop(wanted, current):
+        pi = PID(kp=CURRENT[0], ki=CURRENT[1], lower=0.0, upper=1.0, initial_output=(12.0 + WINDING * drawn) / SUPPLY)
+        return pi(wanted, current).named("duty")
+
+    wanted = Step(times=1e-3, values=12.0 + SIZE, initial_value=12.0, unit="V").y.named("wanted")
+    extra = Step(times=11e-3, values=1.0, unit="A").y.named("extra_load")
+    duty = current_loop(voltage_loop(wanted, buck.voltage), buck.current)
+    return Diagram("converter", buck(duty=duty, extra_load=extra))
+
+
 PROJECT = Project(
     asked={
         "loops": {
@@ -79,6 +123,10 @@ PROJECT = Project(
         ],
     },
     by_hand=by_hand,
+    diagram=diagram,
+    step_at=(1e-3, 11e-3),
+    duration=5e-3,
+    more_delay={"delay": 6},
     breaking={"capacitance": 68e-6},
     harmless={"load": 4.0},
     broken=("current_wanted: gain_margin_high", "current_wanted: ms"),
@@ -89,3 +137,20 @@ PROJECT = Project(
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_verdict_of_a_buck_converter_by_hand(variant):
     check_by_hand(PROJECT, variant)
+
+
+@reports()
+def test_the_report_has_the_verdict_of_a_buck_converter(variant):
+    check_report(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_run_of_a_buck_converter_is_that_by_hand(variant):
+    check_run(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_more_delay_ends_the_stability_of_a_buck_converter_only_where_the_margin_is_broken(variant):
+    check_stability(PROJECT, variant)

@@ -21,8 +21,10 @@ Harmless: half the load, 1000 kg: 63°, 15 %, 11 s.
 import numpy as np
 import pytest
 
+from loopwright.blocks import Block, Input, State, Step, parameter
+from loopwright.diagrams import Diagram, subsystem
 from support.by_hand import SampledLoop, run, step_numbers
-from support.everyday import VARIANTS, Project, check_by_hand, of
+from support.everyday import VARIANTS, Project, check_by_hand, check_report, check_run, check_stability, of, reports
 
 TROLLEY, ROLLING, G, T, SIZE = 1000.0, 200.0, 9.81, 0.05, 1.0
 K = np.array([1910.0, 3150.0, 700.0, 11180.0])
@@ -33,12 +35,14 @@ def law(k, x, memory, wanted, wire):
 
 
 def by_hand(load=2000.0, rope=8.0):
-    A = np.array([
-        [0.0, 1.0, 0.0, 0.0],
-        [0.0, -ROLLING / TROLLEY, load * G / TROLLEY, 0.0],
-        [0.0, 0.0, 0.0, 1.0],
-        [0.0, ROLLING / (TROLLEY * rope), -(TROLLEY + load) * G / (TROLLEY * rope), 0.0],
-    ])  # fmt: skip
+    A = np.array(
+        [
+            [0.0, 1.0, 0.0, 0.0],
+            [0.0, -ROLLING / TROLLEY, load * G / TROLLEY, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+            [0.0, ROLLING / (TROLLEY * rope), -(TROLLEY + load) * G / (TROLLEY * rope), 0.0],
+        ]
+    )
     loop = SampledLoop(A, [0.0, 1 / TROLLEY, 0.0, -1 / (TROLLEY * rope)], law, [], T)
 
     def rates(x, force):
@@ -56,6 +60,36 @@ def by_hand(load=2000.0, rope=8.0):
     )
 
 
+class Crane(Block):
+    """Trolley with a load on a rope: the angle is zero where the load hangs, positive towards the trolley's motion."""
+
+    load: float = parameter(unit="kg", above=0.0)
+    rope: float = parameter(unit="m", above=0.0)
+    force = Input(unit="N")
+    position = State(unit="m", output=True)
+    speed = State(unit="m/s", output=True)
+    angle = State(unit="rad", output=True)
+    rate = State(unit="rad/s", output=True)
+
+    def derivative(self, t, x, u):
+        s, c = np.sin(x.angle), np.cos(x.angle)
+        pull = self.load * (self.rope * x.rate**2 + G * c) * s
+        a = (u.force - ROLLING * x.speed + pull) / (TROLLEY + self.load * s**2)
+        return x.speed, a, x.rate, -(a * c + G * s) / self.rope
+
+
+def diagram(load=2000.0, rope=8.0, delay=0):
+    crane = Crane(load=load, rope=rope, name="crane")
+
+    @subsystem(sample_time=T, delay=delay)
+    def controller(wanted, position, speed, angle, rate):
+        return (K[0] * (wanted - position) - K[1] * speed - K[2] * angle - K[3] * rate).named("force")
+
+    wanted = Step(times=1.0, values=SIZE, unit="m").y.named("wanted")
+    force = controller(wanted, crane.position, crane.speed, crane.angle, crane.rate)
+    return Diagram("bridge", crane(force))
+
+
 PROJECT = Project(
     asked={
         "loops": {"force": {"phase_margin_deg": 45, "gain_margin_high": 3, "ms": 1.5}},
@@ -65,6 +99,10 @@ PROJECT = Project(
         ],
     },
     by_hand=by_hand,
+    diagram=diagram,
+    step_at=1.0,
+    duration=100.0,
+    more_delay={"delay": 5},
     breaking={"rope": 5.0},
     harmless={"load": 1000.0},
     broken=("force: phase_margin_deg", "force: ms", "wanted to position: settling"),
@@ -75,3 +113,20 @@ PROJECT = Project(
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_verdict_of_a_crane_by_hand(variant):
     check_by_hand(PROJECT, variant)
+
+
+@reports(quick=True)
+def test_the_report_has_the_verdict_of_a_crane(variant):
+    check_report(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_run_of_a_crane_is_that_by_hand(variant):
+    check_run(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_more_delay_ends_the_stability_of_a_crane_only_where_the_margin_is_broken(variant):
+    check_stability(PROJECT, variant)

@@ -18,8 +18,10 @@ Harmless: five people and luggage, m = 1900 kg: crossover 0.39 rad/s, 77°, 35 s
 import numpy as np
 import pytest
 
+from loopwright.blocks import PID, Block, Input, State, Step, parameter
+from loopwright.diagrams import Diagram, subsystem
 from support.by_hand import SampledLoop, run, step_numbers
-from support.everyday import VARIANTS, Project, check_by_hand, of
+from support.everyday import VARIANTS, Project, check_by_hand, check_report, check_run, check_stability, of, reports
 
 DRAG, ROLLING, LAG, SPEED, KP, T, SIZE = 0.4, 150.0, 0.3, 30.0, 750.0, 0.05, 1.0
 
@@ -42,22 +44,71 @@ def by_hand(mass=1500.0, ki=37.0):
     return of("force_wanted", loop.margins("force_wanted")) | of("wanted to speed", step_numbers(t, x[:, 0], SIZE))
 
 
+class Car(Block):
+    """Car with an engine's lag, drag and rolling resistance, and an odometer."""
+
+    mass: float = parameter(unit="kg", above=0.0)
+    force_wanted = Input(unit="N")
+    speed = State(start=SPEED, unit="m/s", output=True)
+    force = State(start=DRAG * SPEED**2 + ROLLING, unit="N", output=True)
+    distance = State(unit="m", output=True)
+
+    def derivative(self, t, x, u):
+        resistance = DRAG * x.speed**2 + ROLLING
+        return (x.force - resistance) / self.mass, (u.force_wanted - x.force) / LAG, x.speed
+
+
+def diagram(mass=1500.0, ki=37.0, delay=0):
+    car = Car(mass=mass, name="car")
+
+    @subsystem(sample_time=T, delay=delay)
+    def cruise(wanted, speed):
+        pi = PID(kp=KP, ki=ki, lower=0.0, upper=5000.0, initial_output=DRAG * SPEED**2 + ROLLING)
+        return pi(wanted, speed).named("force_wanted")
+
+    wanted = Step(times=10.0, values=SPEED + SIZE, initial_value=SPEED, unit="m/s").y.named("wanted")
+    return Diagram("car", car(cruise(wanted, car.speed)))
+
+
 PROJECT = Project(
     asked={
         "loops": {"force_wanted": {"phase_margin_deg": 60, "ms": 1.4, "delay_margin_s": 1.5}},
         "step": [{"input": "wanted", "output": "speed", "size": SIZE, "overshoot": 0.2, "settling": 50.0}],
     },
     by_hand=by_hand,
+    diagram=diagram,
+    step_at=10.0,
+    duration=250.0,
+    more_delay={"delay": 30},
     breaking={"ki": 500.0},
     harmless={"mass": 1900.0},
     broken=(
-        "force_wanted: phase_margin_deg", "force_wanted: ms", "force_wanted: delay_margin_s",
+        "force_wanted: phase_margin_deg",
+        "force_wanted: ms",
+        "force_wanted: delay_margin_s",
         "wanted to speed: overshoot",
     ),
-)  # fmt: skip
+)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_verdict_of_a_cruise_control_by_hand(variant):
     check_by_hand(PROJECT, variant)
+
+
+@reports(dict.fromkeys(VARIANTS, "a free integrator keeps the verdict on stability open"))
+def test_the_report_has_the_verdict_of_a_cruise_control(variant):
+    check_report(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_run_of_a_cruise_control_is_that_by_hand(variant):
+    check_run(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_more_delay_ends_the_stability_of_a_cruise_control_only_where_the_margin_is_broken(variant):
+    check_stability(PROJECT, variant)

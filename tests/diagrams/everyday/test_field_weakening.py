@@ -19,8 +19,10 @@ Harmless: a load of 8 N m at 275 rad/s: the damping by the table's slope grows, 
 import numpy as np
 import pytest
 
+from loopwright.blocks import PID, Constant, Integrator, Lookup1D, Product, Step, TransferFunction
+from loopwright.diagrams import Diagram, subsystem
 from support.by_hand import SampledLoop, run, step_numbers
-from support.everyday import VARIANTS, Project, check_by_hand, of
+from support.everyday import VARIANTS, Project, check_by_hand, check_report, check_run, of, reports
 
 INERTIA, VISCOUS, LAG, T, SIZE = 0.05, 0.01, 2e-3, 1e-3, 2.0
 KP, KI, LARGEST = 2.5, 25.0, 40.0
@@ -53,12 +55,32 @@ def by_hand(speed=275.0, load=5.0):
     return margins | of("wanted to speed", step_numbers(t, x[:, 1], SIZE))
 
 
+def diagram(speed=275.0, load=5.0):
+    turning = Integrator(name="turning")
+    current = TransferFunction(numerator=[1.0], denominator=[LAG, 1.0], name="current")
+    constant = Lookup1D(breakpoints=SPEEDS, values=CONSTANTS, name="constant")
+    speed_now = turning.y.named("speed")
+    torque = Product(name="torque")(constant(speed_now), current.y)
+
+    @subsystem(sample_time=T)
+    def controller(wanted, speed):
+        return PID(kp=KP, ki=KI, lower=-LARGEST, upper=LARGEST)(wanted, speed).named("current_wanted")
+
+    wanted = Step(times=[0.0, 6.0], values=[speed, speed + SIZE]).y.named("wanted")
+    rest = torque - VISCOUS * speed_now - Constant(value=load, name="load")
+    return Diagram("spindle", turning((1 / INERTIA) * rest), current(controller(wanted, speed_now)))
+
+
 PROJECT = Project(
     asked={
         "loops": {"current_wanted": {"phase_margin_deg": 50, "ms": 1.3, "bandwidth": 36}},
         "step": [{"input": "wanted", "output": "speed", "size": SIZE, "overshoot": 0.3, "settling": 0.6}],
     },
     by_hand=by_hand,
+    diagram=diagram,
+    at=5.0,
+    step_at=6.0,
+    duration=2.0,
     breaking={"speed": 470.0},
     harmless={"load": 8.0},
     broken=("current_wanted: bandwidth",),
@@ -69,3 +91,14 @@ PROJECT = Project(
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_verdict_of_a_motor_in_field_weakening_by_hand(variant):
     check_by_hand(PROJECT, variant)
+
+
+@reports()
+def test_the_report_has_the_verdict_of_a_motor_in_field_weakening(variant):
+    check_report(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_run_of_a_motor_in_field_weakening_is_that_by_hand(variant):
+    check_run(PROJECT, variant)

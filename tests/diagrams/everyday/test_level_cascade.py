@@ -20,8 +20,10 @@ Harmless: a tank of 2 m²: 66°, 15 % overshoot, 225 s.
 import numpy as np
 import pytest
 
+from loopwright.blocks import PID, Block, Input, State, Step, parameter
+from loopwright.diagrams import Diagram, subsystem
 from support.by_hand import SampledLoop, run, step_numbers
-from support.everyday import VARIANTS, Project, check_by_hand, of
+from support.everyday import VARIANTS, Project, check_by_hand, check_report, check_run, check_stability, of, reports
 
 OUTLET, LEVEL, VALVE, LAG, T = 0.01, 1.0, 2e-4, 2.0, 0.5
 FLOW, KP, SIZE = (5000.0, 2500.0), 0.075, 0.1
@@ -61,6 +63,36 @@ def by_hand(area=1.5, integral_time=80.0):
     )
 
 
+class Tank(Block):
+    """Tank behind a valve: 2 s q' = k u - q and A h' = q - c √h."""
+
+    area: float = parameter(unit="m2", above=0.0)
+    opening = Input(description="percent of the valve")
+    flow = State(start=OUTLET * LEVEL**0.5, unit="m3/s", output=True)
+    level = State(start=LEVEL, unit="m", output=True)
+
+    def derivative(self, t, x, u):
+        return (VALVE * u.opening - x.flow) / LAG, (x.flow - OUTLET * np.sqrt(x.level)) / self.area
+
+
+def diagram(area=1.5, integral_time=80.0, delay=0):
+    tank = Tank(area=area, name="tank")
+    rest = OUTLET * LEVEL**0.5
+
+    @subsystem(sample_time=5.0, delay=delay)
+    def level_loop(wanted, level):
+        pi = PID(kp=KP, ki=KP / integral_time, lower=0.0, upper=0.02, initial_output=rest)
+        return pi(wanted, level).named("flow_wanted")
+
+    @subsystem(sample_time=T)
+    def flow_loop(wanted, flow):
+        pi = PID(kp=FLOW[0], ki=FLOW[1], lower=0.0, upper=100.0, initial_output=rest / VALVE)
+        return pi(wanted, flow).named("valve")
+
+    wanted = Step(times=50.0, values=LEVEL + SIZE, initial_value=LEVEL, unit="m").y.named("wanted")
+    return Diagram("level", tank(flow_loop(level_loop(wanted, tank.level), tank.flow)))
+
+
 PROJECT = Project(
     asked={
         "loops": {
@@ -70,6 +102,10 @@ PROJECT = Project(
         "step": [{"input": "wanted", "output": "level", "size": SIZE, "overshoot": 0.3, "settling": 350.0}],
     },
     by_hand=by_hand,
+    diagram=diagram,
+    step_at=50.0,
+    duration=1500.0,
+    more_delay={"delay": 2},
     breaking={"integral_time": 15.0},
     harmless={"area": 2.0},
     broken=("flow_wanted: phase_margin_deg", "flow_wanted: ms", "wanted to level: overshoot"),
@@ -80,3 +116,20 @@ PROJECT = Project(
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_verdict_of_a_level_cascade_by_hand(variant):
     check_by_hand(PROJECT, variant)
+
+
+@reports()
+def test_the_report_has_the_verdict_of_a_level_cascade(variant):
+    check_report(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_run_of_a_level_cascade_is_that_by_hand(variant):
+    check_run(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_more_delay_ends_the_stability_of_a_level_cascade_only_where_the_margin_is_broken(variant):
+    check_stability(PROJECT, variant)

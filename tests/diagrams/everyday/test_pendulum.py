@@ -20,8 +20,10 @@ import control
 import numpy as np
 import pytest
 
+from loopwright.blocks import Block, Gain, Input, State, Step, parameter
+from loopwright.diagrams import Diagram, subsystem
 from support.by_hand import SampledLoop, discretize, run, step_numbers
-from support.everyday import VARIANTS, Project, check_by_hand, of
+from support.everyday import VARIANTS, Project, check_by_hand, check_report, check_run, check_stability, of, reports
 
 CART, ARM, TURNING, ROLLING, G, T, SIZE = 0.5, 0.3, 0.006, 0.1, 9.81, 0.01, 0.1
 C = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
@@ -32,12 +34,14 @@ def linear(mass):
     """Return the matrices of position, speed, angle from upright and its rate."""
     inertia = TURNING + mass * ARM**2
     p = TURNING * (CART + mass) + CART * mass * ARM**2
-    A = np.array([
-        [0.0, 1.0, 0.0, 0.0],
-        [0.0, -inertia * ROLLING / p, (mass * ARM) ** 2 * G / p, 0.0],
-        [0.0, 0.0, 0.0, 1.0],
-        [0.0, -mass * ARM * ROLLING / p, mass * G * ARM * (CART + mass) / p, 0.0],
-    ])  # fmt: skip
+    A = np.array(
+        [
+            [0.0, 1.0, 0.0, 0.0],
+            [0.0, -inertia * ROLLING / p, (mass * ARM) ** 2 * G / p, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+            [0.0, -mass * ARM * ROLLING / p, mass * G * ARM * (CART + mass) / p, 0.0],
+        ]
+    )
     return A, np.array([0.0, inertia / p, 0.0, mass * ARM / p])
 
 
@@ -81,12 +85,61 @@ def by_hand(mass=0.2, delay=0):
     return of("force", loop.margins("force")) | of("wanted to position", step_numbers(t, x[:, 0], SIZE))
 
 
+class Pendulum(Block):
+    """Pendulum on a cart; the angle is zero upright."""
+
+    mass: float = parameter(unit="kg", above=0.0)
+    force = Input(unit="N")
+    position = State(unit="m", output=True)
+    speed = State(unit="m/s")
+    angle = State(unit="rad", output=True)
+    rate = State(unit="rad/s")
+
+    def derivative(self, t, x, u):
+        s, c = np.sin(x.angle), np.cos(x.angle)
+        arm, inertia = self.mass * ARM, TURNING + self.mass * ARM**2
+        pushed = u.force - ROLLING * x.speed - arm * x.rate**2 * s
+        p = (CART + self.mass) * inertia - (arm * c) ** 2
+        a = (inertia * pushed + arm**2 * G * c * s) / p
+        return x.speed, a, x.rate, (arm * c * pushed + (CART + self.mass) * arm * G * s) / p
+
+
+class Observer(Block):
+    """Stationary Kalman filter of the linear pendulum: x̂[k + 1] = A x̂ + B u + L (y - C x̂)."""
+
+    force = Input(unit="N")
+    position = Input(unit="m")
+    angle = Input(unit="rad")
+    estimate = State(shape=(4,), start=0.0, output=True)
+
+    def update(self, t, x, u):
+        news = np.stack([u.position - x.estimate[0], u.angle - x.estimate[2]])
+        return AD @ x.estimate + BD[:, 0] * u.force + L @ news
+
+
+def diagram(mass=0.2, delay=0):
+    pendulum, observer = Pendulum(mass=mass, name="pendulum"), Observer(name="observer")
+
+    @subsystem(sample_time=T, delay=delay)
+    def controller(wanted, position, angle):
+        force = (K[0] * wanted - Gain(gain=K[None, :], name="feedback")(observer.estimate)[0]).named("force")
+        observer(force=force, position=position, angle=angle)
+        return force
+
+    wanted = Step(times=0.5, values=SIZE, unit="m").y.named("wanted")
+    return Diagram("upright", pendulum(controller(wanted, pendulum.position, pendulum.angle)))
+
+
 PROJECT = Project(
     asked={
         "loops": {"force": {"phase_margin_deg": 30, "gain_margin_high": 2.2, "gain_margin_low": 0.6, "ms": 2.0}},
         "step": [{"input": "wanted", "output": "position", "size": SIZE, "overshoot": 0.1, "settling": 3.0}],
     },
     by_hand=by_hand,
+    diagram=diagram,
+    step_at=0.5,
+    duration=8.0,
+    more_delay={"delay": 3},
     breaking={"delay": 3},
     harmless={"mass": 0.25},
     broken=("force: phase_margin_deg", "force: gain_margin_high", "force: ms"),
@@ -97,3 +150,22 @@ PROJECT = Project(
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_verdict_of_a_pendulum_by_hand(variant):
     check_by_hand(PROJECT, variant)
+
+
+@reports(
+    {"as it is": "the cut takes the observer's input along", "harmless": "the cut takes the observer's input along"}
+)
+def test_the_report_has_the_verdict_of_a_pendulum(variant):
+    check_report(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_run_of_a_pendulum_is_that_by_hand(variant):
+    check_run(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_more_delay_ends_the_stability_of_a_pendulum_only_where_the_margin_is_broken(variant):
+    check_stability(PROJECT, variant)

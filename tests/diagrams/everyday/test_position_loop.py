@@ -16,8 +16,10 @@ Harmless: kv = 45 1/s: 75°, M_s 1.19.
 import numpy as np
 import pytest
 
+from loopwright.blocks import PID, Integrator, Step, TransferFunction
+from loopwright.diagrams import Diagram, subsystem
 from support.by_hand import SampledLoop, run, step_numbers
-from support.everyday import VARIANTS, Project, check_by_hand, of
+from support.everyday import VARIANTS, Project, check_by_hand, check_report, check_run, of, reports
 
 LAG, T, SIZE = 5e-3, 2e-3, 0.02
 
@@ -34,12 +36,28 @@ def by_hand(kv=30.0):
     return margins | of("wanted to position", step_numbers(t, x[:, 1], SIZE))
 
 
+def diagram(kv=30.0):
+    drive = TransferFunction(numerator=[1.0], denominator=[LAG, 1.0], name="drive")
+    axis = Integrator(name="axis")
+    position = axis.y.named("position")
+
+    @subsystem(sample_time=T)
+    def controller(wanted, position):
+        return PID(kp=kv)(wanted, position).named("velocity_wanted")
+
+    wanted = Step(times=0.1, values=SIZE).y.named("wanted")
+    return Diagram("axis", axis(drive(controller(wanted, position))))
+
+
 PROJECT = Project(
     asked={
         "loops": {"velocity_wanted": {"phase_margin_deg": 60, "gain_margin_high": 6, "ms": 1.4, "bandwidth": 20}},
         "step": [{"input": "wanted", "output": "position", "size": SIZE, "overshoot": 0.02, "settling": 0.25}],
     },
     by_hand=by_hand,
+    diagram=diagram,
+    step_at=0.1,
+    duration=2.0,
     breaking={"kv": 10.0},
     harmless={"kv": 45.0},
     broken=("velocity_wanted: bandwidth", "wanted to position: settling"),
@@ -50,3 +68,14 @@ PROJECT = Project(
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_verdict_of_a_p_position_loop_by_hand(variant):
     check_by_hand(PROJECT, variant)
+
+
+@reports(quick=True)
+def test_the_report_has_the_verdict_of_a_p_position_loop(variant):
+    check_report(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_run_of_a_p_position_loop_is_that_by_hand(variant):
+    check_run(PROJECT, variant)

@@ -21,8 +21,10 @@ Harmless: a table of 24 kg: ζ = 0.73, the same margins within a few degrees.
 import numpy as np
 import pytest
 
+from loopwright.blocks import PID, Block, Input, State, Step, parameter
+from loopwright.diagrams import Diagram, subsystem
 from support.by_hand import SampledLoop, run, step_numbers
-from support.everyday import VARIANTS, Project, check_by_hand, of
+from support.everyday import VARIANTS, Project, check_by_hand, check_report, check_run, of, reports
 
 FRICTION, COULOMB, CREEP = 40.0, 15.0, 0.02
 T, FILTER, SIZE = 1e-3, 1e-3, 0.05
@@ -50,12 +52,39 @@ def by_hand(mass=20.0, kp=18e3, kd=920.0):
     return of("force", loop.margins("force")) | of("wanted to position", step_numbers(t, x[:, 0], SIZE))
 
 
+class Axis(Block):
+    """Linear axis with friction: m v' = F - d v - F_c tanh(v / w)."""
+
+    mass: float = parameter(unit="kg", above=0.0)
+    force = Input(unit="N")
+    position = State(unit="m", output=True)
+    speed = State(unit="m/s", output=True)
+
+    def derivative(self, t, x, u):
+        friction = FRICTION * x.speed + COULOMB * np.tanh(x.speed / CREEP)
+        return x.speed, (u.force - friction) / self.mass
+
+
+def diagram(mass=20.0, kp=18e3, kd=920.0):
+    axis = Axis(mass=mass, name="axis")
+
+    @subsystem(sample_time=T)
+    def controller(wanted, position):
+        return PID(kp=kp, kd=kd, filter_time=FILTER, name="pd")(wanted, position).named("force")
+
+    wanted = Step(times=0.1, values=SIZE, unit="m").y.named("wanted")
+    return Diagram("servo", axis(controller(wanted, axis.position)))
+
+
 PROJECT = Project(
     asked={
         "loops": {"force": {"phase_margin_deg": 50, "gain_margin_high": 4, "ms": 1.5}},
         "step": [{"input": "wanted", "output": "position", "size": SIZE, "overshoot": 0.1, "settling": 0.7}],
     },
     by_hand=by_hand,
+    diagram=diagram,
+    step_at=0.1,
+    duration=1.5,
     breaking={"kd": 120.0},
     harmless={"mass": 24.0},
     broken=("wanted to position: overshoot",),
@@ -66,3 +95,14 @@ PROJECT = Project(
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_verdict_of_a_servo_with_friction_by_hand(variant):
     check_by_hand(PROJECT, variant)
+
+
+@reports()
+def test_the_report_has_the_verdict_of_a_servo_with_friction(variant):
+    check_report(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_run_of_a_servo_with_friction_is_that_by_hand(variant):
+    check_run(PROJECT, variant)

@@ -19,8 +19,10 @@ Harmless: a camera below the hub, J = (0.014, 0.014, 0.022): 54°, 1.02.
 import numpy as np
 import pytest
 
+from loopwright.blocks import Block, Gain, Input, State, Step, parameter
+from loopwright.diagrams import Diagram, subsystem
 from support.by_hand import SampledLoop, run, step_numbers
-from support.everyday import VARIANTS, Project, check_by_hand, of
+from support.everyday import VARIANTS, Project, check_by_hand, check_report, check_run, check_stability, of, reports
 
 T, SIZE = 2.5e-3, 0.2
 RATE_GAINS, ANGLE_GAINS = (0.18, 0.18, 0.176), (4.0, 4.0, 2.5)
@@ -48,12 +50,48 @@ def by_hand(inertia=0.012, lag=0.025):
     } | of("wanted[1] to angles[1]", step_numbers(t, x[:, 2], SIZE))
 
 
+class Quadrotor(Block):
+    """Attitude of a quadrotor: rotors with a lag, Euler's equations, and angles of roll, pitch and yaw."""
+
+    inertia: float = parameter(unit="kg.m2", above=0.0)
+    lag: float = parameter(unit="s", above=0.0)
+    torques_wanted = Input(shape=(3,), unit="N.m")
+    torques = State(shape=(3,), unit="N.m")
+    rates = State(shape=(3,), unit="rad/s", output=True)
+    angles = State(shape=(3,), unit="rad", output=True)
+
+    def derivative(self, t, x, u):
+        J = np.stack([self.inertia, self.inertia, YAW])
+        p, q, r = x.rates[0], x.rates[1], x.rates[2]
+        gyroscopic = np.stack([(J[1] - J[2]) * q * r, (J[2] - J[0]) * r * p, (J[0] - J[1]) * p * q])
+        s, c, tan = np.sin(x.angles[0]), np.cos(x.angles[0]), np.tan(x.angles[1])
+        turning = np.stack([p + (q * s + r * c) * tan, q * c - r * s, (q * s + r * c) / np.cos(x.angles[1])])
+        return (u.torques_wanted - x.torques) / self.lag, (x.torques + gyroscopic) / J, turning
+
+
+def diagram(inertia=0.012, lag=0.025, delay=0):
+    quadrotor = Quadrotor(inertia=inertia, lag=lag, name="quadrotor")
+
+    @subsystem(sample_time=T, delay=delay)
+    def controller(wanted, angles, rates):
+        rates_wanted = Gain(gain=np.array(ANGLE_GAINS), name="angle_gains")(wanted - angles).named("rates_wanted")
+        return Gain(gain=np.array(RATE_GAINS), name="rate_gains")(rates_wanted - rates).named("torques")
+
+    roll = Step(times=0.5, values=SIZE, unit="rad", name="roll")
+    wanted = Gain(gain=np.array([1.0, 0.0, 0.0]), name="roll_only")(roll).named("wanted")
+    return Diagram("hover", quadrotor(controller(wanted, quadrotor.angles, quadrotor.rates)))
+
+
 PROJECT = Project(
     asked={
         "loops": {"torques": {"disk_margin": 0.75}, "rates_wanted": {"disk_margin": 0.7}},
         "step": [{"input": "wanted[1]", "output": "angles[1]", "size": SIZE, "overshoot": 0.1, "settling": 1.2}],
     },
     by_hand=by_hand,
+    diagram=diagram,
+    step_at=0.5,
+    duration=4.0,
+    more_delay={"delay": 20},
     breaking={"lag": 0.08},
     harmless={"inertia": 0.014},
     broken=("torques: disk_margin",),
@@ -64,3 +102,20 @@ PROJECT = Project(
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_verdict_of_a_quadrotor_by_hand(variant):
     check_by_hand(PROJECT, variant)
+
+
+@reports()
+def test_the_report_has_the_verdict_of_a_quadrotor(variant):
+    check_report(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_run_of_a_quadrotor_is_that_by_hand(variant):
+    check_run(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_more_delay_ends_the_stability_of_a_quadrotor_only_where_the_margin_is_broken(variant):
+    check_stability(PROJECT, variant)

@@ -20,8 +20,11 @@ Harmless: a warm winding, R = 1.6 Ω: the crossover falls to 119 rad/s, 63°, ov
 import numpy as np
 import pytest
 
+from loopwright.blocks import PID, Step
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.fmus import Fmu, dc_motor
 from support.by_hand import SampledLoop, run, step_numbers
-from support.everyday import VARIANTS, Project, check_by_hand, of
+from support.everyday import VARIANTS, Project, check_by_hand, check_report, check_run, check_stability, of, reports
 
 INDUCTANCE, CONSTANT, INERTIA, VISCOUS = 2e-3, 0.05, 2e-5, 1e-5
 KP, KI, T, SIZE = 0.0587, 7.87, 1e-3, 5.0
@@ -50,12 +53,28 @@ def by_hand(resistance=1.2, delay=0):
     return of("voltage", loop.margins("voltage")) | of("wanted to speed", step_numbers(t, x[:, 1], SIZE))
 
 
+def diagram(resistance=1.2, delay=0):
+    motor = Fmu(dc_motor.build(), name="motor", start={"resistance": resistance})
+
+    @subsystem(sample_time=T, delay=delay)
+    def controller(wanted, speed):
+        return PID(kp=KP, ki=KI, lower=-24.0, upper=24.0, name="pi")(wanted, speed).named("voltage")
+
+    wanted = Step(times=[0.1, 0.6], values=[100.0, 100.0 + SIZE], unit="rad/s").y.named("wanted")
+    load = Step(times=0.3, values=0.01, unit="N.m", name="load")
+    return Diagram("drive", motor(voltage=controller(wanted, motor.speed), load_torque=load))
+
+
 PROJECT = Project(
     asked={
         "loops": {"voltage": {"phase_margin_deg": 50, "gain_margin_high": 4, "ms": 1.6, "delay_margin_s": 2e-3}},
         "step": [{"input": "wanted", "output": "speed", "size": SIZE, "overshoot": 0.15, "settling": 0.12}],
     },
     by_hand=by_hand,
+    diagram=diagram,
+    step_at=0.6,
+    duration=0.5,
+    more_delay={"delay": 6},
     breaking={"delay": 4},
     harmless={"resistance": 1.6},
     broken=("voltage: phase_margin_deg", "voltage: ms", "voltage: gain_margin_high", "wanted to speed: overshoot"),
@@ -66,3 +85,28 @@ PROJECT = Project(
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_verdict_of_a_speed_drive_by_hand(variant):
     check_by_hand(PROJECT, variant)
+
+
+@reports(dict.fromkeys(VARIANTS, "a free integrator keeps the verdict on stability open"), quick=True)
+def test_the_report_has_the_verdict_of_a_speed_drive(variant):
+    check_report(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="a free integrator keeps the verdict on stability open")
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_report_at_100_rad_per_s_has_the_same_verdict(variant):
+    """The angle grows by 100 rad a second there, which is no motion of anything that is asked about."""
+    check_report(PROJECT, variant, at=0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_run_of_a_speed_drive_is_that_by_hand(variant):
+    check_run(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_more_delay_ends_the_stability_of_a_speed_drive_only_where_the_margin_is_broken(variant):
+    check_stability(PROJECT, variant)

@@ -18,8 +18,10 @@ Harmless: θ = 18 s: 69.4°, gain margin 4.4.
 import numpy as np
 import pytest
 
+from loopwright.blocks import PID, StateSpace, Step, TransportDelay
+from loopwright.diagrams import Diagram
 from support.by_hand import loop_numbers, step_numbers
-from support.everyday import VARIANTS, Project, check_by_hand, of
+from support.everyday import VARIANTS, Project, check_by_hand, check_report, check_run, check_stability, of, reports
 
 GAIN, LAG, KC, TI, SIZE = 2.5, 180.0, 1.44, 180.0, 10.0
 
@@ -42,22 +44,57 @@ def by_hand(dead_time=25.0):
     return of("heating", loop_numbers(L, 1e-4, 1.0)) | of("wanted to temperature", numbers)
 
 
+def diagram(dead_time=25.0, more_dead_time=0.0):
+    oven = StateSpace(A=[[-1 / LAG]], B=[GAIN / LAG], C=[1.0], initial_state=[100.0], name="oven")
+    duct = TransportDelay(delay=dead_time + more_dead_time, initial_value=None, name="duct")
+    temperature = duct.y.named("temperature")
+    wanted = Step(times=100.0, values=120.0 + SIZE, initial_value=120.0).y.named("wanted")
+    control = PID(kp=KC, ki=KC / TI, lower=0.0, upper=100.0, initial_output=40.0, name="control")
+    heating = control(wanted, temperature).named("heating")
+    return Diagram("oven", duct(oven(heating) + 20.0))
+
+
 PROJECT = Project(
     asked={
         "loops": {"heating": {"phase_margin_deg": 50, "gain_margin_high": 2.5, "ms": 1.8, "delay_margin_s": 30.0}},
         "step": [{"input": "wanted", "output": "temperature", "size": SIZE, "overshoot": 0.1, "settling": 250.0}],
     },
     by_hand=by_hand,
+    diagram=diagram,
+    step_at=100.0,
+    duration=1500.0,
+    sampled_every=0.1,
+    more_delay={"more_dead_time": 45.0},
     breaking={"dead_time": 40.0},
     harmless={"dead_time": 18.0},
     broken=(
-        "heating: phase_margin_deg", "heating: gain_margin_high", "heating: ms", "wanted to temperature: overshoot",
+        "heating: phase_margin_deg",
+        "heating: gain_margin_high",
+        "heating: ms",
+        "wanted to temperature: overshoot",
         "wanted to temperature: settling",
     ),
-)  # fmt: skip
+)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_verdict_of_an_oven_with_dead_time_by_hand(variant):
     check_by_hand(PROJECT, variant)
+
+
+@reports(dict.fromkeys(VARIANTS, "a transport delay in continuous time has no linear model"))
+def test_the_report_has_the_verdict_of_an_oven_with_dead_time(variant):
+    check_report(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_run_of_an_oven_with_dead_time_is_that_by_hand(variant):
+    check_run(PROJECT, variant)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_more_delay_ends_the_stability_of_an_oven_with_dead_time_only_where_the_margin_is_broken(variant):
+    check_stability(PROJECT, variant)
