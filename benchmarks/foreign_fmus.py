@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import atexit
+import hashlib
 import json
 import math
 import os
@@ -29,6 +30,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from loopwright.fmus import dc_motor
+from loopwright.fmus.platform import native_platform
 
 STEPS = 200
 CLOSE = 1e-9
@@ -137,6 +139,8 @@ REASONS = (
     ("Roberts", "CoSimulation", "slow with either importer: its own step is 1e-3 s, its default stop time 1e8 s"),
 )
 """Reasons of differences: a pattern for source, file and outcomes, an interface or none, and the reason."""
+FOLDERS = {"x86_64-linux": ("linux64",), "x86_64-windows": ("win64",), "x86_64-darwin": ("darwin64",)}
+"""Folders of libraries in FMI 1.0 and 2.0, for those of FMI 3.0."""
 INTERFACES = {"CoSimulation": "co_simulation", "ModelExchange": "model_exchange"}
 
 
@@ -438,6 +442,27 @@ def short_name(tool: str) -> str:
     return " ".join(kept[:2]) or "not stated"
 
 
+def collect(folder: Path, only: str) -> list[Path]:
+    """Return the FMUs with a library for this machine, each content once for a source: repositories hold copies."""
+    found: dict[tuple[str, str], Path] = {}
+    for file in sorted(path for path in folder.rglob("*.fmu") if only in str(path)):
+        content = hashlib.sha256(file.read_bytes()).hexdigest()
+        if has_library(file):
+            found.setdefault((file.relative_to(folder).parts[0], content), file)
+    return list(found.values())
+
+
+def has_library(file: Path) -> bool:
+    """Whether an archive has a library for this machine; one that can't be read counts, as importers say why."""
+    here = native_platform()
+    folders = tuple(f"binaries/{name}/" for name in (here, *FOLDERS.get(here, ())))
+    try:
+        with zipfile.ZipFile(file) as archive:
+            return any(name.startswith(folders) and not name.endswith("/") for name in archive.namelist())
+    except (OSError, zipfile.BadZipFile):
+        return True
+
+
 def main() -> None:
     """Run all FMUs of a folder, one after the other, and print the counts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -466,7 +491,7 @@ def main() -> None:
         for fmi in (2, 3):
             (given.folder / "loopwright+library").mkdir(exist_ok=True)
             shutil.copy(dc_motor.build(fmi=fmi), given.folder / "loopwright+library" / f"dc_motor{fmi}.fmu")
-    for file in sorted(path for path in given.folder.rglob("*.fmu") if given.only in str(path)):
+    for file in collect(given.folder, given.only):
         source = file.relative_to(given.folder).parts[0].replace("+", "/")
         for row in study(file, given.seconds):
             rows.append({"source": source, "file": file.name.split("__")[-1], "path": str(file), **row})
