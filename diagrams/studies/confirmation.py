@@ -23,7 +23,7 @@ from ...blocks.core import (
 from ..flat import WiredDiagram
 from ..frequency import Confirmation, Margins, Number, Realization, disk_margin, margins, mimo_disk_margin, mu_bound
 from ..linearization import Linearization, find_signal, hold_sources, linearize, loop_of_variant, trim
-from ..measure import frequency_response, step_response
+from ..measure import find_least_sine, frequency_response, step_response
 from .numbers import numbers_of
 from .parameters import changed_entry
 
@@ -131,8 +131,7 @@ def confirm_case(
     if still is not diagram:
         diagram, model = still, linearize(still, model.point, plants=model.plants, stairs=model.stairs)
     if case.quantity:
-        size = amplitude if amplitude is not None else _size_at(model, case.loop[0])
-        return _measure_margin(diagram, model, case, size)
+        return _measure_margin(diagram, model, case, amplitude)
     return _measure_growth(diagram, model, case, amplitude)
 
 
@@ -142,10 +141,18 @@ def _size_at(model: Linearization, wire: str) -> float:
     return AMPLITUDE * (1.0 + float(np.max(np.abs(model.point.values.get(path, 0.0)), initial=0.0)))
 
 
-def _measure_margin(diagram: WiredDiagram, model: Linearization, case: StudyCase, amplitude: float) -> RunConfirmation:
-    """Measure L at the frequency that decides a margin, and read the margin from it."""
+def _measure_margin(
+    diagram: WiredDiagram, model: Linearization, case: StudyCase, amplitude: float | None
+) -> RunConfirmation:
+    """Measure L at the frequency that decides a margin, and read the margin from it.
+
+    A sine that is not given is small, and large beside the quanta of converters and encoders.
+    """
     L, wire = model.loop(*case.loop), case.loop[0]
     omega = _deciding_frequency(L, case.quantity, case.value, diagram.name)
+    if amplitude is None:
+        least = find_least_sine(diagram, model.point, wire, L, np.array([omega]))
+        amplitude = max(_size_at(model, wire), 0.0 if least is None else least[0])
     response = frequency_response(diagram, wire, [omega], amplitude=amplitude, at=model.point)
     measured = np.asarray(response.L.frdata)[:, :, 0]
     here = float(response.omega[0])

@@ -9,7 +9,7 @@ import numpy as np
 from ....blocks.core import LoopwrightError, PeriodicLoopError
 from ...frequency import Confirmation, Number
 from ...linearization import Linearization
-from ...measure import FrequencyResponse, frequency_response
+from ...measure import LEAST_SINE, FrequencyResponse, find_least_sine, frequency_response
 from ...results import PointOrigin
 from .. import figures
 from ..case import Case, InjectionPlan
@@ -64,6 +64,11 @@ def injected(case: Case) -> Section | None:
                 case.tell(f"injection at {wire}, {v.title}")
                 L = v.loop(wire)  # a wire without a loop at one rate needs no measurement
                 plan = case.excitation(v, wire)
+                least = find_least_sine(plan.variant.diagram, plan.variant.point, wire, L, plan.frequencies)
+                if least is not None and least[0] > plan.amplitude:
+                    said = {"usual": plan.amplitude, "block": least[1].converter, "many": LEAST_SINE}
+                    plan = plan._replace(amplitude=least[0])
+                    text.append(TEXTS.line("enlarged", variant=v.title, wire=wire, amplitude=plan.amplitude, **said))
                 found, model = _measured(plan, wire), plan.variant.model
                 if plan.left_out:
                     shortened = plan
@@ -80,6 +85,10 @@ def injected(case: Case) -> Section | None:
             if not np.isfinite(own):
                 text.append(TEXTS.line("moved", variant=v.title, wire=wire, moved=found.moved))
                 continue
+            if own > REFUTED and least is not None:
+                text.append(
+                    TEXTS.line("no_range", variant=v.title, wire=wire, uncertainty=own, block=least[1].converter)
+                )
             if worst - 10 * own > REFUTED:
                 text.append(TEXTS.line("refuted", variant=v.title, wire=wire, deviation=worst))
             low, high = float(found.omega[0]), float(found.omega[-1])

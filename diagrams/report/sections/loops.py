@@ -27,7 +27,7 @@ from ...frequency import (
     periodic_margins,
     with_findings,
 )
-from ...linearization import linearize
+from ...linearization import MeanSlope, linearize
 from .. import figures
 from ..case import Case
 from ..pages import Plot, Section, Table, Texts
@@ -37,6 +37,8 @@ from ..wires import blocks_on_loops
 from .poles import list_poles
 
 TEXTS = Texts(__package__, "loops")
+STEEPEST = 4.0 / np.pi
+"""Largest gain of a quantizer, by its describing function: at an amplitude of 1/√2 of its step."""
 ROWS: Mapping[str, str] = {
     "gain_margin_low": "gain margin, low",
     "gain_margin_high": "gain margin, high",
@@ -127,6 +129,9 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
         designs += [at] if v.is_design or v.is_actual else []
         own[v, cut] = with_findings(_numbers(m), m.findings)
         numbers |= {f"{at}.{name}": number for name, number in own[v, cut].items()}
+        low, high = m.gain_margin_low.value, m.gain_margin_high.value
+        if (high < STEEPEST or low > 0.0) and any(isinstance(f, MeanSlope) for f in m.findings):
+            notes.append(TEXTS.line("limit_cycle", variant=title, high=high if high < STEEPEST else 0.0, low=low))
         if m.hidden_unstable:
             shown = _poles(m.hidden_unstable, L.dt)
             notes.append(TEXTS.line("hidden_unstable", variant=title, poles=shown))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,19 @@ from ....blocks.core import LoopwrightError, PeriodicLoopError
 from ...flat import WiredDiagram
 from ...frequency import Confirmation, Number, Realization
 from ...linearization import find_signal
-from ...measure import StepResponse, is_at_rest, measure_step, step_response
+from ...measure import (
+    LEAST,
+    Converter,
+    Quantum,
+    StepResponse,
+    columns_of,
+    find_converters,
+    find_least_step,
+    is_at_rest,
+    measure_step,
+    remaining_oscillation,
+    step_response,
+)
 from ...requirements import StepLimits
 from .. import figures
 from ..case import Case
@@ -81,6 +93,7 @@ def steps(case: Case) -> Section | None:
     numbers: dict[str, Number] = {}
     rows: list[tuple[Any, ...]] = []
     effort: list[tuple[Any, ...]] = []
+    resting: list[tuple[Any, ...]] = []
     text: list[str] = []
     found: dict[StepTest, dict[str, StepResponse]] = {}
     for v in case.judged():
@@ -97,7 +110,7 @@ def steps(case: Case) -> Section | None:
                 continue
             if ran is None:
                 continue
-            got, slowest = ran
+            got, slowest, quantized = ran
             where = f"{test.key}.{v.key}"
             own = _numbers(got, test, v, slowest)
             numbers |= {f"{where}.{name}": number for name, number in own.items()}
@@ -113,6 +126,10 @@ def steps(case: Case) -> Section | None:
                 at_first = Number(before, unit, 1e-9 * abs(before), "the run before the step", given=True)
                 effort.append((_said(test), v.title, name, at_first, numbers[f"{where}.{key}"]))
             text += [TEXTS.line("saturated", variant=v.title, wire=test.wire, blocks=saturated)] if saturated else []
+            text += _said_of_quanta(v, test, got, quantized, saturated)
+            for name, number in quantized.oscillations.items():
+                numbers[f"{where}.{name.replace('.', '_')}.oscillation"] = number
+                resting.append((_said(test), v.title, name, number))
             if got.prediction is None:
                 text.append(TEXTS.line("unpredicted", variant=v.title, wire=test.wire))
             if not own["settled"].value:
@@ -132,6 +149,16 @@ def steps(case: Case) -> Section | None:
                 terms={"before": "before_step"},
             )
         )
+    if resting:
+        tables.append(
+            Table(
+                "Oscillation at rest",
+                ("after a step at", "variant", "converter", "amplitude"),
+                tuple(resting),
+                terms={"amplitude": "oscillation"},
+            )
+        )
+        text.insert(0, TEXTS.line("resting"))
     plots = [_plot(case, test, curves) for test, curves in found.items()]
     overview = tuple(plot for test, curves in found.items() for plot in _overview(case, test, curves))
     whole = (*TEXTS.paragraphs("responses"), *dict.fromkeys(text))
@@ -142,8 +169,67 @@ def _said(test: StepTest) -> str:
     return f"{test.wire} → {test.output}" if test.output else test.wire
 
 
-def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | None] | None:
-    """Return a response and the rate of its slowest mode in 1/s, None if it has none.
+@dataclass(frozen=True)
+class Quantized:
+    """What the converters and encoders of a diagram have to do with a step.
+
+    Attributes
+    ----------
+    least : float
+        Height of the step that moves the answer by `LEAST` quanta; 0 without converters.
+    quantum : Quantum, optional
+        The quantum of the answer.
+    usual : float
+        Height that the step would have without converters.
+    oscillations : mapping of str to Number
+        By converter, what is left of its input's motion at the end of the record, in quanta.
+    """
+
+    least: float = 0.0
+    quantum: Quantum | None = None
+    usual: float = 0.0
+    oscillations: Mapping[str, Number] = field(default_factory=dict)
+
+
+def _said_of_quanta(
+    v: Variant, test: StepTest, got: StepResponse, quantized: Quantized, saturated: list[str]
+) -> Iterator[str]:
+    """Yield what quanta do to a step: it was made larger, is small beside them, or reaches limits ahead of them."""
+    least, quantum = quantized.least, quantized.quantum
+    if quantum is None or (abs(got.size) <= quantized.usual < math.inf and least <= quantized.usual):
+        return
+    said = {"variant": v.title, "wire": test.wire, "size": got.size, "block": quantum.converter, "many": LEAST}
+    if abs(got.size) < (1.0 - 1e-9) * least:
+        yield TEXTS.line("coarse", **said, quanta=LEAST * abs(got.size) / least, least=least)
+    elif saturated:
+        yield TEXTS.line("no_range", **said, blocks=saturated)
+    else:
+        yield TEXTS.line("enlarged", **said, usual=quantized.usual)
+
+
+def _without_converters(
+    got: StepResponse, converters: list[Converter], v: Variant, kept: int
+) -> tuple[StepResponse, dict[str, Number]]:
+    """Return a response without the last signals, which feed converters, and what is left of these at its end."""
+    flat = v.diagram.flatten_like(v.point)
+    names, found = got.outputs[kept:], dict[str, Number]()
+    for converter in converters if got.prediction is not None else ():
+        columns = [kept + i for i in columns_of(names, converter, flat)]
+        assert got.prediction is not None
+        left = got.y[:, columns] - got.prediction[:, [1 + i for i in columns]]
+        amplitude = remaining_oscillation(left, converter.size)
+        how = "the nonlinear co-simulation at the end of the step's record, less the linear model's motion"
+        found[converter.name] = Number(amplitude, "quanta", TICK_ERROR * (1.0 + amplitude), how)
+
+    def first(values: Any) -> Any:
+        return None if values is None else values[..., : 1 + kept]
+
+    ends = {name: first(getattr(got, name)) for name in ("prediction", "final", "later", "between", "steady")}
+    return replace(got, outputs=got.outputs[:kept], y=got.y[:, :kept], before=got.before[:kept], **ends), found
+
+
+def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | None, Quantized] | None:
+    """Return a response, the rate of its slowest mode in 1/s, None if it has none, and what converters do to it.
 
     None at a wire with several entries, which has no single step.
     """
@@ -168,18 +254,28 @@ def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | 
         length = float(np.clip(length, SAMPLES[0] * dt, SAMPLES[1] * dt))
     if limits is not None and limits.length is not None:
         length = limits.length
-    size = SIZE * plan.amplitude if limits is None or limits.size is None else limits.size
+    diagram, point, usual = plan.variant.diagram, plan.variant.point, SIZE * plan.amplitude
+    least = find_least_step(diagram, point, test.wire, test.output or test.wire, length)
+    height, quantum = (0.0, None) if least is None else least
+    size = max(usual, height) if limits is None or limits.size is None else limits.size
     outputs = [*([test.output] if test.output else []), *_commands(v.diagram, test.wire), *_excesses(v.diagram)]
-    got = step_response(
-        plan.variant.diagram,
-        test.wire,
-        size=size,
-        length=length,
-        at=plan.variant.point,
-        outputs=outputs,
-        stairs=v.stairs,
-    )
-    return got, slowest
+    converters = find_converters(v.diagram.flatten_like(v.point))
+    fed = list(dict.fromkeys(converter.signal for converter in converters))
+
+    def respond(size: float) -> StepResponse:
+        return step_response(
+            diagram, test.wire, size=size, length=length, at=point, outputs=[*outputs, *fed], stairs=v.stairs
+        )
+
+    try:
+        got = respond(size)
+    except LoopwrightError:
+        if size <= usual or size != height:
+            raise
+        got = respond(usual)  # the diagram's range is smaller than the quanta ask for
+    kept = sum(len(find_signal(diagram.flatten_like(point), name).labels) for name in outputs)
+    got, left = _without_converters(got, converters, plan.variant, kept)
+    return got, slowest, Quantized(height, quantum, usual if limits is None or limits.size is None else 0.0, left)
 
 
 def _poles(v: Variant, test: StepTest) -> np.ndarray | None:

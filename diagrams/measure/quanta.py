@@ -1,0 +1,173 @@
+"""Quanta of a diagram's converters and encoders: test signals that are large beside them, and what is left at rest.
+
+A linear model has the mean slope of their stairs, which a running diagram shows only for motions of many quanta. The
+quantum of a signal is its largest change where one converter's input changes by one quantum for good, with all loops
+closed. A velocity by differences of an encoder, say, changes by one quantum in a sample time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...blocks.core import explain_calls
+from ..flat import FlatDiagram, WiredDiagram
+from ..linearization import Linearization, find_signal, linearize
+from ..results import OperatingPoint
+from ..wiring import join
+from .step_response import predict
+
+if TYPE_CHECKING:
+    from ..frequency import LinearSystem
+
+LEAST = 400.0
+"""Quanta of a signal that a test signal moves it by at least: one of them is a quarter of a percent."""
+SAMPLES = 2000
+"""Samples at most over which a signal's quantum is looked for."""
+LEAST_SINE = 100.0
+"""Quanta of a signal that a sine moves it by at least: whole periods are averaged."""
+PERIODS = 3.0
+"""Periods of the lowest frequency over which a signal's quantum is looked for."""
+TAIL = 0.2
+"""Share of a record, at its end, in which a diagram counts as at rest."""
+
+
+@explain_calls
+@dataclass(frozen=True)
+class Converter:
+    """An input that its block follows in steps.
+
+    Attributes
+    ----------
+    block, source : str
+        Path of the block, and its input.
+    size : ndarray
+        Size of the steps, one for each entry of the input.
+    signal : str
+        Port that feeds the input.
+    entries : tuple of int
+        Entries of that port that reach the input.
+    """
+
+    block: str
+    source: str
+    size: np.ndarray
+    signal: str
+    entries: tuple[int, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the input."""
+        return join(self.block, self.source)
+
+
+@explain_calls
+@dataclass(frozen=True)
+class Quantum:
+    """Largest change of a signal by one step of one converter.
+
+    Attributes
+    ----------
+    value : float
+        The change, in the signal's unit.
+    converter : str
+        Name of the converter's input.
+    """
+
+    value: float
+    converter: str
+
+
+def find_converters(flat: FlatDiagram) -> list[Converter]:
+    """Return the inputs with quanta that are wired, by path."""
+    found = []
+    for path, block in sorted(flat.table.blocks.items()):
+        for source, parameter in block.quanta.items():
+            wire = flat.table.wires.get((path, source))
+            if wire is None or path not in flat.checked.traced:
+                continue
+            signal = find_signal(flat, join(wire.block, wire.port))
+            whole = np.array(signal.entries).reshape(flat.checked.shapes[signal.port])
+            part = whole if wire.index is None else np.asarray(whole[wire.index])
+            size = np.broadcast_to(np.asarray(getattr(block, parameter), dtype=float), part.shape)
+            found.append(Converter(path, source, np.ravel(size), signal.name, tuple(np.ravel(part).tolist())))
+    return found
+
+
+def find_quantum(diagram: WiredDiagram, point: OperatingPoint, signal: str, length: float) -> Quantum | None:
+    """Return the quantum of a signal with one entry, within a time in s; None where no converter moves it."""
+    converters = find_converters(diagram.flatten_like(point))
+    if not converters:
+        return None
+    model = linearize(diagram, point, inputs=[c.name for c in converters], outputs=[signal])
+    sizes = [(size, c.name) for c in converters for size in c.size]
+    found = [Quantum(float(size * _peak(model, column, length)), name) for column, (size, name) in enumerate(sizes)]
+    largest = max(found, key=lambda quantum: quantum.value)
+    return largest if largest.value > 0.0 else None
+
+
+def find_least_step(
+    diagram: WiredDiagram, point: OperatingPoint, wire: str, signal: str, length: float
+) -> tuple[float, Quantum] | None:
+    """Return the height of a step at a wire that moves a signal by `LEAST` quanta, and the quantum.
+
+    None where no converter moves the signal, or the step doesn't.
+    """
+    quantum = find_quantum(diagram, point, signal, length)
+    if quantum is None:
+        return None
+    moved = _peak(linearize(diagram, point, inputs=[wire], outputs=[signal]), 0, length)
+    return (LEAST * quantum.value / moved, quantum) if moved > 0.0 else None
+
+
+def find_least_sine(
+    diagram: WiredDiagram, point: OperatingPoint, wire: str, L: LinearSystem, frequencies: np.ndarray
+) -> tuple[float, Quantum] | None:
+    """Return the amplitude of sines at a wire that move it by `LEAST_SINE` quanta at each frequency, and the quantum.
+
+    Parameters
+    ----------
+    L : control.StateSpace
+        The wire's loop transfer function.
+    frequencies : ndarray
+        Frequencies in rad/s.
+    """
+    quantum = find_quantum(diagram, point, wire, PERIODS * 2.0 * np.pi / float(np.min(frequencies)))
+    if quantum is None:
+        return None
+    points = np.exp(1j * frequencies * L.dt) if L.dt else 1j * frequencies
+    loop = np.array([complex(np.ravel(L(s))[0]) for s in points])
+    moved = float(np.min(np.abs(loop / (1.0 + loop))))
+    return (LEAST_SINE * quantum.value / moved, quantum) if moved > 0.0 else None
+
+
+def _peak(model: Linearization, column: int, length: float) -> float:
+    """Return the largest change of the output by a step of 1 at an input."""
+    count = int(np.clip(length / model.dt, 2, SAMPLES)) if model.dt else SAMPLES
+    one = replace(model, B=model.B[:, [column]], D=model.D[:, [column]], inputs=(model.inputs[column],))
+    rows, _, between = predict(one, np.ones(count + 1), (model.dt or length / count) * np.arange(count + 1))
+    return float(np.max(np.abs(rows)) + np.max(between))
+
+
+def remaining_oscillation(change: np.ndarray, size: np.ndarray) -> float:
+    """Return the largest amplitude, in quanta, of a converter's inputs at the end of a record.
+
+    Parameters
+    ----------
+    change : (N, K) ndarray
+        Entries of the input over the record, less what the linear model has there.
+    size : (K,) ndarray
+        Size of the steps.
+    """
+    tail = change[int((1.0 - TAIL) * len(change)) :]
+    return float(np.max(np.ptp(tail, axis=0) / 2.0 / size, initial=0.0))
+
+
+def columns_of(labels: Iterable[str], converter: Converter, flat: FlatDiagram) -> list[int]:
+    """Return the columns of a converter's entries among recorded labels."""
+    every = find_signal(flat, converter.signal).labels
+    known = list(labels)
+    return [known.index(every[i]) for i in converter.entries]
