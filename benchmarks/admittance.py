@@ -1,6 +1,6 @@
 """Elasticity's cost to the admittance: limits of three robots, confirmed by runs: python benchmarks/admittance.py.
 
-It makes the table and the figure of docs/frequency.md anew: Fig. 3 with the impedances of Table III, sampled at 1 kHz,
+It makes the table and the figure of docs/frequency.md again: Fig. 3 with the impedances of Table III, sampled at 1 kHz,
 around the rigid gantry, the gantry with elastic screws, and the gantry with bristles; ``--figure`` names the file.
 """
 
@@ -18,7 +18,7 @@ from loopwright.fmus import gantry, gantry_elastic, gantry_stiction
 
 PLANTS = {"rigid": gantry, "elastic": gantry_elastic, "bristles": gantry_stiction}
 PUSH = {"rigid": 1e-6, "elastic": 1e-6, "bristles": 1e-8}
-"""Velocity in m/s that sets a robot in motion: slow beside the friction's width, and so little that bristles hold."""
+"""Velocity in m/s that sets a robot in motion: slow next to the friction's width, and so little that bristles hold."""
 TABLE = (0.0, 10.0, 50.0)
 DAMPINGS = np.linspace(0.0, 60.0, 13)
 SIDES = {"par": "along the path", "perp": "across the path"}

@@ -1,9 +1,9 @@
 """Time of a loop's tick, interpreted and compiled: python benchmarks/compiled.py.
 
-The experiments of Fig. 3, everything recorded. A tick is timed on a run that goes on, so that neither the start nor the
-compiler counts; each figure is the smallest of seven, the two forms take turns. The last column says whether all
+The experiments of Fig. 3, everything recorded. A tick is timed on a run that continues, so that neither the start nor
+the compiler counts; each figure is the smallest of seven, the two forms take turns. The last column says whether all
 samples have the same bits. Below: a PI controller at 1 kHz around two lags in continuous time, with solvers that start
-anew at every tick, and its largest error against the exponential of a matrix. Last: large diagrams, whose blocks are
+again at every tick, and its largest error against the exponential of a matrix. Last: large diagrams, whose blocks are
 evaluated kind by kind, with one signal recorded, and the time until their first tick.
 """
 
@@ -102,7 +102,7 @@ def chain_of_gains(n: int) -> Diagram:
 
 
 def pid_loops(n: int) -> Diagram:
-    """Controllers of lags at 100 Hz, beside each other."""
+    """Controllers of lags at 100 Hz, next to each other."""
 
     @subsystem(sample_time=0.01, name="box")
     def box(signal):

@@ -105,7 +105,7 @@ def marked(function: Any, mark: int) -> Any:
 def with_command(
     command: list[str], flags: tuple[str, ...], ending: tuple[str, ...] = ("-lm",)
 ) -> Callable[[Any, Path, int], tuple[Any, int]]:
-    """Return the way through C and a compiler that is a program of its own."""
+    """Return the way through C and a compiler that is its own program."""
 
     def compile_it(function: Any, folder: Path, mark: int) -> tuple[Any, int]:
         generator = ca.CodeGenerator("tick.c")

@@ -1,4 +1,4 @@
-"""Elementary functions of exported FMUs beside the platform's: python benchmarks/elementary.py.
+"""Elementary functions of exported FMUs next to the platform's: python benchmarks/elementary.py.
 
 Nanoseconds of a call in a chain in which each call waits for the one before, as in an integrator: the smallest of
 nine chains of 100,000. Both are compiled in one library.

@@ -5,7 +5,7 @@ brake holds by a relay; and, if asked for (python benchmarks/events.py antilock)
 with 12,900 events at 9,675 instants: 6,450 switches of the valve, and as often its torque reaches or leaves zero. With
 "compiled" behind it (python benchmarks/events.py antilock compiled) they run by generated code. Printed are the events
 of a run, the instants at which they fall, and the whole time of the run by its instants: the search, the solver, the
-jumps, the record. Times are the processor's, the smallest of three runs; nothing else should run beside it.
+jumps, the record. Times are the processor's, the smallest of three runs; nothing else should run next to it.
 """
 
 from __future__ import annotations

@@ -79,14 +79,14 @@ def main():
     ball, mass = bouncing_ball.build(out=folder / "ball.fmu"), mass_spring_damper.build(out=folder / "mass.fmu")
     print(f"{'':>34}  {'interpreted':>12}  {'compiled':>12}  ratio")
     for isolate in (False, True):
-        place = "in a process of its own" if isolate else "in this process"
+        place = "in its own process" if isolate else "in this process"
         impacts = [measure_impact(ball, isolate=isolate, form=form)[0] for form in (False, True)]
         ticks, tiers = zip(*(measure_tick(mass, isolate=isolate, form=form) for form in (False, True)), strict=True)
         for name, (before, after) in {"impact": impacts, "tick": ticks}.items():
             shown = f"{1e6 * before:9.1f} µs  {1e6 * after:9.1f} µs  {before / after:5.1f}"
             print(f"{name + ' ' + place:>34}  {shown if tiers[1] == 'compiled' else shown[:12] + '   not compiled'}")
     own, foreign = measure_evaluation(mass)
-    print(f"evaluation in a process of its own: {1e6 * own:.1f} µs, of an FMU of another tool {1e6 * foreign:.1f} µs")
+    print(f"evaluation in its own process: {1e6 * own:.1f} µs, of an FMU of another tool {1e6 * foreign:.1f} µs")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """FMUs of other tools, run by Loopwright and by FMPy: python benchmarks/foreign_fmus.py FOLDER --page PAGE.md.
 
-FOLDER has one folder for each source of FMUs; without one, two FMUs of the library stand in. Each run has a process of
+FOLDER has one folder for each source of FMUs; without one, two FMUs of the library are in. Each run has a process of
 its own, an empty working folder and a time limit. Both importers take the FMU's default stop time and step, at most
 `STEPS` steps, and its start values; inputs without one are 0. ``--table`` has a row for each FMU and interface that
 differ. ``--page`` writes counts, and the differences by their reasons (`REASONS`), between two marks of a page.
@@ -41,7 +41,7 @@ REASONS = (
         "rollback-",
         "",
         (
-            "it wants its state of before restored before a shorter step; Loopwright goes on from its "
+            "it wants its state of before restored before a shorter step; Loopwright continues from its "
             "`lastSuccessfulTime`"
         ),
     ),
@@ -280,7 +280,7 @@ def one(tool: str, interface: str, file: str, out: str) -> None:
 
 
 def outcome(tool: str, interface: str, file: Path, seconds: float) -> tuple[str, dict[str, np.ndarray]]:
-    """Return "runs", or the reason why not, and the signals of one run in a process of its own."""
+    """Return "runs", or the reason why not, and the signals of one run in its own process."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         out = Path(folder, "out.json")
         work = Path(folder, "work")
@@ -484,7 +484,7 @@ def main() -> None:
     if given.results:
         given.folder = Path(os.devnull)
     if given.folder is not None:
-        given.folder = given.folder.resolve()  # each run has a working folder of its own
+        given.folder = given.folder.resolve()  # each run has its own working folder
     else:
         given.folder = Path(tempfile.mkdtemp(prefix="loopwright-"))
         atexit.register(shutil.rmtree, given.folder, ignore_errors=True)

@@ -1,7 +1,7 @@
 """How costs grow: python benchmarks/growth.py [picture.png].
 
 Four panels: a tick and the compilation over the number of blocks (a chain of gains and delays), ticks over the number
-of FMUs (motors, each with a controller of its own, 1 kHz), the throughput of a sweep over threads and vector lanes
+of FMUs (motors, each with its own controller, 1 kHz), the throughput of a sweep over threads and vector lanes
 (experiment C of Fig. 3, 2 s a run), and events over the number of bouncing balls in one diagram. Each in the compiled
 and, where it says so, in the interpreted form; everything is recorded, but in the chain and in the sweep, which keep
 one signal, and one number of each run. Times of one thread are the processor's, those of a sweep are elapsed; the
@@ -50,7 +50,7 @@ class Ball(Block):
 
 
 def motors(count: int) -> Diagram:
-    """Motors as FMUs, each with a sampled controller of its own."""
+    """Motors as FMUs, each with its own sampled controller."""
     file, results = dc_motor.build(), []
     for k in range(count):
         motor = Fmu(file, name=f"motor{k}", ports=("voltage", "speed"))
@@ -116,7 +116,7 @@ def over_lanes() -> dict[str, list[float]]:
 
 
 def over_balls() -> dict[str, list[float]]:
-    """Return events a second by form; the balls bounce at times of their own."""
+    """Return events a second by form; the balls bounce at their own times."""
     found: dict[str, list[float]] = {form: [] for form in FORMS}
     for count in BALLS:
         balls = [Ball(start=1.0 + 0.37 * k / count, name=f"ball{k}") for k in range(count)]

@@ -1,4 +1,4 @@
-"""A run beside C that was written by hand: python benchmarks/handwritten.py [--instructions].
+"""A run next to C that was written by hand: python benchmarks/handwritten.py [--instructions].
 
 Experiment C, 12,000 ticks, from `handwritten/experiment_c.c`, which gcc compiles with -O3 and FMA (zig where there is
 no gcc), and by `simulate`, interpreted, compiled and fused (docs/diagrams.md), everything recorded. All forms take
@@ -51,7 +51,7 @@ with diagram.simulation(**{options}) as simulation:
     simulation.advance({seconds})
     os._exit(0)
 """
-COLUMNS = {  # where the recorded values stand in a row of the hand-written C
+COLUMNS = {  # where the recorded values are in a row of the hand-written C
     "position": (16, 17),
     "velocity": (20, 21),
     "motor_force": (6, 7),

@@ -1,4 +1,4 @@
-"""Cost of isolation: steps, evaluations and starts of an FMU in a process of its own, over those in this process.
+"""Cost of isolation: steps, evaluations and starts of an FMU in its own process, over those in this process.
 
     python benchmarks/isolation.py
 

@@ -3,7 +3,7 @@
 Chains, nested boxes, a net of feedback, sampled and continuous, of 10 to 10,000 blocks. Building is what `Diagram(…)`
 does, preparing is the rest until an interpreted run can start (flattening, functions, start), stepping is a tick, or
 one step of RK4 with the four evaluations of the rates. Compiling is what `compile=True` adds to flattening, with a
-cache that has the library. Steps in C are told with one signal recorded, and with all. Beside them stands the least
+cache that has the library. Steps in C are told with one signal recorded, and with all. Next to them stands the least
 that recording can take: writing as many numbers, once each, to memory that the process has just been given.
 
 A virtual machine may be given its memory by its host at the first touch since it was started, which took 22 ns a number

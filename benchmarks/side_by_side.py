@@ -1,12 +1,12 @@
 """All that is compared with others, in one run and one table: python benchmarks/side_by_side.py [--quick].
 
-The Fig. 3 loop beside C that was written by hand for it; sampled and continuous loops in C beside interpreted ones;
+The Fig. 3 loop next to C that was written by hand for it; sampled and continuous loops in C next to interpreted ones;
 sweeps over threads and vector lanes; an anti-lock brake with 12,900 events; and the tools of others. A row has a time,
 what it is compared with, and the ratio of that one's time to it: above 1, it is faster. The ratio is the median of the
-turns that both took, and beside it stand the smallest and the largest one. Below stand the instructions of a tick of
+turns that both took, and next to it are the smallest and the largest one. Below are the instructions of a tick of
 the Fig. 3 loop, as valgrind counts them, where it is installed.
 
-Each comparison is a benchmark of its own too, which says more: handwritten.py, compiled.py, sweep.py, events.py and
+Each comparison is its own benchmark too, which says more: handwritten.py, compiled.py, sweep.py, events.py and
 peers.py. With --quick there are fewer turns and samples, and instructions are not counted. The program ends with status
 1 if a trajectory or a result differs by more than it may.
 """
@@ -56,7 +56,7 @@ def ratios(others: Sequence[float], own: Sequence[float]) -> list[float]:
 
 
 def beside_c(found: handwritten.Measured) -> Iterator[Row]:
-    """Yield our forms of Fig. 3 beside C by hand."""
+    """Yield our forms of Fig. 3 next to C by hand."""
     for form, times in found.ours.items():
         for name in (next(iter(found.by_hand)), handwritten.EVERYTHING):
             tick = statistics.median(times) / handwritten.TICKS
@@ -64,7 +64,7 @@ def beside_c(found: handwritten.Measured) -> Iterator[Row]:
 
 
 def beside_interpreted(wrong: list[str]) -> Iterator[Row]:
-    """Yield compiled runs beside interpreted ones."""
+    """Yield compiled runs next to interpreted ones."""
     for letter in experiments.EXPERIMENTS:
         slow, fast, same = compiled.measure_experiment(letter)
         if not same:
@@ -90,7 +90,7 @@ def beside_interpreted(wrong: list[str]) -> Iterator[Row]:
 
 
 def sweeps(found: sweep.Measured, samples: int) -> Iterator[Row]:
-    """Yield sweeps beside those in one thread, and a core beside C by hand."""
+    """Yield sweeps next to those in one thread, and a core next to C by hand."""
     for (form, threads), times in found.elapsed.items():
         each = [elapsed / samples for elapsed in times]
         named = f"{form}, {threads} thread{'s' if threads > 1 else ''}"
@@ -102,7 +102,7 @@ def sweeps(found: sweep.Measured, samples: int) -> Iterator[Row]:
 
 
 def brake(turns: int) -> Row:
-    """Return an anti-lock brake, compiled, beside the interpreted run."""
+    """Return an anti-lock brake, compiled, next to the interpreted run."""
     diagram, duration, step = events.antilock()
 
     def run(form: bool) -> float:
@@ -124,7 +124,7 @@ def brake(turns: int) -> Row:
 
 
 def beside_tools() -> Iterator[Row | str]:
-    """Yield Loopwright beside other tools; of one that isn't installed, a text."""
+    """Yield Loopwright in comparison with other tools; of one that isn't installed, a text."""
     exact = peers.solve_exactly()
     for title, tools in peers.ROWS.items():
         rows = peers.measure(exact, tools)
@@ -143,13 +143,13 @@ def all_rows(*, quick: bool, wrong: list[str]) -> Iterator[Row | str]:
         library, program = handwritten.compile_by_hand(Path(folder))
         found = handwritten.measure(library, 5 if quick else handwritten.TURNS)
         if max(found.differences.values()) > handwritten.BOUND:
-            wrong.append("a trajectory beside C by hand")
+            wrong.append("a trajectory next to C by hand")
         yield from beside_c(found)
         yield from beside_interpreted(wrong)
         samples = 50 if quick else 1000
         swept = sweep.measure(samples, told=False)
         if not sweep.is_right(swept.differences):
-            wrong.append("a run of a sweep beside a single one")
+            wrong.append("a run of a sweep next to a single one")
         yield from sweeps(swept, samples)
         yield brake(BRAKE_TURNS)
         yield from beside_tools()
@@ -166,7 +166,7 @@ def main() -> int:
     """Print the table."""
     peers.silence()
     wrong: list[str] = []
-    print(f"{'work':27} {'form':25} {'µs a':>10} {'unit':5}  {'ratio':>8}  {'smallest to largest':20} beside")
+    print(f"{'work':27} {'form':25} {'µs a':>10} {'unit':5}  {'ratio':>8}  {'smallest to largest':20} next to")
     for row in all_rows(quick="--quick" in sys.argv[1:], wrong=wrong):
         print(row, flush=True)
     for name in wrong:

@@ -5,7 +5,7 @@ parameters are spread over a Latin hypercube: one of the FMU, one of the control
 other and side by side in vector lanes, with one thread and with several; the smallest time of three sweeps counts, and
 they take turns. The set-up is what a run costs beyond its ticks: the processor time of a sweep with runs of 2 ms.
 
-The last column is the throughput of a core beside that of the C by hand of `handwritten.py`, which takes 4 substeps and
+The last column is the throughput of a core and that of the C by hand of `handwritten.py`, which takes 4 substeps and
 1 projection and records nothing, where these runs take 5 and 2 and keep two signals: its time for as many ticks, over
 the time of a run times the threads. At the end some runs are compared with single ones: bit by bit, and in lanes to
 1e-10 of the largest value. The program ends with status 1 if they differ by more.
@@ -109,7 +109,7 @@ def main(samples: int = 1000) -> int:
     found = measure(samples)
     by_hand = min(found.by_hand)
     print(f"{samples} runs of {SECONDS:g} s, {CORES} cores; C by hand takes {by_hand * 1e3:.2f} ms for as many ticks")
-    print(f"{'runs':>12} threads   time, s   runs/s   ns of a tick   times one thread   a core beside C by hand")
+    print(f"{'runs':>12} threads   time, s   runs/s   ns of a tick   times one thread   a core next to C by hand")
     best = {key: min(times) for key, times in found.elapsed.items()}
     for (form, workers), elapsed in best.items():
         run = elapsed / samples

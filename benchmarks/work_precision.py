@@ -1,4 +1,4 @@
-"""Accuracy and time of the methods in C beside SciPy's of the same names: python benchmarks/work_precision.py.
+"""Accuracy and time of the methods in C next to SciPy's of the same names: python benchmarks/work_precision.py.
 
 Eleven standard problems, each with a closed form or a reference of tight tolerance that SciPy computes on plain NumPy.
 For each tolerance: the largest error of a run over all samples, relative to the largest value of each state, and the

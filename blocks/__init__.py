@@ -8,5 +8,5 @@ from lazy_loader import attach_stub as _load_on_use
 
 from . import moved as _moved
 
-__getattr__, __dir__, __all__ = _load_on_use(__name__, __file__)  # the names stand in __init__.pyi
+__getattr__, __dir__, __all__ = _load_on_use(__name__, __file__)  # the names are in __init__.pyi
 _moved.explain_moved_modules()

@@ -217,7 +217,7 @@ class Diagram:
         Parameters
         ----------
         sample_time : float or Fraction
-            Sample time in s. Subsystems with a sample time of their own keep it.
+            Sample time in s. Subsystems with their own sample time keep it.
         method : {"exact", "forward", "semi_implicit", "trapezoidal"}
             Discretization of the blocks that were continuous; see `loopwright.blocks.hold`. As inputs are held,
             ``trapezoidal`` is not Tustin's method, python-control's ``c2d(…, "bilinear")``, which averages them too.
@@ -267,7 +267,7 @@ class Diagram:
         Raises
         ------
         SimulationError
-            `PathDomainError`, `GuardError`, `NonFiniteError` or `FmuRuntimeError`, a solver that can't go on, events
+            `PathDomainError`, `GuardError`, `NonFiniteError` or `FmuRuntimeError`, a solver that can't continue, events
             that pile up, an algebraic loop without a solution; ``error.run`` holds what was recorded until then.
         OptionError
             A duration that is not positive, or no multiple of the step; an unknown option or solver, a tolerance out of
@@ -276,7 +276,7 @@ class Diagram:
         return simulate(self.wired, duration, RunOptions.of(options, block=self.name), progress=progress)
 
     def simulation(self, **options: Unpack[RunKeywords]) -> Simulation:
-        """Return a run in the making, to go on step by step, to save and to restore; see `Simulation`.
+        """Return a run in the making, to continue step by step, to save and to restore; see `Simulation`.
 
         Parameters
         ----------
@@ -375,7 +375,7 @@ class Diagram:
             Their values then differ from those of single runs by rounding, and the sweep's messages say so. A motion
             that magnifies small differences (a limit cycle, sticking) magnifies these, too; see docs/sweeps.md.
             Every FMU must have been built by Loopwright on this machine, with steps of fixed length and without events;
-            runs that can't go so are made one after the other, which is told.
+            runs that can't go so are made one after the other, which a message says.
         **options
             Options of each run, as for `simulate`; ``compile=True`` is the default, but with ``seeds``.
 
@@ -568,7 +568,7 @@ class Diagram:
         Parameters
         ----------
         points : iterable
-            As `linearize` takes them. Each variant runs to a time or an instant anew; an `OperatingPoint` is taken.
+            As `linearize` takes them. Each variant runs to a time or an instant again; an `OperatingPoint` is taken.
         variants : iterable of mapping
             What `replace` changes: ``[{"controller.pid_par.poles": (-30, -30, -30)}, …]``.
         **options
@@ -728,7 +728,8 @@ class Diagram:
             equations that are not 0, and the parameters that the blocks of FMUs set.
         at : OperatingPoint, Snapshot, float or callable, optional
             Point, as in `linearize`. An equilibrium follows the parameter; a point that is not at rest keeps its
-            states. A function from a diagram to a point, ``lambda d: d.trim(…)``, is asked anew for changed parameters.
+            states. A function from a diagram to a point, ``lambda d: d.trim(…)``, is asked again for changed
+            parameters.
         delay, skew
             As of `margins`. ``options`` are those of `linearize`.
 
@@ -769,14 +770,14 @@ class Diagram:
 
         Samples of the ranges come first, then all corners (of up to 5 numbers), then searches downhill from the worst
         of them, along the exact derivatives of the margins. A case that can't be analysed counts as the worst and
-        tells its reason; then come unstable loops, by their growth.
+        says why; then come unstable loops, by their growth.
 
         Parameters
         ----------
         parameters : mapping of str to (low, high) or Box
             Ranges by path; values of each for a grid; None where ``samples`` is a table.
         loop : str or list of str
-            Wire that the loop is cut at; with requirements several wires, each a loop of its own. Without them several
+            Wire that the loop is cut at; with requirements several wires, each its own loop. Without them several
             wires are one loop, cut at all at once, with a disk margin. Requirements need none where they name loops.
         quantity : str or callable, optional
             The number, ``"disk_margin"`` without it: one of those that `Requirements` can limit. Or a function from a
@@ -795,7 +796,7 @@ class Diagram:
         delay : int
             Whole samples of delay in series with sampled loops.
         progress : callable, optional
-            Told a line for every case. ``options`` are those of `linearize`.
+            Called with a line for every case. ``options`` are those of `linearize`.
 
         Returns
         -------
@@ -847,7 +848,7 @@ class Diagram:
         path : path, optional
             File to write, ``.html``; without it nothing is written. A notebook shows the report.
         pdf, json : bool
-            Write ``.pdf`` (which needs ``pip install 'loopwright[pdf]'``) and ``.json`` beside it, too.
+            Write ``.pdf`` (which needs ``pip install 'loopwright[pdf]'``) and ``.json`` next to it, too.
         paper : {"A4", "letter"}
             Paper of the PDF. ``options`` are those of `analyse`, such as ``requirements``, ``at`` and ``loops``; with
             ``summary=True`` the page is two sheets, with ``appendix=False`` it ends with its chapters.

@@ -1,4 +1,4 @@
-"""Make the figures of the README and of the page on sweeps anew: python docs/figures.py."""
+"""Make the figures of the README and of the page on sweeps again: python docs/figures.py."""
 
 from __future__ import annotations
 

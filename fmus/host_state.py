@@ -61,7 +61,7 @@ class HostState:
     Parameters
     ----------
     tell : callable
-        Told once for each thing that was changed.
+        Called once for each thing that was changed.
     """
 
     def __init__(self, tell: Callable[[str], None]):
@@ -111,7 +111,7 @@ class HostState:
             self._note("the working folder")
 
     def note_modes(self) -> None:
-        """Tell that rounding mode or traps were changed, and set back."""
+        """Say that rounding mode or traps were changed, and set back."""
         self._note("the rounding mode or the traps of floating-point numbers")
 
     def _note(self, change: str) -> None:

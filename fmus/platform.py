@@ -14,7 +14,7 @@ import platformdirs
 from ..blocks.core import FmuError, LoopwrightError, explain_disk_errors
 from .toolchain import native_platform as native_platform
 
-OWN_CACHE = "Set LOOPWRIGHT_CACHE to a folder of your own."
+OWN_CACHE = "Set LOOPWRIGHT_CACHE to your own folder."
 """Step where the cache folder can't be used."""
 
 
@@ -96,7 +96,7 @@ def check_cache() -> Path:
     """
     folder = cache_folder()
     with explain_cache_errors():
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)  # the compiler's own cache stands there, too
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)  # the compiler's own cache is there, too
         with tempfile.TemporaryFile(dir=folder):
             pass
     return folder

@@ -71,7 +71,7 @@ def table():
             else:
                 full = word[0].removesuffix(".py")
                 found.add(full if "/" in full else f"{room}/{full}")
-        assert found <= {*names, *ROOMS}, f"{name}: {found - set(names)} stand in no row"
+        assert found <= {*names, *ROOMS}, f"{name}: {found - set(names)} are in no row"
         allowed[key] = found
     return allowed
 

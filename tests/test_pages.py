@@ -210,7 +210,7 @@ def check_printed(stored, made):
         words = [NUMBER.sub("…", text) for text in texts]
         same = len(numbers[0]) == len(numbers[1]) and all(map(agree, *numbers))
         assert (words[0], same) == (words[1], True), (
-            f"cell {number} holds what it printed once; execute the notebook anew"
+            f"cell {number} holds what it printed once; execute the notebook again"
         )
 
 

@@ -1,6 +1,6 @@
 """Arguments and parameters: declared kinds of values, and one error that names what was found and expected.
 
-A kind stands at the signature: ``@accepts(windows=kinds.integer(2))`` above a function or a dataclass, and
+A kind is declared at the signature: ``@accepts(windows=kinds.integer(2))`` above a function or a dataclass, and
 ``parameter(kind=kinds.choice("linear", "previous"))`` in a block.
 """
 
@@ -235,7 +235,7 @@ def by_shape(name: str, value: Any) -> str:
 
 number = Kind("a number", is_real)
 real = Kind("a number", lambda value: is_real(value) or (isinstance(value, float) and value != value))
-"""A real number, or NaN, which the function refuses with words of its own."""
+"""A real number, or NaN, which the function refuses with its own words."""
 finite = Kind("a finite number", _is_finite)
 positive = Kind("a positive number", lambda value: _is_finite(value) and float(value) > 0)
 above_zero = Kind(

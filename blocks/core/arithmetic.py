@@ -32,8 +32,8 @@ def check_shapes(**values: Array) -> None:
     for name, value in values.items():
         if shape_of(value) not in ((), first[1]):
             raise ShapeError(
-                f"found shape {shape_of(value)} beside {first[0]} of shape {first[1]}; expected one shape for both, or "
-                "a scalar. Take a part of the longer one, such as signal[0:2], or wire another.",
+                f"found shape {shape_of(value)} next to {first[0]} of shape {first[1]}; expected one shape for both, "
+                "or a scalar. Take a part of the longer one, such as signal[0:2], or wire another.",
                 port=name,
             )
 

@@ -346,7 +346,7 @@ def _bind(block: Block, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[s
             f"{len(args)} signals for {len(inputs)} inputs ({', '.join(inputs) or 'none'}).{step}", block=who
         )
     required = [name for name, port in inputs.items() if port.default is None and name not in kwargs]
-    # as many signals as inputs need are theirs, wherever inputs with a default stand
+    # as many signals as inputs need are theirs, wherever inputs with a default are
     given = dict(zip(required if len(args) == len(required) else inputs, args, strict=False))
     for name, value in kwargs.items():
         if name not in inputs:

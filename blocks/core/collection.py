@@ -12,10 +12,10 @@ R = TypeVar("R")
 
 
 def without_collection(function: Callable[P, R]) -> Callable[P, R]:
-    """Run a function without cyclic garbage collection, and go on with it after, if it was on.
+    """Run a function without cyclic garbage collection, and continue with it after, if it was on.
 
     The collector would look at all values again and again while they grow: a third of the time for 10,000 blocks.
-    Reference counts go on. Several threads may do so at once: whoever has turned it off turns it on again.
+    Reference counts continue. Several threads may do so at once: whoever has turned it off turns it on again.
     """
 
     @wraps(function)

@@ -17,7 +17,7 @@ _NO_FOLDER = (errno.ENOTDIR, errno.EEXIST)
 _TOO_MANY = (errno.EMFILE, errno.ENFILE)
 _QUOTA = getattr(errno, "EDQUOT", None)  # not on Windows
 
-OTHER_TEMPORARY = "Set TMPDIR to a folder of your own."
+OTHER_TEMPORARY = "Set TMPDIR to your own folder."
 """Step where the folder of temporary files can't be used."""
 
 _PROBE = 2**24

@@ -245,7 +245,7 @@ class FmuEnd(Enum):
 
 
 class FmuProcessError(FmuRuntimeError):
-    """The process of an isolated FMU has ended in a call, or was ended; this process and other FMUs go on.
+    """The process of an isolated FMU has ended in a call, or was ended; this process and other FMUs continue.
 
     Attributes
     ----------

@@ -43,7 +43,7 @@ class UnknownArgumentError(OptionError, UnknownNameError):
         )
 
     def offer(self, block: str, more: Iterable[str]) -> None:
-        """Tell of the function that was called, which has arguments of its own besides those that it hands on."""
+        """Report the function that was called, which has arguments of its own besides those that it hands on."""
         self.known |= frozenset(more)
         self.block, self.message = block, self._tell()
 

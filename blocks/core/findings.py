@@ -1,4 +1,4 @@
-"""Findings: facts that limit a number, carried beside it."""
+"""Findings: facts that limit a number, which go with it."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class Wanted(NamedTuple):
 
 
 class EvaluationVectors(NamedTuple):
-    """Vectors that an evaluation reads, and the one that it writes, where they stand; all of float64.
+    """Vectors that an evaluation reads, and the one that it writes, where they are; all of float64.
 
     Attributes
     ----------

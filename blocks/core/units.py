@@ -76,7 +76,7 @@ class DefinedUnit(str):
         return made
 
     def __getnewargs__(self) -> tuple[Unit]:  # type: ignore[override]
-        """Return the arguments with which a copy or a pickle makes it anew."""
+        """Return the arguments with which a copy or a pickle makes it again."""
         return (self.unit,)
 
 

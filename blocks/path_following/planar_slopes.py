@@ -24,7 +24,7 @@ class PlanarSlopes(NamedTuple):
 
 _KNOWN: dict[Any, PlanarSlopes] = {}
 MOST = 64
-"""Slopes that are kept: every variant of a loop asks for those of its models anew."""
+"""Slopes that are kept: every variant of a loop asks for those of its models again."""
 
 
 def planar_slopes(model: PlanarModel, position: Array, velocity: Array) -> PlanarSlopes:

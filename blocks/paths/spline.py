@@ -22,7 +22,7 @@ class CubicSpline(Path):
     from the last point back to the first. An open one is natural (σ″ = 0 at its ends) and continues straight beyond
     them.
 
-    κ is continuous and κ_s jumps at the points, so the motor force (10) of a robot that moves beside the path jumps
+    κ is continuous and κ_s jumps at the points, so the motor force (10) of a robot that moves off the path jumps
     there.
 
     Raises

@@ -21,7 +21,7 @@ _LARGEST = 20_000  # operations beyond which a trace is not searched
 def switching_times(traced: Traced, p: np.ndarray, lines: Mapping[str, Line]) -> dict[float, bool]:
     """Return the times at which outputs or rates may not be smooth.
 
-    With each stands whether the equations still have the value from before at the time itself, as ``t > 0.5`` has.
+    Each comes with whether the equations still have the value from before at the time itself, as ``t > 0.5`` has.
 
     A block whose equation says ``np.where(t > 0.5, …)`` switches at 0.5 s, and so does one that says it of an input
     that is a straight line in time.

@@ -188,7 +188,7 @@ NUMBER = (
     "NumPy's functions, such as np.sin for math.sin and np.floor for int"
 )
 ARRAY = (
-    "symbols can't stand in an array of numbers. Write np.stack([a, b]) for np.array([a, b]), and leave np.asarray "
+    "symbols can't be in an array of numbers. Write np.stack([a, b]) for np.array([a, b]), and leave np.asarray "
     "out: the argument is an array already"
 )
 LOGIC = (

@@ -18,7 +18,7 @@ def trapezoidal_step(
 
     Newton's method starts from x (an explicit guess would be far off in a stiff block), has the exact Jacobian, and
     takes a fixed number of steps. The guard is negative if the correction that would follow is larger, for any state,
-    than 1e-9 of it and its nominal value together. A NaN fails no guard: it goes on to the states.
+    than 1e-9 of it and its nominal value together. A NaN fails no guard: it passes on to the states.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ def add_doctor(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="say whether an FMU runs here, and what would help",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Examine an FMU of any tool: content, libraries for this machine, violations of the standard, a\n"
-        "trial run of each interface in a process of its own, and a verdict in the first line.",
+        "trial run of each interface in its own process, and a verdict in the first line.",
         epilog="exit status: 0 done: it runs here, or should; 1 it does not; 2 wrong usage",
     )
     parser.add_argument("file", metavar="FILE.fmu")

@@ -85,7 +85,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="check an FMU and run it for some steps",
         formatter_class=raw,
         description="Check an FMU of any tool: archive, description, model structure, binaries, sources; then run each "
-        "interface\nfor some steps, in a process of its own.",
+        "interface\nfor some steps, in its own process.",
         epilog=_STATUS.format(one="problems were found").strip(),
     )
     check.add_argument("file", metavar="FILE.fmu")

@@ -66,8 +66,8 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     report.add_argument("diagram", nargs="?", metavar="DIAGRAM", help="A, B, C, D, or FILE.py:NAME")
     report.add_argument("--out", metavar="FILE.html", help="the page (default: fig3.html, or the diagram's name)")
-    report.add_argument("--pdf", action="store_true", help="the same as PDF beside it (pip install 'loopwright[pdf]')")
-    report.add_argument("--json", action="store_true", help="all numbers as JSON beside it")
+    report.add_argument("--pdf", action="store_true", help="the same as PDF next to it (pip install 'loopwright[pdf]')")
+    report.add_argument("--json", action="store_true", help="all numbers as JSON next to it")
     report.add_argument(
         "--requirements", metavar="FILE.toml", help="requirements on loops and responses; see docs/reports.md"
     )
@@ -76,7 +76,7 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         metavar="WIRE=FILE.csv",
         action="append",
         default=[],
-        help="a loop that was measured at a wire: its margins stand beside the model's, requirements hold for them, "
+        help="a loop that was measured at a wire: its margins are next to the model's, requirements hold for them, "
         "too; repeat it for several",
     )
     report.add_argument(
@@ -204,7 +204,7 @@ def _read_study(given: str | None, file: TomlFile | None, table: str, option: st
     for key in own.content:
         if key not in STUDIES:
             raise own.error(
-                f"found it beside [{table}], where requirements are not read. Name the file by --requirements, which "
+                f"found it next to [{table}], where requirements are not read. Name the file by --requirements, which "
                 "takes its table along.",
                 key,
             )

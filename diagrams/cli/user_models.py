@@ -24,7 +24,7 @@ class UserModel:
     block : Block
         The block.
     beside : tuple of Path
-        The modules beside the file that it has imported: files, or folders of packages.
+        The modules next to the file that it has imported: files, or folders of packages.
     """
 
     block: Block
@@ -33,7 +33,7 @@ class UserModel:
 
 @contextlib.contextmanager
 def load_user_model(text: str) -> Iterator[UserModel]:
-    """Load a model from ``FILE.py:Name``; its module, and those beside it that it imports, are forgotten afterwards.
+    """Load a model from ``FILE.py:Name``; its module, and those next to it that it imports, are forgotten afterwards.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def _split_name(text: str, port: str = "MODEL", example: str = "model.py:Motor")
 
 @contextlib.contextmanager
 def _load(path: Path) -> Iterator[ModuleType]:
-    """Import a file under a name of our own; files beside it can be imported as from a script."""
+    """Import a file under a name that we choose; files next to it can be imported as from a script."""
     folder = str(path.parent)
     before = set(sys.modules)
     sys.path.insert(0, folder)

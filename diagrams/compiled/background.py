@@ -1,4 +1,4 @@
-"""Code that is compiled beside a run that is interpreted meanwhile."""
+"""Code that is compiled while a run is interpreted."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from .function_code import Code, Sources
 _WRITING = 3e-5  # s to write the C code of an operation
 _COMPILING = 1e-3  # s to compile it
 _SHARE = 0.2  # of the time that a run still takes, at most, for writing code
-_LEAST = 0.1  # s that a run still takes at least, for code that is in the cache; beside a compiler ten times as much
+_LEAST = 0.1  # s that a run still takes at least, for code that is in the cache; with a compiler ten times as much
 
 
 class BackgroundCode(Generic[Code]):
     """C code of a diagram's ticks, made while they are interpreted, as soon as the run is long enough for it.
 
-    A run that is short never waits, and starts no compiler. The compiler is a process of its own.
+    A run that is short never waits, and starts no compiler. The compiler is its own process.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class BackgroundCode(Generic[Code]):
         ----------
         spent, rest : float
             Seconds that interpreted ticks have taken so far, and those that the ticks asked for still take. A run that
-            has taken long is taken to go on for as long.
+            has taken long is taken to continue for as long.
         """
         if self._over:
             return

@@ -84,7 +84,7 @@ class CompiledFunction:
 
 @dataclass(frozen=True, eq=False)
 class MachineFunction(CompiledFunction):
-    """A CasADi function as a program of the virtual machine, whose C function stands at the address."""
+    """A CasADi function as a program of the virtual machine, whose C function is at the address."""
 
     program: MachineProgram
     _bound: list[tuple[Any, BoundFunction]] = field(default_factory=list)

@@ -51,7 +51,7 @@ class TickCode:
     master : function or None
         The C function that goes over ticks; None for the one that all diagrams share.
     notes : tuple of str
-        What a run tells of its code.
+        What a run reports of its code.
     """
 
     ticks: Mapping[frozenset[TickPattern], CompiledTick]
@@ -65,7 +65,7 @@ class TickCode:
 def find_obstacle(flat: FlatDiagram) -> str | None:
     """Return why there can't be generated code of a diagram's ticks; None if there can."""
     if flat.loops.slices and any(flat.table.blocks[path].opaque for path in flat.checked.traced):
-        return "it has an algebraic loop beside blocks that Python evaluates, and Newton's method runs in C alone"
+        return "it has an algebraic loop next to blocks that Python evaluates, and Newton's method runs in C alone"
     return None
 
 
@@ -231,5 +231,5 @@ class GroupedTicks:
 
 
 def master_source() -> str:
-    """Return the C text of the loop over ticks, for code that stands in one unit with it."""
+    """Return the C text of the loop over ticks, for code that is in one unit with it."""
     return read_sources("newton.c", "remote.c", "master.c")

@@ -16,7 +16,7 @@ from ...fmus.platform import OWN_CACHE, cache_folder, explain_cache_errors, nati
 from ...fmus.toolchain import DIAGRAM_FLAGS, SUFFIXES
 
 _OURS = re.compile(r"[0-9a-f]{40}\.(size|so|dll|dylib)")
-"""Names of what stands in the folder of compiled diagrams; other files there are the user's."""
+"""Names of what is in the folder of compiled diagrams; other files there are the user's."""
 
 
 @lru_cache(maxsize=64)
@@ -68,7 +68,7 @@ def is_kept(source: str, flags: tuple[str, ...] = ()) -> bool:
 
 
 def _note_size(library: Path) -> None:
-    """Note a library's length beside it; several threads and processes may do so at once."""
+    """Note a library's length next to it; several threads and processes may do so at once."""
     with replace_file(_size_file(library)) as fresh:
         fresh.write_text(str(library.stat().st_size))
 
@@ -100,13 +100,13 @@ def _library_of(source: str, flags: tuple[str, ...] = (), known: str = "") -> Pa
 
 
 def _check_owner(folder: Path) -> None:
-    """Refuse a folder that others than the user can write to, and a link to one: what stands there is run."""
+    """Refuse a folder that others than the user can write to, and a link to one: what is there is run."""
     if os.name != "posix":
         return
     if folder.is_symlink():
         raise CompilerError(
             f"the folder of compiled diagrams {str(folder)!r} is a link to another one; expected a folder, since what "
-            "stands there is run. Remove the link, or set LOOPWRIGHT_CACHE to where it leads."
+            "is there is run. Remove the link, or set LOOPWRIGHT_CACHE to where it leads."
         )
     was_open = folder.stat().st_mode & 0o022
     with suppress(OSError):
@@ -115,8 +115,8 @@ def _check_owner(folder: Path) -> None:
     if found.st_uid != os.getuid() or found.st_mode & 0o022:
         raise CompilerError(
             f"the folder of compiled diagrams {str(folder)!r} belongs to user {found.st_uid} with permissions "
-            f"{found.st_mode & 0o777:o}; expected user {os.getuid()} and 700, since what stands there is run. Remove "
-            "it, or set LOOPWRIGHT_CACHE to a folder of your own."
+            f"{found.st_mode & 0o777:o}; expected user {os.getuid()} and 700, since what is there is run. Remove "
+            "it, or set LOOPWRIGHT_CACHE to your own folder."
         )
     for file in folder.iterdir() if was_open else ():  # what others may have left there would be run, too
         if _OURS.fullmatch(file.name):

@@ -91,12 +91,12 @@ class NativeDelays:
         return ctypes.addressof(self.structure)
 
     def hand_over(self, t: float) -> None:
-        """Let C go on from a time in s."""
+        """Let C continue from a time in s."""
         past, of = self._past, self.structure
         past.make_room(t)
         of.pieces, of.edges = at(past.pieces), at(past.edges)
         of.capacity, of.room, of.count, of.noted = len(past.pieces), len(past.edges), past.count, past.noted
 
     def take_back(self) -> None:
-        """Let Python go on from where C has come to."""
+        """Let Python continue from where C has come to."""
         self._past.count, self._past.noted = self.structure.count, self.structure.noted

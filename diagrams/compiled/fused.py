@@ -49,7 +49,7 @@ class FusedPlant:
 
 
 def fuse(diagram: WiredDiagram) -> tuple[WiredDiagram, tuple[str, ...]]:
-    """Return a diagram whose FMUs of our own are compiled for this processor, and messages about what was done.
+    """Return a diagram whose FMUs, those of ours, are compiled for this processor, and messages about what was done.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def _compile(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], plants
     library = load_compiled(text, (*processor_flags(), *FUSING), describe_processor())
     master = library[MASTER]
     master.restype = None
-    notes = tuple(f"Fused: the equations of {path} stand in the loop, compiled with the ticks." for path in inside)
+    notes = tuple(f"Fused: the equations of {path} are in the loop, compiled with the ticks." for path in inside)
     if not functions:
         return replace(compile_ticks(flat, acting), master=master, notes=notes)
     bound = {clocks: GeneratedCode(library).find(f) for clocks, f in functions.items()}
@@ -142,7 +142,7 @@ def _write_models(plants: Mapping[str, FusedPlant]) -> tuple[str, str, list[str]
 
 
 def _write_ticks(functions: Sequence[Any]) -> str:
-    """Return the C code of ticks: each as it is, and in another order, with elementary functions of our own."""
+    """Return the C code of ticks: each as it is, and in another order, with our own elementary functions."""
     texts, others, cases = list[str](), list[str](), list[str]()
     for i, function in enumerate(functions):
         text = write_functions(function.name(), [function])

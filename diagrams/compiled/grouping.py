@@ -1,4 +1,4 @@
-"""Grouping: the calls of a tick as runs of equal blocks, with tables of where their values stand."""
+"""Grouping: the calls of a tick as runs of equal blocks, with tables of where their values are."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class PythonCall:
     key : int
         Key of its function in `Program.functions`.
     arguments, results : tuple of slice
-        Where its columns stand: the last argument in p, all others in v.
+        Where its columns are: the last argument in p, all others in v.
     """
 
     key: int
@@ -63,7 +63,7 @@ class TickTables:
     memory : ndarray
         v with its constants.
     next : int
-        Where the next states stand in v.
+        Where the next states are in v.
     inputs, guards, made, taken : ndarray of int32
         Where the inputs of plants, the guards and both sides of the algebraic loops stand.
     log : int
@@ -133,7 +133,7 @@ class PartTables:
     memory : ndarray
         v with its constants.
     where : ndarray of int32
-        Where the results stand in v, one after the other.
+        Where the results are in v, one after the other.
     lengths : tuple of int
         Entries of each result.
     """
@@ -200,9 +200,9 @@ def _write_runs(
 
 
 def _place(tick: TickProgram) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return where each value stands in v (those of p: in p), v with its constants, and where the next states stand.
+    """Return where each value is in v (those of p: in p), v with its constants, and where the next states are.
 
-    Results that are recorded, or are next states, are made where these stand.
+    Results that are recorded, or are next states, are made where these are.
     """
     program = tick.program
     places = np.full(program.count, -1, dtype=np.int64)

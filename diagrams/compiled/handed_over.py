@@ -36,7 +36,7 @@ class HandedBlock(NativeBlock, Protocol):
         """Whether no earlier state will be restored."""
 
     def take_back(self, u: np.ndarray, next_time: float, *, read_nominals: bool) -> None:
-        """Go on from where a loop in C has come to."""
+        """Continue from where a loop in C has come to."""
 
     def take_end(self, t: float, *, in_event: bool) -> None:
         """Note that the block has asked a loop in C to end the run."""
@@ -49,7 +49,7 @@ class HandedBlock(NativeBlock, Protocol):
 
 
 class HandedOver:
-    """Blocks that are evaluated from outside, in a run that goes on in C.
+    """Blocks that are evaluated from outside, in a run that continues in C.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class HandedOver:
     evaluators : mapping of str to ExchangeEvaluator
         Their evaluators, by which Python does what C can't.
     tell : callable
-        Told events of the blocks' own.
+        Called with events of the blocks' own.
     count : callable
         ``count(t, path, name)``: notes an event of time or of a step, and refuses those that pile up.
     """
@@ -119,7 +119,7 @@ class HandedOver:
     # --- from one to the other ---------------------------------------------------------------------------------------
 
     def hand_over(self) -> None:
-        """Let C go on from an instant that Python has come to."""
+        """Let C continue from an instant that Python has come to."""
         self._with_c = True
         for path in self._blocks:
             self._give_block(path)
@@ -136,8 +136,8 @@ class HandedOver:
         )
 
     def take_back(self) -> bool:
-        """Let Python go on from where C has come to; return whether nominal values have changed."""
-        if not self._with_c:  # Python has gone on, and has been interrupted
+        """Let Python continue from where C has come to; return whether nominal values have changed."""
+        if not self._with_c:  # Python has continued, and has been interrupted
             return False
         self._with_c = False
         changed = [self._take_block(path) for path in self._blocks]
@@ -155,7 +155,7 @@ class HandedOver:
         return changed
 
     def tell(self) -> None:
-        """Tell what has happened in C: warnings, and events of the blocks' own."""
+        """Report what has happened in C: warnings, and events of the blocks' own."""
         self.native.remote.take_messages()
         for path, action, t in self.native.take_warnings():
             self._blocks[path].take_warning(action, t)

@@ -28,7 +28,7 @@ from .watch import Fired, Pile, Watch
 
 _SECONDS = 0.05  # of a call, about, after which Ctrl-C has its turn
 _LIBRARY_STEP = 200_000  # ns that a library takes for a step, about
-_UNKNOWN = 20  # steps of the first call beside FMUs that may take any time
+_UNKNOWN = 20  # steps of the first call next to FMUs that may take any time
 
 
 class HybridReason(IntEnum):
@@ -45,7 +45,7 @@ class Lost(IntEnum):
 
 
 class Sign(IntEnum):
-    """Signs that another method may go on: the problem is stiff, no longer, or this method can take no step."""
+    """Signs that another method may continue: the problem is stiff, no longer, or this method can take no step."""
 
     NONE, STIFF, EASY, STUCK = range(4)
 
@@ -195,7 +195,7 @@ class CompiledHybrid:
     drain : callable
         Called where no more events can be logged: takes those that have been.
     coupled : bool
-        Whether the continuous states go on within the steps of the plants, by `run_between`.
+        Whether the continuous states continue within the steps of the plants, by `run_between`.
     """
 
     def __init__(
@@ -400,19 +400,19 @@ class CompiledHybrid:
         made.K, made.D = self._own(np.zeros(17 * n)), self._own(np.zeros(7 * n))
         return made
 
-    # --- going on ----------------------------------------------------------------------------------------------------
+    # --- continuing ------------------------------------------------------------------------------------------------
 
     def begin(self, t: float) -> None:
         """Begin an interval at a tick, or at any instant between two, that the run has reached."""
         self._hybrid.inside, self._hybrid.t = 0, t
 
     def hand_over_domains(self, domains: Domains) -> None:
-        """Let C go on with what is kept of events beside its arrays."""
+        """Let C continue with what is kept of events besides its arrays."""
         watch = self._hybrid.w
         watch.fired_times, (watch.sliding, watch.switched) = domains.fired_times, domains.sliding
 
     def take_back_domains(self, domains: Domains) -> None:
-        """Let Python go on with what is kept of events beside its arrays."""
+        """Let Python continue with what is kept of events besides its arrays."""
         watch = self._hybrid.w
         domains.fired_times, domains.sliding = int(watch.fired_times), (bool(watch.sliding), bool(watch.switched))
 
@@ -460,7 +460,7 @@ class CompiledHybrid:
 
     @property
     def active(self) -> int:
-        """Place of the method that goes on."""
+        """Place of the method that continues."""
         return int(self._hybrid.active)
 
     @active.setter
@@ -469,7 +469,7 @@ class CompiledHybrid:
             self._hybrid.active, self._hybrid.hits, self._hybrid.misses, self._hybrid.easy = place, 0, 0, 0
 
     def take_sign(self) -> tuple[Sign, float]:
-        """Return the sign that another method may go on, and the step in s at which it came; C may go on then."""
+        """Return the sign that another method may continue, and the step in s at which it came; C may continue then."""
         sign, self._hybrid.switched = Sign(self._hybrid.switched), Sign.NONE
         return sign, float(self._hybrid.looked_at)
 
@@ -504,7 +504,7 @@ class CompiledHybrid:
 
     @property
     def coupled(self) -> bool:
-        """Whether the continuous states go on within the steps of the plants."""
+        """Whether the continuous states continue within the steps of the plants."""
         return bool(self._hybrid.coupled)
 
     @property

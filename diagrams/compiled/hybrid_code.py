@@ -89,9 +89,9 @@ def find_code_obstacle(flat: FlatDiagram) -> str | None:
     blocks = flat.table.blocks
     opaque = sorted(path for path in flat.checked.traced if blocks[path].opaque and path not in flat.outside)
     if opaque and flat.outside:
-        return f"Python evaluates the block {opaque[0]!r} beside the FMU {flat.outside[0]!r} in model exchange"
+        return f"Python evaluates the block {opaque[0]!r} next to the FMU {flat.outside[0]!r} in model exchange"
     if opaque and flat.loops.slices:
-        return f"it has an algebraic loop beside the block {opaque[0]!r}, which Python evaluates"
+        return f"it has an algebraic loop next to the block {opaque[0]!r}, which Python evaluates"
     return None
 
 

@@ -241,7 +241,7 @@ def _make_block_program(function: Any, names: Sequence[str], most: int) -> Block
 
 
 def _in_p(body: str, last: int) -> str:
-    """Return a body in which the last argument, the parameters, has a name of its own."""
+    """Return a body in which the last argument, the parameters, has its own name."""
     return re.sub(rf"\bi{last}\b", "q", body)
 
 

@@ -144,7 +144,7 @@ def make_program(function: Any, names: Sequence[str], width: int = 1) -> Machine
 def _sort(
     rows: Sequence[tuple[tuple[int, ...], tuple[int, ...]]], made: Sequence[int]
 ) -> list[tuple[tuple[int, ...], list[int]]]:
-    """Return the operations in runs of one kind: of the kinds that can go on, the one with most operations is next."""
+    """Return the operations in runs of one kind: of the kinds that can be next, the one with most operations is."""
     waits, readers = [0] * len(rows), defaultdict[int, list[int]](list)
     for i, (kind, row) in enumerate(rows):
         operands = () if kind[0] == _INPUT else row[:1] if kind[0] == _OUTPUT else row[1:]

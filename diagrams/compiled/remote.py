@@ -17,7 +17,7 @@ from .runtime import load_runtime
 
 UNDER_WAY, REFUSED, TOLD = 3, 4, 5
 """Stages at which such an FMU is left to Python: its step has begun; no step has, as an input doesn't fit; Python has
-taken it, and the loop can't go on."""
+taken it, and the loop can't continue."""
 _KINDS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "b1")
 _FEWEST = 4  # `wire.FEWEST`
 _IDLE, _POSTED, _ARRIVED = range(3)
@@ -70,7 +70,7 @@ class _Apart(ctypes.Structure):
 
 
 class RemotePlants:
-    """The FMUs of a loop that are in processes of their own, or that Python steps.
+    """The FMUs of a loop that are in their own processes, or that Python steps.
 
     Attributes
     ----------
@@ -225,7 +225,7 @@ class PythonSteps(CalledBack):
     Attributes
     ----------
     step : int
-        Address of the function by which C asks for one; it returns 1 if C can't go on from there.
+        Address of the function by which C asks for one; it returns 1 if C can't continue from there.
     """
 
     def __init__(self) -> None:

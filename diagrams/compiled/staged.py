@@ -148,7 +148,7 @@ class NativeExchange:
     blocks : mapping
         The blocks by path, loaded.
     first : mapping
-        Where the states of each stand in the vector of all.
+        Where the states of each are in the vector of all.
     width : int
         Number of all states.
     library : CDLL
@@ -339,7 +339,7 @@ class NativeExchange:
     # --- between Python and C ----------------------------------------------------------------------------------------
 
     def hand_over(self, path: str, u: np.ndarray, next_time: float, *, asks: bool, ended: bool, final: bool) -> None:
-        """Let C go on with a block from an instant that Python has come to."""
+        """Let C continue with a block from an instant that Python has come to."""
         self._late.check()
         fmu = self._each[self.paths.index(path)]
         self._inputs[path][:] = u

@@ -49,7 +49,7 @@ class WatchStructure(ctypes.Structure):
 
 
 class Pile(IntEnum):
-    """How events pile up so that a run can't go on; see `EventLimits`."""
+    """How events pile up so that a run can't continue; see `EventLimits`."""
 
     IN_CONTACT, ZENO, CHATTERS, ENDLESS, ENDLESS_OUTSIDE = range(5)
 

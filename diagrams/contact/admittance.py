@@ -51,11 +51,11 @@ class ContactAdmittance:
 
 
 BESIDE = 0.05
-"""Part of a frequency within which the admittance's real part changes its sign beside a limit."""
+"""Part of a frequency within which the admittance's real part changes its sign next to a limit."""
 
 
 def look_again(parts: ContactParts, direction: np.ndarray, omega: float) -> float:
-    """Return the stiffness ω/|Y| at which Re Y(jω) = 0 beside a frequency in rad/s; NaN without one."""
+    """Return the stiffness ω/|Y| at which Re Y(jω) = 0 next to a frequency in rad/s; NaN without one."""
     low, high = (1.0 - BESIDE) * omega, (1.0 + BESIDE) * omega
     if not 0.0 < low < high < (math.pi / parts.shortest if parts.shortest else math.inf):
         return math.nan

@@ -1,4 +1,4 @@
-"""Diagrams whose plant is pushed by an environment that is a block beside it.
+"""Diagrams whose plant is pushed by an environment that is a block next to it.
 
 In the solver: the plant is a block with equations, or an FMU in model exchange, and the environment's force follows its
 motion within each step. Held: the plant is an FMU in co-simulation, which gets the force at communication points
@@ -126,7 +126,7 @@ def attach_environment(
     *,
     held: bool = False,
 ) -> WiredDiagram:
-    """Return a diagram with an environment beside its plant; the measured force has the environment's.
+    """Return a diagram with an environment next to its plant; the measured force has the environment's.
 
     Parameters
     ----------

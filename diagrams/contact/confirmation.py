@@ -53,10 +53,10 @@ class TrialMethod(Enum):
 
     INSIDE = "the environment inside the plant"
     """In the equations of a plant of the library, in its own FMU or block."""
-    SOLVER = "the environment beside the plant, in the solver"
-    """A block beside a plant with equations, or beside an FMU in model exchange."""
+    SOLVER = "the environment next to the plant, in the solver"
+    """A block next to a plant with equations, or next to an FMU in model exchange."""
     HELD = "the environment's force held between communication points"
-    """A block beside an FMU in co-simulation: the loop has another limit, and its own linear prediction."""
+    """A block next to an FMU in co-simulation: the loop has another limit, and its own linear prediction."""
 
 
 class TriedContact(Protocol):
@@ -104,7 +104,7 @@ class TriedContact(Protocol):
 
 @dataclass
 class LimitTrials:
-    """Runs beside a limit, and predictions for them.
+    """Runs next to a limit, and predictions for them.
 
     Attributes
     ----------
@@ -186,7 +186,7 @@ class LimitTrials:
         return min(omega % (2.0 * np.pi / T), -omega % (2.0 * np.pi / T)) if T else omega
 
     def find_own_limit(self) -> float:
-        """Return the limit that runs are tried beside: of a loop with a held force, that of its own linear model."""
+        """Return the limit that runs are tried next to: of a loop with a held force, that of its own linear model."""
         if self.method is not TrialMethod.HELD:
             return self.limit.value
         x = [0.97 * self.limit.value, self.limit.value]
@@ -335,7 +335,7 @@ GROWN = 5.0
 DECAYED = 9.0
 """Time that other modes have to decay, in their time constants relative to the mode's own."""
 OWN = 1e-4
-"""Largest difference of the growth rates beside a limit, absolute in 1/s and relative, of one contact."""
+"""Largest difference of the growth rates next to a limit, absolute in 1/s and relative, of one contact."""
 UNEVEN = 1e-3
 """Relative difference of the times between samples up to which they are even."""
 LONGEST = 8.0
@@ -345,7 +345,7 @@ LONGEST = 8.0
 @explain_calls
 @dataclass(frozen=True)
 class ContactTrial:
-    """A run beside a limit.
+    """A run next to a limit.
 
     Attributes
     ----------
@@ -382,7 +382,7 @@ class ContactConfirmation:
     method : TrialMethod
         Place of the environment in the runs.
     tried : float
-        Limit that the runs are beside: that of the contact; for a held force, that of the loop with the held force.
+        Limit that the runs are next to: that of the contact; for a held force, that of the loop with the held force.
     """
 
     limit: ContactLimit
@@ -516,7 +516,7 @@ def _check(contact: TriedContact, limit: ContactLimit) -> None:
     if not (math.isfinite(limit.value) and limit.value > 0.0):
         raise OptionError(
             f"found a limit of {limit.value:g} {limit.unit}; expected a finite one that is not 0, with runs on both "
-            "sides of it. Take one in another environment: other values beside the one that varies.",
+            "sides of it. Take one in another environment: other values besides the one that varies.",
             block=contact.plant,
             port=limit.vary,
         )
@@ -525,7 +525,7 @@ def _check(contact: TriedContact, limit: ContactLimit) -> None:
     found = [loop.growth_at(factor * limit.value) for factor in (1.0 - GROWTH_AT, 1.0 + GROWTH_AT)]
     if not np.allclose(found, known, rtol=OWN, atol=OWN):
         raise OptionError(
-            f"found a limit of another contact: beside it the growth rates are {found[0]:.6g} and {found[1]:.6g} 1/s "
+            f"found a limit of another contact: next to it the growth rates are {found[0]:.6g} and {found[1]:.6g} 1/s "
             f"here, and {known[0]:.6g} and {known[1]:.6g} 1/s there. Give one of this contact: "
             "contact.stability_limit(…).",
             block=contact.plant,
@@ -534,7 +534,7 @@ def _check(contact: TriedContact, limit: ContactLimit) -> None:
 
 
 def _others_decay(trials: LimitTrials, value: float, window: float) -> float:
-    """Return the time in s until modes of about the frequency of the limit's have decayed beside it."""
+    """Return the time in s until modes of about the frequency of the limit's have decayed next to it."""
     mode, rates = trials.find_mode(value), trials.find_rates(value)
     near = np.abs(np.abs(rates.imag) - abs(mode.imag)) < 8 * 2 * math.pi / window
     gaps = mode.real - rates.real[near]

@@ -130,7 +130,7 @@ class Contact:
 
     @accepts(None, omega=kinds.numbers.worded("frequencies in rad/s", "Give numbers."))
     def admittance(self, omega: Array) -> ContactAdmittance:
-        """Return the admittance that the environment feels beside that of the diagram's filter, m/(N s).
+        """Return the admittance that the environment feels in addition to that of the diagram's filter, m/(N s).
 
         Parameters
         ----------
@@ -215,9 +215,10 @@ class Contact:
         The result's ``method`` tells where the environment is:
 
         - "inside": in the equations of a plant of the library, in its own FMU or block.
-        - "solver": beside another plant with equations, or beside an FMU in model exchange. The solver integrates both.
-        - "held": beside an FMU that has co-simulation alone. It gets the force ten times in each tick, and holds it
-          between. That loop has another limit; the runs are beside that one (``tried``), and compared with its own
+        - "solver": next to another plant with equations, or next to an FMU in model exchange. The solver
+          integrates both.
+        - "held": next to an FMU that has co-simulation alone. It gets the force ten times in each tick, and holds it
+          between. That loop has another limit; the runs are next to that one (``tried``), and compared with its own
           linear model. This confirms the models of plant and controller, and the limit only as far as the two agree.
 
         Runs begin at the contact's operating point, with all sources held at their values there.

@@ -362,7 +362,7 @@ def _cut_controller(
     hidden = [i for i, mine in enumerate(own) if mine]
     if np.any(A[np.ix_(keep, hidden)]) or np.any(C[np.ix_(picked, hidden)]):
         raise OptionError(
-            "found a way from its states to its inputs beside its outputs; expected none. Report this diagram as an "
+            "found a way from its states to its inputs besides its outputs; expected none. Report this diagram as an "
             "error of loopwright.",
             block=path,
         )
@@ -436,7 +436,7 @@ def restrict(parts: ContactParts, axes: np.ndarray) -> ContactParts:
 
 
 def _acts(M: np.ndarray) -> np.ndarray:
-    """Return which entries are more than rounding beside the largest of their row or column."""
+    """Return which entries are more than rounding compared with the largest of their row or column."""
     size = np.abs(M)
     largest = np.maximum(size.max(axis=1, initial=0.0)[:, None], size.max(axis=0, initial=0.0))
     return np.asarray(size > _NOTHING * largest)

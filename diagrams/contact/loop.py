@@ -291,7 +291,7 @@ def _grows(A: np.ndarray, pole: complex, rounding: float, sampled: bool) -> bool
 
     A pole that rounding has moved from the border has all its way there within the pseudospectrum of that rounding:
     |A − s|⁻¹ is large at every s between, whether the pole stood alone or several in one place. Halfway is looked at,
-    since a drift stands on the border where another pole's way may end.
+    since a drift is on the border where another pole's way may end.
     """
     place = complex(pole) + float(sampled)
     if (abs(place) <= 1.0) if sampled else (place.real <= 0.0):
@@ -302,7 +302,7 @@ def _grows(A: np.ndarray, pole: complex, rounding: float, sampled: bool) -> bool
 
 
 def _not_reached(A: np.ndarray, B: np.ndarray, lengths: np.ndarray, size: float) -> tuple[np.ndarray, float]:
-    """Return an orthonormal basis beside the subspace that B reaches through A, and the least part told as reached.
+    """Return an orthonormal basis of what B does not reach through A, and the least part told as reached.
 
     ``lengths`` are the sizes of the columns of B, ``size`` that of A, against which rounding is told.
     """

@@ -6,8 +6,8 @@ added to the second. Where a delay, a filter, a gain or a slower clock lies betw
 plant's other inputs on ways of its own, too, and where both are one wire, it is added to the first, for all its readers
 but the plant: so it takes those ways, too.
 
-Without a way between the two, nothing tells the sensor from what follows it, and a measured wire behind states is
-refused.
+Without a way between the two, nothing distinguishes the sensor from what follows it, and a measured wire behind states
+is refused.
 
 A model with another tool adds the inertia of the difference, −Δm p̈, where it adds the environment's force. A run gives
 the diagram's `ForceSensor` another tool. The two are one loop only where that sensor measures the acceleration of the

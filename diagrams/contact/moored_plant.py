@@ -1,6 +1,6 @@
 """Diagrams whose plant has an environment inside: spring, damper and mass as a part of the plant's own equations.
 
-An FMU of a plant of the library is built anew, with the environment in it. It keeps the parameters and start values of
+An FMU of a plant of the library is built again, with the environment in it. It keeps the parameters and start values of
 the diagram's FMU. A plant that is a block of the diagram is replaced by one with the environment.
 """
 

@@ -54,7 +54,7 @@ _FLAT = 20.0
 _ROUNDING = 1e-12
 """Relative rounding error of Brent's method."""
 _UNIT, _CHANGES, _SAFETY = 2e-15, 4, 10.0
-"""Relative change of an entry, or of the largest beside it, how often it is tried, and the factor on the spread."""
+"""Relative change of an entry, or of the largest next to it, how often it is tried, and the factor on the spread."""
 _SMALL = 1e-6
 """Growth rate, relative to the largest of a scan, below which its rounding is looked at."""
 _MORE = 1e3
@@ -66,7 +66,7 @@ def growth_rounding(modes: Modes, rates: Callable[[np.ndarray], np.ndarray], A: 
     """Return a bound of the rounding error of a growth rate in 1/s, infinite where the matrix is not finite.
 
     The growth rate is computed again with every entry of the matrix changed by some roundings. Where the fixed modes
-    are split off, every entry, zeros too, is changed by some roundings of the largest one beside it, as LAPACK's
+    are split off, every entry, zeros too, is changed by some roundings of the largest one next to it, as LAPACK's
     transformations do. The eigenvalues answer as they do to the rounding of any machine: one that stands alone by as
     much, several in one place by far more.
 
@@ -306,7 +306,7 @@ class ContactLimit:
     findings : tuple of Finding
         Kinks and stairs of the diagram that the linear model leaves out.
     second_look : float
-        Stiffness in N/m of a spring alone, from the admittance: ω/|Y| where Re Y(jω) = 0, beside the limit's frequency.
+        Stiffness in N/m of a spring alone, from the admittance: ω/|Y| where Re Y(jω) = 0, near the limit's frequency.
         It is the limit in continuous time. In a sampled loop, where Y is the fundamental, it differs by a part
         of (ω T)⁴, for the library's robots: 7e-4 at ω T = 0.5. T is the period of several rates.
         NaN for other environments, and without such a frequency.

@@ -39,7 +39,7 @@ class BlockReport:
     block : str
         Name of the block.
     kinds : mapping
-        For "sampled" and "continuous": "checked", or the reason why the block refuses to stand in such a subsystem.
+        For "sampled" and "continuous": "checked", or the reason why the block refuses to be in such a subsystem.
     checks : mapping
         Result of each check, with numbers, by "sampled: rule", "continuous: rule" or by rule.
     feedthrough : mapping
@@ -105,8 +105,8 @@ def check_block(
     - Feedthrough: no output changes with an input that the trace doesn't show.
     - Smoothness in a continuous subsystem: outputs and rates jump only at `next_instant` and where an event's indicator
       changes its sign. Indicators are finite, and jumps at one instant come to an end.
-    - Runs in a sampled and in a continuous subsystem, where the block allows it: a run that goes on from a saved state,
-      pickled, equals the straight run bit for bit.
+    - Runs in a sampled and in a continuous subsystem, where the block allows it: a run that continues from a saved
+      state, pickled, equals the straight run bit for bit.
 
     An FMU and a transport delay have no equations; their values, ports and runs are checked.
 
@@ -115,7 +115,7 @@ def check_block(
     block : Block
         The block.
     inputs : mapping, optional
-        For each input by name: a range ``(low, high)``, or a signal (a source of its own). Without one, the range from
+        For each input by name: a range ``(low, high)``, or a signal (its own source). Without one, the range from
         the port's minimum to its maximum, else three times its nominal value to both sides.
     shapes : mapping, optional
         Shapes of inputs that take any; scalars without it.
@@ -126,7 +126,7 @@ def check_block(
     seed : int
         Seed of points and signals.
     kinds : list of str, optional
-        "sampled", "continuous" or both: kinds of subsystems in which the block must stand. Without it, those that it
+        "sampled", "continuous" or both: kinds of subsystems in which the block must be. Without it, those that it
         doesn't refuse.
     duration : float, optional
         Time in s over which jumps in time are looked for: give that of your runs. The length of the runs here without
@@ -196,7 +196,7 @@ class _Findings:
         self.quiet: set[str] = set()
 
     def check_in(self, sampled: bool) -> LoopwrightError | None:
-        """Check the block in a subsystem of one kind; return the error with which it refuses to stand there."""
+        """Check the block in a subsystem of one kind; return the error with which it refuses to be there."""
         exercise, kind, checks = self.exercise, kind_text(sampled), self.checks
         block = exercise.block
         if block.transport or block.stepped:

@@ -229,7 +229,7 @@ def check_events(bench: Bench) -> tuple[int, set[str]]:
                 again = ", ".join(n for n, f in zip(names, fired, strict=True) if f)
                 raise rule_error(
                     "events",
-                    f"at t = {t:.6g} s its events go on firing ({again}), {count} times at one instant; expected a "
+                    f"at t = {t:.6g} s its events keep firing ({again}), {count} times at one instant; expected a "
                     "jump after which nothing fires. Let it lead to a state in which the indicator keeps its sign.",
                     block,
                 )

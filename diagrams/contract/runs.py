@@ -1,4 +1,4 @@
-"""Rule of a block's runs: saved and restored, a run goes on as before; see `check_block`."""
+"""Rule of a block's runs: saved and restored, a run continues as before; see `check_block`."""
 
 from __future__ import annotations
 

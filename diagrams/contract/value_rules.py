@@ -121,7 +121,7 @@ def check_ports(block: Block) -> str:
             if port.name != name:
                 raise rule_error(
                     "ports",
-                    f"it stands under {name!r} and calls itself {port.name!r}; expected one name. Give name={name!r}.",
+                    f"it is under {name!r} and calls itself {port.name!r}; expected one name. Give name={name!r}.",
                     block,
                     name,
                 )

@@ -103,7 +103,7 @@ class CoupledSteps:
         if not steps.regular:
             few = next(path for path in self._flat.plant_ticks if not steps.is_regular(path))
             raise OptionError(
-                f"found coupling {coupling.scheme!r}, while {few} has communication points of its own, fewer than the "
+                f"found coupling {coupling.scheme!r}, while {few} has its own communication points, fewer than the "
                 "run has ticks; expected FMUs that all step at every tick. Give simulate(…, step=…), which asks for "
                 "that, leave out its communication_step, or take coupling='jacobi'.",
                 block=self._name,
@@ -240,7 +240,7 @@ class CoupledSteps:
         """Step all plants with the inputs that follow from w at the end of the step.
 
         The states come of the mean of the inputs at the beginning and at the end: held over the step, it has their
-        integral. Outputs that follow an input at once come of a step of their own, with the input at the end.
+        integral. Outputs that follow an input at once come of their own step, with the input at the end.
         """
         links = self.links
         last = np.where(links.moving & links.smooth_inputs, self._exchange(left_of(end)), inputs)
@@ -362,7 +362,7 @@ class CoupledSteps:
         self._w[:], self._z[:] = saved.w, saved.z
 
     def _restore_plant(self, path: str, saved: Beginning) -> None:
-        """Let a plant go back; its texts, whose record would begin anew, stay as they were there."""
+        """Let a plant go back; its texts, whose record would begin again, stay as they were there."""
         plant = self._plants[path]
         before = self._w[self.links.outputs[path]].copy()
         plant.restore(saved.plants[path])

@@ -36,12 +36,12 @@ class Links:
 
     @cached_property
     def inputs(self) -> dict[str, slice]:
-        """Where the inputs of each plant stand in z."""
+        """Where the inputs of each plant are in z."""
         return {path: part_of(self.flat, self.flat.plant_inputs, path) for path in self.paths}
 
     @cached_property
     def outputs(self) -> dict[str, slice]:
-        """Where the outputs of each plant stand in w."""
+        """Where the outputs of each plant are in w."""
         return {path: part_of(self.flat, self.flat.plant_outputs, path) for path in self.paths}
 
     @cached_property
@@ -185,7 +185,7 @@ class Links:
     def renewed_inputs(self, order: Sequence[str]) -> dict[str, np.ndarray]:
         """Return for each plant the inputs that are renewed before it steps, where one steps after the other.
 
-        These follow outputs of the plants before it, or states of blocks, which have gone on already.
+        These follow outputs of the plants before it, or states of blocks, which have continued already.
         """
         before = np.zeros(self.flat.plant_outputs.total, dtype=bool)
         found = {}

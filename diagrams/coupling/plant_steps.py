@@ -39,7 +39,7 @@ class PlantSteps:
     own : dict
         The inputs of each plant among them, as a slice, by path.
     reached : dict
-        Tick at which each plant stands, by path.
+        Tick at which each plant is, by path.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class PlantSteps:
             self.inputs[:] = self.z
 
     def begin(self, k: int) -> None:
-        """Let every plant stand at tick ``k``, and hold its inputs from there on."""
+        """Put every plant at tick ``k``, and hold its inputs from there on."""
         self.take_inputs()
         self.reached = dict.fromkeys(self._plants, k)
 
@@ -86,7 +86,7 @@ class PlantSteps:
         """Step the plants from a tick that the run has visited to the next one; at the ``last`` tick all that can.
 
         Those step of which the tick is a communication point, each from its last one. A plant that stops on its way, at
-        the end of a run, goes on from there with the inputs that it holds.
+        the end of a run, continues from there with the inputs that it holds.
         """
         due = self.due(k, following, last=last)
         if self.apart:
@@ -136,7 +136,7 @@ class PlantSteps:
 
     @property
     def apart(self) -> bool:
-        """Whether several plants step, one of them in a process of its own."""
+        """Whether several plants step, one of them in its own process."""
         return len(self._plants) > 1 and any(map(runs_apart, self._plants.values()))
 
     def hold(self, k: int) -> None:
@@ -149,13 +149,13 @@ class PlantSteps:
                 self.inputs[own] = self.z[own]
 
     def end_at(self, end: float, k: int) -> None:
-        """Step all plants from where they stand to the end of the run, in s, after tick ``k`` and before the next."""
+        """Step all plants from where they are to the end of the run, in s, after tick ``k`` and before the next."""
         for path, plant in self._plants.items():
             now = self._time_of(k if self.regular else self.reached[path])
             plant.step(now, end - now)
 
     def save(self) -> dict[str, Any] | None:
-        """Return where the plants stand and what they hold; None where all of that is in z."""
+        """Return where the plants are and what they hold; None where all of that is in z."""
         return None if self.regular else {"inputs": self.inputs.copy(), "reached": dict(self.reached)}
 
     def restore(self, saved: Mapping[str, Any] | None, k: int) -> None:
@@ -167,7 +167,7 @@ class PlantSteps:
 
 
 def runs_apart(plant: Any) -> bool:
-    """Whether a plant runs in a process of its own, so that its steps can go on beside others."""
+    """Whether a plant runs in its own process, so that its steps can run alongside others."""
     return not getattr(getattr(plant, "fmi", None), "in_process", True)
 
 
@@ -177,7 +177,7 @@ def asks_to_end(error: SimulationError) -> bool:
 
 
 def step_all(plants: Iterable[Plant], t: float, h: float) -> None:
-    """Let plants step from t over h, both in s; those in processes of their own step at the same time.
+    """Let plants step from t over h, both in s; those in their own processes step at the same time.
 
     Every step that has begun is ended, also where one fails; then the first error is raised, and a plant's request to
     end the run only where nothing else has failed.

@@ -112,7 +112,7 @@ def _note_parts_of_steps(flat: FlatDiagram) -> tuple[str, ...]:
 def load_plants(flat: FlatDiagram, stack: ExitStack, start_time: float = 0.0) -> Iterator[tuple[str, Plant]]:
     """Yield the plants by path, each as soon as it is loaded; ``stack`` unloads them.
 
-    They are told no end of the run: it may be gone on from, and an FMU may keep to the end that it was told.
+    They are told no end of the run: it may be continued, and an FMU may keep to the end that it was told.
     """
     for path, block in stepped_blocks(flat.table).items():
         made: Any = block
@@ -136,6 +136,6 @@ def bind(flat: FlatDiagram, plants: Mapping[str, Plant], inputs: np.ndarray, out
 
 
 def part_of(flat: FlatDiagram, layout: Layout, path: str) -> slice:
-    """Return where the ports of a plant stand in z or w."""
+    """Return where the ports of a plant are in z or w."""
     mine = [s for name, s in layout.slices.items() if flat.ports[name][0] == path]
     return slice(mine[0].start, mine[-1].stop) if mine else slice(0, 0)

@@ -12,7 +12,7 @@ class Rest(Protocol):
     """
 
     def advance(self, t: float, end: float) -> float | None:
-        """Go from t to the end, with the plants' outputs as they stand in w; return where a stop condition ended it."""
+        """Go from t to the end, with the plants' outputs as they are in w; return where a stop condition ended it."""
 
     def save(self) -> Any:
         """Return the present state, for `restore`."""

@@ -19,7 +19,7 @@ ROUNDING = 1e-9
 class Rollback:
     """Compare outputs after a step was taken back with those at its beginning.
 
-    Both are read after a restore, so that an FMU which computes its outputs anew then is compared with itself. An
+    Both are read after a restore, so that an FMU which computes its outputs again then is compared with itself. An
     output is compared until it has moved in a step and come back once.
 
     Parameters

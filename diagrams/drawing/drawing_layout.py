@@ -131,7 +131,7 @@ def _assign_layers(nodes: Sequence[Node], pairs: Sequence[tuple[str, str]]) -> N
             waiting[follower] -= 1
             if not waiting[follower]:
                 ready.append(follower)
-    for key in reversed(order):  # sources stand next to what they drive
+    for key in reversed(order):  # sources are next to what they drive
         if not before[key] and after[key] and not ends[key]:
             layer[key] = max(min(layer[a] for a in after[key]) - 1, first)
     last = max((layer[n.key] for n in nodes if n.side <= 0), default=-1) + 1

@@ -33,7 +33,7 @@ class PinPlace(NamedTuple):
     border: Border | None = None
 
     def key(self, pin: Pin) -> str:
-        """Return the key of the node at this place: on a border every pin is a node of its own."""
+        """Return the key of the node at this place: on a border every pin is its own node."""
         return self.path if self.border is None else f"{self.border.value} of {self.path}: {pin.maker} {pin.port}"
 
 

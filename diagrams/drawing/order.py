@@ -211,7 +211,7 @@ def _stiffness(a: Node, b: Node) -> float:
     """Return the weight of a straight wire between two nodes."""
     if a.lane and b.lane:
         return 4.0
-    if a.loose or b.loose:  # a source can stand anywhere
+    if a.loose or b.loose:  # a source can be anywhere
         return 0.5
     return 2.0 if a.lane or b.lane else 1.5
 

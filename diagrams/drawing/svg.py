@@ -192,7 +192,7 @@ class _Picture:
         return bool(stepped_blocks(self.table, path))
 
     def _pin_texts(self, path: str) -> tuple[list[tuple[Pin, str]], list[tuple[Pin, str]]]:
-        """Return pins and their texts, inputs and outputs, in the order in which they stand."""
+        """Return pins and their texts, inputs and outputs, in the order in which they are."""
         ins, outs = self.nets.ins.get(path, []), self.nets.outs.get(path, [])
         block = self.table.blocks.get(path)
         if block is None:

@@ -8,7 +8,7 @@ that the jump of its own event leaves in contact by an impact: the jump changes 
 with them the motion of the indicator, leaves it on 0 or where the event found it, and the rates lead on beyond. The
 direction in which it leaves decides: down is falling, up is rising, and that fires the event if it is declared. So a
 ball that starts on the floor and moves down, or would fall, hits the floor at the start, one that moves up does not;
-sin ωt rises at the start, −sin ωt falls. An indicator that comes to 0 by itself has changed its domain, and going on
+sin ωt rises at the start, −sin ωt falls. An indicator that comes to 0 by itself has changed its domain, and continuing
 from there fires nothing.
 
 **Rest.** A jump whose motion leads back beyond contact at once, again and again, rests there. That is an error which
@@ -94,7 +94,7 @@ class Domains:
         parts["low"][:], parts["high"][:] = -self._hysteresis, self._hysteresis
 
     def tell_slid(self, t: float, event: int) -> tuple[str, ...]:
-        """Return what is to be told of an event that waits for the ends of steps from t on, in s; once for each."""
+        """Return what is to be reported of an event that waits for the ends of steps from t on, in s; once for each."""
         if event in self._told:
             return ()
         self._told.add(event)
@@ -106,11 +106,11 @@ class Domains:
         return (told,)
 
     def begin_anew(self) -> None:
-        """Tell of events again that were told in a run before."""
+        """Report events again that were reported in a run before."""
         self._told.clear()
 
     def save(self) -> dict[str, Any]:
-        """Return what is needed to go on from here."""
+        """Return what is needed to continue from here."""
         parts = {name: part.copy() for name, part in self.parts.items()}
         return {"parts": parts, "fired_times": self.fired_times, "sliding": self.sliding}
 

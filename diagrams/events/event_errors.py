@@ -1,4 +1,4 @@
-"""Errors of runs that can't go on because of their events: chattering, Zeno behaviour, a rest in contact."""
+"""Errors of runs that can't continue because of their events: chattering, Zeno behaviour, a rest in contact."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class EventLimits:
         event = self.events[i]
         return SimulationError(
             f"the event {event.name!r} rests in contact: its jump leaves its indicator at zero, and the motion leads "
-            f"it back beyond at once, {times} times in a row. Nothing in the equations holds it there; going on would "
-            "let it pass through. Give the block a state of rest: a discrete state that the jump sets and that holds "
-            "the rates, and an event that ends it.",
+            f"it back beyond at once, {times} times in a row. Nothing in the equations holds it there; continuing "
+            "would let it pass through. Give the block a state of rest: a discrete state that the jump sets and that "
+            "holds the rates, and an event that ends it.",
             block=event.path,
             t=t,
         )
@@ -42,12 +42,12 @@ class EventLimits:
     def chatters(self, t: float, i: int, h: float, change: np.ndarray) -> SimulationError:
         """Return the error of event ``i``, which chatters; the indicators change by so much in a time of h, in s."""
         event, size, first = self.events[i], float(change[i]), float(self._parts["recent"].min())
-        told = f"of {size:.1g} it would switch about every {2.0 * h:.2g} s" if 0.0 < size < np.inf else "it would go on"
+        slower = f"of {size:.1g} it would switch about every {2.0 * h:.2g} s" if 0.0 < size < np.inf else "it would run"
         return SimulationError(
             f"the event {event.name!r} chatters: {RECENT} times events fired within "
-            f"{t - first:.2g} s, so the run would not go on. "
+            f"{t - first:.2g} s, so the run would not advance. "
             "What it switches drives the indicator back across zero at once (a sliding mode). Declare a hysteresis; "
-            f"with one {told}. In a block of your own that is Event(hysteresis=…), in a Relay its off_point below its "
+            f"with one {slower}. In your own block that is Event(hysteresis=…), in a Relay its off_point below its "
             "on_point, which takes the place of a Compare, too. Or take a fixed step: solver='rk4'.",
             block=event.path,
             t=t,

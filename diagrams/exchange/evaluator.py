@@ -43,7 +43,7 @@ class ExchangedBlock(Protocol):
 
     @property
     def failed(self) -> bool:
-        """Whether its last call failed, so that it can't go on."""
+        """Whether its last call failed, so that it can't continue."""
 
     @property
     def next_time(self) -> float:
@@ -214,7 +214,7 @@ class ExchangeEvaluator:
     def _jump(self, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Look at an instant that is reached: let events act, or take note of a step that the solver has accepted.
 
-        Behind the inputs stands 1 for each event that fires.
+        Behind the inputs is 1 for each event that fires.
         """
         n = u.size - self._count
         u, fired = u[:n], u[n:]

@@ -11,7 +11,7 @@ from .exchanged_blocks import ExchangedBlocks
 
 _ROUNDS = 100  # of events at one instant
 _MANY, _SPAN = 500, 1e-8  # so many instants within so many seconds (relative to 1 + |t|), as for those of indicators
-_PART = 1e-2  # and within so much of the time between two ticks: a run in picoseconds goes on
+_PART = 1e-2  # and within so much of the time between two ticks: a run in picoseconds continues
 _SLOW = 0.5  # part of the time between two ticks within which so many instants make a run slow
 
 
@@ -32,7 +32,7 @@ class OutsideEvents:
         self._told = set[str]()
 
     def count(self, t: float, path: str, name: str) -> None:
-        """Note an instant of a block's own events; refuse instants that pile up, for the run would not go on."""
+        """Note an instant of a block's own events; refuse instants that pile up, for the run would not advance."""
         recent = self._recent[path]
         if recent and t <= recent[-1]:
             if t == recent[-1]:
@@ -47,7 +47,7 @@ class OutsideEvents:
                 self._told.add(path)
                 self._evaluators[path].block.add_note(
                     f"t = {t:.9g} s: its events ({name}) come every {span / (_MANY - 1):.2g} s, about "
-                    f"{base / span * (_MANY - 1):.2g} times between two ticks of {base:g} s, so the run goes on "
+                    f"{base / span * (_MANY - 1):.2g} times between two ticks of {base:g} s, so the run continues "
                     "slowly. Look up in its documentation which input or parameter sets the time between its events"
                 )
             return
@@ -57,7 +57,7 @@ class OutsideEvents:
         )
         raise SimulationError(
             f"its events pile up ({name}): they came at {_MANY} instants within {span:.2g} s, while two ticks are "
-            f"{base:g} s apart, so the run would not go on; {told}. Look up in its documentation which "
+            f"{base:g} s apart, so the run would not advance; {told}. Look up in its documentation which "
             "input or parameter sets the time between its events, or report it to its makers.",
             block=path,
             t=t,

@@ -75,7 +75,7 @@ class ExchangedBlocks:
         return moved
 
     def begin(self, x: np.ndarray) -> None:
-        """End the start: events there act, and the states after them stand in x."""
+        """End the start: events there act, and the states after them are in x."""
         for path, e in self.evaluators.items():
             x[self.flat.states.slices[path]] = e.block.begin_exchange()
             e.look = Look.EVENTS

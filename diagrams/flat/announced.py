@@ -68,7 +68,7 @@ def _find_announcers(flat: FlatDiagram) -> list[tuple[str, Announcer]]:
 
 
 def _times_of(flat: FlatDiagram, path: str, known: Lines) -> Iterator[tuple[float, bool]]:
-    """Yield the times at which a block without instants of its own is not smooth; see `Times`."""
+    """Yield the times at which a block without its own instants is not smooth; see `Times`."""
     block, traced = flat.table.blocks[path], flat.checked.traced[path]
     lines = {name: line for name in traced.inputs if (line := _line_at(flat, path, name, known)) is not None}
     moving = {name: line for name, line in lines.items() if np.any(line[1])}

@@ -14,7 +14,7 @@ from .program import Cells
 class BlockFunctions:
     """The traced equations of a diagram's blocks, and functions of parts of them.
 
-    An instant may evaluate some outputs of a block before its other ones: for these there is a function of their own.
+    An instant may evaluate some outputs of a block before its other ones: these have a separate function.
 
     Parameters
     ----------

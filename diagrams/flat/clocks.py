@@ -68,7 +68,7 @@ def ticks_after(patterns: Sequence[TickPattern], k: int, last: int, count: int) 
 
 
 def in_order(clocks: frozenset[TickPattern] | set[TickPattern]) -> tuple[TickPattern, ...]:
-    """Return clocks in an order of their own, fastest first."""
+    """Return clocks in their own order, fastest first."""
     return tuple(sorted(clocks, key=lambda c: (c.every, c.offset)))
 
 

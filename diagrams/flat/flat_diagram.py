@@ -80,7 +80,7 @@ class FlatDiagram(FlatLayout):
         return FlatLayout(**{f.name: getattr(self, f.name) for f in fields(FlatLayout)})
 
     def with_apart(self, *paths: str) -> FlatDiagram:
-        """Return the same diagram with some blocks evaluated from outside, in stages of their own."""
+        """Return the same diagram with some blocks evaluated from outside, in their own stages."""
         return replace(self, apart=frozenset(paths) | frozenset(self.outside))
 
     def with_numbers(self, table: Structure, p: np.ndarray, x0: np.ndarray) -> FlatDiagram:

@@ -195,7 +195,7 @@ def indicators_of(instant: Instant) -> tuple[list[Any], list[Any]]:
 def trace_jump(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
     """Return ``(t, x, w, p, fired) -> x_next``: x after the events that fire; each sees the instant before them all.
 
-    A block that is evaluated from outside is asked whatever fires: it has events of its own.
+    A block that is evaluated from outside is asked whatever fires: it has its own events.
     """
     symbols = make_symbols(layout)
     fired = ca.MX.sym("fired", len(layout.events))

@@ -99,9 +99,9 @@ class FlatLayout:
     order, start_order : Order
         In which order ports are evaluated at an instant, and at the start.
     ports : dict
-        Block and port behind every dotted path; an FMU's port may have dots of its own.
+        Block and port behind every dotted path; an FMU's port may have its own dots.
     apart : frozenset of str
-        Blocks that are evaluated from outside, in stages of their own; see `loopwright.diagrams.flat.stages`.
+        Blocks that are evaluated from outside, in their own stages; see `loopwright.diagrams.flat.stages`.
     asked : bool
         Whether ``base`` was asked for, as a ``step``: then something happens at every tick.
     """
@@ -190,7 +190,7 @@ class FlatLayout:
 
     @cached_property
     def outside(self) -> tuple[str, ...]:
-        """Paths of the blocks whose equations a run evaluates from outside, with events of their own."""
+        """Paths of the blocks whose equations a run evaluates from outside, with their own events."""
         return tuple(path for path in sorted(self.apart) if self.table.blocks[path].evaluated_outside)
 
     @cached_property

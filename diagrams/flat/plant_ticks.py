@@ -1,6 +1,6 @@
 """Communication points of plants: the ticks to which an FMU, or another stepped block, steps.
 
-A plant steps at the ticks of the sampled subsystem that it stands in, and of those that it is wired to, directly or
+A plant steps at the ticks of the sampled subsystem that it is in, and of those that it is wired to, directly or
 through blocks in continuous time; plants that are wired to one another in this way share their ticks. So a subsystem
 that has nothing to do with a plant never changes its communication points.
 """
@@ -61,7 +61,7 @@ def find_plant_ticks(
     clocks : mapping
         For every subsystem that is sampled: at which ticks it acts.
     every : bool
-        Whether a step was asked for: then plants without a communication step of their own step at every tick.
+        Whether a step was asked for: then plants without their own communication step step at every tick.
     """
     plants = stepped_blocks(table)
     own = {path: step for path, plant in plants.items() if (step := own_step(plant)) is not None}

@@ -62,7 +62,7 @@ class Evaluator(Protocol):
             Time in s.
         x, u : ndarray
             The block's states and inputs, flat. Inputs that none of ``names`` depends on may be zeros. Behind them, for
-            ``"jump"``, stands 1 for each event that fires, else 0.
+            ``"jump"``, is 1 for each event that fires, else 0.
         """
         ...
 
@@ -341,7 +341,7 @@ def bind_function(function: Any, arguments: Sequence[np.ndarray], results: Seque
 
 
 def call_function(function: Any, arguments: Sequence[Any]) -> list[np.ndarray]:
-    """Return the results of a CasADi function, all of them dense, as matrices of their own.
+    """Return the results of a CasADi function, all of them dense, as their own matrices.
 
     Its buffers take a fifth of the time that a call with CasADi's matrices takes.
     """

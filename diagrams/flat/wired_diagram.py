@@ -32,7 +32,7 @@ from .flatten import flatten, renumber
 from .plant_ticks import own_step
 
 VARIANTS = 8
-"""Variants with functions of their own that a diagram remembers, as long as they are in use."""
+"""Variants with their own functions that a diagram remembers, as long as they are in use."""
 OF_A_RUN = frozenset({"start"})
 """Parameters of a stepped block that a run gives to it, and that no function of the diagram has in it."""
 _STRUCTURE = tuple(f.name for f in fields(Structure) if f.name != "blocks")

@@ -76,7 +76,7 @@ class GroupedCode:
     Attributes
     ----------
     text : str
-        The C code that stands before the ticks.
+        The C code that comes before the ticks.
     """
 
     def __init__(self, programs: Sequence[TickProgram], scalars: ScalarFunctions, driver: str):

@@ -1,13 +1,13 @@
-/* A tick of many blocks over vectors: runs of equal blocks, each one loop over a table that says where their values stand.
+/* A tick of many blocks over vectors: runs of equal blocks, each one loop over a table that says where their values are.
 
    v holds the time, then the log (outputs of plants, outputs of blocks, states before the tick), then whatever else a
-   tick needs, as in fmus/runtime/grouped.c. Above this text stand the kernels and their table. */
+   tick needs, as in fmus/runtime/grouped.c. Above this text are the kernels and their table. */
 
 #include <float.h>
 
 typedef struct {
     const int32_t *runs, *rows;                     /* of each run: its kernel, how many blocks, where its rows begin */
-    const int32_t *inputs, *guards, *made, *taken;  /* where these stand in v */
+    const int32_t *inputs, *guards, *made, *taken;  /* where these are in v */
     int32_t count, log, next, n_guards, n_loops, residual;
 } lane_group;
 

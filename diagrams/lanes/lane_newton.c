@@ -18,7 +18,7 @@ OWN mask finite_of(const vec *values, int n) {
     return found;
 }
 
-/* Factorize J of a lane, which stands column by column, with partial pivoting; false if a pivot is zero. */
+/* Factorize J of a lane, which is column by column, with partial pivoting; false if a pivot is zero. */
 static bool factorize_lane(int n, const vec *J, int lane, double *a, int *rows) {
     for (int i = 0; i < n; i++) {
         rows[i] = i;
@@ -58,7 +58,7 @@ static void substitute_lane(int n, const double *a, const int *rows, const doubl
     }
 }
 
-/* J^-1 r of the lanes that go on; returns where it is found. */
+/* J^-1 r of the lanes that continue; returns where it is found. */
 OWN mask newton_direction(int n, const vec *J, const vec *r, vec *direction, mask going) {
     if (n == 1) {
         direction[0] = r[0] / J[0];

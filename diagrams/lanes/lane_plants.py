@@ -83,7 +83,7 @@ static void ${name}_end(const $name *self, vec *into) {
 
 @dataclass(frozen=True, eq=False)
 class LanePlant:
-    """An FMU's equations, and where its ports stand.
+    """An FMU's equations, and where its ports are.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class LanePlant:
     references : sequence of int
         Value references of the parameters, inputs and states, in this order, then of the integrator's step and kind.
     entries : mapping of int to slice
-        Where the values of these stand among the numbers of a run, by value reference; without the integrator's.
+        Where the values of these are among the numbers of a run, by value reference; without the integrator's.
     """
 
     path: str
@@ -187,7 +187,7 @@ def read_plant(path: str, block: Fmu, inputs: Mapping[str, slice], outputs: Mapp
 
 
 def _places(found: WrittenEquations, variable: FmuVariable) -> list[int]:
-    """Return where the elements of a variable stand among the values of an instance."""
+    """Return where the elements of a variable are among the values of an instance."""
     own = [found.variables[reference] for reference in variable.references]
     return [v.first + k for v in own for k in range(v.size)]
 

@@ -27,7 +27,7 @@ class LaneStart:
     row : ndarray
         The entries of the log that are kept.
     messages : tuple of str
-        What its start has told.
+        What its start has reported.
     """
 
     x: np.ndarray
@@ -83,7 +83,7 @@ class LaneVectors:
     steps : tuple of float
         Longest step of each FMU's integrator in s.
     messages : list of tuple of str
-        What the start of each run has told.
+        What the start of each run has reported.
     """
 
     def __init__(self, code: LaneCode, columns: int):
@@ -126,7 +126,7 @@ class LaneRuns:
     code : LaneCode
         The code.
     vectors : LaneVectors
-        The runs' numbers, which change as they go on.
+        The runs' numbers, which change as they continue.
     columns : ndarray
         Entries of the log that are kept.
     every : int

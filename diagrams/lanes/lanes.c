@@ -1,7 +1,7 @@
 /* The loop over ticks with a vector of runs: FMUs step, the tick is evaluated, its states are taken over, a row is kept.
 
-   It stands behind vectors.h and the functions of a diagram, which are written over vectors. A run that fails is out: it
-   is told with the tick that it could not go beyond, and its lane goes on with the numbers of another one. */
+   It comes after vectors.h and the functions of a diagram, which are written over vectors. A run that fails is out: it
+   is reported with the tick that it could not pass, and its lane continues with the numbers of another one. */
 
 
 #include <float.h>
@@ -15,7 +15,7 @@ typedef struct {
     double *plant;                 /* of the FMUs: parameters, inputs and states, one after the other */
     const double *steps;           /* of the integrator of each FMU, in s, at most */
     double *last;                  /* the row with which a run has ended */
-    int64_t alive[LANES];          /* -1: it goes on; 0: it has ended */
+    int64_t alive[LANES];          /* -1: it continues; 0: it has ended */
     int64_t failed[LANES];         /* the tick that it could not go beyond, counted from 1; 0: none */
     int64_t stopped[LANES];        /* the tick at which it was stopped, counted from 1; 0: none */
     int64_t by[LANES];             /* the stop that ended it, by its place */

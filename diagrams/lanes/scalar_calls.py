@@ -18,7 +18,7 @@ _AS_ALONE, _FUSED = "#pragma STDC FP_CONTRACT OFF\n", "\n#pragma STDC FP_CONTRAC
 
 
 class ScalarFunctions:
-    """Functions that have no form over vectors; their C code stands before all that calls them."""
+    """Functions that have no form over vectors; their C code comes before all that calls them."""
 
     def __init__(self) -> None:
         self._functions: list[Any] = []

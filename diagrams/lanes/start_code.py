@@ -59,7 +59,7 @@ class StartSource:
 def write_start(
     source: StartSource, plants: Sequence[LanePlant], ticks: TickSources, scalars: ScalarFunctions
 ) -> tuple[str, int]:
-    """Write the C code; it stands behind that of the FMUs, ``plant0`` and so on.
+    """Write the C code; it comes after that of the FMUs, ``plant0`` and so on.
 
     Returns
     -------

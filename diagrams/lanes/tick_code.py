@@ -32,7 +32,7 @@ class TickSources:
     Attributes
     ----------
     text : str
-        The C code that stands before the ticks.
+        The C code that comes before the ticks.
     is_grouped : bool
         Whether they are groups of equal blocks, whose values need memory.
     """

@@ -1,6 +1,6 @@
 """The compliance loop of one direction of Fig. 3 against an environment: its parameters, its diagram and its contact.
 
-Fig. 3 is linear for small motions around rest on, or beside, the path. Let p be the displacement in m in the frame of
+Fig. 3 is linear for small motions around rest on, or off, the path. Let p be the displacement in m in the frame of
 the path, first along the tangent t, then along the normal n. Then η = p∥/q and ξ = p⊥ with q = 1 − κ ξ₁ (E22), or
 w = Q⁻¹ p, Q = diag(q, 1). With E = [t n] and the model (2) of the plant, the mobility is G = Eᵀ G_v E, the inertia
 M = G⁻¹, and the slope of the friction C = −M Eᵀ (∂f_v/∂x_v) E. At rest C contains the slope F_c/w of the Coulomb
@@ -146,7 +146,7 @@ class AdmittanceLoop(Value):
         side : str, optional
             ``"par"`` or ``"perp"``.
         point : OperatingPoint, optional
-            Instant of the diagram that gives the plant's states beside position and velocity, such as contact; the
+            Instant of the diagram that gives the plant's states besides position and velocity, such as contact; the
             start without it.
         **changes
             Parameters that the diagram does not hold, or other values: ``eta`` and ``xi`` of the point on the path,

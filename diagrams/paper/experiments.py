@@ -168,7 +168,7 @@ def _plant(letter: str, options: Mapping[str, Any], given: Collection[str], posi
     elif not plant.start:
         raise OptionError(
             f"its {place} is computed and can't be set to ({position[0]:g}, {position[1]:g}) m, where experiment "
-            f"{letter} starts. Give the plant with start values of its own that place it there: "
+            f"{letter} starts. Give the plant with its own start values that place it there: "
             "plant=Fmu(file, start={…}).",
             block=f"experiment {letter}",
             port="plant",

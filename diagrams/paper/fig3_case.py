@@ -128,7 +128,7 @@ class Fig3Case(Case):
         return found
 
     def _placed(self, eta: float, xi: float) -> dict[str, Any]:
-        """Return the change of the diagram that starts its plant at a point beside the path, η and ξ in m."""
+        """Return the change of the diagram that starts its plant at a point off the path, η and ξ in m."""
         position = self.path.to_plane(eta, xi)
         start = {"position": position} if self.plant is None else self.plant.start_of("position", position, "m")
         return {f"{PLANT}.start.{name}": value for name, value in start.items()}
@@ -250,7 +250,7 @@ class Fig3Case(Case):
         return WeakKeyDictionary()
 
     def at(self, variant: Variant, eta: float, xi: float) -> Variant | None:
-        """Return a variant at rest at another point beside the path, made once; None where it is not at rest there."""
+        """Return a variant at rest at another point off the path, made once; None where it is not at rest there."""
         known = self._elsewhere.setdefault(variant, {})
         if (eta, xi) not in known:
             changes = self._placed(eta, xi)
@@ -265,12 +265,12 @@ class Fig3Case(Case):
         return known[eta, xi]
 
     def name_place(self, place: str) -> str:
-        """Return the name of a point beside the path, by its part of dotted paths."""
+        """Return the name of a point off the path, by its part of dotted paths."""
         found = {key: f"η = {1000 * eta:.0f} mm, ξ = {1000 * xi:.0f} mm" for key, eta, xi in self.places()}
         return found.get(place) or super().name_place(place)
 
     def places(self) -> list[tuple[str, float, float]]:
-        """Return points beside the path, η and ξ in m, with the names they have in dotted paths."""
+        """Return points off the path, η and ξ in m, with the names they have in dotted paths."""
         length = self.path.length
         made = []
         for share, xi in ((0.0, 0.0), (0.0, -0.02), (0.15, 0.0), (0.15, 0.02), (0.35, -0.02), (0.35, 0.0)):

@@ -69,7 +69,7 @@ def _asked(case: Fig3Case, side: str, wire: str, block: ErrorDynamics, numbers: 
             got = np.poly(r.closed_matrix())
             how = "characteristic polynomials of the loop at the virtual input"
             off = _off(got, asked)
-            if len(got) != len(asked) and not off <= SAME:  # the plant has dynamics of its own
+            if len(got) != len(asked) and not off <= SAME:  # the plant has its own dynamics
                 rows.append((v.title, list_poles(np.roots(got)), ""))
                 continue
             keep(v, "polynomial_difference", Number(off, "1", 1e-9, how))
@@ -179,7 +179,7 @@ def with_model(v: Variant, model: PlanarModel) -> Variant:
 
 
 class _Claims:
-    """Numbers and rows about the claims, variant by variant, each at several points beside the path."""
+    """Numbers and rows about the claims, variant by variant, each at several points off the path."""
 
     def __init__(self, case: Fig3Case):
         self.case = case

@@ -29,7 +29,7 @@ OPTIONS: Mapping[Implementation, Mapping[str, Any]] = {
 
 
 class LoopKind(NamedTuple):
-    """A loop with its title, and what stands around the names of its numbers in their keys."""
+    """A loop with its title, and what is around the names of its numbers in their keys."""
 
     title: str
     loop: AdmittanceLoop

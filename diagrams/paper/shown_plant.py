@@ -3,7 +3,7 @@
 The reduced model is p̈ = G_v (u + F) + S ṗ + constant with S = ∂f_v/∂x_v: four states, no stiffness. It is compared
 with the plant's own linear model in the coordinates (position, velocity): `Fmu.linear_model` of an FMU, the traced
 Jacobian of a block. Each entry must agree within ten times the error that the linear model states for it, plus
-rounding; the factor is there because the error of differences is an estimate. An error that is large beside the
+rounding; the factor is there because the error of differences is an estimate. An error that is large compared with the
 controller's gains shows nothing, and the plant is refused too.
 
 Both models are taken at the same position and velocity, under the motor force that leaves the plant without

@@ -136,8 +136,8 @@ class Recorder:
         if not found:
             return ()
         text = (
-            f"no finite numbers stand in the record of {enumerate_some(found)}: an FMU puts them out, and the run goes "
-            "on, as nothing reads them. Choose the FMU's ports without them, by ports=, if they are of no use."
+            f"no finite numbers are in the record of {enumerate_some(found)}: an FMU puts them out, and the run "
+            "continues, as nothing reads them. Choose the FMU's ports without them, by ports=, if they are of no use."
         )
         return (text,)
 

@@ -93,7 +93,7 @@ def check_fits(state: RunState, flat: FlatDiagram, name: str) -> None:
     if state.version != VERSION:
         raise OptionError(
             f"found a state of version {state.version}, made by loopwright {state.made_by}; this loopwright "
-            f"{own_version()} reads version {VERSION}. Go on from it there, or make it again.",
+            f"{own_version()} reads version {VERSION}. Continue from it there, or make it again.",
             block=name,
             port="start",
         )
@@ -115,7 +115,7 @@ def check_fits(state: RunState, flat: FlatDiagram, name: str) -> None:
                 reason = explain_absent_state(flat.table.blocks, first)
                 raise OptionError(
                     f"found the state of a run of {state.diagram!r} with other blocks: {whose} the {kind} of "
-                    f"{first!r}.{reason and f' Here {reason}'} Go on with the same blocks and wires; a branch may "
+                    f"{first!r}.{reason and f' Here {reason}'} Continue with the same blocks and wires; a branch may "
                     "change parameters.",
                     block=name,
                     port="start",
@@ -134,6 +134,6 @@ def not_open_error(opened: bool | None, name: str) -> OptionError:
     found = "has not begun" if opened is None else "has ended, and its FMUs are freed"
     return OptionError(
         f"this run {found}; expected it to be used inside of its with statement, once: with diagram.simulation(…) as "
-        "simulation: …. To go on later, keep simulation.save() and give it as start=….",
+        "simulation: …. To continue later, keep simulation.save() and give it as start=….",
         block=name,
     )

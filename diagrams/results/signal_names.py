@@ -76,7 +76,7 @@ def resolve(
         path, variable = hidden
         raise UnknownNameError(
             f"no signal {name!r} was recorded: {variable!r} is a variable of the FMU {path!r}, and no port of its. "
-            f"Make it one, beside those that are needed: Fmu(…, ports=[…, {variable!r}])."
+            f"Make it one, besides those that are needed: Fmu(…, ports=[…, {variable!r}])."
         )
     if reason := explain_absent_state(blocks or {}, name):
         raise UnknownNameError(f"no signal {name!r} was recorded: {reason}")

@@ -79,7 +79,7 @@ class SecondProcess(Generic[T]):
         make : callable
             Makes a part here.
         tell : callable
-            Told what the second process tells, by this thread.
+            Called with what the second process tells, by this thread.
         """
         self._left = deque(keys[1:])
         if self._child is not None:

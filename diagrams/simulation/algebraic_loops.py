@@ -77,7 +77,7 @@ class LoopSolver:
         """
         before = self.x[self.where].copy()
         found = self._seek()
-        if not found <= TOLERANCE and math.isfinite(found):  # a NaN that comes in is told by who made it
+        if not found <= TOLERANCE and math.isfinite(found):  # a NaN that comes in is reported by who made it
             if not search:
                 raise self._unsolved(found)
             others = self._search(before, ())
@@ -204,7 +204,7 @@ class LoopSolver:
         part = np.abs(direction) > 1e-6 * np.max(np.abs(direction))
         free = ", ".join(name for name, is_free in zip(self.names, part, strict=True) if is_free)
         return self._error(
-            f"the algebraic loop does not determine {free}: it is singular, and values beside "
+            f"the algebraic loop does not determine {free}: it is singular, and values next to "
             f"{_text(self.x[self.where])} solve it as well; expected one solution."
         )
 

@@ -1,4 +1,4 @@
-"""Why a run can't go on: the error of the block, or of the method, behind the place where the loop has broken off."""
+"""Why a run can't continue: the error of the block, or of the method, behind the place where the loop broke off."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _explain_step(continuous: Continuous, error: SimulationError) -> SimulationE
     made = None if continuous.beyond is None else _failure_at(continuous, *continuous.beyond)
     if made is None or made.block == error.block:
         return error
-    return made.add(f" The solver could not go on without it: {error.message}")
+    return made.add(f" The solver could not continue without it: {error.message}")
 
 
 def _failure_at(continuous: Continuous, t: float, x: np.ndarray) -> SimulationError | None:

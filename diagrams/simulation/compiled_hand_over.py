@@ -161,7 +161,7 @@ def find_edges(
 
 
 def active_method(continuous: Continuous) -> int:
-    """Return the place of the method that a run goes on with."""
+    """Return the place of the method that a run continues with."""
     return continuous.method.names.index(continuous.method.active) if continuous.where.size else 0
 
 
@@ -176,13 +176,13 @@ def restore_plans(continuous: Continuous, steps: Sequence[float | None]) -> None
 
 
 def changes_method(workspace: Workspace, continuous: Continuous, t: float, sign: Sign, h: float) -> None:
-    """Decide, after a sign at steps of h in s, whether another method goes on from t."""
+    """Decide, after a sign at steps of h in s, whether another method continues from t."""
     continuous.stand_in(math.inf, math.inf)
     x = workspace.here.x[continuous.where]
     workspace.messages += continuous.method.decide(t, x, h, stuck=sign is Sign.STUCK)
 
 
 def tell_fired(continuous: Continuous, fired: Sequence[Fired]) -> None:
-    """Tell events that have fired in C."""
+    """Report events that have fired in C."""
     for one in fired:
         continuous.tell_event(one.t, one.event, one.before, one.after)

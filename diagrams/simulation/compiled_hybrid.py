@@ -99,7 +99,7 @@ class HybridTicks:
         self._handed: HandedOver | None = None
 
     def hand_over(self, code: HybridCode) -> None:
-        """Let generated code of the same functions go on; C must not run meanwhile."""
+        """Let generated code of the same functions continue; C must not run meanwhile."""
         self._code.hand_over(code)
         if self._loop is not None:
             self._loop.take_steps(code.steps)
@@ -109,7 +109,7 @@ class HybridTicks:
         write = partial(hybrid_sources, self._flat, self._acting, stiff=self._stiff)
         return LaterCode(BackgroundCode(self._flat, write, self._plants.prepare()))
 
-    # --- going on ----------------------------------------------------------------------------------------------------
+    # --- continuing ------------------------------------------------------------------------------------------------
 
     def run(
         self,
@@ -179,7 +179,7 @@ class HybridTicks:
         return None
 
     def _step_plants(self, loop: CompiledHybrid, found: HybridOutcome, k: int, following: int, last: int) -> None:
-        """Let Python go on with the steps of the plants."""
+        """Let Python continue with the steps of the plants."""
         try:
             self._plants.go_on(loop.ticks, found, k, following, last)
         except SimulationError as error:
@@ -192,7 +192,7 @@ class HybridTicks:
         self._land(loop, t, loop.kinds.get(acting, len(loop.kinds)), recorder)
 
     def end_between_ticks(self, k: int, end: float, recorder: Recorder) -> float | None:
-        """Go on from tick ``k`` to the end of the run in s, before the next tick, and record it; see `run`."""
+        """Continue from tick ``k`` to the end of the run in s, before the next tick, and record it; see `run`."""
         loop, t = self._bind(recorder), self._time_of(k)
         ended = None if self._plants.are_coupled else self.go_between(t, end)
         if ended is None:
@@ -216,7 +216,7 @@ class HybridTicks:
             self._take_back(loop)
 
     def go_between(self, t: float, end: float) -> float | None:
-        """Go on from t to an instant, both in s, before any tick there; nothing is recorded.
+        """Continue from t to an instant, both in s, before any tick there; nothing is recorded.
 
         Within a step of the plants the loop waits for this; see `PlantsInC`.
 
@@ -244,7 +244,7 @@ class HybridTicks:
             self._take_back(loop)
 
     def _call(self, loop: CompiledHybrid, span: Span, recorder: Recorder) -> HybridOutcome:
-        """Let C go on, and take note of what has happened; see `_look_at`."""
+        """Let C continue, and take note of what has happened; see `_look_at`."""
         rows = recorder.room(float(span.times[0]))
         loop.skip = recorder.skip
         found = loop.run(span, rows)
@@ -258,7 +258,7 @@ class HybridTicks:
         Raises
         ------
         SimulationError
-            If the run can't go on.
+            If the run can't continue.
         """
         loop.ticks.check()
         self._tell()
@@ -343,7 +343,7 @@ class HybridTicks:
         self._hand_over(self._loop, end)
 
     def _hand_over(self, loop: CompiledHybrid, t: float) -> None:
-        """Let C go on from an instant that Python has come to."""
+        """Let C continue from an instant that Python has come to."""
         continuous = self._continuous
         loop.begin(t)
         if self._handed is not None:
@@ -355,7 +355,7 @@ class HybridTicks:
             loop.hand_over_domains(continuous.domains)
 
     def _take_back(self, loop: CompiledHybrid) -> None:
-        """Let Python go on from where C has come to."""
+        """Let Python continue from where C has come to."""
         continuous = self._continuous
         restore_plans(continuous, loop.planned)
         if self._handed is not None and self._handed.take_back():
@@ -364,7 +364,7 @@ class HybridTicks:
             loop.take_back_domains(continuous.domains)
 
     def _tell(self) -> None:
-        """Tell what has happened in C: events that have fired, and those of blocks from outside."""
+        """Report what has happened in C: events that have fired, and those of blocks from outside."""
         loop, continuous = self._loop, self._continuous
         assert loop is not None
         tell_fired(continuous, loop.take_fired())

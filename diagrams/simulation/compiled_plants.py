@@ -82,7 +82,7 @@ class PlantsInC:
         return self.ended is not None or any(getattr(plant, "ends_run", False) for plant in self._plants.values())
 
     def prepare(self) -> Callable[[], object]:
-        """Return a function that compiles what the steps of plants need beside the code of a diagram."""
+        """Return a function that compiles what the steps of plants need besides the code of a diagram."""
         return compile_other_side if any(map(runs_apart, self.entries.values())) else lambda: None
 
     def table(self, ticks: np.ndarray, last: int) -> StepTable | None:
@@ -117,7 +117,7 @@ class PlantsInC:
         return StepTable(np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=np.uint8))
 
     def go_on(self, loop: CompiledLoop, found: Outcome | HybridOutcome, k: int, following: int, last: int) -> None:
-        """Go on with the steps from a visited tick to the next one, from the plant on that C could not go beyond.
+        """Continue with the steps from a visited tick to the next one, from the plant on that C could not go beyond.
 
         Raises
         ------

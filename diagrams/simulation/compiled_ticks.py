@@ -136,7 +136,7 @@ class CompiledTicks:
         return self._code.notes + (() if self._code.exact else (_SIGNS,))
 
     def hand_over(self, code: TickCode) -> None:
-        """Let generated code of the same ticks go on; C must not run meanwhile."""
+        """Let generated code of the same ticks continue; C must not run meanwhile."""
         self._code, self._loop = code, None
 
     def make_later(self) -> LaterCode[TickCode]:
@@ -158,10 +158,10 @@ class CompiledTicks:
         Parameters
         ----------
         arrived : callable
-            Told the ticks at which the loop has returned, and whether plants are in the next step already, in which one
-            may ask for the end; returns whether the run ends there.
+            Called with the ticks at which the loop has returned, and whether plants are in the next step already, in
+            which one may ask for the end; returns whether the run ends there.
         progress : callable
-            Told the time after each chunk.
+            Called with the time after each chunk.
         """
         for window in self._windows(k, last):
             if self._run_window(window, last, recorder, arrived, progress):
@@ -365,7 +365,7 @@ class LaterCode(Generic[Code]):
         return () if self.background.failure is None else tell_failure_once(self.background.failure)
 
 
-_TOLD: list[Exception] = []  # the failure that this process has told
+_TOLD: list[Exception] = []  # the failure that this process has reported
 
 
 def tell_failure_once(failure: Exception) -> tuple[str, ...]:

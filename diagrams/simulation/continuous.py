@@ -40,7 +40,7 @@ class Continuous:
     solver, rtol, atol, max_step
         See `Diagram.simulate`.
     on_event : callable
-        Told every event that fires.
+        Called with every event that fires.
     exchanged : ExchangedBlocks, optional
         Blocks that are evaluated from outside.
 
@@ -140,7 +140,7 @@ class Continuous:
     # --- events ------------------------------------------------------------------------------------------------------
 
     def tell_outside(self, t: float, path: str, name: str, before: np.ndarray, after: np.ndarray) -> None:
-        """Tell an event of a block from outside, with all states before and after it."""
+        """Report an event of a block from outside, with all states before and after it."""
         self.on_event(Occurrence(t, path, name, *(state_values(self.flat, path, x) for x in (before, after))))
 
     def follow(self) -> None:
@@ -152,7 +152,7 @@ class Continuous:
                 self.method.set_absolute_tolerance(absolute_tolerances(self.flat, self.resolution[1], nominals))
 
     def tell_event(self, t: float, i: int, before: np.ndarray, after: np.ndarray) -> None:
-        """Tell that event ``i`` has fired at t in s, with all states before and after it.
+        """Say that event ``i`` has fired at t in s, with all states before and after it.
 
         An FMU hears of every crossing of its indicators. One that comes back at once over the zero beyond which the
         last event was located, and that changes no state, is no event of the run.
@@ -232,7 +232,7 @@ class Continuous:
     # --- what is kept from step to step ------------------------------------------------------------------------------
 
     def save(self) -> dict[str, Any]:
-        """Return what is needed to go on from here."""
+        """Return what is needed to continue from here."""
         return {
             "domains": None if self.domains is None else self.domains.save(),
             "delays": None if self.delays is None else self.delays.save(),

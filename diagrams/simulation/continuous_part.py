@@ -28,7 +28,7 @@ class _Saved:
 class ContinuousPart:
     """The blocks in continuous time between two ticks: advanced, saved and restored; see `Rest`.
 
-    Events are told when they are accepted: those of a pass that is gone back over have not happened.
+    Events are reported when they are accepted: those of a pass that is gone back over have not happened.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class ContinuousPart:
     continuous : Continuous or None
         Its method, events and delays; None where nothing happens between ticks.
     exchanged : ExchangedBlocks
-        Model-exchange FMUs, which keep memory of their own.
+        Model-exchange FMUs, which keep their own memory.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The engine of a run: everything that goes on in time, without the record."""
+"""The engine of a run: everything that advances in time, without the record."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Engine:
     every_tick : bool
         Visit every tick, not only those at which a subsystem acts.
     on_event : callable
-        Told every event that fires.
+        Called with every event that fires.
     """
 
     def __init__(
@@ -178,7 +178,7 @@ class Engine:
         self.workspace.begun = True
 
     def take_tier(self) -> str:
-        """Return in which form the run has gone on since the last call: "interpreted", "compiled" or "both"."""
+        """Return in which form the run has continued since the last call: "interpreted", "compiled" or "both"."""
         found = "both" if self._changed else "compiled" if self._generated else "interpreted"
         self._changed = False
         return found
@@ -195,7 +195,7 @@ class Engine:
         return plain and all(isinstance(p, FmuInstance) and p.native is not None for p in self.plants.values())
 
     def begin_anew(self, flat: FlatDiagram, set_start: Callable[[Workspace], None] | None = None) -> None:
-        """Go back to t = 0 with other numbers; the plants, initialized anew before, stay bound.
+        """Go back to t = 0 with other numbers; the plants, initialized again before, stay bound.
 
         Parameters
         ----------
@@ -214,7 +214,7 @@ class Engine:
         self._find_start(set_start or find_start_values)
 
     def _make_compiled(self, *, machine: bool) -> None:
-        """Make the loop in C, with generated code or the virtual machine; a message tells where code can't be had."""
+        """Make the loop in C, with generated code or the virtual machine; a message says where code can't be had."""
         from .compiled_hybrid import make_hybrid
         from .compiled_ticks import make_compiled
 
@@ -271,14 +271,14 @@ class Engine:
         self._arrive(first)
 
     def go(self, last: int, recorder: Recorder, progress: Progress) -> None:
-        """Go on to a tick, or to where a stop condition ends the run.
+        """Continue to a tick, or to where a stop condition ends the run.
 
         Parameters
         ----------
         recorder : Recorder
             Records the samples.
         progress : callable
-            Told the time now and then, and at the end.
+            Called with the time now and then, and at the end.
 
         Raises
         ------
@@ -299,13 +299,13 @@ class Engine:
                 raise culprit from culprit.__cause__
 
     def _hand_over(self) -> None:
-        """Let generated code go on where the virtual machine has come to."""
+        """Let generated code continue where the virtual machine has come to."""
         assert self._compiled is not None
         self._compiled.hand_over(self._change_over.code)
         self._changed = self._generated = True
 
     def end_between_ticks(self, end: float, recorder: Recorder, progress: Progress) -> None:
-        """Go on from a tick to the end of the run, before the next tick, and record it; see `go`."""
+        """Continue from a tick to the end of the run, before the next tick, and record it; see `go`."""
         position, workspace = self.position, self.workspace
         try:
             ended = None
@@ -328,7 +328,7 @@ class Engine:
                 raise culprit from culprit.__cause__
 
     def take_texts(self) -> dict[str, TextSignal]:
-        """Return texts and binary data of the plants by dotted path; their record begins anew with the last ones."""
+        """Return texts and binary data of the plants by dotted path; their record begins again with the last ones."""
         found = {}
         for path, plant in self.loaded.items():
             for port, changes in getattr(plant, "texts", {}).items():
@@ -389,7 +389,7 @@ class Engine:
         return True
 
     def _note_end(self, t: float, since: float) -> None:
-        """Tell of an FMU in co-simulation: its time, its step's start; one in model exchange tells it itself."""
+        """Describe an FMU in co-simulation: its time, its step's start; one in model exchange does so itself."""
         stopped = self.position.stopped
         plant: Any = None if stopped is None else self.plants.get(stopped.block)
         if stopped is not None and getattr(plant, "ends_run", False):
@@ -411,7 +411,7 @@ class Engine:
         return error if opaque is None else opaque.at(t=error.t)
 
     def set_parameters(self, path: str, block: Block) -> None:
-        """Let a block go on with the parameters of a variant; see `Simulation.set_parameters`."""
+        """Let a block continue with the parameters of a variant; see `Simulation.set_parameters`."""
         if path not in self.flat.checked.traced:
             raise UnknownNameError(
                 f"no block there is evaluated in this run. {near(path, self.flat.checked.traced)}", block=path

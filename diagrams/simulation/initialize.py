@@ -22,7 +22,7 @@ from .transport_delays import Delays
 from .workspace import Workspace
 
 _PLAIN_PASSES = 10
-"""Passes over inputs and outputs at the start, and one for each plant, before it is decided how to go on."""
+"""Passes over inputs and outputs at the start, and one for each plant, before it is decided how to continue."""
 _MOST_PASSES = 100
 """Most passes where each brings the values nearer; ten times as many with loops in the initial states."""
 _LOOKED_BACK = 4

@@ -94,7 +94,7 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, run: Run):
         where = f"at t = {run.t[-1]:.9g} s" if len(run.t) else "before the first sample"
         super().__init__(f"interrupted {where}")
-        told = f"This run was interrupted {where}, within a step: it has no final_state to go on from."
+        told = f"This run was interrupted {where}, within a step: it has no final_state to continue from."
         self.run = run if told in run.messages else replace(run, messages=(*run.messages, told))
 
     def __reduce__(self) -> tuple[type[Interrupted], tuple[Run]]:

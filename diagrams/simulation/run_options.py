@@ -86,7 +86,7 @@ class RunOptions:
     overwrite : bool
         Replace a run that is stored there.
     start : RunState or OperatingPoint, optional
-        State to go on from: ``run.final_state``, that of `Simulation.save`, or an operating point, such as
+        State to continue from: ``run.final_state``, that of `Simulation.save`, or an operating point, such as
         `trim` finds one, with the parameters that belong to it. Where ticks end the solver's steps, the run has the
         bits of one in one go; else the solver would have stepped over that instant, and values differ within the
         tolerances.
@@ -100,7 +100,7 @@ class RunOptions:
     compile : {"auto", True, False}
         Generate C code of the diagram. Runs go in C whatever this says; a virtual machine evaluates the diagram's
         functions unless there is generated code of them, to the same bits. "auto": a run begins with the machine; a
-        compiler works beside it if the run is long enough, and its code takes over. False: no code is generated, and
+        compiler works alongside it if the run is long enough, and its code takes over. False: no code is generated, and
         no compiler is started. True: code is generated before the first tick. That needs a compiler (the extra
         ``build``), and a diagram of which there can be code. Where one of these fails, the run is interpreted, and
         ``run.messages`` says why. ``run.tier`` says what was done.
@@ -109,7 +109,7 @@ class RunOptions:
         together, for its processor, with products and sums fused (FMA): faster, and values differ by rounding, as
         ``run.messages`` says: by less than 1e-10 of a signal's size, but where a motion magnifies small differences (a
         limit cycle, sticking), which magnifies these, too. ``compile="auto"`` is then True. With ``compile=False`` the
-        FMUs alone are compiled anew, see `loopwright.fmus.tune`.
+        FMUs alone are compiled again, see `loopwright.fmus.tune`.
     """
 
     step: float | Fraction | None = None
@@ -153,7 +153,7 @@ class RunOptions:
             raise OptionError(
                 "found None; expected a state or an operating point. A run has no final_state if it was interrupted or "
                 "has failed (run.messages tells when), has ended between two ticks, or an FMU can't turn its state "
-                "into bytes (canSerializeFMUState). Leave out start to begin at t = 0; to go on after an interrupt, "
+                "into bytes (canSerializeFMUState). Leave out start to begin at t = 0; to continue after an interrupt, "
                 "run in parts and keep the final_state of each, or Simulation.save().",
                 block=block,
                 port="start",
@@ -233,7 +233,7 @@ def refuse_rest(flat: FlatDiagram, n: int, duration: Any, name: str) -> None:
 def default_step(diagram: WiredDiagram, step: Any, duration: float | None, solver: str, start: Any = None) -> Any:
     """Return the seconds between two samples of a run that has neither a ``step`` nor a clock.
 
-    That of the run that is gone on from; else a thousandth of the duration, in whole nanoseconds where it has them,
+    That of the run that is continued; else a thousandth of the duration, in whole nanoseconds where it has them,
     where the diagram has no FMU and the solver chooses its own steps.
     """
     if step is not None or diagram.has_clock:

@@ -11,7 +11,7 @@ from ..wiring import join
 from .engine import Engine
 
 SAME = 1e-6
-"""Distance of two outputs, absolute and relative, that an FMU which computes them anew may make."""
+"""Distance of two outputs, absolute and relative, that an FMU which computes them again may make."""
 
 
 def can_save(engine: Engine) -> bool:
@@ -34,7 +34,7 @@ def save_state(engine: Engine) -> RunState:
     if engine.ended_by:
         raise FmuError(
             f"the FMU has asked to end the simulation (terminateSimulation) at t = {position.t:.9g} s, so that "
-            "no run can go on from there; expected a state before that time. Save the run at an earlier tick.",
+            "no run can continue from there; expected a state before that time. Save the run at an earlier tick.",
             block=engine.ended_by,
         )
     if position.end is not None:
@@ -72,7 +72,7 @@ def restore_state(engine: Engine, state: RunState) -> None:
     for path, plant in engine.plants.items():
         before = w.copy()
         plant.restore(plant.deserialize(state.fmus[path]))
-        if isinstance(plant, FmuInstance):  # it reads its outputs anew
+        if isinstance(plant, FmuInstance):  # it reads its outputs again
             left = (w == before) & (np.abs(w - state.w) > SAME * (1.0 + np.abs(state.w)))
             _check_outputs(engine, path, left, state)
     for path, block in engine.exchanged.blocks.items():
@@ -95,7 +95,7 @@ def _check_outputs(engine: Engine, path: str, left: np.ndarray, state: RunState)
             raise FmuRuntimeError(
                 "the FMU does not restore its state, although its function for that reports success: found its output "
                 f"{engine.workspace.here.w[where].tolist()}, as before; expected {state.w[where].tolist()}. Run again "
-                "from the start, and tell its makers.",
+                "from the start, and report it to its makers.",
                 block=path,
                 port=name,
                 t=state.t,

@@ -1,4 +1,4 @@
-"""A run in the making: it goes on, is saved, restored and read.
+"""A run in the making: it continues, is saved, restored and read.
 
 The page docs/architecture.md says what happens in which order.
 """
@@ -41,7 +41,7 @@ from .view import SimulationView, describe_simulation
 class Simulation:
     """A run in the making: made by `Diagram.simulation`, used in a ``with`` statement.
 
-    ``advance`` goes on, ``save`` returns the complete state, ``restore`` goes back to one, ``run`` is what was
+    ``advance`` continues, ``save`` returns the complete state, ``restore`` goes back to one, ``run`` is what was
     recorded. ``view`` shows the instant that it has reached.
 
     Examples
@@ -194,11 +194,11 @@ class Simulation:
         """The instant that it has reached, to be read: its states, signals and plants."""
         return self._engine.view
 
-    # --- going on ----------------------------------------------------------------------------------------------------
+    # --- continuing ------------------------------------------------------------------------------------------------
 
     @accepts(progress=kinds.function)
     def advance(self, duration: float, *, progress: Any = None) -> None:
-        """Go on for a duration in s; one that is no multiple of the step between ticks ends the run.
+        """Continue for a duration in s; one that is no multiple of the step between ticks ends the run.
 
         Raises
         ------
@@ -216,8 +216,9 @@ class Simulation:
             refuse_rest(self.flat, count, duration, self.wired.name)
         if position.end is not None:
             raise OptionError(
-                f"the run has ended at t = {position.end:g} s, between two ticks, and can't go on from "
-                f"there. Let it go on in multiples of {float(self.flat.base):g} s, and end between them only at last.",
+                f"the run has ended at t = {position.end:g} s, between two ticks, and can't continue from "
+                f"there. Let it continue in multiples of {float(self.flat.base):g} s, and end between them only "
+                "at last.",
                 block=self.wired.name,
                 port="duration",
             )
@@ -249,7 +250,7 @@ class Simulation:
 
     @accepts(path=kinds.text, block=kinds.one_of_class(Block, "a block"))
     def set_parameters(self, path: str, block: Block) -> None:
-        """Let a block go on with the parameters of a variant of it, from this instant.
+        """Let a block continue with the parameters of a variant of it, from this instant.
 
         The states stay as they are. A saved state does not hold parameters, and `diagram` stays as it was.
 
@@ -270,7 +271,7 @@ class Simulation:
         self._engine.set_parameters(path, block)
 
     def take_over(self, x: np.ndarray, of: FlatDiagram) -> None:
-        """Put the blocks to the states of another diagram, by their names, and evaluate this tick anew.
+        """Put the blocks to the states of another diagram, by their names, and evaluate this tick again.
 
         States that only this diagram has, such as those of a delay, take the values that they settle at while the
         others are held; plants stay as they are, and so do the samples that were recorded.
@@ -300,14 +301,14 @@ class Simulation:
 
     @accepts(final=kinds.flag, last=kinds.flag)
     def run(self, *, final: bool = True, last: bool = False) -> Run:
-        """Return what was recorded since the start, or since `restore`; afterwards recording begins anew.
+        """Return what was recorded since the start, or since `restore`; afterwards recording begins again.
 
         Parameters
         ----------
         final : bool
             Whether the complete state at the end is kept with it, as ``run.final_state``, where that can be had.
         last : bool
-            End the FMUs first, so that the run's messages tell of those that do not end well; nothing runs on.
+            End the FMUs first, so that the run's messages name those that do not end well; nothing runs on.
         """
         recorder = self._recorder
         state = self.save() if final and self.can_save else None

@@ -66,7 +66,7 @@ def _started_there(block: Any, known: Mapping[str, Any]) -> Any:
 def _settable(diagram: WiredDiagram, point: OperatingPoint) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the FMUs in model exchange, with those states at a point that they take as start values.
 
-    Their continuous states stand in x, so that a run begins with these in any case.
+    Their continuous states are in x, so that a run begins with these in any case.
     """
     for path, known in point.exchanged.items():
         block: Any = diagram.blocks[path]
@@ -75,7 +75,7 @@ def _settable(diagram: WiredDiagram, point: OperatingPoint) -> Iterator[tuple[st
 
 
 def copy_states(values: np.ndarray, old: FlatDiagram, new: FlatDiagram, into: np.ndarray) -> None:
-    """Write a vector x of one diagram into that of another, whatever stands under the same name in both."""
+    """Write a vector x of one diagram into that of another, whatever is under the same name in both."""
     others = [(getattr(old, name), getattr(new, name)) for name in ("held", "gates", "starts", "loops")]
     for theirs, mine in ((old.states.each, new.states.each), *others):
         for key, where in theirs.slices.items():
@@ -94,7 +94,7 @@ def start_at(workspace: Workspace, point: OperatingPoint, name: str) -> int:
     Raises
     ------
     OptionError
-        A point of another diagram, or one that stands on none of the run's ticks.
+        A point of another diagram, or one that is on none of the run's ticks.
     """
     flat, here = workspace.flat, workspace.here
     tick = point.tick * point.base / flat.base
@@ -117,7 +117,7 @@ def start_at(workspace: Workspace, point: OperatingPoint, name: str) -> int:
 
 
 def take_over(workspace: Workspace, x: np.ndarray, of: FlatDiagram, acting: frozenset[TickPattern]) -> None:
-    """Put a run to the states of another diagram, whatever stands under the same name in both, and go through a tick.
+    """Put a run to the states of another diagram, whatever is under the same name in both, and go through a tick.
 
     States that only this diagram has, such as those of a delay, take the values that they settle at while the others
     are held.

@@ -32,11 +32,11 @@ class Delays:
     taus : list of float
         Delay of each in s.
     inputs, outputs : list of slice
-        Where the inputs stand in z, and the outputs in w.
+        Where the inputs are in z, and the outputs in w.
     starts : list of ndarray
         Output of each until its delay has passed; None takes the first input.
     smoothed : bool
-        Whether a state stands between any output and any input of a delay.
+        Whether a state is between any output and any input of a delay.
     total : int, optional
         Number of entries of z.
 
@@ -130,7 +130,7 @@ class Delays:
         return barycentric(self, (s - a) / (b - a), self.pieces[i, 2:].reshape(_NODES, -1)[:, where])
 
     def save(self) -> Any:
-        """Return the memory with which a run goes on from here."""
+        """Return the memory with which a run continues from here."""
         return self.pieces[: self.count].copy(), self.edges[: self.noted].copy(), self.start.copy()
 
     def restore(self, saved: Any) -> None:

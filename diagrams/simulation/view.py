@@ -17,7 +17,7 @@ from .workspace import Workspace
 
 @dataclass
 class Position:
-    """Where a run stands in time; the run alone changes it."""
+    """Where a run is in time; the run alone changes it."""
 
     base: Fraction
     """Seconds between two ticks."""
@@ -57,7 +57,7 @@ class Position:
 class SimulationView:
     """The instant that a simulation has reached, to be read: ``simulation.view``.
 
-    It follows the simulation: its arrays are read-only, and change as the run goes on. Copy what is to be kept.
+    It follows the simulation: its arrays are read-only, and change as the run continues. Copy what is to be kept.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class SimulationView:
         States, held outputs, gates, reset states and loop values at this instant, laid out as `FlatDiagram` says; in
         the units of the blocks' states.
     x_next : ndarray, shape (n,)
-        The states after the instant, laid out as ``x``: the run goes on with them.
+        The states after the instant, laid out as ``x``: the run continues with them.
     w : ndarray, shape (m,)
         Outputs of plants and of transport delays, as ``FlatDiagram.plant_outputs`` lays them out, in the ports' units.
     z : ndarray, shape (k,)

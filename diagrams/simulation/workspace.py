@@ -178,7 +178,7 @@ class Workspace:
         return jump
 
     def set_parameters(self, path: str, block: Block) -> None:
-        """Let a block go on with the parameters of another one of its kind.
+        """Let a block continue with the parameters of another one of its kind.
 
         Raises
         ------
@@ -308,7 +308,7 @@ class Workspace:
         return self.here.x.copy()
 
     def begin(self, acting: frozenset[TickPattern]) -> None:
-        """Let a run begin at ``here``: other solutions that the algebraic loops have there are told in ``messages``."""
+        """Let a run begin at ``here``: ``messages`` names other solutions that the algebraic loops have there."""
         loops = self.loops(acting, self.here)
         if loops is not None:
             loops.solve()

@@ -14,7 +14,7 @@ from .cvode import Cvode
 from .scipy_methods import SciPySolver
 
 _STABLE = {"RK45": 3.25, "DOP853": 6.1}  # h|λ| at the border of the stable region on the real axis
-_MOST_CHANGES = 10  # that are told
+_MOST_CHANGES = 10  # that are reported
 _LARGE = 300  # states of which no eigenvalues are computed
 
 
@@ -99,7 +99,7 @@ class Method(Integration):
     stability bounds the step, not accuracy. Two evaluations at the end of each explicit step give an estimate of the
     dominant eigenvalue (E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, IV.2). If h|λ| stays beyond
     the border of the stable region for 15 looks, and the leftmost eigenvalue of the exact Jacobian agrees, Radau goes
-    on. It hands back when h‖J‖ < 1 for 20 steps: an explicit method would take them too. Each change is told.
+    on. It hands back when h‖J‖ < 1 for 20 steps: an explicit method would take them too. Each change is reported.
 
     Parameters
     ----------
@@ -136,15 +136,15 @@ class Method(Integration):
         super().__init__(name, problem, rtol, absolute, step if self.fixed else bound)
         by_stiffness = ("RK45" if rtol >= 1e-8 else "DOP853", "Radau")
         self.names = ("euler",) if not problem.size else by_stiffness if name == "auto" else (name,)
-        """Names of the methods that may go on; with "auto" the one for problems that are not stiff comes first."""
+        """Names of the methods that may continue; with "auto" the one for problems that are not stiff comes first."""
         self.active = self.names[0]
-        """Name of the method that goes on."""
+        """Name of the method that continues."""
         self.planned: dict[str, float | None] = dict.fromkeys(self.names)
         """Steps in s that the methods would take next; None where they choose their first step."""
         self._changes = 0
 
     def save(self) -> dict[str, Any]:
-        """Return what is needed to go on from here."""
+        """Return what is needed to continue from here."""
         return {"active": self.active, "planned": dict(self.planned)}
 
     def restore(self, saved: Mapping[str, Any]) -> None:
@@ -158,7 +158,7 @@ class Method(Integration):
         self.active, self.planned, self._changes = self.names[0], dict.fromkeys(self.names), 0
 
     def decide(self, t: float, x: np.ndarray, h: float, *, stuck: bool) -> tuple[str, ...]:
-        """Decide at (t, x), after a sign at steps of h in s, which method goes on; return what is to be told of it.
+        """Decide at (t, x), after a sign at steps of h in s, which method continues; return what to report of it.
 
         Parameters
         ----------
@@ -191,7 +191,7 @@ class Method(Integration):
         return float(np.linalg.eigvals(jacobian).real.min()) if np.isfinite(jacobian).all() else 0.0
 
     def named(self, name: str) -> Integration:
-        """Return the method that goes on by its own name, for its errors."""
+        """Return the method that continues by its own name, for its errors."""
         made = Integration(name, self.problem, self.rtol, self.atol, self.max_step)
         made.fixed, made.stiff, made.stop = self.fixed, METHODS[name].uses_slope, self.stop
         return made

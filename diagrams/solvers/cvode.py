@@ -151,7 +151,7 @@ class _CvodeCalls(CalledBack):
 
 
 class Cvode(Solver):
-    """CVODE with variable-order BDF (stiff) or Adams (not stiff). It selects its first step anew at each restart."""
+    """CVODE with variable-order BDF (stiff) or Adams (not stiff). It selects its first step again at each restart."""
 
     def __init__(self, name: str, problem: Problem, rtol: float, atol: float | np.ndarray, max_step: float):
         super().__init__(name, problem, rtol, atol, max_step)

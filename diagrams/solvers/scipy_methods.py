@@ -46,7 +46,7 @@ class _Method(Protocol):
 class SciPySolver(Solver):
     """One of `scipy.integrate`'s multistep methods, given the exact Jacobian.
 
-    After a restart it starts again at order 1, and selects its first step anew.
+    After a restart it starts again at order 1, and selects its first step again.
     """
 
     _inner: _Method

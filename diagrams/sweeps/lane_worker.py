@@ -28,7 +28,7 @@ DIFFER = (
     "Side by side in vector lanes: values differ from those of single runs by rounding, which some motions magnify."
 )
 LEFT = (
-    "Not side by side in vector lanes: the run could not go on in its lane, as where an algebraic loop has no "
+    "Not side by side in vector lanes: the run could not continue in its lane, as where an algebraic loop has no "
     "determined solution, and was made again by itself."
 )
 _MOST_SUBSTEPS = 10_000

@@ -84,10 +84,10 @@ class Plan:
     def obstacle(self) -> str:
         """Why its runs can't follow each other in a thread, as a clause; empty if nothing of the plan forbids it."""
         if "start" in self.options and self.options["start"] is not None:
-            return "they go on from a state, start="
+            return "they continue from a state, start="
         for path, block in self.diagram.scheduled.blocks.items():
             if isinstance(block, Fmu) and not (find_limits(block) is None and is_built_here(block.description.digest)):
-                return f"{path} was not built by Loopwright on this machine, or runs in a process of its own"
+                return f"{path} was not built by Loopwright on this machine, or runs in its own process"
         return ""
 
     @property

@@ -336,13 +336,13 @@ def read_samples(
         )
     if kind != "latin" and count is not None:
         raise OptionError(
-            f"found count={count!r} beside samples that have their number; expected it with samples='latin' alone. "
-            "Leave it out.",
+            f"found count={count!r} together with samples that have their number; expected it with samples='latin' "
+            "alone. Leave it out.",
             block=diagram.name,
         )
     if kind is None and parameters:
         raise OptionError(
-            f"found values of {', '.join(map(str, parameters))} beside a table of samples; give one of them.",
+            f"found values of {', '.join(map(str, parameters))} together with a table of samples; give one of them.",
             block=diagram.name,
         )
     try:

@@ -44,7 +44,7 @@ class Store:
 
     def __init__(self, folder: Path, parts: Parts, about: dict[str, Any], *, overwrite: bool = False):
         own = {"block": str(about.get("diagram", "")) or None, "port": "to"}
-        step = "Choose a folder of your own, such as to='sweeps/first'."
+        step = "Choose your own folder, such as to='sweeps/first'."
         with explain_disk_errors(f"the sweep can't be kept in {str(folder)!r}", folder, step, OptionError, **own):
             self.folder = folder.absolute()  # loading an FMU changes the working folder for a moment
             self._open(parts, about, overwrite=overwrite)

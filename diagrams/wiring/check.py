@@ -223,8 +223,8 @@ def _check_subsystems(table: Structure, traced: dict[str, Traced], shapes: dict[
             kind = "a transport delay" if table.blocks[path].transport else "a block that is stepped, such as an FMU,"
             kind = "an FMU in model exchange" if path in traced else kind
             raise WiringError(
-                f"{kind} can't stand in a subsystem that is {table.subsystems[gates[-1]].control} ({gates[-1]}): its "
-                "time goes on while the subsystem waits. Put it outside, and wire its outputs in.",
+                f"{kind} can't be in a subsystem that is {table.subsystems[gates[-1]].control} ({gates[-1]}): its "
+                "time continues while the subsystem waits. Put it outside, and wire its outputs in.",
                 block=path,
             )
         triggered = table.triggered_around(table.subsystem_of[path])
@@ -241,7 +241,7 @@ def _check_subsystems(table: Structure, traced: dict[str, Traced], shapes: dict[
         outer = table.clock(triggered)
         if inner is not outer:
             raise SampleTimeError(
-                f"the subsystem {inner.path if inner else ''} has a sample time of its own inside the triggered "
+                f"the subsystem {inner.path if inner else ''} has its own sample time inside the triggered "
                 f"subsystem {triggered}; expected none, as it acts whenever {triggered} is triggered. Leave it out.",
                 block=path,
             )

@@ -8,7 +8,7 @@ import numpy as np
 
 
 def find_cyclic_parts(keys: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list[set[str]]:
-    """Return the strongly connected parts of a graph that have a cycle: several nodes, or one with a pair of its own.
+    """Return the strongly connected parts of a graph that have a cycle: several nodes, or one with an arrow to itself.
 
     Parameters
     ----------

@@ -101,7 +101,7 @@ class Structure:
     results: dict[tuple[str, str], Wire] = field(default_factory=dict)
 
     def copy(self) -> Structure:
-        """Return a structure with dictionaries of its own."""
+        """Return a structure with its own dictionaries."""
         return Structure(*(dict(getattr(self, f.name)) for f in fields(self)))
 
     def with_blocks(self, blocks: Mapping[str, Block]) -> Structure:

@@ -65,7 +65,7 @@ def check_units(table: Structure) -> dict[Port, Unit]:
             if block.same_units:
                 if first is None:
                     first = (wire, unit)
-                expected, relation = first[1], f"{first[0]} beside it is"
+                expected, relation = first[1], f"{first[0]} next to it is"
             a, b = next(_mismatches(unit, expected), ("", ""))
             if a:
                 ends = (block, table.blocks[wire.block])

@@ -12,7 +12,7 @@ from .variables import FmuVariable
 
 
 def find_aliases(variables: Mapping[str, FmuVariable]) -> tuple[dict[str, FmuVariable], dict[str, str]]:
-    """Return variables of which each input stands once, and the other names of inputs and parameters.
+    """Return variables in which each input is listed once, and the other names of inputs and parameters.
 
     Parameters
     ----------

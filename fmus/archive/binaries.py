@@ -62,7 +62,9 @@ def judge_name(binary: str, identifier: str) -> tuple[FmuFinding, ...]:
         return ()
     found = f"its library is called {name}, as the only one in its folder; expected the model identifier, {identifier}."
     return (
-        FmuFinding(FmuFault.OTHER_NAME, binary, found, "It runs here; other tools may not find it. Tell its maker."),
+        FmuFinding(
+            FmuFault.OTHER_NAME, binary, found, "It runs here; other tools may not find it. Report it to its maker."
+        ),
     )
 
 
@@ -120,7 +122,7 @@ def check_binary(archive: FmuArchive, binary: str, version: str, *, model_exchan
         )
     missing = missing_functions(library, version, model_exchange=model_exchange)
     beside = {name.rpartition("/")[2] for name in archive.files if name.startswith(f"{binary.rpartition('/')[0]}/")}
-    if missing and not beside & set(library.needed):  # a wrapper may take them from a library of its own
+    if missing and not beside & set(library.needed):  # a wrapper may take them from its own library
         others = sorted({name[:4] for name in library.symbols or () if name[:4] in ("fmi2", "fmi3")} - {missing[0][:4]})
         instead = f" It has functions of FMI {others[0][3]}." if others else ""
         raise FmuFileError(

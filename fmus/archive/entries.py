@@ -74,7 +74,7 @@ def check_entries(
                 f"{len(backslashes)} of {len(items)} paths in the archive have backslashes, such as "
                 f"{backslashes[0]!r}; expected slashes. They are taken for slashes here; other tools refuse the FMU or "
                 "write files with wrong names.",
-                "Tell its maker, or pack it again.",
+                "Report it to its maker, or pack it again.",
             )
         )
     findings += _compare_case(path, found)

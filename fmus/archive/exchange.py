@@ -31,13 +31,13 @@ class ExchangeInfo:
     only_once: bool = False
     """Whether a process can have one instance only."""
     completes_steps: bool = True
-    """Whether it wants to be told each step of the solver that was accepted."""
+    """Whether it wants to be notified of each step of the solver that was accepted."""
     state_count: int = 0
     """Number of continuous states."""
     indicators: tuple[str, ...] = ()
     """Names of the event indicators."""
     dependencies: Mapping[Key, frozenset[Key] | None] = field(default_factory=dict)
-    """For each output and derivative of a state, the variables that it depends on; None: all. They stand by type and
+    """For each output and derivative of a state, the variables that it depends on; None: all. They are by type and
     value reference."""
 
     time: Key | None = None

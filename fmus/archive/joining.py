@@ -117,7 +117,7 @@ def _check(
                     f"{first.name!r} with the {what} {mine or '(none)'} and {variable.name!r} with the {what} "
                     f"{its or '(none)'}",
                     f"one {what}",
-                    "Give them ports of their own, by names without an index.",
+                    "Give them their own ports, by names without an index.",
                 )
     return tuple((variable, tuple(k - start for k in index)) for variable, index in pairs)
 

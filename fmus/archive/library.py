@@ -74,7 +74,7 @@ def read_library(data: bytes) -> SharedLibrary:
 
 
 def _find_platforms(data: bytes) -> tuple[str, ...] | None:
-    """Return the platforms that a header tells; None for an unknown format."""
+    """Return the platforms that a header names; None for an unknown format."""
     if data[:4] == b"\x7fELF":
         return _platforms("linux", struct.unpack_from("<H" if data[5] == 1 else ">H", data, 18)[0])
     if data[:2] == b"MZ":

@@ -81,7 +81,7 @@ def unknown_version(path: Path, version: str) -> FmuFileError:
 
 
 def _form(root: Any) -> str:
-    """Return the version of FMI in whose form a description is written; empty if nothing tells."""
+    """Return the version of FMI in whose form a description is written; empty if nothing says."""
     variable = root.find("ModelVariables/*")
     if variable is None:
         return ""

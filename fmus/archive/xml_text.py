@@ -13,7 +13,7 @@ def parse_xml(path: Path, name: str, text: bytes) -> Any:
     """Return the root element of an XML file of an FMU, as lxml has it, without comments.
 
     Entities are refused, since no tool writes any: an entity can hold others many times over, or another file. The
-    parser has limits of its own: for the depth of elements, and for the size of one text.
+    parser has its own limits: for the depth of elements, and for the size of one text.
 
     Parameters
     ----------

@@ -101,7 +101,7 @@ class BoundCalls:
         return 0
 
     def _run_on(self, first: int, status: int) -> int:
-        """Go on from a place whose call has returned a status, as `run` does."""
+        """Continue from a place whose call has returned a status, as `run` does."""
         worst = self.warned = 0
         for place, function, arguments in self._numbered[first:]:
             status = status if place == first else function(*arguments)
@@ -126,7 +126,7 @@ class BoundCalls:
         return [place for place in range(len(self.calls)) if self.warned & bit_of(place)]
 
     def start(self) -> None:
-        """Begin to run, if that can go on by itself; `finish` ends it."""
+        """Begin to run, if that can continue by itself; `finish` ends it."""
 
     def finish(self) -> int:
         """Return the status of what `start` has begun."""

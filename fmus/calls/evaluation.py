@@ -32,7 +32,7 @@ class Vector:
 class Evaluation:
     """Calls that set time, states and inputs, and get outputs, derivatives and indicators; ``then`` follow others.
 
-    Each call is bound once, to vectors that stay where they are: a process of its own can make one round trip of it.
+    Each call is bound once, to vectors that stay where they are: another process can make one round trip of it.
 
     The order of questions is that of `order_questions`. ``asked_first`` are the variables that are read before the
     derivatives where no outputs are wanted; None for an FMU that computes all that it is asked for, in any order.
@@ -42,7 +42,7 @@ class Evaluation:
     result : ndarray
         Outputs, derivatives and indicators, one after the other.
     rates_at : slice
-        Where the derivatives stand in it.
+        Where the derivatives are in it.
     warned : sequence of str
         Names of the calls that gave a warning in the last run.
     """

@@ -1,4 +1,4 @@
-"""Functions of events in model exchange, and where their answers stand."""
+"""Functions of events in model exchange, and where their answers are."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class AnswersAt(NamedTuple):
 
 @dataclass(frozen=True)
 class EventCalls:
-    """Functions of events in model exchange with their arguments, to be bound, and where their answers stand."""
+    """Functions of events in model exchange with their arguments, to be bound, and where their answers are."""
 
     enter: Call | None  # None without modes, as in FMI 1.0
     update: Call

@@ -16,7 +16,7 @@ from .step_failures import ROUNDED, StepFailures
 from .transfer import WatchedInputs
 
 _CHANGED = 2
-"""Qualifier of an interval that the FMU has set anew (fmi3IntervalChanged)."""
+"""Qualifier of an interval that the FMU has set again (fmi3IntervalChanged)."""
 
 
 @dataclass
@@ -35,12 +35,12 @@ class InputClock:
         self.next = self.origin
 
     def tick(self) -> None:
-        """Go on to the next tick."""
+        """Continue to the next tick."""
         if self.variable.is_periodic:
             self.count += 1
             self.next = self.origin + self.count * self.interval
         else:
-            self.next = math.inf  # until the FMU says it anew
+            self.next = math.inf  # until the FMU says it again
 
     def go_to(self, t: float) -> None:
         """Go to the first tick from a time in s on."""
@@ -52,7 +52,7 @@ class InputClock:
 
 @dataclass(frozen=True)
 class EventMemory:
-    """What is known of events beside the FMU's own state: the next ones, and the values that discrete inputs had."""
+    """What is known of events besides the FMU's own state: the next ones, and the values that discrete inputs had."""
 
     next_event: float
     is_fresh: bool
@@ -79,7 +79,7 @@ class EventMode:
     clocks : list of InputClock
         Input clocks whose ticks are known ahead.
     next_event : float
-        Time in s of the next event of the FMU's own that it has told; infinite without one.
+        Time in s of the next event of the FMU's own that it has announced; infinite without one.
     """
 
     def __init__(self, fmu: StepFailures, inputs: Mapping[str, FmuVariable], vector: np.ndarray):
@@ -119,12 +119,12 @@ class EventMode:
         self._settle(t)
 
     def memory(self) -> EventMemory:
-        """Return what is known beside the FMU's own state."""
+        """Return what is known besides the FMU's own state."""
         clocks = tuple((clock.interval, clock.next, clock.count, clock.origin) for clock in self.clocks)
         return EventMemory(self.next_event, self._is_fresh, clocks, tuple(part.values.copy() for part in self.watched))
 
     def return_to(self, t: float, memory: EventMemory | None) -> None:
-        """Go on from a restored state at a time in s; without a memory Event Mode tells the next events anew."""
+        """Continue from a restored state at a time in s; without a memory Event Mode announces events again."""
         if memory is None:
             self._is_fresh, self.next_event = True, math.inf
             for clock in self.clocks:

@@ -41,7 +41,7 @@ class ExchangeInstance(RunningFmu):
     outputs, derivatives and indicators: this leaves its discrete states as they are. `handle_event` goes through Event
     Mode, where discrete inputs and tunable parameters are set.
 
-    States stand in the order of the description's ``states``, inputs in that of the block's ports.
+    States are in the order of the description's ``states``, inputs in that of the block's ports.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class ExchangeInstance(RunningFmu):
     def evaluation(self, wanted: Wanted) -> Callable[[float, np.ndarray, np.ndarray], np.ndarray]:
         """Return the call ``(t, x, u) -> values`` that gets outputs, then derivatives, then indicators.
 
-        The result is one array, written anew by each call: NaN where the FMU can't compute it there (discard).
+        The result is one array, written again by each call: NaN where the FMU can't compute it there (discard).
         """
         found = self._evaluation(wanted)
 
@@ -154,7 +154,7 @@ class ExchangeInstance(RunningFmu):
         """Return the call that reads and writes these vectors as `evaluation` does its arguments and its result.
 
         An FMU that Loopwright has built reads and writes these vectors itself. With ``again`` another such call always
-        comes right before it, at the same t and x, which need not be set anew.
+        comes right before it, at the same t and x, which need not be set again.
         """
         plain = self.evaluation(wanted)
         t, x, u, into = vectors
@@ -462,7 +462,7 @@ class ExchangeInstance(RunningFmu):
         return wants or changed
 
     def _note_end(self, t: float, place: str) -> None:
-        """Note that the FMU asks to end the simulation; it is told once."""
+        """Note that the FMU asks to end the simulation; it is reported once."""
         if not self.ends_run:
             self.ends_run = True
             self.add_note(f"it asks to end the simulation at t = {t:.9g} s, {place} (terminateSimulation)")
@@ -545,7 +545,7 @@ class ExchangeInstance(RunningFmu):
     def find_native_obstacle(self) -> str | None:
         """Return why a loop in C can't evaluate it; None if it can."""
         if not self.fmi.in_process and self._bind_update().request is None:
-            return "runs in a process of its own, for which C can't wait on this system"
+            return "runs in its own process, for which C can't wait on this system"
         if self.record.variables:
             return "has outputs of texts, which are recorded at each step"
         return None
@@ -555,7 +555,7 @@ class ExchangeInstance(RunningFmu):
         return self._evaluation(wanted).native(vectors, self._order, again=again and self._is_own)
 
     def native_look(self, vectors: EvaluationVectors) -> NativeLook:
-        """Return `accept` and `handle_event` as actions of C, at what stands in t, x and u; states are written."""
+        """Return `accept` and `handle_event` as actions of C, at what is in t, x and u; states are written."""
         inputs, take = self._fill(self._u, self.t), ActionKind.TAKE
         u, without_result = vectors.u, vectors._replace(into=np.zeros(0))
         index = np.concatenate([np.zeros(0, int), *(np.arange(s.start, s.stop) for s in map(self._place, self.inputs))])
@@ -602,7 +602,7 @@ class ExchangeInstance(RunningFmu):
         return self._u
 
     def take_back(self, u: np.ndarray, next_time: float, *, read_nominals: bool) -> None:
-        """Go on from where a loop in C has come to."""
+        """Continue from where a loop in C has come to."""
         self._u, self.next_time = u.copy(), next_time
         if read_nominals:
             self.nominals = self._read_nominals()

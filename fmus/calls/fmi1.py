@@ -88,7 +88,7 @@ class Fmi1Calls(FmiCalls):
         raise NotImplementedError("FMI 1.0 has no Event Mode")
 
     def event_calls(self) -> EventCalls:
-        """Return the functions of events in model exchange, with memory of their own."""
+        """Return the functions of events in model exchange, with their own memory."""
         from fmpy.fmi1 import fmi1EventInfo
 
         info, wanted, final = self.variable(fmi1EventInfo), self.variable(ctypes.c_uint8), self.variable(ctypes.c_int)

@@ -49,7 +49,7 @@ class Fmi2Calls(FmiCalls):
         self.fmu.enterInitializationMode()
 
     def event_calls(self) -> EventCalls:
-        """Return the functions of events in model exchange (3.2.2), with memory of their own."""
+        """Return the functions of events in model exchange (3.2.2), with their own memory."""
         from fmpy.fmi2 import fmi2EventInfo
 
         info, flags, width = self.variable(fmi2EventInfo), self.variable(ctypes.c_int * 2), ctypes.sizeof(ctypes.c_int)

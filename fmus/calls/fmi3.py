@@ -94,7 +94,7 @@ class Fmi3Calls(FmiCalls):
         return function(("fmi3SetFloat64", self.fmu.dll))
 
     def event_calls(self) -> EventCalls:
-        """Return the functions of events in model exchange (FMI 3.0, 2.3.5 and 3.2), with memory of their own."""
+        """Return the functions of events in model exchange (FMI 3.0, 2.3.5 and 3.2), with their own memory."""
         flags, t = self.variable(ctypes.c_bool * 8), self.variable(ctypes.c_double)
         final, instance, at = self.variable(ctypes.c_bool), self.instance_argument, ctypes.addressof(flags)
         final.value = True

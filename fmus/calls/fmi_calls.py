@@ -1,6 +1,6 @@
 """Functions of an FMU's library for one instance, for all versions of FMI.
 
-What differs between versions in names and in the shapes of arguments stands in a table, `FmiVersion`; what an instance
+What differs between versions in names and in the shapes of arguments is in a table, `FmiVersion`; what an instance
 has to be told otherwise, in the class of a version.
 """
 
@@ -313,7 +313,7 @@ class FmiCalls(ABC):
     """Function for bound calls that notes whether texts have changed; None in this process, where they are read."""
 
     def slopes_call(self, references: Sequence[int], slopes: np.ndarray) -> Call:
-        """Return the call that tells the slopes of inputs within a step, which stand in an array; not in FMI 3.0."""
+        """Return the call that tells the slopes of inputs within a step, which are in an array; not in FMI 3.0."""
         n, kept = slopes.size, (ctypes.c_uint * len(references))(*references)
         values = (ctypes.c_int * n)(*[1] * n), ctypes.c_void_p(slopes.ctypes.data)
         return self.function("SetRealInputDerivatives"), (self.instance_argument, kept, ctypes.c_size_t(n), *values)
@@ -388,7 +388,7 @@ class FmiCalls(ABC):
             return status, False
 
     def time_after_discard(self, t: float, h: float) -> float | None:
-        """Return the time in s at which the FMU stands after a step from t over h was discarded; None if unknown.
+        """Return the time in s that the FMU has reached when a step from t over h was discarded; None if unknown.
 
         In FMI 3.0 it is where it was; before, it says so by lastSuccessfulTime (FMI 1.0, 3.6; FMI 2.0, 4.2.3).
         """
@@ -525,7 +525,7 @@ class FmiCalls(ABC):
         return EventUpdate(bool(again), bool(terminate), bool(nominals), t if defined else math.inf)
 
     def event_calls(self) -> EventCalls:
-        """Return the functions of events in model exchange, with memory of their own."""
+        """Return the functions of events in model exchange, with their own memory."""
         raise NotImplementedError
 
     def _mode_call(self, name: str) -> Call:

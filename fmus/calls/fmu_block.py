@@ -24,7 +24,7 @@ class FmuBlock(Protocol):
 
     @property
     def isolate(self) -> object:
-        """Whether it is loaded in a process of its own, or the limits of that process; None to decide by its origin."""
+        """Whether it is loaded in its own process, or the limits of that process; None to decide by its origin."""
 
     @property
     def start(self) -> Mapping[str, Any]:

@@ -25,7 +25,7 @@ class FmuInstance(StepFailures):
     step: Callable[[float, float], None]
     """Set the inputs, take a step from a time over a length, both in s, and get the outputs (after `bind`)."""
     start_step: Callable[[float, float], None]
-    """Begin a step, as `step`; one in another process goes on by itself until `finish_step` (after `bind`)."""
+    """Begin a step, as `step`; one in another process continues by itself until `finish_step` (after `bind`)."""
     finish_step: Callable[[], None]
     """End the step that `start_step` has begun, and get the outputs."""
     exchange: Callable[[], None]
@@ -82,7 +82,7 @@ class FmuInstance(StepFailures):
         Parameters
         ----------
         values : mapping of str to array
-            Start values beside those of the block, which they override, by the FMU's names.
+            Start values besides those of the block, which they override, by the FMU's names.
         """
         self.reset()
         if self._step is not None:
@@ -111,7 +111,7 @@ class FmuInstance(StepFailures):
             self._step.begin(self._began)
 
     def begin_texts(self, t: float) -> None:
-        """Let the record of texts go on from a time in s."""
+        """Let the record of texts continue from a time in s."""
         if self._step is not None:
             self._step.look_at_texts()
         super().begin_texts(t)
@@ -119,7 +119,7 @@ class FmuInstance(StepFailures):
     # ---- states ----
 
     def save(self) -> FmuState:
-        """Save the present state with all its parts, and what its steps keep beside it; see `SavingFmu.save`."""
+        """Save the present state with all its parts, and what its steps keep besides it; see `SavingFmu.save`."""
         state = super().save()
         state.steps = None if self._step is None else self._step.memory()
         return state

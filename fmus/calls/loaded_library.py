@@ -61,7 +61,7 @@ class LoadedFmu:
         except FmuError as error:
             error.at(block=block.label)
             raise
-        # FMPy stays in the binary's folder if loading fails, too; another process has a folder of its own
+        # FMPy stays in the binary's folder if loading fails, too; another process has its own folder
         with FOLDER if make_calls is None else nullcontext(), self.host:
             try:
                 self.fmi = make(
@@ -242,7 +242,7 @@ class LoadedFmu:
         if self.is_built_here:
             self.call("resetting it", self.fmi.reset)
         else:
-            self.call("making it anew", self.fmi.renew, self.log.take, self._running and not self.failed)
+            self.call("making it again", self.fmi.renew, self.log.take, self._running and not self.failed)
             self._reading = BoundReading(self.fmi)
         self.failed = self._running = False
 
@@ -254,7 +254,7 @@ class LoadedFmu:
             raise self._initialization_error(error) from error
         self._running = True
         if self._start is None or not self._start.are_kept():
-            others = {*self.description.texts, *(v.name for v in self.block.input_variables.values())}  # set anew
+            others = {*self.description.texts, *(v.name for v in self.block.input_variables.values())}  # set again
             names = [n for n in self._given if n not in others and self.description.find(n).causality != "input"]
             self._refuse_lost(self._find_lost({n: self._given[n] for n in names}), " after its initialization")
         if self.fmi.event_mode_used:
@@ -393,7 +393,7 @@ class LoadedFmu:
         Parameters
         ----------
         order : ndarray of int
-            Where the derivatives, as the FMU orders them, stand in the result: the description's ``state_order``.
+            Where the derivatives, as the FMU orders them, are in the result: the description's ``state_order``.
         rates, names : sequence of str
             Variables of the derivatives, and others to be read.
         """

@@ -14,10 +14,10 @@ _LONGEST = 2000
 """Most characters of a message that are kept."""
 _QUOTED = 5
 
-_RERUN = "Samples until then are in error.run. The FMU can be run again; other FMUs and this process go on."
+_RERUN = "Samples until then are in error.run. The FMU can be run again; other FMUs and this process continue."
 _ADVICE = {
     FmuEnd.CRASH: f"{_RERUN} Report it to its makers.",
-    FmuEnd.KILLED: "The system does so where memory is short, and its log tells it (dmesg); another program may, too. "
+    FmuEnd.KILLED: "The system does so where memory is short, and its log says so (dmesg); another program may, too. "
     f"Free some memory, or run fewer FMUs at once. {_RERUN}",
     FmuEnd.EXIT: f"{_RERUN} Report it to its makers: a library must not end its process.",
     FmuEnd.TIMEOUT: "It may wait for a licence or another program, or hang. Give it more time by "
@@ -45,7 +45,7 @@ class MessageLog:
         self._notes.append(f"{self._label}: {text}")
 
     def begin_anew(self) -> None:
-        """Forget all but the notes that stood at the first call: another run begins, and tells its own."""
+        """Forget all but the notes that were there at the first call: another run begins, and tells its own."""
         if self._lasting is None:
             self._lasting = len(self._notes)
         del self._notes[self._lasting :]
@@ -57,7 +57,7 @@ class MessageLog:
         """Note a call that gave a warning, with the FMU's last words: the first time that an action does."""
         if action not in self._warned:
             self._warned.add(action)
-            self.note(f"{action} gave {status} at t = {t:.9g} s; further ones are not told{self.quote()}")
+            self.note(f"{action} gave {status} at t = {t:.9g} s; further ones are not reported{self.quote()}")
 
     def take(self, status: int, text: str) -> None:
         """Take a message of the FMU, of a status that is a warning or worse."""

@@ -111,7 +111,7 @@ def check_structure(
             f"its model structure says that {names[row]!r} does not depend on {knowns[k]!r}; found a change of "
             f"{max(sizes):.3g} where that moves by {step[k]:.3g}. The order of evaluation would be wrong. Take "
             "interface='co_simulation' if it is offered, or dependencies='all', by which everything may depend on "
-            "everything, and tell its makers.",
+            "everything, and report it to its makers.",
             block=fmu.block.label,
             t=t,
         )

@@ -34,7 +34,7 @@ class NativeAction(NamedTuple):
     function : int
         The function that is called; its first argument is the instance.
     arguments : tuple of int
-        Its arguments, as they stand in registers; of `ActionKind.TIME` the instance, and where the time stands.
+        Its arguments, as they are in registers; of `ActionKind.TIME` the instance, and where the time is.
     bound : BoundCalls or None
         Of `ActionKind.ASK`: calls that another process makes.
     vector : int
@@ -71,7 +71,7 @@ def copy_action(
 ) -> list[NativeAction]:
     """Return the copy of some entries of a vector into a buffer, or back; ``type_`` is that of the FMU's variables.
 
-    Python alone knows the items of an enumeration: no other value fits than what stands in the buffer.
+    Python alone knows the items of an enumeration: no other value fits than what is in the buffer.
     """
     if not index.size:
         return []
@@ -94,7 +94,7 @@ def copy_action(
 
 
 def call_action(call: Call, name: str) -> NativeAction:
-    """Return a call with its arguments, which are C values, as they stand in registers."""
+    """Return a call with its arguments, which are C values, as they are in registers."""
     function, arguments = call
     words = []
     for argument in arguments[1:]:
@@ -116,7 +116,7 @@ def _word_of(argument: Any) -> int:
 def transfer_actions(
     transfer: Transfer, vector: np.ndarray, index: np.ndarray, kind: ActionKind
 ) -> Iterable[NativeAction]:
-    """Return the copies between a vector, where the ports stand at ``index``, and the buffers of a transfer."""
+    """Return the copies between a vector, where the ports are at ``index``, and the buffers of a transfer."""
     for group in transfer.groups:
         type_ = next((variable.type for variable in group.ports.values()), "")
         yield from copy_action(kind, vector, index[group.index], group.buffer[: group.size], type_=type_)
@@ -129,11 +129,11 @@ class NativeLook:
     Attributes
     ----------
     complete : list of NativeAction
-        Tells that a step is complete; empty where the FMU need not be told.
+        Says that a step is complete; empty where the FMU need not be told.
     enter, update, leave : list of NativeAction
         Go into Event Mode with all inputs for a first round of updates, take another round, go back and get the states.
     answers : AnswersAt
-        Where the answers stand.
+        Where the answers are.
     final : object
         C value that `complete` reads in another process: whether no earlier state will be restored; in this process
         None, where it is its second argument, and a value that nobody reads in FMI 1.0.

@@ -55,7 +55,7 @@ class RunningFmu(LoadedFmu):
         return self.record.values
 
     def begin_texts(self, t: float) -> None:
-        """Let the record of texts go on from a time in s."""
+        """Let the record of texts continue from a time in s."""
         for text in self.call("reading its texts", self.record.go_back, t):
             self.add_note(text)
 

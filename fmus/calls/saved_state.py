@@ -65,7 +65,7 @@ class SavingFmu(RunningFmu):
         self.failed, self._running = False, state.running
 
     def go_back(self, state: FmuState) -> None:
-        """Set the FMU back to a state of its own, and nothing else."""
+        """Set the FMU back to its own state, and nothing else."""
         self.call("restoring its state", self.fmi.set_state, state.handle)
 
     def serialize(self, state: FmuState | None = None) -> bytes:

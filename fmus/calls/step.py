@@ -1,4 +1,4 @@
-"""A communication step of an FMU: its inputs are set, it goes on in time, its outputs are read.
+"""A communication step of an FMU: its inputs are set, time advances, its outputs are read.
 
 `StepParts` says what else belongs to it. It is the same step in this process and in another one, for Python and for the
 loops in C, which take it by its addresses (`native_step`).
@@ -39,7 +39,7 @@ _SLOW = 1000
 
 @dataclass(frozen=True)
 class StepMemory:
-    """What the steps keep beside the FMU's own state, for a return to it."""
+    """What the steps keep besides the FMU's own state, for a return to it."""
 
     added: float
     sloped: np.ndarray
@@ -152,7 +152,7 @@ class InstanceStep:
         self.finish()
 
     def start(self, t: float, h: float) -> None:
-        """Set the inputs, and begin a step; one in another process goes on by itself until `finish`."""
+        """Set the inputs, and begin a step; one in another process continues by itself until `finish`."""
         if StepParts.ADDED_TIME in self.parts:
             t = t if math.isnan(self._added[0]) else float(self._added[0])
             self._added[0] = t + h
@@ -183,7 +183,7 @@ class InstanceStep:
         self.finish()
 
     def _end(self, status: int) -> None:
-        """Go on to the end of a step whose calls have returned a status, and get the outputs."""
+        """Continue to the end of a step whose calls have returned a status, and get the outputs."""
         fmu, t, h = self.fmu, self._t, self._h
         self._go_on(self._judge_calls(status), t, h)
         fmu.set_span(t, h)
@@ -222,7 +222,7 @@ class InstanceStep:
         return found
 
     def _go_on(self, status: int, t: float, h: float) -> None:
-        """Go on from the first part of a step from t over h, in parts where events are or the FMU ends a step early."""
+        """Continue from the first part of a step from t over h, in parts where events are or the FMU stops early."""
         fmu, end, now, part = self.fmu, t + h, t, self.fmu.width.value
         if not self.parts & (StepParts.EVENTS | StepParts.EARLY_RETURN):
             self._judge_part(status, t, h)
@@ -418,7 +418,7 @@ class InstanceStep:
         if latest[-1] > latest[0]:
             self._look_for_pile(latest, ends=True)
         raise FmuRuntimeError(
-            f"its steps returned early at {reached:.9g} s {count} times in a row; expected that it goes on. "
+            f"its steps returned early at {reached:.9g} s {count} times in a row; expected that it continues. "
             "Report it to its makers, or leave early_return out of stepping=.",
             block=self.fmu.block.label,
             t=self._t,
@@ -439,13 +439,13 @@ class InstanceStep:
         advice = "Look up in its documentation which input or parameter sets the time between its events"
         if refused:
             raise FmuRuntimeError(
-                f"{found} of {h:g} s, so the run would not go on; expected events that leave it its way. {advice}, or "
-                "report it to its makers.",
+                f"{found} of {h:g} s, so the run would not advance; expected events that leave it its way. {advice}, "
+                "or report it to its makers.",
                 block=self.fmu.block.label,
                 t=now,
             )
         self._has_warned = True
-        self.fmu.add_note(f"t = {now:.9g} s: {found} of {h:g} s; the run goes on slowly. {advice}")
+        self.fmu.add_note(f"t = {now:.9g} s: {found} of {h:g} s; the run continues slowly. {advice}")
 
     # ---- the start, and saved states ----
 
@@ -463,12 +463,12 @@ class InstanceStep:
         self._hold()
 
     def memory(self) -> StepMemory:
-        """Return what the steps keep beside the FMU's own state."""
+        """Return what the steps keep besides the FMU's own state."""
         sloped = np.zeros(0) if self._slopes is None else self._slopes.last.copy()
         return StepMemory(float(self._added[0]), sloped, None if self.events is None else self.events.memory())
 
     def return_to(self, t: float, memory: StepMemory | None) -> None:
-        """Go on from a restored state at a time in s, of which a memory was kept, or none."""
+        """Continue from a restored state at a time in s, of which a memory was kept, or none."""
         self.forget()
         if memory is not None:
             self._added[:] = memory.added

@@ -31,7 +31,7 @@ class StepFailures(SavingFmu):
     is_stepping : bool
         Whether a step is under way.
     on_end : callable or None
-        Told when the FMU asks to end the simulation at the end of its step; without it the request is an error.
+        Called when the FMU asks to end the simulation at the end of its step; without it the request is an error.
     """
 
     is_stepping = False

@@ -79,7 +79,7 @@ class StepOptions:
         Save the FMU's state before each step, so that a discarded one is taken again from there (FMI 2.0, 4.2.2), by
         the length that its lastSuccessfulTime says, or half of it. The FMU must be able to save its state.
     input_derivatives : bool
-        Let real inputs go on with their slopes within a step, by the difference from the step before: in FMI 1.0 and
+        Let real inputs continue with their slopes within a step, by the difference from the step before: in FMI 1.0 and
         2.0 where the FMU has ``canInterpolateInputs``; in FMI 3.0 for inputs with ``intermediateUpdate`` where it has
         ``providesIntermediateUpdate``. This helps where inputs are smooth; where they are held
         or jump, it overshoots.
@@ -136,14 +136,14 @@ def check_offered(options: StepOptions, about: FmuDescription, label: str) -> No
 
 
 class StepParts(Flag):
-    """What belongs to a step of an FMU beside setting its inputs, stepping, and getting its outputs."""
+    """What belongs to a step of an FMU besides setting its inputs, stepping, and getting its outputs."""
 
     EVENTS = auto()
     """Event Mode before it, within it and at its end: discrete inputs, clocks, time events (FMI 3.0, 4.2.1)."""
     EARLY_RETURN = auto()
     """It may end early; the rest follows at once (FMI 3.0, 4.2.1)."""
     SLOPES = auto()
-    """Real inputs go on with their slopes within it (FMI 2.0, 4.2.1; FMI 3.0, 4.2.2)."""
+    """Real inputs continue with their slopes within it (FMI 2.0, 4.2.1; FMI 3.0, 4.2.2)."""
     ROLLBACK = auto()
     """The state before it is saved, from which it is taken again where it is discarded (FMI 2.0, 4.2.2)."""
     ADDED_TIME = auto()

@@ -37,7 +37,7 @@ class FmuVerdict(StrEnum):
 @explain_calls
 @dataclass(frozen=True)
 class FmuTrial:
-    """Trial run of an interface, in a process of its own.
+    """Trial run of an interface, in its own process.
 
     Parameters
     ----------

@@ -59,7 +59,7 @@ def doctor(
 ) -> FmuDiagnosis:
     """Examine an FMU of any tool: its content, whether it runs here, and violations of the standard.
 
-    Nothing of it runs in this process. The trial run is in a process of its own; it may take a licence's seat.
+    Nothing of it runs in this process. The trial run is in its own process; it may take a licence's seat.
 
     Parameters
     ----------
@@ -284,7 +284,7 @@ def _experiment(name: str, found: str, expected: str) -> FmuFinding:
         FmuFault.EXPERIMENT,
         name,
         f"its default experiment {found}; expected {expected} number.",
-        "Nothing of it is used here but in the trial; give times of your own in other tools.",
+        "Nothing of it is used here but in the trial; give your own times in other tools.",
         FmuSeverity.WARNING,
     )
 
@@ -321,7 +321,7 @@ def _try(
     hopeless: bool,
     progress: bool,
 ) -> tuple[FmuTrial, FmuFinding | None]:
-    """Run an interface in a process of its own, if it is to be tried."""
+    """Run an interface in its own process, if it is to be tried."""
     attributes = summary["interfaces"][kind]
     folders = binaries_of(archive.files)
     if hopeless:

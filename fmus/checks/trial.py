@@ -1,4 +1,4 @@
-"""Trial run of an FMU's interface, in a process of its own, as a run of a diagram would load it."""
+"""Trial run of an FMU's interface, in its own process, as a run of a diagram would load it."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def try_out(
     *,
     progress: bool = True,
 ) -> FmuProblem | None:
-    """Run an FMU for some steps in a process of its own; return its fault, or None.
+    """Run an FMU for some steps in its own process; return its fault, or None.
 
     In model exchange the derivatives are evaluated at the start.
 
@@ -117,7 +117,7 @@ def try_out(
 
 def _announce(file: Path, interface: str) -> None:
     print(
-        f"{file.name} is being {RUNS[interface]} by {INTERFACES[interface]}, in a process of its own. A call that "
+        f"{file.name} is being {RUNS[interface]} by {INTERFACES[interface]}, in its own process. A call that "
         f"takes longer than {PATIENCE:g} s counts as hung; Ctrl-C ends it before.",
         file=sys.stderr,
         flush=True,

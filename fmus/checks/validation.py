@@ -1,7 +1,7 @@
 """Validation of a third-party FMU, by FMPy and by further checks.
 
 The checks cover the archive, the description (against the standard's schemas, which FMPy ships), the model structure,
-and the declared binaries and sources. Then each interface is tried in a process of its own.
+and the declared binaries and sources. Then each interface is tried in its own process.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def validate(file: Path, *, run: bool = True, limits: ArchiveLimits | None = Non
     file : Path
         The FMU.
     run : bool
-        Whether to run it, in a process of its own.
+        Whether to run it, in its own process.
     limits : ArchiveLimits, optional
         Limits of its size; the usual ones without it.
     """
@@ -227,7 +227,7 @@ def _binaries(archive: FmuArchive, root: Any, tool: str) -> Iterator[FmuProblem]
     for folder, names in folders.items():
         platform = tuple_of(folder)
         if platform is None:
-            continue  # a tool may have folders of its own
+            continue  # a tool may have its own folders
         for library in sorted({library_name(i, platform) for i in _identifiers(root).values() if i}):
             users = [who for who, i in _identifiers(root).items() if i and library_name(i, platform) == library]
             if library not in names:

@@ -212,7 +212,7 @@ def _run(command: Sequence[str], folder: Path, platform: str) -> None:
         failed = f"the C compiler failed for {platform} with exit code {code}"
         temporary = os.environ.get("TMPDIR", folder)
         for place, instead in ((folder, OWN_CACHE), (cache_folder(), OWN_CACHE), (temporary, OTHER_TEMPORARY)):
-            if (error := find_disk_error(place)) is not None:  # the compiler has words of its own for it
+            if (error := find_disk_error(place)) is not None:  # the compiler has its own words for it
                 found = describe_disk_error(error, place, instead)
                 raise CompilerError(f"{failed}. Its message:\n{said}\nThe cause: {found}") from error
         raise CompilerError(

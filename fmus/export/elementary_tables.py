@@ -1,7 +1,7 @@
 """Tables of the elementary functions in exported FMUs, computed in decimal arithmetic: no platform's function is asked.
 
-The functions themselves stand in ``runtime/elementary.c``. The equations of a generated ``model.c`` call them under
-names of their own, so that an FMU computes the same bits on every platform.
+The functions themselves are in ``runtime/elementary.c``. The equations of a generated ``model.c`` call them under
+their own names, so that an FMU computes the same bits on every platform.
 """
 
 from __future__ import annotations

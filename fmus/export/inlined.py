@@ -30,7 +30,7 @@ def inline_model(path: str | os.PathLike[str], prefix: str) -> str | None:
     path : path
         An FMU that Loopwright has built on this machine.
     prefix : str
-        Begin of every name of it, so that several stand in one unit.
+        Begin of every name of it, so that several are in one unit.
 
     Returns
     -------

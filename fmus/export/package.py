@@ -43,7 +43,7 @@ FOLDERS2 = {"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin
 
 @dataclass(frozen=True)
 class Options:
-    """Options of a build, beside the model.
+    """Options of a build, besides the model.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def fmi_headers() -> tuple[Path, str]:
     spec = importlib.util.find_spec("fmpy")
     folder = Path(spec.origin).parent / "c-code" if spec is not None and spec.origin is not None else None
     if folder is None or not all((folder / f"fmi{v}Functions.h").is_file() for v in (2, 3)):
-        raise FmuError(f"found no FMI header files in {folder}. Install FMPy anew: pip install --force-reinstall fmpy.")
+        raise FmuError(f"found no FMI header files in {folder}. Reinstall FMPy: pip install --force-reinstall fmpy.")
     return folder, importlib.metadata.version("fmpy")
 
 
@@ -92,7 +92,7 @@ def _text(value: Any) -> str:
 
 
 def _code_parts(fmi: int) -> list[str]:
-    """Return the text of the modules that write the files, so that a change of them builds anew."""
+    """Return the text of the modules that write the files, so that a change of them builds again."""
     folder = Path(__file__).parent
     written = ("c_code", "elementary_tables", "html_page", "package", "quantities", "scalars", "xml_fmi2", "xml_fmi3")
     modules = [(folder / f"{name}.py").read_text(encoding="utf-8") for name in written]
@@ -226,7 +226,7 @@ def build_fmu(
     platform : str or iterable of str, optional
         FMI 3.0 platform tuples (2.5.1.4) to build binaries for, or "all" of them; native if not given.
     documentation : str
-        Plain text for ``documentation/index.html``, beside the equations and the table of variables.
+        Plain text for ``documentation/index.html``, besides the equations and the table of variables.
     notify : callable, optional
         Called with a line of text before each long step.
 

@@ -338,7 +338,7 @@ def _pickle(block: Block, name: str, module: str | None) -> bytes:
 
 
 def _make(script: Path, out: Path, files: list[Path], name: str, kind: str) -> Path:
-    """Run PythonFMU's builder in a process of its own, since it leaves modules and paths behind and runs the block."""
+    """Run PythonFMU's builder in its own process, since it leaves modules and paths behind and runs the block."""
     options = {
         "needsExecutionTool": True,
         "canHandleVariableCommunicationStepSize": kind != "sampled",

@@ -1,7 +1,7 @@
 """Program inside an FMU that needs Python: `python_fmu.py` copies it there; it is never imported from here.
 
-It is beside ``loopwright.json`` (variables and steps), ``loopwright.pickle`` (the block) and, if the block comes from a
-file of its own, that file. PythonFMU makes one object of the class for each instance of the FMU.
+It is next to ``loopwright.json`` (variables and steps), ``loopwright.pickle`` (the block) and, if the block comes from
+its own file, that file. PythonFMU makes one object of the class for each instance of the FMU.
 """
 
 # PythonFMU finds the class by importing this file, so it imports only modules that the FMU needs.
@@ -49,7 +49,7 @@ _ENDING: dict[str, Any] = {}
 
 
 class _Unpickler(pickle.Unpickler):
-    """Unpickler that finds objects of the block's own file in the copy beside this file."""
+    """Unpickler that finds objects of the block's own file in the copy next to this file."""
 
     def __init__(self, stream: Any, module: Any):
         super().__init__(stream)

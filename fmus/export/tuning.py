@@ -1,4 +1,4 @@
-"""An FMU of our own, compiled anew for the processor of this machine."""
+"""An FMU of our own, compiled again for the processor of this machine."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def processor_flags() -> tuple[str, ...]:
 
 @accepts(path=kinds.path)
 def tune(path: str | os.PathLike[str]) -> Path:
-    """Return an FMU with its binary compiled anew for the processor of this machine.
+    """Return an FMU with its binary compiled again for the processor of this machine.
 
     It has the instructions of this processor and fuses products with sums (FMA), so that it is faster, and runs on such
     processors only. Its values differ from the FMU's by rounding. It is made once, and kept in the cache.

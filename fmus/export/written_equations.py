@@ -145,7 +145,7 @@ def read_equations(path: Path) -> WrittenEquations:
     except (OSError, KeyError, zipfile.BadZipFile) as error:
         raise FmuError(f"its sources can't be read: {error}. Export it with Loopwright.") from None
     if texts not in (runtime(3), runtime(2)):
-        raise FmuError("another version of Loopwright has exported it. Export it anew.")
+        raise FmuError("another version of Loopwright has exported it. Export it again.")
     return read_text(text)
 
 

@@ -1,4 +1,4 @@
-"""FMUs in processes of their own: the face of `fmus/calls`, with the library in a child."""
+"""FMUs in their own processes: the face of `fmus/calls`, with the library in a child."""
 
 from .opening import find_limits, open_fmu
 from .pool import count_processes, end_idle

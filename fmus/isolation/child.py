@@ -69,7 +69,7 @@ class Child:
         self.printf = importlib.import_module(".printf", __package__)
         self.before: list[Any] = []
         self.line: Any = None
-        """Inputs that go on along lines within a step: start, status, values and slopes, then references, instance."""
+        """Inputs that follow lines within a step: start, status, values and slopes, then references, instance."""
         self._logging = threading.Lock()
 
     # ---- requests ----
@@ -136,7 +136,7 @@ class Child:
         return run
 
     def _leave_copy(self) -> None:
-        """End this process if the FMU has made it from the child: the child itself goes on."""
+        """End this process if the FMU has made it from the child: the child itself continues."""
         if os.getpid() != self.me:
             os._exit(0)
 

@@ -51,7 +51,7 @@ _WATCH = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_size_t, ctypes
 def make_watch() -> Any:
     """Return a function for bound calls that notes in a word whether texts are others than when it was called last.
 
-    Its arguments are where the texts stand, their number, and where the word stands, which it never sets back.
+    Its arguments are where the texts are, their number, and where the word is, which it never sets back.
     """
     kept: list[Any] = []
 

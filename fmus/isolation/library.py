@@ -116,7 +116,7 @@ class RemoteFunction:
 
 
 def _held(value: Any) -> Any:
-    """Return the C object that a pointer points to, itself if it is one with memory of its own, else None."""
+    """Return the C object that a pointer points to, itself if it is one with its own memory, else None."""
     if hasattr(value, "_obj"):  # byref
         return value._obj
     if isinstance(value, ctypes._Pointer):  # of a cast: it keeps the array whose size it has lost

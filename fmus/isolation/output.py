@@ -43,7 +43,7 @@ class ChildOutput:
         """Return the last lines that the FMU has written to its standard output and standard error."""
         with suppress(OSError), open(self.folder / "printed", "rb") as file:
             size = file.seek(0, os.SEEK_END)
-            file.seek(max(0, size - 4096, self._printed if self._printed <= size else 0))  # it may have begun anew
+            file.seek(max(0, size - 4096, self._printed if self._printed <= size else 0))  # it may have begun again
             lines = file.read().decode(errors="replace").splitlines()
             return [line.strip() for line in lines if line.strip()][-_LAST_LINES:]
         return []

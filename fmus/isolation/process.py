@@ -327,7 +327,7 @@ class ChildProcess:
             text = f"{call} has not ended after {seconds:g} s; its process was ended"
         said = f" It wrote: {' / '.join(printed)}." if printed else ""
         found = FmuProcessError(
-            f"{text}{'' if cause is FmuEnd.TIMEOUT else f' in {call}'} (FMU {self.name!r}, in a process of its own).",
+            f"{text}{'' if cause is FmuEnd.TIMEOUT else f' in {call}'} (FMU {self.name!r}, in its own process).",
             call=call,
             cause=cause,
             printed=said,

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import Any
 
 REQUEST, REPLY, CHILD_SLEEPS, PARENT_SLEEPS = 0, 8, 16, 24
-"""Places of words, each in a cache line of its own: number of the last request and of the last reply, and flags."""
+"""Places of words, each in its own cache line: number of the last request and of the last reply, and flags."""
 SEQUENCE, STATUS, PLACE, LENGTH, MESSAGES, CAUSE = 32, 33, 34, 35, 40, 48
 """Sequence to run; its status; call in work; length of the message; number of log messages; reason of the end."""
 MAIL = 1 << 32

@@ -39,7 +39,7 @@ class Derivation:
     order : int, optional
         Number of states of an identified model.
     restarted : bool
-        Whether the FMU was started anew for each difference, as it does not restore the states that it saves.
+        Whether the FMU was started again for each difference, as it does not restore the states that it saves.
     gap : float
         Largest distance of the FMU's directional derivatives from differences of its own values, relative to their
         size; 0 where they agree, NaN where they could not be compared.

@@ -1,6 +1,6 @@
 """Difference quotients of an FMU's results, with an estimate of their error, over the lengths that tell most.
 
-Values may be rounded more coarsely than to double precision: an FMU may compute in single precision, beside a large
+Values may be rounded more coarsely than to double precision: an FMU may compute in single precision, next to a large
 offset, or give out the numbers of a converter. They are stairs then, and a short difference sees one step or none.
 """
 
@@ -34,7 +34,7 @@ SLIGHT = 1e-2
 _PLACES = (0.13, 0.31, 0.47, 0.71, 1.0)
 _LONGER = (1e-4, 1e-3, 1e-2, FAR / 4)
 _SHORTER = 0.01
-"""Lengths beside the first one: longer ones, relative to the size, and a shorter one, relative to the first."""
+"""Lengths besides the first one: longer ones, relative to the size, and a shorter one, relative to the first."""
 _EPS = float(np.finfo(float).eps)
 _SCATTER = 6.0
 """Size of a rounding in largest distances of the values from a smooth curve."""

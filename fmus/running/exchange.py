@@ -167,7 +167,7 @@ def events_of(block: ExchangeMembers) -> dict[str, Event]:
 def dependence(block: ExchangeMembers, equation: str, rates: str) -> dict[str, np.ndarray]:
     """Return which entries of an output, or of the derivatives (``rates``), depend on which of the states and inputs.
 
-    The states stand under ``"x"``, inputs under their ports. Discrete inputs and parameters act at events alone.
+    The states are under ``"x"``, inputs under their ports. Discrete inputs and parameters act at events alone.
     """
     about, exchange = block.description, block.exchange_info
     assert exchange is not None

@@ -35,7 +35,7 @@ class Fmu(ExchangeMembers):
 
     Scalars ``s[1]``, ``s[2]``, as FMI 2.0 writes an array, are one port ``s``, if they are complete from 0 or 1 and
     alike; ``plant["s[1]"]`` reads one of them, ``start`` takes both names, and scalars that ``rename`` or ``ports``
-    name are ports of their own.
+    name are their own ports.
 
     A wire carries numbers: integers and enumerations as such, a Boolean as 0 or 1. An input of one of these types
     refuses other numbers in a run. Texts, binaries and clocks are no ports (`left_out`); ``start`` takes texts.
@@ -62,7 +62,7 @@ class Fmu(ExchangeMembers):
     )
     isolate: bool | Isolation | None = parameter(
         default=None,
-        description="a process of its own: True, its limits, False; None for all but own builds",
+        description="its own process: True, its limits, False; None for all but own builds",
         kind=kinds.one_of_class((bool, Isolation), "True, False, None or an Isolation").worded(step="Give one."),
     )
     ports: Sequence[str] | None = parameter(
@@ -231,8 +231,8 @@ class Fmu(ExchangeMembers):
         The method is the first of these that the FMU supports: directional derivatives in model exchange
         (Continuous-Time Mode), in co-simulation (Step Mode); differences in model exchange, in co-simulation
         (Initialization Mode). The clauses are FMI 2.0, 2.1.9, 3.2.3, 4.2.4, and FMI 3.0, 2.2.11, 2.3.3, 3.2, 4.2. It
-        loads an instance of its own. Discrete states and parameters are constant. Directional derivatives of an FMU
-        of others are held against differences, which stand in where they are plainly wrong (``derivation.refuted``).
+        loads its own instance. Discrete states and parameters are constant. Directional derivatives of an FMU
+        of others are held against differences, used instead where they are plainly wrong (``derivation.refuted``).
 
         Parameters
         ----------
@@ -271,7 +271,7 @@ class Fmu(ExchangeMembers):
 
         The method is differences of ``doStep`` in co-simulation. States are moved by their start values, the only way
         that is allowed there (FMI 2.0, 4.2.4; FMI 3.0, 4.2), inputs between steps, from a saved state if the FMU can
-        save one. Impacts and switches within the step count. Memory that is no variable of the FMU starts anew with
+        save one. Impacts and switches within the step count. Memory that is no variable of the FMU starts again with
         each difference, such as that of its solver, or the side of a threshold.
 
         Parameters

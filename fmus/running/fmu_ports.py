@@ -31,7 +31,7 @@ def choose_ports(
     description : FmuDescription
         The FMU's description.
     rename : tuple of pairs of str
-        Variables and the names of their ports. Scalars of a gathered array that are renamed are ports of their own,
+        Variables and the names of their ports. Scalars of a gathered array that are renamed are their own ports,
         and so are the array's other scalars; those that are renamed to elements are one port (`join_scalars`).
     chosen : tuple of str, optional
         Variables that are ports; None for all inputs and outputs.

@@ -170,7 +170,7 @@ def _linearize_by_directions(point: FmuPoint, instance: LoadedFmu) -> FmuLineari
 
 
 def _check(point: FmuPoint, instance: LoadedFmu, J: np.ndarray, rows: np.ndarray) -> SlopeCheck:
-    """Hold directional derivatives against differences, in Continuous-Time Mode, or in Initialization Mode anew.
+    """Hold directional derivatives against differences, in Continuous-Time Mode, or in Initialization Mode again.
 
     Discrete inputs of model exchange are left out: to move them is an event.
     """
@@ -305,7 +305,7 @@ def find_exchange_slopes(
 
 
 def _states_in(block: ExchangeMembers) -> Iterator[tuple[FmuVariable, slice]]:
-    """Yield the variables of the continuous states, and where they stand among these."""
+    """Yield the variables of the continuous states, and where they are among these."""
     about = block.description
     layout = about.layout(about.states).slices
     yield from ((about.find(name), layout[name]) for name in about.states)

@@ -17,7 +17,7 @@ class RestoredPoint:
     """A state that is saved and restored, as long as that has the values of the point again.
 
     Values are compared until each has moved and come back once. They are read after a restore at the point itself,
-    too, so that an FMU which computes outputs anew then is compared with itself.
+    too, so that an FMU which computes outputs again then is compared with itself.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ class RestoredPoint:
     Attributes
     ----------
     is_restored : bool
-        Whether states are restored; else every return begins anew.
+        Whether states are restored; else every return begins again.
     lied : bool
         Whether the FMU has said that it restored a state, and had not.
     """
@@ -63,7 +63,7 @@ class RestoredPoint:
         self.save()
 
     def give_up(self) -> None:
-        """Restore no state from here on: the FMU goes on otherwise behind a restored state than from its start."""
+        """Restore no state from here on: the FMU continues otherwise behind a restored state than from its start."""
         self.free()
         self.is_restored, self.lied = False, True
 
@@ -72,7 +72,7 @@ class RestoredPoint:
         self.is_restored, self.lied = True, False
 
     def free(self) -> None:
-        """Free the saved state; do so before the instance is made anew, to which it does not belong."""
+        """Free the saved state; do so before the instance is made again, to which it does not belong."""
         if self._handle is not None:
             self._instance.free_state(self._handle)
             self._handle = None

@@ -92,7 +92,7 @@ def check_slopes(
         if all(checker.compare(J, v).agrees.all() for v in checker.directions()):
             return agreed
         return checker.check_columns(J)
-    except LoopwrightError:  # the FMU can't be evaluated beside this point: nothing is known
+    except LoopwrightError:  # the FMU can't be evaluated next to this point: nothing is known
         return SlopeCheck(J, np.where(checker.moved, np.nan, agreed.error), np.nan, False)
 
 
@@ -154,7 +154,7 @@ class _Checker:
         self.moved = moved & (self.up | self.down)
 
     def directions(self) -> Iterator[np.ndarray]:
-        """Yield directions that move all entries; those beside a limit away from it."""
+        """Yield directions that move all entries; those next to a limit away from it."""
         rng = np.random.default_rng(0)
         for _ in range(DIRECTIONS):
             sign = np.where(self.up & self.down, rng.choice([-1.0, 1.0], self.at.size), np.where(self.up, 1.0, -1.0))

@@ -1,6 +1,6 @@
 /* The other side of `remote.c`, in the process of an FMU: it waits for requests, and calls the FMU's functions.
 
-   What is no sequence of such calls is left to Python. It stands behind `newton.c` and `remote.c`. */
+   What is no sequence of such calls is left to Python. It comes after `newton.c` and `remote.c`. */
 
 /* A function of an FMU by its form, with its arguments: p is a pointer, n a number of elements, d a time, b a flag. */
 enum { TRANSFER_4, TRANSFER_5, STEP_INT, STEP_CHAR, STEP_3, TIME_1, VECTOR_3, MODE_1, UPDATE_2, UPDATE_7, DONE_INT, DONE_CHAR,

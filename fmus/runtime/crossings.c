@@ -1,6 +1,6 @@
 /* Events within a step: when an indicator leaves its domain, and what a jump leaves in contact.
 
-   Runs of diagrams and exported FMUs use them. Before this file stand LW_SEARCH, the type of a step in which events are
+   Runs of diagrams and exported FMUs use them. Defined before this file are LW_SEARCH, the type of a step in which events are
    sought, and LW_VALUE(s, i, t, lost), the value of indicator i at a time in it, which sets *lost where there is none. */
 
 /* The distance between times that are told apart. */

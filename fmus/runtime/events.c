@@ -4,7 +4,7 @@
    has just crossed zero has some slack for rounding errors; one that comes close to zero between two instants is followed
    to where it is closest. At an indicator that is not finite the run ends. */
 
-enum { QUIET, EVENT, LOST, PILED }; /* PILED: events pile up, and the run can't go on: */
+enum { QUIET, EVENT, LOST, PILED }; /* PILED: events pile up, and the run can't continue: */
 enum { IN_CONTACT, ZENO, CHATTERS, ENDLESS, ENDLESS_OUTSIDE }; /* the last one: of FMUs in model exchange */
 enum { ULPS = 16 }; /* an event within so many ulps of a tick or a sample belongs to it */
 enum { HALVINGS = 40, FEW = 48, BLOCK = 63, MOST = 1024, LATEST = 9, RECENT = 500, SLIDES = 10, ROUNDS = 100, AROUND = 5 };
@@ -38,7 +38,7 @@ typedef struct {
     const double *start;          /* domains at the start */
     int64_t sliding, switched;    /* whether events of a fixed step wait for its end; whether one has fired there */
     double *slid;                 /* when each has begun to slide for the first time, s; NaN: it has not */
-    int64_t pile, culprit, piled; /* why the run can't go on, by which event, and how many times in a row */
+    int64_t pile, culprit, piled; /* why the run can't continue, by which event, and how many times in a row */
 } watch;
 
 static inline double lowest(const watch *w, int64_t i, double domain, double slack) {
@@ -304,7 +304,7 @@ static void note_sizes(watch *w, int64_t n, bool begins) {
     }
 }
 
-/* Find the first instant in the last step at which events fire: they stand in w->fires then, the domains are new. */
+/* Find the first instant in the last step at which events fire: they are in w->fires then, the domains are new. */
 static int locate(watch *w, problem *p, method *method, double *found) {
     const double a = method->t_old, b = method->t;
     const int64_t m = w->m, parts = (int64_t)fmax(4.0, ceil((b - a) / w->spacing));

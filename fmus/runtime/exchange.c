@@ -3,8 +3,8 @@
    An evaluation leaves all that an FMU keeps as it is. A look at an instant that is reached tells the FMU that a step is
    complete, or lets an event act: of its indicators, or of inputs that have jumped. Python lets those of time and of steps
    act, and does whatever C can't: it transfers values that don't fit, and evaluates blocks that are no FMU of C's.
-   An FMU in a process of its own is asked for all calls between two copies at once: its buffers are in the memory that
-   both share. It stands behind `remote.c` and `master.c`. */
+   An FMU in its own process is asked for all calls between two copies at once: its buffers are in the memory that
+   both share. It comes after `remote.c` and `master.c`. */
 
 enum { TAKE, GIVE, SET_TIME, CALL, ASK };
 enum { OK, WARNING, DISCARD, LOST_PROCESS };
@@ -16,7 +16,7 @@ enum { EVENT_ROUNDS = 100 };
 typedef struct {
     int64_t kind, count;
     void *function;
-    uint64_t arguments[8];  /* as they stand in registers, the instance first; of a request its number */
+    uint64_t arguments[8];  /* as they are in registers, the instance first; of a request its number */
     double *vector;         /* of a copy: entries index[0], index[1] and so on, of a type in the buffer */
     const int64_t *index;
     void *buffer;
@@ -35,7 +35,7 @@ struct outside;
 /* An FMU in model exchange. */
 typedef struct {
     struct outside *of;
-    int64_t place, states, inputs, events, first; /* first: where its states stand in the vector of all */
+    int64_t place, states, inputs, events, first; /* first: where its states are in the vector of all */
     sequence complete, enter, update, leave;
     const uint8_t *again, *terminate, *nominals, *defined, *wants, *ends; /* its answers: flags of some bytes */
     const double *time;
@@ -71,7 +71,7 @@ typedef struct outside {
     int (*wait)(int64_t);       /* Python waits for the late reply of an FMU; 0: it never comes, or not in time */
 } outside;
 
-/* A stage of a schedule: a traced function, or an FMU with where its values stand. */
+/* A stage of a schedule: a traced function, or an FMU with where its values are. */
 typedef struct {
     tick f;
     exchanged *fmu;             /* NULL: a traced function */
@@ -299,7 +299,7 @@ static int ask_python(const stage_of *g) {
     return result;
 }
 
-/* Look at an instant that is reached. Behind the inputs stands 1 for each event that fires. */
+/* Look at an instant that is reached. Behind the inputs is 1 for each event that fires. */
 static void look_at(const stage_of *g) {
     exchanged *e = g->fmu;
     outside *o = e->of;

@@ -1,6 +1,6 @@
 /* Steps of explicit Runge-Kutta methods of a given length, from (t, x) with the rates k1 there to out, which may be x.
 
-   Runs of diagrams, exported FMUs and vectors of runs use them. Before this file stand LW_EQUATION, the type of a
+   Runs of diagrams, exported FMUs and vectors of runs use them. Defined before this file are LW_EQUATION, the type of a
    differential equation; LW_RATE(e, t, x, f), which writes its n rates at (t, x) to f and is not 0 where it can't; and
    LW_NUMBER, the type of a state. What x has beyond the n states that are integrated, y has too. Functions are inlined:
    where n is a constant and the arrays are local, numbers stay in registers. */

@@ -28,7 +28,7 @@ static inline double begin_stretch(hybrid *h, progress *g, double end) {
 /* Whether the run ends at the instant that has been evaluated. */
 static inline bool is_at_end(const hybrid *h) { return is_stopped(&h->l) || (h->o && has_ended(h->o)); }
 
-/* Go on to the next tick that is landed on; DONE: it is reached. */
+/* Continue to the next tick that is landed on; DONE: it is reached. */
 static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
     const span *s = g->s;
     problem *p = &h->p;
@@ -167,7 +167,7 @@ VISIBLE void loopwright_go(hybrid *h, const span *s, double *rows, outcome *out)
     out->ticks = g.i;
 }
 
-/* Go on to an instant before any tick there, within a step of the plants; the span ends there. */
+/* Continue to an instant before any tick there, within a step of the plants; the span ends there. */
 VISIBLE void loopwright_go_between(hybrid *h, const span *s, double *rows, outcome *out) {
     progress g = {s, rows, out, 0, 0, -1};
     int64_t steps = 0;

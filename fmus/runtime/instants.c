@@ -2,7 +2,7 @@
 
 /* Reasons, after those of the loop over ticks. */
 enum { SUSPENDED = HALTED + 1, ENDED, LOOK, OUTSIDE_FAILED, PILED_UP, BROKEN_OFF };
-enum { STIFF = 1, EASY, STUCK }; /* signs that another method may go on: the last one is that this one can't */
+enum { STIFF = 1, EASY, STUCK }; /* signs that another method may continue: the last one is that this one can't */
 
 /* Ticks and instants to be recorded. */
 typedef struct {
@@ -34,13 +34,13 @@ typedef struct hybrid {
     const int64_t *taken, *taken_first; /* states that a tick of each kind renews */
     double *taken_states;
     double *before;     /* states before FMUs act */
-    int64_t switched;   /* a sign that another method may go on, and has to be looked at */
+    int64_t switched;   /* a sign that another method may continue, and has to be looked at */
     double *solved;     /* values of the algebraic loops at an event */
     double looked_at;   /* step in s at which it seemed so */
     outside *o;         /* FMUs in model exchange; NULL without any */
     double jump;        /* first discontinuity of a source, or event of time of an FMU, behind the stretch's begin */
     void (*drain)(void); /* Python takes the events that have been logged */
-    int64_t coupled;    /* whether the continuous states go on within the steps of the plants */
+    int64_t coupled;    /* whether the continuous states continue within the steps of the plants */
     int64_t lost_at;    /* kind of the tick that can't be evaluated */
     double looked;      /* tick at which they have been looked at, and before which nothing changes any more */
 } hybrid;
@@ -59,7 +59,7 @@ static inline int64_t landing_of(progress *g) {
     return g->landing;
 }
 
-/* Stand at an instant, beyond any discontinuity there. */
+/* Move to an instant, beyond any discontinuity there. */
 static inline void enter(hybrid *h, progress *g, double t) {
     problem *p = &h->p;
     const span *s = g->s;
@@ -80,14 +80,14 @@ static inline void put_states(hybrid *h, const double *x) {
     for (int64_t i = 0; i < h->p.n; i++) h->l.x[h->p.where[i]] = x[i];
 }
 
-/* Stand at a time of the last step, with these states. */
+/* Move to a time of the last step, with these states. */
 static inline void stand_at(hybrid *h, double t, const double *x) {
     put_states(h, x);
     *h->l.t = t;
     if (h->p.delays) put_delayed(h->p.delays, t, h->p.delays->here);
 }
 
-/* Evaluate everything at the present instant; false: the run can't go on. */
+/* Evaluate everything at the present instant; false: the run can't continue. */
 static inline bool evaluate_here(hybrid *h, int64_t kind) {
     if (evaluate(&h->l, kind) == DONE) return true;
     h->p.lost = AT_INSTANT;
@@ -187,7 +187,7 @@ static bool is_contact(const watch *w, const problem *p, const double *x, const 
     return moved && (new[m + i] != old[m + i] || w->stuck[i] != 0.0);
 }
 
-/* Note why the run can't go on. */
+/* Note why the run can't continue. */
 static int pile_up(watch *w, int64_t pile, int64_t culprit, int64_t times) {
     w->pile = pile;
     w->culprit = culprit;
@@ -271,7 +271,7 @@ static void look_for_sliding(watch *w) {
     if (isnan(w->slid[event])) w->slid[event] = last;
 }
 
-/* Let the domains of a subsystem's events start anew where it has just been enabled and its states do so. */
+/* Let the domains of a subsystem's events start again where it has just been enabled and its states do so. */
 static void reset_domains(const hybrid *h, watch *w, int64_t i) {
     if (w->gate[i] < 0 || !(h->l.x[w->gate[i]] > 0.5)) return;
     for (int64_t j = w->inside_first[i]; j < w->inside_first[i + 1]; j++) w->domain[w->inside[j]] = w->start[w->inside[j]];
@@ -361,7 +361,7 @@ static bool jump(hybrid *h, double at) {
 }
 
 /* Let the events in w->fires fire at t, and those that they make fire; jumps are evaluated at `at`, a few ulps later
-   perhaps. LOST or PILED: the run can't go on. */
+   perhaps. LOST or PILED: the run can't continue. */
 static int fire(hybrid *h, double t, double at) {
     watch *w = &h->w;
     problem *p = &h->p;
@@ -476,7 +476,7 @@ static int settle(hybrid *h, double t, bool ahead) {
 
 /* --- a tick -------------------------------------------------------------------------------------------------------- */
 
-/* The run can't go on from the present instant: Python says why. */
+/* The run can't continue from the present instant: Python says why. */
 static int64_t break_off(hybrid *h, double t, int result) {
     h->t = t;
     return result == PILED ? PILED_UP : h->o && h->o->failed ? OUTSIDE_FAILED : BROKEN_OFF;

@@ -3,7 +3,7 @@
    A function is a list of runs. A run is one operation that is done on many values one after the other, so that the
    processor meets the same loop again and again; `machine.py` sorts the operations of a function in this way. Every
    value has a place in the memory `v` that nothing else is written to, so their order changes no bit. Constants are in
-   `v` from the beginning. The machine stands behind `newton.c`. */
+   `v` from the beginning. The machine comes after `newton.c`. */
 
 /* The operations: name, as CasADi calls it without OP_; and the value that is made of a, or of a and b. */
 #define UNARY_OPERATIONS(X) \
@@ -55,7 +55,7 @@ typedef struct {
         }                                                  \
         break;
 
-/* A function as `tick.evaluate`: its program stands in the place of iw, its values in that of w. */
+/* A function as `tick.evaluate`: its program is in the place of iw, its values in that of w. */
 VISIBLE int loopwright_machine(const double **arguments, double **results, long long *iw, double *v, int memory) {
     const program *of = (const program *)iw;
     const int32_t *c = of->code;

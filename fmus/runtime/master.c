@@ -65,7 +65,7 @@ typedef struct {
 enum { DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED };
 enum { INPUTS, STEP, OUTPUTS, UNDER_WAY, REFUSED, TOLD }; /* of an FMU in another process; of a step by Python */
 
-/* A fused loop stands in one unit with the code of its ticks, and of FMUs; then these are no calls by address. */
+/* A fused loop is in one unit with the code of its ticks, and of FMUs; then these are no calls by address. */
 #ifndef CALL_TICK
 #define CALL_TICK(l, kind) call((l)->ticks + (kind))
 #endif
@@ -126,9 +126,9 @@ static inline void set_back(const plant *p, uint64_t own) {
     }
 }
 
-/* Step one FMU; return DONE, or why it can't go on. */
+/* Step one FMU; return DONE, or why it can't continue. */
 static inline int64_t step_plant(const plant *p, double now, double width, uint64_t own, outcome *out) {
-    unsigned status = 0; /* Python tells a warning, and what is worse; a negative one is no success */
+    unsigned status = 0; /* Python reports a warning, and what is worse; a negative one is no success */
     out->stage = INPUTS;
     if (p->inputs.function) status = (unsigned)move(p, &p->inputs);
     set_back(p, own);
@@ -201,7 +201,7 @@ static inline int64_t end_apart(const loop *l, const plant *p, double width, out
     return out->status = 0, FMU_FAILED;
 }
 
-/* Let Python take a step of an FMU; return whether it has to go on from there. */
+/* Let Python take a step of an FMU; return whether it has to continue from there. */
 static inline bool step_by_python(const loop *l, const plant *p, double now, double width, outcome *out) {
     if (p->by_python(out->plant, now, width)) {
         out->stage = TOLD;

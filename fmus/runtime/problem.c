@@ -6,7 +6,7 @@ typedef struct {
     const int64_t *where;
     tick flow, slope;        /* the rates at (t, x), and their derivative by the integrated states */
     double *t, *x, *slopes;
-    int64_t entries;         /* of the slope that may not be 0, which stand in slopes; else all of them do, by columns */
+    int64_t entries;         /* of the slope that may not be 0, which are in slopes; else all of them are, by columns */
     const int64_t *row, *column;
     double stop;             /* rates are evaluated no later */
     double edge, left;       /* up to the discontinuity `edge` sources are seen at the time `left` before it at most */
@@ -16,7 +16,7 @@ typedef struct {
     double *by_loops;        /* of the slope: ∂f/∂v, then ∂r/∂x, for loops with the values v and r(x, v) = 0 */
     struct delays *delays;   /* transport delays; NULL: none */
     int64_t rates, jacobians;
-    int64_t lost;            /* where a run can't go on */
+    int64_t lost;            /* where a run can't continue */
     int64_t noting;          /* whether a trial is noted at which a rate is not finite */
     double beyond_t, *beyond; /* the last such trial: its time, NaN without one, and its states; IN_PROGRESS: mean step, s */
 } problem;

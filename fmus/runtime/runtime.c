@@ -1,5 +1,5 @@
 /* The runtime library: the loops over ticks and time, their methods and events, the virtual machine, and the other side
-   of FMUs in processes of their own.
+   of FMUs in their own processes.
 
    It knows no diagram. It is compiled when the package is installed, else by the first run that needs it. */
 #include "newton.c"

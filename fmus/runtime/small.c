@@ -1,5 +1,5 @@
 /* Steps of explicit methods for the equation of one small diagram, whose rates are inlined into every stage: numbers stay in
-   registers that `methods.c` has in memory. The steps themselves are those of `steps.c`. It stands behind `newton.c`,
+   registers that `methods.c` has in memory. The steps themselves are those of `steps.c`. It comes after `newton.c`,
    `problem.c` and the text of the diagram: N integrated ones of WIDTH states, their places PLACES, and the function
    RATES(arguments, results); INLINE makes a function one that is always inlined. */
 

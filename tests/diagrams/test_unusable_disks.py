@@ -92,7 +92,7 @@ def test_a_cache_that_can_not_be_used(use, code, file, tmp_path, monkeypatch):
         with pytest.raises(LoopwrightError) as caught:
             CACHE[use](file)
     check(str(caught.value), code, theirs)
-    assert str(caught.value).endswith(" Set LOOPWRIGHT_CACHE to a folder of your own.") is (code != errno.ENOSPC)
+    assert str(caught.value).endswith(" Set LOOPWRIGHT_CACHE to your own folder.") is (code != errno.ENOSPC)
 
 
 @pytest.mark.parametrize("code", FOUND, ids=errno.errorcode.get)

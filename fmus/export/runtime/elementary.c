@@ -112,7 +112,7 @@ static inline double lw_expm1(double x) {
 /* ---- log: x = 2^k · m, with 1/m rounded to 9 bits from a table ---- */
 
 #if LW_NEEDS_LOG || LW_NEEDS_POW
-#define LW_FIRST_BITS UINT64_C(0x3fe6b00000000000) /* of about √½, the least m; 1 stands in the middle of an interval */
+#define LW_FIRST_BITS UINT64_C(0x3fe6b00000000000) /* of about √½, the least m; 1 is in the middle of an interval */
 
 /* The exponent k, the row of the table, and r = m · inverse - 1 as the exact sum of two parts. */
 static inline const double *lw_split(double x, double *k, double *r1, double *r2) {

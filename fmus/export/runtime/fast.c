@@ -1,6 +1,6 @@
 /* Sine, cosine and tangent hyperbolic of a fused run: elementary.c's tables and series without a branch, so that the compiler
  * goes over several of them at a time. Errors are some units in the last place of 1; sine and cosine hold below
- * LW_FAST_LIMIT and are left to elementary.c beyond. They stand behind elementary.c in one unit. */
+ * LW_FAST_LIMIT and are left to elementary.c beyond. They come after elementary.c in one unit. */
 #define LW_FAST_LIMIT 0x1p20
 
 #if LW_NEEDS_TANH

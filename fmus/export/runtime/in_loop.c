@@ -1,5 +1,5 @@
 /* A communication step within a fused loop: the equations are inlined into each stage of the classical Runge-Kutta method,
- * and inputs and outputs are copied. It stands behind stepping.c, without the files of a version of FMI, and works on an
+ * and inputs and outputs are copied. It comes after stepping.c, without the files of a version of FMI, and works on an
  * instance that the FMU's own library has made from the same sources. Functions that return false have changed nothing:
  * the FMU's own functions then do the step, or say why it fails. */
 

@@ -103,7 +103,7 @@ typedef struct {
     uint8_t stop_time_defined, tolerance_given, iterations; /* iterations in this visit of Event Mode */
     uint8_t moving, moved, unused[3]; /* do the inputs move in the next step; did they in the last one? */
     double stop_time;
-    double step_size; /* of the adaptive integrators, to try next; 0: choose anew */
+    double step_size; /* of the adaptive integrators, to try next; 0: choose again */
     double values[LW_N_VALUES];
 #if LW_MOVING_INPUTS
     double slopes[LW_MAX_ORDER][LW_N_U]; /* derivatives of the inputs by time at the start of the next step, from order 1 on */

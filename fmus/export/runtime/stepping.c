@@ -4,7 +4,7 @@
 
 #define LW_SAME_INPUT 1e-12 /* an input that has moved to a value and is then set to it is equal but for rounding */
 
-/* Have the inputs jumped since the last step? Then an adaptive integrator starts anew. */
+/* Have the inputs jumped since the last step? Then an adaptive integrator starts again. */
 static inline bool lw_inputs_jumped(const lw_instance *self) {
     const double *v = self->s.values;
 #if LW_MOVING_INPUTS
@@ -30,7 +30,7 @@ static bool lw_step_too_small(lw_instance *self, double t, double h) {
     }
     size_t v = 0;
     while ((size_t)LW_X + worst >= (size_t)lw_variables[v].first + lw_variables[v].size) v++;
-    return lw_fail(self, "the integrator can't go on at t = %.9g s: its step fell to %.3g s; %s (element %zu), now %.9g, changes "
+    return lw_fail(self, "the integrator can't continue at t = %.9g s: its step fell to %.3g s; %s (element %zu), now %.9g, changes "
                    "the most. Is there a solution beyond? Else check the inputs and parameters, or set a larger tolerance.",
                    t, h, lw_variables[v].name, (size_t)(LW_X + worst) - lw_variables[v].first, self->x[worst]);
 }
@@ -42,7 +42,7 @@ typedef struct {
     double segment; /* rk4: begin of the equal substeps, since the last event */
     double length;  /* rk4: length of all substeps */
     long n, i;      /* rk4: number of substeps, and of those done */
-    bool fresh;     /* after a jump: slope and step size must be found anew */
+    bool fresh;     /* after a jump: slope and step size must be found again */
     bool rejected;
 } lw_run;
 

@@ -52,19 +52,19 @@ def value(block, *u):
 @pytest.mark.parametrize(
     ("block", "shapes", "text"),
     [
-        (Sum(), ((2,), (3,)), r"sum\.u2: found shape \(3,\) beside u1 of shape \(2,\); expected one shape for both"),
-        (Sum(signs="+-+"), ((), (2,), (3,)), r"sum\.u3: found shape \(3,\) beside u2 of shape \(2,\)"),
-        (Sum(), ((2,), (2, 2)), r"sum\.u2: found shape \(2, 2\) beside u1 of shape \(2,\)"),
-        (Sum(), ((1,), (3,)), r"sum\.u2: found shape \(3,\) beside u1 of shape \(1,\)"),
-        (Product(), ((2,), (3,)), r"product\.u2: found shape \(3,\) beside u1 of shape \(2,\)"),
-        (Gain(gain=(1, 2)), ((3,),), r"gain\.u: found shape \(3,\) beside gain of shape \(2,\)"),
+        (Sum(), ((2,), (3,)), r"sum\.u2: found shape \(3,\) next to u1 of shape \(2,\); expected one shape for both"),
+        (Sum(signs="+-+"), ((), (2,), (3,)), r"sum\.u3: found shape \(3,\) next to u2 of shape \(2,\)"),
+        (Sum(), ((2,), (2, 2)), r"sum\.u2: found shape \(2, 2\) next to u1 of shape \(2,\)"),
+        (Sum(), ((1,), (3,)), r"sum\.u2: found shape \(3,\) next to u1 of shape \(1,\)"),
+        (Product(), ((2,), (3,)), r"product\.u2: found shape \(3,\) next to u1 of shape \(2,\)"),
+        (Gain(gain=(1, 2)), ((3,),), r"gain\.u: found shape \(3,\) next to gain of shape \(2,\)"),
         (
             Gain(gain=np.ones((2, 3))),
             ((2,),),
             r"gain\.u: found shape \(2,\); the gain is a matrix of 2 × 3 and takes 3",
         ),
         (Gain(gain=np.ones((2, 3))), ((),), r"gain\.u: found shape \(\); the gain is a matrix of 2 × 3 and takes 3"),
-        (Saturation(limit=(1, 2)), ((3,),), r"saturation\.u: found shape \(3,\) beside limit of shape \(2,\)"),
+        (Saturation(limit=(1, 2)), ((3,),), r"saturation\.u: found shape \(3,\) next to limit of shape \(2,\)"),
     ],
 )
 def test_shapes_that_do_not_fit(block, shapes, text):

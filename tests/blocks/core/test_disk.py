@@ -75,10 +75,10 @@ def test_missing_folders_and_files_in_place_of_folders(tmp_path):
     (tmp_path / "file").write_text("")
     for path, found, step in (
         (tmp_path / "none" / "a.txt", f"there is no folder '{tmp_path}/none'; expected one", "Make it."),
-        (tmp_path / "file" / "a.txt", f"'{tmp_path}/file' is a file; expected a folder", "Go on."),
-        (tmp_path, f"'{tmp_path}' is a folder; expected a file, or nothing", "Go on."),
+        (tmp_path / "file" / "a.txt", f"'{tmp_path}/file' is a file; expected a folder", "Continue."),
+        (tmp_path, f"'{tmp_path}' is a folder; expected a file, or nothing", "Continue."),
     ):
-        with pytest.raises(DiskError) as caught, explain_disk_errors("no", "x", "Go on."):
+        with pytest.raises(DiskError) as caught, explain_disk_errors("no", "x", "Continue."):
             path.write_text("")
         assert str(caught.value) == f"no: {found}. {step}"
 

@@ -21,7 +21,7 @@ def differ(first, second):
 
 
 def inside(run):
-    return [m.split()[4] for m in run.messages if "stand in the loop" in m]
+    return [m.split()[4] for m in run.messages if "are in the loop" in m]
 
 
 @pytest.mark.parametrize("letter", ["C", *(pytest.param(x, marks=pytest.mark.slow) for x in "ABD")])

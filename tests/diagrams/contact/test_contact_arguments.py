@@ -113,7 +113,7 @@ def test_a_limit_that_is_confirmed_is_one_of_the_contact():
     with pytest.raises(OptionError, match="expected a finite one that is not 0"):
         here.confirm(replace(limit, value=math.inf))
     changed = cart_diagram().replace({"share.gain": 3.0}).contact("cart.push", direction=[1.0], **PORTS)
-    with pytest.raises(OptionError, match="found a limit of another contact: beside it the growth rates are"):
+    with pytest.raises(OptionError, match="found a limit of another contact: next to it the growth rates are"):
         changed.confirm(limit)
     for push in ("a", None, math.nan, -1.0, 0.0, [1.0], math.inf):
         with pytest.raises(OptionError, match="push: found .*; expected a positive velocity in m/s"):

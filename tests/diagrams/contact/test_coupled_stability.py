@@ -154,7 +154,14 @@ OTHERS = {
     "continuous, ellipse": {"path": ELLIPSE, "eta": 0.1, "xi": -0.02, "implementation": "continuous", "tool_mass": 0.1},
     "shares": {"feed_forward": 0.6, "cancelled": 0.8, "tool_mass": 0.2, "delay": 2},
     "moving": {"model": ROUGH, "velocity": (0.5, 0.1)},
-    "beside the ellipse": {"path": ELLIPSE, "eta": 0.2, "xi": 0.03, "model": ROUGH, "plant": MORE_FRICTION, "delay": 1},
+    "next to the ellipse": {
+        "path": ELLIPSE,
+        "eta": 0.2,
+        "xi": 0.03,
+        "model": ROUGH,
+        "plant": MORE_FRICTION,
+        "delay": 1,
+    },
 }
 ENVIRONMENTS = (
     {},
@@ -488,7 +495,7 @@ LIMITS = {
     "perp d0, load": (loop(), {"mass": 1.0}),
     "perp d0, less friction": (loop(model=ROUGH, plant=ROUGH.replace(coulomb_scale=0.8)), {"damping": 10.0}),
     "par d0, more friction, tool": (loop("par", ROUGH, plant=MORE_FRICTION, tool_mass=0.3), {}),
-    "par on the ellipse, beside it": (loop("par", ROUGH, path=ELLIPSE, eta=0.18, xi=-0.03), {"damping": 5.0}),
+    "par on the ellipse, next to it": (loop("par", ROUGH, path=ELLIPSE, eta=0.18, xi=-0.03), {"damping": 5.0}),
     "perp on the ellipse, d1": (loop(path=ELLIPSE, eta=0.09, delay=1), {"damping": 5.0}),
 }
 QUICK = 3

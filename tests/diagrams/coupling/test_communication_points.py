@@ -228,7 +228,7 @@ def test_an_own_communication_step_is_a_clock_and_must_fit_the_others(cache, ste
         two.flatten(0.015)
     with pytest.raises(ParameterError, match="expected seconds, positive"):
         StepOptions(communication_step=-1.0)
-    with pytest.raises(OptionError, match="plant has communication points of its own, fewer than the run has ticks"):
+    with pytest.raises(OptionError, match="plant has its own communication points, fewer than the run has ticks"):
         spring(0.01, stepped=own(0.02)).simulate(0.1, progress=False, coupling="gauss_seidel")
 
 

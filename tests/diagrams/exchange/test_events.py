@@ -141,7 +141,7 @@ def test_it_refuses_to_stand_in_an_enabled_subsystem(file):
         return plant(file)(u=u, n=Constant(value=0.0, name="n")).x
 
     with pytest.raises(
-        WiringError, match=r"box.plant: an FMU in model exchange can't stand in a subsystem that is enabled"
+        WiringError, match=r"box.plant: an FMU in model exchange can't be in a subsystem that is enabled"
     ):
         Diagram("d", box(Constant(value=1.0), enable=Constant(value=1.0)).named("x"))
 
@@ -203,7 +203,7 @@ def test_time_events_in_picoseconds_are_told_where_ticks_are_short(cache, tmp_pa
                 simulation.advance(tick)
             return
         simulation.advance(tick)
-        told = [m for m in simulation.run().messages if "so the run goes on slowly" in m]
+        told = [m for m in simulation.run().messages if "so the run continues slowly" in m]
     assert len(told) == (tick == 1.2e-9)
     assert all("its events (time_event) come every 1e-12 s, about 1.2e+03 times between two ticks" in m for m in told)
 
@@ -267,7 +267,7 @@ def test_a_warning_of_an_evaluation_is_told_once_for_each_kind_of_call(tmp_path,
     told = [m for m in run.messages if "Warning" in m]
     assert len(told) == 1, run.messages
     found = re.fullmatch(
-        rf"plant: reading the outputs gave fmi{fmi}Warning at t = (\S+) s; further ones are not told.", told[0]
+        rf"plant: reading the outputs gave fmi{fmi}Warning at t = (\S+) s; further ones are not reported.", told[0]
     )
     assert 0.3 < float(found.group(1)) <= 0.4
     np.testing.assert_allclose(run["plant.x"], exact(run.t, 0.5), atol=1e-12)  # its values count

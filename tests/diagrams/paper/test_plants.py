@@ -150,7 +150,7 @@ def test_a_position_that_can_not_be_set(carriage, runs):
     position = experiments.ELLIPSE.to_plane(0.10, 0.01)
     assert str(caught.value) == (
         f"experiment A.plant: its position is computed and can't be set to ({position[0]:g}, {position[1]:g}) m, where "
-        "experiment A starts. Give the plant with start values of its own that place it there: "
+        "experiment A starts. Give the plant with its own start values that place it there: "
         "plant=Fmu(file, start={…})."
     )
     start = {"carriage": np.subtract(position, (0.1, 0.2))}

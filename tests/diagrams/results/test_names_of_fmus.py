@@ -48,7 +48,7 @@ def test_a_local_variable_is_named_with_the_way_to_record_it(file):
     run = simulate(file)
     expected = (
         r"^no signal 'plant\.inertia2\.w' was recorded: 'inertia2\.w' is a variable of the FMU 'plant', and no port of "
-        r"its\. Make it one, beside those that are needed: Fmu\(…, ports=\[…, 'inertia2\.w'\]\)\.$"
+        r"its\. Make it one, besides those that are needed: Fmu\(…, ports=\[…, 'inertia2\.w'\]\)\.$"
     )
     for ask in (run.plot, run.__getitem__, run.unit):
         with pytest.raises(UnknownNameError, match=expected):

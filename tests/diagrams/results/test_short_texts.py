@@ -95,7 +95,7 @@ def test_an_instant_of_a_run_is_refused_in_short_with_a_next_step(diagram, run):
 def test_an_interrupted_run_says_when_and_that_it_has_no_final_state(diagram, run):
     error = Interrupted(run)
     assert error.run.messages[-1] == (
-        "This run was interrupted at t = 2 s, within a step: it has no final_state to go on from."
+        "This run was interrupted at t = 2 s, within a step: it has no final_state to continue from."
     )
     assert error.run.messages[-1] in repr(error.run)
     again, (same,) = error.__reduce__()

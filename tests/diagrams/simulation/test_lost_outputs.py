@@ -34,7 +34,7 @@ def assert_went_on(run, value=np.nan):
     said = [m for m in run.messages if "plant.lost" in m]
     assert len(said) == 1
     first = float(run.t[lost][0])
-    assert said[0].startswith(f"no finite numbers stand in the record of plant.lost from t = {first:.9g} s on: an FMU")
+    assert said[0].startswith(f"no finite numbers are in the record of plant.lost from t = {first:.9g} s on: an FMU")
     assert "ports=" in said[0]
 
 

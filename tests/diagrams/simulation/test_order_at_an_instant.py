@@ -672,7 +672,9 @@ def test_a_continuous_run_goes_on_for_another_duration_on_the_same_samples():
 def test_a_rate_that_is_not_finite_names_the_block_that_made_it_so():
     bad = Function(lambda u: 1.0 / (1.0 - np.where(u > 0.5, 1.0, 0.0)), name="bad")
     diagram = Diagram("d", Integrator(name="i")(bad(Integrator(name="ramp")(Constant(value=1.0)))))
-    with pytest.raises(NonFiniteError, match=r"^bad\.y, t = 0\.5.* s: found \[inf\].* The solver could not go on") as e:
+    with pytest.raises(
+        NonFiniteError, match=r"^bad\.y, t = 0\.5.* s: found \[inf\].* The solver could not continue"
+    ) as e:
         diagram.simulate(1.0, progress=False)
     assert (e.value.block, e.value.port) == ("bad", "y")
     assert 0.49 < e.value.run.t[-1] <= 0.5

@@ -82,6 +82,6 @@ def test_an_fmu_in_the_home_folder_is_fused_and_runs_in_lanes(tmp_path, monkeypa
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("USERPROFILE", str(tmp_path))
     diagram = rooted("~/root.fmu")
-    assert any("stand in the loop" in text for text in diagram.simulate(0.1, fuse=True).messages)
+    assert any("are in the loop" in text for text in diagram.simulate(0.1, fuse=True).messages)
     found = diagram.sweep({"plant.rate": (0.1, 0.2)}, 0.1, signals="plant.x", progress=False, lanes=True)
     assert any("Side by side" in text for text in found.messages)

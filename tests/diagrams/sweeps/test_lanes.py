@@ -201,7 +201,7 @@ def test_why_each_run_needs_a_set_up_of_its_own_is_told():
     isolated = loop()
     isolated = isolated.replace({"plant": isolated["plant"].replace(isolate=True)})
     assert "plant was not built by Loopwright on this machine, or runs in a process" in notes(isolated, table)
-    assert "they go on from a state" in notes(loop(), table, start=loop().operating_point(0.05))
+    assert "they continue from a state" in notes(loop(), table, start=loop().operating_point(0.05))
 
 
 @pytest.mark.parametrize(("kind", "port"), [("triggered", "trigger"), ("enabled", "enable")])

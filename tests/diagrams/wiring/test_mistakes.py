@@ -223,7 +223,7 @@ def test_another_scale_of_the_same_unit_says_the_factor():
 
 
 def test_a_sum_of_different_units():
-    with pytest.raises(UnitError, match=r"^sum\.u2: b\.y is in m; a\.y beside it is in N"):
+    with pytest.raises(UnitError, match=r"^sum\.u2: b\.y is in m; a\.y next to it is in N"):
         Diagram("d", Sum()(Constant(value=1, unit="N", name="a"), Constant(value=1, unit="m", name="b")))
 
 

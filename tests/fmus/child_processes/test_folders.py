@@ -25,7 +25,7 @@ def test_no_folder_for_temporary_files(code, tmp_path, monkeypatch):
         assert said.endswith("; expected some. Make room there.")
     else:
         assert said.startswith(f"plant: the FMU can't be built: there is no permission to use '{tmp_path}'")
-        assert said.endswith(". Set TMPDIR to a folder of your own.")
+        assert said.endswith(". Set TMPDIR to your own folder.")
 
 
 def test_a_temporary_folder_goes_whatever_happens():

@@ -91,7 +91,7 @@ def test_a_cache_that_can_not_be_written_is_named(where, tmp_path, monkeypatch):
     with pytest.raises(FmuError) as caught:
         gantry.build(gantry.nominal.replace(gravity=1.0), out=tmp_path / "out.fmu")
     assert not isinstance(caught.value, CompilerError)
-    assert str(caught.value).endswith(" Set LOOPWRIGHT_CACHE to a folder of your own.")
+    assert str(caught.value).endswith(" Set LOOPWRIGHT_CACHE to your own folder.")
     if where.endswith("none"):
         assert f"the cache folder {where!r} can't be used: " in str(caught.value)
     else:

@@ -207,7 +207,9 @@ def test_a_solution_that_ends_stops_the_step(instance, integrator):
         item.step(0.0, 2.0)
     assert [item[name] for name in ("time", "x")] == before
     message = item.log[-1][2]
-    assert "the integrator can't go on at t = 1" in message or "the integrator can't go on at t = 0.999" in message
+    assert (
+        "the integrator can't continue at t = 1" in message or "the integrator can't continue at t = 0.999" in message
+    )
     assert "x (element 0)" in message
 
 

@@ -22,7 +22,7 @@ CASES = {  # equations, states, inputs, [[A, B], [C, D]], and whether it can say
         [[0, 1, 0], [-9.81 * np.cos(0.4), -0.3, 1], [-np.sin(0.4), 0, 0]],
         True,
     ),
-    "single precision beside an offset": (
+    "single precision next to an offset": (
         "dx[0] = single(single(single(101325.0 + x[0]) - 101325.0) * -3.0) + u[0]; y[0] = x[0];",
         [X],
         [U],
@@ -82,7 +82,7 @@ CASES = {  # equations, states, inputs, [[A, B], [C, D]], and whether it can say
         True,
     ),
     "relay": (FIRST + "y[0] = x[0] > 0.65 ? 1.0 : -1.0;", [X], [U], [[-1, 1], [0, 0]], True),
-    "beside a kink": (FIRST + "y[0] = fabs(x[0] - 0.70002);", [X], [U], [[-1, 1], [-1, 0]], True),
+    "next to a kink": (FIRST + "y[0] = fabs(x[0] - 0.70002);", [X], [U], [[-1, 1], [-1, 0]], True),
     "offset of an input": (
         "dx[0] = -x[0] + 1e-3*(u[0] - 101325.0); y[0] = u[0];",
         [X],
@@ -162,7 +162,7 @@ def test_every_entry_is_right_within_its_uncertainty(folder, name):
             assert np.all(model.uncertainty <= 0.1 * np.abs(J).max())
 
 
-@pytest.mark.parametrize("name", ["linear", "single precision beside an offset", "floats"])
+@pytest.mark.parametrize("name", ["linear", "single precision next to an offset", "floats"])
 def test_a_step_of_a_coarse_fmu_is_right_within_its_uncertainty(folder, name):
     plant, point, J, _ = made(folder, name, 3)
     model = plant.step_difference(0.01, **point)
@@ -173,7 +173,7 @@ def test_a_step_of_a_coarse_fmu_is_right_within_its_uncertainty(folder, name):
 
 @pytest.mark.parametrize("interface", WAYS)
 def test_a_diagram_around_coarse_values_says_so_and_its_numbers_are_as_uncertain(folder, interface):
-    plant, point, *_ = made(folder, "single precision beside an offset", 3)
+    plant, point, *_ = made(folder, "single precision next to an offset", 3)
     plant = plant.replace(interface=interface, name="plant", start={**plant.start, **point["state"]})
     linear = Diagram("d", plant(u1=Constant(value=0.3, name="push")())).linearize(inputs="push.y", outputs="plant.y1")
     (finding,) = linear.findings

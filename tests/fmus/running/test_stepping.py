@@ -107,7 +107,7 @@ def test_a_clock_that_ticks_very_often_is_told_with_its_rate(folder, step, every
         return
     run = diagram.simulate(step, step=step, progress=False)
     assert run["plant.beats"][-1] == pytest.approx(step / every, abs=1)
-    told = [m for m in run.messages if "goes on slowly" in m]
+    told = [m for m in run.messages if "continues slowly" in m]
     assert len(told) == (step == 0.1)
     assert all("its clock beat) every 2e-05 s, about 5e+03 times in a step of 0.1 s" in m for m in told)
 
