@@ -213,7 +213,8 @@ class PID(Block):
         integral = 0.0 if self.initial_output is None else self.initial_output - proportional
         start = {"integral": integral, "filtered": self.c * u.r - u.y}
         start["clamped"] = float(self.clamps and self.outward_excess(proportional + integral, u) > 0.0)
-        return _together(start, self.states)
+        states: tuple[float, ...] | float = _together(start, self.states)
+        return states
 
     def tracking_rate(self) -> Array:
         """Return 1 / T_t."""

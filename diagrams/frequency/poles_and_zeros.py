@@ -31,7 +31,7 @@ class AxisPole:
         """
         if self.multiplicity == 1:
             return GAP
-        return max(GAP, 30.0 * self.scatter / self.omega, 3.0 * 1e-15 ** (1.0 / self.multiplicity))
+        return max(GAP, 30.0 * self.scatter / self.omega, 3.0 * float(1e-15 ** (1.0 / self.multiplicity)))
 
 
 @dataclass(frozen=True, eq=False)
