@@ -24,11 +24,11 @@ def hear_builds(listener: Callable[[str], None]) -> Iterator[None]:
 
 
 @contextmanager
-def tell_build(note: str) -> Iterator[None]:
+def announce_build(note: str) -> Iterator[None]:
     """Tell whoever listens that something is compiled within the ``with`` statement; a terminal if nobody does."""
     listener = _LISTENER.get()
     if listener is None:
-        with _tell_terminal(note):
+        with _write_to_terminal(note):
             yield
         return
     listener(note)
@@ -39,7 +39,7 @@ def tell_build(note: str) -> Iterator[None]:
 
 
 @contextmanager
-def _tell_terminal(note: str) -> Iterator[None]:
+def _write_to_terminal(note: str) -> Iterator[None]:
     """Show a note on a terminal while something lasts, if that takes longer than `LATE`."""
     out = sys.stderr
     if out is None or not out.isatty():

@@ -60,17 +60,17 @@ class HostState:
 
     Parameters
     ----------
-    tell : callable
+    report : callable
         Called once for each thing that was changed.
     """
 
-    def __init__(self, tell: Callable[[str], None]):
-        self._tell = tell
+    def __init__(self, report: Callable[[str], None]):
+        self._report = report
         self._floating_point = _modes()
         self._numbers, self._now = ctypes.create_string_buffer(64), ctypes.create_string_buffer(64)
         self._views, self._views_now = (self._floating_point.views(found) for found in (self._numbers, self._now))
         self._keep_modes()
-        self._told: set[str] = set()
+        self._noted: set[str] = set()
         self._folder, self._depth = "", 0
 
     def __enter__(self) -> HostState:
@@ -115,6 +115,6 @@ class HostState:
         self._note("the rounding mode or the traps of floating-point numbers")
 
     def _note(self, change: str) -> None:
-        if change not in self._told:
-            self._told.add(change)
-            self._tell(f"the FMU has changed {change} of this process; it was set back")
+        if change not in self._noted:
+            self._noted.add(change)
+            self._report(f"the FMU has changed {change} of this process; it was set back")

@@ -13,8 +13,8 @@ def brief(kind: str, *facts: str, then: str = "") -> str:
     >>> brief("run of 'drive'", "11 samples from 0 to 1 s", "", then="run['y']")
     "<run of 'drive': 11 samples from 0 to 1 s; run['y']>"
     """
-    told = ", ".join(fact for fact in facts if fact)
-    return f"<{kind}{': ' if told else ''}{told}{'; ' if then else ''}{then}>"
+    shown = ", ".join(fact for fact in facts if fact)
+    return f"<{kind}{': ' if shown else ''}{shown}{'; ' if then else ''}{then}>"
 
 
 def enumerate_some(names: Iterable[str], most: int = 4) -> str:

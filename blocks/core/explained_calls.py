@@ -33,9 +33,9 @@ class UnknownArgumentError(OptionError, UnknownNameError):
         elsewhere: Mapping[str, str] | None = None,
     ):
         self.argument, self.known, self.found, self.elsewhere = argument, frozenset(known), found, elsewhere or {}
-        super().__init__(self._tell(), block=block)
+        super().__init__(self._describe(), block=block)
 
-    def _tell(self) -> str:
+    def _describe(self) -> str:
         close = close_names(self.argument, self.known | self.elsewhere.keys())
         offered = " or ".join(self.elsewhere.get(name, repr(name)) for name in close)
         return f"{self.found} {self.argument!r}. " + (
@@ -45,7 +45,7 @@ class UnknownArgumentError(OptionError, UnknownNameError):
     def offer(self, block: str, more: Iterable[str]) -> None:
         """Report the function that was called, which has arguments of its own besides those that it hands on."""
         self.known |= frozenset(more)
-        self.block, self.message = block, self._tell()
+        self.block, self.message = block, self._describe()
 
 
 def offer_elsewhere(**ways: str) -> Callable[[F], F]:

@@ -247,10 +247,10 @@ def _failure(error: BaseException, equation: str, foreign: Foreign, arguments: S
     text = (
         str(error) if isinstance(error, LoopwrightError) else f"its {equation} failed: {type(error).__name__}: {error}."
     )
-    told = SimulationError(f"{text} Its inputs then: {shown or 'none'}. Correct the function.", t=t)
-    told.port = getattr(error, "port", None)
-    told.__cause__ = error
-    return told
+    explained = SimulationError(f"{text} Its inputs then: {shown or 'none'}. Correct the function.", t=t)
+    explained.port = getattr(error, "port", None)
+    explained.__cause__ = error
+    return explained
 
 
 def _read(buffer: Any) -> np.ndarray:

@@ -145,8 +145,8 @@ def report_command(arguments: argparse.Namespace) -> int:
         began = time.perf_counter()
         about = {name: text for name in ABOUT if (text := getattr(arguments, name)) is not None}
         try:
-            with _progress(diagram.name) as tell:
-                report = _analyse(diagram, experiment, arguments, asked, about, tell, measured, searched, touched)
+            with _progress(diagram.name) as progress:
+                report = _analyse(diagram, experiment, arguments, asked, about, progress, measured, searched, touched)
         except UnknownNameError as error:
             say(f"loopwright: error: {error}", sys.stderr)
             return 1 if asked is None and not measured else 2
@@ -253,7 +253,7 @@ def _analyse(
     arguments: argparse.Namespace,
     asked: Requirements | None,
     about: Mapping[str, str],
-    tell: Callable[[str], None],
+    progress: Callable[[str], None],
     measured: Mapping[str, Any],
     searched: WorstCaseTask | None,
     touched: ContactTask | None,
@@ -268,7 +268,7 @@ def _analyse(
         about=about,
         decibels=arguments.db,
         hertz=arguments.hz,
-        progress=tell,
+        progress=progress,
         measured=measured,
         worst_case=searched,
         contacts=touched,

@@ -29,14 +29,14 @@ from .kernels import Kernel
 from .library_method import StepFailure
 from .loop import CompiledLoop, NewtonOptions, Outcome, ReturnReason
 from .native_tick import bind_call
-from .remote import REFUSED, TOLD, UNDER_WAY, PythonStep, compile_other_side
+from .remote import REFUSED, TAKEN_BY_PYTHON, UNDER_WAY, PythonStep, compile_other_side
 from .staged import NativeExchange, OwnEvent
 from .watch import Fired, Pile
 
 __all__ = [
     "LARGEST",
     "REFUSED",
-    "TOLD",
+    "TAKEN_BY_PYTHON",
     "UNDER_WAY",
     "BackgroundCode",
     "BrokenOff",

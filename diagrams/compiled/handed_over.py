@@ -59,7 +59,7 @@ class HandedOver:
         The blocks by path, loaded.
     evaluators : mapping of str to ExchangeEvaluator
         Their evaluators, by which Python does what C can't.
-    tell : callable
+    report : callable
         Called with events of the blocks' own.
     count : callable
         ``count(t, path, name)``: notes an event of time or of a step, and refuses those that pile up.
@@ -70,10 +70,10 @@ class HandedOver:
         flat: FlatDiagram,
         blocks: Mapping[str, Any],
         evaluators: Mapping[str, ExchangeEvaluator],
-        tell: Callable[[OwnEvent], None],
+        report: Callable[[OwnEvent], None],
         count: Callable[[float, str, str], None],
     ):
-        self._evaluators, self._tell, self._count = evaluators, tell, count
+        self._evaluators, self._report, self._count = evaluators, report, count
         self._blocks: dict[str, HandedBlock] = {path: blocks[path] for path in flat.outside}
         first = {path: flat.states.slices[path].start for path in flat.outside}
         self.native = NativeExchange(self._blocks, first, flat.width, load_runtime(), self._by_python)
@@ -154,13 +154,13 @@ class HandedOver:
         block.take_back(self.native.inputs_of(path), state.next_time, read_nominals=changed)
         return changed
 
-    def tell(self) -> None:
+    def report(self) -> None:
         """Report what has happened in C: warnings, and events of the blocks' own."""
         self.native.remote.take_messages()
         for path, action, t in self.native.take_warnings():
             self._blocks[path].take_warning(action, t)
         for event in self.native.take_events():
-            self._tell(event)
+            self._report(event)
 
     def has_news(self) -> bool:
         """Whether a block asks for the end of the run, or has other nominal values."""

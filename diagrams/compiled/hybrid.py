@@ -317,12 +317,12 @@ class CompiledHybrid:
         self._taken_first[-1] = first + len(states)
         self._taken[first : first + len(states)] = states
 
-    def begin_anew(self) -> None:
+    def begin_again(self) -> None:
         """Forget the run before: methods have no step in mind, and no sign of stiffness has been seen."""
         for structure, content in self._fresh:
             ctypes.memmove(ctypes.addressof(structure), content, len(content))
         for library in self._libraries.values():
-            library.begin_anew()
+            library.begin_again()
 
     def _zeros(self, n: int) -> np.ndarray:
         self._kept.append(np.zeros(n))

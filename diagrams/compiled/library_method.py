@@ -93,7 +93,7 @@ class LibraryMethod:
         self._step: AcceptedStep | None = None
         self._solver = self._make_solver()
 
-    def begin_anew(self) -> None:
+    def begin_again(self) -> None:
         """Forget the run before."""
         self._beyond = self._step = None
         self._called.take_error()

@@ -15,7 +15,7 @@ from ...fmus.calls import ERROR, BoundCalls, ChildFace, ChildRequest, QuietStep,
 from .bound_functions import at
 from .runtime import load_runtime
 
-UNDER_WAY, REFUSED, TOLD = 3, 4, 5
+UNDER_WAY, REFUSED, TAKEN_BY_PYTHON = 3, 4, 5
 """Stages at which such an FMU is left to Python: its step has begun; no step has, as an input doesn't fit; Python has
 taken it, and the loop can't continue."""
 _KINDS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "b1")

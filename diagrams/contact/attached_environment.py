@@ -23,7 +23,7 @@ from ...fmus.running import Fmu
 from ..linearization import PlantEquations
 from ..wiring import Structure, SubsystemSettings, Wire
 from .contact_ports import Ports
-from .moored_plant import Mooring, copy_table, hold_beside, set_tool
+from .moored_plant import Mooring, copy_table, hold_separately, set_tool
 
 if TYPE_CHECKING:
     from ..flat import WiredDiagram
@@ -205,7 +205,7 @@ def attach_environment(
         table.wires[path_of, port] = wire
     table.wires[path, ports.force] = Wire(path_of, "total")
     if measured is not None:
-        felt = hold_beside(table, measured.port[0], felt, f"{name}_felt")
+        felt = hold_separately(table, measured.port[0], felt, f"{name}_felt")
         terms = [felt]
         if not held and mooring.mass:
             inertia = Wire(path_of, "inertia")

@@ -226,7 +226,7 @@ def moored_diagram(
                 if (wire.block, wire.port) == source and key != (plant, ports[0]):
                     group[key] = Wire(total, "y", wire.index)  # type: ignore[index]
         table.blocks[total], table.subsystem_of[total] = Sum(name=total), ""
-        felt = hold_beside(table, source[0], Wire(plant, FORCE), "environment_held")
+        felt = hold_separately(table, source[0], Wire(plant, FORCE), "environment_held")
         table.wires[total, "u1"], table.wires[total, "u2"] = Wire(*source), felt
     return diagram.with_structure(table)
 
@@ -239,7 +239,7 @@ def copy_table(diagram: WiredDiagram) -> Structure:
     return table
 
 
-def hold_beside(table: Structure, block: str, wire: Wire, name: str) -> Wire:
+def hold_separately(table: Structure, block: str, wire: Wire, name: str) -> Wire:
     """Return the wire of a signal as it is at the ticks of a block; the signal's own where all ticks are the same."""
     subsystem = table.subsystem_of[block]
     clocks = {(settings.sample_time, settings.offset) for settings in table.subsystems.values() if settings.sample_time}

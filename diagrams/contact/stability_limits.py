@@ -83,11 +83,11 @@ def growth_rounding(modes: Modes, rates: Callable[[np.ndarray], np.ndarray], A: 
         return math.inf
     draws, reduced = np.random.default_rng(0), modes.reduce(A)
     changed = modes.reduce(A * (1.0 + _UNIT * draws.uniform(-1.0, 1.0, (_CHANGES, *A.shape))))
-    changed += _UNIT * draws.uniform(-1.0, 1.0, changed.shape) * _sizes_beside(reduced)
+    changed += _UNIT * draws.uniform(-1.0, 1.0, changed.shape) * _sizes_around(reduced)
     return float(_SAFETY * np.ptp(rates(np.concatenate([reduced[None], changed]))))
 
 
-def _sizes_beside(A: np.ndarray) -> np.ndarray:
+def _sizes_around(A: np.ndarray) -> np.ndarray:
     """Return the largest entry in each one's row or column, whichever is less, of the balanced matrix."""
     from scipy.linalg.lapack import dgebal
 

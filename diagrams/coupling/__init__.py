@@ -1,7 +1,7 @@
 """Plants of a run: loaded, stepped between their communication points, and coupled with one another."""
 
 from .connection_delays import CoupledConnection, CouplingReport, HeldFrom, LinkKind, report_coupling
-from .coupled_steps import CoupledSteps, Effort, tells_slopes
+from .coupled_steps import CoupledSteps, Effort, passes_slopes
 from .coupling_options import Coupling, Scheme, refuse_exchanged, to_coupling
 from .fixed_points import find_fixed_point
 from .links import Links
@@ -30,11 +30,11 @@ __all__ = [
     "load_plants",
     "note_loops",
     "note_steps",
+    "passes_slopes",
     "refuse_exchanged",
     "report_coupling",
     "runs_apart",
     "step_all",
-    "tells_slopes",
     "to_coupling",
     "try_steps",
 ]

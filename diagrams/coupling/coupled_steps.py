@@ -119,7 +119,7 @@ class CoupledSteps:
                     block=path,
                     port="coupling",
                 )
-            if coupling.scheme != Scheme.JACOBI and tells_slopes(blocks[path]):
+            if coupling.scheme != Scheme.JACOBI and passes_slopes(blocks[path]):
                 raise OptionError(
                     f"found input_derivatives with coupling {coupling.scheme!r}, whose inputs are no longer those of "
                     "the step's beginning, so that a slope from there leads astray; expected coupling 'jacobi', which "
@@ -388,7 +388,7 @@ class CoupledSteps:
         return (f"{text}.",)
 
 
-def tells_slopes(block: Any) -> bool:
+def passes_slopes(block: Any) -> bool:
     """Whether a run tells a plant the slopes of its inputs."""
     return bool(getattr(getattr(block, "stepping", None), "input_derivatives", False))
 

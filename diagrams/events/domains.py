@@ -82,7 +82,7 @@ class Domains:
         self._hysteresis = np.array([e.hysteresis for e in events])
         self._gates = np.array([e.subsystem for e in events], dtype=bool)
         self.fired_times, self.sliding = 0, (False, False)
-        self._told = set[int]()
+        self._reported = set[int]()
         self.limits = EventLimits(events, self.parts)
 
     def begin(self, z: np.ndarray) -> None:
@@ -93,21 +93,21 @@ class Domains:
         parts["start"][:], parts["slack"][:] = parts["domain"], 0.0
         parts["low"][:], parts["high"][:] = -self._hysteresis, self._hysteresis
 
-    def tell_slid(self, t: float, event: int) -> tuple[str, ...]:
+    def report_sliding(self, t: float, event: int) -> tuple[str, ...]:
         """Return what is to be reported of an event that waits for the ends of steps from t on, in s; once for each."""
-        if event in self._told:
+        if event in self._reported:
             return ()
-        self._told.add(event)
+        self._reported.add(event)
         of = self._flat.events[event]
-        told = (
+        message = (
             f"t = {t:.6g} s: {of.path}.{of.name} switches back and forth without end (a sliding mode); from here on it "
             "is looked at once a step. A hysteresis would make it an event again."
         )
-        return (told,)
+        return (message,)
 
-    def begin_anew(self) -> None:
+    def begin_again(self) -> None:
         """Report events again that were reported in a run before."""
-        self._told.clear()
+        self._reported.clear()
 
     def save(self) -> dict[str, Any]:
         """Return what is needed to continue from here."""

@@ -29,7 +29,7 @@ class OutsideEvents:
         self._evaluators = blocks.evaluators
         self._recent = {path: deque[float](maxlen=_MANY) for path in self._evaluators}
         """The last instants at which a block had an event of time or of a step."""
-        self._told = set[str]()
+        self._reported = set[str]()
 
     def count(self, t: float, path: str, name: str) -> None:
         """Note an instant of a block's own events; refuse instants that pile up, for the run would not advance."""
@@ -43,8 +43,8 @@ class OutsideEvents:
         if len(recent) < _MANY or span >= min(_SPAN * (1.0 + abs(t)), _SLOW * base):
             return
         if span >= _PART * base:
-            if path not in self._told:
-                self._told.add(path)
+            if path not in self._reported:
+                self._reported.add(path)
                 self._evaluators[path].block.add_note(
                     f"t = {t:.9g} s: its events ({name}) come every {span / (_MANY - 1):.2g} s, about "
                     f"{base / span * (_MANY - 1):.2g} times between two ticks of {base:g} s, so the run continues "
@@ -52,12 +52,12 @@ class OutsideEvents:
                 )
             return
         time = self._evaluators[path].block.next_time
-        told = (
+        counted = (
             f"the next time event is at t + {time - t:.2g} s" if math.isfinite(time) else "it has no time event ahead"
         )
         raise SimulationError(
             f"its events pile up ({name}): they came at {_MANY} instants within {span:.2g} s, while two ticks are "
-            f"{base:g} s apart, so the run would not advance; {told}. Look up in its documentation which "
+            f"{base:g} s apart, so the run would not advance; {counted}. Look up in its documentation which "
             "input or parameter sets the time between its events, or report it to its makers.",
             block=path,
             t=t,

@@ -77,7 +77,7 @@ def write_lanes(
     parts = [ticks.text]
     if loops:
         parts.append(read_source("lane_newton.c"))
-    prepare, steps, go_on, keep = [], [], [], []
+    prepare, steps, resume, keep = [], [], [], []
     cases, room = [], 0
 
     def take(name: str, size: int) -> str:
@@ -107,7 +107,7 @@ def write_lanes(
         first, at = at, at + plant.width
         prepare.append(f"plant{i} of{i}; plant{i}_begin(&of{i}, (const vec *)l->plant + {first});")
         steps.append(f"plant{i}_step(&of{i}, t0, h, substeps(h, l->steps[{i}]), z, w);")
-        go_on.append(f"plant{i}_go_on(&of{i}, which, from);")
+        resume.append(f"plant{i}_resume(&of{i}, which, from);")
         keep.append(f"plant{i}_end(&of{i}, (vec *)l->plant + {first});")
     states = ""
     if flow is not None:
@@ -122,7 +122,7 @@ def write_lanes(
         f"#define STEP_STATES(t0, t1) {states}\n",
         f"#define STEP_PLANTS(t0, h) {' '.join(steps)}\n",
         f"#define EVALUATE(kind) {evaluate}\n",
-        f"#define PLANTS_GO_ON(which, from) {' '.join(go_on)}\n",
+        f"#define PLANTS_RESUME(which, from) {' '.join(resume)}\n",
         f"#define KEEP_PLANTS {' '.join(keep)}\n",
         read_source("lanes.c"),
     ]

@@ -70,7 +70,7 @@ static void ${name}_look($name *self, const vec *z, vec *w) {
     $outputs
 }
 
-static void ${name}_go_on($name *self, mask which, int from) {
+static void ${name}_resume($name *self, mask which, int from) {
     for (int i = 0; i < $n_x; i++) self->x[i] = choose(which, splat(self->x[i][from]), self->x[i]);
 }
 

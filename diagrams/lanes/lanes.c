@@ -66,7 +66,7 @@ VISIBLE void loopwright_lanes(lanes *l, int64_t count, const double *times, cons
             /* numbers that are no numbers would only cost time */
             for (int64_t j = 0; j < N_X; j++) x_next[j] = choose(bad, splat(x_next[j][from]), x_next[j]);
             for (int64_t j = 0; j < N_Z; j++) z[j] = choose(bad, splat(z[j][from]), z[j]);
-            PLANTS_GO_ON(bad, from)
+            PLANTS_RESUME(bad, from)
         }
         memcpy(x, x_next, sizeof(vec) * N_X);
         if (l->skip) {

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...blocks.core import OptionError, left_of
-from ..coupling import Links, Scheme, tells_slopes
+from ..coupling import Links, Scheme, passes_slopes
 from ..flat import NONE, FlatDiagram
 from ..results import OperatingPoint
 from .derivatives import LocalDerivatives
@@ -201,7 +201,7 @@ def coupling_at(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) 
         If the run takes adaptive communication steps, or tells an FMU slopes.
     """
     for path, inputs in Links(flat).inputs.items():
-        if inputs.stop > inputs.start and tells_slopes(flat.table.blocks[path]):
+        if inputs.stop > inputs.start and passes_slopes(flat.table.blocks[path]):
             raise OptionError(
                 "found input_derivatives among its options: its inputs are ramps over a communication step; expected "
                 "held inputs, which a linear model over communication steps has. Linearize the diagram with "

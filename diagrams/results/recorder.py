@@ -238,7 +238,7 @@ class Recorder:
             except OSError as error:
                 raise self._write_error(error) from error
 
-    def begin_anew(self) -> None:
+    def begin_again(self) -> None:
         """Take the samples of another run into memory, after `finish`."""
         self._skip, self._tail, self._fired, self._lost = 0, None, [], {}
         self.events = self._fired

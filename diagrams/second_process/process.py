@@ -36,7 +36,7 @@ class SecondProcess(Generic[T]):
 
     def __init__(self, make: Make, name: str):
         self._child: PythonChild | None = None
-        self._told: SimpleQueue[str] = SimpleQueue()
+        self._texts: SimpleQueue[str] = SimpleQueue()
         self._lock, self._over = threading.Lock(), False
         self._made: dict[str, bytes] = {}
         self._left: deque[str] = deque()
@@ -67,7 +67,7 @@ class SecondProcess(Generic[T]):
             self._thread.join()
         self._child.wait()
 
-    def share(self, keys: Sequence[str], make: Callable[[str], T], tell: Callable[[str], None]) -> list[T]:
+    def share(self, keys: Sequence[str], make: Callable[[str], T], report: Callable[[str], None]) -> list[T]:
         """Return the parts of all keys: from the first one on made here, from the last one on in the second process.
 
         The first one is always made here.
@@ -78,7 +78,7 @@ class SecondProcess(Generic[T]):
             The keys, in the order of the result.
         make : callable
             Makes a part here.
-        tell : callable
+        report : callable
             Called with what the second process tells, by this thread.
         """
         self._left = deque(keys[1:])
@@ -88,22 +88,22 @@ class SecondProcess(Generic[T]):
         found: dict[str, T] = {}
         key = keys[0] if keys else None
         while key is not None:
-            self._pass_on(tell)
+            self._pass_on(report)
             found[key] = make(key)
             key = self._take(first=True)
         while self._thread is not None and self._thread.is_alive():
             self._thread.join(PAUSE)
-            self._pass_on(tell)
-        self._pass_on(tell)
+            self._pass_on(report)
+        self._pass_on(report)
         for key in keys:
             if key not in found:  # in their order, so that the first error is that of one process alone
                 found[key] = pickle.loads(self._made.pop(key)) if key in self._made else make(key)
         return [found[key] for key in keys]
 
-    def _pass_on(self, tell: Callable[[str], None]) -> None:
+    def _pass_on(self, report: Callable[[str], None]) -> None:
         with suppress(Empty):
             while True:
-                tell(self._told.get_nowait())
+                report(self._texts.get_nowait())
 
     def _take(self, *, first: bool) -> str | None:
         with self._lock:
@@ -118,7 +118,7 @@ class SecondProcess(Generic[T]):
                 child.send(key)
                 kind, answer = child.receive()
                 while kind == "told":
-                    self._told.put(answer)
+                    self._texts.put(answer)
                     kind, answer = child.receive()
                 if kind == "made":
                     self._made[key] = answer

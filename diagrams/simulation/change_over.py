@@ -41,7 +41,7 @@ class ChangeOver:
         """
         started, before, first, end = perf_counter(), self._spent, self._position.t, self._position.time_of(last)
 
-        def tell(t: float) -> None:
+        def arrive(t: float) -> None:
             spent = perf_counter() - started
             self._spent = before + spent
             if self._possible and self._spent > _PATIENCE and t > first:
@@ -51,16 +51,16 @@ class ChangeOver:
                     take_over()
             progress(t)
 
-        return tell
+        return arrive
 
     def _look(self, make: Callable[[], LaterCode[Any]], rest: float) -> None:
         if self._later is None:
             self._later = make()
         self._later.background.look(self._spent, rest)
 
-    def tell_failure(self) -> tuple[str, ...]:
+    def report_failure(self) -> tuple[str, ...]:
         """Return a message that there is no compiler, or one that fails; once in a process."""
-        return () if self._later is None else self._later.tell_failure()
+        return () if self._later is None else self._later.report_failure()
 
     @property
     def code(self) -> Any:

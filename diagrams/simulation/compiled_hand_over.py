@@ -86,7 +86,7 @@ def bind_hybrid(
         None
         if blocks is None or continuous.outside is None
         else HandedOver(
-            flat, blocks.blocks, blocks.evaluators, partial(_tell_outside, continuous), continuous.outside.count
+            flat, blocks.blocks, blocks.evaluators, partial(_report_own_event, continuous), continuous.outside.count
         )
     )
     native = None if handed is None else handed.native
@@ -113,8 +113,8 @@ def bind_hybrid(
     return loop, handed
 
 
-def _tell_outside(continuous: Continuous, event: OwnEvent) -> None:
-    continuous.tell_outside(*event)
+def _report_own_event(continuous: Continuous, event: OwnEvent) -> None:
+    continuous.report_own_event(*event)
 
 
 def describe_methods(methods: Sequence[MethodOptions], solver: str) -> str:
@@ -182,7 +182,7 @@ def changes_method(workspace: Workspace, continuous: Continuous, t: float, sign:
     workspace.messages += continuous.method.decide(t, x, h, stuck=sign is Sign.STUCK)
 
 
-def tell_fired(continuous: Continuous, fired: Sequence[Fired]) -> None:
+def report_fired(continuous: Continuous, fired: Sequence[Fired]) -> None:
     """Report events that have fired in C."""
     for one in fired:
-        continuous.tell_event(one.t, one.event, one.before, one.after)
+        continuous.report_event(one.t, one.event, one.before, one.after)

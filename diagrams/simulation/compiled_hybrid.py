@@ -36,8 +36,8 @@ from .compiled_hand_over import (
     find_edges,
     methods_of,
     planned_steps,
+    report_fired,
     restore_plans,
-    tell_fired,
 )
 from .compiled_plants import PlantsInC
 from .compiled_ticks import FIRST, LARGEST_CHUNK, WISHED, LaterCode
@@ -129,7 +129,7 @@ class HybridTicks:
         """
         loop = self._bind(recorder)
         if k == 0:  # of a run before nothing is left
-            loop.begin_anew()
+            loop.begin_again()
         t = self._time_of(k)
         self._hand_over(loop, t)
         try:
@@ -181,14 +181,14 @@ class HybridTicks:
     def _step_plants(self, loop: CompiledHybrid, found: HybridOutcome, k: int, following: int, last: int) -> None:
         """Let Python continue with the steps of the plants."""
         try:
-            self._plants.go_on(loop.ticks, found, k, following, last)
+            self._plants.continue_steps(loop.ticks, found, k, following, last)
         except SimulationError as error:
             raise error.at(t=self._time_of(following)) from error.__cause__
 
     def take_first(self, t: float, acting: frozenset[TickPattern], recorder: Recorder) -> None:
         """Go through the tick with which a run begins, at t in s, with the events there, and record it."""
         loop = self._bind(recorder)
-        loop.begin_anew()
+        loop.begin_again()
         self._land(loop, t, loop.kinds.get(acting, len(loop.kinds)), recorder)
 
     def end_between_ticks(self, k: int, end: float, recorder: Recorder) -> float | None:
@@ -261,7 +261,7 @@ class HybridTicks:
             If the run can't continue.
         """
         loop.ticks.check()
-        self._tell()
+        self._report()
         failure = loop.take_failure()
         if failure is not None and found.reason is not HybridReason.OUTSIDE_FAILED:
             raise explain_library(self._continuous, failure)
@@ -317,7 +317,7 @@ class HybridTicks:
                 self._stops,
                 methods_of(self._continuous),
                 rest=self._take_rare_tick,
-                drain=self._tell,
+                drain=self._report,
             )
             self._recorder = recorder
             self._kinds = ClockSets(self._flat.distinct, self._loop.kinds, len(self._loop.kinds))
@@ -363,16 +363,16 @@ class HybridTicks:
         if continuous.domains is not None:
             loop.take_back_domains(continuous.domains)
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         """Report what has happened in C: events that have fired, and those of blocks from outside."""
         loop, continuous = self._loop, self._continuous
         assert loop is not None
-        tell_fired(continuous, loop.take_fired())
+        report_fired(continuous, loop.take_fired())
         if self._handed is not None:
-            self._handed.tell()
+            self._handed.report()
         for t, event in () if loop.watch is None else loop.watch.take_slid():
             assert continuous.domains is not None
-            self._workspace.messages += continuous.domains.tell_slid(t, event)
+            self._workspace.messages += continuous.domains.report_sliding(t, event)
 
 
 def find_code(
@@ -423,7 +423,7 @@ def make_hybrid(
         else:
             if machine:
                 return found, ()
-            told = (
+            compiled_text = (
                 f"Compiled: {describe_methods(methods_of(continuous), continuous.method.name)}, by the same rules as "
                 "interpreted; values differ from those of an interpreted run by rounding and within the tolerances."
             )
@@ -431,5 +431,5 @@ def make_hybrid(
                 "Fused: ticks and rates are compiled for this processor; values differ by rounding, which some motions "
                 "magnify."
             )
-            return found, (*((told,) if continuous.where.size else ()), *((fused,) if fuse else ()))
+            return found, (*((compiled_text,) if continuous.where.size else ()), *((fused,) if fuse else ()))
     return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)

@@ -11,7 +11,7 @@ import numpy as np
 from ...fmus.calls import FmuInstance
 from ..compiled import (
     REFUSED,
-    TOLD,
+    TAKEN_BY_PYTHON,
     UNDER_WAY,
     CompiledLoop,
     HybridOutcome,
@@ -116,7 +116,9 @@ class PlantsInC:
         shape = 1, len(self._plants)
         return StepTable(np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=np.uint8))
 
-    def go_on(self, loop: CompiledLoop, found: Outcome | HybridOutcome, k: int, following: int, last: int) -> None:
+    def continue_steps(
+        self, loop: CompiledLoop, found: Outcome | HybridOutcome, k: int, following: int, last: int
+    ) -> None:
         """Continue with the steps from a visited tick to the next one, from the plant on that C could not go beyond.
 
         Raises
@@ -140,7 +142,7 @@ class PlantsInC:
                 rest.append(partial(plant.finish_remote, *due[path]))
             elif place > found.plant:
                 rest.append(partial(plant.step, *due[path]))
-            elif found.stage == TOLD:
+            elif found.stage == TAKEN_BY_PYTHON:
                 rest.append(loop.check_steps)
             else:
                 assert found.stage != UNDER_WAY

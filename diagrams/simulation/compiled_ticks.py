@@ -252,7 +252,7 @@ class CompiledTicks:
                 forget_trials(self._flat)  # an interrupt of a block of Python is raised
             elif found.reason in (ReturnReason.FMU_FAILED, ReturnReason.FMU_FLAGS):
                 assert self._loop is not None
-                self._plants.go_on(self._loop, found, before, k, last)
+                self._plants.continue_steps(self._loop, found, before, k, last)
             else:
                 self._plants.go(before, k, last)
         except SimulationError as error:
@@ -360,18 +360,18 @@ class LaterCode(Generic[Code]):
 
     background: BackgroundCode[Code]
 
-    def tell_failure(self) -> tuple[str, ...]:
+    def report_failure(self) -> tuple[str, ...]:
         """Return a message that there is no compiler, or one that fails; once in a process."""
-        return () if self.background.failure is None else tell_failure_once(self.background.failure)
+        return () if self.background.failure is None else report_failure_once(self.background.failure)
 
 
-_TOLD: list[Exception] = []  # the failure that this process has reported
+_REPORTED: list[Exception] = []  # the failure that this process has reported
 
 
-def tell_failure_once(failure: Exception) -> tuple[str, ...]:
+def report_failure_once(failure: Exception) -> tuple[str, ...]:
     """Return a message that there is no compiler, or one that fails; once in a process."""
-    if _TOLD:
+    if _REPORTED:
         return ()
-    _TOLD.append(failure)
+    _REPORTED.append(failure)
     text = "Interpreted, though the run is long enough for C: {}. compile=False asks for no compiler."
     return (text.format(str(failure).rstrip(".")),)

@@ -139,7 +139,7 @@ class Continuous:
 
     # --- events ------------------------------------------------------------------------------------------------------
 
-    def tell_outside(self, t: float, path: str, name: str, before: np.ndarray, after: np.ndarray) -> None:
+    def report_own_event(self, t: float, path: str, name: str, before: np.ndarray, after: np.ndarray) -> None:
         """Report an event of a block from outside, with all states before and after it."""
         self.on_event(Occurrence(t, path, name, *(state_values(self.flat, path, x) for x in (before, after))))
 
@@ -151,7 +151,7 @@ class Continuous:
                 self._nominals = nominals
                 self.method.set_absolute_tolerance(absolute_tolerances(self.flat, self.resolution[1], nominals))
 
-    def tell_event(self, t: float, i: int, before: np.ndarray, after: np.ndarray) -> None:
+    def report_event(self, t: float, i: int, before: np.ndarray, after: np.ndarray) -> None:
         """Say that event ``i`` has fired at t in s, with all states before and after it.
 
         An FMU hears of every crossing of its indicators. One that comes back at once over the zero beyond which the
@@ -257,12 +257,12 @@ class Continuous:
         """
         return self.delays is None and all(scales_of(block) == scales_of(old[path]) for path, block in new.items())
 
-    def begin_anew(self, flat: FlatDiagram) -> None:
+    def begin_again(self, flat: FlatDiagram) -> None:
         """Forget the run before: another one begins, with other numbers of the diagram."""
         self.flat, self.sources = flat, announcers(flat)
         self.late, self.beyond = find_late(self.sources), None
         self.stand_in(math.inf, math.inf)
         self.restore(self._fresh)
-        self.method.begin_anew()
+        self.method.begin_again()
         if self.domains is not None:
-            self.domains.begin_anew()
+            self.domains.begin_again()

@@ -50,7 +50,7 @@ class ContinuousPart:
         self._events: list[Occurrence] = []
         self.go_between: Callable[[float, float], float | None] | None = None
         if continuous is not None:
-            self._tell = continuous.on_event
+            self._report = continuous.on_event
             continuous.on_event = self._events.append
 
     def advance(self, t: float, end: float) -> float | None:
@@ -88,5 +88,5 @@ class ContinuousPart:
         accept_steps(self._exchanged.blocks.values())
         if self._events:
             for event in self._events:
-                self._tell(event)
+                self._report(event)
             self._events.clear()

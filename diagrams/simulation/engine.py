@@ -82,7 +82,7 @@ class Engine:
         self._can_stop = self._stops.exist or bool(self.exchanged)
         self.is_ahead = False
         """Whether the run has ended at a tick beyond which the solver has gone: signals are not those of the end."""
-        self._tell = on_event
+        self._report = on_event
         if flat.hybrid:
             self.continuous = Continuous(
                 self.workspace,
@@ -189,12 +189,12 @@ class Engine:
         return self._generated
 
     @property
-    def can_begin_anew(self) -> bool:
-        """Whether `begin_anew` leaves nothing of a run: generated code between ticks, no coupling, no outside block."""
+    def can_begin_again(self) -> bool:
+        """Whether `begin_again` leaves nothing of a run: C between ticks, no coupling, no FMU in model exchange."""
         plain = (self.continuous is None or self.is_compiled) and self.coupled is None and not self.exchanged
         return plain and all(isinstance(p, FmuInstance) and p.native is not None for p in self.plants.values())
 
-    def begin_anew(self, flat: FlatDiagram, set_start: Callable[[Workspace], None] | None = None) -> None:
+    def begin_again(self, flat: FlatDiagram, set_start: Callable[[Workspace], None] | None = None) -> None:
         """Go back to t = 0 with other numbers; the plants, initialized again before, stay bound.
 
         Parameters
@@ -204,10 +204,10 @@ class Engine:
         set_start : callable, optional
             Computes start values, as `initialize` takes it.
         """
-        self.workspace.begin_anew(flat)
+        self.workspace.begin_again(flat)
         self.position.restore(0, None)
         if self.continuous is not None:
-            self.continuous.begin_anew(flat)
+            self.continuous.begin_again(flat)
         for plant in self.plants.values():
             assert isinstance(plant, FmuInstance)
             plant.read(0.0)
@@ -290,7 +290,7 @@ class Engine:
             progress = self._change_over.watch(last, progress, ticks.make_later, self._hand_over)
         try:
             ended = ticks.run(self.position.tick, last, recorder, arrived=self._arrive, progress=progress)
-            self.messages += self._change_over.tell_failure()
+            self.messages += self._change_over.report_failure()
             if ended is not None:
                 self.position.stopped = self._stops.met_at(ended)
         except SimulationError as error:
@@ -399,7 +399,7 @@ class Engine:
 
     def _on_event(self, event: Occurrence) -> None:
         self.position.note_event(event)
-        self._tell(event)
+        self._report(event)
 
     def blame(self, error: SimulationError) -> SimulationError:
         """Return the error with the full path of a plant that has failed, or the error of an opaque block behind it."""

@@ -98,7 +98,7 @@ class _Start:
         self._first = self._at
         self._lengths: list[float] = []
 
-    def go_on(self) -> None:
+    def make_pass(self) -> None:
         """Make one pass.
 
         Raises
@@ -129,7 +129,7 @@ class _Start:
         """Make one pass, and return whether it has changed nothing but by rounding."""
         workspace = self.workspace
         try:
-            self.go_on()
+            self.make_pass()
         except SimulationError:
             if self.passes < 2:  # it is not the passes that have led there
                 raise
@@ -201,7 +201,7 @@ class _Start:
                 return
             if stays is None:
                 break
-        self.go_on()
+        self.make_pass()
         raise self._failure()
 
     def _find_smooth(self) -> bool | None:
@@ -218,7 +218,7 @@ class _Start:
             here.w[:], here.x[:] = w, x
             put(values)
             try:
-                self.go_on()
+                self.make_pass()
             except SimulationError:  # no value at such numbers, which a search need not come to
                 return np.full(len(values), np.nan)
             self.passes += 1

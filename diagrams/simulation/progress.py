@@ -49,14 +49,14 @@ def late_progress(name: str, start: float, end: float, show: bool | None = None)
     """Yield a function that is told how far some work is; it is drawn as by `progress_bar` once it has taken 2 s."""
     begun = time.monotonic()
     with ExitStack() as stack:
-        tell: Callable[[float], None] | None = None
+        draw: Callable[[float], None] | None = None
 
         def note(t: float) -> None:
-            nonlocal tell
-            if tell is None and time.monotonic() - begun > LATE:
-                tell = stack.enter_context(progress_bar(name, start, end, show))
-            if tell is not None:
-                tell(t)
+            nonlocal draw
+            if draw is None and time.monotonic() - begun > LATE:
+                draw = stack.enter_context(progress_bar(name, start, end, show))
+            if draw is not None:
+                draw(t)
 
         yield note
 
@@ -94,8 +94,8 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, run: Run):
         where = f"at t = {run.t[-1]:.9g} s" if len(run.t) else "before the first sample"
         super().__init__(f"interrupted {where}")
-        told = f"This run was interrupted {where}, within a step: it has no final_state to continue from."
-        self.run = run if told in run.messages else replace(run, messages=(*run.messages, told))
+        message = f"This run was interrupted {where}, within a step: it has no final_state to continue from."
+        self.run = run if message in run.messages else replace(run, messages=(*run.messages, message))
 
     def __reduce__(self) -> tuple[type[Interrupted], tuple[Run]]:
         return type(self), (self.run,)

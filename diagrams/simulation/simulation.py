@@ -226,7 +226,7 @@ class Simulation:
         end = float(position.tick * self.flat.base + count * self.flat.base + rest) if rest else None
         started = time.perf_counter()
 
-        def tell(t: float) -> None:
+        def arrive(t: float) -> None:
             self._recorder.flush()
             if progress is not None:
                 progress(t)
@@ -234,9 +234,9 @@ class Simulation:
         try:
             if self.stopped is None:
                 if count:
-                    self._engine.go(last, self._recorder, tell)
+                    self._engine.go(last, self._recorder, arrive)
                 if end is not None and self.stopped is None:
-                    self._engine.end_between_ticks(end, self._recorder, tell)
+                    self._engine.end_between_ticks(end, self._recorder, arrive)
         except SimulationError as error:
             self._elapsed += time.perf_counter() - started
             raise self._with_run(error) from error.__cause__
@@ -352,8 +352,8 @@ class Simulation:
     def _messages(self) -> tuple[str, ...]:
         engine = self._engine
         coupled = () if engine.coupled is None else engine.coupled.messages
-        told = (m for p in engine.loaded.values() for m in p.messages)
-        return (*self._notes, *engine.messages, *engine.workspace.messages, *coupled, *told)
+        of_plants = (m for p in engine.loaded.values() for m in p.messages)
+        return (*self._notes, *engine.messages, *engine.workspace.messages, *coupled, *of_plants)
 
     @property
     def can_save(self) -> bool:

@@ -72,7 +72,7 @@ class Workspace:
         self.messages: tuple[str, ...] = ()
         self._solved: dict[tuple[frozenset[TickPattern], int], LoopSolver] = {}
 
-    def begin_anew(self, flat: FlatDiagram) -> None:
+    def begin_again(self, flat: FlatDiagram) -> None:
         """Put all numbers to those with which a run of a diagram begins; its functions are those that are bound."""
         self.flat, self.begun = flat, False
         self.p[:], self.messages = flat.p, ()

@@ -153,7 +153,7 @@ class Method(Integration):
             self.active = saved["active"]
         self.planned = {name: saved.get("planned", {}).get(name) for name in self.names}
 
-    def begin_anew(self) -> None:
+    def begin_again(self) -> None:
         """Forget the run before."""
         self.active, self.planned, self._changes = self.names[0], dict.fromkeys(self.names), 0
 
@@ -176,12 +176,12 @@ class Method(Integration):
         return ()
 
     def _change(self, to: str, t: float, h: float | None, why: str) -> tuple[str, ...]:
-        told = f"t = {t:.6g} s: {why}; {self.active} → {to}"
+        message = f"t = {t:.6g} s: {why}; {self.active} → {to}"
         self.active, self.planned[to] = to, h
         self._changes += 1
         if self._changes > _MOST_CHANGES:
             return ("… and more such changes",) if self._changes == _MOST_CHANGES + 1 else ()
-        return (told,)
+        return (message,)
 
     def _leftmost_eigenvalue(self, t: float, x: np.ndarray) -> float:
         """Return the real part of the leftmost eigenvalue: that of the fastest decaying mode."""

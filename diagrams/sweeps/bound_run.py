@@ -63,7 +63,7 @@ class BoundRun:
             *note_held_inputs(self.flat),
         )
         self._has_begun = False
-        self._told: dict[str, int] = {}
+        self._messages_before: dict[str, int] = {}
         self._places: Places = {}
         self._start = StartValues(self.engine.workspace) if StartValues.fits(self.flat) else None
         self._stack = ExitStack()
@@ -96,7 +96,7 @@ class BoundRun:
         engine, flat = self.engine, self.flat
         if opaque := [path for path in flat.checked.traced if flat.table.blocks[path].opaque]:
             return f"{opaque[0]} is evaluated by Python, and may keep something of a run"
-        if engine.can_begin_anew:
+        if engine.can_begin_again:
             return ""
         if engine.exchanged:
             return f"{next(iter(engine.exchanged.blocks))} is an FMU in model exchange, loaded for each"
@@ -145,7 +145,7 @@ class BoundRun:
             As of `Diagram.simulate`; ``error.run`` holds what was recorded until then.
         """
         engine, recorder, started = self.engine, self.recorder, perf_counter()
-        recorder.begin_anew()
+        recorder.begin_again()
         try:
             self.begin(numbers)
             engine.take_first_tick(None, recorder)
@@ -176,9 +176,9 @@ class BoundRun:
             self._forget_messages()
             for path, plant in self.engine.plants.items():
                 assert isinstance(plant, FmuInstance)
-                plant.start_anew(numbers.starts.get(path, {}))
+                plant.start_again(numbers.starts.get(path, {}))
             find_start = None if self._start is None else self._start.set
-            self.engine.begin_anew(renumber(self.flat, numbers.blocks), find_start)
+            self.engine.begin_again(renumber(self.flat, numbers.blocks), find_start)
             self._has_begun = True
 
     def _take_record(self, started: float) -> Run:
@@ -238,14 +238,14 @@ class BoundRun:
         """Let FMUs forget the messages of earlier runs: a run's messages, and its error, quote its own."""
         for path, plant in self.engine.plants.items():
             if isinstance(plant, FmuInstance):
-                plant.log.begin_anew()
-                self._told[path] = len(plant.messages)
+                plant.log.begin_again()
+                self._messages_before[path] = len(plant.messages)
 
     def take_messages(self) -> tuple[str, ...]:
         """Return the messages of the start and of FMUs since the last run."""
         found = [*self.engine.workspace.messages]
         for path, plant in self.engine.plants.items():
             texts = plant.messages
-            found += texts[self._told.get(path, 0) :]
-            self._told[path] = len(texts)
+            found += texts[self._messages_before.get(path, 0) :]
+            self._messages_before[path] = len(texts)
         return tuple(found)

@@ -201,7 +201,7 @@ class _Lanes:
         """
         bound = self.bound
         engine, workspace = bound.engine, bound.engine.workspace
-        bound.recorder.begin_anew()
+        bound.recorder.begin_again()
         bound.begin(numbers)
         try:
             engine.take_first_tick(None, bound.recorder)

@@ -69,7 +69,7 @@ class Store:
             if not fits and not overwrite:
                 raise OptionError(
                     f"the folder {str(folder)!r} holds a sweep of {found.get('diagram')!r} that differs from this one "
-                    f"in {_tell(found, parts)}. Choose another folder, or replace it with overwrite=True."
+                    f"in {_describe(found, parts)}. Choose another folder, or replace it with overwrite=True."
                 )
             if not fits:
                 self._remove()
@@ -119,7 +119,7 @@ class Store:
         self._last = monotonic()
 
 
-def _tell(found: Mapping[str, Any], parts: Parts) -> str:
+def _describe(found: Mapping[str, Any], parts: Parts) -> str:
     """Return in words in what a stored sweep differs from this one."""
     if found.get("format") != _FORMAT:
         return "the version of Loopwright that wrote it"

@@ -52,7 +52,7 @@ class StartSearch:
             return
         with LOADING:
             workspace = bound.engine.workspace
-            workspace.begin_anew(flat)
+            workspace.begin_again(flat)
             self.left = {port: np.asarray(tap(None)) for port, tap in values_from_left(workspace).items()}
             self.functions = trace_start(flat, self.left)
         self.source = StartSource(flat.acting(0), self.values, tuple(self.left))
@@ -115,7 +115,7 @@ class VectorStart:
             instance = search.bound.engine.plants[path]
             assert isinstance(instance, FmuInstance)
             with LOADING:
-                instance.start_anew({})
+                instance.start_again({})
                 numbers, step = plant.read(instance)
             self._places[path] = {
                 name: at + np.concatenate([np.r_[plant.entries[r]] for r in variable.references])

@@ -74,7 +74,7 @@ class FmuInstance(StepFailures):
             if self.record.variables:
                 self.begin_texts(self._began)
 
-    def start_anew(self, values: Mapping[str, np.ndarray]) -> None:
+    def start_again(self, values: Mapping[str, np.ndarray]) -> None:
         """Reset it, set start values and enter Initialization Mode at t = 0, as `reset` and `initialize` do.
 
         An FMU that Loopwright has built, with a plain step (`native`), is started by a few calls that are bound once.

@@ -44,7 +44,7 @@ class MessageLog:
         """Add a note, which is not the FMU's own."""
         self._notes.append(f"{self._label}: {text}")
 
-    def begin_anew(self) -> None:
+    def begin_again(self) -> None:
         """Forget all but the notes that were there at the first call: another run begins, and tells its own."""
         if self._lasting is None:
             self._lasting = len(self._notes)

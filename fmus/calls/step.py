@@ -185,7 +185,7 @@ class InstanceStep:
     def _end(self, status: int) -> None:
         """Continue to the end of a step whose calls have returned a status, and get the outputs."""
         fmu, t, h = self.fmu, self._t, self._h
-        self._go_on(self._judge_calls(status), t, h)
+        self._continue_step(self._judge_calls(status), t, h)
         fmu.set_span(t, h)
         if self._slopes is not None and (status := self._slopes.take_status()) > WARNING:
             raise fmu.report(f"setting its inputs within the step by {h:g} s", status, t)
@@ -221,7 +221,7 @@ class InstanceStep:
             self._kept = self._before = self._kept or fmu.keep(self._handle)
         return found
 
-    def _go_on(self, status: int, t: float, h: float) -> None:
+    def _continue_step(self, status: int, t: float, h: float) -> None:
         """Continue from the first part of a step from t over h, in parts where events are or the FMU stops early."""
         fmu, end, now, part = self.fmu, t + h, t, self.fmu.width.value
         if not self.parts & (StepParts.EVENTS | StepParts.EARLY_RETURN):
@@ -558,10 +558,12 @@ class InputSlopes:
         fmi, is_new = fmu.fmi, fmu.description.fmi.startswith("3")
         places = Layout.of({port: v.shape for port, v in fmu.inputs.items()}).slices
         variables = {port: fmu.inputs[port] for port in ports}
-        told = {port: v for port, v in variables.items() if v.type == "Float64" and (v.intermediate or not is_new)}
-        self.places = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[places[port]] for port in told)])
+        with_slopes = {
+            port: v for port, v in variables.items() if v.type == "Float64" and (v.intermediate or not is_new)
+        }
+        self.places = np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[places[port]] for port in with_slopes)])
         self._u, n = u, self.places.size
-        references = [r for v in told.values() for r in v.references]
+        references = [r for v in with_slopes.values() for r in v.references]
         self.last = np.full(1 + n, math.nan)
         self.line = fmi.slope_line(references, n) if n and is_new else None
         self.slopes = fmi.allocate(n, ctypes.c_double) if self.line is None else self.line[2 + n :]

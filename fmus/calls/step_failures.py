@@ -116,11 +116,11 @@ class StepFailures(SavingFmu):
 
     def _beyond_the_end(self, end: float) -> str:
         """Return the next step where a step ends in s beyond the end that the FMU knows; "" where it doesn't."""
-        told, default = self.block.stepping.stop_time, self.description.stop_time
-        stop = default if told is None else told
+        given, default = self.block.stepping.stop_time, self.description.stop_time
+        stop = default if given is None else given
         if stop is None or end <= stop * (1 + ROUNDED):
             return ""
-        if told is None:
+        if given is None:
             return (
                 f"Its default experiment ends at {stop:g} s, beyond which some FMUs take no step. Tell it a later end: "
                 "stepping=StepOptions(stop_time=…)."

@@ -62,7 +62,7 @@ class Keeper:
         self.kept: set[int | str] = set()
         """Groups and folders."""
 
-    def tell(self, request: str, folder: str) -> None:
+    def send(self, request: str, folder: str) -> None:
         """Write a request about a folder.
 
         Raises
@@ -155,14 +155,14 @@ def _current() -> Keeper:
 def _keep_folder(folder: str) -> None:
     keeper = _current()
     keeper.kept.add(folder)
-    keeper.tell("folder", folder)
+    keeper.send("folder", folder)
 
 
-def _release(keeper: Keeper, subject: int | str, tell: Callable[[], None]) -> None:
+def _release(keeper: Keeper, subject: int | str, send: Callable[[], None]) -> None:
     """Tell a keeper that it keeps something no longer; the last one lets it end."""
     keeper.kept.discard(subject)
     with suppress(OSError, ValueError):  # one that was ended by somebody else keeps nothing
-        tell()
+        send()
     if not keeper.kept and keeper in _KEEPERS:
         _KEEPERS.remove(keeper)
         keeper.end()
@@ -206,7 +206,7 @@ def release_folder(folder: str | os.PathLike[str]) -> None:
     path = os.path.abspath(folder)
     with _LOCKS[0]:
         for keeper in [keeper for keeper in _KEEPERS if path in keeper.kept]:
-            _release(keeper, path, partial(keeper.tell, "removed", path))
+            _release(keeper, path, partial(keeper.send, "removed", path))
 
 
 def end_all() -> None:

@@ -27,7 +27,7 @@ from ...blocks.core import (
     find_disk_error,
     near,
 )
-from ..build_notes import tell_build
+from ..build_notes import announce_build
 from ..child_processes import find_python, folder_in, run_in_group
 from ..platform import OWN_CACHE, cache_folder, check_cache, native_platform
 from ..toolchain import TARGETS, find_command, flags
@@ -166,7 +166,7 @@ def compile_shared(
             includes = [f"-I{path}" for path in include]
             given = [*flags(platform, zig=compiler.zig), *more_flags]
             command = [*compiler.command, *given, "-I.", *includes, "-o", library, *names, *math]
-            with tell_build(_note(compiler)):
+            with announce_build(_note(compiler)):
                 _run(command, folder, platform)
             if not (folder / library).is_file():
                 raise CompilerError(f"{shlex.join(command)} wrote no library. Check LOOPWRIGHT_CC.")

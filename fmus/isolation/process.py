@@ -45,7 +45,7 @@ class ChildProcess:
     ----------
     folder : Path
         Private folder; its ``fmu`` is the copy of the files, its ``work`` the working folder.
-    told : callable
+    take_message : callable
         Takes status and text of the FMU's log messages.
     arrived : bool
         Whether C has seen the reply to the last request, which nobody has finished yet.
@@ -55,7 +55,7 @@ class ChildProcess:
 
     def __init__(self, name: str, files: Path, size: int, memory: float, output: float):
         self.name, self.size, self.memory_limit, self.output_limit = name, size, int(memory), int(output)
-        self.told: Callable[[int, str], None] = lambda status, text: None
+        self.take_message: Callable[[int, str], None] = lambda status, text: None
         self.lose: Callable[[FmuProcessError], FmuProcessError] = lambda error: error
         self.used = self.alive = self.arrived = self._runs_in_c = False
         failed = f"the process for the FMU {name!r} can't be started"
@@ -284,7 +284,7 @@ class ChildProcess:
         """Give the FMU's log messages to `told`."""
         self.words[MESSAGES] = 0
         for status, text in self._output.read_messages():
-            self.told(status, text)
+            self.take_message(status, text)
 
     def read_printed(self) -> list[str]:
         """Return the last lines that the FMU has written since the present instance was made."""
@@ -382,7 +382,7 @@ class ChildProcess:
         """Prepare for another instance: forget memory, sequences and messages."""
         self._allotted = DATA
         self._names.clear()
-        self.told, self.lose = lambda status, text: None, lambda error: error
+        self.take_message, self.lose = lambda status, text: None, lambda error: error
         self._output.begin_again()
         self.words[MESSAGES] = 0
 

@@ -182,7 +182,7 @@ class RemoteCalls(FmiCalls):
 
     def instantiate(self, log: Log) -> None:
         """Make the instance; its messages go to ``log``."""
-        self.process.told, self.process.lose = log, self.lose
+        self.process.take_message, self.process.lose = log, self.lose
         super().instantiate(log)  # type: ignore[safe-super]
         if self.process.find(self.fmu.component) is not None:  # an address there that is shared memory here
             raise FmuError("its instance has an address that can't be told from shared memory; run it again.")

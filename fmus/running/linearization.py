@@ -161,7 +161,7 @@ def _linearize_by_directions(point: FmuPoint, instance: LoadedFmu) -> FmuLineari
         first += size
     if others.any():  # local variables
         if not instance.model_exchange:
-            _initialize_anew(point, instance)
+            _initialize_again(point, instance)
         found_too = _differences(point, instance, values)
         part[others], uncertainty[others] = found_too.J[others], found_too.error[others]
         derivation = replace(derivation, coarseness=found_too.find_coarseness(others))
@@ -194,7 +194,7 @@ def _check(point: FmuPoint, instance: LoadedFmu, J: np.ndarray, rows: np.ndarray
     try:
         at = np.concatenate([instance.values(point.states), instance.values(point.moved)])
         if not instance.model_exchange:
-            _initialize_anew(point, instance)
+            _initialize_again(point, instance)
     except FmuError:
         return SlopeCheck(J, np.full(J.shape, np.nan), np.nan, is_wrong=False)
     limits = [np.concatenate([np.ravel(v.limits[side]) for v in variables]) for side in (0, 1)]
@@ -205,7 +205,7 @@ def _check(point: FmuPoint, instance: LoadedFmu, J: np.ndarray, rows: np.ndarray
     return found
 
 
-def _initialize_anew(point: FmuPoint, instance: LoadedFmu) -> None:
+def _initialize_again(point: FmuPoint, instance: LoadedFmu) -> None:
     """Go back to Initialization Mode at the operating point."""
     given = {n: v for n, v in point.given.items() if point.about.find(n).initial == "exact"}
     instance.reset()
@@ -367,12 +367,12 @@ def _linearize_step(point: FmuPoint, instance: LoadedFmu, h: float, relative_ste
     point.check(x)
     at = about.layout(known).split(np.concatenate([x, u]))
 
-    def start_anew(set_before: Mapping[str, Any]) -> None:
+    def start_again(set_before: Mapping[str, Any]) -> None:
         instance.reset()
         instance.initialize(None, start_time=point.t, values={**point.given, **at, **set_before})
         instance.begin()
 
-    back = RestoredPoint(instance, [*known, *point.outputs], lambda: start_anew({}))
+    back = RestoredPoint(instance, [*known, *point.outputs], lambda: start_again({}))
     back.save()
 
     def step_from_point(
@@ -381,7 +381,7 @@ def _linearize_step(point: FmuPoint, instance: LoadedFmu, h: float, relative_ste
         """Take a step from the operating point; states are set by the initialization, inputs in Step Mode."""
         if set_before:
             back.free()
-            start_anew(set_before)
+            start_again(set_before)
         elif not first:
             back.go_back()
         instance.set_values(set_after)

@@ -95,14 +95,14 @@ static inline bool await_request(server *s, uint64_t last) {
     const bool seen = watch_word(&words[AT_REQUEST], last, s->patience.looks);
     note_watching(seen, &s->patience);
     if (seen) return true;
-    bool told = s->ordered;
-    while (!told || READ(words[AT_REQUEST]) == last) {
+    bool woken = s->ordered;
+    while (!woken || READ(words[AT_REQUEST]) == last) {
         WRITE(words[CHILD_SLEEPS], 1);
         FENCE();
         if (!s->ordered || READ(words[AT_REQUEST]) == last) {
             const ssize_t n = read(s->commands, bytes, sizeof bytes);
             if (n == 0 || (n < 0 && errno != EINTR)) return false;
-            told = told || n > 0;
+            woken = woken || n > 0;
         }
         WRITE(words[CHILD_SLEEPS], 0);
     }

@@ -95,13 +95,13 @@ static inline int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
         const double at = h->to, t = h->found && h->counts_as < at ? h->counts_as : at;
         bool happened = h->found;
         if (h->o) {
-            int told = tell_step(h);
-            if (told == EVENT && !h->found) {
+            int result = report_step(h);
+            if (result == EVENT && !h->found) {
                 happened = true;
-                told = settle(h, t, false);
-                if (told < LOST && has_ended(h->o) && !accept(h)) told = LOST;
+                result = settle(h, t, false);
+                if (result < LOST && has_ended(h->o) && !accept(h)) result = LOST;
             }
-            if (told >= LOST) return break_off(h, t, told);
+            if (result >= LOST) return break_off(h, t, result);
             h->looked = t == end && !happened && !h->l.plants && is_before(end, h->jump) ? end : NAN;
         }
         h->stepped = 0;

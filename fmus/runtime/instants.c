@@ -483,7 +483,7 @@ static int64_t break_off(hybrid *h, double t, int result) {
 }
 
 /* Tell FMUs that a step is complete; EVENT: one wants an event there, or the end of the run. */
-static int tell_step(hybrid *h) {
+static int report_step(hybrid *h) {
     bool acted;
     fire_none(h);
     if (!see(h, *h->l.t, TO_STEP, &acted)) return LOST;

@@ -63,7 +63,7 @@ typedef struct {
 } loop;
 
 enum { DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED };
-enum { INPUTS, STEP, OUTPUTS, UNDER_WAY, REFUSED, TOLD }; /* of an FMU in another process; of a step by Python */
+enum { INPUTS, STEP, OUTPUTS, UNDER_WAY, REFUSED, TAKEN_BY_PYTHON }; /* of an FMU in another process; of a step by Python */
 
 /* A fused loop is in one unit with the code of its ticks, and of FMUs; then these are no calls by address. */
 #ifndef CALL_TICK
@@ -204,7 +204,7 @@ static inline int64_t end_apart(const loop *l, const plant *p, double width, out
 /* Let Python take a step of an FMU; return whether it has to continue from there. */
 static inline bool step_by_python(const loop *l, const plant *p, double now, double width, outcome *out) {
     if (p->by_python(out->plant, now, width)) {
-        out->stage = TOLD;
+        out->stage = TAKEN_BY_PYTHON;
         out->status = 0;
         return true;
     }

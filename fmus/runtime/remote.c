@@ -197,16 +197,16 @@ static bool sleep_for_reply(remote *r, apart *a) {
     uint64_t *words = r->words;
     const int64_t end = nanoseconds() + SLICE * INT64_C(1000000);
     int64_t left = SLICE;
-    bool told = r->ordered;
+    bool woken = r->ordered;
     char bytes[4096];
     WRITE(words[PARENT_SLEEPS], 1);
     FENCE();
-    while (!told || READ(words[AT_REPLY]) != r->number) {
+    while (!woken || READ(words[AT_REPLY]) != r->number) {
         struct pollfd pipe = {r->replies, POLLIN, 0};
         const int found = left > 0 ? poll(&pipe, 1, (int)left) : 0;
         if (found > 0) {
             if (read(r->replies, bytes, sizeof bytes) <= 0) break;
-            told = true;
+            woken = true;
         } else if (found < 0 && errno == EINTR)
             a->late = 1; /* Ctrl-C, perhaps: Python looks after this tick */
         else
@@ -214,7 +214,7 @@ static bool sleep_for_reply(remote *r, apart *a) {
         left = (end - nanoseconds()) / 1000000;
     }
     WRITE(words[PARENT_SLEEPS], 0);
-    return told && READ(words[AT_REPLY]) == r->number;
+    return woken && READ(words[AT_REPLY]) == r->number;
 }
 
 /* Wait for a reply. */

@@ -63,7 +63,7 @@ def eager(monkeypatch):
         monkeypatch.setattr(background, name, 0.0)
     monkeypatch.setattr(background, "_LEAST", -1.0)
     monkeypatch.setattr(background, "Thread", AtOnce)
-    monkeypatch.setattr(compiled_ticks, "_TOLD", [])
+    monkeypatch.setattr(compiled_ticks, "_REPORTED", [])
 
 
 def test_many_ticks_are_those_of_the_matrix_exponential(eager):

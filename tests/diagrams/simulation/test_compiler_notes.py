@@ -4,7 +4,7 @@ import pytest
 
 from loopwright.blocks import Sine
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus.build_notes import hear_builds, tell_build
+from loopwright.fmus.build_notes import announce_build, hear_builds
 from loopwright.fmus.export import compile_shared, compiler
 
 
@@ -29,7 +29,7 @@ def test_the_first_start_of_a_compiler_is_announced(tmp_path, monkeypatch):
 
 def test_the_end_is_told_of_a_compilation_that_fails():
     heard = []
-    with pytest.raises(ZeroDivisionError), hear_builds(heard.append), tell_build("x"):
+    with pytest.raises(ZeroDivisionError), hear_builds(heard.append), announce_build("x"):
         raise ZeroDivisionError
     assert heard == ["x", ""]
 

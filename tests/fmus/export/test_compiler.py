@@ -107,7 +107,7 @@ def test_a_terminal_is_told_of_a_build_that_takes_longer_and_is_clean_again(monk
     for out, late, shown in ((Terminal(), 0.01, True), (Terminal(), 100.0, False), (io.StringIO(), 0.0, False)):
         monkeypatch.setattr("sys.stderr", out)
         monkeypatch.setattr(build_notes, "LATE", late)
-        with build_notes.tell_build("compiling C code"):
+        with build_notes.announce_build("compiling C code"):
             while shown and not out.getvalue():
                 time.sleep(0.005)
             told = out.getvalue()
