@@ -135,7 +135,7 @@ class Block(Value, Wireable):
     exchange: continuous states that a solver integrates, and events.
 
     Instead of equations it has ``dependence`` and ``exchange(wired, start_time)``, a context manager: ``wired`` names
-    the inputs that the run sets, times are in s. It yields the simulation's ``ExchangedBlock``.
+    the inputs that the run sets, times are in s. It yields the simulation's ``ModelExchangeBlock``.
     """
 
     inputs: ClassVar[Mapping[str, Input]] = {}

@@ -30,7 +30,7 @@ from .library_method import StepFailure
 from .loop import CompiledLoop, NewtonOptions, Outcome, ReturnReason
 from .native_tick import bind_call
 from .remote import REFUSED, TAKEN_BY_PYTHON, UNDER_WAY, PythonStep, compile_other_side
-from .staged import NativeExchange, OwnEvent
+from .staged import NativeModelExchange, OwnEvent
 from .watch import Fired, Pile
 
 __all__ = [
@@ -52,7 +52,7 @@ __all__ = [
     "Kernel",
     "Lost",
     "MethodOptions",
-    "NativeExchange",
+    "NativeModelExchange",
     "NewtonOptions",
     "Outcome",
     "OwnEvent",

@@ -8,17 +8,17 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...blocks.core import EvaluationVectors, FmuRuntimeError, SimulationError
-from ..exchange import OWN_EVENTS, ExchangeEvaluator
 from ..flat import JUMP, FlatDiagram, OpaqueStage
+from ..model_exchange import OWN_EVENTS, ModelExchangeEvaluator
 from .runtime import load_runtime
-from .staged import NativeBlock, NativeExchange, OwnEvent
+from .staged import NativeBlock, NativeModelExchange, OwnEvent
 
 _DONE, _NOT_COMPUTED = range(2)
 _FIRED = -1
 
 
 class HandedBlock(NativeBlock, Protocol):
-    """A block that C can evaluate; see `loopwright.fmus.calls.ExchangeInstance`."""
+    """A block that C can evaluate; see `loopwright.fmus.calls.ModelExchangeInstance`."""
 
     next_time: float
     ends_run: bool
@@ -57,7 +57,7 @@ class HandedOver:
         The diagram.
     blocks : mapping of str to HandedBlock
         The blocks by path, loaded.
-    evaluators : mapping of str to ExchangeEvaluator
+    evaluators : mapping of str to ModelExchangeEvaluator
         Their evaluators, by which Python does what C can't.
     report : callable
         Called with events of the blocks' own.
@@ -69,14 +69,14 @@ class HandedOver:
         self,
         flat: FlatDiagram,
         blocks: Mapping[str, Any],
-        evaluators: Mapping[str, ExchangeEvaluator],
+        evaluators: Mapping[str, ModelExchangeEvaluator],
         report: Callable[[OwnEvent], None],
         count: Callable[[float, str, str], None],
     ):
         self._evaluators, self._report, self._count = evaluators, report, count
         self._blocks: dict[str, HandedBlock] = {path: blocks[path] for path in flat.outside}
         first = {path: flat.states.slices[path].start for path in flat.outside}
-        self.native = NativeExchange(self._blocks, first, flat.width, load_runtime(), self._by_python)
+        self.native = NativeModelExchange(self._blocks, first, flat.width, load_runtime(), self._by_python)
         """The blocks as C knows them."""
         self._with_c = False
 

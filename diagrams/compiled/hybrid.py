@@ -22,7 +22,7 @@ from .loop import CompiledLoop, NewtonOptions, NewtonStructure, OutcomeStructure
 from .radau import radau_numbers
 from .rate_differences import RateDifferences
 from .runtime import load_runtime
-from .staged import NativeExchange
+from .staged import NativeModelExchange
 from .staged_functions import Staged, StagedSlopes
 from .watch import Fired, Pile, Watch
 
@@ -184,7 +184,7 @@ class CompiledHybrid:
         What is kept of events, where there are some.
     loops : NewtonOptions, optional
         Newton's method for the algebraic loops between ticks, where there are some.
-    exchange : NativeExchange, optional
+    exchange : NativeModelExchange, optional
         FMUs in model exchange, where there are some.
     accepts : {0, 1, 2}
         Whether blocks are to be evaluated after every step (1): they remember something, have guards, may fail, or FMUs
@@ -211,7 +211,7 @@ class CompiledHybrid:
         domains: Domains | None,
         accepts: int,
         loops: NewtonOptions | None = None,
-        exchange: NativeExchange | None = None,
+        exchange: NativeModelExchange | None = None,
         delays: PastInputs | None = None,
         tolerances: tuple[float, float] = (0.0, 0.0),
         drain: Callable[[], None],

@@ -152,7 +152,7 @@ class Outcome(NamedTuple):
 
 
 class StagedBinding(Protocol):
-    """Binds functions in stages to vectors; see `NativeExchange`."""
+    """Binds functions in stages to vectors; see `NativeModelExchange`."""
 
     watched: list[tuple[HostState, ctypes.c_bool]]
     """States of this process that FMUs may change, and whether C has seen that."""

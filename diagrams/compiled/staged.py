@@ -13,8 +13,8 @@ from ...blocks.called_back import CalledBack
 from ...blocks.core import EvaluationVectors, Wanted
 from ...fmus.calls import BoundCalls, NativeAction, NativeLook
 from ...fmus.host_state import HostState
-from ..exchange import OWN_EVENTS
 from ..flat import JUMP, OpaqueStage
+from ..model_exchange import OWN_EVENTS
 from .bound_functions import CALL, TickStructure, address_of, at, list_vectors
 from .loop import NewtonStructure
 from .rate_differences import color_columns
@@ -103,7 +103,7 @@ class _SlopesInC(ctypes.Structure):
 
 
 class NativeBlock(Protocol):
-    """A block that a loop in C evaluates; see `loopwright.fmus.calls.ExchangeInstance`."""
+    """A block that a loop in C evaluates; see `loopwright.fmus.calls.ModelExchangeInstance`."""
 
     @property
     def native_host(self) -> HostState | None:
@@ -140,7 +140,7 @@ def find_obstacle(block: Any) -> str | None:
     return block.find_native_obstacle() if hasattr(block, "find_native_obstacle") else "is evaluated by Python"
 
 
-class NativeExchange:
+class NativeModelExchange:
     """Blocks that are evaluated from outside, as C knows them in a run.
 
     Parameters

@@ -14,7 +14,7 @@ from ..flat import FlatDiagram
 from .bound_functions import TickStructure, at
 from .hybrid_code import Between
 from .rate_differences import RateDifferences
-from .staged import NativeExchange
+from .staged import NativeModelExchange
 from .staged_functions import Staged, StagedSlopes
 
 _LOGGED = 2**22  # bytes of what has fired in a call
@@ -80,7 +80,7 @@ class Watch:
         What is kept of them, where C writes.
     step : float or None
         Fixed step of the method in s; None where it chooses its steps.
-    exchange : NativeExchange, optional
+    exchange : NativeModelExchange, optional
         FMUs in model exchange, whose events they are, too.
 
     Attributes
@@ -99,7 +99,7 @@ class Watch:
         *,
         domains: Domains,
         step: float | None,
-        exchange: NativeExchange | None = None,
+        exchange: NativeModelExchange | None = None,
     ):
         self._kept: list[Any] = []
         events, n = flat.events, flat.continuous.size

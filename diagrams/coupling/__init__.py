@@ -2,7 +2,7 @@
 
 from .connection_delays import CoupledConnection, CouplingReport, HeldFrom, LinkKind, report_coupling
 from .coupled_steps import CoupledSteps, Effort, passes_slopes
-from .coupling_options import Coupling, Scheme, refuse_exchanged, to_coupling
+from .coupling_options import Coupling, Scheme, refuse_model_exchange, to_coupling
 from .fixed_points import find_fixed_point
 from .links import Links
 from .loops import note_loops
@@ -31,7 +31,7 @@ __all__ = [
     "note_loops",
     "note_steps",
     "passes_slopes",
-    "refuse_exchanged",
+    "refuse_model_exchange",
     "report_coupling",
     "runs_apart",
     "step_all",

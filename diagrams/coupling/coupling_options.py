@@ -92,7 +92,7 @@ class Coupling:
         return 2 if self.scheme == Scheme.ITERATED else 1
 
 
-def refuse_exchanged(coupling: Coupling, blocks: Mapping[str, Any]) -> None:
+def refuse_model_exchange(coupling: Coupling, blocks: Mapping[str, Any]) -> None:
     """Refuse a scheme that goes back over a step where a model-exchange FMU can't.
 
     Parameters

@@ -17,7 +17,7 @@ NEAR = 1e-9
 
 
 class Plant(Protocol):
-    """A stepped block in a run, as its ``instantiate`` yields it: `bind`, `exchange`, `begin`, then each `step`.
+    """A stepped block in a run, as its ``instantiate`` yields it: `bind`, `model_exchange`, `begin`, then each `step`.
 
     A protocol: instances of FMUs come from the room `fmus`, which this sub-package doesn't know, others from users.
     """

@@ -207,7 +207,7 @@ class FlatDiagram(FlatLayout):
     @_shared
     def exchange(self) -> Schedule:
         """``(t, x, w, p, log) -> z`` between ticks: the inputs of plants, with outputs of sampled blocks from log."""
-        return flat_functions.trace_exchange(self, self.blocks)
+        return flat_functions.trace_model_exchange(self, self.blocks)
 
     def output(self, port: tuple[str, str]) -> Schedule:
         """Return ``(t, x, w, p) -> y``: an output between ticks, without entries where nothing evaluates it then."""

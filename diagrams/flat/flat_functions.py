@@ -122,7 +122,7 @@ def trace_driven(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
     )
 
 
-def trace_exchange(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
+def trace_model_exchange(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
     """Return ``(t, x, w, p, log) -> z`` between ticks; sampled blocks put out what they did at the last tick."""
     symbols = {**make_symbols(layout), "log": ca.MX.sym("log", layout.log.total)}
 

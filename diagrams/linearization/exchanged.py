@@ -13,8 +13,8 @@ import numpy as np
 
 from ...blocks.core import Finding, FmuError, Layout
 from ...fmus.running import Derivation, DerivativeMethod, FmuLinearization, check_exchange_slopes, find_exchange_slopes
-from ..exchange import ExchangeEvaluator
 from ..flat import Evaluators, FlatDiagram
+from ..model_exchange import ModelExchangeEvaluator
 from ..results import OperatingPoint
 from ..wiring import join
 from .findings import CoarseValues, InexactDerivatives, RefutedDerivatives
@@ -27,7 +27,7 @@ KEPT = 2**20
 """Bytes of derivatives of an FMU that are kept at an operating point."""
 
 
-class PointEvaluator(ExchangeEvaluator):
+class PointEvaluator(ModelExchangeEvaluator):
     """Evaluator of one FMU at an operating point; it notes how its derivatives are computed."""
 
     def __init__(self, flat: FlatDiagram, path: str):

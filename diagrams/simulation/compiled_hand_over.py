@@ -15,7 +15,7 @@ from ..compiled import (
     HandedOver,
     HybridCode,
     MethodOptions,
-    NativeExchange,
+    NativeModelExchange,
     OwnEvent,
     Sign,
     TickCode,
@@ -38,7 +38,7 @@ def bind_loop(
     code: TickCode,
     recorder: Recorder,
     stops: Sequence[int],
-    exchange: NativeExchange | None = None,
+    exchange: NativeModelExchange | None = None,
     rest: Callable[[], int] | None = None,
 ) -> CompiledLoop:
     """Return the loop over ticks in C, bound to the numbers of a run, its plants, and the samples that it keeps."""

@@ -11,8 +11,8 @@ import numpy as np
 
 from ...blocks.core import Block, FmuRuntimeError, OptionError, SimulationError
 from ..events import Domains
-from ..exchange import ExchangedBlocks, OutsideEvents
 from ..flat import FlatDiagram, announcers
+from ..model_exchange import BlocksInModelExchange, OutsideEvents
 from ..results import Occurrence
 from ..solvers import METHODS, Method, MethodKind, Problem
 from .diagnosis import state_values
@@ -41,7 +41,7 @@ class Continuous:
         See `Diagram.simulate`.
     on_event : callable
         Called with every event that fires.
-    exchanged : ExchangedBlocks, optional
+    exchanged : BlocksInModelExchange, optional
         Blocks that are evaluated from outside.
 
     Attributes
@@ -67,7 +67,7 @@ class Continuous:
         atol: float,
         max_step: float | None,
         on_event: Callable[[Occurrence], None],
-        exchanged: ExchangedBlocks | None = None,
+        exchanged: BlocksInModelExchange | None = None,
     ):
         flat = workspace.flat
         self.workspace, self.flat, self.name, self.on_event = workspace, flat, name, on_event

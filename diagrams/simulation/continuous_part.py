@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..coupling import accept_steps, try_steps
-from ..exchange import ExchangedBlocks
+from ..model_exchange import BlocksInModelExchange
 from ..results import Occurrence
 from .continuous import Continuous
 from .workspace import Workspace
@@ -36,7 +36,7 @@ class ContinuousPart:
         The run's numbers.
     continuous : Continuous or None
         Its method, events and delays; None where nothing happens between ticks.
-    exchanged : ExchangedBlocks
+    exchanged : BlocksInModelExchange
         Model-exchange FMUs, which keep their own memory.
 
     Attributes
@@ -45,7 +45,7 @@ class ContinuousPart:
         Takes them from one instant to another, as `HybridTicks.go_between`; None where nothing happens between ticks.
     """
 
-    def __init__(self, workspace: Workspace, continuous: Continuous | None, exchanged: ExchangedBlocks):
+    def __init__(self, workspace: Workspace, continuous: Continuous | None, exchanged: BlocksInModelExchange):
         self._workspace, self._continuous, self._exchanged = workspace, continuous, exchanged
         self._events: list[Occurrence] = []
         self.go_between: Callable[[float, float], float | None] | None = None

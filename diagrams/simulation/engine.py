@@ -11,9 +11,9 @@ import numpy as np
 
 from ...blocks.core import Block, SimulationError, UnknownNameError, near
 from ...fmus.calls import FmuInstance
-from ..coupling import CoupledSteps, Links, Plant, PlantSteps, load_plants, refuse_exchanged, to_coupling
-from ..exchange import ExchangedBlock, ExchangedBlocks
+from ..coupling import CoupledSteps, Links, Plant, PlantSteps, load_plants, refuse_model_exchange, to_coupling
 from ..flat import FlatDiagram, kinds_of
+from ..model_exchange import BlocksInModelExchange, ModelExchangeBlock
 from ..results import Occurrence, OperatingPoint, Recorder, Stopped, TextSignal
 from ..solvers import solver_name
 from .change_over import ChangeOver
@@ -64,7 +64,7 @@ class Engine:
         on_event: Callable[[Occurrence], None],
     ):
         self.flat, self.name = flat, name
-        self.exchanged = ExchangedBlocks(flat)
+        self.exchanged = BlocksInModelExchange(flat)
         self.workspace = Workspace(flat, self.exchanged.evaluators)
         self.position = Position(flat.base)
         self.plants: dict[str, Plant] = {}
@@ -113,7 +113,7 @@ class Engine:
         self._change_over = ChangeOver(self.position)
         self._part = ContinuousPart(self.workspace, self.continuous, self.exchanged) if is_coupled else None
         if self._part is not None:
-            refuse_exchanged(self.coupling, {path: flat.table.blocks[path] for path in flat.outside})
+            refuse_model_exchange(self.coupling, {path: flat.table.blocks[path] for path in flat.outside})
             self.coupled = CoupledSteps(
                 flat,
                 name,
@@ -122,7 +122,7 @@ class Engine:
                 self.steps,
                 self.workspace.z,
                 self.workspace.here.w,
-                self.workspace.bind_exchange(),
+                self.workspace.bind_model_exchange(),
                 self._part,
             )
 
@@ -135,7 +135,7 @@ class Engine:
         self.exchanged.load(stack, start_time)
 
     @property
-    def loaded(self) -> dict[str, Plant | ExchangedBlock]:
+    def loaded(self) -> dict[str, Plant | ModelExchangeBlock]:
         """All that is loaded for the run, by path."""
         return {**self.plants, **self.exchanged.blocks}
 

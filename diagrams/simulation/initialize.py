@@ -15,8 +15,8 @@ import numpy as np
 from ...blocks.core import Block, LoopwrightError, NonFiniteError, SimulationError
 from ...blocks.tracing import bundle, initial_state
 from ..coupling import Links, Plant, find_fixed_point
-from ..exchange import ExchangedBlocks
 from ..flat import NONE, FlatDiagram, Instant, evaluate, evaluate_apart, indicators_of, is_true
+from ..model_exchange import BlocksInModelExchange
 from .diagnosis import START_SETTLED, inputs_text, shaped_inputs, unsettled, unsolved_start
 from .transport_delays import Delays
 from .workspace import Workspace
@@ -39,7 +39,7 @@ def initialize(
     plants: Mapping[str, Plant],
     delays: Delays | None,
     take_inputs: Callable[[], None],
-    exchanged: ExchangedBlocks,
+    exchanged: BlocksInModelExchange,
     passes_on: str,
     set_start: Callable[[Workspace], None],
 ) -> None:
@@ -79,7 +79,7 @@ class _Start:
         plants: Mapping[str, Plant],
         delays: Delays | None,
         take_inputs: Callable[[], None],
-        exchanged: ExchangedBlocks,
+        exchanged: BlocksInModelExchange,
         passes_on: str,
         set_start: Callable[[Workspace], None],
     ):

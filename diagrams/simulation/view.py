@@ -10,7 +10,7 @@ import numpy as np
 
 from ...blocks.core import brief, explain_calls
 from ..coupling import Plant
-from ..exchange import ExchangedBlock
+from ..model_exchange import ModelExchangeBlock
 from ..results import Occurrence, Stopped
 from .workspace import Workspace
 
@@ -74,7 +74,7 @@ class SimulationView:
         Every output, as ``FlatDiagram.log`` lays them out, in the ports' units.
     plants : mapping of str to Plant
         The plants that are loaded, by path.
-    exchanged : mapping of str to ExchangedBlock
+    exchanged : mapping of str to ModelExchangeBlock
         The blocks that are evaluated from outside, by path, in a run that has begun.
     """
 
@@ -84,7 +84,7 @@ class SimulationView:
     z: np.ndarray
     log: np.ndarray
     plants: Mapping[str, Plant]
-    exchanged: Mapping[str, ExchangedBlock]
+    exchanged: Mapping[str, ModelExchangeBlock]
     _position: Position = field(repr=False)
 
     def __repr__(self) -> str:
@@ -95,7 +95,7 @@ class SimulationView:
         cls,
         workspace: Workspace,
         plants: Mapping[str, Plant],
-        exchanged: Mapping[str, ExchangedBlock],
+        exchanged: Mapping[str, ModelExchangeBlock],
         position: Position,
     ) -> SimulationView:
         """Return the view of a run's numbers, plants and position."""

@@ -250,7 +250,7 @@ class Workspace:
 
         return evaluate
 
-    def bind_exchange(self) -> Callable[[float], np.ndarray]:
+    def bind_model_exchange(self) -> Callable[[float], np.ndarray]:
         """Return ``z(t)`` at ``here`` between ticks, with the outputs that sampled blocks had at the last tick."""
         log = self.log[: self.flat.log.total]
         bound = self._bind(self.flat.exchange, self.here, None, log)

@@ -3,12 +3,12 @@
 from .archive_limits import ArchiveLimits
 from .binaries import check_binary, find_binary, missing_functions
 from .description import FmuDescription, find_description, read_description
-from .exchange import ExchangeInfo
 from .faults import FmuFault, FmuFinding, FmuSeverity
 from .gathering import read_index
 from .joining import join_scalars
 from .library import SharedLibrary, read_library
 from .model import read_model
+from .model_exchange import ModelExchangeInfo
 from .repair import repair
 from .unpacking import unpack, unpack_archive, write_files
 from .variables import FmuVariable, OtherVariable, inexact
@@ -19,13 +19,13 @@ __all__ = [
     "BUILD_DESCRIPTION",
     "DESCRIPTION",
     "ArchiveLimits",
-    "ExchangeInfo",
     "FmuArchive",
     "FmuDescription",
     "FmuFault",
     "FmuFinding",
     "FmuSeverity",
     "FmuVariable",
+    "ModelExchangeInfo",
     "OtherVariable",
     "SharedLibrary",
     "check_binary",

@@ -18,11 +18,11 @@ from ..host_state import FOLDER
 from .aliases import find_aliases
 from .archive_limits import ArchiveLimits
 from .binaries import find_binary, judge_name
-from .exchange import ExchangeInfo, read_exchange
 from .faults import FmuFault, FmuFinding
 from .feedthrough import Feedthrough, feeds_through, read_feedthrough
 from .gathering import Elements, gather
 from .model import read_model
+from .model_exchange import ModelExchangeInfo, read_model_exchange
 from .negated import judge_negated, read_negated
 from .rules import KNOWN_VERSIONS, check_dimensions, unknown_version
 from .sizes import resize
@@ -110,7 +110,7 @@ class FmuDescription:
     """Limits within which it is read and unpacked."""
     findings: tuple[FmuFinding, ...] = ()
     """Faults of the archive that don't keep the FMU from running."""
-    exchange: ExchangeInfo | None = None
+    exchange: ModelExchangeInfo | None = None
     """The model-exchange interface, if there is one with a library for this platform."""
     co_simulation: bool = True
     """Whether there is a co-simulation interface; ``identifier`` and ``binary`` are else those of model exchange."""
@@ -343,7 +343,7 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
         except FmuFileError:
             flags["model_exchange"] = None
         else:
-            flags["exchange"] = read_exchange(root, model, flags["model_exchange_binary"])
+            flags["exchange"] = read_model_exchange(root, model, flags["model_exchange_binary"])
     flags["co_simulation"] = model.coSimulation is not None
     dropped, units = _dropped_attributes(root), FmuUnits({u.name: u for u in model.unitDefinitions})
     scalars, other, negated = {}, {}, read_negated(root, model)

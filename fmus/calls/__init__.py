@@ -1,12 +1,12 @@
 """FMI calls into a library that is loaded in this process."""
 
 from .bound_calls import BoundCalls, Call, ChildFace, ChildRequest
-from .exchange_instance import ExchangeInstance
 from .fmi_calls import ERROR, WARNING, FmiCalls, Log
 from .fmu_block import FmuBlock
 from .instance import FmuInstance
 from .library_functions import LibraryFunctions, exported_name, list_prototypes
 from .loaded_library import CALLS, LoadedFmu, MakeCalls
+from .model_exchange_instance import ModelExchangeInstance
 from .model_structure import is_smooth
 from .native_actions import NativeAction, NativeLook
 from .native_step import NativeStep, QuietStep, RemoteStep, SharedValues
@@ -24,7 +24,6 @@ __all__ = [
     "Call",
     "ChildFace",
     "ChildRequest",
-    "ExchangeInstance",
     "FmiCalls",
     "FmuBlock",
     "FmuInstance",
@@ -33,6 +32,7 @@ __all__ = [
     "LoadedFmu",
     "Log",
     "MakeCalls",
+    "ModelExchangeInstance",
     "NativeAction",
     "NativeLook",
     "NativeStep",

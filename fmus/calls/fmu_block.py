@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 from ...blocks.core import FmuRuntimeError
-from ..archive import ExchangeInfo, FmuDescription, FmuVariable, OtherVariable
+from ..archive import FmuDescription, FmuVariable, ModelExchangeInfo, OtherVariable
 from .step_options import StepOptions
 
 
@@ -43,7 +43,7 @@ class FmuBlock(Protocol):
         """Texts and binary data that are recorded in a run, by their ports."""
 
     @property
-    def exchange_info(self) -> ExchangeInfo | None:
+    def model_exchange_info(self) -> ModelExchangeInfo | None:
         """Its model exchange, with the dependencies that hold for it; None without one."""
 
     @property

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from ...blocks.core import FmuRuntimeError, Wanted, elements
-from ..archive import ExchangeInfo, FmuVariable
+from ..archive import FmuVariable, ModelExchangeInfo
 from .running_fmu import RunningFmu
 
 _MOVED, _SAME = 1e-4, 1e-8
@@ -27,7 +27,7 @@ def is_smooth(variable: FmuVariable) -> bool:
 
 def check_structure(
     fmu: RunningFmu,
-    exchange: ExchangeInfo,
+    exchange: ModelExchangeInfo,
     places: Mapping[str, slice],
     evaluation: Callable[[Wanted], Callable[[float, np.ndarray, np.ndarray], np.ndarray]],
     t: float,
@@ -45,7 +45,7 @@ def check_structure(
     ----------
     fmu : RunningFmu
         The instance, in Continuous-Time Mode.
-    exchange : ExchangeInfo
+    exchange : ModelExchangeInfo
         Its model structure.
     places : mapping of str to slice
         Places of all inputs in u, by port.

@@ -19,14 +19,14 @@ from ...blocks.core import (
 from ..archive import ArchiveLimits, FmuDescription, find_description, join_scalars
 from ..calls import FmuInstance, StepOptions, check_offered
 from ..isolation import Isolation, open_fmu
-from .exchange import DEPENDENCIES, INTERFACES, ExchangeMembers, choose_interface
 from .fmu_point import FmuLinearization
 from .linearization import STEP, linear_model, step_difference
+from .model_exchange_members import DEPENDENCIES, INTERFACES, ModelExchangeMembers, choose_interface
 from .replacement import check_replacement
 from .start_values import check_start, check_value, read_sized
 
 
-class Fmu(ExchangeMembers):
+class Fmu(ModelExchangeMembers):
     """FMU of FMI 1.0, 2.0 or 3.0 as a block, by co-simulation or model exchange; its inputs and outputs are ports.
 
     Outputs are attributes (``plant.position``). A port whose name is no identifier is read by index

@@ -20,8 +20,8 @@ from ..archive import FmuVariable
 from ..calls import FmuBlock, LoadedFmu, is_smooth
 from .derivation import Derivation, DerivativeMethod
 from .difference_quotients import Column, Differences, differentiate
-from .exchange import ExchangeMembers
 from .fmu_point import FmuLinearization, FmuPoint, initialize_at
+from .model_exchange_members import ModelExchangeMembers
 from .restored_point import RestoredPoint
 from .slope_check import SlopeCheck, check_slopes
 
@@ -269,7 +269,7 @@ def _differences(point: FmuPoint, instance: LoadedFmu, values: np.ndarray) -> Di
 
 
 def find_exchange_slopes(
-    block: ExchangeMembers,
+    block: ModelExchangeMembers,
     wired: Sequence[str],
     values: Callable[[np.ndarray, np.ndarray], np.ndarray],
     x: np.ndarray,
@@ -304,7 +304,7 @@ def find_exchange_slopes(
     return made
 
 
-def _states_in(block: ExchangeMembers) -> Iterator[tuple[FmuVariable, slice]]:
+def _states_in(block: ModelExchangeMembers) -> Iterator[tuple[FmuVariable, slice]]:
     """Yield the variables of the continuous states, and where they are among these."""
     about = block.description
     layout = about.layout(about.states).slices
@@ -312,7 +312,7 @@ def _states_in(block: ExchangeMembers) -> Iterator[tuple[FmuVariable, slice]]:
 
 
 def check_exchange_slopes(
-    block: ExchangeMembers,
+    block: ModelExchangeMembers,
     wired: Sequence[str],
     values: Callable[[np.ndarray, np.ndarray], np.ndarray],
     x: np.ndarray,

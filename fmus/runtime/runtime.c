@@ -8,7 +8,7 @@
 #include "remote.c"
 #include "child.c"
 #include "master.c"
-#include "exchange.c"
+#include "model_exchange.c"
 #include "problem.c"
 #include "delays.c"
 #include "methods.c"

@@ -7,7 +7,7 @@ from scipy.linalg import expm
 
 from loopwright.blocks import Block, Constant, Gain, Input, Output, State, TransferFunction, parameter
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.exchange import ExchangeEvaluator
+from loopwright.diagrams.model_exchange import ModelExchangeEvaluator
 from loopwright.fmus import Fmu, build, mass_spring_damper
 
 T = 0.05
@@ -86,8 +86,8 @@ def test_an_fmu_in_model_exchange_at_rest_is_no_integration(cache, monkeypatch):
     """Its derivatives are asked for once at each instant, whatever wires and parameters they are for."""
     monkeypatch.setattr(scipy.integrate, "solve_ivp", lambda *_, **__: pytest.fail("integrated"))
     asked = []
-    plain = ExchangeEvaluator.differentiate
-    monkeypatch.setattr(ExchangeEvaluator, "differentiate", lambda s, *a: asked.append(a[1]) or plain(s, *a))
+    plain = ModelExchangeEvaluator.differentiate
+    monkeypatch.setattr(ModelExchangeEvaluator, "differentiate", lambda s, *a: asked.append(a[1]) or plain(s, *a))
     diagram = exchanged(mass_spring_damper.build(), position=0.0)
     model = diagram.linearize()
     A, B = np.array([[0.0, 1.0], [-100.0, -1.0]]), np.array([[0.0], [1.0]])

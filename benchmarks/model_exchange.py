@@ -1,6 +1,6 @@
 """CPU time of an event in model exchange, with its search and the restart of the solver, and of a tick: docs/fmus.md.
 
-python benchmarks/exchange.py
+python benchmarks/model_exchange.py
 """
 
 import tempfile

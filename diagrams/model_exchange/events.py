@@ -7,7 +7,7 @@ from collections import deque
 
 from ...blocks.core import SimulationError
 from ..flat import FlatDiagram
-from .exchanged_blocks import ExchangedBlocks
+from .blocks_in_a_run import BlocksInModelExchange
 
 _ROUNDS = 100  # of events at one instant
 _MANY, _SPAN = 500, 1e-8  # so many instants within so many seconds (relative to 1 + |t|), as for those of indicators
@@ -20,11 +20,11 @@ class OutsideEvents:
 
     Parameters
     ----------
-    blocks : ExchangedBlocks
+    blocks : BlocksInModelExchange
         The blocks.
     """
 
-    def __init__(self, blocks: ExchangedBlocks):
+    def __init__(self, blocks: BlocksInModelExchange):
         self.flat: FlatDiagram = blocks.flat
         self._evaluators = blocks.evaluators
         self._recent = {path: deque[float](maxlen=_MANY) for path in self._evaluators}

@@ -11,8 +11,8 @@ import numpy as np
 
 from ...blocks.core import Array, Event, FmuError, FmuFileError, State
 from ...blocks.tracing import NEXT
-from ..archive import ExchangeInfo, FmuDescription, FmuVariable
-from ..calls import ExchangeInstance, StepOptions, is_smooth
+from ..archive import FmuDescription, FmuVariable, ModelExchangeInfo
+from ..calls import ModelExchangeInstance, StepOptions, is_smooth
 from ..isolation import open_fmu
 from ..platform import is_built_here
 from .port_members import PortMembers
@@ -49,7 +49,7 @@ def choose_interface(description: FmuDescription, asked: str | None, label: str)
     return asked
 
 
-class ExchangeMembers(PortMembers):
+class ModelExchangeMembers(PortMembers):
     """Members of an FMU's block that make it one of model exchange."""
 
     if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class ExchangeMembers(PortMembers):
         return self.used_interface == INTERFACES[1]
 
     @property
-    def exchange_info(self) -> ExchangeInfo | None:
+    def model_exchange_info(self) -> ModelExchangeInfo | None:
         """Model exchange as the description states it, without its dependencies where these are not to count.
 
         A state that is an output follows itself alone in any case. Other continuous outputs and derivatives may follow
@@ -121,7 +121,7 @@ class ExchangeMembers(PortMembers):
         return dependence(self, equation, NEXT)
 
     @contextmanager
-    def exchange(self, wired: Sequence[str], *, start_time: float = 0.0) -> Iterator[ExchangeInstance]:
+    def exchange(self, wired: Sequence[str], *, start_time: float = 0.0) -> Iterator[ModelExchangeInstance]:
         """Load the FMU for a run in model exchange; it is terminated and freed at the end, in any case.
 
         Parameters
@@ -131,7 +131,7 @@ class ExchangeMembers(PortMembers):
         start_time : float
             Start of the run in s.
         """
-        instance = open_fmu(ExchangeInstance, self, wired)
+        instance = open_fmu(ModelExchangeInstance, self, wired)
         try:
             instance.initialize(None, start_time=start_time)
             instance.add_note(f"it runs {self.interface_text}: the solver integrates it")
@@ -140,7 +140,7 @@ class ExchangeMembers(PortMembers):
             instance.close()
 
 
-def states_of(block: ExchangeMembers) -> dict[str, State]:
+def states_of(block: ModelExchangeMembers) -> dict[str, State]:
     """Return the continuous states as those of a block, with start values and nominal values."""
     about = block.description
     exchange = about.exchange
@@ -152,24 +152,24 @@ def states_of(block: ExchangeMembers) -> dict[str, State]:
     return {name: _state(block, about.find(name)) for name in about.states}
 
 
-def _state(block: ExchangeMembers, v: FmuVariable) -> State:
+def _state(block: ModelExchangeMembers, v: FmuVariable) -> State:
     start = block.start.get(v.name, v.start)
     value = np.zeros(v.shape) if start is None else np.broadcast_to(np.asarray(start, dtype=float), v.shape)
     return State(v.unit, v.description, shape=v.shape, start=np.array(value), name=v.name)
 
 
-def events_of(block: ExchangeMembers) -> dict[str, Event]:
+def events_of(block: ModelExchangeMembers) -> dict[str, Event]:
     """Return one event for each indicator; a change of domain in both directions fires it."""
     exchange = block.description.exchange
     return {name: Event(name=name) for name in exchange.indicators} if exchange is not None else {}
 
 
-def dependence(block: ExchangeMembers, equation: str, rates: str) -> dict[str, np.ndarray]:
+def dependence(block: ModelExchangeMembers, equation: str, rates: str) -> dict[str, np.ndarray]:
     """Return which entries of an output, or of the derivatives (``rates``), depend on which of the states and inputs.
 
     The states are under ``"x"``, inputs under their ports. Discrete inputs and parameters act at events alone.
     """
-    about, exchange = block.description, block.exchange_info
+    about, exchange = block.description, block.model_exchange_info
     assert exchange is not None
     n = exchange.state_count
     states = [about.find(name) for name in about.states]

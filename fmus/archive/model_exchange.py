@@ -16,7 +16,7 @@ Key = tuple[str, int]
 
 
 @dataclass(frozen=True, eq=False)
-class ExchangeInfo:
+class ModelExchangeInfo:
     """Model-exchange interface of an FMU (FMI 2.0, 2.2.8 and 3.3.1; FMI 3.0, 2.4.8 and 3.4)."""
 
     identifier: str
@@ -72,7 +72,7 @@ def _keys(variable: FmuVariable) -> list[Key]:
     return keys if len(keys) == variable.size else keys * variable.size
 
 
-def read_exchange(root: ET.Element, model: Any, binary: str) -> ExchangeInfo:
+def read_model_exchange(root: ET.Element, model: Any, binary: str) -> ModelExchangeInfo:
     """Return what a description says of model exchange.
 
     Parameters
@@ -94,7 +94,7 @@ def read_exchange(root: ET.Element, model: Any, binary: str) -> ExchangeInfo:
         return given.get(name) in ("true", "1")
 
     completes = not flag("completedIntegratorStepNotNeeded") if two else flag("needsCompletedIntegratorStep")
-    return ExchangeInfo(
+    return ModelExchangeInfo(
         identifier=given.get("modelIdentifier", ""),
         binary=binary,
         can_save=flag(f"canGetAndSet{state}"),

@@ -10,12 +10,12 @@ import numpy as np
 
 from ...blocks.core import FmuRuntimeError, LoopwrightError, SimulationError
 from ..flat import FlatDiagram
-from .evaluator import Exchangeable, ExchangedBlock, ExchangeEvaluator, Look
+from .evaluator import HasModelExchange, Look, ModelExchangeBlock, ModelExchangeEvaluator
 
 _SETTLED = 1e-13  # relative change of a state between two passes at the start, a few hundred ulps
 
 
-class ExchangedBlocks:
+class BlocksInModelExchange:
     """All blocks of a run that are evaluated from outside, with their events.
 
     Attributes
@@ -26,8 +26,8 @@ class ExchangedBlocks:
 
     def __init__(self, flat: FlatDiagram):
         self.flat = flat
-        self.evaluators = {path: ExchangeEvaluator(flat, path) for path in flat.outside}
-        self.blocks: dict[str, ExchangedBlock] = {}
+        self.evaluators = {path: ModelExchangeEvaluator(flat, path) for path in flat.outside}
+        self.blocks: dict[str, ModelExchangeBlock] = {}
         """The blocks that are loaded, by path."""
 
     def __bool__(self) -> bool:
@@ -37,7 +37,7 @@ class ExchangedBlocks:
         """Load the blocks for a run from a time in s on; ``stack`` unloads them."""
         for path, evaluator in self.evaluators.items():
             made: Any = self.flat.table.blocks[path]
-            block: Exchangeable = made
+            block: HasModelExchange = made
             try:
                 wired = [port for port in made.inputs if (path, port) in self.flat.table.wires]
                 self.blocks[path] = stack.enter_context(block.exchange(wired, start_time=start_time))

@@ -1,6 +1,6 @@
 """A block that is evaluated from outside in a run, such as an FMU in model exchange, and its evaluator.
 
-An `ExchangedBlock` is loaded for a run, as a plant is. An `ExchangeEvaluator` lets the stages of the diagram's
+An `ModelExchangeBlock` is loaded for a run, as a plant is. An `ModelExchangeEvaluator` lets the stages of the diagram's
 functions call it; it is there before the block is loaded, as the functions are bound first.
 """
 
@@ -22,8 +22,8 @@ _STEP = float(np.cbrt(np.finfo(float).eps))  # of a difference, relative to the 
 Values = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
 
 
-class ExchangedBlock(Protocol):
-    """A block whose equations a run evaluates; see `loopwright.fmus.calls.ExchangeInstance`.
+class ModelExchangeBlock(Protocol):
+    """A block whose equations a run evaluates; see `loopwright.fmus.calls.ModelExchangeInstance`.
 
     States and inputs are flat, in the order of the block's. A protocol: the instances come from the room `fmus`, which
     this sub-package doesn't know, or from users.
@@ -108,10 +108,10 @@ class ExchangedBlock(Protocol):
         """Go to the state of such bytes."""
 
 
-class Exchangeable(Protocol):
+class HasModelExchange(Protocol):
     """A block whose class says ``evaluated_outside``: an `Fmu`, or one that a user has written."""
 
-    def exchange(self, wired: Sequence[str], *, start_time: float) -> AbstractContextManager[ExchangedBlock]:
+    def exchange(self, wired: Sequence[str], *, start_time: float) -> AbstractContextManager[ModelExchangeBlock]:
         """Load it for a run; see `loopwright.blocks.Block`."""
 
 
@@ -130,7 +130,7 @@ class Look(Enum):
     """Events may act there."""
 
 
-class ExchangeEvaluator:
+class ModelExchangeEvaluator:
     """Evaluator of one block in a run: for the stages, and for the events."""
 
     def __init__(self, flat: FlatDiagram, path: str):
@@ -139,7 +139,7 @@ class ExchangeEvaluator:
         """Purpose of the next evaluations of `JUMP`."""
         self._outputs = frozenset(flat.checked.traced[path].outputs)
         self._count = len(flat.table.blocks[path].events)
-        self._loaded: ExchangedBlock | None = None
+        self._loaded: ModelExchangeBlock | None = None
         self._calls: dict[tuple[str, ...], Values] = {}
         self.u = np.zeros(0)
         """The inputs at the last look at an instant."""
@@ -149,13 +149,13 @@ class ExchangeEvaluator:
         """Whether the block wants an event at the instant that was accepted."""
 
     @property
-    def block(self) -> ExchangedBlock:
+    def block(self) -> ModelExchangeBlock:
         """The block, once it is loaded."""
         if self._loaded is None:
             raise no_evaluator(self.path)
         return self._loaded
 
-    def load(self, block: ExchangedBlock) -> None:
+    def load(self, block: ModelExchangeBlock) -> None:
         """Take the block of a run."""
         self._loaded = block
 

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from ...blocks.core import EvaluationVectors, FmuError, FmuRuntimeError, Layout, Wanted
-from ..archive import ExchangeInfo, FmuVariable
+from ..archive import FmuVariable, ModelExchangeInfo
 from ..host_state import HostState
 from .bound_calls import DISCARD, ERROR, FATAL, WARNING, BoundCalls, Call
 from .evaluation import DirectEvaluation, Evaluation, Vector, call_actions
@@ -34,7 +34,7 @@ _FORMAT = StateFormat(b"lw-fmu-x", "dd", "state of an FMU in model exchange", "t
 """State in model exchange: its time and the time of the next time event, in s; all inputs go before the FMU's bytes."""
 
 
-class ExchangeInstance(RunningFmu):
+class ModelExchangeInstance(RunningFmu):
     """Loaded FMU whose continuous states a solver integrates.
 
     After `begin` it is in Continuous-Time Mode. There `evaluation` sets time, states and continuous inputs and gets
@@ -45,7 +45,7 @@ class ExchangeInstance(RunningFmu):
 
     Attributes
     ----------
-    about : ExchangeInfo
+    about : ModelExchangeInfo
         Model exchange as the FMU's description states it.
     next_time : float
         Time of its next time event in s, infinite without one.
@@ -55,8 +55,8 @@ class ExchangeInstance(RunningFmu):
 
     def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):
         super().__init__(block, wired, model_exchange=True, make_calls=make_calls)
-        assert block.exchange_info is not None
-        self.about: ExchangeInfo = block.exchange_info
+        assert block.model_exchange_info is not None
+        self.about: ModelExchangeInfo = block.model_exchange_info
         self._ports = dict(block.input_variables)
         self._places = Layout.of({port: v.shape for port, v in self._ports.items()}).slices
         self._smooth = {port: v for port, v in self.inputs.items() if is_smooth(v)}
