@@ -31,6 +31,7 @@ from .loop import CompiledLoop, NewtonOptions, Outcome, ReturnReason
 from .native_tick import bind_call
 from .remote import REFUSED, TAKEN_BY_PYTHON, UNDER_WAY, PythonStep, compile_other_side
 from .staged import NativeModelExchange, OwnEvent
+from .transport_delays import Delays, delays_of
 from .watch import Fired, Pile
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "Code",
     "CompiledHybrid",
     "CompiledLoop",
+    "Delays",
     "Fired",
     "FusedPlant",
     "HandedOver",
@@ -68,6 +70,7 @@ __all__ = [
     "compile_hybrid",
     "compile_other_side",
     "compile_ticks",
+    "delays_of",
     "find_code_obstacle",
     "find_obstacle",
     "fuse",

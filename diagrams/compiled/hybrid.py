@@ -14,7 +14,6 @@ from ..events import Domains
 from ..flat import NONE, FlatDiagram, StepTable, TickPattern
 from ..solvers import METHODS, MethodKind
 from .bound_functions import CALL, at
-from .delays import NativeDelays, PastInputs
 from .hybrid_code import Between, HybridCode
 from .hybrid_structures import HybridStructure, MethodStructure, ProblemStructure, SpanStructure
 from .library_method import LibraryMethod, StepFailure
@@ -24,6 +23,7 @@ from .rate_differences import RateDifferences
 from .runtime import load_runtime
 from .staged import NativeModelExchange
 from .staged_functions import Staged, StagedSlopes
+from .transport_delays import Delays, NativeDelays
 from .watch import Fired, Pile, Watch
 
 _SECONDS = 0.05  # of a call, about, after which Ctrl-C has its turn
@@ -189,7 +189,7 @@ class CompiledHybrid:
     accepts : {0, 1, 2}
         Whether blocks are to be evaluated after every step (1): they remember something, have guards, may fail, or FMUs
         read them; or after every one that ends between ticks (2).
-    delays : PastInputs, optional
+    delays : Delays, optional
         The memory of transport delays, where there are some; their inputs are kept within ``tolerances``, relative and
         absolute.
     drain : callable
@@ -212,7 +212,7 @@ class CompiledHybrid:
         accepts: int,
         loops: NewtonOptions | None = None,
         exchange: NativeModelExchange | None = None,
-        delays: PastInputs | None = None,
+        delays: Delays | None = None,
         tolerances: tuple[float, float] = (0.0, 0.0),
         drain: Callable[[], None],
         coupled: bool = False,

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Block, FmuRuntimeError, OptionError, SimulationError
+from ..compiled import delays_of
 from ..events import Domains
 from ..flat import FlatDiagram, announcers
 from ..model_exchange import BlocksInModelExchange, OutsideEvents
@@ -18,7 +19,6 @@ from ..solvers import METHODS, Method, MethodKind, Problem
 from .diagnosis import state_values
 from .initialize import domains_from_left
 from .solver_setup import absolute_tolerances, find_late, longest_step, scales_of, time_scale_of
-from .transport_delays import delays_of
 from .workspace import Workspace
 
 _AT_ONCE = 1e-6

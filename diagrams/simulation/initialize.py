@@ -14,11 +14,11 @@ import numpy as np
 
 from ...blocks.core import Block, LoopwrightError, NonFiniteError, SimulationError
 from ...blocks.tracing import bundle, initial_state
+from ..compiled import Delays
 from ..coupling import Links, Plant, find_fixed_point
 from ..flat import NONE, FlatDiagram, Instant, evaluate, evaluate_apart, indicators_of, is_true
 from ..model_exchange import BlocksInModelExchange
 from .diagnosis import START_SETTLED, inputs_text, shaped_inputs, unsettled, unsolved_start
-from .transport_delays import Delays
 from .workspace import Workspace
 
 _PLAIN_PASSES = 10

@@ -1,6 +1,6 @@
 /* Transport delays in continuous time: their inputs, kept as polynomials over the steps of the method.
 
-   The rules are those of diagrams/simulation/transport_delays.py, which says why: no step is longer than the shortest
+   The rules are those of diagrams/compiled/transport_delays.py, which says why: no step is longer than the shortest
    delay, so that what comes out is a known function of time; each step is kept as the polynomial through the inputs at
    Chebyshev points, halved until that is as exact as the tolerance asks for; a discontinuity that goes in comes out a
    delay later, and the method lands there. The caller enlarges the memory between two calls. */

@@ -10,7 +10,9 @@ some of them the solver need not land there any more. C keeps the steps (`fmus/r
 
 from __future__ import annotations
 
+import ctypes
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,8 @@ import numpy as np
 from ...blocks.core import ShapeError, is_before
 from ..flat import FlatDiagram
 from ..wiring import join
+from .bound_functions import TickStructure, at
+from .hybrid_structures import DelaysStructure
 
 _NODES = 9
 _ROOM = 2048  # pieces and discontinuities that there is memory for, at first
@@ -153,6 +157,77 @@ def barycentric(delays: Delays, part: float, samples: np.ndarray) -> np.ndarray:
 
 def _same(a: float, b: float) -> bool:
     return not is_before(a, b) and not is_before(b, a)
+
+
+class NativeDelays:
+    """Transport delays bound to the numbers of a run, whose memory of past inputs C reads and writes.
+
+    Parameters
+    ----------
+    past : Delays
+        The memory.
+    driven : TickStructure
+        Evaluates the inputs z at a trial.
+    z : ndarray
+        Its result.
+    here, trial : ndarray
+        The vector w of the run, and that of trials.
+    tolerances : pair of float
+        Relative and absolute tolerance with which inputs are kept.
+    """
+
+    def __init__(
+        self,
+        past: Delays,
+        driven: TickStructure,
+        z: np.ndarray,
+        here: np.ndarray,
+        trial: np.ndarray,
+        tolerances: tuple[float, float],
+    ):
+        self._past, self._kept = past, list[Any]([driven, z, here, trial])
+        self.structure = DelaysStructure(
+            n=len(past.taus),
+            distinct=len(set(past.taus)),
+            tau=self._own(past.taus),
+            different=self._own(sorted(set(past.taus))),
+            input=self._own([s.start for s in past.inputs], np.int64),
+            output=self._own([s.start for s in past.outputs], np.int64),
+            size=self._own([s.stop - s.start for s in past.inputs], np.int64),
+            start=at(past.start),
+            node=self._own(past.nodes),
+            weight=self._own(past.weights),
+            inputs=z.size,
+            outputs=here.size,
+            here=at(here),
+            trial=at(trial),
+            driven=driven,
+            z=at(z),
+            found=self._own(np.zeros(z.size)),
+            rtol=tolerances[0],
+            atol=tolerances[1],
+            smoothed=past.smoothed,
+        )
+
+    def _own(self, values: Sequence[Any] | np.ndarray, kind: type = float) -> int | None:
+        self._kept.append(np.array(values, dtype=kind))
+        return at(self._kept[-1])
+
+    @property
+    def address(self) -> int:
+        """Address of the delays as C knows them."""
+        return ctypes.addressof(self.structure)
+
+    def hand_over(self, t: float) -> None:
+        """Let C continue from a time in s."""
+        past, of = self._past, self.structure
+        past.make_room(t)
+        of.pieces, of.edges = at(past.pieces), at(past.edges)
+        of.capacity, of.room, of.count, of.noted = len(past.pieces), len(past.edges), past.count, past.noted
+
+    def take_back(self) -> None:
+        """Let Python continue from where C has come to."""
+        self._past.count, self._past.noted = self.structure.count, self.structure.noted
 
 
 def delays_of(flat: FlatDiagram) -> Delays | None:
