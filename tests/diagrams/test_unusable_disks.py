@@ -186,7 +186,7 @@ def test_a_user_without_a_home_folder(cache, monkeypatch, tmp_path):
         monkeypatch.delenv(name, raising=False)
     if cache is not None:
         monkeypatch.setenv("LOOPWRIGHT_CACHE", cache)
-    with pytest.raises(LoopwrightError, match=r"^found no home folder for the cache, .* to a folder of your own\.$"):
+    with pytest.raises(LoopwrightError, match=r"^found no home folder for the cache, .* to your own folder\.$"):
         load_compiled(SOURCE + "/* no home */")
     assert list(tmp_path.iterdir()) == []  # no folder named "~"
 

@@ -91,7 +91,7 @@ def test_times_and_values_that_do_not_fit_are_refused(times, values):
 
 @pytest.mark.parametrize("source", [Step(times=1, values=1, unit="N"), Constant(value=1.0, unit="N")], ids=["s", "c"])
 def test_the_unit_of_a_source_is_checked(source):
-    with pytest.raises(UnitError, match=r"\.y is in m; .*\.y beside it is in N"):
+    with pytest.raises(UnitError, match=r"\.y is in m; .*\.y next to it is in N"):
         Diagram("units", Sum()(source, Constant(value=1.0, unit="m", name="other")))
 
 

@@ -53,7 +53,7 @@ def test_a_users_contact_gets_its_limits_their_trial_and_figures(tmp_path):
         kx = factor * k10
         roots = np.roots([M * TAU, M + b * TAU, kx * TAU + DRAG + b * (1 + SHARE), kx * (1 + SHARE)])
         assert tried.value == pytest.approx(roots.real.max(), abs=tried.tolerance)
-        assert "beside the plant, in the solver" in tried.confirmed_by
+        assert "next to the plant, in the solver" in tried.confirmed_by
     (section,) = (s for s in report.sections if s.key == "contact")
     assert [plot.key for plot in section.sections[0].plots] == ["contact_admittance_hand", "contact_map_hand"]
     page = (tmp_path / "cart.html").read_text(encoding="utf-8")

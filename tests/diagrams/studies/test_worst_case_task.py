@@ -218,7 +218,7 @@ def folder(tmp_path, monkeypatch):
     ("files", "arguments", "message"),
     [
         ({"w.toml": TABLE.replace('"u"', '"v"')}, ["--worst-case", "w.toml"], "w.toml, line 2: worst_case.loop: there"),
-        ({"w.toml": "ms = 2"}, ["--worst-case", "w.toml"], "w.toml, line 1: ms: found it beside [worst_case]"),
+        ({"w.toml": "ms = 2"}, ["--worst-case", "w.toml"], "w.toml, line 1: ms: found it next to [worst_case]"),
         ({"w.toml": ""}, ["--worst-case", "w.toml"], "w.toml: found no table [worst_case]"),
         ({}, ["--worst-case", "w.toml"], "--worst-case: 'w.toml' can't be read"),
         (
