@@ -50,7 +50,7 @@ class Continuous:
         The method of integration.
     domains : Domains or None
         The domains of the indicators; None without events.
-    delays : PastInputs or None
+    delays : Delays or None
         Transport delays; None without any.
     outside : OutsideEvents or None
         Events of blocks that are evaluated from outside; None without such blocks.
