@@ -229,6 +229,7 @@ def take_apart(
         entry = find_entry(diagram, point, ports, signal, wires, outputs, options)
     injected = outputs if entry is None or inside else [*outputs, entry.name]
     model = linearize(diagram, point, inputs=injected, outputs=sources, openings=outputs, **options)
+    model.refuse_delays("a contact")
     _check_held(diagram, point, path, model, outputs, sources)
     m = _linearize_plant(diagram, point, path)
     _check_rest(path, m, model)

@@ -83,6 +83,7 @@ def find_entry(
         if port[0] in find_upstream(flat, signal.port[0], ports.plant):
             before = find_signal(flat, f"{source.block}.{source.port}")
             model = linearize(diagram, point, inputs=before.name, outputs=signal.name, openings=list(opened), **options)
+            model.refuse_delays("a contact")
             leads, unchanged = _follow(model)
             if leads:
                 return signal if unchanged and one_way else before

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from .delay_matrices import DelayMatrices
 from .delayed_hold import delayed_hold, delayed_hold_margin
-from .disk_margins import DiskMargin, disk_margin, loop_at, mimo_disk_margin, mu_bound
+from .delayed_realization import DelayedRealization, realize
+from .disk_margins import DiskMargin, disk_margin, loop_at, mimo_disk_margin
 from .loop_margins import GainCrossover, Margins, PhaseCrossover, find_disk_frequency, margins
 from .margin_slopes import MarginSlope, margin_slopes
 from .measured_margins import MeasuredMargins, measured_margins, read_frequency_data
@@ -20,8 +22,11 @@ from .sampled_design import SampledDesign, sampled_gains, sampled_poles
 from .scan_refine_confirm import first_largest, order_key, refine_sign_change
 from .sensitivities import GangOfFour, complementary, gang_of_four, sensitivity
 from .state_space import FourMatrices, advance_held, hold_inputs, read_matrices
+from .structured_value import mu_bound
 
 if TYPE_CHECKING:
+    from .delayed_system import DelayedSystem as DelayedSystem
+    from .loop_transfer import DelayedLoop as DelayedLoop
     from .loop_transfer import LoopTransfer as LoopTransfer
 
 
@@ -32,10 +37,26 @@ def loop_class() -> type[LoopTransfer]:
     return LoopTransfer
 
 
+def delayed_loop_class() -> type[DelayedLoop]:
+    """Return `DelayedLoop`, loaded when the first one is made."""
+    from .loop_transfer import DelayedLoop
+
+    return DelayedLoop
+
+
+def delayed_system_class() -> type[DelayedSystem]:
+    """Return `DelayedSystem`, loaded when the first one is made."""
+    from .delayed_system import DelayedSystem
+
+    return DelayedSystem
+
+
 __all__ = [
     "MARK",
     "Comparison",
     "Confirmation",
+    "DelayMatrices",
+    "DelayedRealization",
     "DiskMargin",
     "FourMatrices",
     "GainCrossover",
@@ -56,6 +77,8 @@ __all__ = [
     "complementary",
     "delayed_hold",
     "delayed_hold_margin",
+    "delayed_loop_class",
+    "delayed_system_class",
     "disk_margin",
     "find_disk_frequency",
     "find_hidden_unstable",
@@ -76,6 +99,7 @@ __all__ = [
     "place",
     "read_frequency_data",
     "read_matrices",
+    "realize",
     "refine_sign_change",
     "relative_difference",
     "sampled_gains",

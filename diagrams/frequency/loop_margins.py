@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, explain_calls, kinds, on_one_thread
+from .delayed_margins import ByArgument
+from .delayed_realization import DelayedRealization, realize
 from .loop_scan import Crossing, LoopScan, Peak
 from .margin_analysis import EIGENVALUES, MarginFinder, StabilityMargins
 from .number import Confirmation, Number, carries_findings
@@ -58,7 +60,8 @@ class Margins(StabilityMargins):
     stable : bool
         Whether all of `closed_loop_poles` are stable. Hidden modes are not among them: see `hidden_unstable`.
     gain_crossovers, phase_crossovers : tuple
-        All crossovers by rising frequency; phase crossovers also at 0, at π/T and at infinity.
+        All crossovers by rising frequency; phase crossovers also at 0, at π/T and at infinity. With delays there are
+        infinitely many phase crossovers: those with the smaller |L| are left out.
     gain_margin_low, gain_margin_high : Number
         Largest factor below 1, and smallest above 1, on L that ends stability; 0 and infinity where there is none.
     phase_margin_deg : Number
@@ -76,7 +79,8 @@ class Margins(StabilityMargins):
     bandwidth : Number
         Lowest frequency at which |T| falls below 1/√2 (3.0103 dB) of its value at low frequency.
     closed_loop_poles : tuple of complex
-        In the s plane (continuous) or the z plane (sampled). Multiple poles scatter, as ε^(1/multiplicity).
+        In the s plane (continuous) or the z plane (sampled). Multiple poles scatter, as ε^(1/multiplicity). With delays
+        there are infinitely many: those far to the left are left out, and ``stable`` doesn't hang on their number.
     hidden_poles : tuple of complex
         Poles that are not controllable or not observable in the loop; none of the numbers above contains them.
     hidden_unstable : tuple of complex
@@ -129,7 +133,8 @@ def margins(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Margins
     Parameters
     ----------
     loop : control.StateSpace
-        L with S = 1/(1 + L): continuous (dt = 0) or sampled (dt = T). It may have poles at s = 0 or z = 1, and
+        L with S = 1/(1 + L): continuous (dt = 0), with delays or without, or sampled (dt = T).
+        It may have poles at s = 0 or z = 1, and
         unstable ones. A transfer function is realized first, in powers of z − 1 where it is sampled: the margins
         are those of its coefficients as they were given, whose rounding the tolerances count.
     delay : int
@@ -152,7 +157,7 @@ def margins(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Margins
     >>> round(found.phase_margin_deg.value, 4), round(9 * found.gain_margin_low.value, 9)
     (71.2498, 1.0)
     """
-    r = Realization.of(loop, delay=delay)
+    r = realize(loop, delay=delay)
     if r.D.shape != (1, 1):
         raise ParameterError(
             f"found a loop with {r.D.shape[1]} inputs and {r.D.shape[0]} outputs; expected one of each. "
@@ -181,15 +186,62 @@ def _constant_loop_error(value: float, findings: tuple[Finding, ...]) -> Paramet
     )
 
 
+class ByEigenvalues:
+    """The scan of a loop without delays, and confirmations by eigenvalues of its matrices."""
+
+    stability = EIGENVALUES
+    late = "encirclements of 1 + L exp(−sτ)"
+
+    def __init__(self, r: Realization):
+        self.r, self.scan, self.floor = r, LoopScan(r), 0.0
+
+    def count_encirclements(self) -> int:
+        """Return the clockwise encirclements of −1, confirmed."""
+        return count_encirclements(self.r, self.scan.features).encirclements
+
+    def gain_at_infinity(self) -> float:
+        """Return |L| at infinite frequency."""
+        return abs(float(self.r.D[0, 0]))
+
+    def is_stable_late(self, tau: float) -> bool:
+        """Whether the closed loop of a continuous loop is stable with a delay in series."""
+        features = self.scan.features
+        return winding_number(self.r, features, delay=tau) + features.unstable_poles() == 0
+
+    def confirm_crossing(self, c: Crossing, factor: complex, name: str) -> str:
+        """Confirm that the loop, multiplied by this factor, has a closed-loop pole at the crossing's frequency."""
+        return _confirm_crossing(self.r, c, factor, name)
+
+    def confirm_peak(self, a: float, b: float, peak: Peak, name: str) -> str:
+        """Confirm the largest |(a + b L)/(1 + L)|."""
+        return confirm_peak(self.r, a, b, peak.value, name)
+
+    def confirm_bandwidth(self, omega: float, level: float) -> str:
+        """Confirm the lowest frequency at which |T| falls to a level."""
+        found = find_level_frequencies(self.r, 0.0, 1.0, level)
+        if found is None:
+            return "the frequency response only: |T| is above the level at the highest frequency"
+        if not len(found) or np.min(np.abs(found - omega)) > 1e-3 * omega:
+            raise ConfirmationError(
+                f"found {omega:.12g} rad/s, but the Hamiltonian has the level of |T| at {found!r} rad/s; expected it "
+                "at the same frequency. Look at closed_loop_poles: the realization may be ill-conditioned.",
+                block="bandwidth",
+            )
+        return "Hamiltonian eigenvalues: |T| falls to 1/√2 of its low-frequency value within 0.1 % of this"
+
+
 class _LoopMarginFinder(MarginFinder[Margins]):
     """A scanned loop; each ``_find_…`` computes some of the margins and confirms them."""
 
     result = Margins
 
-    def __init__(self, r: Realization, skew: float):
+    def __init__(self, r: Realization | DelayedRealization, skew: float):
         super().__init__(r)
-        self.skew, self.scan = skew, LoopScan(r)
-        self.gain, self.phase = self.scan.find_gain_crossovers(), self.scan.find_phase_crossovers()
+        self.by = ByArgument(r) if isinstance(r, DelayedRealization) else ByEigenvalues(r)
+        self.eigenvalues = self.by.stability
+        self.skew, self.scan = skew, self.by.scan
+        self.gain = self.scan.find_gain_crossovers()
+        self.phase = [c for c in self.scan.find_phase_crossovers() if abs(c.L) >= self.by.floor]
 
     def find_numbers(self) -> dict[str, Number]:
         return {
@@ -200,13 +252,13 @@ class _LoopMarginFinder(MarginFinder[Margins]):
         }
 
     def describe(self) -> dict[str, Any]:
-        r, features = self.r, self.scan.features
+        r = self.r
         try:
-            encirclements = count_encirclements(r, features).encirclements
+            encirclements = self.by.count_encirclements()
         except ConfirmationError:  # of an unstable loop a pole may lie on the limit: the curve passes through −1
             if not self.unstable:
                 raise
-            encirclements = self.unstable - features.unstable_poles()
+            encirclements = int(self.unstable - self.scan.features.unstable_poles())
         return {
             "gain_crossovers": tuple(self._make_gain_crossover(c) for c in self.gain),
             "phase_crossovers": tuple(self._make_phase_crossover(c) for c in self.phase),
@@ -220,14 +272,14 @@ class _LoopMarginFinder(MarginFinder[Margins]):
         return Number(c.omega, "rad/s", 0.0 if ends else c.tolerance * c.omega, how)
 
     def _make_gain_crossover(self, c: Crossing) -> GainCrossover:
-        how = _confirm_crossing(self.r, c, -1 / c.L, "gain_crossover")
+        how = self.by.confirm_crossing(c, -1 / c.L, "gain_crossover")
         return GainCrossover(
             self._frequency(c, how), Number(_missing_phase(c), "deg", 2 * np.degrees(c.tolerance), how)
         )
 
     def _make_phase_crossover(self, c: Crossing) -> PhaseCrossover:
         k = -1 / c.L.real
-        how = _confirm_crossing(self.r, c, k, "phase_crossover")
+        how = self.by.confirm_crossing(c, k, "phase_crossover")
         return PhaseCrossover(self._frequency(c, how), Number(k, "1", k * 2 * c.tolerance, how))
 
     def _find_gain_margins(self) -> dict[str, Number]:
@@ -247,7 +299,7 @@ class _LoopMarginFinder(MarginFinder[Margins]):
             return self.make_phase_margin(np.inf, 0.0)
         margin, c = min(((abs(_missing_phase(c)), c) for c in self.gain), key=lambda pair: pair[0])
         if margin > 180 - 1e-6:  # L = 1: both directions have the same limit
-            return Number(180.0, "deg", 1e-6, _confirm_crossing(self.r, c, -1 / c.L, "phase_margin_deg"))
+            return Number(180.0, "deg", 1e-6, self.by.confirm_crossing(c, -1 / c.L, "phase_margin_deg"))
         others = [abs(_missing_phase(o)) for o in self.gain if o is not c]
         return self.make_phase_margin(margin, 2 * np.degrees(c.tolerance), others=others)
 
@@ -272,21 +324,15 @@ class _LoopMarginFinder(MarginFinder[Margins]):
 
     def _find_continuous_delay(self, lags: dict[Crossing, float], limits: list[tuple[float, float]]) -> Number:
         """Return the delay margin in s of a continuous loop, confirmed by the encirclements of 1 + L e^(−sτ)."""
-        r, features = self.r, self.scan.features
-        if abs(r.D[0, 0]) >= 1:
+        if self.by.gain_at_infinity() >= 1:
             return Number(0.0, "s", 0.0, "|L| ≥ 1 at infinite frequency: any delay has poles beyond the limit")
         if not limits:
             return Number(np.inf, "s", 0.0, "|L| < 1 at all frequencies: no delay matters")
-        unstable = features.unstable_poles()
-
-        def stable(tau: float) -> bool:
-            return winding_number(r, features, delay=tau) + unstable == 0
-
         tau, error = limits[0]
         others = [(lag + 2 * np.pi * k) / c.omega for c, lag in lags.items() for k in range(50)]
         others = [o for o in others if o != tau]
-        how = "encirclements of 1 + L exp(−sτ)"
-        return number_of_limit("delay_margin_s", tau, "s", tau * error, stable, how, others=others)
+        name, how = "delay_margin_s", self.by.late
+        return number_of_limit(name, tau, "s", tau * error, self.by.is_stable_late, how, others=others)
 
     def _confirm_samples(self, n: float, lags: dict[Crossing, float]) -> str:
         """Confirm a margin by the number of unstable poles with the whole samples next to it; return the computation.
@@ -340,12 +386,12 @@ class _LoopMarginFinder(MarginFinder[Margins]):
         s, t, disk = self.scan.find_peak(1, 0), self.scan.find_peak(0, 1), self.scan.find_peak(upper, lower)
         found = {}
         for name, peak, (a, b) in (("ms", s, (1.0, 0.0)), ("mt", t, (0.0, 1.0))):
-            how = confirm_peak(self.r, a, b, peak.value, name)
+            how = self.by.confirm_peak(a, b, peak, name)
             found[name] = Number(peak.value, "1", peak.value * self._error(peak, t), how)
             found[name + "_frequency"] = Number(peak.omega, "rad/s", *self._tolerate(peak, how))
         ms = found["ms"]
         found["modulus_margin"] = Number(1 / ms.value, "1", ms.tolerance / ms.value**2, ms.confirmed_by)
-        how = confirm_peak(self.r, upper, lower, disk.value, "disk_margin")
+        how = self.by.confirm_peak(upper, lower, disk, "disk_margin")
         found["disk_margin"] = Number(1 / disk.value, "1", self._error(disk, t) / disk.value, how)
         return {**found, "bandwidth": self._find_bandwidth()}
 
@@ -365,25 +411,15 @@ class _LoopMarginFinder(MarginFinder[Margins]):
         omega = self.scan.find_fall_below(level) if level > 0 else np.nan
         if np.isnan(omega):
             return Number(omega, "rad/s", np.nan, "T vanishes at low frequency")
-        found = find_level_frequencies(self.r, 0.0, 1.0, level)
         if np.isinf(omega):
             return Number(omega, "rad/s", 0.0, "the response: |T| never falls below 1/√2 of its low-frequency value")
-        if found is None:
-            how = "the frequency response only: |T| is above the level at the highest frequency"
-        elif not len(found) or np.min(np.abs(found - omega)) > 1e-3 * omega:
-            raise ConfirmationError(
-                f"found {omega:.12g} rad/s, but the Hamiltonian has the level of |T| at {found!r} rad/s; expected it "
-                "at the same frequency. Look at closed_loop_poles: the realization may be ill-conditioned.",
-                block="bandwidth",
-            )
-        else:
-            how = "Hamiltonian eigenvalues: |T| falls to 1/√2 of its low-frequency value within 0.1 % of this"
-        return Number(omega, "rad/s", 1e-10 * omega, how)
+        return Number(omega, "rad/s", 1e-10 * omega, self.by.confirm_bandwidth(omega, level))
 
 
-def find_disk_frequency(r: Realization, skew: float = 0.0) -> float:
+def find_disk_frequency(r: Realization | DelayedRealization, skew: float = 0.0) -> float:
     """Return the frequency in rad/s at which |S + (σ − 1)/2| is largest: that of the disk margin."""
-    return float(LoopScan(r).find_peak((1 + skew) / 2, -(1 - skew) / 2).omega)
+    scan = ByArgument(r).scan if isinstance(r, DelayedRealization) else LoopScan(r)
+    return float(scan.find_peak((1 + skew) / 2, -(1 - skew) / 2).omega)
 
 
 def _missing_phase(c: Crossing) -> float:

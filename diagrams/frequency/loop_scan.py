@@ -4,19 +4,52 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
 from .poles_and_zeros import SIDES, Features
-from .realization import Realization
 from .scan_refine_confirm import refine_sign_change
+
+if TYPE_CHECKING:
+    from .realization import Realization
 
 Function = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """From L and dL/d(log ω) to a value and its slope over log ω."""
 PER_DECADE = 40
 """Frequencies of a scan, besides those around poles and zeros."""
+TURNS_MATTER = 0.3
+"""|L| below which the turns that a delay makes don't matter for the encirclements of −1."""
 POLISHED = 20
 """Number of candidates of a peak that are refined."""
+
+
+class Response(Protocol):
+    """A loop with one channel that is scanned: a `Realization`, or one with delays."""
+
+    @property
+    def dt(self) -> float:
+        """Sample time in s, 0 of a continuous loop."""
+
+    @property
+    def nyquist(self) -> float:
+        """Highest frequency in rad/s."""
+
+    @property
+    def D(self) -> np.ndarray:  # noqa: N802 - as of a realization
+        """L at infinite frequency, shape (1, 1)."""
+
+    def matrix(self, s: np.ndarray) -> np.ndarray:
+        """Return L at points, shape (points, 1, 1)."""
+
+    def response(self, omega: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+        """Return L and dL/dω at frequencies."""
+
+    def error(self, omega: float) -> float:
+        """Return an estimate of the relative error of L at a frequency."""
+
+    def rounding(self, s: np.ndarray) -> np.ndarray:
+        """Return a bound of the rounding error of L at points."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +80,12 @@ class Peak:
 class LoopScan:
     """Frequency response of a loop with one channel, sampled once; crossings and peaks are refined from the samples."""
 
-    def __init__(self, r: Realization):
+    def __init__(self, r: Response, features: Features | None = None, *, floor: float = 0.0):
         self.r = r
-        self.features = Features.of(r)
-        self.segments = make_grid(r, self.features)
+        self.features = features if features is not None else Features.of(cast("Realization", r))
+        self.segments = make_grid(r, self.features, floor=floor)
+        if floor:
+            self.segments = _leave_small(r, self.segments, 0.5 * floor)
         self.samples = [self._response(omega) for omega in self.segments]
 
     def find_gain_crossovers(self) -> list[Crossing]:
@@ -192,13 +227,15 @@ class LoopScan:
         return float(np.exp(refine_sign_change(lambda x: function(np.exp(x)), low, high, xtol=1e-14)))
 
 
-def make_grid(r: Realization, features: Features, *, delay: float = 0.0) -> list[np.ndarray]:
+def make_grid(r: Response, features: Features, *, delay: float = 0.0, floor: float = 0.0) -> list[np.ndarray]:
     """Return segments of frequencies in rad/s that resolve every pole and zero, cut at those on the axis.
 
     The grid has 40 points a decade, and more around each pole and zero in proportion to its distance from the axis. It
     is then bisected until the response L e^(−jω delay) turns by less than 0.15 rad and changes by less than 0.3 in its
-    logarithm from one point to the next.
+    logarithm from one point to the next. A delay turns a response without end: where |L| is below ``floor`` that is
+    left out, with a delay in series below 0.3.
     """
+    floor = max(floor, TURNS_MATTER) if delay else floor
     sizes = features.sizes()
     low, high = (sizes[0] / 1e4, sizes[-1] * 1e4) if len(sizes) else (1e-3, 1e3)
     if r.dt:
@@ -221,12 +258,20 @@ def make_grid(r: Realization, features: Features, *, delay: float = 0.0) -> list
         end = cut * (1 - gap) if np.isfinite(cut) else high
         inside = omega[(omega > start) & (omega < min(end, high))]
         if start < min(end, high):
-            segments.append(_bisect(r, np.array([start, *inside, min(end, high)]), delay))
+            segments.append(_bisect(r, np.array([start, *inside, min(end, high)]), delay, floor))
         start = max(start, cut * (1 + gap))
     return segments
 
 
-def _bisect(r: Realization, omega: np.ndarray, delay: float) -> np.ndarray:
+def _leave_small(r: Response, segments: list[np.ndarray], size: float) -> list[np.ndarray]:
+    """Return segments without the frequencies behind the last at which |L| is above a size, and one more."""
+    last = [np.flatnonzero(np.abs(r.matrix(1j * omega)[:, 0, 0]) > size) for omega in segments]
+    most = max((k for k, found in enumerate(last) if found.size), default=0)
+    end = int(last[most][-1]) + 2 if last[most].size else 2
+    return [*segments[:most], segments[most][:end]]
+
+
+def _bisect(r: Response, omega: np.ndarray, delay: float, floor: float) -> np.ndarray:
     def respond(at: np.ndarray) -> np.ndarray:
         return np.asarray(r.matrix(1j * at)[:, 0, 0] * np.exp(-1j * at * delay))
 
@@ -235,8 +280,8 @@ def _bisect(r: Realization, omega: np.ndarray, delay: float) -> np.ndarray:
         with np.errstate(divide="ignore", invalid="ignore"):
             step = np.log(L[1:] / L[:-1])
         coarse = ~((np.abs(step.real) < 0.3) & (np.abs(step.imag) < 0.15)) & (np.diff(omega) > 1e-12 * omega[1:])
-        if delay:  # a delay turns L without end, which does not matter where |L| is small
-            coarse &= np.maximum(np.abs(L[1:]), np.abs(L[:-1])) > 0.3
+        if floor:
+            coarse &= np.maximum(np.abs(L[1:]), np.abs(L[:-1])) > floor
         if not coarse.any() or len(omega) > 40_000:
             break
         between, after = np.sqrt(omega[1:] * omega[:-1])[coarse], np.flatnonzero(coarse) + 1

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from ...blocks.core import OptionError, accepts, brief, count_of, explain_calls, kinds, shorten, with_unit
 from ..results import BLUE, DARK, GREEN, GREY, PURPLE, STONE, VERMILION, legend_above, new_figure, style
-from .realization import Realization
+from .delayed_realization import DelayedRealization, realize
+from .delayed_system import DelayedSystem
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,56 +28,22 @@ FAR = 8.0
 """Largest part of the plane that a Nyquist plot shows: the real and imaginary part up to this."""
 
 
-@explain_calls
-class LoopTransfer(StateSpace):  # type: ignore[misc]
-    """The loop transfer function L at a wire, a `control.StateSpace`; `Linearization.loop` returns it.
-
-    All that python-control does with a state space, it does with this; a result of its arithmetic is a plain state
-    space again. The plots take further loops, which are overlaid: of other diagrams, of python-control, and
-    frequency-response data (`FrequencyResponse.L`), which appears as points. They return a matplotlib figure, drawn
-    without pyplot.
-
-    Attributes
-    ----------
-    linearization : Linearization or None
-        The model that it was made from.
-    wires : tuple of str
-        The wires that are cut.
-    inexactness : float
-        Estimated error of its matrices, relative to their largest entry: that of the linear models of FMUs; NaN
-        if it is not known.
-    findings, notes : tuple
-        Effects that limit it; see `Linearization.loop`.
-    """
+class LoopPlots:
+    """Plots of a loop, alone or with further loops, and what it was made from."""
 
     linearization: Any = None
     wires: tuple[str, ...] = ()
     inexactness: float = 0.0
-
-    # python-control keeps two functions in a state space that refer to it. Such a circle of references, and with it the
-    # linear model and the processes of its FMUs, would stay until garbage is collected.
-    @property
-    def updfcn(self) -> Any:
-        """Function ``(t, x, u, params)`` of python-control that returns dx/dt, or x at the next tick."""
-        return lambda t, x, u, params: self.A @ np.atleast_1d(x) + self.B @ np.atleast_1d(u)
-
-    @updfcn.setter
-    def updfcn(self, function: Any) -> None:
-        """Do nothing: the matrices are the function."""
-
-    @property
-    def outfcn(self) -> Any:
-        """Function ``(t, x, u, params)`` of python-control that returns y."""
-        return lambda t, x, u, params: self.C @ np.atleast_1d(x) + self.D @ np.atleast_1d(u)
-
-    @outfcn.setter
-    def outfcn(self, function: Any) -> None:
-        """Do nothing: the matrices are the function."""
+    findings: tuple[Any, ...] = ()
+    dt: Any
+    nstates: int
 
     def __repr__(self) -> str:
         sampling = f"T = {self.dt:g} s" if self.dt else "continuous"
-        facts = count_of(self.nstates, "state"), sampling, count_of(len(self.findings), "finding") * bool(self.findings)
-        then = "margins(loop), loop.bode(), loop.nyquist(), print(…) shows its matrices"
+        delays = count_of(len(getattr(self, "delays", ())), "delay") * hasattr(self, "delays")
+        found = count_of(len(self.findings), "finding") * bool(self.findings)
+        facts = count_of(self.nstates, "state"), delays, sampling, found
+        then = "margins(loop), loop.bode(), loop.nyquist()" + ", print(…) shows its matrices" * (not delays)
         return brief(f"loop at {', '.join(self.wires)}" if self.wires else "loop", *facts, then=then)
 
     def _repr_html_(self) -> None:
@@ -182,6 +149,68 @@ class LoopTransfer(StateSpace):  # type: ignore[misc]
         return _plot_gang_of_four([_find_gang_of_four(loop, measured) for loop in loops], names, omega)
 
 
+@explain_calls
+class LoopTransfer(LoopPlots, StateSpace):  # type: ignore[misc]
+    """The loop transfer function L at a wire, a `control.StateSpace`; `Linearization.loop` returns it.
+
+    All that python-control does with a state space, it does with this; a result of its arithmetic is a plain state
+    space again. The plots take further loops, which are overlaid: of other diagrams, of python-control, and
+    frequency-response data (`FrequencyResponse.L`), which appears as points. They return a matplotlib figure, drawn
+    without pyplot.
+
+    Attributes
+    ----------
+    linearization : Linearization or None
+        The model that it was made from.
+    wires : tuple of str
+        The wires that are cut.
+    inexactness : float
+        Estimated error of its matrices, relative to their largest entry: that of the linear models of FMUs; NaN
+        if it is not known.
+    findings, notes : tuple
+        Effects that limit it; see `Linearization.loop`.
+    """
+
+    # python-control keeps two functions in a state space that refer to it. Such a circle of references, and with it the
+    # linear model and the processes of its FMUs, would stay until garbage is collected.
+    @property
+    def updfcn(self) -> Any:
+        """Function ``(t, x, u, params)`` of python-control that returns dx/dt, or x at the next tick."""
+        return lambda t, x, u, params: self.A @ np.atleast_1d(x) + self.B @ np.atleast_1d(u)
+
+    @updfcn.setter
+    def updfcn(self, function: Any) -> None:
+        """Do nothing: the matrices are the function."""
+
+    @property
+    def outfcn(self) -> Any:
+        """Function ``(t, x, u, params)`` of python-control that returns y."""
+        return lambda t, x, u, params: self.C @ np.atleast_1d(x) + self.D @ np.atleast_1d(u)
+
+    @outfcn.setter
+    def outfcn(self, function: Any) -> None:
+        """Do nothing: the matrices are the function."""
+
+
+@explain_calls
+class DelayedLoop(LoopPlots, DelayedSystem):
+    """The loop transfer function L at a wire of a continuous diagram with delays; `Linearization.loop` returns it.
+
+    It is exact in e^(−sτ), as a `DelayedSystem` is, and plots itself as a `LoopTransfer` does.
+
+    Attributes
+    ----------
+    linearization : Linearization or None
+        The model that it was made from.
+    wires : tuple of str
+        The wires that are cut.
+    findings, notes : tuple
+        Effects that limit it; see `Linearization.loop`.
+    """
+
+    __str__ = LoopPlots.__repr__
+
+
 def _find_gang_of_four(loop: Any, measured: str) -> dict[str, StateSpace]:
     """Return L, S, PS, CS and T at the wire of a loop and a measured one, as `control.StateSpace`."""
     model = getattr(loop, "linearization", None)
@@ -211,6 +240,11 @@ def _close_loop(loop: Any) -> StateSpace:
         )
     model = getattr(loop, "linearization", None)
     closed = feedback(loop, 1) if model is None else model.complementary(*loop.wires)
+    if isinstance(loop, DelayedSystem) and not DelayedRealization.of(loop).is_stable():
+        raise OptionError(
+            "found a closed loop that is not stable; expected one that settles. Look at L.nyquist() and margins(L).",
+            block=name,
+        )
     poles = feedback(loop, 1).poles()
     growth = np.abs(poles) - 1.0 if loop.dt else np.real(poles)
     if np.max(growth, initial=-np.inf) > 1e-9:
@@ -262,17 +296,24 @@ def _frequencies(loop: Any) -> np.ndarray:
     """Return frequencies in rad/s over which a loop is worth looking at: around its crossovers, poles and zeros."""
     if _is_measured(loop):
         return np.asarray(loop.omega, dtype=float)
+    if isinstance(loop, DelayedSystem):
+        return _between_crossings(loop, DelayedRealization.of(loop).features().sizes(), 0.0)
     dt = float(loop.dt or 0.0)
-    limit = np.pi / dt if dt else np.inf
     marks = np.abs(np.concatenate([np.ravel(loop.poles()), np.ravel(loop.zeros())]))
     if dt:
         roots = np.concatenate([np.ravel(loop.poles()), np.ravel(loop.zeros())]).astype(complex)
         with np.errstate(all="ignore"):
             marks = np.abs(np.log(roots[np.abs(roots) > 1e-6]) / dt)
+    return _between_crossings(loop, marks, dt)
+
+
+def _between_crossings(loop: Any, marks: np.ndarray, dt: float) -> np.ndarray:
+    """Return frequencies around the crossovers of a loop, whose poles and zeros have these sizes in rad/s."""
+    limit = np.pi / dt if dt else np.inf
     marks = marks[np.isfinite(marks) & (marks > 1e-6) & (marks < limit)]
     high = min(1e3 * float(np.max(marks, initial=1.0)), limit)
     wide = np.geomspace(1e-3 * float(np.min(marks, initial=min(1.0, 0.1 * limit))), high, 2000)
-    size = np.abs(Realization.of(loop).response(wide * (1 - 1e-9))[0])
+    size = np.abs(realize(loop).response(wide * (1 - 1e-9))[0])
     crossed = wide[1:][(size[1:] > 1.0) != (size[:-1] > 1.0)]
     if crossed.size:
         low, high = float(crossed[0]) / 50, min(float(crossed[-1]) * 50, limit)
@@ -285,7 +326,7 @@ def _response(loop: Any, omega: np.ndarray) -> np.ndarray:
     """Return the values of a loop at frequencies in rad/s; of data those that it has."""
     if _is_measured(loop):
         return np.asarray(np.reshape(loop.frdata, (1, 1, -1))[0, 0], dtype=complex)
-    return np.asarray(Realization.of(loop).response(omega)[0])
+    return np.asarray(realize(loop).response(omega)[0])
 
 
 def _span(loops: Sequence[Any], omega: ArrayLike | None) -> list[np.ndarray]:
@@ -298,7 +339,7 @@ def _span(loops: Sequence[Any], omega: ArrayLike | None) -> list[np.ndarray]:
             spans.append(w)
             continue
         if omega is None:
-            spans.append(Realization.of(loop).grid(low, high, POINTS))
+            spans.append(realize(loop).grid(low, high, POINTS))
             continue
         asked = _read_omega(omega)
         limit = _limit(loop)
@@ -461,9 +502,11 @@ def _plot_step(closed: Sequence[Any], names: Sequence[str], times: ArrayLike | N
         for i, system in enumerate(closed):
             dt = float(system.dt or 0.0)
             grid = dt * np.arange(int(end / dt * (1 + 1e-9)) + 1) if dt else np.linspace(0.0, end, POINTS)
-            found = control.step_response(system, T=grid)
+            answer = system.step_response(grid)[:, 0] if isinstance(system, DelayedSystem) else None
+            if answer is None:
+                answer = np.ravel(control.step_response(system, T=grid).y)
             look = _style_of(i, system)
-            axes.plot(found.t, np.ravel(found.y), label=names[i], drawstyle="steps-post" if dt else "default", **look)
+            axes.plot(grid, answer, label=names[i], drawstyle="steps-post" if dt else "default", **look)
         axes.axhline(1.0, color=GREY, linewidth=0.8, zorder=0)
         axes.set(xlim=(0.0, end), xlabel=with_unit("t", "s"), ylabel="response to a unit step")
         _legend(figure, axes)
@@ -481,7 +524,7 @@ def _plot_gang_of_four(systems: Sequence[Mapping[str, Any]], names: Sequence[str
             for i, (system, w) in enumerate(zip(own, spans, strict=True)):
                 if omega is None:  # closed loops have resonances of their own, up to π/T
                     top = _limit(system) * BELOW if system.dt else float(w[-1])
-                    w = Realization.of(system).grid(float(w[0]), top, POINTS)
+                    w = realize(system).grid(float(w[0]), top, POINTS)
                 axes.plot(w, np.abs(_response(system, w)), label=names[i], **_style_of(i, system))
             axes.set_xscale("log")
             axes.set_yscale("log")

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 
 from ...blocks.core import Finding, brief, explain_calls
+from .delayed_realization import DelayedRealization
 from .number import MARK, Interval, Number
 from .realization import Realization
 from .scan_refine_confirm import number_of_limit
@@ -103,12 +104,13 @@ class MarginFinder(ABC, Generic[Found]):
 
     result: type[Any]
     """Class of the result, `Found`."""
-    eigenvalues: ClassVar[str] = EIGENVALUES
+    eigenvalues: str = EIGENVALUES
+    """Computation that tells whether a closed loop is stable."""
     rotated: ClassVar[str] = " with L rotated"
 
-    def __init__(self, r: Realization):
-        self.r = r
-        self.unstable = r.count_unstable()
+    def __init__(self, r: Realization | DelayedRealization):
+        self.r: Any = r
+        self.unstable: float = r.count_unstable()
 
     @abstractmethod
     def find_numbers(self) -> dict[str, Number]:
@@ -124,7 +126,9 @@ class MarginFinder(ABC, Generic[Found]):
         poles = r.eigenvalues()
         if self.unstable:
             near = r.growth(poles).max()
-            reason = f"the closed loop is not stable: {self.unstable} of its poles are not (largest growth {near:.3g})"
+            reason = (
+                f"the closed loop is not stable: {self.unstable:g} of its poles are not (largest growth {near:.3g})"
+            )
             names = [f.name for f in fields(self.result) if f.type == "Number"]
             found = {name: Number(np.nan, UNITS.get(name, "1"), np.nan, reason) for name in names}
         else:
@@ -151,7 +155,7 @@ class MarginFinder(ABC, Generic[Found]):
         """Return the phase margin; infinite where no rotation ends stability."""
 
         def stable(degrees: float) -> bool:
-            return self.r.is_stable(np.exp(-1j * np.radians(degrees)))
+            return bool(self.r.is_stable(np.exp(-1j * np.radians(degrees))))
 
         how = self.eigenvalues + (self.rotated if np.isfinite(degrees) else "")
         others = [*others, *(360 - o for o in (degrees, *others))]  # the same limits, reached by the other direction

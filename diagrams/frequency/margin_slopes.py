@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import ParameterError, on_one_thread
-from .disk_margins import mimo_disk_margin, mu_bound
+from .disk_margins import mimo_disk_margin
 from .loop_margins import Margins, find_disk_frequency, margins
 from .number import Number
 from .realization import Realization
 from .state_space import FourMatrices, read_matrices
+from .structured_value import mu_bound
 
 if TYPE_CHECKING:
     from .state_space import LinearSystem

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, explain_calls, kinds
-from .loop_scan import make_grid
+from .delayed_realization import DelayedRealization
+from .loop_scan import TURNS_MATTER, make_grid
 from .number import carries_findings
 from .poles_and_zeros import Features, find_hidden_unstable, tell_hidden_unstable
 from .realization import Realization
@@ -113,7 +114,7 @@ def count_encirclements(r: Realization, features: Features) -> NyquistCount:
     return NyquistCount(n, open_loop + len(hidden), eigenvalues + len(hidden), hidden)
 
 
-def winding_number(r: Realization, features: Features, *, delay: float = 0.0) -> int:
+def winding_number(r: Realization | DelayedRealization, features: Features, *, delay: float = 0.0) -> int:
     """Return the clockwise encirclements of 0 by 1 + L e^(−sτ) along the limit of stability.
 
     A sampled loop takes a delay τ of whole samples.
@@ -121,9 +122,10 @@ def winding_number(r: Realization, features: Features, *, delay: float = 0.0) ->
     Only the upper half of the contour is followed: the lower one is its mirror image. The contour passes each pole on
     the axis by a half-circle to the right, smaller than the distance to any other pole, zero or closed-loop pole.
     """
+    turning = bool(delay) or not isinstance(r, Realization)
     if len(r.D) != 1:
         raise ParameterError(f"found a loop of {len(r.D)} channels; expected one. Open a single wire.", block="nyquist")
-    if delay and not r.dt and abs(r.D[0, 0]) >= 1:
+    if turning and not r.dt and abs(r.D[0, 0]) >= 1:
         raise ParameterError(
             f"found |D| = {abs(r.D[0, 0]):.6g}; expected less than 1: with a delay the curve turns around −1 without "
             "end. Leave the delay out.",
@@ -138,7 +140,7 @@ def winding_number(r: Realization, features: Features, *, delay: float = 0.0) ->
         total += float(np.sum(np.angle(values[1:] / values[:-1])))
         last = values[-1]
     if not r.dt:  # the arc at infinity
-        total += float(np.angle((1.0 if delay else 1 + r.D[0, 0]) / last))
+        total += float(np.angle((1.0 if turning else 1 + r.D[0, 0]) / last))
     turns = -total / np.pi
     if abs(turns - round(turns)) > 1e-3:
         raise ConfirmationError(
@@ -149,13 +151,14 @@ def winding_number(r: Realization, features: Features, *, delay: float = 0.0) ->
     return round(turns)
 
 
-def _make_contour(r: Realization, features: Features, delay: float) -> list[np.ndarray]:
+def _make_contour(r: Realization | DelayedRealization, features: Features, delay: float) -> list[np.ndarray]:
     """Return the upper half of the contour as lines and arcs of points s."""
-    segments = make_grid(r, features, delay=delay)
+    turning = bool(delay) or not isinstance(r, Realization)
+    segments = make_grid(r, features, delay=delay, floor=TURNS_MATTER if turning else 0.0)
     others = np.concatenate([features.poles, features.closed, features.zeros])
     spots = [a.omega for a in features.axis_poles]
     top = segments[-1][-1]
-    if delay and not r.dt:  # beyond the last sample with |L| ≥ 0.95 the curve does not turn around 0
+    if turning and not r.dt:  # beyond the last sample with |L| ≥ 0.95 the curve does not turn around 0
         every = np.concatenate(segments)
         large = np.flatnonzero(np.abs(r.matrix(1j * every)[:, 0, 0]) >= 0.95)
         top = every[min(large[-1] + 1, len(every) - 1)] if len(large) else every[0]
@@ -188,7 +191,7 @@ def _make_contour(r: Realization, features: Features, delay: float) -> list[np.n
     return path + ([1j * line] if len(line) else [])
 
 
-def _follow_loop(r: Realization, s: np.ndarray, delay: float) -> NDArray[np.complex128]:
+def _follow_loop(r: Realization | DelayedRealization, s: np.ndarray, delay: float) -> NDArray[np.complex128]:
     """Return 1 + L e^(−s delay) along points, bisected until it turns by less than 0.5 rad from one to the next."""
     for _ in range(30):
         f: NDArray[np.complex128] = 1 + r.matrix(s)[:, 0, 0] * np.exp(-s * delay)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -12,6 +13,40 @@ SIDES = np.array([-10, -3, -1, -0.3, 0.0, 0.3, 1, 3, 10])
 """Distances from a pole or zero, in parts of its distance from the axis, at which a scan has frequencies."""
 GAP = 2e-9
 """Relative distance that a scan keeps from a single pole or zero on the axis."""
+
+
+class Plane(Protocol):
+    """The plane in which the poles of a realization are."""
+
+    @property
+    def dt(self) -> float:
+        """Sample time in s, 0 of a continuous system."""
+
+    @property
+    def nyquist(self) -> float:
+        """Highest frequency in rad/s."""
+
+    def growth(self, p: np.ndarray) -> np.ndarray:
+        """Return the distance of poles beyond the limit of stability."""
+
+    def logarithm(self, p: np.ndarray) -> np.ndarray:
+        """Return s at points of the plane."""
+
+
+class HiddenPoles(Plane, Protocol):
+    """A realization from which hidden poles were removed."""
+
+    @property
+    def hidden(self) -> np.ndarray:
+        """The hidden poles in the plane."""
+
+    @property
+    def hidden_errors(self) -> np.ndarray:
+        """How far rounding may have moved each."""
+
+    @property
+    def rounding_scale(self) -> float:
+        """Size to which the rounding of the poles is relative."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +113,7 @@ class Features:
 
 
 def split_axis_poles(
-    r: Realization, p: np.ndarray, scale: float, errors: np.ndarray | None = None
+    r: Plane, p: np.ndarray, scale: float, errors: np.ndarray | None = None
 ) -> tuple[tuple[AxisPole, ...], np.ndarray]:
     """Split poles into those on the limit of stability, with coinciding ones gathered, and the others, all as s.
 
@@ -154,7 +189,7 @@ def count_zeros_at_infinity(r: Realization) -> int:
     return r.order
 
 
-def find_hidden_unstable(r: Realization) -> tuple[complex, ...]:
+def find_hidden_unstable(r: HiddenPoles) -> tuple[complex, ...]:
     """Return the hidden poles beyond the limit, in the planes of s or z.
 
     Coinciding poles on the limit scatter to both sides and are left out.

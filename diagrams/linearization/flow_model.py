@@ -13,6 +13,7 @@ from ..flat import NONE, FlatDiagram, WiredDiagram, announcers
 from ..frequency import FourMatrices, hold_inputs
 from ..results import OperatingPoint
 from ..simulation import late_progress
+from .delay_channels import delay_channels
 from .derivatives import LocalDerivatives
 from .exchanged import noise_of
 from .plant_models import EQUILIBRIUM, join_matrices, states_of
@@ -21,9 +22,34 @@ STAGES = (1.0, 0.6, 0.2816, 0.857, 0.0526, 0.3333, 0.6513, 0.1184, 0.25, 0.3077,
 """Instants within a step at which DOP853 asks for rates, as parts of the step; the end comes first."""
 
 
+@dataclass(frozen=True, eq=False)
+class LinearDelays:
+    """The delays of a continuous linear model, closed around its matrices.
+
+    ẋ = A x + B d + G w, z = Z x + F d + H w, y = C x + D d + E w, with wᵢ(t) = zᵢ(t − τᵢ).
+
+    Attributes
+    ----------
+    names : tuple of str
+        Outputs of the `TransportDelay` blocks, entry by entry.
+    times : ndarray, shape (m,)
+        τ in s.
+    G, Z, H, E, F : ndarray
+        Matrices of shapes (states, m), (m, states), (m, m), (outputs, m) and (m, inputs).
+    """
+
+    names: tuple[str, ...]
+    times: np.ndarray
+    G: np.ndarray
+    Z: np.ndarray
+    H: np.ndarray
+    E: np.ndarray
+    F: np.ndarray
+
+
 @dataclass
 class Model:
-    """Matrices A, B, C, D of a linear model, with its states and findings; see `Linearization`."""
+    """Matrices A, B, C, D of a linear model, with its states, delays and findings; see `Linearization`."""
 
     matrices: FourMatrices
     dt: float
@@ -33,6 +59,7 @@ class Model:
     uncertainty: float = 0.0
     memory: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
+    delays: LinearDelays | None = None
 
 
 def differentiate_flow(
@@ -135,7 +162,7 @@ def model_continuous(
     models = local.model_equations(at, plants)
     xc = flat.continuous
     Ap, Bp, Cp, Dp = (join_matrices(flat, models, which) for which in "ABCD")
-    # w = Cp xp + Dp z, z = Zx x + Zw w + Zd d
+    # w = Cp xp + Dp z + S l, z = Zx x + Zw w + Zd d, with l the outputs of the delays
     loop = np.eye(len(at.w)) - Dp @ J["z", "w"]
     if loop.size and not np.linalg.cond(loop) < 1e12:
         raise OptionError(
@@ -143,27 +170,38 @@ def model_continuous(
             "without feedthrough, or linearize over a step, step=….",
             block=diagram.name,
         )
+    channels = delay_channels(flat)
+    S = np.zeros((len(at.w), len(channels)))
+    S[channels.outputs, np.arange(len(channels))] = 1.0
     zx = J["z", "x"][:, xc]
-    w_of = {k: np.linalg.solve(loop, v) for k, v in (("x", Dp @ zx), ("p", Cp), ("d", Dp @ J["z", "d"]))}
-    z_of = {
-        "x": zx + J["z", "w"] @ w_of["x"],
-        "p": J["z", "w"] @ w_of["p"],
-        "d": J["z", "d"] + J["z", "w"] @ w_of["d"],
-    }
+    moved = (("x", Dp @ zx), ("p", Cp), ("d", Dp @ J["z", "d"]), ("l", S))
+    w_of = {k: np.linalg.solve(loop, v) for k, v in moved}
+    z_of = {k: J["z", "w"] @ v for k, v in w_of.items()}
+    z_of["x"], z_of["d"] = z_of["x"] + zx, z_of["d"] + J["z", "d"]
 
     def eliminate_w(quantity: str) -> list[np.ndarray]:
         by_w = J[quantity, "w"]
-        return [J[quantity, "x"][:, xc] + by_w @ w_of["x"], by_w @ w_of["p"], J[quantity, "d"] + by_w @ w_of["d"]]
+        by_x, by_p, by_d, by_l = (by_w @ w_of[k] for k in "xpdl")
+        return [J[quantity, "x"][:, xc] + by_x, by_p, J[quantity, "d"] + by_d, by_l]
 
-    fx, fp, fd = eliminate_w("dx")
-    yx, yp, yd = eliminate_w("y")
+    fx, fp, fd, fl = eliminate_w("dx")
+    yx, yp, yd, yl = eliminate_w("y")
     A = np.block([[fx, fp], [Bp @ z_of["x"], Ap + Bp @ z_of["p"]]])
     B = np.vstack([fd, Bp @ z_of["d"]])
+    rates = np.concatenate([J["dx"], *(m.f for m in models)])
+    delays = None
+    if len(channels):
+        mine = {k: v[channels.inputs] for k, v in z_of.items()}
+        G, Z = np.vstack([fl, Bp @ z_of["l"]]), np.hstack([mine["x"], mine["p"]])
+        delays = LinearDelays(channels.labels, np.array([*map(float, channels.times)]), G, Z, mine["l"], yl, mine["d"])
+        off = J["z"][channels.inputs] - at.w[channels.outputs]  # still on their way
+        rates = rates + G @ off
     return Model(
         (A, B, np.hstack([yx, yp]), yd),
         0.0,
         flat.continuous_labels + states_of(models),
-        np.concatenate([J["dx"], *(m.f for m in models)]),
+        rates,
         {m.path: m.derivation for m in models},
         max((m.uncertainty for m in models), default=0.0),
+        delays=delays,
     )

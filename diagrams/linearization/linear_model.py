@@ -32,13 +32,13 @@ from ...blocks.core import (
 )
 from ...fmus.running import Derivation, DerivativeMethod
 from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
-from ..frequency import loop_class
+from ..frequency import DelayMatrices, delayed_loop_class, delayed_system_class, loop_class
 from ..results import OperatingPoint
 from ..wiring import exact_time
 from .derivatives import LocalDerivatives, Tap, find_moving, find_signal
 from .exchanged import derivations_at, evaluators_at, findings_on
 from .findings import EntryTaken
-from .flow_model import Model, model_continuous, relative_error
+from .flow_model import LinearDelays, Model, model_continuous, relative_error
 from .free_motions import ClosedModel, FreeMotions, find_free_motions
 from .inserted_blocks import find_cut_findings, name_inputs, split_consumers, split_inputs
 from .kinks import find_kinks
@@ -97,6 +97,9 @@ class Linearization:
         Communication step that was asked for; the loops of this model use it too.
     stairs : str or None
         Treatment of stairs that was asked for; the loops of this model use it too.
+    delays : LinearDelays or None
+        Transport delays of a continuous model, which are closed around the matrices: ``A`` to ``D`` are those of the
+        rest, and `system` and the loops are `DelayedSystem`. In a sampled model the past is a part of the states.
     """
 
     wired: WiredDiagram = field(repr=False)
@@ -119,9 +122,11 @@ class Linearization:
     plants: str | None = field(default=None, repr=False)
     step: float | Fraction | None = field(default=None, repr=False)
     stairs: str | None = field(default=None, repr=False)
+    delays: LinearDelays | None = None
 
     def __repr__(self) -> str:
-        facts = f"T = {self.dt:g} s" if self.dt else "continuous", count_of(len(self.states), "state")
+        facts = [f"T = {self.dt:g} s" if self.dt else "continuous", count_of(len(self.states), "state")]
+        facts += [count_of(len(self.delays.times), "delay")] if self.delays else []
         return brief(f"linear model of {self.wired.name!r}", *facts, then="model.loop('wire'), .A, .findings")
 
     @property
@@ -150,7 +155,9 @@ class Linearization:
         """
         return self._state_space(self.C, self.D, self.wired.name)
 
-    def _state_space(self, C: np.ndarray, D: np.ndarray, name: str, kind: type[StateSpace] | None = None) -> Any:
+    def _state_space(
+        self, C: np.ndarray, D: np.ndarray, name: str, kind: type[StateSpace] | None = None, *, sign: float = 1.0
+    ) -> Any:
         from control import StateSpace
 
         if not self.inputs or not self.outputs:
@@ -164,14 +171,61 @@ class Linearization:
             key: [e.replace(".", "_") for e in labels]
             for key, labels in (("inputs", self.inputs), ("outputs", self.outputs), ("states", self.states))
         }
-        system = (kind or StateSpace)(
-            self.A, self.B, C, D, self.dt, name=name.replace(".", "_"), remove_useless_states=False, **names
-        )
+        name = name.replace(".", "_")
+        if self.delays:
+            system = self._delayed_system(C, D, sign * self.delays.E, name, names, loop=kind is not None)
+        else:
+            system = (kind or StateSpace)(
+                self.A, self.B, C, D, self.dt, name=name, remove_useless_states=False, **names
+            )
         system.inexactness = relative_error(self.uncertainty, self.A, self.B, C, D)
         system.findings = self.carried
         taken = (finding for finding in self.findings if isinstance(finding, EntryTaken))
         system.notes = tuple(map(str, dict.fromkeys((*self.carried, *taken))))
         return system
+
+    def _delayed_system(
+        self, C: np.ndarray, D: np.ndarray, E: np.ndarray, name: str, names: dict[str, Any], *, loop: bool
+    ) -> Any:
+        """Return the model as a system with delays; C, D and E are the matrices of its outputs."""
+        from control import StateSpace
+
+        delays = self.delays
+        assert delays is not None  # callers look
+        rest = StateSpace(
+            self.A,
+            np.hstack([self.B, delays.G]),
+            np.vstack([C, delays.Z]),
+            np.block([[D, E], [delays.F, delays.H]]),
+            0,
+            remove_useless_states=False,
+        )
+        kind = delayed_loop_class() if loop else delayed_system_class()
+        return kind(rest, delays.times, delays.names, name=name, inputs=names["inputs"], outputs=names["outputs"])
+
+    def refuse_delays(self, what: str) -> None:
+        """Refuse a use of the matrices alone, which ``what`` names.
+
+        Raises
+        ------
+        OptionError
+            If the model is continuous and has delays.
+        """
+        if self.delays is not None:
+            raise OptionError(
+                f"found a transport delay in a continuous diagram, which {what} can't take; expected a model that is "
+                "its matrices alone. Take PadeDelay(delay=…, order=…) in its place.",
+                block=self.delays.names[0].rpartition(".")[0],
+            )
+
+    @cached_property
+    def characteristic(self) -> DelayMatrices:
+        """The characteristic function of a continuous model, whose roots are its poles; without memory."""
+        keep = [i for i, name in enumerate(self.states) if name not in self.memory]
+        A, delays = self.A[np.ix_(keep, keep)], self.delays
+        if delays is None:
+            return DelayMatrices(A, np.zeros((len(A), 0)), np.zeros((0, len(A))), np.zeros((0, 0)), np.zeros(0))
+        return DelayMatrices(A, delays.G[keep], delays.Z[:, keep], delays.H, delays.times)
 
     @cached_property
     def findings_on_loops(self) -> tuple[Finding, ...]:
@@ -181,7 +235,13 @@ class Linearization:
 
     @property
     def poles(self) -> np.ndarray:
-        """Poles of the model without those of `memory`, the largest first."""
+        """Poles of the model without those of `memory`, the largest first.
+
+        With delays in a loop there are infinitely many: the rightmost are given, the rightmost first, and all beyond
+        the limit of stability are among them.
+        """
+        if self.delays:
+            return np.array(self.characteristic.poles())
         keep = [i for i, name in enumerate(self.states) if name not in self.memory]
         return _sorted_poles(self.A[np.ix_(keep, keep)])
 
@@ -276,7 +336,7 @@ class Linearization:
             diagram, point, port = split_consumers(self.wired, self.point, wires, _as_list(to))
             return replace(self, wired=diagram, point=point).loop(port, lifted=lifted, slow=slow)
         cut = self._make_at(wires, openings=wires, loop="lifted" if lifted else "one", slow=slow)
-        made: LoopTransfer = cut._state_space(-cut.C, -cut.D, f"L({', '.join(wires)})", loop_class())
+        made: LoopTransfer = cut._state_space(-cut.C, -cut.D, f"L({', '.join(wires)})", loop_class(), sign=-1.0)
         made.linearization, made.wires = self, wires
         return made
 
@@ -293,7 +353,7 @@ class Linearization:
     def complementary(self, *wires: str) -> StateSpace:
         """Return T = 1 − S at a wire."""
         closed = self._make_at(wires)
-        return closed._state_space(-closed.C, -closed.D, f"T({', '.join(wires)})")
+        return closed._state_space(-closed.C, -closed.D, f"T({', '.join(wires)})", sign=-1.0)
 
     def _make_at(
         self, wires: tuple[str, ...], openings: tuple[str, ...] = (), loop: str = "", slow: str = "closed"
@@ -316,7 +376,8 @@ class Linearization:
             closed = self if own else _linearize(self.wired, at, (), (), (), **how)
             known = 0.0 if math.isnan(made.uncertainty) else made.uncertainty
             cut = Model((made.A, made.B, made.C, made.D), made.dt, [], made.affine, uncertainty=known)
-            confirm_loop(cut, closed.A, wires, self.wired.name)
+            cut.delays = made.delays
+            confirm_loop(cut, closed.A, wires, self.wired.name, closed.delays)
         return made
 
 
@@ -390,8 +451,6 @@ def _linearize(
     names = [_as_list(n) for n in (inputs, outputs, openings)]
     flat = diagram.flatten_like(at)
     at.check_fits(flat, diagram.name)
-    if not (diagram.has_clock or (diagram.has_fmu and step is not None)):
-        _refuse_transport_delays(flat)
     found = [[find_signal(flat, n) for n in group] for group in names]
     for signal in found[2]:
         _check_opening(flat, signal)
@@ -441,6 +500,7 @@ def _linearize(
         plants=plants,
         step=step,
         stairs=stairs,
+        delays=model.delays,
     )
 
 
@@ -484,17 +544,6 @@ def _check_loop(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) 
             block=local.inputs[0].port[0],
             port=local.inputs[0].port[1],
         )
-
-
-def _refuse_transport_delays(flat: FlatDiagram) -> None:
-    """Refuse a diagram with transport delays in continuous time."""
-    for path in sorted(flat.table.blocks):
-        if flat.table.blocks[path].transport and path not in flat.checked.traced:
-            raise WiringError(
-                "found a transport delay in continuous time, which has no finite linear model; expected none. Put it "
-                "into a sampled subsystem, where it is a delay of whole samples, or take PadeDelay(delay=…, order=…).",
-                block=path,
-            )
 
 
 def _check_opening(flat: FlatDiagram, signal: Tap) -> None:

@@ -28,7 +28,7 @@ from ..results import OperatingPoint
 from .derivatives import LocalDerivatives, Tap, find_signal
 from .exchanged import evaluators_at
 from .findings import MemoryActs
-from .flow_model import Model
+from .flow_model import LinearDelays, Model
 from .mean_stairs import replace_stairs
 from .plant_models import EQUILIBRIUM
 from .tick_chain import Chain, period_of
@@ -354,8 +354,10 @@ def _find_channels(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, m
     return found
 
 
-def confirm_loop(cut: Model, A: np.ndarray, wires: tuple[str, ...], name: str) -> None:
-    """Compare the poles of the closed loop with those of the diagram.
+def confirm_loop(
+    cut: Model, A: np.ndarray, wires: tuple[str, ...], name: str, delays: LinearDelays | None = None
+) -> None:
+    """Compare the poles of the closed loop with those of the diagram, of matrix A with its delays.
 
     Raises
     ------
@@ -366,13 +368,20 @@ def confirm_loop(cut: Model, A: np.ndarray, wires: tuple[str, ...], name: str) -
     back = np.eye(len(D)) - D
     if len(D) and not np.linalg.cond(back) < 1e12:
         return  # the closed loop has no unique solution, which its margins say
+    late = cut.delays
     closed = Ac + B @ np.linalg.solve(back, C) if len(D) else Ac
     size = [float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) for a in (closed, A, 0.1 * Ac)]
     radius = 1.5 * max(size) or 1.0  # the open loop counts too: the poles of a deadbeat loop are rounding alone
     worst = 0.0
     for angle in (0.3, 1.1, 2.0):  # det(I − A/z) does not count states at zero, such as values held for later
         z = radius * np.exp(1j * angle)
-        (s1, l1), (s2, l2) = (np.linalg.slogdet(np.eye(len(a)) - a / z) for a in (closed, A))
+        if late is None or delays is None:
+            both = [np.eye(len(a)) - a / z for a in (closed, A)]
+        else:
+            into, through = np.linalg.solve(back, C), np.linalg.solve(back, late.E)
+            made = closed, late.G + B @ through, late.Z + late.F @ into, late.H + late.F @ through
+            both = [_with_delays(four, late.times, z) for four in (made, (A, delays.G, delays.Z, delays.H))]
+        (s1, l1), (s2, l2) = map(np.linalg.slogdet, both)
         worst = max(worst, float(abs(s1 / s2 * np.exp(l1 - l2) - 1.0)))
     if not worst <= SAME_POLES + 100 * cut.uncertainty / radius:
         raise ConfirmationError(
@@ -381,6 +390,13 @@ def confirm_loop(cut: Model, A: np.ndarray, wires: tuple[str, ...], name: str) -
             "margins of this loop are not those of the diagram. Cut another wire.",
             block=name,
         )
+
+
+def _with_delays(four: FourMatrices, tau: np.ndarray, s: complex) -> np.ndarray:
+    """Return the matrix whose determinant is the characteristic function at s, over s to the number of states."""
+    A, G, Z, H = four
+    w = np.exp(-s * tau)
+    return np.block([[np.eye(len(A)) - A / s, -G * w / s], [-Z, np.eye(len(H)) - H * w]])
 
 
 # --- each tick -------------------------------------------------------------------------------------------------------

@@ -16,9 +16,10 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError, ParameterError
 from ..flat import FlatDiagram, WiredDiagram
-from ..frequency import FourMatrices
+from ..frequency import FourMatrices, delayed_system_class
 from ..results import OperatingPoint, layout_of
 from ..wiring import join
+from .delay_channels import delay_channels
 from .derivatives import LocalDerivatives, find_signal, join_slope, slope_of
 from .exchanged import evaluators_at
 from .flow_model import Model, model_continuous
@@ -107,6 +108,7 @@ def differentiate_loop(
     UnknownNameError, ParameterError
         A parameter that isn't there, isn't a number, or that the equations do not contain.
     """
+    model.refuse_delays("a derivative by parameters")
     cut = _Cut(model, tuple(wires), slow)
     found = []
     for name in dict.fromkeys(parameters):
@@ -145,7 +147,12 @@ def loop_of_variant(
     local, closed = (LocalDerivatives(flat, t, t, t, outside, means) for t in (taps, []))
     made = _model_at(model, flat, diagram, at, local, closed, slow)
     rests = bool(np.max(np.abs(made.affine), initial=0.0) <= EQUILIBRIUM)
-    return System(*_loop_matrices(made), made.dt, remove_useless_states=False), rests
+    A, B, C, D = _loop_matrices(made)
+    if (late := made.delays) is not None:
+        whole = np.hstack([B, late.G]), np.vstack([C, late.Z]), np.block([[D, -late.E], [late.F, late.H]])
+        rest = System(A, *whole, 0, remove_useless_states=False)
+        return delayed_system_class()(rest, late.times, late.names), rests
+    return System(A, B, C, D, made.dt, remove_useless_states=False), rests
 
 
 def _loop_matrices(made: Model) -> FourMatrices:
@@ -236,7 +243,9 @@ class _Cut:
         x, of_plants, z = np.split(moved, np.cumsum([flat.width, chain.n_p]))
         z = z[: flat.plant_inputs.total]
         C, D = (np.real(join_matrices(flat, chain.models, which)) for which in "CD")
-        return _with_slopes(flat, at, x, C @ of_plants + D @ z, of_plants, z, chain)
+        w, late = C @ of_plants + D @ z, delay_channels(flat)
+        w[late.outputs] = z[late.inputs]  # at rest a delay puts out what it takes in
+        return _with_slopes(flat, at, x, w, of_plants, z, chain)
 
 
 def _smallest(M: np.ndarray, right: np.ndarray) -> np.ndarray | None:

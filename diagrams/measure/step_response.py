@@ -44,6 +44,14 @@ CONSTANTS = 40.0
 """Time constants of the slowest other pole after which a linear model rests."""
 FINER = 6
 """Halvings of a sample time within which the largest value between two samples is looked for."""
+FINER_DELAYED = 3
+"""Instants a sample at which a response with delays is looked at."""
+LATER = 5.0
+"""Parts of the longest delay for which a response is looked at after its last sample, at least."""
+MOST_LATER = 10
+"""Lengths of a response up to which it is looked at after its last sample."""
+SAMPLES_LATER = 2000
+"""Instants at which it is."""
 FINEST = 40
 """Halvings of it right behind a sample, where a fast mode has decayed before the next one."""
 DOUBLED = 200
@@ -331,6 +339,8 @@ def predict(model: Linearization, d: np.ndarray, t: np.ndarray) -> tuple[np.ndar
     between : (K,) ndarray
         Largest size of the outputs between the samples, less that at the samples; 0 of a sampled model.
     """
+    if model.delays is not None:
+        return _predict_with_delays(model, d, t)
     C, D, n = model.C, model.D[:, 0], len(model.A)
     h = float(t[1] - t[0])
     one = _advance_by(model, h)
@@ -353,6 +363,25 @@ def predict(model: Linearization, d: np.ndarray, t: np.ndarray) -> tuple[np.ndar
             inside = states @ (C @ move[:n]).T + np.outer(d, D)
             between = np.maximum(between, np.max(np.abs(inside), axis=0) - size)
     return rows, later, between
+
+
+def _predict_with_delays(
+    model: Linearization, d: np.ndarray, t: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what `predict` returns of a continuous model with delays and a step at its first sample.
+
+    Later outputs are looked at until the slowest pole has decayed, between the samples at three instants of each.
+    """
+    h, size, poles = float(t[1] - t[0]), float(d[0]), model.poles
+    slowest = float(np.min(np.abs(poles.real), initial=np.inf)) if poles.size else np.inf
+    after = max(LATER * float(np.max(model.delays.times)) if model.delays else 0.0, CONSTANTS / slowest, 4.0 * h)
+    end = t[-1] + min(after, MOST_LATER * h * len(t))
+    fine = h / FINER_DELAYED * np.arange(FINER_DELAYED * (len(t) - 1) + 1)
+    times = np.concatenate([fine, np.linspace(fine[-1], end, SAMPLES_LATER)[1:]])
+    found = size * model.system.step_response(times)
+    rows, later = found[: len(fine) : FINER_DELAYED], found[len(fine) - 1 :]
+    between = np.max(np.abs(found[: len(fine)]), axis=0) - np.max(np.abs(rows), axis=0)
+    return rows, np.stack([later.min(axis=0), later.max(axis=0)]), between
 
 
 def _advance_by(model: Linearization, h: float) -> np.ndarray:
@@ -396,6 +425,10 @@ def find_final(model: Linearization) -> np.ndarray:
     They are those after many time constants of its slowest pole; poles slower than `SLOWEST` of the fastest stay where
     they are.
     """
+    if model.delays is not None:
+        at_rest = model.characteristic.count_unstable() == 0
+        final = np.atleast_1d(np.real(model.system(0.0, squeeze=False))).reshape(len(model.C), -1)[:, 0]
+        return final if at_rest else np.full(len(model.C), np.nan)
     C, D, n, rates = model.C, model.D[:, 0], len(model.A), _find_rates(model)
     if not rates.size:
         return np.asarray(D, dtype=float)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from enum import StrEnum
 
 import numpy as np
@@ -22,6 +23,11 @@ class Stability(StrEnum):
     @classmethod
     def of(cls, v: Variant) -> Stability:
         """Return the stability of a variant's linear model, memory aside."""
+        delays = v.model.delays
+        if delays is not None and (count := v.model.characteristic.count_unstable()) == 0:
+            return cls.STABLE  # by the argument: infinitely many poles are not looked at one by one
+        if delays is not None and math.isinf(count):
+            return cls.UNSTABLE
         slowest, margin = float(np.max(poles_in_s(v).real, initial=-np.inf)), stability_margin(v)
         return cls.STABLE if slowest < -margin else cls.UNSTABLE if slowest > margin else cls.ON_THE_LIMIT
 
@@ -34,6 +40,8 @@ def without_memory(v: Variant) -> np.ndarray:
 
 def scatter(v: Variant) -> float:
     """Return how far the slowest pole in 1/s moves when the model's matrix is rounded, tenfold."""
+    if v.model.delays is not None:
+        return 1e-10 * (1.0 + abs(float(np.max(v.model.poles.real, initial=0.0))))
     A = without_memory(v)
     rng = np.random.default_rng(0)
     moved = np.linalg.eigvals(A * (1 + 1e-15 * rng.standard_normal(A.shape)))

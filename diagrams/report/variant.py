@@ -162,6 +162,8 @@ class Variant:
         model = self.model
         moving = [i for i, change in enumerate(model.affine) if not abs(change) <= AT_REST]
         fed = model.A - np.eye(len(model.A)) if model.dt else model.A
+        if model.delays is not None:
+            fed = np.vstack([fed, model.delays.Z])
         if not moving or np.max(np.abs(fed[:, moving])) > 1e-9 * (model.dt or 1.0):
             return ()
         return tuple(model.states[i] for i in moving)

@@ -21,7 +21,7 @@ from ...blocks.core import (
     kinds,
 )
 from ..flat import WiredDiagram
-from ..frequency import Confirmation, Margins, Number, Realization, disk_margin, margins, mimo_disk_margin, mu_bound
+from ..frequency import Confirmation, Margins, Number, disk_margin, margins, mimo_disk_margin, mu_bound, realize
 from ..linearization import Linearization, find_signal, hold_sources, linearize, loop_of_variant, trim
 from ..measure import find_least_sine, frequency_response, step_response
 from .numbers import numbers_of
@@ -240,7 +240,7 @@ def _find_unstable_wire(model: Linearization, wires: tuple[str, ...]) -> str:
     for name in (*wires, *model.wired.names):
         for label in find_signal(flat, name).labels:
             try:
-                r = Realization.of(model.loop(label))
+                r = realize(model.loop(label))
             except LoopwrightError:
                 continue
             if r.order and not r.is_stable():

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError, OptionError, UnknownArgumentError
 from ..flat import WiredDiagram
-from ..frequency import Number, Realization, find_hidden_unstable, margin_slopes, order_key
+from ..frequency import Number, find_hidden_unstable, margin_slopes, order_key, realize
 from ..linearization import Linearization, differentiate_loop, linearize, loop_of_variant, operating_point
 from ..results import OperatingPoint
 from ..sweeps import Box
@@ -146,7 +146,7 @@ class Study:
         for wires in self.goal.loops:
             L, still = loop_of_variant(base, wires, diagram, at)
             L, rests = loops.get(wires, L), rests and still
-            r = Realization.of(L, delay=self.delay)
+            r = realize(L, delay=self.delay)
             own = r.logarithm(r.eigenvalues()) if r.order and not r.is_stable() else np.zeros(0)
             hidden = np.array(find_hidden_unstable(r))  # poles of other loops, which this one does not move
             beyond = [*own.real, *(np.log(np.abs(hidden)) / r.dt if r.dt else hidden.real)]

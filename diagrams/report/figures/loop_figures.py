@@ -62,9 +62,9 @@ def _span(loops: Mapping[str, Any], found: Mapping[str, Margins]) -> tuple[float
 
 
 def _response(L: Any, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
-    from ...frequency import Realization
+    from ...frequency import realize
 
-    r = Realization.of(L)
+    r = realize(L)
     w = r.grid(low, high, 600)
     return w, r.response(w)[0]
 
@@ -243,6 +243,6 @@ def gang(
 
 def response(L: Any, w: np.ndarray) -> np.ndarray:
     """Return the response of a loop with one channel at frequencies."""
-    from ...frequency import Realization
+    from ...frequency import realize
 
-    return Realization.of(L).response(w)[0]
+    return realize(L).response(w)[0]

@@ -22,6 +22,7 @@ from ...frequency import (
     PeriodicMargins,
     Realization,
     compare_margins,
+    delayed_system_class,
     margins,
     mimo_disk_margin,
     periodic_margins,
@@ -127,7 +128,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
         at = cut_key(v, cut)
         found[at], loops[at], titles[at] = m, L, title
         designs += [at] if v.is_design or v.is_actual else []
-        own[v, cut] = with_findings(_numbers(m), m.findings)
+        own[v, cut] = with_findings(_numbers(m, L), m.findings)
         numbers |= {f"{at}.{name}": number for name, number in own[v, cut].items()}
         low, high = m.gain_margin_low.value, m.gain_margin_high.value
         if (high < STEEPEST or low > 0.0) and any(isinstance(f, MeanSlope) for f in m.findings):
@@ -150,6 +151,8 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
                     notes.append(TEXTS.line("unstable", variant=v.title, poles=shown))
         if not m.stable:
             notes.append(TEXTS.line("unstable", variant=title, poles=_poles(m.unstable_poles, L.dt)))
+        elif v.is_design and isinstance(L, delayed_system_class()):
+            notes.append(TEXTS.line("no_rational_model", variant=title))
         elif v.is_design:
             try:
                 with np.errstate(all="ignore"):
@@ -204,14 +207,15 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
     return LoopPart(Section(key, f"Loop at {wire}", tuple(notes), tuple(tables), (), numbers), own, drawn)
 
 
-def _numbers(m: Margins) -> dict[str, Number]:
+def _numbers(m: Margins, L: Any) -> dict[str, Number]:
     """Return the numbers of a loop by the ends of their paths."""
     found = {name: number for name, number in m.numbers().items() if number.unit != "samples" or number.value >= 0}
-    how = "closed-loop eigenvalues"
+    delayed = isinstance(L, delayed_system_class())
+    how = "argument of the closed loop's characteristic function" if delayed else "closed-loop eigenvalues"
     found["stable"] = Number(float(m.stable), "1", 0.0, how)
-    found["encirclements"] = Number(
-        m.encirclements, "1", 0.0, "winding of 1 + L, and eigenvalues of open and closed loop"
-    )
+    of = "characteristic functions" if delayed else "eigenvalues"
+    said = f"winding of 1 + L, and {of} of open and closed loop"
+    found["encirclements"] = Number(m.encirclements, "1", 0.0, said)
     kinds: tuple[tuple[str, tuple[Any, ...], str], ...] = (
         ("gain_crossover", m.gain_crossovers, "phase_margin_deg"),
         ("phase_crossover", m.phase_crossovers, "gain_margin"),
@@ -379,11 +383,13 @@ def _relative_error(v: Variant, wire: str, cut: Cut, w: np.ndarray) -> tuple[flo
         return float(np.nanmax([np.linalg.norm(m - n) / s for m, n, s in zip(moved, nominal, sizes, strict=True)]))
 
     rng = np.random.default_rng(0)
-    largest = max([1e-300, *(float(np.max(np.abs(M), initial=0.0)) for M in (L.A, L.B, L.C, L.D))])
+    delayed = isinstance(L, delayed_system_class())
+    largest = max([1e-300, *(float(np.max(np.abs(M), initial=0.0)) for M in _matrices(L))])
     relative = 0.0 if math.isnan(v.model.uncertainty) else v.model.uncertainty / largest  # tolerances are NaN already
     error = 0.0
     for _ in range(4):
-        error = max(error, off(_Moved(*(M * (1 + relative * rng.choice([-1, 1], M.shape)) for M in _matrices(L)))))
+        moved = [M * (1 + relative * rng.choice([-1, 1], M.shape)) for M in _matrices(L)]
+        error = max(error, off(L.with_rest(*moved) if delayed else _Moved(*moved)))
     if not any(d.method is DerivativeMethod.STEP_DIFFERENCES for d in v.model.derivations.values()):
         return error, ""
     try:
@@ -404,10 +410,13 @@ class _Moved:
 
 
 def _matrices(L: Any) -> tuple[np.ndarray, ...]:
-    return tuple(np.asarray(M, dtype=float) for M in (L.A, L.B, L.C, L.D))
+    of = L.rest if isinstance(L, delayed_system_class()) else L
+    return tuple(np.asarray(M, dtype=float) for M in (of.A, of.B, of.C, of.D))
 
 
 def _model_response(L: Any, p: complex) -> np.ndarray:
+    if isinstance(L, delayed_system_class()):
+        return np.asarray(L(p, squeeze=False)).reshape(L.noutputs, L.ninputs)
     try:
         return np.asarray(L.C @ np.linalg.solve(p * np.eye(len(L.A)) - L.A, L.B.astype(complex)) + L.D)
     except np.linalg.LinAlgError:  # on a pole
@@ -523,8 +532,7 @@ def _gang_responses(v: Variant, wire: str, other: str) -> tuple[np.ndarray, np.n
     low = min(float(np.min(s, initial=1.0)) / 10, top / 100)
     w = np.geomspace(max(low, top / 1e6), top, POINTS)
     points = np.exp(1j * w * model.dt) if model.dt else 1j * w
-    eye = np.eye(len(model.A))
-    G = np.array([model.C @ np.linalg.solve(p * eye - model.A, model.B.astype(complex)) + model.D for p in points])
+    G = np.moveaxis(np.asarray(model.system(points, squeeze=False)), 2, 0)
     L = figures.response(v.loop(wire), w)
     both, expected = np.abs(G[:, 1, 0] * G[:, 0, 1]), np.abs(L / (1 + L) ** 2)
     if np.max(np.abs(both - expected)) > WHOLE * np.max(expected):

@@ -15,10 +15,10 @@ from ...frequency import (
     Interval,
     MeasuredMargins,
     Number,
-    Realization,
     margins,
     measured_margins,
     read_frequency_data,
+    realize,
 )
 from ...linearization import find_signal
 from .. import figures
@@ -132,7 +132,7 @@ def measured_loops(case: Case, loops: Sequence[MeasuredLoop]) -> Section:
         plots.append(_plot(case, of, L, variant.title))
         if L is not None:
             values = np.ravel(of.data.frdata)
-            ours = Realization.of(L).response(np.asarray(of.data.omega, dtype=float))[0]
+            ours = realize(L).response(np.asarray(of.data.omega, dtype=float))[0]
             far = np.abs(values - ours) / np.abs(ours)
             worst = int(np.argmax(far))
             omega = float(of.data.omega[worst])

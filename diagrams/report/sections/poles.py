@@ -41,6 +41,10 @@ def closed_loops(case: Case) -> Section | None:
         s = in_s(v.model.poles, v.model.dt)
         if s.size:
             how = "eigenvalues; tolerance by perturbing the matrix"
+            if v.model.delays is not None:
+                how = "the argument of the characteristic function, which counts no root beyond the axis"
+                if Stability.of(v) is not Stability.STABLE:
+                    how = "the argument of the characteristic function, which counts the roots beyond the axis"
             slowest = with_findings(Number(float(np.max(s.real)), "1/s", scatter(v), how), v.model.findings_on_loops)
             facts = {"count": len(s), "stable": Stability.of(v), "slowest": slowest, "fastest": float(np.min(s.real))}
             rows.append({"variant": v.title, "key": v.key, **facts})

@@ -12,7 +12,7 @@ import numpy as np
 from ....blocks import Saturation
 from ....blocks.core import LoopwrightError, PeriodicLoopError
 from ...flat import WiredDiagram
-from ...frequency import Confirmation, Number, Realization
+from ...frequency import Confirmation, Number, realize
 from ...linearization import find_signal
 from ...measure import (
     LEAST,
@@ -288,8 +288,8 @@ def _poles(v: Variant, test: StepTest) -> np.ndarray | None:
         L = v.loop(test.wire)
     except PeriodicLoopError:
         return in_s(v.model.poles, v.model.dt)
-    r = Realization.of(L)
-    poles = np.linalg.eigvals(r.closed_matrix())
+    r = realize(L)
+    poles = r.eigenvalues()
     return in_s(1 + poles if r.dt else poles, r.dt)
 
 

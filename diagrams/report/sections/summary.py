@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ....blocks.core import LoopwrightError, print_unit
-from ...frequency import Number, Realization, find_disk_frequency, order_key
+from ...frequency import Number, find_disk_frequency, order_key, realize
 from ...linearization import Linearization, find_signal
 from ...requirements import Limit, RequirementResult, Review, Verdict
 from ...studies import CaseState
@@ -253,7 +253,7 @@ def _frequency(v: Variant, wire: str, path: str, numbers: Mapping[str, Number]) 
     except LoopwrightError:
         return None
     is_this = path.split(".")[3:-1] == ([] if cut is Cut.PLAIN else [cut.value])
-    found = find_disk_frequency(Realization.of(L)) if is_this else math.inf
+    found = find_disk_frequency(realize(L)) if is_this else math.inf
     return found if math.isfinite(found) else None
 
 

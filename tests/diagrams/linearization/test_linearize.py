@@ -544,11 +544,13 @@ def test_an_opening_at_which_nothing_is_wired_is_refused():
         diagram.linearize(openings="x.y")
 
 
-def test_a_transport_delay_in_continuous_time_is_refused():
-    x = Integrator()
-    diagram = Diagram("d", x(TransportDelay(delay=0.1)(x.y)))
-    with pytest.raises(WiringError, match=r"no finite linear model.*PadeDelay\(delay=…, order=…\)"):
-        diagram.linearize()
+def test_a_transport_delay_in_continuous_time_is_closed_around_the_matrices():
+    """ẋ = −y, y(t) = x(t − 0.1)."""
+    x = Integrator(name="x")
+    model = Diagram("d", x(-TransportDelay(delay=0.1, name="late")(x.y))).linearize()
+    delays = model.delays
+    assert (model.A.tolist(), delays.names, delays.times.tolist()) == ([[0.0]], ("late.y",), [0.1])
+    assert np.ravel([delays.G, delays.Z, delays.H]) == pytest.approx([-1.0, 1.0, 0.0], abs=1e-12)
 
 
 def test_the_point_of_another_diagram_is_refused():

@@ -1,0 +1,283 @@
+"""Loops with dead time in continuous time: margins against closed forms, stability against Lambert's W and roots.
+
+The oracles take L as a formula in e^(−sτ), and nothing of the linear model.
+"""
+
+import itertools
+
+import control
+import mpmath
+import numpy as np
+import pytest
+from scipy.optimize import brentq, minimize_scalar
+from scipy.special import lambertw
+
+from loopwright.blocks import Constant, Gain, Integrator, OptionError, Sum, TransferFunction, TransportDelay
+from loopwright.diagrams import Diagram, margins
+from loopwright.diagrams.frequency.delay_matrices import DelayMatrices
+from loopwright.diagrams.frequency.delayed_system import DelayedSystem
+
+
+def rational(numerator, denominator, name):
+    return TransferFunction(numerator=numerator, denominator=denominator, name=name)
+
+
+def delay(tau, name="late"):
+    return TransportDelay(delay=tau, name=name)
+
+
+def error(y):
+    return Sum(signs="+-", name="e")(Constant(value=0.0, name="r"), y)
+
+
+def pi(y, kp, ki):
+    return rational([kp, ki], [1.0, 0.0], "pi")(error(y)).named("u")
+
+
+def one_lag():
+    """PI, a lag of 5 s and 1 s of dead time."""
+    plant = rational([2.0], [5.0, 1.0], "lag")
+    L = lambda s: (1 + 0.25 / s) * 2 * np.exp(-s) / (5 * s + 1)  # noqa: E731
+    return Diagram("d", plant(delay(1.0)(pi(plant.y, 1.0, 0.25)))), L, (0.1, 1.0, 3.0)
+
+
+def integrating():
+    """K e^(−sτ)/s: phase margin 90° − K τ 180°/π, gain margin π/(2 K τ)."""
+    plant, late = Integrator(name="tank"), delay(0.8)
+    u = Gain(gain=0.7, name="k")(error(late.y)).named("u")
+    return Diagram("d", late(plant(u))), lambda s: 0.7 * np.exp(-0.8 * s) / s, (0.1, 1.0, 3.0)
+
+
+def integrating_with_pi():
+    """A double integrator with dead time: gain margins to both sides."""
+    plant, late = Integrator(name="tank"), delay(0.8)
+    L = lambda s: (0.6 + 0.1 / s) * np.exp(-0.8 * s) / s  # noqa: E731
+    return Diagram("d", late(plant(pi(late.y, 0.6, 0.1)))), L, (0.3, 1.0, 3.0)
+
+
+def two_ways():
+    """Two lags in parallel, with different dead times."""
+    a, b = rational([1.0], [1.0, 1.0], "a"), rational([0.5], [2.0, 1.0], "b")
+    both = Sum(signs="++", name="both")
+    u = pi(both.y, 0.6, 0.5)
+    L = lambda s: (0.6 + 0.5 / s) * (np.exp(-0.5 * s) / (s + 1) + 0.5 * np.exp(-1.3 * s) / (2 * s + 1))  # noqa: E731
+    return Diagram("d", both(a(delay(0.5, "short")(u)), b(delay(1.3, "long")(u)))), L, (0.1, 0.6, 3.0)
+
+
+def inner_loop():
+    """A lag that is fed back with a dead time of its own, and another one ahead of it."""
+    lag = rational([1.0], [1.0, 1.0], "lag")
+    sum_of = Sum(signs="+-", name="inner")
+    y = lag(sum_of(delay(0.4, "outer")(pi(lag.y, 0.8, 0.6)), Gain(gain=0.7, name="k")(delay(0.9, "back")(lag.y))))
+    L = lambda s: (0.8 + 0.6 / s) * np.exp(-0.4 * s) / (s + 1 + 0.7 * np.exp(-0.9 * s))  # noqa: E731
+    return Diagram("d", y), L, (0.1, 0.5, 3.0)
+
+
+def smith_predictor():
+    """A Smith predictor whose model has another dead time than the plant, at the plant's input."""
+    plant, model = rational([2.0], [5.0, 1.0], "plant"), rational([2.0], [5.0, 1.0], "model")
+    late, guess = delay(2.0, "late"), delay(2.3, "guess")
+    feedback = Sum(signs="++-", name="feedback")
+    c = rational([2.0, 0.5], [1.0, 0.0], "pi")(error(feedback(late.y, model.y, guess.y)))
+    u = Gain(gain=1.0, name="valve")(c).named("u")
+    known = model(c)
+
+    def L(s):
+        C, G = 2.0 + 0.5 / s, 2.0 / (5 * s + 1)
+        return C * G * np.exp(-2.0 * s) / (1 + C * G * (1 - np.exp(-2.3 * s)))
+
+    return Diagram("d", late(plant(u)), guess(known)), L, (0.05, 0.4, 3.0)
+
+
+def unstable_plant():
+    """1.5 e^(−0.3 s)/(s − 1)."""
+    plant = rational([1.0], [1.0, -1.0], "plant")
+    u = Gain(gain=1.5, name="k")(error(plant.y)).named("u")
+    return Diagram("d", plant(delay(0.3)(u))), lambda s: 1.5 * np.exp(-0.3 * s) / (s - 1), (0.1, 1.0, 5.0)
+
+
+def resonant():
+    """A resonance of damping 0.05 that crosses |L| = 1 three times."""
+    plant = rational([1.0], [1.0, 0.1, 1.0], "plant")
+    L = lambda s: 0.2 / s * np.exp(-0.2 * s) / (s * s + 0.1 * s + 1)  # noqa: E731
+    u = rational([0.05], [1.0, 0.0], "i")(error(plant.y)).named("u")
+    return Diagram("d", plant(delay(0.2)(u))), lambda s: L(s) / 4, (0.01, 0.3, 1.02)
+
+
+def tiny_delay():
+    """A delay a million times as short as the lags."""
+    plant = rational([3.0], [0.2, 1.2, 1.0], "plant")
+    L = lambda s: (1 + 0.5 / s) * 3 * np.exp(-1e-6 * s) / (0.2 * s * s + 1.2 * s + 1)  # noqa: E731
+    return Diagram("d", plant(delay(1e-6)(pi(plant.y, 1.0, 0.5)))), L, (0.3, 3.0, 5e3)
+
+
+def long_delay():
+    """17 s of dead time, and a lag of 5 s."""
+    plant = rational([1.0], [5.0, 1.0], "plant")
+    L = lambda s: (0.3 + 0.04 / s) * np.exp(-17 * s) / (5 * s + 1)  # noqa: E731
+    return Diagram("d", plant(delay(17.0)(pi(plant.y, 0.3, 0.04)))), L, (0.003, 0.05, 0.2)
+
+
+def filtered_pid():
+    """A PID with a filtered derivative, and two lags."""
+    plant = rational([1.0], [2.0, 3.0, 1.0], "plant")
+    pid = rational([1.05 * 1.0 + 0.6, 1.0 + 0.05 * 0.5, 0.5], [0.05, 1.0, 0.0], "pid")
+    C = lambda s: ((1.65 * s + 1.025) * s + 0.5) / (s * (0.05 * s + 1))  # noqa: E731
+    u = pid(error(plant.y)).named("u")
+    L = lambda s: C(s) * np.exp(-0.5 * s) / ((2 * s + 1) * (s + 1))  # noqa: E731
+    return Diagram("d", plant(delay(0.5)(u))), L, (0.05, 1.0, 4.0)
+
+
+def three_delays():
+    """Three dead times in series with lags between them: only their sum counts."""
+    a, b = rational([1.0], [1.0, 1.0], "a"), rational([2.0], [0.5, 1.0], "b")
+    third = delay(0.3, "third")
+    y = third(b(delay(0.2, "second")(a(delay(0.1, "first")(pi(third.y, 0.5, 0.4))))))
+    L = lambda s: (0.5 + 0.4 / s) * 2 * np.exp(-0.6 * s) / ((s + 1) * (0.5 * s + 1))  # noqa: E731
+    return Diagram("d", y), L, (0.1, 0.9, 4.0)
+
+
+LOOPS = [
+    one_lag,
+    integrating,
+    integrating_with_pi,
+    two_ways,
+    inner_loop,
+    smith_predictor,
+    unstable_plant,
+    resonant,
+    tiny_delay,
+    long_delay,
+    filtered_pid,
+    three_delays,
+]
+
+
+def roots(function, w):
+    """Return the sign changes of a function at frequencies, refined, where it does not jump."""
+    values = function(w)
+    at = np.flatnonzero(values[:-1] * values[1:] < 0)
+    return np.array([brentq(lambda x: function(np.array([x]))[0], w[k], w[k + 1], xtol=1e-15, rtol=1e-14) for k in at])
+
+
+@pytest.mark.drawn(2)
+@pytest.mark.parametrize("make", LOOPS, ids=lambda f: f.__name__)
+def test_margins_are_those_of_the_closed_form(make):
+    diagram, L, (low, middle, high) = make()
+    loop = diagram.linearize().loop("u")
+    s = 1j * np.array([low, middle, high])
+    assert np.max(np.abs(loop(s) / L(s) - 1)) < 1e-12
+    made = margins(loop)
+    assert made.stable
+    w = np.geomspace(low / 30, 30 * high, 40_001)
+    crossovers = roots(lambda w: np.log(np.abs(L(1j * w))), w)
+    assert [c.frequency.value for c in made.gain_crossovers] == pytest.approx(crossovers, rel=1e-10)
+    ahead = np.degrees(np.angle(-L(1j * crossovers)))
+    assert made.phase_margin_deg.value == pytest.approx(np.min(np.abs(ahead)), abs=1e-8)
+    lag = np.radians(ahead) % (2 * np.pi)
+    assert made.delay_margin_s.value == pytest.approx(np.min(lag / crossovers), rel=1e-9)
+    turns = roots(lambda w: L(1j * w).imag / np.abs(L(1j * w)), w)
+    factors = np.array([-1 / L(1j * x).real for x in turns if L(1j * x).real < 0])
+    assert made.gain_margin_high.value == pytest.approx(np.min(factors[factors > 1]), rel=1e-9)
+    if np.any(factors < 1) or make is unstable_plant:
+        at_rest = [1 / 1.5] if make is unstable_plant else []  # L(0) = −1.5
+        assert made.gain_margin_low.value == pytest.approx(max([*factors[factors < 1], *at_rest]), rel=1e-9)
+    k = int(np.argmax(1 / np.abs(1 + L(1j * w))))
+    best = minimize_scalar(
+        lambda x: np.abs(1 + L(1j * x)), bounds=(w[k - 1], w[k + 1]), method="bounded", options={"xatol": 1e-13}
+    )
+    assert made.ms.value == pytest.approx(1 / best.fun, rel=1e-9)
+
+
+@pytest.mark.parametrize("k", [0.5, 1.5, 1.5707, 1.5709, 3.0, 9.0, 40.0])
+def test_roots_of_a_delayed_integrator_are_those_of_lamberts_w(k):
+    """The roots of s + k e^(−s): those of W of −k."""
+    system = DelayMatrices(*(np.array([[v]]) for v in (0.0, -k, 1.0, 0.0)), np.array([1.0]))
+    wanted = np.array([lambertw(-k, branch) for branch in range(-30, 31)])
+    assert system.count_unstable() == np.sum(wanted.real > 0)
+    near = sorted(wanted, key=lambda p: -p.real)[: max(4, int(np.sum(wanted.real > 0)))]
+    assert all(np.min(np.abs(system.roots - root)) < 1e-9 for root in near)
+
+
+@pytest.mark.parametrize(("k", "count"), [(0.9, 1), (1.1, 0), (3.2, 0), (6.0, 2), (40.0, 4)])
+def test_the_count_includes_the_poles_of_the_loop_itself(k, count):
+    """(s − 1) + k e^(−0.3 s), whose roots mpmath finds: the plant alone is unstable."""
+    plant = rational([1.0], [1.0, -1.0], "plant")
+    u = Gain(gain=k, name="k")(error(plant.y)).named("u")
+    model = Diagram("d", plant(delay(0.3)(u))).linearize()
+    starts = [complex(x, y) for x in (0.5, 1.5, 3.0) for y in np.arange(0.0, 60.0, 2.0)]
+    found = set()
+    for start in starts:
+        try:
+            root = complex(mpmath.findroot(lambda s: s - 1 + k * mpmath.exp(-0.3 * s), start))
+        except ValueError:
+            continue
+        found |= {np.round(root, 6), np.round(np.conj(root), 6)} if root.real > 0 else set()
+    assert len({complex(round(p.real, 6), round(p.imag, 6) + 0.0) for p in found}) == count
+    assert model.characteristic.count_unstable() == count
+    assert margins(model.loop("u")).stable == (count == 0)
+    assert np.sum(model.poles.real > 0) == count
+
+
+@pytest.mark.parametrize(("gain", "stable"), [(0.95, True), (1.05, False), (-0.95, True), (-1.05, False)])
+def test_a_way_without_a_state_around_a_delay_needs_a_gain_below_one(gain, stable):
+    """ẏ + ... with y(t − τ) fed back at once: a chain of poles at ln|gain|/τ."""
+    late, lag = delay(0.5), rational([1.0], [1.0, 1.0], "lag")
+    total = Sum(signs="++", name="total")
+    y = total(Gain(gain=gain, name="g")(late(total.y)), lag(Constant(value=1.0, name="r") - total.y))
+    assert (Diagram("d", y).linearize().characteristic.count_unstable() == 0) == stable
+
+
+def test_two_ways_without_a_state_are_stable_for_all_delays_only_if_their_gains_sum_up_to_less_than_one():
+    first, second = delay(1.0, "first"), delay(0.37, "second")
+    for gains, stable in (((0.5, 0.45), True), ((0.5, 0.55), False), ((0.5, -0.55), False)):
+        total = Sum(signs="+++", name="total")
+        a, b = (Gain(gain=g, name=n)(d(total.y)) for g, n, d in zip(gains, "ab", (first, second), strict=True))
+        diagram = Diagram("d", total(a, b, rational([1.0], [1.0, 1.0], "lag")(-0.1 * total.y)))
+        assert (diagram.linearize().characteristic.count_unstable() == 0) == stable
+
+
+def test_python_control_draws_it_exactly_and_gets_no_wrong_matrices():
+    diagram, L, _ = one_lag()
+    loop = diagram.linearize().loop("u")
+    w = np.geomspace(0.01, 30.0, 50)
+    assert np.max(np.abs(np.ravel(control.frequency_response(loop, w).complex) / L(1j * w) - 1)) < 1e-12
+    control.bode_plot(loop)
+    assert control.nyquist_response(loop, omega=np.geomspace(1e-4, 1e3, 5000), warn_encirclements=False).count == 0
+    for use in (control.ss, control.step_response, lambda system: system.A, lambda system: system.D):
+        with pytest.raises(OptionError, match=r"a system with delays, which has no .*pade"):
+            use(loop)
+    S, T = diagram.linearize().sensitivity("u"), diagram.linearize().complementary("u")
+    assert np.max(np.abs(S(1j * w) * (1 + L(1j * w)) - 1)) < 1e-12
+    assert np.max(np.abs(T(1j * w) - L(1j * w) / (1 + L(1j * w)))) < 1e-12
+    assert np.max(np.abs(control.feedback(loop, 1)(1j * w) - T(1j * w))) < 1e-12
+
+
+def test_systems_with_delays_are_added_multiplied_and_closed():
+    G = control.ss(control.tf([2.0], [5.0, 1.0]))
+    late = DelayedSystem(control.ss([], [], [], [[0.0, 1.0], [1.0, 0.0]], 0), [0.7])
+    s = 1j * np.array([0.1, 1.0, 4.0])
+    e, g = np.exp(-0.7 * s), 2.0 / (5 * s + 1)
+    for made, wanted in (
+        (late * G, e * g),
+        (G * late, e * g),
+        (late + G, e + g),
+        (G - late, g - e),
+        (1 - 0.5 * late, 1 - 0.5 * e),
+        ((late * G).feedback(1), e * g / (1 + e * g)),
+        ((late * G).feedback(late), e * g / (1 + e * g * e)),
+        (-late / 2, -0.5 * e),
+    ):
+        assert np.max(np.abs(made(s) - wanted)) < 1e-13
+    rough = [np.max(np.abs((late * G).pade(order)(s) - e * g)) for order in (1, 2, 4, 6)]
+    assert all(b < 0.2 * a for a, b in itertools.pairwise(rough))
+
+
+def test_a_step_response_is_that_of_the_method_of_steps():
+    """ẏ = u − k y(t − τ): Σ (−k)ⁿ (t − nτ)₊ⁿ⁺¹/(n + 1)!."""
+    k, tau, t = 3.0, 0.37, np.linspace(0.0, 4.0, 301)
+    system = DelayedSystem(control.ss([[0.0]], [[1.0, -k]], [[1.0], [1.0]], np.zeros((2, 2)), 0), [tau])
+    wanted = sum(
+        (-k) ** n * np.clip(t - n * tau, 0, None) ** (n + 1) / float(mpmath.factorial(n + 1)) for n in range(60)
+    )
+    assert np.max(np.abs(system.step_response(t)[:, 0] - wanted)) < 1e-10
