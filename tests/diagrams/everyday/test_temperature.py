@@ -83,7 +83,7 @@ def test_the_verdict_of_an_oven_with_dead_time_by_hand(variant):
     check_by_hand(PROJECT, variant)
 
 
-@reports(dict.fromkeys(VARIANTS, "a transport delay in continuous time has no linear model"))
+@reports()
 def test_the_report_has_the_verdict_of_an_oven_with_dead_time(variant):
     check_report(PROJECT, variant)
 
