@@ -1,5 +1,6 @@
 """Results of runs: recording, storage, plots and exports."""
 
+from .layout import lay_out
 from .memory import machine_memory
 from .operating_point import FreeDirection, OperatingPoint, PointOrigin, units_of
 from .plots import (
@@ -51,6 +52,7 @@ __all__ = [
     "TextSignal",
     "check_fits",
     "entries",
+    "lay_out",
     "layout_of",
     "legend_above",
     "limit_time",

@@ -10,6 +10,8 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
+from ...results import lay_out
+
 if TYPE_CHECKING:
     from markupsafe import Markup
 
@@ -99,8 +101,9 @@ def _drawn(figure: Any) -> str:
     own: dict[Any, Any] = {"svg.fonttype": "path", "svg.hashsalt": "loopwright"}
     with rc_context({**own, "figure.autolayout": False, "figure.constrained_layout.use": False}):
         if engine is not None:  # with an engine, or a tight box, saving would go over the whole figure twice
-            engine.execute(figure)
             figure.set_layout_engine(None)
+            if not lay_out(figure):
+                engine.execute(figure)
         try:
             figure.savefig(buffer, format="svg", metadata={"Date": None}, **options)
         finally:

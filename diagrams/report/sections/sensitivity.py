@@ -11,6 +11,7 @@ from ...studies import Sensitivities, Sensitivity, confirm_parameter, sensitivit
 from .. import figures
 from ..case import Case
 from ..pages import Section, Table, Texts
+from ..same_loops import find_same
 from .loops import ROWS
 
 TEXTS = Texts(__package__, "sensitivity")
@@ -38,6 +39,11 @@ def sensitivity(case: Case) -> Section | None:
             text.append(TEXTS.line("unstable", wire=wire))
         elif found.rows:
             parts.append(_part(case, key, wire, found))
+    wires, shown = case.sensitivity_wires(), find_same({part.key: part.numbers for part in parts})
+    for i, part in enumerate(parts):
+        if part.key in shown:
+            said = TEXTS.line("same", wire=wires[shown[part.key]])
+            parts[i] = replace(part, text=(said, *part.text), plots=())
     return Section("sensitivity", "Sensitivity to parameters", tuple(text), sections=tuple(parts)) if parts else None
 
 

@@ -53,6 +53,8 @@ AGREEMENT = 0.01
 """Difference of co-simulation and linear model, relative to the largest change, up to which they agree."""
 SIZE = 100.0
 """Size of a step, in amplitudes of the injection check, where none is given."""
+ALIKE = 1e-4
+"""Difference of two responses, relative to their size, that no figure shows."""
 SLOWEST = 1e-6
 """Poles slower than that, relative to the fastest, are taken as integrators that nothing feeds back."""
 NAMES: Mapping[str, str] = {
@@ -159,7 +161,12 @@ def steps(case: Case) -> Section | None:
             )
         )
         text.insert(0, TEXTS.line("resting"))
-    plots = [_plot(case, test, curves) for test, curves in found.items()]
+    same = _find_same_curves(found)
+    plots = [
+        _plot(case, test, curves, [_said(other) for other in same if same[other] == test])
+        for test, curves in found.items()
+        if test not in same
+    ]
     overview = tuple(plot for test, curves in found.items() for plot in _overview(case, test, curves))
     whole = (*TEXTS.paragraphs("responses"), *dict.fromkeys(text))
     return Section("steps", TITLE, whole, tuple(tables), tuple(plots), numbers, overview=overview)
@@ -428,8 +435,38 @@ def _how(got: StepResponse) -> Confirmation:
     return run.and_by(f"the linear model differs by {deviation:.2g} of the largest change", agrees)
 
 
-def _plot(case: Case, test: StepTest, curves: Mapping[str, StepResponse]) -> Plot:
-    said, titles = _said(test), {key: case.variants[key].title for key in curves}
+def _find_same_curves(found: Mapping[StepTest, Mapping[str, StepResponse]]) -> dict[StepTest, StepTest]:
+    """Return the steps whose responses look as an earlier one's, with that one: a loop may have several names."""
+    same: dict[StepTest, StepTest] = {}
+    for test, curves in found.items():
+        earlier = (other for other in found if other not in same and bool(other.output) == bool(test.output))
+        for other in earlier:
+            if other == test:
+                break
+            if found[other].keys() == curves.keys() and all(
+                _is_alike(found[other][k], curves[k], test) for k in curves
+            ):
+                same[test] = other
+                break
+    return same
+
+
+def _is_alike(one: StepResponse, other: StepResponse, test: StepTest) -> bool:
+    """Return whether two responses differ by less than a line's width, per unit of the step."""
+    if len(one.t) != len(other.t) or one.held != other.held or (one.prediction is None) != (other.prediction is None):
+        return False
+    pairs = [(of.answer(bool(test.output)), of.t - of.t[int(np.argmax(of.d != 0.0))]) for of in (one, other)]
+    size = max(1.0, *(float(np.max(np.abs(y))) for y, _ in pairs))
+    time = float(np.max(np.abs(pairs[0][1]))) or 1.0
+    return bool(
+        np.max(np.abs(pairs[0][0] - pairs[1][0])) <= ALIKE * size
+        and np.max(np.abs(pairs[0][1] - pairs[1][1])) <= ALIKE * time
+    )
+
+
+def _plot(case: Case, test: StepTest, curves: Mapping[str, StepResponse], others: list[str]) -> Plot:
+    said = " and ".join([_said(test), *others])
+    titles = {key: case.variants[key].title for key in curves}
     caption = TEXTS.line("figure_to", said=said) if test.output else TEXTS.line("figure", said=said)
     return Plot(
         f"steps_{test.key}", caption, figures.step_responses(curves, titles, case.looks, to_output=bool(test.output))

@@ -187,15 +187,18 @@ def test_a_block_that_is_defined_at_samples_has_no_continuous_variant_and_the_re
     assert "sample_time=" not in case.variants["continuous"].problem
 
 
-def test_a_figure_is_laid_out_once_and_drawn_once(monkeypatch):
+@pytest.mark.parametrize("in_a_grid", [True, False])
+def test_a_figure_is_laid_out_once_and_drawn_once(in_a_grid, monkeypatch):
     w = np.geomspace(1.0, 100.0, 9)
     figure = measured("m", "u", MeasuredCurve("model", w, 1 / (1j * w), w, 1 / (1j * w)), AxisUnits()).figure
+    if not in_a_grid:
+        figure = contact_map("m", "hand", w, w, np.ones((9, 9))).figure
     engine, draws, layouts = figure.get_layout_engine(), [], []
     whole, execute = type(figure).draw, type(engine).execute
     monkeypatch.setattr(type(figure), "draw", lambda self, renderer: draws.append(1) or whole(self, renderer))
     monkeypatch.setattr(type(engine), "execute", lambda self, fig: layouts.append(1) or execute(self, fig))
     assert "<svg" in embedded(figure, "k").screen
-    assert (len(draws), len(layouts)) == (1, 1)
+    assert (len(draws), len(layouts)) == (1, 0 if in_a_grid else 1)
     assert figure.get_layout_engine() is engine
 
 
