@@ -108,10 +108,14 @@ class LoopScan:
         found = [c for c in inside if c.L.real < 0 and c.slope != 0.0]
         zeros = {a.omega for a in self.features.axis_zeros}
         for omega, value in self.ends():
-            if np.isfinite(value) and value.real < 0 and omega not in zeros:
+            if np.isfinite(value) and value.real < 0 and omega not in zeros and not self._is_rounding(omega, value):
                 error = self.r.error(omega) if np.isfinite(omega) else 1e-15
                 found.append(Crossing(omega, complex(value.real), 0.0, error))
         return sorted(found, key=lambda c: c.omega)
+
+    def _is_rounding(self, omega: float, L: complex) -> bool:
+        """Whether a value at an end is that of a zero there, as rounding moves it."""
+        return bool(np.isfinite(omega) and abs(L) <= self.r.rounding(np.array([1j * omega]))[0])
 
     def ends(self) -> list[tuple[float, complex]]:
         """Return frequency and L at both ends of the axis, 0 and π/T or ∞; L is real there, infinite at a pole."""
