@@ -186,6 +186,7 @@ def convert(value: Any, spec: ParameterSpec, owner: str, name: str) -> Any:
         )
 
     kinds = _kinds(spec.annotation)
+    # Most values are a float within its bounds, which needs no array.
     if type(value) is float and kinds <= _FLOAT and spec.shape is None and isfinite(value) and _is_within(value, spec):
         return value
     array = bool(kinds & {"Array", "ndarray", "NDArray"})
@@ -195,6 +196,7 @@ def convert(value: Any, spec: ParameterSpec, owner: str, name: str) -> Any:
     for kind, accepted, word in (("bool", bool | np.bool_, "True or False"), ("str", str, "a text")):
         if kinds - {"None"} == {kind} and not isinstance(value, accepted):
             raise error(repr(value), word)
+    # A declaration with floats takes integers, too; one of integers alone takes no float, and True is no number.
     if "int" in kinds and not numeric:
         if isinstance(value, bool) or not isinstance(value, numbers.Integral):
             raise error(repr(value), "an integer")
@@ -217,6 +219,7 @@ def convert(value: Any, spec: ParameterSpec, owner: str, name: str) -> Any:
         raise error(repr(value), "a number")
     else:
         return _freeze_hashable(value, error)
+    # Bounds hold for every entry of an array.
     for bound, holds, words in (
         (spec.above, np.greater, "above"),
         (spec.minimum, np.greater_equal, "at least"),

@@ -175,6 +175,7 @@ def _run(arguments: argparse.Namespace) -> int:
     except LoopwrightError as error:
         _say(f"loopwright: error: {error}", sys.stderr)
         return 1 if isinstance(error, FmuError) and not isinstance(error, FmuFileError) else 2
+    # From here on one experiment that fails, or is interrupted, leaves the files of the others.
     folder = _make_folder(arguments.out)
     table: dict[str, dict[str, float | None]] = {}
     written: list[list[str]] = []

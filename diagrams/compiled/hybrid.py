@@ -219,6 +219,7 @@ class CompiledHybrid:
     ):
         self.ticks, self._kept = loop, list[Any]([code, arguments, x_next])
         self.kinds: Mapping[frozenset[TickPattern], int] = loop.kinds
+        # Trials have their own t and x; w is the run's, unless delays write their outputs of the trial's time into it.
         n, width, (_, x, w, p) = flat.continuous.size, flat.width, arguments
         trial = [np.zeros(1), x.copy(), w if delays is None else w.copy(), p]
         where = flat.continuous
@@ -241,12 +242,14 @@ class CompiledHybrid:
             x=self._own(trial[1]),
             slopes=self._own(slopes),
         )
+        # Delays put out what went in τ before: C evaluates their inputs at a trial by another function.
         self._delays: NativeDelays | None = None
         if delays is not None:
             driven = np.zeros(flat.plant_inputs.total)
             bound = self._bind(code.between["driven"], trial, [driven])
             self._delays = NativeDelays(delays, bound, driven, w, trial[2], tolerances)
             hybrid.p.delays = self._delays.address
+        # Algebraic loops are solved at each trial: the slope needs its parts by the loops' values, too.
         results = [slopes]
         if loops is not None:
             m = len(loops.where)
@@ -264,6 +267,7 @@ class CompiledHybrid:
                 rows, columns = slope.pattern
                 hybrid.p.entries = len(rows)
                 hybrid.p.row, hybrid.p.column = (self._own(np.array([*v, 0], dtype=np.int64)) for v in (rows, columns))
+        # Each method integrates the one problem; those of libraries are asked for steps by a callback into Python.
         of = ctypes.addressof(hybrid) + HybridStructure.p.offset
         self.methods = [self._method(options, n, of, code.steps.get(options.name)) for options in methods]
         self._names = [options.name for options in methods]
@@ -282,6 +286,7 @@ class CompiledHybrid:
         hybrid.drain = loop.called.function(CALL, drain)
         hybrid.coupled = coupled
         hybrid.outputs = flat.log.total
+        # Events come last: their jumps read the vectors above, and those of FMUs in model exchange fire with them.
         self.watch: Watch | None = None
         """The events; None without any."""
         if domains is not None:
@@ -369,6 +374,7 @@ class CompiledHybrid:
         )
         self._tolerances.append(np.broadcast_to(options.atol, (n,)).astype(float))
         made.atol = self._own(self._tolerances[-1])
+        # SciPy has the coefficients; C has the steps, the norms and the control.
         if name in ("RK23", "RK45", "DOP853"):
             of_scipy = getattr(scipy.integrate, name)
             stages = made.stages = of_scipy.n_stages
@@ -395,6 +401,7 @@ class CompiledHybrid:
             made.Z, made.W, made.F = (self._own(np.zeros(3 * n)) for _ in range(3))
             made.error, made.scale = (self._own(np.zeros(n)) for _ in range(2))
             made.pivots, made.pivots_complex = (self._own(np.zeros(n, dtype=np.int64)) for _ in range(2))
+        # K: stages, at most 16, those of DOP853 with its end and three for the dense output D.
         for field in ("x", "x_old", "f", "y", "g"):
             setattr(made, field, self._own(np.zeros(n)))
         made.K, made.D = self._own(np.zeros(17 * n)), self._own(np.zeros(7 * n))

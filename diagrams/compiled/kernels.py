@@ -157,6 +157,7 @@ class BlockKinds:
                 texts.append(_loop(bodies[text], body))
             found[key] = bodies[text]
 
+        # All functions are generated in one go, so that CasADi writes what they share once.
         functions = dict(single_functions())
         functions.update(sorted(self._functions.items(), key=lambda item: str(item[1])))
         keys = [*functions]
@@ -167,6 +168,7 @@ class BlockKinds:
             generator.add(ca.Function(f"k{i}", arguments, function.call(arguments)))
         code = re.sub(r"^casadi_real (casadi_\w+\()", r"static inline casadi_real \1", generator.dump(), flags=re.M)
         written, names = dict(BODY.findall(code)), {int(i): name for i, name in _NAME.findall(code)}
+        # Scalar code is inlined into the loop over the table; other code is called with pointers to its columns.
         scalar = []
         for i, key in enumerate(keys):
             function, name = functions[key], names[i]
@@ -190,6 +192,7 @@ class BlockKinds:
             used = [*_columns(function)]
             call += [f"  res[{k}] = r{k};\n" if out else f"  arg[{k}] = i{k};\n" for out, k in used]
             add(key, used, _in_p("".join([*call, f"  {name}(arg, res, iw, w, 0);\n"]), last))
+        # Inlined functions are left out of the text, unless another one calls them.
         called = {name for body in written.values() for name in _CALL.findall(body)}
         kept = "\n".join(_drop(code, [name for name in scalar if name not in called]))
         table = ", ".join(f"kernel{k.place}" for k in bodies.values())

@@ -88,6 +88,7 @@ def write_lanes(
         room += size
         return f"vec *{name} = (vec *)l->room + {room - size};"
 
+    # Every kind of tick becomes a case of the switch; what depends on parameters alone is prepared once.
     names = "x", "w", "z", "p", "x_next", "log"
     own = [take(name, getattr(sizes, name.partition("_")[0])) for name in names]
     for i, clocks in enumerate(kinds):
@@ -101,6 +102,7 @@ def write_lanes(
             prepare.append(f"vec kept_loops{i}[AT_LEAST_1({kept})]; loops{i}_equations_prepare(p, kept_loops{i});")
             solve = f"unsolved = loops{i}(t, x, w, p, kept_loops{i}, alive); "
         cases.append(f"case {i}: {solve}tick{i}(t, x, w, p, kept_tick{i}, x_next, z, log, ok); break;")
+    # The FMUs' vectors are one after the other; a lane whose run has ended takes the numbers of another one.
     at = 0
     for i, plant in enumerate(plants):
         parts.append(plant.write(f"plant{i}"))
@@ -115,6 +117,7 @@ def write_lanes(
         parts.append(text)
         prepare.append(f"vec kept_flow[AT_LEAST_1({kept})]; flow_prepare(p, kept_flow);")
         states = "step_states(t0, t1, x, w, p, kept_flow);"
+    # lanes.c goes over the ticks; macros put the parts of this diagram into it.
     evaluate = f"switch (kind) {{ {' '.join(cases)} }}"
     parts += [
         f"#define TAKE_ROOM {' '.join(own)}\n",

@@ -278,6 +278,8 @@ def _pair_entries(m: FmuLinearization, model: PlanarSlopes, rate: float) -> dict
     u, F = (_entries(m.inputs, port) for port in ("motor_force", "external_force"))
     both, rows = u + F, outputs["position"] + outputs["velocity"]
     U = np.nan_to_num(m.uncertainty)
+    # The FMU's states may be any: its outputs position and velocity are the coordinates. Uncertainties go along,
+    # as the largest that the products can have.
     T, U_T = m.C[rows], U[n:, :n][rows]
     Ti = np.linalg.inv(T)
     A, B = T @ m.A @ Ti, T @ m.B[:, both]
@@ -301,6 +303,7 @@ def _pair_entries(m: FmuLinearization, model: PlanarSlopes, rate: float) -> dict
         found, off = read_output(port)
         return EntryPair(found, np.hstack([C, D]), off, natural)
 
+    # Natural sizes of the entries, for motions about as fast as the rate: rounding is judged by them.
     GG, none = np.hstack([G, G]), np.zeros((2, 4))
     states, forces = size(rate, 1.0), size(g / rate, g / rate)
     parts = {

@@ -203,6 +203,7 @@ def _check_subsystems(table: Structure, traced: dict[str, Traced], shapes: dict[
             raise ShapeError(
                 f"{wire} has shape {found}; expected a logic signal, one number. Index it.", block=gated, port=port
             )
+    # A subsystem can hold or delay only what a block in it makes, not a signal that passes through it.
     for (path, port), handed in sorted(table.handed.items()):
         for passing, output in handed:
             settings, clock = table.subsystems[passing], table.clock(table.subsystem_of[path])
@@ -219,6 +220,7 @@ def _check_subsystems(table: Structure, traced: dict[str, Traced], shapes: dict[
             )
     for path in sorted(table.blocks):
         gates = table.gates(table.subsystem_of[path])
+        # Time can't wait in an FMU or a transport delay, while the subsystem around it does.
         if gates and (path not in traced or table.blocks[path].evaluated_outside):
             kind = "a transport delay" if table.blocks[path].transport else "a block that is stepped, such as an FMU,"
             kind = "an FMU in model exchange" if path in traced else kind
@@ -227,6 +229,7 @@ def _check_subsystems(table: Structure, traced: dict[str, Traced], shapes: dict[
                 "time continues while the subsystem waits. Put it outside, and wire its outputs in.",
                 block=path,
             )
+        # What is triggered acts at no regular distance: nothing in it may need one.
         triggered = table.triggered_around(table.subsystem_of[path])
         if triggered is None:
             continue

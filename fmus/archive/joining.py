@@ -72,6 +72,7 @@ def _check(
     def element(index: tuple[int, ...]) -> str:
         return f"{port}[{','.join(map(str, index))}]"
 
+    # Each member is a scalar, is there once, and has as many indices as the others.
     pairs = [(description.scalars.get(name, description.find(name)), index) for name, index in members]
     for variable, index in pairs:
         if variable.shape:
@@ -91,6 +92,7 @@ def _check(
             "as many indices for each element",
             "Give them alike.",
         )
+    # Counting begins at 0 or 1, as the names do, and leaves no gap.
     base = min(min(index) for _, index in pairs)
     indices = [index for _, index in pairs]
     ends = np.max(indices, axis=0)
@@ -103,6 +105,7 @@ def _check(
             f"all of its elements from {element((start,) * len(ends))} to {element(tuple(map(int, ends)))}",
             "Rename those, too, or count without gaps.",
         )
+    # One port has one type and one meaning: what the members say of themselves must agree.
     for variable, _ in pairs[1:]:
         for what, mine, its in (
             ("type", first.type, variable.type),
