@@ -166,6 +166,14 @@ class Block(Value, Wireable):
             if not isinstance(getattr(cls, attribute), property):  # ports that follow from the parameters
                 setattr(cls, attribute, chosen)
             cls.__doc__ = with_section(cls.__doc__ or "", attribute.capitalize(), port_section(chosen))
+        for source, held in cls.quanta.items():
+            for name, known in ((source, ports), (held, cls.parameter_specs)):
+                if name not in known:
+                    raise DefinitionError(
+                        f"found quanta={dict(cls.quanta)!r}; expected an input, and the parameter that holds its step. "
+                        f"{near(name, known)}",
+                        block=cls.__name__,
+                    )
         for name, port in ports.items():
             tracked = getattr(port, "tracks", None)
             if tracked is not None and not (tracked in ports and _is_kind(ports[tracked], "outputs")):

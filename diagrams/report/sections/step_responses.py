@@ -28,6 +28,7 @@ from ...measure import (
     step_response,
 )
 from ...requirements import StepLimits
+from ...results import OperatingPoint
 from .. import figures
 from ..case import Case
 from ..pages import Plot, Section, Table, Texts
@@ -186,15 +187,15 @@ class Quantized:
         Height of the step that moves the answer by `LEAST` quanta; 0 without converters.
     quantum : Quantum, optional
         The quantum of the answer.
-    usual : float
-        Height that the step would have without converters.
+    usual : float, optional
+        Height that the step would have without converters; None where its height was given.
     oscillations : mapping of str to Number
         By converter, what is left of its input's motion at the end of the record, in quanta.
     """
 
     least: float = 0.0
     quantum: Quantum | None = None
-    usual: float = 0.0
+    usual: float | None = None
     oscillations: Mapping[str, Number] = field(default_factory=dict)
 
 
@@ -202,16 +203,16 @@ def _said_of_quanta(
     v: Variant, test: StepTest, got: StepResponse, quantized: Quantized, saturated: list[str]
 ) -> Iterator[str]:
     """Yield what quanta do to a step: it was made larger, is small beside them, or reaches limits ahead of them."""
-    least, quantum = quantized.least, quantized.quantum
-    if quantum is None or (abs(got.size) <= quantized.usual < math.inf and least <= quantized.usual):
+    least, quantum, usual = quantized.least, quantized.quantum, quantized.usual
+    if quantum is None:
         return
     said = {"variant": v.title, "wire": test.wire, "size": got.size, "block": quantum.converter, "many": LEAST}
     if abs(got.size) < (1.0 - 1e-9) * least:
         yield TEXTS.line("coarse", **said, quanta=LEAST * abs(got.size) / least, least=least)
-    elif saturated:
+    elif usual is not None and saturated and got.size > usual:
         yield TEXTS.line("no_range", **said, blocks=saturated)
-    else:
-        yield TEXTS.line("enlarged", **said, usual=quantized.usual)
+    elif usual is not None and got.size > usual:
+        yield TEXTS.line("enlarged", **said, usual=usual)
 
 
 def _without_converters(
@@ -233,6 +234,17 @@ def _without_converters(
 
     ends = {name: first(getattr(got, name)) for name in ("prediction", "final", "later", "between", "steady")}
     return replace(got, outputs=got.outputs[:kept], y=got.y[:, :kept], before=got.before[:kept], **ends), found
+
+
+def _least_step(
+    diagram: WiredDiagram, point: OperatingPoint, test: StepTest, length: float
+) -> tuple[float, Quantum | None]:
+    """Return the height of a step that is large beside quanta, with the quantum; 0 where none is known."""
+    try:
+        found = find_least_step(diagram, point, test.wire, test.output or test.wire, length)
+    except LoopwrightError:  # no linear model: the run may be had all the same
+        found = None
+    return (0.0, None) if found is None else found
 
 
 def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | None, Quantized] | None:
@@ -262,9 +274,9 @@ def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | 
     if limits is not None and limits.length is not None:
         length = limits.length
     diagram, point, usual = plan.variant.diagram, plan.variant.point, SIZE * plan.amplitude
-    least = find_least_step(diagram, point, test.wire, test.output or test.wire, length)
-    height, quantum = (0.0, None) if least is None else least
-    size = max(usual, height) if limits is None or limits.size is None else limits.size
+    given = None if limits is None else limits.size
+    height, quantum = _least_step(diagram, point, test, length)
+    size = max(usual, height) if given is None else given
     outputs = [*([test.output] if test.output else []), *_commands(v.diagram, test.wire), *_excesses(v.diagram)]
     converters = find_converters(v.diagram.flatten_like(v.point))
     fed = list(dict.fromkeys(converter.signal for converter in converters))
@@ -277,12 +289,12 @@ def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | 
     try:
         got = respond(size)
     except LoopwrightError:
-        if size <= usual or size != height:
+        if given is not None or size <= usual:
             raise
         got = respond(usual)  # the diagram's range is smaller than the quanta ask for
     kept = sum(len(find_signal(diagram.flatten_like(point), name).labels) for name in outputs)
     got, left = _without_converters(got, converters, plan.variant, kept)
-    return got, slowest, Quantized(height, quantum, usual if limits is None or limits.size is None else 0.0, left)
+    return got, slowest, Quantized(height, quantum, usual if given is None else None, left)
 
 
 def _poles(v: Variant, test: StepTest) -> np.ndarray | None:

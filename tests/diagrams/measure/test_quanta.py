@@ -1,23 +1,29 @@
 """Test signals are large beside the quanta of converters and encoders, and a run tells what is left at rest."""
 
 import math
+from types import MappingProxyType
 
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
 from loopwright.blocks import (
+    Block,
     Constant,
+    DefinitionError,
     Encoder,
     Function,
     Gain,
+    Input,
     Integrator,
+    Output,
     Quantizer,
     Saturation,
     Sum,
     TransferFunction,
+    parameter,
 )
-from loopwright.diagrams import Diagram, Requirements, subsystem
+from loopwright.diagrams import Diagram, MeanSlope, Requirements, subsystem
 from loopwright.diagrams.measure import LEAST, LEAST_SINE, find_least_sine, find_least_step, find_quantum
 
 T, KP, KD, Q = 1e-3, 400.0, 40.0, 1e-5
@@ -100,7 +106,10 @@ def test_a_report_says_how_many_quanta_a_required_step_has():
     report = servo().report(only=("steps",), requirements=asked)
     quanta = by_hand().max() / (Q * (KP + KD / T))
     (line,) = [line for line in section(report, "steps").text if "which show" in line]
-    assert f"by {quanta:.2f} quanta" in line or f"by {quanta:.3g} quanta" in line
+    assert f"by {quanta:.3g} quanta" in line
+    asked = Requirements(step={"overshoot": 0.3, "size": 200.0}, stable=False)
+    text = section(servo().report(only=("steps",), requirements=asked), "steps").text
+    assert not any("quanta of" in line for line in text)  # it is large enough, and as it was given
 
 
 def cubic(gain):
@@ -128,6 +137,25 @@ def test_a_limit_cycle_is_flagged_and_measured_in_quanta():
     report = cubic(3.0).report(only=("inner", "steps"))
     assert not any("limit cycle is possible" in line for s in section(report, "inner").sections for line in s.text)
     assert report.numbers()["steps.u.continuous.seen_u.oscillation"].value < 0.5
+
+
+def test_a_block_of_ones_own_may_name_its_steps():
+    class Converter(Block):
+        """A converter that rounds down."""
+
+        quanta = MappingProxyType({"u": "step"})
+        step: float = parameter(default=0.01, above=0.0)
+        u = Input()
+        y = Output()
+
+        def output(self, t, x, u):
+            return self.step * np.floor(u.u / self.step)
+
+    lin = rounded(Converter(name="adc")).linearize()
+    assert lin.findings == (MeanSlope("box.adc", "y", "u", pytest.approx(1.0, rel=1e-14)),)
+    assert not lin.findings[0].puts_in_doubt
+    with pytest.raises(DefinitionError, match="expected an input, and the parameter that holds its step"):
+        type("Wrong", (Converter,), {"quanta": {"u": "stp"}})
 
 
 def rounded(block):
