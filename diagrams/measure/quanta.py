@@ -21,7 +21,7 @@ from ..wiring import join
 from .step_response import predict
 
 if TYPE_CHECKING:
-    from ..frequency import LinearSystem
+    from ..frequency import LoopTransfer
 
 LEAST = 400.0
 """Quanta of a signal that a test signal moves it by at least: one of them is a quarter of a percent."""
@@ -124,7 +124,7 @@ def find_least_step(
 
 
 def find_least_sine(
-    diagram: WiredDiagram, point: OperatingPoint, wire: str, L: LinearSystem, frequencies: np.ndarray
+    diagram: WiredDiagram, point: OperatingPoint, wire: str, L: LoopTransfer, frequencies: np.ndarray
 ) -> tuple[float, Quantum] | None:
     """Return the amplitude of sines at a wire that move it by `LEAST_SINE` quanta at each frequency, and the quantum.
 
