@@ -20,6 +20,7 @@ from .findings import (
     ZeroSlope,
 )
 from .free_motions import FreeMotion, FreeMotions, deflate
+from .inserted_blocks import find_inputs, name_wire_to, with_passed_values
 from .kinks import find_kinks_between
 from .linear_model import Linearization, linearize, linearize_batch
 from .operating_points import (
@@ -71,6 +72,7 @@ __all__ = [
     "copy_point",
     "deflate",
     "differentiate_loop",
+    "find_inputs",
     "find_kinks_between",
     "find_signal",
     "find_ways_back",
@@ -82,10 +84,12 @@ __all__ = [
     "loop_of_variant",
     "model_ticks",
     "moves_between_ticks",
+    "name_wire_to",
     "operating_point",
     "point_from_states",
     "run_to",
     "ticks_between_renewals",
     "ticks_to_renewal",
     "trim",
+    "with_passed_values",
 ]

@@ -164,6 +164,17 @@ def name_wire_to(diagram: WiredDiagram, name: str, inputs: Sequence[Port]) -> Wi
     return diagram.with_structure(table)
 
 
+def with_passed_values(diagram: WiredDiagram, point: OperatingPoint) -> OperatingPoint:
+    """Return an operating point with the values of inserted blocks, where it is that of a diagram without them."""
+    table, values = diagram.structure, dict(point.values)
+    for path, block in table.blocks.items():
+        if isinstance(block, Passage) and f"{path}.y" not in values:
+            source = table.wires[path, "u"]
+            passed = np.asarray(values[join(source.block, source.port)])
+            values[f"{path}.y"] = passed if source.index is None else passed[source.index]
+    return replace(point, values=values)
+
+
 def _carry_point(
     flat: FlatDiagram, split: FlatDiagram, point: OperatingPoint, path: str, value: np.ndarray
 ) -> OperatingPoint:
@@ -209,20 +220,8 @@ def split_consumers(
             port="to",
         )
     flat = diagram.flatten_like(point)
-    signal, table = find_signal(flat, wires[0]), diagram.structure.copy()
-    inputs = [_find_input(diagram, name) for name in to]
-    for block, port in inputs:
-        source = table.wires[block, port]
-        found = find_signal(flat, f"{source.block}.{source.port}")
-        entries = np.array(found.entries).reshape(flat.checked.shapes[found.port])
-        part = tuple(np.ravel(entries if source.index is None else entries[source.index]).tolist())
-        if found.port != signal.port or part != signal.entries:
-            raise WiringError(
-                f"found {source} wired to it; expected {wires[0]!r}. Name the wire that feeds this input, or one of "
-                f"its consumers: {', '.join(join(*c) for c in _consumers(table.wires, signal.port)) or 'it has none'}.",
-                block=block,
-                port=port,
-            )
+    signal = find_signal(flat, wires[0])
+    inputs = find_inputs(diagram, flat, wires[0], to)
     _check_one_subsystem(diagram, inputs)
     return insert_ahead(diagram, flat, point, inputs, signal.port, signal.entries)
 
@@ -236,6 +235,33 @@ def _check_one_subsystem(diagram: WiredDiagram, inputs: Sequence[Port]) -> None:
             block=inputs[0][0],
             port=inputs[0][1],
         )
+
+
+def find_inputs(diagram: WiredDiagram, flat: FlatDiagram, wire: str, to: Iterable[str]) -> list[Port]:
+    """Return the inputs of some names, which a wire feeds.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such input.
+    WiringError
+        If an input has another source.
+    """
+    signal, table = find_signal(flat, wire), diagram.structure
+    inputs = [_find_input(diagram, name) for name in to]
+    for block, port in inputs:
+        source = table.wires[block, port]
+        found = find_signal(flat, f"{source.block}.{source.port}")
+        entries = np.array(found.entries).reshape(flat.checked.shapes[found.port])
+        part = tuple(np.ravel(entries if source.index is None else entries[source.index]).tolist())
+        if found.port != signal.port or part != signal.entries:
+            raise WiringError(
+                f"found {source} wired to it; expected {wire!r}. Name the wire that feeds this input, or one of "
+                f"its consumers: {', '.join(join(*c) for c in _consumers(table.wires, signal.port)) or 'it has none'}.",
+                block=block,
+                port=port,
+            )
+    return inputs
 
 
 def _find_input(diagram: WiredDiagram, name: str) -> Port:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...blocks.core import Array, Block, Output, Sum, WiringError, parameter
 from ..flat import FlatDiagram, WiredDiagram
-from ..linearization import Tap
+from ..linearization import Tap, with_passed_values
 from ..results import OperatingPoint
 from ..simulation import RunOptions, Simulation, copy_states
 from ..wiring import SubsystemSettings, Wire
@@ -194,6 +194,7 @@ class InjectionRun:
         self.point: OperatingPoint | None = None
         if isinstance(begins, OperatingPoint):
             before = diagram.replace(begins.parameters) if begins.parameters else diagram
+            begins = with_passed_values(before, begins)
             self.point = _translate_point(begins, before.flatten_like(begins), made, signal)
             self.runs_to = begins.tick * begins.base
             if can_start_at(made.diagram, begins):

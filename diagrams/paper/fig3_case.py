@@ -210,7 +210,7 @@ class Fig3Case(Case):
 
     # --- where it is looked at ----------------------------------------------------------------------------------------
 
-    def loop_wires(self) -> Mapping[str, str]:
+    def named_wires(self) -> Mapping[str, str]:
         """Return the virtual inputs."""
         return {side: f"controller.{name}" for side, name in SIDES.items()}
 

@@ -205,7 +205,7 @@ def analyse(
     loops_measured = read_measured(case, measured) if measured else ()
     if loops_measured:
         sections = (*sections, measured_loops(case, loops_measured))
-    searched = None if task is None else find_reported(wired, task, asked, point, stairs, tell, case.loop_wires())
+    searched = None if task is None else find_reported(wired, task, asked, point, stairs, tell, case.loop_places)
     if searched is not None:
         sections = (*sections, worst_case_of(searched))
     if touched is not None and touched.contacts:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -11,6 +12,7 @@ from ...blocks.core import LoopwrightError, SampleTimeError
 from ..flat import WiredDiagram
 from ..linearization import UnusualStart
 from ..requirements import Requirements
+from ..studies import LoopPlace, cut_places, find_places
 from .figures import AxisUnits
 from .pages import Texts
 from .variant import Implementation, Variant, in_s, look_of
@@ -91,7 +93,7 @@ class Case:
     """A diagram with its variants, for the parts of a report.
 
     It knows nothing of the diagram but its structure. A kind of diagram that is known better has a case of its own: a
-    subclass that overrides `bases`, `loop_wires` and `excitation`.
+    subclass that overrides `bases`, `named_wires` and `excitation`.
 
     Parameters
     ----------
@@ -105,6 +107,8 @@ class Case:
         Wires at which loops are looked at, instead of all named ones on loops.
     stairs : {"gain", "zero"}, optional
         Treatment of stairs in the linear models, as of `Diagram.linearize`.
+    requirements : Requirements, optional
+        Requirements on the design.
 
     Attributes
     ----------
@@ -114,8 +118,6 @@ class Case:
         Remarks on how the variants were made.
     keys : tuple of str
         Keys of the sections that the report is to have.
-    requirements : Requirements, optional
-        Requirements on the design.
     axes : AxisUnits
         Units of the axes of frequency responses.
     tell : callable
@@ -134,12 +136,12 @@ class Case:
         experiment: ReportedExperiment | None = None,
         wires: tuple[str, ...] | None = None,
         stairs: str | None = None,
+        requirements: Requirements | None = None,
     ):
         self.diagram, self.point, self.experiment, self.wires = diagram, point, experiment, wires
-        self.stairs = stairs
+        self.stairs, self.requirements = stairs, requirements
         self.notes: list[str] = []
         self.keys: tuple[str, ...] = ()
-        self.requirements: Requirements | None = None
         self.axes = AxisUnits()
         self.tell: Callable[[str], None] = lambda doing: None
         self.variants: dict[str, Variant] = {}
@@ -153,9 +155,22 @@ class Case:
         """Yield the diagrams whose implementations are analysed: the diagram itself."""
         yield Basis(self.diagram)
 
-    def loop_wires(self) -> Mapping[str, str]:
+    def named_wires(self) -> Mapping[str, str]:
         """Return the wires at which loops are looked at, by their keys in the report."""
         return wires_on_loops(self.diagram, self.wires)
+
+    @cached_property
+    def loop_places(self) -> Mapping[str, LoopPlace]:
+        """The places at which these loops are cut, by their keys."""
+        return find_places(self.diagram, self.named_wires(), self.requirements)
+
+    def loop_wires(self) -> dict[str, str]:
+        """Return the names of the wires that are cut in the variants, by the keys of their loops."""
+        return {key: place.name for key, place in self.loop_places.items()}
+
+    def names_of_loops(self) -> dict[str, tuple[str, ...]]:
+        """Return the names that a loop at a wire has in requirements, by its key."""
+        return {key: tuple(dict.fromkeys((key, place.wire, place.name))) for key, place in self.loop_places.items()}
 
     def sensitivity_wires(self) -> dict[str, str]:
         """Return the wires whose loops' sensitivities to parameters are told, by their keys."""
@@ -242,7 +257,7 @@ class Case:
 
         found = variant(self.diagram, self.point)
         try:
-            found = variant(make(), self.point)
+            found = variant(cut_places(make(), tuple(self.loop_places.values())), self.point)
             if self.point is None and any(isinstance(f, UnusualStart) for f in found.model.findings):
                 found = variant(found.diagram, LATER * found.model.dt)
             _ = found.model

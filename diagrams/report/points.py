@@ -8,7 +8,7 @@ from typing import Any
 
 from ...blocks.core import OptionError
 from ..flat import WiredDiagram
-from ..linearization import capture, operating_point
+from ..linearization import capture, operating_point, with_passed_values
 from ..results import OperatingPoint, PointOrigin, Snapshot
 from ..simulation import apply_point
 
@@ -33,7 +33,7 @@ def point_of(diagram: WiredDiagram, where: Any, source: WiredDiagram | None = No
         where.check_fits(diagram.flatten_like(where), diagram.name)
     except OptionError:
         return taken_over(diagram, where, diagram if source is None else source, options)
-    return where
+    return with_passed_values(diagram, where)
 
 
 def taken_over(

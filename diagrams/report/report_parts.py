@@ -71,7 +71,9 @@ class ReportKind(Generic[C]):
         Titles of sections, by their keys, in place of those that their parts give.
     """
 
-    case: Callable[[WiredDiagram, Any, ReportedExperiment | None, tuple[str, ...] | None, str | None], C]
+    case: Callable[
+        [WiredDiagram, Any, ReportedExperiment | None, tuple[str, ...] | None, str | None, Requirements | None], C
+    ]
     parts: tuple[ReportPart[C], ...]
     definitions: Mapping[str, str] = field(default_factory=dict)
     titles: Mapping[str, str] = field(default_factory=dict)
@@ -163,8 +165,8 @@ class SectionTask:
 
     def make_case(self, experiment: ReportedExperiment | None = None) -> Case:
         """Return the case of the diagram."""
-        case: Case = self.kind.case(self.diagram, self.point, experiment, self.wires, self.stairs)
-        case.axes, case.keys, case.requirements = self.axes, self.keys, self.requirements
+        case: Case = self.kind.case(self.diagram, self.point, experiment, self.wires, self.stairs, self.requirements)
+        case.axes, case.keys = self.axes, self.keys
         return case
 
     @cached_property

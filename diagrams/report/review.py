@@ -46,8 +46,8 @@ HAS_NONE = (
 
 def check_names(case: Case, asked: Requirements, measured: Collection[str] = ()) -> None:
     """Refuse names in requirements that the diagram does not have."""
-    wires = case.loop_wires()
-    known = {*wires, *wires.values(), *case.extra_loops(), *measured}
+    names = (name for all_names in case.names_of_loops().values() for name in all_names)
+    known = {*names, *case.extra_loops(), *measured}
     for name in asked.loops:
         if name not in known:
             error = UnknownNameError(
@@ -99,7 +99,7 @@ def _results(case: Case, asked: Requirements, numbers: Mapping[str, Number]) -> 
     if case.actual is None:
         yield RequirementResult("stable", "", "", STABLE, Verdict.UNDECIDED, Reason.NOT_ANALYSED)
     wires = case.loop_wires()
-    loops = {**{key: (key, wire) for key, wire in wires.items()}, **{key: (key,) for key in case.extra_loops()}}
+    loops = {**case.names_of_loops(), **{key: (key,) for key in case.extra_loops()}}
     for v in judged:
         state = _State.of(v)
         if asked.stable:
@@ -128,10 +128,10 @@ def _measured(
     case: Case, asked: Requirements, numbers: Mapping[str, Number], measured: Sequence[MeasuredLoop]
 ) -> Iterator[RequirementResult]:
     """Yield the verdicts on margins of measured loops: the whole interval has to be within the limits."""
-    wires, actual = case.loop_wires(), case.actual
+    named, actual = case.names_of_loops(), case.actual
     dt = actual.model.dt if actual is not None and not actual.problem else 0.0
     for of in measured:
-        names = tuple(dict.fromkeys((of.key, wires.get(of.key, of.wire), of.wire)))
+        names = tuple(dict.fromkeys((of.key, *named.get(of.key, ()), of.wire)))
         intervals, own = of.intervals(dt), asked.limits_of_variant(names, MEASURED)
         for name, limit in asked.limits_of(names, MEASURED).items():
             result = RequirementResult(name, of.key, MEASURED, limit, Verdict.UNDECIDED, Reason.NO_NUMBER)

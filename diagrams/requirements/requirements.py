@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from copy import copy
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -91,6 +92,10 @@ class LoopLimits:
         Limits of the loop's response to a step at its wire.
     variants : mapping or iterable of str, optional
         Further variants that are judged, by their keys such as ``sampled_d1``, with limits that replace these.
+    to : str or iterable of str, optional
+        Inputs ahead of which the loop's wire is cut, such as ``"plant.u"``: the loop at these consumers alone. An
+        empty list cuts it for all. Without it a report cuts a wire that also feeds a model of the controller's own at
+        the plant's input.
     **limits : float or (float, float)
         ``phase_margin_deg``, ``gain_margin_low``, ``gain_margin_high``, ``delay_margin_s``, ``delay_margin_samples``,
         ``modulus_margin``, ``disk_margin`` and ``bandwidth`` (rad/s): at least; ``ms`` and ``mt``: at most. Of the low
@@ -102,7 +107,11 @@ class LoopLimits:
         An unknown name, or a limit that is none.
     """
 
-    def __init__(self, *, step: Any = None, variants: Any = None, **limits: Any):
+    to: tuple[str, ...] | None = None
+
+    def __init__(self, *, step: Any = None, variants: Any = None, to: Any = None, **limits: Any):
+        if to is not None:
+            self.to = _read_inputs(to)
         for name in limits:
             if name not in SENSES:
                 raise OptionError(f"there is no requirement {name!r}. {near(name, self._names())}", port=name)
@@ -128,7 +137,7 @@ class LoopLimits:
 
     @staticmethod
     def _names() -> tuple[str, ...]:
-        return (*SENSES, "step", "variants")
+        return (*SENSES, "step", "variants", "to")
 
     @property
     def is_empty(self) -> bool:
@@ -203,6 +212,12 @@ class Requirements(LoopLimits):
         own = [one for one in steps if not one.input]
         if len(own) > 1:
             raise OptionError("found two without an input; expected one. Name the wires of the others.", port="step")
+        if "to" in limits:
+            raise OptionError(
+                "found it for all loops; expected it for one. Write [loops.u], and to = 'plant.u' below it; in Python "
+                "loops={'u': {'to': 'plant.u'}}.",
+                port="to",
+            )
         super().__init__(step=own[0] if own else None, variants=variants, **limits)
         self.stable = stable
         self.steps: tuple[StepLimits, ...] = tuple(one for one in steps if one.input)
@@ -238,6 +253,20 @@ class Requirements(LoopLimits):
     def judges(self, names: Iterable[str], variant: str) -> bool:
         """Return whether a further variant of a loop is judged; ``names`` are the loop's key and wire."""
         return variant in self.variants or any(variant in of.variants for of in self._of_loop(names))
+
+    def inputs_of(self, names: Iterable[str]) -> tuple[str, ...] | None:
+        """Return the inputs ahead of which a loop is cut, none for all its consumers; None if nothing says it."""
+        return next((limits.to for limits in self._of_loop(names) if limits.to is not None), None)
+
+    def with_loops(self, names: Mapping[str, str]) -> Requirements:
+        """Return the requirements with other names of some loops, which are cut at their places already."""
+        made, loops = copy(self), dict[str, LoopLimits]()
+        for name, limits in self.loops.items():
+            loops[names.get(name, name)] = placed = copy(limits)
+            if name in names:
+                placed.to = None
+        made.loops = MappingProxyType(loops)
+        return made
 
     def limits_of(self, names: Iterable[str], variant: str) -> dict[str, Limit]:
         """Return the limits of a loop in a variant, the special ones in place of the general ones."""
@@ -281,13 +310,28 @@ class Requirements(LoopLimits):
                 yield limits.variants[variant]
 
 
+def _read_inputs(given: Any) -> tuple[str, ...]:
+    named = (given,) if isinstance(given, str) else given
+    if not isinstance(named, list | tuple) or not all(isinstance(name, str) and name for name in named):
+        raise OptionError(f"found {given!r}; expected inputs of blocks. Give one, such as 'plant.u'.", port="to")
+    return tuple(named)
+
+
 def _variants(given: Any) -> dict[str, LoopLimits]:
     if given is None:
         return {}
     if isinstance(given, str):
         return {given: LoopLimits()}
     if isinstance(given, Mapping):
-        return {str(key): _loop_limits(limits, f"variants.{key}") for key, limits in given.items()}
+        found = {str(key): _loop_limits(limits, f"variants.{key}") for key, limits in given.items()}
+        for key, limits in found.items():
+            if limits.to is not None:
+                raise OptionError(
+                    "found it for a variant; expected it for a loop, whose variants are all cut at one place. Write it "
+                    "in [loops.NAME].",
+                    port=f"variants.{key}.to",
+                )
+        return found
     if isinstance(given, Iterable):
         keys = list(given)
         if all(isinstance(key, str) for key in keys):

@@ -3,6 +3,7 @@
 from .cases import CaseOrigin, CaseState, Goal, StudyCase
 from .confirmation import ConfirmationKind, RunConfirmation, confirm_parameter, confirm_sensitivity
 from .contact_task import ContactTask
+from .loop_places import LoopPlace, cut_places, find_places
 from .sensitivity import Sensitivities, Sensitivity, find_sensitivities, sensitivities_of
 from .worst_case import WorstCase, find_worst_case
 from .worst_case_task import WorstCaseTask
@@ -13,6 +14,7 @@ __all__ = [
     "ConfirmationKind",
     "ContactTask",
     "Goal",
+    "LoopPlace",
     "RunConfirmation",
     "Sensitivities",
     "Sensitivity",
@@ -21,6 +23,8 @@ __all__ = [
     "WorstCaseTask",
     "confirm_parameter",
     "confirm_sensitivity",
+    "cut_places",
+    "find_places",
     "find_sensitivities",
     "find_worst_case",
     "sensitivities_of",

@@ -18,6 +18,7 @@ from ..requirements import Requirements
 from ..sweeps import Box, Samples, read_samples
 from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe, make_goal
 from .confirmation import RunConfirmation, confirm_case
+from .loop_places import place_loops
 from .measures import ContactMeasure, FunctionMeasure, Measure
 from .parameters import check_parameters
 from .search import Study
@@ -218,6 +219,8 @@ def find_worst_case(
         goal = Goal({(measure.place,): {measure.name: None}})
     else:
         assert not callable(quantity)
+        if requirements is not None:
+            diagram, loop, requirements = place_loops(diagram, loop, requirements)
         goal = make_goal(loop, quantity, requirements, diagram.name)
     if isinstance(samples, str) and samples == "latin" and count is None:
         count = 100

@@ -13,6 +13,7 @@ from ..linearization import find_signal
 from ..requirements import Limit, Requirements, TomlFile
 from ..sweeps import Box, read_samples
 from .cases import Goal, make_goal
+from .loop_places import STEP
 from .measures import ContactMeasure
 from .parameters import check_parameters
 from .worst_case import WorstCase, find_worst_case
@@ -23,8 +24,6 @@ KEYS = ("ranges", "loop", "quantity", "requirements", "contact", "samples", "cou
 """Entries of the table."""
 RANGE = ("low", "high", "scale")
 """Entries of a range that is a table."""
-STEP = 1e-3
-"""Communication step in s with which signals of a diagram without a clock are looked up."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,9 @@ from ...frequency import (
     periodic_margins,
     with_findings,
 )
-from ...linearization import MeanSlope, linearize
+from ...linearization import MeanSlope, ParallelWays, linearize
+from ...studies import LoopPlace, cut_places
+from ...wiring import join
 from .. import figures
 from ..case import Case
 from ..pages import Plot, Section, Table, Texts
@@ -166,6 +168,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
                 beside.append((title, c.name, c.value, c.control, c.function, c.right, c.why))
     if not found:
         return None
+    notes = [*_other_cuts(case, case.loop_places[key]), *notes] if key in case.loop_places else notes
     if periodic:
         notes += TEXTS.paragraphs("periodic", wire=wire)
     tables = [
@@ -205,6 +208,34 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
     looks = {at: case.looks[at.partition(".")[0]] for at in designs}
     drawn = figures.DrawnLoops(wire, plain, found, titles, looks, case.axes)
     return LoopPart(Section(key, f"Loop at {wire}", tuple(notes), tuple(tables), (), numbers), own, drawn)
+
+
+def _other_cuts(case: Case, place: LoopPlace) -> list[str]:
+    """Return what a loop is where its wire has several ways back, with the numbers of its other cuts."""
+    v = case.actual
+    if v is None or v.problem:
+        return []
+    inputs = ", ".join(join(*to) for to in place.to)
+    if place.to:
+        others = ", ".join(join(*to) for to in place.own)
+        return [TEXTS.line("at_inputs", wire=place.wire, inputs=inputs, own=others, whole=_margins_of(v, place.wire))]
+    try:
+        parallel = [f for f in v.loop(place.wire).findings if isinstance(f, ParallelWays)]
+    except LoopwrightError:
+        return []
+    return [
+        TEXTS.line("parallel", wire=f.wire, inputs=[(to, _margins_of(v, place.wire, to)) for to in f.to])
+        for f in parallel
+    ]
+
+
+def _margins_of(v: Variant, wire: str, to: str = "") -> tuple[float, float] | None:
+    """Return the phase margin in degrees and M_s of a loop; None where it has none."""
+    try:
+        found = margins(v.model.loop(wire, to=to or ()))
+    except LoopwrightError:
+        return None
+    return (found.phase_margin_deg.value, found.ms.value) if found.stable else None
 
 
 def _numbers(m: Margins, L: Any) -> dict[str, Number]:
@@ -482,7 +513,7 @@ def gang_of_four(case: Case, key: str, wire: str) -> tuple[Plot, ...]:
 
     P leads from the wire to the nearest named one downstream that the whole loop goes through, C back from there.
     """
-    for other in wires_downstream(case.diagram, wire):
+    for other in wires_downstream(cut_places(case.diagram, tuple(case.loop_places.values())), wire):
         curves = {}
         for v in case.usable():
             if v.is_design or v.is_actual:

@@ -76,7 +76,7 @@ class MeasuredLoop:
 def read_measured(case: Case, measured: Mapping[str, Any]) -> tuple[MeasuredLoop, ...]:
     """Return measured loops with their margins."""
     flat = case.diagram.flatten(None if case.diagram.has_clock else STEP)
-    known = {_place(flat, wire): key for key, wire in case.loop_wires().items()}
+    known = {_place(flat, wire): key for key, wire in case.named_wires().items()}
     found: dict[str, MeasuredLoop] = {}
     for wire, given in measured.items():
         source = read_frequency_data(given) if isinstance(given, str | os.PathLike) else given

@@ -79,8 +79,9 @@ class StepTest:
 def step_tests(case: Case, v: Variant) -> Iterator[StepTest]:
     """Yield the steps that are tried in a variant: at the wire of each loop, and those that are required besides."""
     asked = case.requirements
+    names = case.names_of_loops()
     for key, wire in case.loop_wires().items():
-        yield StepTest(key, wire, "", None if asked is None else asked.step_of((key, wire), v.key))
+        yield StepTest(key, wire, "", None if asked is None else asked.step_of(names[key], v.key))
     for limits in () if asked is None else asked.steps:
         yield StepTest(key_of_step(limits), limits.input, limits.output, limits)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +14,16 @@ from ....blocks.core import LoopwrightError, OptionError
 from ...flat import WiredDiagram
 from ...frequency import Number
 from ...requirements import Limit, Reason, RequirementResult, Requirements, TomlFile, Verdict, judge
-from ...studies import CaseOrigin, CaseState, RunConfirmation, StudyCase, WorstCase, WorstCaseTask
+from ...studies import (
+    CaseOrigin,
+    CaseState,
+    LoopPlace,
+    RunConfirmation,
+    StudyCase,
+    WorstCase,
+    WorstCaseTask,
+    cut_places,
+)
 from ..content_hash import content_hash
 from ..pages import Plot, Section, Table, Texts
 from .loops import ROWS
@@ -69,13 +77,18 @@ def find_reported(
     at: Any,
     stairs: str | None,
     tell: Callable[[str], None],
-    wires: Mapping[str, str],
+    places: Mapping[str, LoopPlace],
 ) -> ReportedWorstCase | MissingWorstCase:
-    """Return the worst case of a report: one that was found, or one that a file asks for, with its run."""
+    """Return the worst case of a report: one that was found, or one that a file asks for, with its run.
+
+    The loops of a file are cut where the report cuts them: at ``places``, by their keys.
+    """
     if isinstance(given, WorstCaseTask):
         options = {} if stairs is None else {"stairs": stairs}
-        asked = None if requirements is None else _name_wires(requirements, wires, given.loops)
-        task = given
+        asked = _name_wires(requirements, places, given.loops)
+        diagram = cut_places(diagram, tuple(places.values()))
+        names = {w: p.name for w in given.loops for p in places.values() if w == p.wire or p.wire.endswith(f".{w}")}
+        given = task = replace(given, loops=tuple(names.get(wire, wire) for wire in given.loops))
         try:
             given = task.find(diagram, asked, at=at, progress=lambda line: tell(f"{KEY}: {line}"), **options)
         except LoopwrightError as error:
@@ -86,13 +99,17 @@ def find_reported(
         return ReportedWorstCase(given, problem=error.message)
 
 
-def _name_wires(requirements: Requirements, wires: Mapping[str, str], loops: tuple[str, ...]) -> Requirements:
+def _name_wires(
+    requirements: Requirements | None, places: Mapping[str, LoopPlace], loops: tuple[str, ...]
+) -> Requirements | None:
     """Return requirements whose loops are named by wires, as a worst case names them, and not by keys of the report."""
-    short = {wire: next((w for w in loops if wire == w or wire.endswith(f".{w}")), wire) for wire in wires.values()}
-    names = {name: short[wire] for key, wire in wires.items() for name in (key, wire)}
-    made = copy(requirements)
-    made.loops = {names.get(name, name): limits for name, limits in requirements.loops.items()}
-    return made
+    if requirements is None:
+        return None
+    names: dict[str, str] = {}
+    for key, place in places.items():
+        named = next((w for w in loops if place.wire == w or place.wire.endswith(f".{w}")), place.wire)
+        names |= dict.fromkeys((key, place.wire, named, place.name), place.name if place.to else named)
+    return requirements.with_loops(names)
 
 
 @dataclass(frozen=True)
