@@ -24,7 +24,7 @@ from ...blocks.core import (
 from ...fmus.models import gantry
 from ..diagram import Diagram
 from ..paper import EXPERIMENTS, Experiment
-from ..requirements import STUDIES, Reason, Requirements, Review, TomlFile, Verdict, read_requirements
+from ..requirements import STUDIES, Requirements, Review, TomlFile, Verdict, explain, read_requirements
 from .options import parse_options, share
 from .text import say
 from .user_models import load_user_file
@@ -237,12 +237,13 @@ def verdict_text(reviewed: Review) -> str:
 
     lines = [f"Requirements: {reviewed.verdict}."]
     for result in (*reviewed.of(Verdict.FAILED), *reviewed.of(Verdict.UNDECIDED)):
-        place = result.path or ".".join(part for part in (result.loop, result.variant, result.quantity) if part)
+        parts = (result.loop or result.place, result.variant, result.quantity)
+        place = result.path or ".".join(part for part in parts if part)
         found = "" if result.number is None else f" found {quantity(result.number).replace(NARROW, ' ')},"
         unit = "" if result.number is None else print_unit(result.number.unit)
         required = f"{result.limit}{'' if unit in ('', '°') else ' '}{unit}"
-        detail = f": {result.detail}" if result.detail else ""
-        reason = "" if result.reason is Reason.COMPARED else f" ({result.reason}{detail})"
+        why = explain(result)
+        reason = f" ({why})" if why else ""
         lines.append(f"  {result.verdict}: {place}:{found} required {required}{reason}")
     return "\n".join(lines)
 

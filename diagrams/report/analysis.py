@@ -211,8 +211,9 @@ def analyse(
     if touched is not None and touched.contacts:
         tell("contact")
         sections = (*sections, contact_sections(touched))
-    made = Report("", sections).numbers()
-    reviewed = None if asked is None else review(case, asked, made, loops_measured, searched, touched)
+    whole = Report("", sections)
+    made, absent = whole.numbers(), whole.absent()
+    reviewed = None if asked is None else review(case, asked, made, loops_measured, searched, touched, absent)
     if only is None or asked is not None or summary:
         more = [] if touched is None or not touched.contacts else [contacts_on_first_page(touched)]
         first = summarize(case, reviewed, made, searched, more, sections), all_requirements(case, reviewed)

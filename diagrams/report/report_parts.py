@@ -191,4 +191,5 @@ def joined(sections: list[Section]) -> Section:
         {path: number for s in sections for path, number in s.numbers.items()},
         tuple(chain.from_iterable(s.sections for s in sections)),
         tuple(chain.from_iterable(s.overview for s in sections)),
+        {path: why for s in sections for path, why in s.absent.items()},
     )

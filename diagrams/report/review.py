@@ -83,18 +83,33 @@ def review(
     measured: Sequence[MeasuredLoop] = (),
     worst_case: ReportedWorstCase | MissingWorstCase | None = None,
     contacts: ReportedContacts | None = None,
+    absent: Mapping[str, str] | None = None,
 ) -> Review:
-    """Return the verdicts on requirements."""
+    """Return the verdicts on requirements; ``absent`` has the reasons why numbers are missing, by path."""
     felt = () if contacts is None else contacts.results(numbers)
     outcomes = {} if worst_case is None else worst_case.outcomes()
     searched = () if worst_case is None else worst_case.results()
     plain = (_plain(path, limit, numbers, outcomes) for path, limit in asked.numbers.items())
     return Review(
-        (*_results(case, asked, numbers), *plain, *_measured(case, asked, numbers, measured), *searched, *felt)
+        (
+            *_results(case, asked, numbers, absent or {}),
+            *plain,
+            *_measured(case, asked, numbers, measured),
+            *searched,
+            *felt,
+        )
     )
 
 
-def _results(case: Case, asked: Requirements, numbers: Mapping[str, Number]) -> Iterator[RequirementResult]:
+def reason_of(absent: Mapping[str, str], path: str) -> str:
+    """Return the reason why numbers below a path are missing; that of the longest part of it that has one."""
+    parts = path.split(".")
+    return next((absent[p] for n in range(len(parts), 0, -1) if (p := ".".join(parts[:n])) in absent), "")
+
+
+def _results(
+    case: Case, asked: Requirements, numbers: Mapping[str, Number], absent: Mapping[str, str]
+) -> Iterator[RequirementResult]:
     judged = list(case.judged())
     if case.actual is None:
         yield RequirementResult("stable", "", "", STABLE, Verdict.UNDECIDED, Reason.NOT_ANALYSED)
@@ -114,14 +129,14 @@ def _results(case: Case, asked: Requirements, numbers: Mapping[str, Number]) -> 
                     continue  # a general limit of single loops
                 is_periodic = _is_periodic(numbers, f"inner.{key}.{v.key}")
                 reason, said = (Reason.PERIODIC, HAS_NONE) if is_periodic else (Reason.NO_NUMBER, "")
-                detail = said if found is None else ""
+                detail = (said or reason_of(absent, f"inner.{key}.{v.key}")) if found is None else ""
                 result = RequirementResult(name, key, v.key, limit, Verdict.UNDECIDED, reason, detail=detail)
                 yield _with(state, result, found, _refuted(numbers, key, v.key))
             step = asked.step_of(names, v.key)
             if step is not None and key in wires:
-                yield from _step(case, v, state, key, step, numbers)
+                yield from _step(case, v, state, key, step, numbers, absent)
         for step in asked.steps:
-            yield from _step(case, v, state, key_of_step(step), step, numbers, loop="")
+            yield from _step(case, v, state, key_of_step(step), step, numbers, absent, loop="")
 
 
 def _measured(
@@ -256,6 +271,7 @@ def _step(
     key: str,
     step: StepLimits,
     numbers: Mapping[str, Number],
+    absent: Mapping[str, str],
     loop: str | None = None,
 ) -> Iterator[RequirementResult]:
     settled, length = (numbers.get(f"steps.{key}.{v.key}.{name}") for name in ("settled", "length"))
@@ -265,7 +281,9 @@ def _step(
         where = key if loop is None else loop
         result = RequirementResult(f"step.{name}", where, v.key, limit, Verdict.UNDECIDED, Reason.NOT_MEASURED)
         if loop == "":
-            result = replace(result, detail=key)
+            result = replace(result, place=f"{step.input} → {step.output}" if step.output else step.input)
+        if number is None:
+            result = replace(result, detail=reason_of(absent, f"steps.{key}.{v.key}"))
         result = _with(state, result, None if number is None else (path, number))
         if number is not None and settled is not None and not settled.value and length is not None:
             result = _not_settled(result, number, length)

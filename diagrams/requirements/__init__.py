@@ -1,6 +1,7 @@
 """Requirements on a design, and the verdicts on its numbers."""
 
 from .contact_limits import ContactLimits, read_contact_limits
+from .explanations import explain
 from .number_limits import SENSES, Limit, Reason, Sense, Verdict, is_doubtful, judge, judge_interval
 from .requirements import LoopLimits, Requirements, StepLimits
 from .results import RequirementResult, Review
@@ -21,6 +22,7 @@ __all__ = [
     "StepLimits",
     "TomlFile",
     "Verdict",
+    "explain",
     "is_doubtful",
     "judge",
     "judge_interval",

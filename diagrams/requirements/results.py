@@ -37,6 +37,8 @@ class RequirementResult:
         The number.
     detail : str
         More about the reason, in words.
+    place : str
+        Wires of a step from one to another, such as "wish → y"; empty of all other numbers.
     """
 
     quantity: str
@@ -49,6 +51,7 @@ class RequirementResult:
     path: str = ""
     number: Number | None = None
     detail: str = ""
+    place: str = ""
 
     @property
     def relative(self) -> float:
@@ -70,6 +73,7 @@ class RequirementResult:
             "path": self.path,
             "value": math.nan if self.number is None else self.number.value,
             "detail": self.detail,
+            "place": self.place,
         }
 
 

@@ -23,7 +23,7 @@ from ...blocks.core import (
 from ..flat import WiredDiagram
 from ..frequency import Confirmation, Margins, Number, disk_margin, margins, mimo_disk_margin, mu_bound, realize
 from ..linearization import Linearization, find_signal, hold_sources, linearize, loop_of_variant, trim
-from ..measure import find_least_sine, frequency_response, step_response
+from ..measure import StepResponse, find_least_sine, frequency_response, step_response
 from .numbers import numbers_of
 from .parameters import changed_entry
 
@@ -57,6 +57,9 @@ class ConfirmationKind(StrEnum):
     """A sine is added to the wire of the running diagram, at the frequency that decides the margin."""
     GROWTH = "growth"
     """A small step is added to the wire, and the signal grows as the unstable pole says."""
+    DEPARTURE = "departure"
+    """The point is not at rest, and the run leaves it at least as fast as the unstable pole says: limits that act there
+    may hold the wire, so that no step grows at it."""
     CONTACT = "contact"
     """The environment is at the plant, at 0.97 and 1.03 of the limit, and the motion decays and grows as predicted."""
 
@@ -69,16 +72,17 @@ class RunConfirmation:
     Attributes
     ----------
     kind : ConfirmationKind
-        Injection, growth, or contact.
+        Injection, growth, departure, or contact.
     wire : str
         Wire at which the test signal was added; of a contact the port at which the environment pushes.
     omega : float
         Frequency of the sine, or of the motion in contact, in rad/s; NaN of a growth.
     predicted, measured : float
         The margin, or the growth in 1/s (of a contact at 1.03 of its limit), which the linear model's response shows in
-        the same time. A response that leaves all bounds has an infinite growth.
+        the same time. A response that leaves all bounds has an infinite growth. Of a departure the least growth.
     agrees : bool
-        Whether they agree: a margin to 1 % and ten times the measurement's own uncertainty, a growth to 10 %.
+        Whether they agree: a margin to 1 % and ten times the measurement's own uncertainty, a growth to 10 %. A
+        departure agrees if it grows as fast, less 10 %, or faster.
     uncertainty : float
         Relative uncertainty of the measurement's loop L; NaN of a growth.
     """
@@ -264,7 +268,34 @@ def _measure_growth(
     measured = _read_growth(found.v, found.t)
     expected = case.growth if found.prediction is None else _read_growth(found.prediction[:, 0], found.t)
     agrees = 0.0 < measured < math.inf and abs(measured - expected) <= GROWTH_AGREEMENT * abs(expected)
+    if not agrees and not model.is_equilibrium:
+        departure = _measure_departure(diagram, model, wire, size, length)
+        if departure >= (1.0 - GROWTH_AGREEMENT) * case.growth:
+            return RunConfirmation(ConfirmationKind.DEPARTURE, wire, math.nan, case.growth, departure, agrees=True)
     return RunConfirmation(ConfirmationKind.GROWTH, wire, math.nan, expected, measured, agrees)
+
+
+def _measure_departure(diagram: WiredDiagram, model: Linearization, wire: str, size: float, length: float) -> float:
+    """Return the growth in 1/s of the run's distance from its point, by its largest one in all and in half the time.
+
+    The distance is that of the blocks with states, relative to 1 + their values. A ramp is no growth: its distance
+    doubles in the second half of eight time constants, where a mode's grows fiftyfold.
+    """
+    blocks = diagram.blocks
+    moving = (path for path, b in blocks.items() if b.states or b.stepped or b.evaluated_outside)
+    names = [f"{path}.{port}" for path in moving for port in blocks[path].outputs]
+
+    def respond(length: float) -> StepResponse:
+        at, stairs = model.point, model.stairs
+        return step_response(diagram, wire, size=size, length=length, at=at, outputs=names, stairs=stairs)
+
+    try:
+        half, whole = respond(0.5 * length), respond(length)
+    except SimulationError:  # it has left all bounds
+        return math.inf
+    if not 0.0 < half.moved < whole.moved < math.inf:
+        return -math.inf
+    return math.log(whole.moved / half.moved) / float(whole.t[-1] - half.t[-1])
 
 
 def _read_growth(v: np.ndarray, t: np.ndarray) -> float:

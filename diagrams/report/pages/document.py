@@ -118,6 +118,8 @@ class Section:
     sections: tuple[Section, ...] = ()
     overview: tuple[Plot, ...] = ()
     """Small figures of it that stand in the summary."""
+    absent: Mapping[str, str] = field(default_factory=dict)
+    """Reasons why numbers are missing, by the beginnings of their paths within the section."""
 
     def __post_init__(self) -> None:
         of_tables = {path: number for table in self.tables for path, number in table.numbers.items()}
@@ -168,12 +170,19 @@ class Document:
 
     def numbers(self) -> dict[str, Number]:
         """Return every number by its dotted path, such as ``inner.par.sampled_d0.phase_margin_deg``."""
+        return {here + path: n for here, section in self._walk() for path, n in section.numbers.items()}
 
-        def walk(sections: Iterable[Section], prefix: str) -> Iterator[tuple[str, Number]]:
+    def absent(self) -> dict[str, str]:
+        """Return the reasons why numbers are missing, by the beginnings of their paths."""
+        return {here + path: why for here, section in self._walk() for path, why in section.absent.items()}
+
+    def _walk(self) -> Iterator[tuple[str, Section]]:
+        """Yield each section with the beginning of its paths."""
+
+        def walk(sections: Iterable[Section], prefix: str) -> Iterator[tuple[str, Section]]:
             for section in sections:
                 here = f"{prefix}{section.key}."
-                for path, number in section.numbers.items():
-                    yield here + path, number
+                yield here, section
                 yield from walk(section.sections, here)
 
-        return dict(walk(self.sections, ""))
+        yield from walk(self.sections, "")

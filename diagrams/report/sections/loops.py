@@ -71,12 +71,14 @@ WHOLE = 1e-6
 
 def inner(case: Case) -> Section | None:
     """Return the section about the loops, one part for each wire; None where nothing is to be said of any."""
-    text, parts = [*TEXTS.paragraphs("margins")], dict[str, LoopPart]()
+    text, parts, absent = [*TEXTS.paragraphs("margins")], dict[str, LoopPart](), dict[str, str]()
     wires = case.loop_wires()
     for key, wire in wires.items():
         part = _wire(case, key, wire)
         if part is None:
-            text += left_out(case, wire, blocks_on_loops(case.diagram))
+            reasons = left_out(case, wire, blocks_on_loops(case.diagram))
+            text += reasons
+            absent |= {key: reasons[0]} if reasons else {}
         else:
             parts[key] = part
     if not parts:
@@ -92,7 +94,7 @@ def inner(case: Case) -> Section | None:
         elif part.drawn is not None:
             made = _with_figures(case, key, made, part.drawn)
         sections.append(made)
-    return Section("inner", LOOPS_TITLE, tuple(text), sections=tuple(sections))
+    return Section("inner", LOOPS_TITLE, tuple(text), sections=tuple(sections), absent=absent)
 
 
 def _with_figures(case: Case, key: str, section: Section, drawn: figures.DrawnLoops) -> Section:
@@ -118,6 +120,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
     notes: list[str] = []
     numbers: dict[str, Number] = {}
     beside: list[tuple[Any, ...]] = []
+    absent: dict[str, str] = {}
     for v in case.usable():
         try:
             cut, title, L = v.fullest_loop(wire)
@@ -126,6 +129,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
             m = margins(L)
         except LoopwrightError as error:
             notes.append(f"{v.title}: {error.message}")
+            absent[v.key] = error.message
             continue
         at = cut_key(v, cut)
         found[at], loops[at], titles[at] = m, L, title
@@ -207,7 +211,9 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
     plain = {at: loops[at] for at in designs}
     looks = {at: case.looks[at.partition(".")[0]] for at in designs}
     drawn = figures.DrawnLoops(wire, plain, found, titles, looks, case.axes)
-    return LoopPart(Section(key, f"Loop at {wire}", tuple(notes), tuple(tables), (), numbers), own, drawn)
+    return LoopPart(
+        Section(key, f"Loop at {wire}", tuple(notes), tuple(tables), (), numbers, absent=absent), own, drawn
+    )
 
 
 def _other_cuts(case: Case, place: LoopPlace) -> list[str]:

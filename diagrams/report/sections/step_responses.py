@@ -100,6 +100,7 @@ def steps(case: Case) -> Section | None:
     resting: list[tuple[Any, ...]] = []
     text: list[str] = []
     found: dict[StepTest, dict[str, StepResponse]] = {}
+    absent: dict[str, str] = {}
     for v in case.judged():
         if v.problem:
             continue
@@ -111,8 +112,10 @@ def steps(case: Case) -> Section | None:
                 ran = _run(case, v, test)
             except LoopwrightError as error:
                 text.append(TEXTS.line("failed", variant=v.title, wire=test.wire, message=str(error)))
+                absent[f"{test.key}.{v.key}"] = str(error)
                 continue
             if ran is None:
+                absent[f"{test.key}.{v.key}"] = TEXTS.line("no_single", wire=test.wire)
                 continue
             got, slowest, quantized = ran
             where = f"{test.key}.{v.key}"
@@ -142,7 +145,7 @@ def steps(case: Case) -> Section | None:
                 text.append(TEXTS.line("moved", variant=v.title, wire=test.wire, moved=got.moved))
             found.setdefault(replace(test, limits=None), {})[v.key] = got
     if not found:
-        return Section("steps", TITLE, tuple(dict.fromkeys(text))) if text else None
+        return Section("steps", TITLE, tuple(dict.fromkeys(text)), absent=absent) if text else None
     tables = [Table("Step responses", ("step", "variant", "number", "co-simulation", "linear"), tuple(rows))]
     if effort:
         tables.append(
@@ -171,7 +174,7 @@ def steps(case: Case) -> Section | None:
     ]
     overview = tuple(plot for test, curves in found.items() for plot in _overview(case, test, curves))
     whole = (*TEXTS.paragraphs("responses"), *dict.fromkeys(text))
-    return Section("steps", TITLE, whole, tuple(tables), tuple(plots), numbers, overview=overview)
+    return Section("steps", TITLE, whole, tuple(tables), tuple(plots), numbers, overview=overview, absent=absent)
 
 
 def _said(test: StepTest) -> str:

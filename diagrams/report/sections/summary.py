@@ -9,7 +9,7 @@ from typing import Any
 from ....blocks.core import LoopwrightError, print_unit
 from ...frequency import Number, find_disk_frequency, order_key, realize
 from ...linearization import Linearization, find_signal
-from ...requirements import Limit, RequirementResult, Review, Verdict
+from ...requirements import Limit, RequirementResult, Review, Verdict, explain
 from ...studies import CaseState
 from ..case import Case
 from ..figures import HEIGHTS, fit_overview
@@ -141,14 +141,13 @@ def _relative(result: RequirementResult) -> float:
 def _row(case: Case, result: RequirementResult) -> tuple[Any, ...]:
     variant = case.variants.get(result.variant)
     unit = "" if result.number is None or result.number.unit == "1" else result.number.unit
-    touches = result.variant == CONTACT
-    facts = {"verdict": result.verdict.value, "reason": result.reason.name, "contact": touches}
-    said = TEXTS.line("outcome", **facts, detail=result.detail)
+    touches, why = result.variant == CONTACT, explain(result)
+    said = f"{result.verdict}: {why}" if why else str(result.verdict)
     distance: Any = "–"
     if result.number is not None and not math.isnan(result.distance):
         number = result.number
         distance = Number(result.distance, number.unit, number.tolerance, number.confirmed_by, findings=number.findings)
-    place = case.loop_wires().get(result.loop, result.loop) or (result.detail if result.quantity[:5] == "step." else "")
+    place = case.loop_wires().get(result.loop, result.loop) or result.place
     place = f"{place}, with {result.detail}" if touches and place and result.detail else place
     others = {MEASURED: "measured", WORST_CASE: "worst case", CONTACT: "as it is"}
     title = variant.title if variant else others.get(result.variant, "–")

@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import brentq
 
 from loopwright.blocks import (
+    PID,
     Block,
     Constant,
     Gain,
@@ -14,6 +15,7 @@ from loopwright.blocks import (
     Integrator,
     OptionError,
     Output,
+    Saturation,
     TransferFunction,
     UnknownNameError,
     parameter,
@@ -294,3 +296,38 @@ def test_a_worst_bandwidth_is_confirmed_by_a_run_at_it():
     assert found.worst.value == pytest.approx(expected, rel=1e-6)
     assert confirmed.agrees
     assert confirmed.measured == pytest.approx(expected, rel=1e-3)
+
+
+def limited(start, gain_limit=3.0, leak=0.5, T=0.02):
+    """x' = leak x + k sat(PI(−x)): unstable with a small gain k."""
+    x, gain = Integrator(initial_value=start, name="x"), Gain(gain=1.0, name="k")
+
+    @subsystem(sample_time=T)
+    def controller(y):
+        v = PID(kp=2.0, ki=1.0, name="pid")(Constant(value=0.0, name="r"), y)
+        return Saturation(limit=gain_limit, name="sat")(v).y.named("u")
+
+    return Diagram("limited", x(gain(controller(x.y)) + leak * x.y))
+
+
+def test_a_worst_case_that_leaves_a_moving_point_into_its_limits_is_confirmed():
+    """Saturated, the wire shows no growth; x grows by e^(0.5 t), faster than the loop's pole of 0.15 1/s."""
+    found = limited(0.5).worst_case({"k.gain": [0.1, 1.0]}, "u", quantity="ms", samples="grid", starts=0)
+    assert found.worst.state is CaseState.UNSTABLE
+    run = found.confirm()
+    assert (run.kind, run.agrees) == (ConfirmationKind.DEPARTURE, True)
+    assert run.predicted == found.worst.growth == pytest.approx(0.1513, abs=1e-3)
+    assert run.measured == pytest.approx(0.5, rel=2e-3)
+
+
+def test_a_motion_that_ends_in_a_limit_cycle_is_no_departure():
+    """x[k+1] = x[k] − 2.5 sat(x[k]) jumps to and fro between bounds, though its pole is at −1.5."""
+    x, gain = Integrator(initial_value=0.4, name="x"), Gain(gain=1.0, name="k")
+
+    @subsystem(sample_time=1.0)
+    def controller(y):
+        return Saturation(limit=0.5, name="sat")(Gain(gain=-1.0, name="law")(y)).y.named("u")
+
+    diagram = Diagram("cycle", x(gain(controller(x.y))))
+    found = diagram.worst_case({"k.gain": [0.5, 2.5]}, "u", quantity="ms", samples="grid", starts=0)
+    assert not found.confirm().agrees

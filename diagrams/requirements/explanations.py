@@ -1,0 +1,113 @@
+"""Verdicts in words: why, and of one that is not decided also what would decide it."""
+
+from __future__ import annotations
+
+import math
+
+from ..frequency import Number
+from .number_limits import Reason, Verdict
+from .results import RequirementResult
+
+MEASURED = "measured"
+"""Key of the variant of measured loops."""
+
+
+def explain(result: RequirementResult) -> str:
+    """Return the reason of a verdict, and the step that would decide an open one; empty where numbers were compared.
+
+    Examples
+    --------
+    >>> from loopwright.diagrams.requirements import Limit
+    >>> open_ = Limit(40.0, math.inf), Verdict.UNDECIDED, Reason.MOVING
+    >>> explain(RequirementResult("phase_margin_deg", "u", "sampled_d0", *open_, detail="plant.v"))
+    'the operating point moves (plant.v); give one at rest, such as at=diagram.trim(…)'
+    """
+    if result.reason is Reason.COMPARED:
+        return ""
+    if result.verdict is not Verdict.UNDECIDED:
+        return str(result.reason)
+    why, step = _find_reason(result)
+    return f"{why.rstrip('.')}; {step}" if step else why.rstrip(".")
+
+
+def _find_reason(result: RequirementResult) -> tuple[str, str]:
+    """Return why a verdict is open, and what would decide it."""
+    detail, number = result.detail, result.number
+    about = f": {detail}" if detail else ""
+    is_contact, is_step = result.variant == "contact", result.quantity.startswith("step.")
+    known: dict[Reason, tuple[str, str]] = {
+        Reason.UNSTABLE: ("the closed loop is unstable", ""),
+        Reason.WITHIN_TOLERANCE: (f"the limit is within {_interval(result)}", _sharpen(result)),
+        Reason.NO_NUMBER: (f"the report has no such number{about}", "limit one that report.numbers() has"),
+        Reason.PERIODIC: (
+            "a wire that is renewed several times in the period has no such number",
+            "limit disk_margin, gain_margin_high or phase_margin_deg",
+        ),
+        Reason.NO_VALUE: (
+            f"the number does not exist here{_reason_of(number)}",
+            "limit another one" if is_step else "limit another margin, such as disk_margin",
+        ),
+        Reason.NO_UNCERTAINTY: ("the data don't say how uncertain they are", "give their uncertainty"),
+        Reason.NOT_CONFIRMED: ("nothing confirms the number", "limit one that a second computation confirms"),
+        Reason.FINDINGS: (
+            f"the linear model leaves something out (†){_finding_of(number)}",
+            "limit a step response, which the run decides, or give the loop as measured",
+        ),
+        Reason.REFUTED: (
+            f"the {'nonlinear run' if is_contact else 'injection check'} contradicts the linear model",
+            "look at its section: the run counts" if is_contact else "limit a step response, which the run decides",
+        ),
+        Reason.NOT_MEASURED: (
+            f"no response was measured{about}",
+            "" if detail else "name a step's input and output, one entry each",
+        ),
+        Reason.NOT_SETTLED: (f"the response has not settled in its record of {detail}", "give a longer length"),
+        Reason.MOVING: (
+            f"the operating point moves{f' ({detail})' if detail else ''}",
+            "give one at rest, such as at=diagram.trim(…)",
+        ),
+        Reason.ON_THE_LIMIT: (
+            f"a pole lies on the limit of stability{about}",
+            "feed it back, or take it out: the chapter on poles names it",
+        ),
+        Reason.NOT_ANALYSED: (f"not analysed{about}", "" if detail else "the diagram as it is has to be analysed"),
+    }
+    return known[result.reason]
+
+
+def _interval(result: RequirementResult) -> str:
+    if result.detail:
+        return f"the interval {result.detail}"
+    number = result.number
+    if number is None:
+        return "the number's tolerance"
+    return f"the number's tolerance, {number.value - number.tolerance:.5g} … {number.value + number.tolerance:.5g}"
+
+
+def _sharpen(result: RequirementResult) -> str:
+    """Return how the tolerance of a number gets smaller."""
+    if result.variant == MEASURED:
+        return "measure more points, or with less uncertainty"
+    if result.quantity.startswith("step."):
+        return "give a longer length or a larger size, or a limit farther away"
+    why = "" if result.number is None else result.number.confirmed_by
+    if "FMU" in why:
+        return "give a limit farther away, or an FMU with derivatives of its own: the tolerance is that of its model"
+    return "give a limit farther away"
+
+
+def _reason_of(number: Number | None) -> str:
+    """Return the reason that a number without a value carries."""
+    if number is None:
+        return ""
+    if math.isnan(number.value) and number.confirmed_by:
+        return f": {number.confirmed_by}"
+    return ": its tolerance is not known" if not number.tolerance < math.inf else ""
+
+
+def _finding_of(number: Number | None) -> str:
+    """Return the first finding of a number, one that puts it in doubt if there is any."""
+    if number is None or not number.findings:
+        return ""
+    findings = sorted(number.findings, key=lambda finding: not finding.puts_in_doubt)
+    return f": {str(findings[0]).rstrip('.')}"

@@ -1,0 +1,55 @@
+"""Open verdicts on the first page: the place that was named, the reason, and what would decide it."""
+
+from loopwright.blocks import Constant, Gain, Integrator, StateSpace
+from loopwright.diagrams import Diagram, Requirements
+from loopwright.diagrams.cli.report import verdict_text
+from loopwright.diagrams.requirements import Reason
+
+
+def spring(start=0.0):
+    """s² + 3 s + 40: L = (3 s + 40)/s² at the command of a double integrator."""
+    place, speed = Integrator(initial_value=start, name="place"), Integrator(name="speed")
+    law = (Constant(value=0.0, name="wish") - (3.0 * speed.y + 40.0 * place.y)).named("u")
+    return Diagram("spring", place(speed(law)))
+
+
+def row_of(report, quantity):
+    for section in report.sections:
+        for table in section.tables:
+            if table.title == "Requirements" or "required" in table.columns:
+                for row in table.rows:
+                    if quantity in str(row[1]):
+                        return [str(cell) for cell in row[:3]]
+    raise AssertionError(quantity)
+
+
+def test_the_place_of_a_step_stays_where_its_response_has_not_settled():
+    step = {"input": "u", "output": "place.y", "length": 0.3, "settling": 5.0}
+    report = spring().report(only=("steps",), requirements=Requirements(stable=False, step=step))
+    verdict, _, at = row_of(report, "settling")
+    assert at == "u → place.y"
+    assert verdict == "not decided: the response has not settled in its record of 0.3 s; give a longer length"
+    (result,) = report.review.results
+    assert (result.reason, result.place, result.detail) == (Reason.NOT_SETTLED, "u → place.y", "0.3 s")
+    assert "has not settled in its record of 0.3 s; give a longer length" in verdict_text(report.review)
+
+
+def test_the_place_of_a_step_stays_where_the_operating_point_moves():
+    step = {"input": "u", "output": "place.y", "settling": 5.0}
+    report = spring(start=0.1).report(only=("steps",), requirements=Requirements(stable=False, step=step))
+    verdict, _, at = row_of(report, "settling")
+    assert at == "u → place.y"
+    assert verdict == "not decided: the operating point moves (speed); give one at rest, such as at=diagram.trim(…)"
+
+
+def test_a_response_that_was_not_measured_says_why():
+    step = {"input": "y", "output": "plant.y", "settling": 5.0}
+    plant = StateSpace(
+        A=[[-1.0, 0.0], [0.0, -2.0]], B=[[1.0, 0.0], [0.0, 1.0]], C=[[1.0, 0.0], [0.0, 1.0]], name="plant"
+    )
+    diagram = Diagram("two", plant(Gain(gain=-1.0, name="minus")(plant.y.named("y"))))
+    report = diagram.report(only=("steps",), requirements=Requirements(stable=False, step=step))
+    verdict, _, at = row_of(report, "settling")
+    assert at == "y → plant.y"
+    assert verdict.startswith("not decided: no response was measured: ")
+    assert "found 2 entries; expected one" in verdict
