@@ -38,7 +38,10 @@ def _find_reason(result: RequirementResult) -> tuple[str, str]:
     known: dict[Reason, tuple[str, str]] = {
         Reason.UNSTABLE: ("the closed loop is unstable", ""),
         Reason.WITHIN_TOLERANCE: (f"the limit is within {_interval(result)}", _sharpen(result)),
-        Reason.NO_NUMBER: (f"the report has no such number{about}", "limit one that report.numbers() has"),
+        Reason.NO_NUMBER: (
+            f"the report has no such number{f'. {detail}' if detail else ''}",
+            "limit one that report.numbers() has",
+        ),
         Reason.PERIODIC: (
             "a wire that is renewed several times in the period has no such number",
             "limit disk_margin, gain_margin_high or phase_margin_deg",

@@ -235,13 +235,15 @@ def _other_cuts(case: Case, place: LoopPlace) -> list[str]:
     ]
 
 
-def _margins_of(v: Variant, wire: str, to: str = "") -> tuple[float, float] | None:
-    """Return the phase margin in degrees and M_s of a loop; None where it has none."""
+def _margins_of(v: Variant, wire: str, to: str = "") -> str:
+    """Return the phase margin and M_s of a loop in words."""
     try:
-        found = margins(v.model.loop(wire, to=to or ()))
+        m = margins(v.model.loop(wire, to=to or ()))
     except LoopwrightError:
-        return None
-    return (found.phase_margin_deg.value, found.ms.value) if found.stable else None
+        return TEXTS.line("no_numbers")
+    if not m.stable:
+        return TEXTS.line("no_numbers")
+    return TEXTS.line("numbers", phase=m.phase_margin_deg.value, ms=m.ms.value)
 
 
 def _numbers(m: Margins, L: Any) -> dict[str, Number]:
