@@ -27,7 +27,8 @@ def explain(result: RequirementResult) -> str:
     if result.verdict is not Verdict.UNDECIDED:
         return str(result.reason)
     why, step = _find_reason(result)
-    return f"{why.rstrip('.')}; {step}" if step else why.rstrip(".")
+    why = why.rstrip(".")
+    return f"{why}{' Or ' if why.endswith('?') else '; '}{step}" if step else why
 
 
 def _find_reason(result: RequirementResult) -> tuple[str, str]:
