@@ -54,7 +54,7 @@ from .one_thread import on_one_thread, one_thread
 from .outside import EvaluationVectors, Wanted
 from .parameters import ParameterSpec
 from .ports import Event, Input, Output, Port, PortUnit, Shape, State, number_inputs
-from .signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, check_name, recorder
+from .signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, check_name, primary_outputs, recorder
 from .source import Constant, Source
 from .units import (
     BASE_UNITS,
@@ -166,6 +166,7 @@ __all__ = [
     "parameter",
     "parse_unit",
     "period_of",
+    "primary_outputs",
     "print_unit",
     "rate_of",
     "read_time",

@@ -96,7 +96,7 @@ def find_signal(flat: FlatDiagram, name: str) -> Tap:
         raise UnknownNameError(f"found {name!r}; expected the name of a wire, or the path of a port. Give a text.")
     name, entry = split_entry(name, {*wires, *ports})
     try:
-        full = resolve(name, wires, ports)
+        full = resolve(name, wires, ports, flat.table.blocks)
     except UnknownNameError as error:
         if error.candidates:
             raise

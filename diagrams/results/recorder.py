@@ -397,7 +397,8 @@ def select(
     for name in record:
         inside = [where for port, where in layout.slices.items() if port.startswith(f"{name}.")]
         try:
-            kept.update(entries(resolve(name, wires, layout.slices, blocks), layout, wires).ravel().tolist())
+            full = resolve(name, wires, layout.slices, None if inside else blocks)
+            kept.update(entries(full, layout, wires).ravel().tolist())
         except UnknownNameError:
             if not inside:
                 raise

@@ -62,7 +62,9 @@ class Snapshot:
         return brief(f"instant t = {self.t:.9g} s{of}", *facts, then="instant['name'], diagram.linearize(instant)")
 
     def __getitem__(self, name: str) -> Any:
-        full, entry = split_entry(resolve(name, self.names, self.values), self.values)
+        diagram = None if self.run is None else self.run.diagram
+        full = resolve(name, self.names, self.values, getattr(diagram, "blocks", None))
+        full, entry = split_entry(full, self.values)
         value = self.values[full]
         return value[index_of(entry, value.shape, full)] if entry else value
 
@@ -311,7 +313,7 @@ class Run:
 
     def __contains__(self, name: str) -> bool:
         try:
-            return self._find_columns(resolve(name, self.wires, self.layout.slices)) is not None
+            return self._find_columns(self._resolve(name)) is not None
         except UnknownNameError:
             return False
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Layout, UnknownNameError, near
+from ...blocks.core import Layout, UnknownNameError, near, primary_outputs
 from ..wiring import Wire, explain_absent_state, index_of, split_entry
 
 _COMPUTED = ("local", "output", "calculatedParameter")
@@ -34,7 +34,7 @@ def resolve(
     """Return the full name that ``name`` stands for: a wire's or port's path, or a unique end of one; wires go first.
 
     An output ``w`` goes before ports of the same block with longer names, such as ``inertia.w``. An entry, ``name[1]``,
-    stays behind it.
+    stays behind it. Last of all, a block with one output, secondary ones aside, is that output by its own name.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def resolve(
     wires, ports : mapping, collection
         Named wires, and the dotted paths of ports.
     blocks : mapping, optional
-        Blocks by path: an error names their variables that are no ports.
+        Blocks by path, whose names stand for their outputs; an error names their variables that are no ports.
 
     Raises
     ------
@@ -69,6 +69,8 @@ def resolve(
             )
             error.candidates = tuple(found)
             raise error
+    if (output := _only_output(name, blocks or {})) in ports:
+        return output
     whole, entry = split_entry(name, {*wires, *ports})
     if entry:
         return resolve(whole, wires, ports, blocks) + name[len(whole) :]
@@ -89,6 +91,13 @@ def _output_itself(name: str, found: Collection[str]) -> str:
     shortest = min(found, key=len)
     head = shortest[: -len(name)]
     return shortest if all(other.startswith(head) for other in found) else ""
+
+
+def _only_output(name: str, blocks: Mapping[str, Any]) -> str:
+    """Return the path of the only output, secondary ones aside, of the block that a name stands for, else ""."""
+    found = [name] if name in blocks else [path for path in blocks if path.endswith("." + name)]
+    outputs = primary_outputs(blocks[found[0]].outputs) if len(found) == 1 else []
+    return f"{found[0]}.{outputs[0]}" if len(outputs) == 1 else ""
 
 
 def _hidden_variable(name: str, blocks: Mapping[str, Any]) -> tuple[str, str] | None:

@@ -245,7 +245,9 @@ def _check_names(plan: Plan, swept: Sequence[str]) -> None:
 def _check_room(plan: Plan, flat: FlatDiagram, count: int) -> None:
     """Refuse a sweep whose samples can't fit into memory."""
     names = flat.table.names
-    width = sum(entries(resolve(name, names, flat.log.slices), flat.log, names).size for name in plan.signals)
+    width = sum(
+        entries(resolve(name, names, flat.log.slices, flat.table.blocks), flat.log, names).size for name in plan.signals
+    )
     rows = int(plan.duration / float(flat.base)) // int(plan.run_options.every) + 2
     needed, there = 2 * 8 * (width + 1) * rows * count, machine_memory()
     if plan.signals and needed > 0.8 * there:
