@@ -206,7 +206,7 @@ except ModuleNotFoundError as error:
 import loopwright.blocks, loopwright.fmus, loopwright.diagrams
 wave = loopwright.blocks.Sine(frequency=1.0)()
 loopwright.diagrams.Diagram("wave", wave).simulate(1.0, step=0.5, progress=False)
-needed = {"compiled", "coupling", "diagram", "events", "exchange", "flat", "results", "simulation", "solvers", "wiring"}  # a run pays for nothing else
+needed = {"compiled", "coupling", "diagram", "events", "flat", "model_exchange", "results", "simulation", "solvers", "wiring"}  # a run pays for nothing else
 assert {m.split(".")[2] for m in sys.modules if m.startswith("loopwright.diagrams.")} == needed
 loopwright.diagrams.experiments.path_following().diagram.simulate(0.01, progress=False)
 late = [m for m in ("control", "matplotlib.pyplot", "scipy.integrate") if m in sys.modules]

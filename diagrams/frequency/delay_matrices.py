@@ -46,7 +46,7 @@ SIDES = np.array([-30, -10, -3, -1, -0.3, 0.0, 0.3, 1, 3, 10, 30])
 """Distances from a root, in parts of its distance from the axis, at which the argument is looked at."""
 
 
-class Part(NamedTuple):
+class DecoupledPart(NamedTuple):
     """States and delays that all act on one another, of a system with delays."""
 
     states: np.ndarray
@@ -64,7 +64,7 @@ class DelayMatrices:
     tau: np.ndarray
 
     @cached_property
-    def parts(self) -> list[Part]:
+    def parts(self) -> list[DecoupledPart]:
         """The strongly connected parts; the characteristic function is the product of theirs."""
         from scipy.sparse.csgraph import connected_components
 
@@ -73,10 +73,10 @@ class DelayMatrices:
         found = []
         for k in range(count):
             members = np.flatnonzero(labels == k)
-            found.append(Part(members[members < n], members[members >= n] - n))
+            found.append(DecoupledPart(members[members < n], members[members >= n] - n))
         return found
 
-    def take(self, part: Part) -> DelayMatrices:
+    def take(self, part: DecoupledPart) -> DelayMatrices:
         """Return the matrices of a part alone."""
         x, w = part
         return DelayMatrices(

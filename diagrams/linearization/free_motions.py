@@ -215,7 +215,7 @@ def _describe(v: np.ndarray, left: np.ndarray, names: Sequence[str], alone: tupl
     weight = np.abs(v) * np.linalg.norm(left, axis=1)
     first = int(np.argmax(weight >= 0.5 * np.max(weight)))
     shares = v / v[first]
-    entries = tuple((names[i], float(shares[i])) for i in np.flatnonzero(v))
+    entries = tuple((names[int(i)], float(shares[i])) for i in np.flatnonzero(v))
     return FreeMotion(names[first], tuple(sorted(entries, key=lambda e: e[0] != names[first])), alone)
 
 
@@ -398,6 +398,7 @@ class _Look:
         self.nominals, self.noise = nominals, noise
         self.error, noise_of_slopes = noise_of(local.evaluators)
         self.slopes = max(SLOPES, 10.0 * noise_of_slopes)
+        self.sizes: tuple[float, ...]
         self.sizes, self.rounding = (PLANT_SIZES, SOLVED) if _has_foreign(flat) else (SIZES, ROUNDING)
 
     @classmethod

@@ -103,7 +103,7 @@ def _are_apart(flat: FlatDiagram, port: Port, consumers: Sequence[Port]) -> bool
     paths = SignalPaths(flat, [port])
     back = paths.before([port])
     ways = [{n.block for n in paths.reach(PathNode(*to, False), lambda block: False) & back} for to in consumers]
-    return any(_is_dynamic(flat, block) for block in set().union(*ways) - set.intersection(*ways))
+    return any(_is_dynamic(flat, block) for block in set[str]().union(*ways) - set[str].intersection(*ways))
 
 
 def _is_dynamic(flat: FlatDiagram, path: str) -> bool:

@@ -25,7 +25,7 @@ def lay_out(figure: Figure) -> bool:
     if not cells:
         return False
     rows, columns = (1 + max(place[i] for place in cells.values()) for i in (0, 1))
-    renderer = FigureCanvasAgg(figure).get_renderer()
+    renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
     legends = [legend.get_tightbbox(renderer) for legend in figure.legends]
     above = max((box.height / figure.dpi for box in legends if box is not None), default=0.0)
     above += PAD if above else 0.0
@@ -50,7 +50,7 @@ def lay_out(figure: Figure) -> bool:
 def _cells(figure: Figure) -> dict[Axes, tuple[int, int]]:
     """Return the row and column of all axes; none where they don't stand in one grid, as a color bar doesn't."""
     found: dict[Axes, tuple[int, int]] = {}
-    grids = []
+    grids: list[object] = []
     for ax in figure.axes:
         place = ax.get_subplotspec()
         if place is None or len(place.rowspan) != 1 or len(place.colspan) != 1:

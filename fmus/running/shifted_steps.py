@@ -70,4 +70,5 @@ def take_shifted_steps(
 
 def _part_of(layout: Any, name: str, shift: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Return the part of a shift that belongs to a state or an input."""
-    return np.concatenate(shift)[layout.slices[name]]
+    part: np.ndarray = np.concatenate(shift)[layout.slices[name]]
+    return part

@@ -66,7 +66,7 @@ def set_powers(axis: Axis, ends: tuple[float, float], most: int) -> None:
     if decades >= DECADES:
         axis.set_major_formatter(FuncFormatter(_power))
         axis.set_major_locator(LogLocator(numticks=most))
-        if axis.axis_name == "y":  # they would touch, and cost a quarter of a figure's time
+        if getattr(axis, "axis_name", "") == "y":  # they would touch, and cost a quarter of a figure's time
             axis.set_minor_locator(NullLocator())
         return
     axis.set_major_formatter(FuncFormatter(_label))

@@ -78,7 +78,7 @@ def _draw(
         few = np.unique(np.linspace(0, len(t) - 1, 40).astype(int))
         y = got.answer(to_output)
         shown = whole * (got.d != 0.0) - y if whole else y
-        drawn = {"drawstyle": "steps-post"} if got.held else {}
+        drawn: dict[str, Any] = {"drawstyle": "steps-post"} if got.held else {}
         ax.plot(t, shown, label=title, **look, **drawn)
         if got.prediction is not None:
             p = got.answer(to_output, linear=True)
