@@ -8,7 +8,7 @@ import numpy as np
 
 from ....blocks.core import LoopwrightError, PeriodicLoopError
 from ...frequency import Confirmation, Number
-from ...linearization import Linearization
+from ...linearization import Linearization, hold_sources
 from ...measure import LEAST_SINE, FrequencyResponse, find_least_sine, frequency_response
 from ...results import PointOrigin
 from .. import figures
@@ -141,9 +141,11 @@ def _moving(v: Variant) -> dict[str, Any]:
 
 
 def _measured(plan: InjectionPlan, wire: str) -> FrequencyResponse:
-    excited, point = plan.variant, plan.variant.point
+    diagram, point = plan.variant.diagram, plan.variant.point
     at = point.t if point.how is PointOrigin.RUN else point
-    return frequency_response(excited.diagram, wire, plan.frequencies, amplitude=plan.amplitude, at=at, compile=True)
+    if at == 0.0:  # a step of the diagram's own would move it away from its start
+        diagram = hold_sources(diagram, point.values)
+    return frequency_response(diagram, wire, plan.frequencies, amplitude=plan.amplitude, at=at, compile=True)
 
 
 def _curve(title: str, found: FrequencyResponse, L: Linearization) -> figures.MeasuredCurve:
