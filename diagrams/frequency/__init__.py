@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .delay_matrices import DelayMatrices
+from .delay_matrices import DelayMatrices, replace_delays
 from .delayed_hold import delayed_hold, delayed_hold_margin
 from .delayed_realization import DelayedRealization, realize
 from .disk_margins import DiskMargin, disk_margin, loop_at, mimo_disk_margin
@@ -102,6 +102,7 @@ __all__ = [
     "realize",
     "refine_sign_change",
     "relative_difference",
+    "replace_delays",
     "sampled_gains",
     "sampled_poles",
     "sensitivity",

@@ -163,28 +163,16 @@ class DelayMatrices:
 
     def approximate_poles(self) -> np.ndarray:
         """Return the poles with the delays replaced by Padé's approximation: starts of searches, never results."""
-        n = len(self.A)
-        blocks = []
-        for tau in self.tau:
-            order = int(np.clip(np.ceil(self.bound * tau) + 6, 8, 24))
-            matrix, column = PadeDelay(delay=float(tau), order=order).ladder()
-            sign = (-1.0) ** order
-            blocks.append((matrix * 2.0 / tau, column * 2.0 / tau, -sign * column_row(column), sign))
-        sizes = [len(b[0]) for b in blocks]
-        q, m = sum(sizes), len(blocks)
-        Ap, Bp, Cp, Dp = np.zeros((q, q)), np.zeros((q, m)), np.zeros((m, q)), np.zeros((m, m))
-        begin = 0
-        for i, (matrix, column, row, sign) in enumerate(blocks):
-            where = slice(begin, begin + len(matrix))
-            Ap[where, where], Bp[where, i], Cp[i, where], Dp[i, i] = matrix, column, row, sign
-            begin += len(matrix)
-        # w = Cp p + Dp z, z = C x + H w
-        loop = np.eye(m) - Dp @ self.H
-        if np.linalg.cond(loop) > 1e12:
+        if not len(self.A):
             return np.zeros(0, dtype=complex)
-        wx, wp = np.linalg.solve(loop, Dp @ self.C), np.linalg.solve(loop, Cp)
-        A = np.block([[self.A + self.G @ wx, self.G @ wp], [Bp @ (self.C + self.H @ wx), Ap + Bp @ self.H @ wp]])
-        return np.linalg.eigvals(A) if n else np.zeros(0, dtype=complex)
+        orders = [int(np.clip(np.ceil(self.bound * tau) + 6, 8, 24)) for tau in self.tau]
+        none = np.zeros((len(self.A), 0)), np.zeros((0, len(self.A))), np.zeros((0, 0))
+        empty = np.zeros((0, len(self.tau))), np.zeros((len(self.tau), 0))
+        try:
+            rest = self.A, *none, self.G, self.C, self.H, *empty
+            return np.linalg.eigvals(replace_delays(*rest, self.tau, orders)[0])
+        except np.linalg.LinAlgError:
+            return np.zeros(0, dtype=complex)
 
     @cached_property
     def starts(self) -> np.ndarray:
@@ -330,11 +318,43 @@ class DelayMatrices:
         return np.concatenate(turns), np.concatenate(rates)
 
 
-def column_row(column: np.ndarray) -> np.ndarray:
-    """Return the output row of Padé's ladder, whose only entry is that of its input column."""
-    row = np.zeros(len(column))
-    row[0] = column[0]
-    return row
+def replace_delays(
+    A: np.ndarray,
+    B: np.ndarray,
+    C: np.ndarray,
+    D: np.ndarray,
+    G: np.ndarray,
+    Z: np.ndarray,
+    H: np.ndarray,
+    E: np.ndarray,
+    F: np.ndarray,
+    tau: np.ndarray,
+    orders: Sequence[int],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return A, B, C and D with Padé's approximations of the delays, of some orders, behind the states.
+
+    The system is ẋ = A x + B u + G w, z = Z x + F u + H w, y = C x + D u + E w. Numbers may be complex, with slopes.
+
+    Raises
+    ------
+    LinAlgError
+        If a way around the delays without a state has no unique solution.
+    """
+    m, q = len(tau), sum(orders)
+    kind = np.result_type(A, G, tau)
+    Ap, Bp, Cp, Dp = (np.zeros(shape, dtype=kind) for shape in ((q, q), (q, m), (m, q), (m, m)))
+    begin = 0
+    for i, (time, order) in enumerate(zip(tau, orders, strict=True)):
+        matrix, column = PadeDelay(delay=1.0, order=order).ladder()
+        where, sign = slice(begin, begin + order), (-1.0) ** order
+        Ap[where, where], Bp[where, i] = matrix * 2.0 / time, column * 2.0 / time
+        Cp[i, begin], Dp[i, i] = -sign * column[0], sign
+        begin += order
+    # w = Cp p + Dp z, z = Z x + F u + H w
+    loop = np.eye(m) - Dp @ H
+    wx, wu, wp = (np.linalg.solve(loop, part) for part in (Dp @ Z, Dp @ F, Cp))
+    whole = np.block([[A + G @ wx, G @ wp], [Bp @ (Z + H @ wx), Ap + Bp @ H @ wp]])
+    return whole, np.vstack([B + G @ wu, Bp @ (F + H @ wu)]), np.hstack([C + E @ wx, E @ wp]), D + E @ wu
 
 
 def replace_conjugate(system: DelayMatrices) -> DelayMatrices:

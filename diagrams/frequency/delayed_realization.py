@@ -242,6 +242,14 @@ class DelayedRealization:
         """Whether all closed-loop poles are stable."""
         return self.count_unstable(factor) == 0
 
+    def find_marginal(self) -> np.ndarray:
+        """Return the closed-loop poles that are on the limit of stability, up to rounding."""
+        system = self.close()
+        late = [part.near_axis[np.abs(part.near_axis.real) <= MARGINAL * part.bound] for part in system.delayed]
+        plain = system.plain_poles
+        on_it = np.abs(plain.real) <= 1e-13 * float(np.abs(plain).max(initial=0.0))
+        return np.concatenate([plain[on_it], *late])
+
     def eigenvalues(self, factor: complex = 1.0) -> np.ndarray:
         """Return the rightmost closed-loop poles."""
         return np.array(sort_rightmost(_poles_of(self.close(factor)))[:SHOWN], dtype=complex)

@@ -11,7 +11,7 @@ from control.iosys import InputOutputSystem
 from numpy.typing import ArrayLike
 
 from ...blocks.core import Finding, OptionError, brief, count_of, explain_calls
-from .delay_matrices import DelayMatrices
+from .delay_matrices import DelayMatrices, replace_delays
 from .delayed_response import DelayedEquations
 
 if TYPE_CHECKING:
@@ -213,25 +213,12 @@ class DelayedSystem(StateSpace):  # type: ignore[misc]
 
         Its phase is that of the delay up to about ω τ = order; `PadeDelay` has the realization.
         """
-        from ...blocks.library import PadeDelay
-
-        m = len(self.delays)
-        A, B, C, D = (np.asarray(getattr(self.rest, k), dtype=float) for k in "ABCD")
-        parts = []
-        for tau in self.delays:
-            matrix, column = PadeDelay(delay=float(tau), order=order).ladder()
-            row = np.zeros(order)
-            row[0] = -((-1.0) ** order) * column[0]
-            parts.append(ss(matrix * 2.0 / tau, column[:, None] * 2.0 / tau, row[None, :], [[(-1.0) ** order]], 0))
-        if not m:
-            return ss(A, B, C, D, 0)
-        whole = parts[0]
-        for part in parts[1:]:
-            whole = whole.append(part)
-        made = ss(A, B, C, D, 0).lft(whole, m, m)
-        return ss(
-            made.A, made.B, made.C, made.D, 0, inputs=self.input_labels, outputs=self.output_labels, name=self.name
-        )
+        e = self.equations()
+        four = replace_delays(e.A, e.B, e.C, e.D, e.G, e.Z, e.H, e.E, e.F, self.delays, [order] * len(self.delays))
+        labels = {"inputs": self.input_labels, "outputs": self.output_labels}
+        made = ss(*four, 0, remove_useless_states=False, name=self.name, **labels)
+        made.findings, made.notes, made.inexactness = self.findings, self.notes, self.inexactness
+        return made
 
     def step_response(self, times: ArrayLike, entry: int = 0) -> np.ndarray:
         """Return the outputs after a unit step of one input from rest, by the method of steps; shape (times, outputs).

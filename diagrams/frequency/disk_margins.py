@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, brief, explain_calls, kinds
+from .delayed_margins import ByArgument
+from .delayed_realization import DelayedRealization, realize
 from .loop_scan import LoopScan
 from .margin_analysis import EIGENVALUES
 from .number import Confirmation, Number, carries_findings
@@ -89,7 +91,8 @@ def disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Dis
     ParameterError
         If the closed loop is not stable.
     """
-    return _compute_disk_margin(Realization.of(loop, delay=delay), skew)
+    r = realize(loop, delay=delay)
+    return _compute_delayed(r, skew) if isinstance(r, DelayedRealization) else _compute_disk_margin(r, skew)
 
 
 @accepts(delay=kinds.finite, skew=kinds.number)
@@ -204,6 +207,34 @@ def _compute_disk_margin(r: Realization, skew: float) -> DiskMargin:
         phase_deg=phase,
         destabilizing=tuple(complex(f) for f in np.atleast_1d(factor(delta, skew))),
         destabilizing_alpha=1 / lower,
+    )
+
+
+def _compute_delayed(r: DelayedRealization, skew: float) -> DiskMargin:
+    """Return the disk margin of a loop with delays and one channel."""
+    if not r.order or not r.is_stable():
+        raise ParameterError(
+            f"found {r.count_unstable():g} closed-loop poles that are not stable; expected a stable closed loop: this "
+            "one has no margin. Look at margins(loop).closed_loop_poles.",
+            block="disk_margin",
+        )
+    by, upper, lower = ByArgument(r), (1 + skew) / 2, -(1 - skew) / 2
+    peak = by.scan.find_peak(upper, lower)
+    how = by.confirm_peak(upper, lower, peak, "disk_margin")
+    alpha, inside = 1 / peak.value, 0.0 < peak.omega < np.inf
+    L = next((value for end, value in by.scan.ends() if end == peak.omega), None)
+    L = complex(r.matrix(np.array([1j * peak.omega]))[0, 0, 0]) if L is None else L
+    M = complex(lower if np.isinf(L) else (upper + lower * L) / (1 + L))
+    low, high, phase = disk_gains(alpha, skew)
+    return DiskMargin(
+        alpha=Number(alpha, "1", alpha * max(1e-9, 3 * r.error(peak.omega) if inside else 0.0), how),
+        skew=skew,
+        frequency=Number(peak.omega, "rad/s", 1e-4 * peak.omega if inside else 0.0, how),
+        gain_low=low,
+        gain_high=high,
+        phase_deg=phase,
+        destabilizing=tuple(complex(f) for f in factor(np.array([1 / M]), skew)),
+        destabilizing_alpha=alpha,
     )
 
 

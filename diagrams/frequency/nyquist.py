@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, explain_calls, kinds
-from .delayed_realization import DelayedRealization
+from .delayed_realization import DelayedRealization, realize
 from .loop_scan import TURNS_MATTER, make_grid
 from .number import carries_findings
 from .poles_and_zeros import Features, find_hidden_unstable, tell_hidden_unstable
@@ -87,13 +87,21 @@ def nyquist_count(loop: LinearSystem, *, delay: int = 0) -> NyquistCount:
     NyquistCount(encirclements=-1, open_loop=2, closed_loop=1, hidden_unstable=((1+0j),))
     hidden_unstable       1: not in this loop, and not moved by feedback around it
     """
-    r = Realization.of(loop, delay=delay)
-    return count_encirclements(r, Features.of(r))
+    r = realize(loop, delay=delay)
+    return count_encirclements(r, r.features() if isinstance(r, DelayedRealization) else Features.of(r))
 
 
-def count_encirclements(r: Realization, features: Features) -> NyquistCount:
+def count_encirclements(r: Realization | DelayedRealization, features: Features) -> NyquistCount:
     """Count the encirclements of a realization; see `nyquist_count`."""
-    eigenvalues, open_loop = r.count_unstable(), features.unstable_poles()
+    closed = r.count_unstable()
+    found = r.count_open() if isinstance(r, DelayedRealization) else features.unstable_poles()
+    if np.isinf(closed) or np.isinf(found):
+        raise ConfirmationError(
+            "found ways around the delays without a state whose gain is 1 or more; expected less: there are infinitely "
+            "many unstable poles, and the curve turns around −1 without end. Put a lag into the loop.",
+            block="nyquist",
+        )
+    eigenvalues, open_loop = int(closed), int(found)
     if len(marginal := r.find_marginal()):
         pole = complex(marginal[0]) + (1.0 if r.dt else 0.0)
         raise ConfirmationError(
@@ -104,9 +112,10 @@ def count_encirclements(r: Realization, features: Features) -> NyquistCount:
         )
     n = winding_number(r, features)
     if n + open_loop != eigenvalues:
+        how = "eigenvalues" if isinstance(r, Realization) else "roots of the characteristic function"
         raise ConfirmationError(
             f"found {n} clockwise encirclements of −1 and {open_loop} unstable open-loop poles, but {eigenvalues} "
-            "unstable eigenvalues of the closed loop; expected Z = N + P. Look at closed_loop_poles: one may lie on "
+            f"unstable {how} of the closed loop; expected Z = N + P. Look at closed_loop_poles: one may lie on "
             "the limit of stability.",
             block="nyquist",
         )

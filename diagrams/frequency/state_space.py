@@ -90,6 +90,11 @@ def read_matrices(system: LinearSystem) -> Matrices:
                 f"found a {type(system).__name__}, measured data without poles; expected a control.StateSpace. The "
                 "margins of data are measured_margins(data), with their uncertainty."
             ) from error
+        if hasattr(system, "delays") and hasattr(system, "rest"):
+            raise ParameterError(
+                f"found a {type(system).__name__}, which has delays and no matrices; expected a control.StateSpace. "
+                "Its approximation is system.pade(order); margins, disk_margin and nyquist_count take it as it is."
+            ) from error
         if hasattr(system, "linearize") or hasattr(system, "loop"):
             made_of = "diagram.linearize()" if hasattr(system, "linearize") else "model"
             raise ParameterError(

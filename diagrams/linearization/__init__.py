@@ -34,7 +34,7 @@ from .operating_points import (
     run_to,
 )
 from .over_a_period import TickModel, model_ticks, ticks_between_renewals, ticks_to_renewal
-from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop, loop_of_variant
+from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop, loop_of_variant, rational_loop
 from .plant_models import EQUILIBRIUM, PlantEquations, linearize_plant
 from .shared_wires import WaysBack, find_ways_back
 from .trim_search import point_from_states, trim
@@ -87,6 +87,7 @@ __all__ = [
     "name_wire_to",
     "operating_point",
     "point_from_states",
+    "rational_loop",
     "run_to",
     "ticks_between_renewals",
     "ticks_to_renewal",

@@ -195,7 +195,7 @@ def model_continuous(
         G, Z = np.vstack([fl, Bp @ z_of["l"]]), np.hstack([mine["x"], mine["p"]])
         delays = LinearDelays(channels.labels, np.array([*map(float, channels.times)]), G, Z, mine["l"], yl, mine["d"])
         off = J["z"][channels.inputs] - at.w[channels.outputs]  # still on their way
-        rates = rates + G @ off
+        rates = rates + G @ np.linalg.lstsq(np.eye(len(channels)) - mine["l"], off, rcond=None)[0]
     return Model(
         (A, B, np.hstack([yx, yp]), yd),
         0.0,

@@ -227,6 +227,14 @@ class Linearization:
             return DelayMatrices(A, np.zeros((len(A), 0)), np.zeros((0, len(A))), np.zeros((0, 0)), np.zeros(0))
         return DelayMatrices(A, delays.G[keep], delays.Z[:, keep], delays.H, delays.times)
 
+    def characteristic_without(self, free: FreeMotions) -> DelayMatrices:
+        """Return the characteristic function without the roots of some free motions, of a continuous model."""
+        delays = self.delays
+        if not free or delays is None:
+            return self.characteristic
+        A, G, Z = free.reduce(self.A), free.reduce_inputs(delays.G), free.reduce_outputs(delays.Z)
+        return DelayMatrices(A, G, Z, delays.H, delays.times)
+
     @cached_property
     def findings_on_loops(self) -> tuple[Finding, ...]:
         """Those of the findings that limit numbers about all loops together, such as the poles."""
@@ -270,7 +278,11 @@ class Linearization:
         names = tuple(dict.fromkeys(_as_list(required)))
         if names not in self._free:
             own = {f.name: getattr(self, f.name) for f in fields(ClosedModel)}
-            self._free[names] = find_free_motions(ClosedModel(**own), names)
+            found = find_free_motions(ClosedModel(**own), names)
+            if self.delays is not None and found:
+                acting = self.delays.G.any(axis=0) | self.delays.H.any(axis=0) | self.delays.E.any(axis=0)
+                found = found.keep_unseen(self.delays.Z[acting], self.A)
+            self._free[names] = found
         return self._free[names]
 
     @cached_property
@@ -279,6 +291,8 @@ class Linearization:
 
     def poles_without(self, free: FreeMotions) -> np.ndarray:
         """Return the poles without those of some free motions, as `poles` does."""
+        if self.delays is not None:
+            return np.array(self.characteristic_without(free).poles())
         return _sorted_poles(free.reduce(self.A)) if free else self.poles
 
     @property

@@ -13,7 +13,14 @@ import numpy as np
 from ...blocks.core import LoopwrightError, OptionError, UnknownArgumentError
 from ..flat import WiredDiagram
 from ..frequency import Number, find_hidden_unstable, margin_slopes, order_key, realize
-from ..linearization import Linearization, differentiate_loop, linearize, loop_of_variant, operating_point
+from ..linearization import (
+    Linearization,
+    differentiate_loop,
+    linearize,
+    loop_of_variant,
+    operating_point,
+    rational_loop,
+)
 from ..results import OperatingPoint
 from ..sweeps import Box
 from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe
@@ -283,7 +290,8 @@ class Study:
             mine = [one for one in made if one.parameter == name or one.parameter.startswith(f"{name}[")]
             slopes += mine if len(mine) == box.size else [None] * box.size
         known = [s for s in slopes if s is not None]
-        exact = iter(margin_slopes(L, [s.slopes for s in known], delay=self.delay)[case.quantity].slopes)
+        by_matrices = margin_slopes(rational_loop(L), [s.slopes for s in known], delay=self.delay)
+        exact = iter(by_matrices[case.quantity].slopes)
         by_number = self.goal.slope(case.loop, case.quantity, case.value)
         widths = self._widths(case.parameters)
         for i, slope in enumerate(slopes):

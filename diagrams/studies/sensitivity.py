@@ -12,8 +12,8 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError, UnknownNameError, accepts, brief, enumerate_some, explain_calls, kinds, near
 from ..flat import WiredDiagram
-from ..frequency import MarginSlope, Number, margin_slopes, order_key
-from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize
+from ..frequency import MarginSlope, Number, margin_slopes, margins, order_key
+from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize, rational_loop
 from ..results import BLUE, DARK, VERMILION, OperatingPoint, new_figure, style
 from .parameters import check_parameters, list_parameters, unit_of
 
@@ -269,8 +269,10 @@ def sensitivities_of(
     refused = left_out if parameters is None else None
     slopes: list[LoopSlope] = differentiate_loop(model, wires, names, find=find, left_out=refused)
     acting = [one for one in slopes if any(np.any(M) for M in one.slopes)]
-    found = margin_slopes(L, [one.slopes for one in acting], delay=delay, skew=skew)
-    bounds = _bound_errors(L, acting, found, delay, skew)
+    rational = rational_loop(L)
+    known = margins(L, delay=delay, skew=skew) if rational is not L and L.ninputs == 1 else None
+    found = margin_slopes(rational, [one.slopes for one in acting], delay=delay, skew=skew, found=known)
+    bounds = _bound_errors(rational, acting, found, delay, skew)
     rows = []
     for i, one in enumerate(acting):
         unit = unit_of(diagram, one.parameter)

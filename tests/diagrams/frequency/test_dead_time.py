@@ -13,7 +13,7 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.special import lambertw
 
 from loopwright.blocks import Constant, Gain, Integrator, OptionError, Sum, TransferFunction, TransportDelay
-from loopwright.diagrams import Diagram, margins
+from loopwright.diagrams import Diagram, disk_margin, margins, nyquist_count
 from loopwright.diagrams.frequency.delay_matrices import DelayMatrices
 from loopwright.diagrams.frequency.delayed_system import DelayedSystem
 
@@ -281,3 +281,56 @@ def test_a_step_response_is_that_of_the_method_of_steps():
         (-k) ** n * np.clip(t - n * tau, 0, None) ** (n + 1) / float(mpmath.factorial(n + 1)) for n in range(60)
     )
     assert np.max(np.abs(system.step_response(t)[:, 0] - wanted)) < 1e-10
+
+
+def test_disk_margin_and_encirclements_take_loops_with_delays():
+    diagram, L, _ = one_lag()
+    loop = diagram.linearize().loop("u")
+    found, w = disk_margin(loop), np.geomspace(0.05, 5.0, 20_001)
+    k = int(np.argmax(np.abs((1 - L(1j * w)) / (1 + L(1j * w)))))
+    best = minimize_scalar(
+        lambda x: -0.5 * np.abs((1 - L(1j * x)) / (1 + L(1j * x))),
+        bounds=(w[k - 1], w[k + 1]),
+        method="bounded",
+        options={"xatol": 1e-13},
+    )
+    assert found.alpha.value == pytest.approx(-1 / best.fun, rel=1e-9)
+    assert abs(1 + found.destabilizing[0] * L(1j * found.frequency.value)) < 1e-9
+    assert (nyquist_count(loop).encirclements, nyquist_count(loop).closed_loop) == (0, 0)
+    plant, _, _ = unstable_plant()
+    assert nyquist_count(plant.linearize().loop("u")).encirclements == -1
+
+
+def test_sensitivities_of_a_loop_with_dead_time_are_those_of_its_closed_form():
+    """K e^(−τ s)/s: the phase margin in degrees is 90 − K τ 180/π, the gain margin π/(2 K τ)."""
+    diagram, _, _ = integrating()
+    found = diagram.sensitivity("u", ["k.gain", "late.delay"])
+    slopes = {(s.parameter, s.quantity): s.slope.value for s in found.rows}
+    assert slopes["k.gain", "phase_margin_deg"] == pytest.approx(-0.8 * 180 / np.pi, rel=1e-8)
+    assert slopes["k.gain", "gain_margin_high"] == pytest.approx(-np.pi / (2 * 0.7**2 * 0.8), rel=1e-8)
+    assert slopes["late.delay", "phase_margin_deg"] == pytest.approx(-0.7 * 180 / np.pi, rel=1e-4)
+    assert slopes["late.delay", "gain_margin_high"] == pytest.approx(-np.pi / (2 * 0.7 * 0.8**2), rel=1e-4)
+
+
+@pytest.mark.slow
+def test_the_worst_case_of_a_dead_time_is_the_longest_and_the_run_says_so():
+    diagram, _, _ = integrating()
+    worst = diagram.worst_case({"late.delay": (0.6, 1.0)}, "u", quantity="phase_margin_deg", count=2)
+    assert worst.parameters == {"late.delay": 1.0}
+    assert worst.worst.value == pytest.approx(90 - 0.7 * 180 / np.pi, abs=1e-8)
+    assert "confirmed" in str(worst.confirm())
+
+
+def test_an_angle_behind_a_loop_with_dead_time_is_free_and_its_ramp_is_not():
+    lag, late, pipe = rational([2.0], [1.0, 1.0], "lag"), delay(0.25), delay(0.4, "pipe")
+    angle, ramp = Integrator(name="angle"), Integrator(name="ramp")
+    y = lag(late(pi(lag.y, 0.5, 0.4)))
+    model = Diagram("d", angle(y)).linearize()
+    free = model.free_motions()
+    assert [str(motion) for motion in free.motions] == ["angle.y drifts: nothing feeds it back"]
+    assert model.characteristic.count_unstable() == 1
+    assert model.characteristic_without(free).count_unstable() == 0
+    alone = Diagram("d", y).linearize()
+    assert model.poles_without(free)[:3] == pytest.approx(alone.poles[:3], abs=1e-9)
+    ramped = Diagram("d", ramp(pipe(angle(y)))).linearize()
+    assert ramped.characteristic_without(ramped.free_motions()).count_unstable() > 0

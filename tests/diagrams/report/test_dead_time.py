@@ -1,0 +1,62 @@
+"""Reports of process loops with dead time: everyday loops have an everyday verdict."""
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import PID, Step, TransferFunction, TransportDelay
+from loopwright.diagrams import Diagram, Requirements, subsystem
+
+
+def process(sample_time, dead_time=1.05, gain=2.0):
+    """PI with kp = 1 and ki = 0.25 1/s, a lag of 5 s, and dead time between valve and room."""
+    room = TransferFunction(numerator=[gain], denominator=[5.0, 1.0], name="room")
+    pipe = TransportDelay(delay=dead_time, name="pipe")
+    wish = Step(times=1.0, values=1.0, name="wish").y
+
+    @subsystem(sample_time=sample_time)
+    def heating(wish, temperature):
+        return PID(kp=1.0, ki=0.25, name="pi")(wish, temperature).named("valve")
+
+    return Diagram("process", room(pipe(heating(wish, room.y))).named("temperature"))
+
+
+ASKED = {"phase_margin_deg": 40, "gain_margin_high": 2.0, "ms": 2.0}
+
+
+def frequency_response(w, sample_time, dead_time=1.05, gain=2.0):
+    """L of the continuous loop, or of the sampled one by the sum of its aliases behind the hold."""
+    if sample_time is None:
+        s = 1j * w
+        return (1 + 0.25 / s) * gain * np.exp(-dead_time * s) / (5 * s + 1)
+    z = np.exp(1j * w * sample_time)
+    s = 1j * (w + 2 * np.pi / sample_time * np.arange(-20000, 20001))
+    plant = np.sum(gain * np.exp(-dead_time * s) / (5 * s + 1) * (1 - np.exp(-s * sample_time)) / (s * sample_time))
+    return (1 + 0.25 * sample_time / (z - 1)) * plant
+
+
+@pytest.mark.drawn(1)
+@pytest.mark.parametrize("sample_time", [0.1, None, 1.0])
+def test_an_everyday_loop_with_dead_time_passes(sample_time):
+    diagram = process(sample_time)
+    report = diagram.report(
+        requirements=Requirements(**ASKED, step={"overshoot": 0.4, "settling": 40.0}), loops=["valve"]
+    )
+    assert report.review.verdict == "passed", report.review
+    key = "continuous" if sample_time is None else "sampled_d0"
+    numbers = report.numbers()
+    crossover = numbers[f"inner.valve.{key}.gain_crossover_1.frequency"].value
+    value = frequency_response(crossover, sample_time)
+    assert abs(value) == pytest.approx(1.0, abs=1e-5)
+    margin = 180.0 + np.degrees(np.angle(value))
+    assert numbers[f"inner.valve.{key}.phase_margin_deg"].value == pytest.approx(margin, abs=1e-3)
+    assert numbers[f"steps.valve.{key}.difference"].value < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sample_time", [None, 0.1])
+@pytest.mark.parametrize(
+    ("change", "verdict"), [({"gain": 5.0}, "failed"), ({"dead_time": 4.5}, "failed"), ({"gain": 1.0}, "passed")]
+)
+def test_what_breaks_a_loop_with_dead_time_fails_and_what_does_not_passes(sample_time, change, verdict):
+    report = process(sample_time, **change).report(requirements=Requirements(**ASKED), loops=["valve"])
+    assert report.review.verdict == verdict
