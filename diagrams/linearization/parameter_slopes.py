@@ -271,8 +271,8 @@ class _Cut:
         x, of_plants, z = np.split(moved, np.cumsum([flat.width, chain.n_p]))
         z = z[: flat.plant_inputs.total]
         C, D = (np.real(join_matrices(flat, chain.models, which)) for which in "CD")
-        w, late = C @ of_plants + D @ z, delay_channels(flat)
-        w[late.outputs] = z[late.inputs]  # at rest a delay puts out what it takes in
+        w, channels = C @ of_plants + D @ z, delay_channels(flat)
+        w[channels.outputs] = z[channels.inputs]  # at rest a delay puts out what it takes in
         return _with_slopes(flat, at, x, w, of_plants, z, chain)
 
 
