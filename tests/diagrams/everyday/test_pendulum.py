@@ -152,9 +152,7 @@ def test_the_verdict_of_a_pendulum_by_hand(variant):
     check_by_hand(PROJECT, variant)
 
 
-@reports(
-    {"as it is": "the cut takes the observer's input along", "harmless": "the cut takes the observer's input along"}
-)
+@reports()
 def test_the_report_has_the_verdict_of_a_pendulum(variant):
     check_report(PROJECT, variant)
 
