@@ -11,6 +11,7 @@ from .quanta import (
     find_least_sine,
     find_least_step,
     find_quantum,
+    find_rest,
     remaining_oscillation,
 )
 from .step_measures import ExpectedStep, Measured, is_at_rest, measure_step
@@ -30,6 +31,7 @@ __all__ = [
     "find_least_sine",
     "find_least_step",
     "find_quantum",
+    "find_rest",
     "frequency_response",
     "is_at_rest",
     "measure_step",

@@ -123,6 +123,28 @@ def find_least_step(
     return (LEAST * quantum.value / moved, quantum) if moved > 0.0 else None
 
 
+def find_rest(
+    diagram: WiredDiagram, point: OperatingPoint, wire: str, size: float, slowest: float, length: float
+) -> float:
+    """Return the time in s after a step from whose `TAIL` on its motion is a tenth of a quantum, by the linear model.
+
+    Parameters
+    ----------
+    size : float
+        Height of the step at the wire.
+    slowest : float
+        Rate in 1/s of the slowest mode.
+    length : float
+        Time in s within which the step moves the converters' inputs most.
+    """
+    converters = find_converters(diagram.flatten_like(point))
+    if not converters:
+        return 0.0
+    model = linearize(diagram, point, inputs=[wire], outputs=[c.name for c in converters])
+    quanta = abs(size) * _peaks(model, 0, length) / np.concatenate([c.size for c in converters])
+    return float(np.log(max(1.0, 10.0 * float(np.max(quanta)))) / (slowest * (1.0 - TAIL)))
+
+
 def find_least_sine(
     diagram: WiredDiagram, point: OperatingPoint, wire: str, L: LoopTransfer, frequencies: np.ndarray
 ) -> tuple[float, Quantum] | None:
@@ -146,24 +168,32 @@ def find_least_sine(
 
 def _peak(model: Linearization, column: int, length: float) -> float:
     """Return the largest change of the output by a step of 1 at an input."""
+    return float(_peaks(model, column, length)[0])
+
+
+def _peaks(model: Linearization, column: int, length: float) -> np.ndarray:
+    """Return the largest change of each output by a step of 1 at an input."""
     count = int(np.clip(length / model.dt, 2, SAMPLES)) if model.dt else SAMPLES
     one = replace(model, B=model.B[:, [column]], D=model.D[:, [column]], inputs=(model.inputs[column],))
     rows, _, between = predict(one, np.ones(count + 1), (model.dt or length / count) * np.arange(count + 1))
-    return float(np.max(np.abs(rows)) + np.max(between))
+    return np.asarray(np.max(np.abs(rows), axis=0) + between)
 
 
-def remaining_oscillation(change: np.ndarray, size: np.ndarray) -> float:
+def remaining_oscillation(change: np.ndarray, predicted: np.ndarray, size: np.ndarray) -> float:
     """Return the largest amplitude, in quanta, of a converter's inputs at the end of a record.
+
+    What the linear model does there doesn't count; where the run doesn't follow the model, the run's own motion does.
 
     Parameters
     ----------
-    change : (N, K) ndarray
-        Entries of the input over the record, less what the linear model has there.
+    change, predicted : (N, K) ndarray
+        Entries of the input over the record, of the run and of the linear model.
     size : (K,) ndarray
         Size of the steps.
     """
-    tail = change[int((1.0 - TAIL) * len(change)) :]
-    return float(np.max(np.ptp(tail, axis=0) / 2.0 / size, initial=0.0))
+    begins = int((1.0 - TAIL) * len(change))
+    spans = [np.ptp(part[begins:], axis=0) for part in (change, change - predicted)]
+    return float(np.max(np.minimum(*spans) / 2.0 / size, initial=0.0))
 
 
 def columns_of(labels: Iterable[str], converter: Converter, flat: FlatDiagram) -> list[int]:

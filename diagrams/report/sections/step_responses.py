@@ -22,6 +22,7 @@ from ...measure import (
     columns_of,
     find_converters,
     find_least_step,
+    find_rest,
     is_at_rest,
     measure_step,
     remaining_oscillation,
@@ -228,9 +229,10 @@ def _without_converters(
     for converter in converters if got.prediction is not None else ():
         columns = [kept + i for i in columns_of(names, converter, flat)]
         assert got.prediction is not None
-        left = got.y[:, columns] - got.prediction[:, [1 + i for i in columns]]
-        amplitude = remaining_oscillation(left, converter.size)
-        how = "the nonlinear co-simulation at the end of the step's record, less the linear model's motion"
+        amplitude = remaining_oscillation(
+            got.y[:, columns], got.prediction[:, [1 + i for i in columns]], converter.size
+        )
+        how = "the nonlinear co-simulation at the end of the step's record"
         found[converter.name] = Number(amplitude, "quanta", TICK_ERROR * (1.0 + amplitude), how)
 
     def first(values: Any) -> Any:
@@ -249,6 +251,16 @@ def _least_step(
     except LoopwrightError:  # no linear model: the run may be had all the same
         found = None
     return (0.0, None) if found is None else found
+
+
+def _rest(
+    diagram: WiredDiagram, point: OperatingPoint, test: StepTest, size: float, slowest: float | None, length: float
+) -> float:
+    """Return the time after a step from which the linear model rests within a quantum; 0 where it is not known."""
+    try:
+        return find_rest(diagram, point, test.wire, size, slowest, length) if slowest else 0.0
+    except LoopwrightError:  # no linear model
+        return 0.0
 
 
 def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | None, Quantized] | None:
@@ -281,6 +293,9 @@ def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | 
     given = None if limits is None else limits.size
     height, quantum = _least_step(diagram, point, test, length)
     size = max(usual, height) if given is None else given
+    if limits is None or limits.length is None:
+        length = max(length, _rest(diagram, point, test, size, slowest, length))
+        length = min(length, SAMPLES[1] * dt) if dt else length
     outputs = [*([test.output] if test.output else []), *_commands(v.diagram, test.wire), *_excesses(v.diagram)]
     converters = find_converters(v.diagram.flatten_like(v.point))
     fed = list(dict.fromkeys(converter.signal for converter in converters))
