@@ -235,7 +235,7 @@ def verdict_text(reviewed: Review) -> str:
     """Return the verdict as lines of text: all requirements that are not met, by the paths of their numbers."""
     from ..report import quantity
 
-    lines = [f"Requirements: {reviewed.verdict}."]
+    lines = [f"Requirements: {reviewed.verdict}.", *(f"  {motion}" for motion in reviewed.free)]
     for result in (*reviewed.of(Verdict.FAILED), *reviewed.of(Verdict.UNDECIDED)):
         parts = (result.loop or result.place, result.variant, result.quantity)
         place = result.path or ".".join(part for part in parts if part)

@@ -126,6 +126,11 @@ class FreeMotions:
     Q: np.ndarray = field(repr=False)
     P: np.ndarray = field(repr=False)
 
+    @classmethod
+    def none(cls, n: int) -> FreeMotions:
+        """Return no free motions of a model with n states."""
+        return cls((), np.zeros((n, 0)), np.eye(n), np.eye(n))
+
     def __bool__(self) -> bool:
         return bool(self.motions)
 
@@ -183,7 +188,7 @@ def find_free_motions(model: ClosedModel, required: Iterable[str] = ()) -> FreeM
     UnknownNameError
         If there is no such wire or port.
     """
-    none = FreeMotions((), np.zeros((len(model.A), 0)), np.eye(len(model.A)), np.eye(len(model.A)))
+    none = FreeMotions.none(len(model.A))
     kept = [i for i, name in enumerate(model.states) if name not in model.memory]
     A = model.A[np.ix_(kept, kept)]
     M = A - np.eye(len(A)) if model.dt else A

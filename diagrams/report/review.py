@@ -30,7 +30,7 @@ from .sections.injection import REFUTED
 from .sections.measured_loops import MEASURED, MeasuredLoop
 from .sections.step_responses import key_of_step
 from .sections.worst_case import MissingWorstCase, ReportedWorstCase
-from .stability import Stability
+from .stability import Stability, free_motions
 from .variant import Cut, Variant
 
 STABLE = Limit(-math.inf, 0.0)
@@ -97,7 +97,8 @@ def review(
             *_measured(case, asked, numbers, measured),
             *searched,
             *felt,
-        )
+        ),
+        free_motions(case.judged()),
     )
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from enum import StrEnum
 
 import numpy as np
 
+from ...blocks.core import LoopwrightError
+from ..linearization import FreeMotion
 from .variant import Variant, in_s
 
 ON_THE_LIMIT = 1e-9
@@ -22,14 +25,27 @@ class Stability(StrEnum):
 
     @classmethod
     def of(cls, v: Variant) -> Stability:
-        """Return the stability of a variant's linear model, memory aside."""
+        """Return the stability of a variant's linear model, memory and free motions aside."""
         delays = v.model.delays
-        if delays is not None and (count := v.model.characteristic.count_unstable()) == 0:
+        if delays is not None and (count := v.model.characteristic_without(v.free).count_unstable()) == 0:
             return cls.STABLE  # by the argument: infinitely many poles are not looked at one by one
         if delays is not None and math.isinf(count):
             return cls.UNSTABLE
         slowest, margin = float(np.max(poles_in_s(v).real, initial=-np.inf)), stability_margin(v)
         return cls.STABLE if slowest < -margin else cls.UNSTABLE if slowest > margin else cls.ON_THE_LIMIT
+
+
+def free_motions(variants: Iterable[Variant]) -> tuple[FreeMotion, ...]:
+    """Return the free motions of some variants, each state once."""
+    found: dict[str, FreeMotion] = {}
+    for v in variants:
+        try:
+            motions = () if v.problem else v.free.motions
+        except LoopwrightError:  # its model can't be made, which its rows say
+            continue
+        for motion in motions:
+            found.setdefault(motion.state, motion)
+    return tuple(found.values())
 
 
 def without_memory(v: Variant) -> np.ndarray:
@@ -41,8 +57,10 @@ def without_memory(v: Variant) -> np.ndarray:
 def scatter(v: Variant) -> float:
     """Return how far the slowest pole in 1/s moves when the model's matrix is rounded, tenfold."""
     if v.model.delays is not None:
-        return 1e-10 * (1.0 + abs(float(np.max(v.model.poles.real, initial=0.0))))
-    A = without_memory(v)
+        return 1e-10 * (1.0 + abs(float(np.max(v.poles.real, initial=0.0))))
+    A = v.free.reduce(v.model.A) if v.free else without_memory(v)
+    if not len(A):
+        return 0.0
     rng = np.random.default_rng(0)
     moved = np.linalg.eigvals(A * (1 + 1e-15 * rng.standard_normal(A.shape)))
     before = np.linalg.eigvals(A)
@@ -53,8 +71,8 @@ def scatter(v: Variant) -> float:
 
 
 def poles_in_s(v: Variant) -> np.ndarray:
-    """Return the poles of a variant's linear model in 1/s."""
-    return in_s(v.model.poles, v.model.dt)
+    """Return the poles of a variant's linear model in 1/s, memory and free motions aside."""
+    return in_s(v.poles, v.model.dt)
 
 
 def stability_margin(v: Variant) -> float:

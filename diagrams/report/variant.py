@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Finding, LoopwrightError, PeriodicLoopError
-from ..flat import WiredDiagram
-from ..linearization import Linearization, linearize
+from ..flat import FlatDiagram, WiredDiagram
+from ..linearization import FreeMotions, Linearization, find_signal, linearize
 from ..results import BLUE, DARK, GREEN, PURPLE, STONE, VERMILION, OperatingPoint
 from .points import point_of
 
@@ -100,6 +100,10 @@ class Variant:
         Inputs and outputs of the linear model.
     stairs : {"gain", "zero"}, optional
         Treatment of stairs in the linear model.
+    required : tuple of str
+        Wires and ports on which something is required: a motion that changes one of them is not free.
+    every_state : bool
+        Whether free motions count as any other: the strict rule.
     """
 
     key: str
@@ -114,6 +118,8 @@ class Variant:
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
     stairs: str | None = None
+    required: tuple[str, ...] = ()
+    every_state: bool = False
     _loops: dict[tuple[Any, ...], Any] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -125,6 +131,19 @@ class Variant:
     def model(self) -> Linearization:
         """Its linear model."""
         return linearize(self.diagram, self.point, inputs=self.inputs, outputs=self.outputs, stairs=self.stairs)
+
+    @property
+    def free(self) -> FreeMotions:
+        """Its free motions, which are no instability; none by the strict rule."""
+        if self.every_state:
+            return FreeMotions.none(len(self.model.states))
+        flat = self.diagram.flatten_like(self.point)
+        return self.model.free_motions([name for name in self.required if _has(flat, name)])
+
+    @property
+    def poles(self) -> np.ndarray:
+        """Poles of its linear model but for those of memory and of free motions."""
+        return self.model.poles_without(self.free)
 
     def loop(self, *wires: str, cut: Cut = Cut.PLAIN) -> Any:
         """Return the loop transfer function at wires, computed once."""
@@ -161,6 +180,11 @@ class Variant:
         """States that move at its operating point though nothing depends on them; empty where others move as well."""
         model = self.model
         moving = [i for i, change in enumerate(model.affine) if not abs(change) <= AT_REST]
+        if moving and self.free:
+            V = self.free.V
+            left = model.affine - V @ np.linalg.lstsq(V, model.affine)[0]
+            if np.max(np.abs(left)) <= AT_REST:
+                return tuple(model.states[i] for i in moving)
         fed = model.A - np.eye(len(model.A)) if model.dt else model.A
         if model.delays is not None:
             fed = np.vstack([fed, model.delays.Z])
@@ -182,7 +206,17 @@ class Variant:
             inputs=self.inputs,
             outputs=self.outputs,
             stairs=self.stairs,
+            required=self.required,
+            every_state=self.every_state,
         )
+
+
+def _has(flat: FlatDiagram, name: str) -> bool:
+    """Whether a diagram has a wire or port; variants may have other ones."""
+    try:
+        return bool(find_signal(flat, name).entries)
+    except LoopwrightError:
+        return False
 
 
 def in_s(poles: Any, dt: float) -> np.ndarray:

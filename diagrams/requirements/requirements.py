@@ -12,6 +12,8 @@ from ...blocks.core import LoopwrightError, OptionError, UnknownNameError, accep
 from .contact_limits import ContactLimits, read_contacts
 from .number_limits import SENSES, STEP_SENSES, Limit, make_limit
 
+EVERY_STATE = "every state"
+"""Value of ``stable`` by which free motions count, too: the strict rule."""
 PLACES = ("input", "output", "size", "length")
 """Entries of a step's requirement that are no limits."""
 
@@ -167,8 +169,9 @@ class Requirements(LoopLimits):
     contact : mapping, optional
         Limits of coupled stability of the report's contacts, as `ContactLimits`: ``{"stiffness": 5e4}`` of all, and
         ``{"hand": {"stiffness": 5e4, "with": {"damping": 10}}}`` of the one with that name. A list has several.
-    stable : bool
-        Whether all closed-loop poles of the diagram as it is have to be stable.
+    stable : bool or "every state"
+        Whether all closed-loop poles of the diagram as it is have to be stable. A motion that nothing notices, such as
+        that of an angle that nothing feeds back, doesn't count; with ``"every state"`` it does.
     **limits : float or (float, float)
         As of `LoopLimits`.
 
@@ -188,7 +191,9 @@ class Requirements(LoopLimits):
 
     @accepts(
         None,
-        stable=kinds.one_of_class(bool, "true or false").worded(step="Give one of them."),
+        stable=kinds.either(kinds.flag, kinds.choice(EVERY_STATE)).worded(
+            "true, false or 'every state'", "Give one of them."
+        ),
         loops=kinds.one_of_class(Mapping, "limits by loop").worded(
             step="Write [loops.u], and ms = 1.6 below it; in Python loops={'u': {'ms': 1.6}}."
         ),
@@ -205,7 +210,7 @@ class Requirements(LoopLimits):
         variants: Any = None,
         numbers: Any = None,
         contact: Any = None,
-        stable: bool = True,
+        stable: bool | str = True,
         **limits: Any,
     ):
         steps = [StepLimits.of(one) for one in (step if isinstance(step, list | tuple) else [step]) if one is not None]
@@ -243,6 +248,18 @@ class Requirements(LoopLimits):
             return error
         placed = self.place(error, key)
         return UnknownNameError(placed.message) if isinstance(error, UnknownNameError) else placed
+
+    @property
+    def every_state(self) -> bool:
+        """Whether motions that nothing notices count as instabilities, too."""
+        return self.stable == EVERY_STATE
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Names of wires, ports and loops on which something is required: of steps, loops and numbers."""
+        ends = [name for step in self.steps for name in (step.input, step.output) if name]
+        parts = [part for path in self.numbers for part in path.split(".")[1:2]]
+        return tuple(dict.fromkeys((*ends, *self.loops, *parts)))
 
     @property
     def further_variants(self) -> tuple[str, ...]:

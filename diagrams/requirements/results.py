@@ -86,9 +86,13 @@ class Review:
     ----------
     results : tuple of RequirementResult
         In the order of the report.
+    free : tuple of FreeMotion
+        Motions that nothing notices, and that don't count as instabilities: ``motor.angle drifts: nothing feeds it
+        back``. A forgotten wire looks the same.
     """
 
     results: tuple[RequirementResult, ...]
+    free: tuple[Any, ...] = ()
 
     def __repr__(self) -> str:
         told = [f"{len(self.of(verdict))} {verdict.value}" for verdict in Verdict if self.of(verdict)]
@@ -111,5 +115,6 @@ class Review:
         return {
             "verdict": self.verdict.value,
             **{verdict.name.lower(): len(self.of(verdict)) for verdict in Verdict},
+            "free": [str(motion) for motion in self.free],
             "results": [result.as_dict() for result in self.results],
         }

@@ -9,7 +9,7 @@ import numpy as np
 from ...frequency import Number, order_key, with_findings
 from ..case import Case
 from ..pages import Section, TableForm, Texts
-from ..stability import ON_THE_LIMIT, Stability, poles_in_s, scatter, stability_margin
+from ..stability import ON_THE_LIMIT, Stability, free_motions, poles_in_s, scatter, stability_margin
 from ..variant import Variant, in_s
 from .subject import SUBJECT_TITLE
 
@@ -38,20 +38,23 @@ def closed_loops(case: Case) -> Section | None:
     """Return the table of each variant's slowest and fastest poles, all loops closed; None without any states."""
     rows = []
     for v in case.usable():
-        s = in_s(v.model.poles, v.model.dt)
-        if s.size:
+        every, s = in_s(v.model.poles, v.model.dt), poles_in_s(v)
+        if every.size:
             how = "eigenvalues; tolerance by perturbing the matrix"
             if v.model.delays is not None:
                 how = "the argument of the characteristic function, which counts no root beyond the axis"
                 if Stability.of(v) is not Stability.STABLE:
                     how = "the argument of the characteristic function, which counts the roots beyond the axis"
-            slowest = with_findings(Number(float(np.max(s.real)), "1/s", scatter(v), how), v.model.findings_on_loops)
-            facts = {"count": len(s), "stable": Stability.of(v), "slowest": slowest, "fastest": float(np.min(s.real))}
+            largest = Number(float(np.max(s.real, initial=-np.inf)), "1/s", scatter(v), how)
+            facts = {"count": len(every), "stable": Stability.of(v), "fastest": float(np.min(every.real))}
+            facts["slowest"] = with_findings(largest, v.model.findings_on_loops)
             rows.append({"variant": v.title, "key": v.key, **facts})
     if not rows:
         return None
     title = POLES_TITLE if case.loop_wires() else TEXTS.line("no_loop")
-    return Section("poles", title, (), (POLES.fill(rows, TEXTS.line("closed_loop", limit=ON_THE_LIMIT)),))
+    free = free_motions(case.usable())
+    text = TEXTS.paragraphs("free", motions=[str(motion) for motion in free]) if free else ()
+    return Section("poles", title, text, (POLES.fill(rows, TEXTS.line("closed_loop", limit=ON_THE_LIMIT)),))
 
 
 def memory(case: Case) -> Section | None:

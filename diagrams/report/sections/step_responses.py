@@ -319,13 +319,13 @@ def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | 
 def _poles(v: Variant, test: StepTest) -> np.ndarray | None:
     """Return the poles that decide how long a response lasts, in 1/s; None at a wire with several entries."""
     if test.output:
-        return in_s(v.model.poles, v.model.dt)
+        return in_s(v.poles, v.model.dt)
     if len(find_signal(v.diagram.flatten_like(v.point), test.wire).entries) > 1:
         return None
     try:
         L = v.loop(test.wire)
     except PeriodicLoopError:
-        return in_s(v.model.poles, v.model.dt)
+        return in_s(v.poles, v.model.dt)
     r = realize(L)
     poles = r.eigenvalues()
     return in_s(1 + poles if r.dt else poles, r.dt)

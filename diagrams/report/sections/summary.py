@@ -16,6 +16,7 @@ from ..figures import HEIGHTS, fit_overview
 from ..pages import SUMMARY, Judged, Plot, Section, Table, Texts
 from ..review import weakest
 from ..same_loops import find_same
+from ..stability import free_motions
 from ..variant import Cut, Implementation, Variant
 from .contacts import KEY as CONTACT
 from .loops import ROWS
@@ -65,6 +66,8 @@ def summarize(
         said = TEXTS.line("verdict", verdict=reviewed.verdict.name, total=len(reviewed.results), **counts)
         text.append(Judged(said, reviewed.verdict))
         tables.append(_requirements(case, reviewed, MOST_REQUIREMENTS))
+    motions = free_motions(case.judged()) if reviewed is None else reviewed.free
+    text += [TEXTS.line("drifts", motions=[str(motion) for motion in motions])] if motions else []
     text += _weakest(case, numbers)
     text += [_worst_case(worst_case)] if worst_case is not None else []
     loops = _loops(case, numbers)

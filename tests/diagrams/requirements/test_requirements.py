@@ -141,7 +141,8 @@ def test_the_step_of_a_loop_replaces_the_general_one_and_steps_between_wires_sta
         ({"loops": {"u": 3}}, "loops.u: found 3; expected limits by name"),
         ({"loops": {"u": {"mss": 3}}}, "loops.u.mss: there is no requirement 'mss'. Did you mean 'ms'"),
         ({"numbers": {"poles.sampled_d0.slowest": -1.0}}, "found -1.0; expected two numbers, low and high"),
-        ({"stable": 1}, "stable: found 1; expected true or false"),
+        ({"stable": 1}, "stable: found 1; expected true, false or 'every state'"),
+        ({"stable": "always"}, "stable: found 'always'; expected true, false or 'every state'"),
     ],
 )
 def test_wrong_requirements_are_refused_with_the_next_step(wrong, said):
