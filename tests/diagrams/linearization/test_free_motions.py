@@ -18,10 +18,13 @@ from loopwright.blocks import (
     Integrator,
     LimitedIntegrator,
     Output,
+    Product,
+    Requirement,
     Saturation,
     Sine,
     State,
     StateSpace,
+    Step,
     StopCondition,
     TransferFunction,
     parameter,
@@ -111,7 +114,12 @@ def test_a_required_angle_is_not_free():
 
 def test_a_condition_on_the_angle_requires_it():
     sampled = control(lambda angle: StopCondition(name="stop")(angle - 5.0), T)
-    for more in (lambda angle: [StopCondition(name="stop")(angle - 5.0)], lambda angle: [sampled(angle)]):
+    within = Requirement("the angle stays below 50", upper=50.0, name="within")
+    for more in (
+        lambda angle: [StopCondition(name="stop")(angle - 5.0)],
+        lambda angle: [sampled(angle)],
+        lambda angle: [within(angle)],
+    ):
         assert states_of(Diagram("d", *speed_drive(more=more))) == ()
 
 
@@ -317,6 +325,16 @@ def test_a_feedback_that_is_zero_at_this_point_alone_is_no_free_motion(link, ref
     assert model.free_motions().motions == ()
 
 
+def test_a_feedback_that_is_switched_on_later_is_no_free_motion():
+    # its wire is on a loop of the port graph, whatever the product is now
+    motor = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="motor")
+    angle, switch = Integrator(name="angle"), Step(times=5.0, values=1.0, name="switch")
+    u = Product(name="product")(switch, Constant(value=0.0, name="r") - angle.y)
+    model = Diagram("d", angle(motor(u))).linearize()
+    assert np.min(np.abs(model.poles)) < 1e-12
+    assert model.free_motions().motions == ()
+
+
 class Cube(Block):
     u = Input()
     y = Output()
@@ -339,6 +357,10 @@ class Inside(Block):
             return -(a**3)
         if self.kind == "play":
             return -1e3 * (np.maximum(a - 0.01, 0.0) + np.minimum(a + 0.01, 0.0))
+        if self.kind == "far stops":
+            return -1e3 * (np.maximum(a - 100.0, 0.0) + np.minimum(a + 100.0, 0.0))
+        if self.kind == "detents":
+            return -1e-3 * np.floor(a / 0.3 + 0.5)
         if self.kind == "cogging":
             return 1e-3 * (1.0 - np.cos(2.0 * np.pi * a))
         if self.kind == "commutation":  # the torque constant follows the angle
@@ -352,7 +374,7 @@ class Inside(Block):
         return u.u - x.y + self.torque(x, u), x.y
 
 
-@pytest.mark.parametrize("kind", ["none", "cube", "play", "cogging", "commutation", "stuck"])
+@pytest.mark.parametrize("kind", ["none", "cube", "play", "far stops", "detents", "cogging", "commutation", "stuck"])
 @pytest.mark.parametrize("sample_time", [None, T], ids=["continuous", "sampled"])
 def test_a_torque_that_is_zero_at_this_angle_alone_is_found_by_finite_shifts(sample_time, kind):
     plant = Inside(kind=kind, name="plant")
