@@ -13,6 +13,7 @@ from loopwright.blocks import (
     Constant,
     DeadZone,
     Encoder,
+    FmuError,
     Gain,
     Input,
     Integrator,
@@ -30,7 +31,7 @@ from loopwright.blocks import (
     parameter,
 )
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus import Fmu, dc_motor
+from loopwright.fmus import Fmu, build, dc_motor
 
 T = 0.01
 
@@ -112,6 +113,19 @@ def test_a_required_angle_is_not_free():
     assert states_of(diagram, ["drive_motor.y"]) == ("drive_angle.y",)
 
 
+class Fence(Block):
+    """A guard on a signal, and nothing else."""
+
+    u = Input()
+    y = Output()
+
+    def output(self, t, x, u):
+        return u.u
+
+    def guards(self, t, x, u):
+        return {"inside": 5.0 - u.u}
+
+
 def test_a_condition_on_the_angle_requires_it():
     sampled = control(lambda angle: StopCondition(name="stop")(angle - 5.0), T)
     within = Requirement("the angle stays below 50", upper=50.0, name="within")
@@ -119,6 +133,7 @@ def test_a_condition_on_the_angle_requires_it():
         lambda angle: [StopCondition(name="stop")(angle - 5.0)],
         lambda angle: [sampled(angle)],
         lambda angle: [within(angle)],
+        lambda angle: [Fence(name="fence")(angle)],
     ):
         assert states_of(Diagram("d", *speed_drive(more=more))) == ()
 
@@ -202,6 +217,29 @@ def test_the_angle_of_a_motor_that_is_an_fmu_is_free(interface, at):
     assert free.motions[0].by_model_alone == ()
     assert np.max(np.abs(model.poles_without(free))) < 1.0 - 1e-4
     assert len(model.poles_without(free)) == len(model.poles) - 1
+
+
+def test_an_fmu_whose_states_can_not_be_shifted_is_judged_by_its_linear_model_and_says_so(monkeypatch):
+    def refuse(block, **how):
+        raise FmuError("its state has no exact start value")
+
+    monkeypatch.setattr("loopwright.diagrams.linearization.free_motions.take_shifted_steps", refuse)
+    (motion,) = fmu_drive().linearize(0.0).free_motions().motions
+    assert motion.by_model_alone == ("motor",)
+    assert str(motion) == (
+        "motor.angle drifts: nothing feeds it back (by the linear model alone: the states of motor can't be shifted)"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sample_time", [None, T], ids=["continuous", "sampled"])
+@pytest.mark.parametrize("kind", ["none", "play", "cogging"])
+def test_what_an_fmu_hides_is_found_by_its_steps(kind, sample_time):
+    plant = Fmu(build(Inside(kind=kind), name=f"inside_{kind}"), name="plant")
+    gain = control(lambda y: Gain(gain=-2.0, name="gain")(y), sample_time)
+    options = {} if sample_time else {"at": 0.0}
+    found = states_of(Diagram("d", plant(gain(plant.y))), **options)
+    assert found == (("plant.angle",) if kind == "none" else ())
 
 
 # --- what must not pass -----------------------------------------------------------------------------------------------
