@@ -41,10 +41,14 @@ from .tick_chain import Chain, Visit, period_of
 
 NULL = 1e-12
 """Largest singular value of a direction that counts as an eigenvector of 0, relative to the largest one."""
+ERROR = 1e-6
+"""The most that this is where the entries of an FMU's model have an error."""
 NOISE = 1e-12
 """Part of a signal, relative to that of all states in balanced units, that is rounding of a direction."""
 UNSEEN = 1e-9
 """Relative size of an entry, or of a row, of directions that counts as none."""
+ROUNDED = 1e-15
+"""Entry of a matrix, relative to the largest one, that may be a zero that rounding has changed."""
 CHAIN = 1e-9
 """Share of a direction outside of the range of A below which it counts as the end of a Jordan chain."""
 ROUNDING = 1e-10
@@ -241,12 +245,13 @@ def _describe(v: np.ndarray, left: np.ndarray, names: Sequence[str], alone: tupl
 # --- eigenvectors of 0 -----------------------------------------------------------------------------------------------
 
 
-def _scales(M: np.ndarray) -> np.ndarray:
-    """Return the factors, powers of two, that balance a matrix."""
+def _scales(M: np.ndarray, error: float = 0.0) -> np.ndarray:
+    """Return the factors, powers of two, that balance a matrix; entries that are rounding, or error, count as 0."""
     from scipy.linalg import matrix_balance
 
+    least = max(10.0 * error, ROUNDED * float(np.max(np.abs(M), initial=0.0)))
     with np.errstate(invalid="ignore"):
-        _, (d, _) = matrix_balance(M, permute=False, separate=True)
+        _, (d, _) = matrix_balance(np.where(np.abs(M) <= least, 0.0, M), permute=False, separate=True)
     return np.asarray(d)
 
 
@@ -257,10 +262,10 @@ def _null_spaces(M: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray, f
     """
     if not len(M):
         return np.zeros((0, 0)), np.zeros((0, 0)), NULL
-    d = _scales(M)
+    d = _scales(M, error)
     U, sigma, Wt = np.linalg.svd(M * d / d[:, None])
-    moved = error * float(np.max(np.outer(1.0 / d, d))) if error else 0.0
-    rest = max(NULL, 10.0 * moved / (float(sigma[0]) or 1.0))
+    relative = 100.0 * error / (float(np.max(np.abs(M))) or 1.0)
+    rest = max(NULL, min(ERROR, relative))
     first = len(M) - int(np.sum(sigma <= rest * sigma[0]))
     return d[:, None] * Wt[first:].T, U[:, first:] / d[:, None], rest
 

@@ -102,9 +102,10 @@ def test_a_turning_angle_on_which_nothing_depends_is_told_apart():
     assert all("only motor.angle moves, and nothing depends on it" in t for t in said)
 
 
-def test_an_integrator_outside_the_loop_is_called_neither_stable_nor_unstable():
-    rows = moving_report().sections[1].tables[0].rows
-    assert [row[2] for row in rows] == ["on the limit"] * 3
+def test_an_integrator_outside_the_loop_is_named_and_is_no_instability():
+    poles = moving_report().sections[1]
+    assert [row[2] for row in poles.tables[0].rows] == ["yes"] * 3
+    assert "motor.angle drifts: nothing feeds it back" in poles.text[0]
 
 
 def test_a_wire_that_is_not_there_is_refused():
