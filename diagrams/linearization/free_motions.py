@@ -31,8 +31,10 @@ from ...fmus.running import take_shifted_steps
 from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
+from .delay_channels import delay_channels
 from .derivatives import LocalDerivatives, Numbers, Tap, find_signal
 from .exchanged import evaluators_at, noise_of
+from .flow_model import LinearDelays
 from .mean_stairs import replace_stairs
 from .over_a_period import find_needed, own_states
 from .plant_models import PlantModel, fmu_at, join_matrices, linearize_equations, plant_entries, point_inputs
@@ -79,6 +81,7 @@ class ClosedModel:
     uncertainty: float = 0.0
     plants: str | None = None
     stairs: str | None = None
+    delays: LinearDelays | None = None
 
 
 @explain_calls
@@ -120,7 +123,7 @@ class FreeMotions:
     V : ndarray, shape (n, m)
         Their directions in the model's states: A V = 0, or A V = V of a sampled model.
     Q : ndarray, shape (n, n − m)
-        Coordinates of the rest, orthonormal to V in balanced states.
+        Coordinates of the rest: all states but one for each motion.
     P : ndarray, shape (n − m, n)
         Inverse of Q on the rest: P Q = 1 and P V = 0.
     """
@@ -168,13 +171,18 @@ class FreeMotions:
 def deflate(A: np.ndarray, V: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return Q and P of `FreeMotions` for eigenvectors V of a matrix: the rest of it is P A Q.
 
-    With x = V a + Q b the matrix is block triangular, so P A Q has its other eigenvalues. Both are orthonormal in the
-    states that balance A: the eigenvalues of the rest are as accurate as those of A.
+    With x = V a + Q b the matrix is block triangular, so P A Q has its other eigenvalues. Q keeps all states but one
+    for each motion, the largest in balanced units: zeros of the matrix stay zeros.
     """
-    d = _scales(A)
-    whole, _ = np.linalg.qr(V / d[:, None], mode="complete")
-    rest = whole[:, V.shape[1] :]
-    return d[:, None] * rest, rest.T / d
+    from scipy.linalg import qr
+
+    d, n = _scales(A), len(A)
+    _, _, order = qr((V / d[:, None]).T, pivoting=True, mode="economic")
+    gone = order[: V.shape[1]]
+    others = np.setdiff1d(np.arange(n), gone)
+    P = np.eye(n)[others]
+    P[:, gone] = -np.linalg.solve(V[gone].T, V[others].T).T
+    return np.eye(n)[:, others], P
 
 
 def find_free_motions(model: ClosedModel, required: Iterable[str] = ()) -> FreeMotions:
@@ -200,6 +208,10 @@ def find_free_motions(model: ClosedModel, required: Iterable[str] = ()) -> FreeM
     right, left, rest = _null_spaces(M, uncertainty)
     if not right.shape[1]:
         return none
+    if model.delays is not None:  # a Jordan chain may go through a delay
+        F = model.delays
+        through = np.linalg.lstsq(np.eye(len(F.H)) - F.H, F.Z[:, kept])[0]
+        left = _null_spaces(M + F.G[kept] @ through, uncertainty)[1]
     noise = max(NOISE, 100.0 * uncertainty / (float(np.max(np.abs(A))) or 1.0))
     look = _Look.of(model, required, kept, noise)
     V = _localize(right, M, rest)
@@ -356,7 +368,7 @@ class _Instant:
     """An instant of a period at which functions are evaluated with shifted states.
 
     ``Vx`` and ``Vw`` lead from the model's states at the beginning to the shifts of x and w here, ``rows`` are the
-    entries of each result that count.
+    entries of each result that count, ``still`` those of z that go into delays of a continuous model.
     """
 
     acting: frozenset[TickPattern]
@@ -367,6 +379,7 @@ class _Instant:
     Vw: np.ndarray
     numbers: Numbers
     rows: Mapping[str, np.ndarray]
+    still: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
 
     def slope(self, name: str) -> np.ndarray:
         """Return the derivative of a result's rows by the model's states."""
@@ -379,7 +392,9 @@ class _Instant:
         Inputs of FMUs may follow a shift: their steps say what comes of it.
         """
         if name == "z":
-            return self.slope(name)
+            found = self.slope(name)
+            found[self.still] = 0.0
+            return found
         return self.Vx[self.rows[name]] if name == "x" else np.zeros((len(self.rows[name]), self.Vx.shape[1]))
 
     def size(self, name: str) -> np.ndarray:
@@ -594,7 +609,8 @@ def _look_at_flow(
     Vw = np.linalg.solve(loop, Dp @ J["z", "x"] @ Vx + Cp @ Vp)
     Vx, Vw, Vp = Vx[:, kept], Vw[:, kept], Vp[:, kept]
     rows = {name: np.arange(len(J[name])) for name in ("dx", "y", "z")}
-    instants = [_Instant(NONE, at.t, at.x, at.w, Vx, Vw, J, rows)]
+    still = delay_channels(flat).inputs
+    instants = [_Instant(NONE, at.t, at.x, at.w, Vx, Vw, J, rows, still)]
     needed = np.any(np.vstack([J[name, "w"] != 0.0 for name in rows]), axis=0)
     Vz = J["z", "x"] @ Vx + J["z", "w"] @ Vw
     plants, first = [], 0

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.special import lambertw
 
 from loopwright.blocks import (
     PID,
@@ -28,6 +29,7 @@ from loopwright.blocks import (
     Step,
     StopCondition,
     TransferFunction,
+    TransportDelay,
     parameter,
 )
 from loopwright.diagrams import Diagram, subsystem
@@ -188,6 +190,24 @@ def test_entries_of_a_wire_that_nobody_on_the_loop_takes_may_move():
     assert states_of(by_entry) == ("plant.x[1]",)
     both = Diagram("d", plant(Gain(gain=np.array([[0.0, -2.0]]), name="gain")(plant.y)[0]))
     assert states_of(both) == ()
+
+
+def test_a_drive_with_a_dead_time_keeps_its_rightmost_pole_without_its_angle():
+    # s + 1 + 2 exp(−0.1 s) = 0, by Lambert's function: s = −1 + W(−0.2 exp(0.1))/0.1
+    motor = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="motor")
+    late, angle = TransportDelay(delay=0.1, name="late"), Integrator(name="angle")
+    model = Diagram("d", angle(motor(late(Gain(gain=-2.0, name="gain")(motor.y))))).linearize()
+    free = model.free_motions()
+    assert [m.state for m in free.motions] == ["angle.y"]
+    rightmost = -1.0 + lambertw(-0.2 * np.exp(0.1)) / 0.1
+    found = model.poles_without(free)
+    assert found[0] == pytest.approx(rightmost, abs=1e-9)
+    assert model.characteristic_without(free).count_unstable() == 0
+
+
+def test_an_angle_that_a_dead_time_integrates_is_not_free():
+    late = TransportDelay(delay=0.1, name="late")
+    assert states_of(Diagram("d", *speed_drive(more=lambda angle: [Integrator(name="i")(late(angle))]))) == ()
 
 
 # --- motors that are FMUs ---------------------------------------------------------------------------------------------
