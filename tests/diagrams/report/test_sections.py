@@ -74,7 +74,8 @@ def test_a_diagram_without_loops_has_plain_poles_and_its_first_page_says_that_th
     assert "Step responses" not in said("open")
     assert "injection" not in said("open")
     assert next(s.title for s in report("open").sections if s.key == "poles") == "Poles"
-    assert report("open").numbers()["poles.continuous.slowest"].value == 0.0
+    assert report("open").numbers()["poles.continuous.slowest"].value == -np.inf  # its one pole is a free motion's
+    assert "drifts: nothing feeds it back" in said("open")
 
 
 def test_the_first_page_says_why_steps_and_injection_are_missing():
