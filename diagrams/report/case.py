@@ -145,23 +145,15 @@ class Case:
         self.axes = AxisUnits()
         self.tell: Callable[[str], None] = lambda doing: None
         self.variants: dict[str, Variant] = {}
-        self._requirements: Requirements | None = None
         own = self.own_delay()
         for basis in self.bases():
             for implementation, make in _implementations(basis.diagram, own):
                 self._add(basis, implementation, make, _title(implementation, basis.lacks, own, diagram.has_clock))
         self.variants = dict(sorted(self.variants.items(), key=lambda item: not item[1].is_actual))
-
-    @property
-    def requirements(self) -> Requirements | None:
-        """Requirements on the design, if there are any."""
-        return self._requirements
-
-    @requirements.setter
-    def requirements(self, asked: Requirements | None) -> None:
-        self._requirements = asked
-        for v in self.variants.values():
-            v.required, v.every_state = self.required_signals(), asked is not None and asked.every_state
+        if requirements is not None:
+            required = self.required_signals()
+            for v in self.variants.values():
+                v.required, v.every_state = required, requirements.every_state
 
     def required_signals(self) -> tuple[str, ...]:
         """Return the wires and ports on which something is required: of steps, loops, and numbers of loops."""
