@@ -46,11 +46,13 @@ from .frequency import (
     sensitivity,
 )
 from .linearization import (
+    ApproximateDelay,
     CoarseValues,
     FreeMotion,
     FreeMotions,
     InexactDerivatives,
     Kink,
+    LinearDelays,
     Linearization,
     MeanSlope,
     RefutedDerivatives,
@@ -103,6 +105,7 @@ from .wiring import Subsystem, SubsystemSettings, Wire, subsystem
 
 __all__ = [
     "AdmittanceLoop",
+    "ApproximateDelay",
     "BlockReport",
     "Box",
     "Channel",
@@ -132,6 +135,7 @@ __all__ = [
     "InterruptedSweep",
     "Kink",
     "Layout",
+    "LinearDelays",
     "Linearization",
     "Margins",
     "MeanSlope",

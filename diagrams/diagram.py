@@ -514,6 +514,8 @@ class Diagram:
         openings: str | Iterable[str] = (),
         plants: str | None = None,
         stairs: str | None = None,
+        delays: str = "exact",
+        order: int = 5,
         **options: Any,
     ) -> Linearization:
         """Return the linear model of this very diagram at an operating point.
@@ -540,6 +542,11 @@ class Diagram:
         stairs : {"gain", "zero"}, optional
             "zero" takes stairs by their slope of zero, "gain" all by their mean slope, also rounding of your own.
             Without it those of `Quantizer` and `Encoder` have their mean slope. A relay has none.
+        delays : {"exact", "pade"}
+            "pade" takes `TransportDelay` in a continuous diagram as Padé's approximation, for what needs a rational
+            model; a finding says up to which frequency it is right. Sampled diagrams are exact with either.
+        order : int
+            Order of that approximation.
         **options
             Options of the run to a time, as of `operating_point`. With ``step`` a diagram that is continuous but for an
             FMU is linearized over its communication step.
@@ -547,17 +554,21 @@ class Diagram:
         Returns
         -------
         Linearization
-            With `Linearization.system`, a `control.StateSpace` with names, and the loops: ``.loop("v_perp")``.
+            With `Linearization.system`, a `control.StateSpace` with names, and the loops: ``.loop("v_perp")``. Of a
+            continuous diagram with transport delays these are systems with delays, which evaluate exactly and have no
+            matrices; see docs/frequency.md.
 
         Raises
         ------
         UnknownNameError, WiringError, FmuError
-            A signal that isn't there; an opening at which nothing is wired, or a transport delay in continuous time; an
-            FMU that can't be linearized: the error says what it lacks.
+            A signal that isn't there; an opening at which nothing is wired; an FMU that can't be linearized: the error
+            says what it lacks.
+        OptionError
+            A transport delay that acts back on itself between the ticks of a sampled diagram.
         """
         from .linearization import linearize
 
-        options = {"plants": plants, "stairs": stairs, **options}
+        options = {"plants": plants, "stairs": stairs, "delays": delays, "order": order, **options}
         return linearize(self.wired, point, inputs=inputs, outputs=outputs, openings=openings, **options)
 
     def linearize_batch(

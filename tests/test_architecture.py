@@ -212,9 +212,9 @@ PUBLIC = {
         mass_spring_damper model_spec read_description scara tune
     """,
     "diagrams": """
-        AdmittanceLoop BlockReport Box Channel CoarseValues Comparison Contact ContactAdmittance ContactConfirmation ContactLimit ContactMap
+        AdmittanceLoop ApproximateDelay BlockReport Box Channel CoarseValues Comparison Contact ContactAdmittance ContactConfirmation ContactLimit ContactMap
         ContactTrial Coupling CouplingReport Diagram DiskMargin Drawing Failure Fig3Diagram FlatDiagram FreeMotion FreeMotions FrequencyResponse
-        GainCrossover GangOfFour InexactDerivatives Interrupted InterruptedSweep Kink Layout Linearization Margins MeanSlope MeasuredMargins Number
+        GainCrossover GangOfFour InexactDerivatives Interrupted InterruptedSweep Kink Layout LinearDelays Linearization Margins MeanSlope MeasuredMargins Number
         NyquistCount Occurrence OperatingPoint Passivity PassivityReason PeriodicMargins PhaseCrossover Plot PortPassivity Reduction RefutedDerivatives Report Requirements Review
         Rig Run RunConfirmation RunOptions RunState Sample SampledDesign Samples Section Sensitivities Sensitivity Simulation SimulationView Snapshot StabilityLimit
         StabilityMap StepResponse StepsOnly Stopped Subsystem SubsystemSettings Sweep Table TextSignal TrialMethod Verdict Wire

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .delay_matrices import DelayMatrices, replace_delays
+from .delay_matrices import DelayMatrices, find_pade_limit, replace_delays
 from .delayed_hold import delayed_hold, delayed_hold_margin
 from .delayed_realization import DelayedRealization, realize
 from .disk_margins import DiskMargin, disk_margin, loop_at, mimo_disk_margin
@@ -82,6 +82,7 @@ __all__ = [
     "disk_margin",
     "find_disk_frequency",
     "find_hidden_unstable",
+    "find_pade_limit",
     "first_largest",
     "gang_of_four",
     "hold_inputs",

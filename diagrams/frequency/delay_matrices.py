@@ -40,6 +40,8 @@ MOST_POINTS = 200_000
 """Points after which the argument is given up."""
 NEAR = 0.1
 """Damping ratio of Padé's poles below which roots are searched to tell on which side of the axis they are."""
+RIGHT = 0.01
+"""Error of Padé's approximation, in parts of its input, up to which it is called right."""
 NEWTON = 60
 """Steps of Newton's method."""
 SIDES = np.array([-30, -10, -3, -1, -0.3, 0.0, 0.3, 1, 3, 10, 30])
@@ -355,6 +357,17 @@ def replace_delays(
     wx, wu, wp = (np.linalg.solve(loop, part) for part in (Dp @ Z, Dp @ F, Cp))
     whole = np.block([[A + G @ wx, G @ wp], [Bp @ (Z + H @ wx), Ap + Bp @ H @ wp]])
     return whole, np.vstack([B + G @ wu, Bp @ (F + H @ wu)]), np.hstack([C + E @ wx, E @ wp]), D + E @ wu
+
+
+def find_pade_limit(order: int) -> float:
+    """Return the ω τ up to which Padé's approximation of a delay, an all-pass, is right to 1 % of its input."""
+    one, none = np.ones((1, 1)), np.zeros((0, 0))
+    row, column, empty = np.zeros((1, 0)), np.zeros((0, 1)), np.zeros((1, 1))
+    rest = none, column, row, empty, column, row, empty, one, one
+    A, B, C, D = replace_delays(*rest, np.ones(1), [order])
+    x = np.geomspace(0.01, 4.0 * order + 4.0, 4000)
+    made = np.array([(C @ np.linalg.solve(1j * w * np.eye(order) - A, B) + D)[0, 0] for w in x])
+    return float(x[int(np.argmax(np.abs(made - np.exp(-1j * x)) > RIGHT))])
 
 
 def replace_conjugate(system: DelayMatrices) -> DelayMatrices:

@@ -3,6 +3,7 @@
 from .block_slopes import linearize_block
 from .derivatives import Tap, find_signal, moves_between_ticks
 from .findings import (
+    ApproximateDelay,
     BlockFinding,
     CoarseValues,
     CutFromTracking,
@@ -19,6 +20,7 @@ from .findings import (
     UnusualStart,
     ZeroSlope,
 )
+from .flow_model import LinearDelays
 from .free_motions import FreeMotion, FreeMotions, deflate
 from .inserted_blocks import find_inputs, name_wire_to, with_passed_values
 from .kinks import find_kinks_between
@@ -42,6 +44,7 @@ from .trim_search import point_from_states, trim
 __all__ = [
     "EQUILIBRIUM",
     "RUN_OPTIONS",
+    "ApproximateDelay",
     "BlockFinding",
     "CoarseValues",
     "CutFromTracking",
@@ -52,6 +55,7 @@ __all__ = [
     "InertConsumer",
     "InexactDerivatives",
     "Kink",
+    "LinearDelays",
     "Linearization",
     "LoopSlope",
     "MeanSlope",

@@ -98,6 +98,32 @@ class MeanSlope(BlockFinding):
 
 @explain_calls
 @dataclass(frozen=True)
+class ApproximateDelay(BlockFinding):
+    """A transport delay that the model replaces by Padé's approximation.
+
+    Attributes
+    ----------
+    order : int
+        Order of the approximation.
+    delay : float
+        The delay in s.
+    limit : float
+        Frequency in rad/s up to which the approximation is right to 1 % of the signal.
+    """
+
+    order: int
+    delay: float
+    limit: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.block}: the delay of {self.delay:.6g} s is Padé's approximation of order {self.order}, right to "
+            f"1 % up to {self.limit:.4g} rad/s"
+        )
+
+
+@explain_calls
+@dataclass(frozen=True)
 class Kink(BlockFinding):
     """A point at which the slopes to both sides differ, or the value jumps.
 

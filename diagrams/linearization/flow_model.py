@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ...blocks.core import Finding, OptionError, left_of
 from ...fmus.running import Derivation
 from ..flat import NONE, FlatDiagram, WiredDiagram, announcers
-from ..frequency import FourMatrices, hold_inputs
+from ..frequency import FourMatrices, find_pade_limit, hold_inputs, replace_delays
 from ..results import OperatingPoint
 from ..simulation import late_progress
 from .delay_channels import delay_channels
 from .derivatives import LocalDerivatives
 from .exchanged import noise_of
+from .findings import ApproximateDelay
 from .plant_models import EQUILIBRIUM, join_matrices, states_of
 
 STAGES = (1.0, 0.6, 0.2816, 0.857, 0.0526, 0.3333, 0.6513, 0.1184, 0.25, 0.3077, 0.0789)
@@ -204,4 +205,30 @@ def model_continuous(
         {m.path: m.derivation for m in models},
         max((m.uncertainty for m in models), default=0.0),
         delays=delays,
+    )
+
+
+def approximate_delays(model: Model, order: int) -> Model:
+    """Return a model with Padé's approximation of an order in place of each delay, and a finding on each."""
+    late = model.delays
+    if late is None:
+        return model
+    n, m = len(model.matrices[0]), len(late.times)
+    A, B, C, D = model.matrices
+    B, C = B.reshape(n, late.F.shape[1]), C.reshape(len(late.E), n)
+    D = D.reshape(len(late.E), late.F.shape[1])
+    four = replace_delays(A, B, C, D, late.G, late.Z, late.H, late.E, late.F, late.times, [order] * m)
+    limit = find_pade_limit(order)
+    findings = [
+        ApproximateDelay(name.rpartition(".")[0], "y", "u", order, float(tau), limit / float(tau))
+        for name, tau in zip(late.names, late.times, strict=True)
+    ]
+    states = [f"{name}.pade[{k + 1}]" for name in late.names for k in range(order)]
+    return replace(
+        model,
+        matrices=four,
+        states=[*model.states, *states],
+        affine=np.append(model.affine, np.zeros(len(states))),
+        findings=(*model.findings, *findings),
+        delays=None,
     )

@@ -38,7 +38,7 @@ from ..wiring import exact_time
 from .derivatives import LocalDerivatives, Tap, find_moving, find_signal
 from .exchanged import derivations_at, evaluators_at, findings_on
 from .findings import EntryTaken
-from .flow_model import LinearDelays, Model, model_continuous, relative_error
+from .flow_model import LinearDelays, Model, approximate_delays, model_continuous, relative_error
 from .free_motions import ClosedModel, FreeMotions, find_free_motions
 from .inserted_blocks import find_cut_findings, name_inputs, split_consumers, split_inputs
 from .kinks import find_kinks
@@ -100,6 +100,8 @@ class Linearization:
     delays : LinearDelays or None
         Transport delays of a continuous model, which are closed around the matrices: ``A`` to ``D`` are those of the
         rest, and `system` and the loops are `DelayedSystem`. In a sampled model the past is a part of the states.
+    pade : int
+        Order of Padé's approximations of the delays, 0 where they are exact; the loops of this model use it too.
     """
 
     wired: WiredDiagram = field(repr=False)
@@ -123,6 +125,7 @@ class Linearization:
     step: float | Fraction | None = field(default=None, repr=False)
     stairs: str | None = field(default=None, repr=False)
     delays: LinearDelays | None = None
+    pade: int = field(default=0, repr=False)
 
     def __repr__(self) -> str:
         facts = [f"T = {self.dt:g} s" if self.dt else "continuous", count_of(len(self.states), "state")]
@@ -382,7 +385,7 @@ class Linearization:
         flat = self.wired.flatten_like(self.point)
         ports = [find_signal(flat, w).port for w in wires]
         at, frozen = begin_loop(flat, self.point, ports, self.plants, slow, self.wired.name, moves=bool(self.dt))
-        how: dict[str, Any] = {"plants": self.plants, "step": self.step, "stairs": self.stairs}
+        how: dict[str, Any] = {"plants": self.plants, "step": self.step, "stairs": self.stairs, "pade": self.pade}
         how |= {"frozen": frozen, "findings": self.findings}
         made = _linearize(self.wired, at, wires, wires, openings, loop=loop, **how)
         if loop:
@@ -410,9 +413,13 @@ def linearize(
     openings: str | Iterable[str] = (),
     plants: str | None = None,
     stairs: str | None = None,
+    delays: Literal["exact", "pade"] = "exact",
+    order: int = 5,
     **options: Any,
 ) -> Linearization:
     """Linearize a diagram; see `Diagram.linearize`."""
+    check_argument(delays, kinds.choice("exact", "pade"), "delays", "linearize")
+    check_argument(order, kinds.integer(1), "order", "linearize")
     check_options(diagram, options, "linearize")
     at = operating_point(diagram, point, options)
     _refuse_lost(diagram, at)
@@ -420,7 +427,8 @@ def linearize(
     given = [_as_list(names) for names in (inputs, outputs, openings)]
     diagram, at, ports = split_inputs(diagram, at, itertools.chain(*given))
     places = [[ports.get(name, name) for name in names] for names in given]
-    made = _linearize(diagram, at, *places, plants=plants, stairs=stairs, step=options.get("step"))
+    how: dict[str, Any] = {"plants": plants, "stairs": stairs, "pade": order if delays == "pade" else 0}
+    made = _linearize(diagram, at, *places, step=options.get("step"), **how)
     return replace(made, inputs=name_inputs(made.inputs, ports), outputs=name_inputs(made.outputs, ports))
 
 
@@ -449,6 +457,7 @@ def _linearize(
     plants: str | None,
     step: float | Fraction | None,
     stairs: str | None = None,
+    pade: int = 0,
     loop: str = "",
     frozen: frozenset[TickPattern] = NONE,
     findings: tuple[Finding, ...] | None = None,
@@ -480,6 +489,7 @@ def _linearize(
             model = model_period(flat, local, at, plants, frozen)
     else:
         model = model_continuous(diagram, flat, local, at, plants)
+        model = approximate_delays(model, pade) if pade else model
     A, B, C, D = model.matrices
     n, ins, outs = len(A), *(tuple(e for s in group for e in s.labels) for group in found[:2])
     if channels:
@@ -515,6 +525,7 @@ def _linearize(
         step=step,
         stairs=stairs,
         delays=model.delays,
+        pade=pade,
     )
 
 

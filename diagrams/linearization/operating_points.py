@@ -25,7 +25,10 @@ RUN_OPTIONS = ("step", "solver", "rtol", "atol", "max_step", "start", "coupling"
 """Options of a run to an operating point."""
 AGAIN = 1e-3
 """Largest deviation of a repeated run, whose solver takes other steps, relative to 1 + the size of a state."""
-MORE = {"linearize": ("inputs", "outputs", "openings", "plants", "stairs"), "operating_point": ("t",)}
+MORE = {
+    "linearize": ("inputs", "outputs", "openings", "plants", "stairs", "delays", "order"),
+    "operating_point": ("t",),
+}
 """Further arguments of methods that run to an operating point."""
 
 

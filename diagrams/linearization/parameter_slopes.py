@@ -162,21 +162,21 @@ def _loop_matrices(made: Model) -> FourMatrices:
     return A, B.reshape(n, m), -C.reshape(m, n), -D
 
 
-def rational_loop(L: Any) -> Any:
+def rational_loop(L: Any, order: int = 0) -> Any:
     """Return a loop whose matrices have slopes: with delays, the one with Padé's approximation of order 14.
 
-    Up to ω τ = 6 it is the loop to rounding, up to ω τ = 12 to 1e-7.
+    Up to ω τ = 6 it is the loop to rounding, up to ω τ = 12 to 1e-7. ``order`` takes another one.
     """
-    return L.pade(SLOPES_ORDER) if isinstance(L, delayed_system_class()) else L
+    return L.pade(order or SLOPES_ORDER) if isinstance(L, delayed_system_class()) else L
 
 
-def _rational_matrices(made: Model) -> FourMatrices:
+def _rational_matrices(made: Model, order: int) -> FourMatrices:
     """Return the matrices of `rational_loop`."""
     A, B, C, D = _loop_matrices(made)
     late = made.delays
     if late is None:
         return A, B, C, D
-    orders = [SLOPES_ORDER] * len(late.times)
+    orders = [order or SLOPES_ORDER] * len(late.times)
     return replace_delays(A, B, C, D, late.G, late.Z, late.H, -late.E, late.F, late.times, orders)
 
 
@@ -221,7 +221,8 @@ class _Cut:
         """Return A, B, C, D of L with slopes along a direction of the parameters, at a point with slopes."""
         local, closed = self.derivatives(flat, diagram)
         local.direction = closed.direction = direction
-        return _rational_matrices(_model_at(self.model, flat, diagram, at, local, closed, self.slow))
+        made = _model_at(self.model, flat, diagram, at, local, closed, self.slow)
+        return _rational_matrices(made, self.model.pade)
 
     def rest(self, flat: FlatDiagram, diagram: WiredDiagram, direction: np.ndarray) -> OperatingPoint | None:
         """Return the point with the slopes of the equilibrium that follows a parameter; None if none follows.
@@ -385,7 +386,7 @@ class _StartValues:
     def _loop(self, diagram: WiredDiagram, at: OperatingPoint) -> tuple[FourMatrices, bool]:
         """Return A, B, C, D of the loop of a diagram, and whether its point is an equilibrium."""
         L, rests = loop_of_variant(self.cut.model, self.cut.wires, diagram, at, slow=self.cut.slow)
-        L = rational_loop(L)
+        L = rational_loop(L, self.cut.model.pade)
         return (L.A, L.B, L.C, L.D), rests
 
 

@@ -334,3 +334,23 @@ def test_an_angle_behind_a_loop_with_dead_time_is_free_and_its_ramp_is_not():
     assert model.poles_without(free)[:3] == pytest.approx(alone.poles[:3], abs=1e-9)
     ramped = Diagram("d", ramp(pipe(angle(y)))).linearize()
     assert ramped.characteristic_without(ramped.free_motions()).count_unstable() > 0
+
+
+def test_a_model_with_pades_approximation_says_its_order_and_how_far_it_is_right():
+    """Padé's approximation of order 2 of e^(−s): (s² − 6 s + 12)/(s² + 6 s + 12); the numbers carry the finding."""
+    diagram, L, _ = one_lag()
+    model = diagram.linearize(delays="pade", order=2)
+    loop, s = model.loop("u"), 1j * np.array([0.1, 1.0, 3.0])
+    pade = (s * s - 6 * s + 12) / (s * s + 6 * s + 12)
+    assert np.max(np.abs(loop(s) / (L(s) * np.exp(s) * pade) - 1)) < 1e-12
+    (finding,) = model.findings
+    assert (finding.block, finding.order, finding.delay) == ("late", 2, 1.0)
+    assert "Padé's approximation of order 2, right to 1 % up to" in str(finding)
+
+    def error(w):
+        return abs((-w * w - 6j * w + 12) / (-w * w + 6j * w + 12) - np.exp(-1j * w)) - 0.01
+
+    assert finding.limit == pytest.approx(brentq(error, 0.5, 3.0), rel=3e-3)
+    assert margins(loop).phase_margin_deg.findings == (finding,)
+    assert model.A.shape == (4, 4)
+    assert model.delays is None
