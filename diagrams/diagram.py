@@ -644,7 +644,8 @@ class Diagram:
             Whether to measure a second time, with half the amplitude and smaller tolerances, for the uncertainty.
         **options
             Of the run, as in `operating_point`. A continuous diagram is run with rtol = 1e-9, atol = 1e-12, and sampled
-            16 times in a period of the highest frequency, if nothing else is said.
+            16 times in a period of the highest frequency, if nothing else is said; more often where ``at`` is a time
+            that needs it, to have a sample there.
 
         Returns
         -------

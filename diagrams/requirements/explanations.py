@@ -8,8 +8,8 @@ from ..frequency import Number
 from .number_limits import Reason, Verdict
 from .results import RequirementResult
 
-MEASURED = "measured"
-"""Key of the variant of measured loops."""
+MEASURED, WORST_CASE, CONTACT = "measured", "worst_case", "contact"
+"""Keys of results that belong to no variant of the diagram: of measured loops, searches and contacts."""
 
 
 def explain(result: RequirementResult) -> str:
@@ -33,12 +33,15 @@ def explain(result: RequirementResult) -> str:
 
 def _find_reason(result: RequirementResult) -> tuple[str, str]:
     """Return why a verdict is open, and what would decide it."""
-    detail, number = result.detail, result.number
+    number = result.number
+    is_contact, is_step = result.variant == CONTACT, result.quantity.startswith("step.")
+    is_searched = result.variant == WORST_CASE
+    detail = "" if is_contact else result.detail  # a contact's is its environment
     about = f": {detail}" if detail else ""
-    is_contact, is_step = result.variant == "contact", result.quantity.startswith("step.")
+    run = "nonlinear run" if is_contact or is_searched else "injection check"
     known: dict[Reason, tuple[str, str]] = {
         Reason.UNSTABLE: ("the closed loop is unstable", ""),
-        Reason.WITHIN_TOLERANCE: (f"the limit is within {_interval(result)}", _sharpen(result)),
+        Reason.WITHIN_TOLERANCE: (f"the limit is within {_interval(number, detail)}", _sharpen(result)),
         Reason.NO_NUMBER: (
             f"the report has no such number{f'. {detail}' if detail else ''}",
             "limit one that report.numbers() has",
@@ -48,7 +51,9 @@ def _find_reason(result: RequirementResult) -> tuple[str, str]:
             "limit disk_margin, gain_margin_high or phase_margin_deg",
         ),
         Reason.NO_VALUE: (
-            f"the number does not exist here{_reason_of(number)}",
+            "one of the cases has no such number"
+            if is_searched
+            else f"the number does not exist here{_reason_of(number)}",
             "limit another one" if is_step else "limit another margin, such as disk_margin",
         ),
         Reason.NO_UNCERTAINTY: ("the data don't say how uncertain they are", "give their uncertainty"),
@@ -58,8 +63,10 @@ def _find_reason(result: RequirementResult) -> tuple[str, str]:
             "limit a step response, which the run decides, or give the loop as measured",
         ),
         Reason.REFUTED: (
-            f"the {'nonlinear run' if is_contact else 'injection check'} contradicts the linear model",
-            "look at its section: the run counts" if is_contact else "limit a step response, which the run decides",
+            f"the {run} contradicts the linear model",
+            "limit a step response, which the run decides"
+            if run == "injection check"
+            else "the run counts: look at it",
         ),
         Reason.NOT_MEASURED: (
             f"no response was measured{about}",
@@ -68,7 +75,7 @@ def _find_reason(result: RequirementResult) -> tuple[str, str]:
         Reason.NOT_SETTLED: (f"the response has not settled in its record of {detail}", "give a longer length"),
         Reason.MOVING: (
             f"the operating point moves{f' ({detail})' if detail else ''}",
-            "give one at rest, such as at=diagram.trim(…)",
+            f"give one at rest, such as at={'lambda d: d.trim(…)' if is_searched else 'diagram.trim(…)'}",
         ),
         Reason.ON_THE_LIMIT: (
             f"a pole lies on the limit of stability{about}",
@@ -79,10 +86,9 @@ def _find_reason(result: RequirementResult) -> tuple[str, str]:
     return known[result.reason]
 
 
-def _interval(result: RequirementResult) -> str:
-    if result.detail:
-        return f"the interval {result.detail}"
-    number = result.number
+def _interval(number: Number | None, detail: str) -> str:
+    if detail:
+        return f"the interval {detail}"
     if number is None:
         return "the number's tolerance"
     return f"the number's tolerance, {number.value - number.tolerance:.5g} … {number.value + number.tolerance:.5g}"

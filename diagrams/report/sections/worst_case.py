@@ -136,8 +136,10 @@ class MissingWorstCase:
         for loop, limits in self.limits.items():
             for quantity, limit in limits.items():
                 if limit is not None:
-                    place = ", ".join(loop)
-                    yield RequirementResult(quantity, place, KEY, limit, Verdict.UNDECIDED, Reason.NOT_ANALYSED)
+                    place, why = ", ".join(loop), self.problem
+                    yield RequirementResult(
+                        quantity, place, KEY, limit, Verdict.UNDECIDED, Reason.NOT_ANALYSED, detail=why
+                    )
 
     def section(self) -> Section:
         """Return the section, which has the reason alone."""

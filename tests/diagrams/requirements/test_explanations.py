@@ -50,3 +50,19 @@ def test_a_number_that_does_not_exist_says_why():
 def test_decided_verdicts_need_no_step():
     assert explain(result(Reason.COMPARED, verdict=Verdict.PASSED)) == ""
     assert explain(result(Reason.UNSTABLE, verdict=Verdict.FAILED)) == "unstable"
+
+
+def test_the_environment_of_a_contact_is_no_interval():
+    number = Number(5.1e4, "N/m", 2e3, "poles")
+    said = explain(result(Reason.WITHIN_TOLERANCE, "contact.stiffness", "contact", number=number, detail="damping 10"))
+    assert said == "the limit is within the number's tolerance, 49000 … 53000; give a limit farther away"
+
+
+def test_a_worst_case_names_its_own_run_and_point():
+    assert explain(result(Reason.REFUTED, variant="worst_case")) == (
+        "the nonlinear run contradicts the linear model; the run counts: look at it"
+    )
+    assert explain(result(Reason.MOVING, variant="worst_case")).endswith("such as at=lambda d: d.trim(…)")
+    assert explain(result(Reason.NO_VALUE, variant="worst_case", number=Number(80.0, "deg", 1e-6, "eigenvalues"))) == (
+        "one of the cases has no such number; limit another margin, such as disk_margin"
+    )
