@@ -808,7 +808,8 @@ class Diagram:
         delay : int
             Whole samples of delay in series with sampled loops.
         progress : callable, optional
-            Called with a line for every case. ``options`` are those of `linearize`.
+            Called with a line for every case; without it the lines are shown on a terminal, once the search has taken
+            2 s. ``options`` are those of `linearize`.
 
         Returns
         -------
@@ -821,26 +822,28 @@ class Diagram:
         OptionError, UnknownNameError
             Ranges, numbers or loops that aren't there; a diagram that can't be analysed as it is.
         """
+        from .simulation import work_notes
         from .studies import find_worst_case
 
-        return find_worst_case(
-            self.wired,
-            parameters,
-            loop,
-            quantity=quantity,
-            requirements=requirements,
-            contact=contact,
-            samples=samples,
-            count=count,
-            seed=seed,
-            starts=starts,
-            steps=steps,
-            at=at,
-            points=points,
-            delay=delay,
-            progress=progress,
-            **options,
-        )
+        with work_notes(self.name, progress) as tell:
+            return find_worst_case(
+                self.wired,
+                parameters,
+                loop,
+                quantity=quantity,
+                requirements=requirements,
+                contact=contact,
+                samples=samples,
+                count=count,
+                seed=seed,
+                starts=starts,
+                steps=steps,
+                at=at,
+                points=points,
+                delay=delay,
+                progress=tell,
+                **options,
+            )
 
     # --- report and drawing ------------------------------------------------------------------------------------------
 
@@ -876,10 +879,14 @@ class Diagram:
             A path that does not end in ``.html``, a PDF without its library; a number that its confirmation refutes.
         """
         from .report import analyse, check_files, with_drawing, write_report
+        from .simulation import work_notes
 
         check_files(path, pdf=pdf, json=json, paper=paper)
-        made = with_drawing(analyse(self, _written=path is not None, **options), self.wired)
-        write_report(made, path, pdf=pdf, json=json, paper=paper)
+        with work_notes(self.name, options.pop("progress", None)) as tell:
+            analysed = analyse(self, _written=path is not None, progress=tell, **options)
+            made = with_drawing(analysed, self.wired)
+            tell("writing the files")
+            write_report(made, path, pdf=pdf, json=json, paper=paper)
         return made
 
     def draw(

@@ -25,6 +25,7 @@ from ...fmus.models import gantry
 from ..diagram import Diagram
 from ..paper import EXPERIMENTS, Experiment
 from ..requirements import STUDIES, Requirements, Review, TomlFile, Verdict, explain, read_requirements
+from ..simulation import work_notes
 from .options import parse_options, share
 from .text import say
 from .user_models import load_user_file
@@ -145,7 +146,7 @@ def report_command(arguments: argparse.Namespace) -> int:
         began = time.perf_counter()
         about = {name: text for name in ABOUT if (text := getattr(arguments, name)) is not None}
         try:
-            with _progress(diagram.name) as progress:
+            with work_notes(diagram.name) as progress:
                 report = _analyse(diagram, experiment, arguments, asked, about, progress, measured, searched, touched)
         except UnknownNameError as error:
             say(f"loopwright: error: {error}", sys.stderr)
@@ -278,21 +279,6 @@ def _analyse(
         _written=True,
     )
     return with_drawing(made, diagram.wired)
-
-
-@contextlib.contextmanager
-def _progress(name: str) -> Iterator[Callable[[str], None]]:
-    """Show the section in the making on a terminal, with the time since the start."""
-    if not sys.stderr.isatty():
-        yield lambda key: None
-        return
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(f"{name}: analysing", total=None)
-        yield lambda key: progress.update(task, description=f"{name}: {key.replace('_', ' ')}")
 
 
 # --- the diagram ---------------------------------------------------------------------------------------------------

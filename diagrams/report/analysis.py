@@ -155,7 +155,8 @@ def analyse(
         The limits that it was looked for with get verdicts of their own. Limits of its numbers fail where it is
         unstable. One that can't be looked for, as at a wire without a loop, is left out with the reason.
     progress : callable, optional
-        Called with the key of each section before it is made, and with each measurement of the injection check.
+        Called with the key of each section before it is made, and with what is being computed or confirmed in it:
+        margins, steps, sensitivities and measurements, at which wire and of which variant, and cases of a worst case.
     workers : int, optional
         1 makes all sections in this process; with 2, a second process makes some of a diagram with FMUs. The report is
         the same. Without it there are two where the report is written, and two processors.

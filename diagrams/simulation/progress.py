@@ -62,6 +62,33 @@ def late_progress(name: str, start: float, end: float, show: bool | None = None)
 
 
 @contextmanager
+def work_notes(name: str, given: Callable[[str], None] | None = None) -> Iterator[Callable[[str], None]]:
+    """Yield a function that is told in words what is being computed: the one given, or one that shows it with the time.
+
+    It is shown on a terminal, and in a notebook with widgets, once the work has taken 2 s.
+    """
+    if given is not None or not _is_shown(None):
+        yield given or (lambda said: None)
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
+    drawn = Progress(*columns, console=Console(stderr=True), transient=True)
+    task, begun = drawn.add_task(name, total=None), time.monotonic()
+
+    def note(said: str) -> None:
+        drawn.update(task, description=f"{name}: {said if ' ' in said else said.replace('_', ' ')}")
+        if not drawn.live.is_started and time.monotonic() - begun > LATE:
+            drawn.start()
+
+    try:
+        yield note
+    finally:
+        drawn.stop()
+
+
+@contextmanager
 def compiler_notes(show: bool | None) -> Iterator[None]:
     """Say within the ``with`` statement that a compiler runs, where progress is shown: a run may wait for it."""
     if not _is_shown(show):

@@ -30,6 +30,7 @@ def sensitivity(case: Case) -> Section | None:
         return None
     text, parts = [*TEXTS.paragraphs("about", title=variant.title)], []
     for key, wire in case.sensitivity_wires().items():
+        case.tell(f"sensitivity at {wire}")
         try:
             found = sensitivities_of(variant.model, (wire,))
         except LoopwrightError as error:
@@ -60,6 +61,7 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities) -> Section:
     lost: list[str] = []
     text: list[str] = []
     for name in names:
+        case.tell(f"confirming the sensitivity at {wire} to {name}")
         try:
             made = confirm_parameter(found, name, shown)
         except LoopwrightError as error:

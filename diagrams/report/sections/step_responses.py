@@ -109,6 +109,7 @@ def steps(case: Case) -> Section | None:
             text.append(TEXTS.line("unstable", variant=v.title))
             continue
         for test in step_tests(case, v):
+            case.tell(f"step at {_said(test)}, {v.title}")
             try:
                 ran = _run(case, v, test)
             except LoopwrightError as error:

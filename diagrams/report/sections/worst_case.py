@@ -93,6 +93,7 @@ def find_reported(
             given = task.find(diagram, asked, at=at, progress=lambda line: tell(f"{KEY}: {line}"), **options)
         except LoopwrightError as error:
             return MissingWorstCase(task.find_limits(diagram, asked), error.message)
+    tell("confirming the worst case by a run")
     try:
         return ReportedWorstCase(given, given.confirm())
     except LoopwrightError as error:

@@ -205,3 +205,16 @@ def test_a_summary_has_two_sheets_where_smaller_figures_suffice_and_is_whole(row
     whole = sheets(report, tmp_path)
     assert all("Caption" not in sheet for sheet in whole[2:])
     assert "CHAPTER" not in whole[0].partition("Contents")[0]
+
+
+def test_progress_says_what_is_computed_and_confirmed():
+    told = []
+    analyse(loop(), only=("inner", "steps", "sensitivity"), progress=told.append)
+    for said in (
+        "margins at u, as it is",
+        "confirming the margins at u, as it is",
+        "step at u, as it is",
+        "sensitivity at u",
+        "confirming the sensitivity at u to gain.gain",
+    ):
+        assert said in told

@@ -23,7 +23,7 @@ from loopwright.blocks import (
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.linearization import loop_of_variant
 from loopwright.diagrams.requirements import Requirements
-from loopwright.diagrams.studies import CaseOrigin, CaseState, ConfirmationKind
+from loopwright.diagrams.studies import CaseOrigin, CaseState, ConfirmationKind, search
 from loopwright.diagrams.sweeps import Box
 from support.tuned_loops import Tank, make_pi_loop, pi_phase_margin
 
@@ -331,3 +331,36 @@ def test_a_motion_that_ends_in_a_limit_cycle_is_no_departure():
     diagram = Diagram("cycle", x(gain(controller(x.y))))
     found = diagram.worst_case({"k.gain": [0.5, 2.5]}, "u", quantity="ms", samples="grid", starts=0)
     assert not found.confirm().agrees
+
+
+def test_a_search_computes_no_case_twice_and_finds_the_least_value():
+    """(k − 0.7)² + (1 − p)² has its least value, 0.01, at k = 0.7 and the end p = 0.9 of its range."""
+    diagram, seen = make_pi_loop(), list[tuple[float, float]]()
+
+    def bowl(changed):
+        values = changed.blocks["p"].gain, changed.blocks["ki"].gain
+        seen.append(values)
+        return (values[0] - 0.7) ** 2 + (1.0 - values[1]) ** 2
+
+    found = diagram.worst_case({"p.gain": (0.1, 1.0), "ki.gain": (0.0, 0.9)}, quantity=bowl, count=6, seed=2)
+    assert found.worst.value == pytest.approx(0.01, abs=1e-5)
+    ran = seen[1:]  # the first is the diagram as it is
+    near = [(i, k) for i in range(len(ran)) for k in range(i) if np.max(np.abs(np.subtract(ran[i], ran[k]))) < 5e-10]
+    assert near == []
+    assert len(ran) == len(found.cases) - 1
+
+
+def test_slopes_by_differences_need_no_further_linear_model(monkeypatch):
+    made, linearize = [], search.linearize
+    monkeypatch.setattr(search, "linearize", lambda *of, **options: made.append(1) or linearize(*of, **options))
+    monkeypatch.setattr(search, "_is_start_value", lambda diagram, name: True)  # as an FMU's parameter
+    found = make_pi_loop().worst_case({"p.gain": (0.5, 2.0)}, "u", quantity="ms", count=3, starts=1, steps=3)
+    exact = make_pi_loop().worst_case({"p.gain": (0.5, 2.0)}, "u", quantity="ms", count=300, starts=0)
+    assert found.worst.value >= exact.worst.value - 1e-6
+    assert len(made) == 4  # of both searches: the diagram as it is, and the worst case with its findings
+
+
+def test_equal_samples_are_cases_of_their_own():
+    ranges = {"p.gain": [0.5, 0.5, 1.0]}
+    found = make_pi_loop().worst_case(ranges, "u", quantity="ms", samples="grid", starts=0)
+    assert [case.origin for case in found.cases].count(CaseOrigin.SAMPLE) == 3
