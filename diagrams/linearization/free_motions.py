@@ -141,20 +141,6 @@ class FreeMotions:
     def __bool__(self) -> bool:
         return bool(self.motions)
 
-    def keep_unseen(self, C: np.ndarray, A: np.ndarray) -> FreeMotions:
-        """Return those of the motions that outputs C of a model with the matrix A don't see."""
-        sizes = np.abs(C) @ np.abs(self.V)
-        unseen = np.all(np.abs(C @ self.V) <= UNSEEN * np.maximum(sizes, np.abs(C).max(initial=0.0)), axis=0)
-        if unseen.all():
-            return self
-        V = self.V[:, unseen]
-        motions = tuple(motion for motion, keep in zip(self.motions, unseen, strict=True) if keep)
-        kept = np.flatnonzero(np.any(self.Q, axis=1) | np.any(self.V, axis=1))
-        Q, P = deflate(A[np.ix_(kept, kept)], V[kept])
-        wide, tall = np.zeros((len(A), Q.shape[1])), np.zeros((P.shape[0], len(A)))
-        wide[kept], tall[:, kept] = Q, P
-        return FreeMotions(motions, V, wide, tall)
-
     def reduce(self, A: np.ndarray) -> np.ndarray:
         """Return a model's A without the free motions: its eigenvalues are those of A, less one 0 for each of them."""
         return np.asarray(self.P @ A @ self.Q) if self.motions else A

@@ -281,11 +281,7 @@ class Linearization:
         names = tuple(dict.fromkeys(_as_list(required)))
         if names not in self._free:
             own = {f.name: getattr(self, f.name) for f in fields(ClosedModel)}
-            found = find_free_motions(ClosedModel(**own), names)
-            if self.delays is not None and found:
-                acting = self.delays.G.any(axis=0) | self.delays.H.any(axis=0) | self.delays.E.any(axis=0)
-                found = found.keep_unseen(self.delays.Z[acting], self.A)
-            self._free[names] = found
+            self._free[names] = find_free_motions(ClosedModel(**own), names)
         return self._free[names]
 
     @cached_property
