@@ -97,7 +97,7 @@ def test_the_verdict_of_a_cruise_control_by_hand(variant):
     check_by_hand(PROJECT, variant)
 
 
-@reports(dict.fromkeys(VARIANTS, "a free integrator keeps the verdict on stability open"))
+@reports()
 def test_the_report_has_the_verdict_of_a_cruise_control(variant):
     check_report(PROJECT, variant)
 
