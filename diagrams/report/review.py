@@ -28,7 +28,7 @@ from .points import STEP
 from .sections.contacts import ReportedContacts
 from .sections.injection import REFUTED
 from .sections.measured_loops import MEASURED, MeasuredLoop
-from .sections.step_responses import key_of_step
+from .sections.step_responses import APART, key_of_step
 from .sections.worst_case import MissingWorstCase, ReportedWorstCase
 from .stability import Stability, free_motions
 from .variant import Cut, Variant
@@ -288,7 +288,18 @@ def _step(
         result = _with(state, result, None if number is None else (path, number))
         if number is not None and settled is not None and not settled.value and length is not None:
             result = _not_settled(result, number, length)
-        yield result
+        yield result if step.size is not None else _at_no_size(result, numbers, f"steps.{key}.{v.key}", name)
+
+
+def _at_no_size(result: RequirementResult, numbers: Mapping[str, Number], start: str, name: str) -> RequirementResult:
+    """Return a result on a step of no given size: it is open where run and linear model differ about the limit."""
+    difference, linear = numbers.get(f"{start}.difference"), numbers.get(f"{start}.linear.{name}")
+    if difference is None or linear is None or difference.value <= APART or result.reason is not Reason.COMPARED:
+        return result
+    if judge(linear, result.limit)[0] is result.verdict:
+        return result
+    detail = f"{linear.value:.4g} there, and they differ by {difference.value:.2g} of the largest change"
+    return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.SIZE_NOT_GIVEN, detail=detail)
 
 
 def _not_settled(result: RequirementResult, number: Number, length: Number) -> RequirementResult:

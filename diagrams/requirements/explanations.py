@@ -72,6 +72,10 @@ def _find_reason(result: RequirementResult) -> tuple[str, str]:
             f"no response was measured{about}",
             "" if detail else "name a step's input and output, one entry each",
         ),
+        Reason.SIZE_NOT_GIVEN: (
+            f"the response to a small step is not that of the linear model: {detail}",
+            "give the size for which the limit holds, size=…",
+        ),
         Reason.NOT_SETTLED: (f"the response has not settled in its record of {detail}", "give a longer length"),
         Reason.MOVING: (
             f"the operating point moves{f' ({detail})' if detail else ''}",

@@ -50,6 +50,8 @@ class Reason(StrEnum):
     """The co-simulation was to be measured, and gave no number."""
     NOT_SETTLED = "not settled"
     """The response still moves at the end of its record: its numbers so far are least values."""
+    SIZE_NOT_GIVEN = "size not given"
+    """The response to a step depends on the size of the step, and the requirement gives none."""
     MOVING = "moving"
     """The operating point is not an equilibrium."""
     ON_THE_LIMIT = "on the limit"

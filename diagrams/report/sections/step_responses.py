@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -53,8 +53,14 @@ TICK_ERROR = 1e-9
 """That of one that was computed at ticks alone."""
 AGREEMENT = 0.01
 """Difference of co-simulation and linear model, relative to the largest change, up to which they agree."""
+APART = 0.05
+"""Difference of them, relative to the largest change, from which on a response depends on the size of its step."""
 SIZE = 100.0
 """Size of a step, in amplitudes of the injection check, where none is given."""
+SMALLER = 0.1
+"""Factor by which a step of no given size is made smaller while its response is not that of the linear model."""
+TIMES_SMALLER = 4
+"""Most times that it is."""
 ALIKE = 1e-4
 """Difference of two responses, relative to their size, that no figure shows."""
 SLOWEST = 1e-6
@@ -312,9 +318,27 @@ def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | 
         if given is not None or size <= usual:
             raise
         got = respond(usual)  # the diagram's range is smaller than the quanta ask for
+    if given is None:
+        got = _small_response(got, respond, height)
     kept = sum(len(find_signal(diagram.flatten_like(point), name).labels) for name in outputs)
     got, left = _without_converters(got, converters, plan.variant, kept)
     return got, slowest, Quantized(height, quantum, usual if given is None else None, left)
+
+
+def _small_response(got: StepResponse, respond: Callable[[float], StepResponse], least: float) -> StepResponse:
+    """Return a response to a smaller step of at least a height, if it comes nearer to the linear model; else the same.
+
+    A step that reaches limits of the diagram says little about the loop: 1 % of 1 + the signal's size is much where
+    signals are small in SI units.
+    """
+    for _ in range(TIMES_SMALLER):
+        if got.prediction is None or _deviation(got) <= APART or SMALLER * abs(got.size) < least:
+            break
+        smaller = respond(SMALLER * got.size)
+        if smaller.prediction is None or not _deviation(smaller) < _deviation(got):
+            break
+        got = smaller
+    return got
 
 
 def _poles(v: Variant, test: StepTest) -> np.ndarray | None:

@@ -1,9 +1,13 @@
 """Open verdicts on the first page: the place that was named, the reason, and what would decide it."""
 
-from loopwright.blocks import Constant, Gain, Integrator, StateSpace
+import control
+import numpy as np
+import pytest
+
+from loopwright.blocks import Constant, Gain, Integrator, Saturation, StateSpace
 from loopwright.diagrams import Diagram, Requirements
 from loopwright.diagrams.cli.report import verdict_text
-from loopwright.diagrams.requirements import Reason
+from loopwright.diagrams.requirements import Reason, Verdict
 
 
 def spring(start=0.0):
@@ -53,3 +57,30 @@ def test_a_response_that_was_not_measured_says_why():
     assert at == "y → plant.y"
     assert verdict.startswith("not decided: no response was measured: ")
     assert "found 2 entries; expected one" in verdict
+
+
+def limited(limit):
+    """The spring, whose command is limited: a step of 1 % of 1 + its size, which is taken where none is given, isn't small."""
+    place, speed = Integrator(name="place"), Integrator(name="speed")
+    law = (Constant(value=0.0, name="wish") - (3.0 * speed.y + 40.0 * place.y)).named("u")
+    return Diagram("limited", place(speed(Saturation(lower=-limit, upper=limit, name="drive")(law))))
+
+
+def test_a_step_of_no_given_size_is_small_enough_for_the_linear_model():
+    """T = (3 s + 40)/(s² + 3 s + 40)."""
+    asked = Requirements(loops={"u": {"step": {"overshoot": 1.0}}})
+    report = limited(1e-3).report(only=("steps",), requirements=asked)
+    t = np.linspace(0.0, 2.0, 20001)
+    expected = control.step_response(control.tf([3.0, 40.0], [1.0, 3.0, 40.0]), t).y.max() - 1.0
+    number = report.numbers()["steps.u.continuous.overshoot"]
+    assert number.value == pytest.approx(expected, abs=max(number.tolerance, 1e-4))
+    assert report.numbers()["steps.u.continuous.difference"].value < 0.01
+    assert [result.verdict for result in report.review.results if result.loop == "u"] == [Verdict.PASSED]
+
+
+def test_a_step_that_is_never_small_is_open_where_run_and_linear_model_differ_about_the_limit():
+    asked = Requirements(loops={"u": {"step": {"overshoot": 1.0, "settling": 3.0}}})
+    review = limited(1e-9).report(only=("steps",), requirements=asked).review
+    (settling,) = (result for result in review.results if result.quantity == "step.settling")
+    assert (settling.verdict, settling.reason) == (Verdict.UNDECIDED, Reason.SIZE_NOT_GIVEN), settling
+    assert "give the size for which the limit holds, size=…" in verdict_text(review)
