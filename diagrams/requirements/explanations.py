@@ -34,11 +34,10 @@ def explain(result: RequirementResult) -> str:
 def _find_reason(result: RequirementResult) -> tuple[str, str]:
     """Return why a verdict is open, and what would decide it."""
     number = result.number
-    is_contact, is_step = result.variant == CONTACT, result.quantity.startswith("step.")
-    is_searched = result.variant == WORST_CASE
+    is_contact, is_searched = result.variant == CONTACT, result.variant == WORST_CASE
     detail = "" if is_contact else result.detail  # a contact's is its environment
     about = f": {detail}" if detail else ""
-    run = "nonlinear run" if is_contact or is_searched else "injection check"
+    by_run = is_contact or is_searched  # or by the injection check
     known: dict[Reason, tuple[str, str]] = {
         Reason.UNSTABLE: ("the closed loop is unstable", ""),
         Reason.WITHIN_TOLERANCE: (f"the limit is within {_interval(number, detail)}", _sharpen(result)),
@@ -54,7 +53,7 @@ def _find_reason(result: RequirementResult) -> tuple[str, str]:
             "one of the cases has no such number"
             if is_searched
             else f"the number does not exist here{_reason_of(number)}",
-            "limit another one" if is_step else "limit another margin, such as disk_margin",
+            "limit another one" if result.is_step else "limit another margin, such as disk_margin",
         ),
         Reason.NO_UNCERTAINTY: ("the data don't say how uncertain they are", "give their uncertainty"),
         Reason.NOT_CONFIRMED: ("nothing confirms the number", "limit one that a second computation confirms"),
@@ -63,10 +62,8 @@ def _find_reason(result: RequirementResult) -> tuple[str, str]:
             "limit a step response, which the run decides, or give the loop as measured",
         ),
         Reason.REFUTED: (
-            f"the {run} contradicts the linear model",
-            "limit a step response, which the run decides"
-            if run == "injection check"
-            else "the run counts: look at it",
+            f"the {'nonlinear run' if by_run else 'injection check'} contradicts the linear model",
+            "the run counts: look at it" if by_run else "limit a step response, which the run decides",
         ),
         Reason.NOT_MEASURED: (
             f"no response was measured{about}",
@@ -102,7 +99,7 @@ def _sharpen(result: RequirementResult) -> str:
     """Return how the tolerance of a number gets smaller."""
     if result.variant == MEASURED:
         return "measure more points, or with less uncertainty"
-    if result.quantity.startswith("step."):
+    if result.is_step:
         return "give a longer length or a larger size, or a limit farther away"
     why = "" if result.number is None else result.number.confirmed_by
     if "FMU" in why:

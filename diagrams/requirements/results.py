@@ -54,6 +54,11 @@ class RequirementResult:
     place: str = ""
 
     @property
+    def is_step(self) -> bool:
+        """Whether the number is one of a step response."""
+        return self.quantity.partition(".")[0] == "step"
+
+    @property
     def relative(self) -> float:
         """The distance over the limit's size, by which results are compared; NaN where there is none."""
         ends = [abs(end) for end in self.limit if math.isfinite(end)]
