@@ -64,6 +64,8 @@ LINEAR = 1e-3
 """A difference between an FMU's step and its equations beyond which it is not the solver's: it moves as it steps."""
 NOTHING = 1e-12
 """Size of a loop that is zero but for rounding."""
+RIGHT = 5
+"""Column of the comparison with python-control that says whose number is right."""
 POINTS = 400
 WHOLE = 1e-6
 """Relative deviation of PS·CS from S·T below which the loop goes through both wires."""
@@ -209,7 +211,10 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
     if beside:
         columns = ("variant", "number", "here", "python-control", "its function", "right", "why")
         title = f"Margins at {wire} beside python-control's own values"
-        tables.append(Table(title, columns, tuple(beside), details=True))
+        differing = tuple(row for row in beside if row[RIGHT] != "both")
+        note = TEXTS.line("agreeing", count=len(beside) - len(differing))
+        if differing:
+            tables.append(Table(title, columns, differing, note, details=True))
     plain = {at: loops[at] for at in designs}
     looks = {at: case.looks[at.partition(".")[0]] for at in designs}
     drawn = figures.DrawnLoops(wire, plain, found, titles, looks, case.axes)

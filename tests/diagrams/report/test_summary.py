@@ -218,3 +218,14 @@ def test_progress_says_what_is_computed_and_confirmed():
         "confirming the sensitivity at u to gain.gain",
     ):
         assert said in told
+
+
+def test_the_heading_of_the_contents_is_on_the_sheet_of_its_lines(tmp_path):
+    for lines in range(36, 56):
+        summary = Section("summary", "Summary", ("Filling.",) * lines)
+        parts = tuple(Section(f"c{i}", f"Chapter number {i} with a long title") for i in range(8))
+        found = sheets(Report("R", (summary, *parts)), tmp_path)
+        (at,) = [sheet for sheet in found if "CONTENTS" in sheet.upper()]
+        listed = at.upper().partition("CONTENTS")[2].replace("\r\n", " ").replace("\n", " ")
+        assert listed.strip().startswith(": ")  # on the line of the first chapter
+        assert all(f"CHAPTER NUMBER {i} WITH" in listed for i in range(8))
