@@ -420,7 +420,8 @@ def find_step_gap(
 ) -> tuple[float, float]:
     """Return how far a step is from a linear model of it, in one random direction, and the error of that distance.
 
-    Both are relative to the model's own motion. States that can't be set at the start are not moved.
+    Both are relative to the model's own motion. States that can't be set at the start move as the FMU's initialization
+    makes them: one may follow from those that are set.
 
     Parameters
     ----------
@@ -439,15 +440,17 @@ def find_step_gap(
     with initialize_at(point, exchange=False) as instance:
         found, names = {}, [*point.states, *point.inputs]
 
-        def step(moved: Mapping[str, Any]) -> np.ndarray:
+        def step(moved: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+            """Return the states and inputs before a step, and the states after it."""
             instance.reset()
             values = {n: v for n, v in {**point.given, **moved}.items() if about.find(n).initial == "exact"}
             instance.initialize(None, start_time=point.t, values=values)
             instance.begin()
             instance.call("setting its inputs", instance.set_values, {n: moved[n] for n in point.inputs if n in moved})
+            before = np.concatenate([instance.values(point.states), instance.values(point.inputs)])
             if instance.call(f"a step by {h:g} s", instance.fmi.do_step, point.t, h, True):
                 raise FmuError("it ends its step early, so the step has no derivative.", block=block.label)
-            return instance.values(point.states)
+            return before, instance.values(point.states)
 
         at = np.concatenate([instance.values(point.states), instance.values(point.inputs)])
         layout, rng = about.layout(names), np.random.default_rng(0)
@@ -457,10 +460,14 @@ def find_step_gap(
         for k in (1, -1, 2, -2):
             moved = layout.split(at + k * v)
             found[k] = step({n: part for n, part in moved.items() if n in settable or n in point.moved})
-    near, far = (found[1] - found[-1]) / 2, (found[2] - found[-2]) / 4
+    (moved_near, near), (moved_far, far) = (
+        tuple((part - other) / (2 * k) for part, other in zip(found[k], found[-k], strict=True)) for k in (1, 2)
+    )
     slope, error = extrapolate(near, far), np.abs(near - far)
-    predicted = np.hstack([A, B]) @ v
-    size = float(np.max(np.abs(A) @ np.abs(v[: len(A)]) + np.abs(B) @ np.abs(v[len(A) :]), initial=0.0))
-    error += 4.0 * np.finfo(float).eps * np.max(np.abs([found[1], found[2]]), axis=0)
+    moved_by, both = extrapolate(moved_near, moved_far), np.hstack([A, B])
+    predicted = both @ moved_by
+    size = float(np.max(np.abs(both) @ np.abs(moved_by), initial=0.0))
+    error += np.abs(both) @ np.abs(moved_near - moved_far)
+    error += 4.0 * np.finfo(float).eps * np.max(np.abs([found[1][1], found[2][1]]), axis=0)
     gap, own = (float(np.max(part, initial=0.0)) for part in (np.abs(slope - predicted), error))
     return (gap / size, own / size) if size else (0.0, 0.0)
