@@ -87,7 +87,8 @@ def find_reported(
         options = {} if stairs is None else {"stairs": stairs}
         asked = _name_wires(requirements, places, given.loops)
         diagram = cut_places(diagram, tuple(places.values()))
-        names = {w: p.name for w in given.loops for p in places.values() if w == p.wire or p.wire.endswith(f".{w}")}
+        moved = [place for place in places.values() if place.to]  # others keep the names of the file
+        names = {w: p.name for w in given.loops for p in moved if w == p.wire or p.wire.endswith(f".{w}")}
         given = task = replace(given, loops=tuple(names.get(wire, wire) for wire in given.loops))
         try:
             given = task.find(diagram, asked, at=at, progress=lambda line: tell(f"{KEY}: {line}"), **options)
