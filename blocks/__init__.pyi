@@ -1,6 +1,7 @@
 from .core import (
     AlgebraicLoopError,
     Array,
+    BetweenTicksError,
     Block,
     Call,
     CompilerError,
@@ -129,6 +130,7 @@ __all__ = [  # noqa: RUF022 - as sorted() does, acronyms too
     "Array",
     "Backlash",
     "BandLimitedNoise",
+    "BetweenTicksError",
     "Block",
     "Call",
     "Chirp",

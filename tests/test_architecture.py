@@ -191,7 +191,7 @@ def test_the_page_names_what_exists():
 
 PUBLIC = {
     "blocks": """
-        AdmittanceFilter AlgebraicLoopError And Array Backlash BandLimitedNoise Block Call Chirp Circle Clock
+        AdmittanceFilter AlgebraicLoopError And Array Backlash BandLimitedNoise BetweenTicksError Block Call Chirp Circle Clock
         Compare CompilerError ConfirmationError Constant Counter CubicSpline DeadZone DefinitionError Delay
         DiscreteIntegrator DiscreteStateSpace DiscreteTransferFunction DiscreteZeroPoleGain DiskError DoubleDriveError
         DuplicateNameError EdgeDetector Ellipse Encoder ErrorDynamics Event FIR FeedbackLinearization

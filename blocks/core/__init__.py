@@ -15,6 +15,7 @@ from .disk import (
 )
 from .errors import (
     AlgebraicLoopError,
+    BetweenTicksError,
     CompilerError,
     ConfirmationError,
     DefinitionError,
@@ -78,6 +79,7 @@ __all__ = [
     "SOLVED",
     "AlgebraicLoopError",
     "Array",
+    "BetweenTicksError",
     "Block",
     "Call",
     "CompilerError",

@@ -104,6 +104,10 @@ class OptionError(DefinitionError):
     """An option of an experiment, a run or a command is wrong."""
 
 
+class BetweenTicksError(OptionError):
+    """A loop of a sampled diagram is cut at a wire that acts between ticks: it has no L at ticks."""
+
+
 class TraceError(DefinitionError):
     """An equation can't be traced, or its traced result differs from NumPy's.
 

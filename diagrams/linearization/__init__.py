@@ -39,6 +39,7 @@ from .over_a_period import TickModel, model_ticks, ticks_between_renewals, ticks
 from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop, loop_of_variant, rational_loop
 from .plant_models import EQUILIBRIUM, PlantEquations, linearize_plant
 from .shared_wires import WaysBack, find_ways_back
+from .signal_paths import SignalPaths
 from .trim_search import point_from_states, trim
 
 __all__ = [
@@ -65,6 +66,7 @@ __all__ = [
     "PointLike",
     "RefutedDerivatives",
     "SharedCut",
+    "SignalPaths",
     "StepsOnly",
     "Tap",
     "TickModel",

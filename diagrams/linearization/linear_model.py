@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ...blocks.core import (
+    BetweenTicksError,
     Finding,
     LoopwrightError,
     NonFiniteError,
@@ -336,8 +337,9 @@ class Linearization:
         Raises
         ------
         OptionError
-            If no wire is named or, in a discrete model, a wire changes between ticks and acts there: it has no loop at
-            ticks. Also if there is no such ``slow``, or no clock behind the wire or its readers.
+            If no wire is named, there is no such ``slow``, or no clock behind the wire or its readers.
+        BetweenTicksError
+            In a discrete model, if a wire changes between ticks and acts there: it has no loop at ticks.
         UnknownNameError, WiringError
             If there is no input of ``to``, or it is fed by another wire.
         PeriodicLoopError
@@ -559,7 +561,7 @@ def _check_loop(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) 
     """Refuse the loop of a wire that changes between ticks and acts there."""
     moving = find_moving(flat, local, at)
     if moving:
-        raise OptionError(
+        raise BetweenTicksError(
             f"{moving[0]!r} changes between ticks, and blocks in continuous time use it there; expected a loop that is "
             "closed at ticks. Take the loop at a sampled signal, or that of diagram.continuous().",
             block=local.inputs[0].port[0],

@@ -79,6 +79,10 @@ class SignalPaths:
         """Return the inputs and outputs that follow a port as far as nothing is cut."""
         return _reach(self._forward, {PathNode(*port, True)})
 
+    def is_on_loop(self, *ports: tuple[str, str]) -> bool:
+        """Return whether ports are on one loop: each follows what the consumers of each get."""
+        return all(PathNode(*port, True) in self.after([other]) for port in ports for other in ports)
+
     def reach(self, start: PathNode, avoiding: Callable[[str], bool]) -> set[PathNode]:
         """Return the inputs and outputs that follow one through blocks that are not to be avoided, by their paths."""
         open_ways = {

@@ -126,8 +126,11 @@ def _results(
             own = asked.limits_named(names, v.key)
             for name, limit in asked.limits_of(names, v.key).items():
                 found = _worst(numbers, f"inner.{key}.{v.key}", name, limit)
-                if found is None and name not in own and _has_channels(numbers, f"inner.{key}"):
-                    continue  # a general limit of single loops
+                if found is None and name not in own:
+                    if _has_channels(numbers, f"inner.{key}"):
+                        continue  # a general limit of single loops
+                    if key in wires and v.loops_elsewhere(wires[key], _wires_judged(case, asked, numbers, v, name)):
+                        continue  # its loops are judged at other wires
                 is_periodic = _is_periodic(numbers, f"inner.{key}.{v.key}")
                 reason, said = (Reason.PERIODIC, HAS_NONE) if is_periodic else (Reason.NO_NUMBER, "")
                 detail = (said or reason_of(absent, f"inner.{key}.{v.key}")) if found is None else ""
@@ -135,9 +138,42 @@ def _results(
                 yield _with(state, result, found, _refuted(numbers, key, v.key))
             step = asked.step_of(names, v.key)
             if step is not None and key in wires:
+                others = _wires_stepped(case, asked, numbers, v, step)
+                if step is not asked.step_named(names, v.key) and v.loops_elsewhere(wires[key], others):
+                    continue  # a general limit, judged at other wires of the loop
                 yield from _step(case, v, state, key, step, numbers, absent)
         for step in asked.steps:
             yield from _step(case, v, state, key_of_step(step), step, numbers, absent, loop="")
+
+
+def _wires_judged(
+    case: Case, asked: Requirements, numbers: Mapping[str, Number], v: Variant, name: str
+) -> Iterator[str]:
+    """Yield the wires at which a variant's loop has a number that is limited there."""
+    for key, wire, names in _judged_loops(case, asked, v):
+        limit = asked.limits_of(names, v.key).get(name)
+        if limit is not None and _worst(numbers, f"inner.{key}.{v.key}", name, limit) is not None:
+            yield wire
+
+
+def _wires_stepped(
+    case: Case, asked: Requirements, numbers: Mapping[str, Number], v: Variant, step: StepLimits
+) -> Iterator[str]:
+    """Yield the wires at which a variant has a response to a step whose numbers are limited there, too."""
+    for key, wire, names in _judged_loops(case, asked, v):
+        own = asked.step_of(names, v.key)
+        if own is not None and all(
+            name in own.limits and f"steps.{key}.{v.key}.{name}" in numbers for name in step.limits
+        ):
+            yield wire
+
+
+def _judged_loops(case: Case, asked: Requirements, v: Variant) -> Iterator[tuple[str, str, tuple[str, ...]]]:
+    """Yield the loops at wires that are judged in a variant: their keys, wires and names."""
+    wires = case.loop_wires()
+    for key, names in case.names_of_loops().items():
+        if v.is_actual or asked.judges(names, v.key):
+            yield key, wires[key], names
 
 
 def _measured(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Finding, LoopwrightError, PeriodicLoopError
+from ...blocks.core import BetweenTicksError, Finding, LoopwrightError, PeriodicLoopError
 from ..flat import FlatDiagram, WiredDiagram
 from ..linearization import FreeMotions, Linearization, find_signal, linearize
 from ..results import BLUE, DARK, GREEN, PURPLE, STONE, VERMILION, OperatingPoint
 from .points import point_of
+from .wires import ways_through
 
 AT_REST = 1e-6
 """Largest change of a state, relative to 1 + its size, at which nothing is said to move."""
@@ -160,6 +161,26 @@ class Variant:
             return Cut.PLAIN, self.title, self.loop(wire)
         except PeriodicLoopError:
             return Cut.SLOW_OPEN, f"{self.title}, slow loops open", self.loop(wire, cut=Cut.SLOW_OPEN)
+
+    def acts_between_ticks(self, wire: str) -> bool:
+        """Return whether a wire has no loop as it changes between ticks, and blocks in continuous time use it there."""
+        try:
+            self.fullest_loop(wire)
+        except BetweenTicksError:
+            return True
+        except LoopwrightError:
+            return False
+        return False
+
+    def loops_elsewhere(self, wire: str, others: Iterable[str]) -> tuple[str, ...]:
+        """Return those of other wires that each loop through a wire without a loop at ticks goes through.
+
+        It is empty where the wire has a loop, and where a loop goes through none of the others.
+        """
+        others = tuple(others)
+        if not others or not self.acts_between_ticks(wire):
+            return ()
+        return ways_through(self.diagram.flatten_like(self.point), wire, others)
 
     def findings(self, *wires: str) -> tuple[Finding, ...]:
         """Return the findings that limit the numbers of the loop at wires."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-from ..flat import WiredDiagram
+from ..flat import FlatDiagram, WiredDiagram
+from ..linearization import SignalPaths, find_signal
 from ..wiring import find_cyclic_parts
 
 MOST = 4
@@ -43,6 +45,23 @@ def blocks_on_loops(diagram: WiredDiagram) -> set[str]:
     table = diagram.structure
     pairs = [(w.block, block) for (block, _), w in table.wires.items()]
     return set().union(*find_cyclic_parts(sorted(table.blocks), pairs))
+
+
+def ways_through(flat: FlatDiagram, wire: str, others: Iterable[str]) -> tuple[str, ...]:
+    """Return those of other wires that every loop through a wire goes through; empty where a loop misses them all.
+
+    They are wires that each loop goes through, where there are any; else all that share a loop with the wire.
+    """
+    port = find_signal(flat, wire).port
+    whole, ports = SignalPaths(flat), dict[str, tuple[str, str]]()
+    for other in others:
+        tap = find_signal(flat, other)
+        is_whole = len(tap.entries) == math.prod(flat.checked.shapes[tap.port])
+        if is_whole and tap.port != port and whole.is_on_loop(port, tap.port):
+            ports[other] = tap.port
+    alone = [other for other, cut in ports.items() if not SignalPaths(flat, [cut]).is_on_loop(port)]
+    together = not SignalPaths(flat, ports.values()).is_on_loop(port)
+    return tuple(alone or ports) if together else ()
 
 
 def _key(name: str) -> str:

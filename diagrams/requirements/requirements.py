@@ -295,10 +295,8 @@ class Requirements(LoopLimits):
     def limits_named(self, names: Iterable[str], variant: str) -> dict[str, Limit]:
         """Return the limits that a loop has by its own name."""
         found: dict[str, Limit] = {}
-        for limits in self._of_loop(names):
+        for limits in self._layers(names, variant, is_general=False):
             found |= limits.limits
-            if variant in limits.variants:
-                found |= limits.variants[variant].limits
         return found
 
     def limits_of_variant(self, names: Iterable[str], variant: str) -> dict[str, Limit]:
@@ -316,12 +314,19 @@ class Requirements(LoopLimits):
             found = found if limits.step is None else limits.step
         return found
 
+    def step_named(self, names: Iterable[str], variant: str) -> StepLimits | None:
+        """Return the limits of that response which a loop has by its own name."""
+        found = None
+        for limits in self._layers(names, variant, is_general=False):
+            found = found if limits.step is None else limits.step
+        return found
+
     def _of_loop(self, names: Iterable[str]) -> list[LoopLimits]:
         return [self.loops[name] for name in dict.fromkeys(names) if name in self.loops]
 
-    def _layers(self, names: Iterable[str], variant: str) -> Iterator[LoopLimits]:
+    def _layers(self, names: Iterable[str], variant: str, *, is_general: bool = True) -> Iterator[LoopLimits]:
         mine = self._of_loop(names)
-        for limits in (self, *mine):
+        for limits in (self, *mine) if is_general else mine:
             yield limits
             if variant in limits.variants:
                 yield limits.variants[variant]

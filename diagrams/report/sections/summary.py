@@ -303,10 +303,12 @@ def _not_analysed(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
     actual = case.actual
     if actual is None or actual.problem:
         return
+    found = {path.split(".")[1] for path in numbers if path.split(".")[0::2][:2] == ["inner", actual.key]}
+    analysed = [wire for key, wire in case.loop_wires().items() if key in found]
     for key, wire in case.loop_wires().items():
-        start = f"inner.{key}.{actual.key}."
-        if "inner" in case.keys and not any(path.startswith(start) for path in numbers):
-            yield TEXTS.line("loop_left_out", wire=wire)
+        if "inner" in case.keys and key not in found:
+            elsewhere, judged = actual.loops_elsewhere(wire, analysed), case.requirements is not None
+            yield TEXTS.line("loop_left_out", wire=wire, elsewhere=elsewhere, judged=judged)
     model = _model(actual)
     if model is not None and not actual.rests and not actual.moving_alone:
         yield TEXTS.line("moving", largest=actual.point.largest)
