@@ -19,7 +19,6 @@ from ...blocks.core import (
     UnknownNameError,
     describe_disk_error,
     near,
-    print_unit,
 )
 from ...fmus.models import gantry
 from ..diagram import Diagram
@@ -241,11 +240,9 @@ def verdict_text(reviewed: Review) -> str:
         parts = (result.loop or result.place, result.variant, result.quantity)
         place = result.path or ".".join(part for part in parts if part)
         found = "" if result.number is None else f" found {quantity(result.number).replace(NARROW, ' ')},"
-        unit = "" if result.number is None else print_unit(result.number.unit)
-        required = f"{result.limit}{'' if unit in ('', '°') else ' '}{unit}"
         why = explain(result)
         reason = f" ({why})" if why else ""
-        lines.append(f"  {result.verdict}: {place}:{found} required {required}{reason}")
+        lines.append(f"  {result.verdict}: {place}:{found} required {result.required}{reason}")
     return "\n".join(lines)
 
 

@@ -9,6 +9,7 @@ from .delayed_hold import delayed_hold, delayed_hold_margin
 from .delayed_realization import DelayedRealization, realize
 from .disk_margins import DiskMargin, disk_margin, loop_at, mimo_disk_margin
 from .loop_margins import GainCrossover, Margins, PhaseCrossover, find_disk_frequency, margins
+from .margin_analysis import MARGIN_UNITS
 from .margin_slopes import MarginSlope, margin_slopes
 from .measured_margins import MeasuredMargins, measured_margins, read_frequency_data
 from .number import MARK, Confirmation, Interval, Number, method_of, with_findings
@@ -52,6 +53,7 @@ def delayed_system_class() -> type[DelayedSystem]:
 
 
 __all__ = [
+    "MARGIN_UNITS",
     "MARK",
     "Comparison",
     "Confirmation",

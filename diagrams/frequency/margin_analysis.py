@@ -18,7 +18,7 @@ from .scan_refine_confirm import number_of_limit
 EIGENVALUES = "closed-loop eigenvalues"
 NEAR = 1e-12
 """Distance from the limit of stability, relative to the largest pole, within which an unstable loop's pole is named."""
-UNITS = {
+MARGIN_UNITS = {
     "phase_margin_deg": "deg",
     "delay_margin_s": "s",
     "delay_margin_samples": "samples",
@@ -130,7 +130,7 @@ class MarginFinder(ABC, Generic[Found]):
                 f"the closed loop is not stable: {self.unstable:g} of its poles are not (largest growth {near:.3g})"
             )
             names = [f.name for f in fields(self.result) if f.type == "Number"]
-            found = {name: Number(np.nan, UNITS.get(name, "1"), np.nan, reason) for name in names}
+            found = {name: Number(np.nan, MARGIN_UNITS.get(name, "1"), np.nan, reason) for name in names}
         else:
             found = self.find_numbers()
         made: Found = self.result(

@@ -28,7 +28,7 @@ from .points import STEP
 from .sections.contacts import ReportedContacts
 from .sections.injection import REFUTED
 from .sections.measured_loops import MEASURED, MeasuredLoop
-from .sections.step_responses import APART, key_of_step
+from .sections.step_responses import APART, key_of_step, unit_at
 from .sections.worst_case import MissingWorstCase, ReportedWorstCase
 from .stability import Stability, free_motions
 from .variant import Cut, Variant
@@ -317,6 +317,8 @@ def _step(
         number = numbers.get(path)
         where = key if loop is None else loop
         result = RequirementResult(f"step.{name}", where, v.key, limit, Verdict.UNDECIDED, Reason.NOT_MEASURED)
+        if name == "peak" and number is None:
+            result = replace(result, unit=unit_at(v.diagram, step.output or step.input or case.loop_wires()[key]))
         if loop == "":
             result = replace(result, place=f"{step.input} → {step.output}" if step.output else step.input)
         if number is None:

@@ -2,7 +2,7 @@
 
 from .contact_limits import ContactLimits, read_contact_limits
 from .explanations import explain
-from .number_limits import SENSES, Limit, Reason, Sense, Verdict, is_doubtful, judge, judge_interval
+from .number_limits import SENSES, STEP_UNITS, Limit, Reason, Sense, Verdict, is_doubtful, judge, judge_interval
 from .requirements import LoopLimits, Requirements, StepLimits
 from .results import RequirementResult, Review
 from .toml_file import REQUIRED, STUDIES, TomlFile, read_requirements
@@ -10,6 +10,7 @@ from .toml_file import REQUIRED, STUDIES, TomlFile, read_requirements
 __all__ = [
     "REQUIRED",
     "SENSES",
+    "STEP_UNITS",
     "STUDIES",
     "ContactLimits",
     "Limit",

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from ...blocks.core import OptionError
-from ..frequency import Number
+from ..frequency import MARGIN_UNITS, Number
 
 
 class Verdict(StrEnum):
@@ -115,6 +115,21 @@ STEP_SENSES: Mapping[str, Sense] = MappingProxyType(
     {"overshoot": Sense.MOST, "settling": Sense.MOST, "rise": Sense.MOST, "peak": Sense.MOST}
 )
 """Numbers of a step response that can be limited."""
+STEP_UNITS: Mapping[str, str] = MappingProxyType({"settling": "s", "rise": "s"})
+"""Units of those that are the same for all signals."""
+
+
+def unit_of(quantity: str) -> str:
+    """Return the unit of a number by its name or dotted path; empty for a pure number, or where neither says it.
+
+    Examples
+    --------
+    >>> unit_of("phase_margin_deg"), unit_of("step.settling"), unit_of("stable"), unit_of("ms")
+    ('deg', 's', '1/s', '')
+    """
+    if quantity == "stable":
+        return "1/s"
+    return {**MARGIN_UNITS, **STEP_UNITS}.get(quantity.rpartition(".")[2], "")
 
 
 def make_limit(name: str, given: Any, sense: Sense | None, port: str = "") -> Limit:

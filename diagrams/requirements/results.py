@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from ...blocks.core import brief, explain_calls
+from ...blocks.core import brief, explain_calls, print_unit
 from ..frequency import Number
-from .number_limits import Limit, Reason, Verdict
+from .number_limits import Limit, Reason, Verdict, unit_of
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,8 @@ class RequirementResult:
         More about the reason, in words.
     place : str
         Wires of a step from one to another, such as "wish → y"; empty of all other numbers.
+    unit : str
+        Unit of the limit: the number's, or where there is none that of the quantity; empty if neither says it.
     """
 
     quantity: str
@@ -52,6 +54,17 @@ class RequirementResult:
     number: Number | None = None
     detail: str = ""
     place: str = ""
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        unit = self.unit or unit_of(self.quantity) if self.number is None else self.number.unit
+        object.__setattr__(self, "unit", unit)
+
+    @property
+    def required(self) -> str:
+        """The limit with its unit, such as "≥ 45°"."""
+        unit = print_unit(self.unit) if self.unit else ""
+        return f"{self.limit}{'' if unit in ('', '°') else ' '}{unit}"
 
     @property
     def is_step(self) -> bool:

@@ -73,14 +73,20 @@ class TableForm:
 
 
 class Judged(str):
-    """A text that is shown in the color of its verdict: a cell of a table, or a paragraph."""
+    """A text that is shown in the color of its verdict: a cell of a table, or a paragraph.
+
+    Its ``reason`` is a part of the text, after a colon; that of a cell stands below the table, by a letter.
+    """
 
     verdict: Verdict
+    reason: str
+    short: str
+    """The text without the reason."""
 
-    def __new__(cls, text: str, verdict: Verdict) -> Judged:
+    def __new__(cls, text: str, verdict: Verdict, reason: str = "") -> Judged:
         """Make a text with its verdict."""
-        made = super().__new__(cls, text)
-        made.verdict = verdict
+        made = super().__new__(cls, f"{text}: {reason}" if reason else text)
+        made.verdict, made.reason, made.short = verdict, reason, text
         return made
 
 

@@ -48,7 +48,7 @@ class CellView:
 
 @dataclass(frozen=True)
 class NoteView:
-    """A line below a table: how numbers were confirmed, and their letter where there are several."""
+    """A line below a table: why verdicts are open, or how numbers were confirmed, and its letter if it has one."""
 
     letter: str
     text: str
@@ -62,6 +62,8 @@ class TableView:
     title: str
     headings: tuple[Heading, ...]
     rows: tuple[tuple[CellView, ...], ...]
+    reasons: tuple[NoteView, ...]
+    """Reasons of verdicts, each a line of its own below the table."""
     note: str
     confirmations: tuple[NoteView, ...]
     is_long: bool
@@ -105,7 +107,9 @@ class Numbered:
         headings = [_heading(str(text), unit, flush) for text, unit, flush in heads]
         shown = (v for row in table.rows for v in row if isinstance(v, Number))
         reasons = _grouped(v for v in shown if not (table.brief and _is_confirmed(v)))
-        letters = {method: _letter(i) for i, method in enumerate(reasons)} if len(reasons) > 1 else {}
+        verdicts = dict.fromkeys(v.reason for row in table.rows for v in row if isinstance(v, Judged) and v.reason)
+        lettered = [*verdicts, *(reasons if verdicts or len(reasons) > 1 else ())]
+        letters = {why: _letter(i) for i, why in enumerate(lettered)}
         rows = []
         for above, row in zip([(), *table.rows], table.rows, strict=False):
             cells = []
@@ -124,12 +128,15 @@ class Numbered:
             rows.append(tuple(cells))
         said = tuple(NoteView(letters.get(method, ""), _said(*why)) for method, why in reasons.items())
         said += tuple(NoteView(MARK, text) for text in _left_out(table))
+        why = tuple(NoteView(letters[reason], _sentence(reason)) for reason in verdicts)
         is_long = len(rows) > (LONG_DETAILS if table.details else LONG)
-        return TableView(self.count, table.title, tuple(headings), tuple(rows), table.note, said, is_long)
+        return TableView(self.count, table.title, tuple(headings), tuple(rows), why, table.note, said, is_long)
 
     def _cell(
         self, value: Any, kind: str, letters: Mapping[str, str], digits: int, term: str, *, first: bool, with_unit: bool
     ) -> CellView:
+        if isinstance(value, Judged):
+            return CellView(value.short, kind, first, letter=letters.get(value.reason, ""))
         if not isinstance(value, Number):
             return CellView(cell(value), kind, first)
         path = self.paths.get(id(value)) or ("" if term else self.equal.get(value))
@@ -187,8 +194,12 @@ def _whole(number: Number, why: str) -> str:
 def _said(number: Number, why: str) -> str:
     """Return a sentence on how a number was confirmed."""
     plainly = number.given or math.isnan(number.value) or why == NOT_CONFIRMED
-    text = why[0].upper() + why[1:] if plainly else f"Confirmed by {why}"
-    return text if text.endswith(".") else f"{text}."
+    return _sentence(why if plainly else f"confirmed by {why}")
+
+
+def _sentence(text: str) -> str:
+    text = text[0].upper() + text[1:]
+    return text if text.endswith((".", "?")) else f"{text}."
 
 
 def _left_out(table: Table) -> dict[str, None]:

@@ -220,12 +220,14 @@ class ReportedContacts:
             for one in self.limits.get("", ()):
                 for vary, limit in one.limits.items():
                     name = f"{KEY}.{vary}"
-                    yield RequirementResult(name, "", KEY, limit, Verdict.UNDECIDED, Reason.NO_NUMBER)
+                    yield RequirementResult(name, "", KEY, limit, Verdict.UNDECIDED, Reason.NO_NUMBER, unit=UNITS[vary])
         for name in self.contacts:
             for one in self.limits_of(name):
                 for vary, limit in one.limits.items():
                     path = f"{KEY}.{name}.{LIMITS[vary]}.{_place(vary, one.environment)}"
-                    result = RequirementResult(f"{KEY}.{vary}", name, KEY, limit, Verdict.UNDECIDED, Reason.NO_NUMBER)
+                    result = RequirementResult(
+                        f"{KEY}.{vary}", name, KEY, limit, Verdict.UNDECIDED, Reason.NO_NUMBER, unit=UNITS[vary]
+                    )
                     if path in numbers:
                         verdict, reason, distance = judge(numbers[path], limit)
                         if path in self.refuted:

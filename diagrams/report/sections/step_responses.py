@@ -28,7 +28,7 @@ from ...measure import (
     remaining_oscillation,
     step_response,
 )
-from ...requirements import StepLimits
+from ...requirements import STEP_UNITS, StepLimits
 from ...results import OperatingPoint
 from .. import figures
 from ..case import Case
@@ -136,7 +136,7 @@ def steps(case: Case) -> Section | None:
             saturated = _limits_reached(v.diagram, got)
             for name, before, change, off in _effort(got, test, slowest):
                 key = f"effort.{name.replace('.', '_')}"
-                unit = _unit(v.diagram, name)
+                unit = unit_at(v.diagram, name)
                 numbers[f"{where}.{key}"] = Number(change, unit, off, _how(got))
                 at_first = Number(before, unit, 1e-9 * abs(before), "the run before the step", given=True)
                 effort.append((_said(test), v.title, name, at_first, numbers[f"{where}.{key}"]))
@@ -413,7 +413,7 @@ def _accuracy(got: StepResponse) -> float:
     return SOLVER_ERROR if got.solved else TICK_ERROR
 
 
-def _unit(diagram: WiredDiagram, name: str) -> str:
+def unit_at(diagram: WiredDiagram, name: str) -> str:
     """Return the unit of a signal, "1" where it is not known or its entries differ."""
     plain = name.partition("[")[0]
     wire = diagram.names.get(plain)
@@ -436,7 +436,7 @@ def _numbers(got: StepResponse, test: StepTest, v: Variant, slowest: float | Non
     expected = got.expected(column, got.size if output else -got.size, begins)
     options: dict[str, Any] = {"held": got.is_steady(column), "expected": expected, "accuracy": _accuracy(got)}
     how = _how(got)
-    units = {"settling": "s", "rise": "s", "peak": _unit(v.diagram, test.output or test.wire)}
+    units = {**STEP_UNITS, "peak": unit_at(v.diagram, test.output or test.wire)}
     found = {}
     answer = got.answer(output)[begins:]
     settled = is_at_rest(t, answer, expected, slowest)

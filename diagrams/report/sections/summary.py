@@ -9,7 +9,7 @@ from typing import Any
 from ....blocks.core import LoopwrightError, print_unit
 from ...frequency import Number, find_disk_frequency, order_key, realize
 from ...linearization import Linearization, find_signal
-from ...requirements import Limit, RequirementResult, Review, Verdict, explain
+from ...requirements import RequirementResult, Review, Verdict, explain
 from ...studies import CaseState
 from ..case import Case
 from ..figures import HEIGHTS, fit_overview
@@ -143,9 +143,10 @@ def _relative(result: RequirementResult) -> float:
 
 def _row(case: Case, result: RequirementResult) -> tuple[Any, ...]:
     variant = case.variants.get(result.variant)
-    unit = "" if result.number is None or result.number.unit == "1" else result.number.unit
     touches, why = result.variant == CONTACT, explain(result)
-    said = f"{result.verdict}: {why}" if why else str(result.verdict)
+    said = Judged(str(result.verdict), result.verdict, why)
+    if result.verdict is not Verdict.UNDECIDED:  # a word, which stands in the row
+        said = Judged(str(said), result.verdict)
     distance: Any = "–"
     if result.number is not None and not math.isnan(result.distance):
         number = result.number
@@ -155,19 +156,14 @@ def _row(case: Case, result: RequirementResult) -> tuple[Any, ...]:
     others = {MEASURED: "measured", WORST_CASE: "worst case", CONTACT: "as it is"}
     title = variant.title if variant else others.get(result.variant, "–")
     return (
-        Judged(said, result.verdict),
+        said,
         words_of(result.quantity),
         place or "whole diagram",
         title,
-        _required(result.limit, unit),
+        result.required,
         result.number if result.number is not None else "–",
         distance,
     )
-
-
-def _required(limit: Limit, unit: str) -> str:
-    shown = print_unit(unit) if unit else ""
-    return f"{limit}{'' if shown in ('', '°') else ' '}{shown}"
 
 
 def words_of(quantity: str) -> str:

@@ -4,10 +4,11 @@ import control
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, Gain, Integrator, Saturation, StateSpace
+from loopwright.blocks import Constant, Gain, Integrator, Saturation, StateSpace, UnitConversion
 from loopwright.diagrams import Diagram, Requirements
 from loopwright.diagrams.cli.report import verdict_text
-from loopwright.diagrams.requirements import Reason, Verdict
+from loopwright.diagrams.report.pages.tables import Numbered
+from loopwright.diagrams.requirements import Limit, Reason, RequirementResult, Verdict
 
 
 def spring(start=0.0):
@@ -84,3 +85,50 @@ def test_a_step_that_is_never_small_is_open_where_run_and_linear_model_differ_ab
     (settling,) = (result for result in review.results if result.quantity == "step.settling")
     assert (settling.verdict, settling.reason) == (Verdict.UNDECIDED, Reason.SIZE_NOT_GIVEN), settling
     assert "give the size for which the limit holds, size=…" in verdict_text(review)
+
+
+def test_reasons_of_open_verdicts_stand_below_the_table_each_once():
+    step = {"input": "u", "output": "place.y", "length": 0.3, "settling": 5.0, "rise": 2.0}
+    report = spring().report(only=("steps",), requirements=Requirements(stable=False, step=step, delay_margin_s=0.1))
+    (table,) = (table for table in report.sections[0].tables if table.title == "Requirements")
+    shown = Numbered(report.numbers()).view(table)
+    rows = {row[1].text: row for row in shown.rows}
+    assert {row[0].text for row in rows.values()} == {"not decided"}
+    assert rows["settling time, 2 %"][0].letter == rows["rise time, 10 to 90 %"][0].letter
+    reasons = {note.letter: note.text for note in shown.reasons}
+    assert reasons[rows["settling time, 2 %"][0].letter] == (
+        "The response has not settled in its record of 0.3 s; give a longer length."
+    )
+    assert reasons[rows["delay margin"][0].letter].startswith("The report has no such number")
+    assert len(reasons) == 2
+    assert rows["delay margin"][4].text == "≥ 0.1 s"
+
+
+@pytest.mark.parametrize(
+    ("quantity", "required"),
+    [
+        ("phase_margin_deg", "≥ 45°"),
+        ("delay_margin_s", "≥ 45 s"),
+        ("delay_margin_samples", "≥ 45 samples"),
+        ("bandwidth", "≥ 45 rad/s"),
+        ("ms", "≥ 45"),
+        ("inner.u.sampled_d0.phase_margin_deg", "≥ 45°"),
+        ("step.rise", "≥ 45 s"),
+        ("stable", "≥ 45 1/s"),
+    ],
+)
+def test_a_limit_has_the_unit_of_its_quantity_without_a_number(quantity, required):
+    limit = Limit(45.0, np.inf)
+    assert RequirementResult(quantity, "u", "", limit, Verdict.UNDECIDED, Reason.NO_NUMBER).required == required
+
+
+def test_the_limit_of_a_largest_change_that_was_not_measured_has_the_unit_of_its_wire():
+    plant = StateSpace(
+        A=[[-1.0, 0.0], [0.0, -2.0]], B=[[1.0, 0.0], [0.0, 1.0]], C=[[1.0, 0.0], [0.0, 1.0]], name="plant"
+    )
+    back = Gain(gain=-1.0, name="minus")(plant.y.named("y"))
+    way = UnitConversion(from_unit="mm", to_unit="m", name="way")(Constant(value=1.0, unit="mm", name="one"))
+    diagram = Diagram("two", plant(back), way)
+    step = {"input": "y", "output": "way.y", "peak": 5.0}
+    report = diagram.report(only=("steps",), requirements=Requirements(stable=False, step=step))
+    assert [(r.verdict, r.required) for r in report.review.results] == [(Verdict.UNDECIDED, "≤ 5 m")]

@@ -62,7 +62,7 @@ def verdicts(report):
     assert (first.get("id"), first.get("class")) == ("s-summary", "level2")
     assert any("verdict" in (p.get("class") or "") and shown in "".join(p.itertext()) for p in first.iter("p"))
     table = next(first.iter("tbody"))
-    rows = sorted("".join(next(iter(row)).itertext()).partition(":")[0] for row in table)
+    rows = sorted(next(iter(row)).text.partition(":")[0] for row in table)
     assert rows == sorted(r["verdict"] for r in tree["requirements"]["results"])
     return shown, tree["requirements"]["verdict"]
 
@@ -253,7 +253,7 @@ def test_a_single_number_is_judged_by_its_path_and_a_missing_one_is_not_decided(
     assert found["inner.u.sampled_d0.mt"].verdict is Verdict.PASSED
     assert found["inner.u.sampled_d0.nothing"].verdict is Verdict.UNDECIDED
     assert "'inner.u.sampled_d0.ms'" in found["inner.u.sampled_d0.m_s"].detail
-    assert "the report has no such number. Did you mean" in to_html(report)
+    assert "The report has no such number. Did you mean" in to_html(report)
 
 
 def test_an_unstable_diagram_fails_in_everything():
