@@ -7,7 +7,8 @@ eigenvalue 0, or of z = 1, if nothing notices a shift along it:
 - finite shifts along v, to both sides and of several sizes, change no derivative, no other next state, no indicator of
   an event, no wire on a loop of the port graph and no required signal. The diagram's own functions are evaluated at
   every tick of the period, and between the ticks. Their slopes may not change either: a loop that is stable at one
-  angle alone is not stable at all of them.
+  angle alone is not stable at all of them. A wire on a loop may shift where it leads into a block with states that
+  answers such a shift alike at every point (`absorbed_shifts`), as an encoder of which the speed is taken.
 
 The linear model alone would not do: an actuator at its limit, a dead zone, x³ at 0 or stuck friction hide a feedback at
 one point. An oscillation with the frequency 2π/T has z = 1 as well, but it changes derivatives between the ticks.
@@ -31,6 +32,7 @@ from ...fmus.running import take_shifted_steps
 from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
+from .absorbed_shifts import ShiftedBlock
 from .delay_channels import delay_channels
 from .derivatives import LocalDerivatives, Numbers, Tap, find_signal
 from .exchanged import evaluators_at, noise_of
@@ -61,6 +63,8 @@ SIZES = (7.390851e-7, 7.390851e-4, 7.390851e-2, 0.7390851, 7.390851, 7.390851e2,
 """Sizes of shifts, in units of a state's nominal value. No period of a periodic function fits into all of them."""
 PLANT_SIZES = (7.390851e-2, 0.7390851, 7.390851)
 """The same of an FMU's states, whose solver may follow their size."""
+QUANTA = (1.0, 7.0, 739.0, 73907.0)
+"""The same in whole quanta, where a shift moves what an encoder or a converter rounds."""
 PART = 0.37
 """Part of an FMU's step after which its states are looked at, too."""
 SOLVED = 1e-6
@@ -215,8 +219,10 @@ def find_free_motions(model: ClosedModel, required: Iterable[str] = ()) -> FreeM
     if not found:
         return none
     V = np.column_stack([v for v, _ in found])
-    names = [model.states[i] for i in kept]
-    motions = tuple(_describe(v, left, names, alone) for v, alone in found)
+    names, flat = [model.states[i] for i in kept], look.flat
+    sampled = {label for i, label in enumerate(flat.states.labels) if i not in flat.continuous}
+    follows = np.array([name in sampled for name in names])
+    motions = tuple(_describe(v, left, names, follows, alone) for v, alone in found)
     Q, P = deflate(M, V)
     return FreeMotions(motions, *(_spread(X, kept, model, axis) for X, axis in ((V, 0), (Q, 0), (P, 1))))
 
@@ -231,9 +237,16 @@ def _spread(X: np.ndarray, kept: list[int], model: ClosedModel, axis: int) -> np
     return whole
 
 
-def _describe(v: np.ndarray, left: np.ndarray, names: Sequence[str], alone: tuple[str, ...]) -> FreeMotion:
-    """Return a motion with its states: the one that integrates has the largest participation."""
+def _describe(
+    v: np.ndarray, left: np.ndarray, names: Sequence[str], follows: np.ndarray, alone: tuple[str, ...]
+) -> FreeMotion:
+    """Return a motion with its states: the one that integrates has the largest participation.
+
+    States of sampled blocks (``follows``), such as the last angle of an encoder, name it only without others.
+    """
     weight = np.abs(v) * np.linalg.norm(left, axis=1)
+    if np.any(weight[~follows]):
+        weight[follows] = 0.0
     first = int(np.argmax(weight >= 0.5 * np.max(weight)))
     shares = v / v[first]
     entries = tuple((names[int(i)], float(shares[i])) for i in np.flatnonzero(v))
@@ -321,22 +334,31 @@ def _without_chains(
 # --- shifts ----------------------------------------------------------------------------------------------------------
 
 
-def _watched(flat: FlatDiagram, model: ClosedModel, required: Iterable[str]) -> list[Tap]:
+def _watched(flat: FlatDiagram, model: ClosedModel, required: Iterable[str]) -> tuple[list[Tap], list[ShiftedBlock]]:
     """Return the signals that a free motion does not change: wires on loops, and those on which something is required.
 
-    A block with a guard, and one that ends a run, requires its inputs.
+    A block with a guard, and one that ends a run, requires its inputs. Wires on loops that lead into a block which may
+    absorb a shift are left out; these blocks are the second result.
     """
     cut = [find_signal(flat, wire).port for wire in model.openings]
     table, found = flat.table, dict[Port, set[int]]()
-    for source, reader in SignalPaths(flat, cut).wires_on_loops():
-        wire = table.wires.get((reader.block, reader.port))
-        _add_entries(flat, found, (source.block, source.port), None if reader.is_output or wire is None else wire.index)
+    on_loops = SignalPaths(flat, cut).wires_on_loops()
+    read: dict[str, list[str]] = {}
+    for _, reader in on_loops:
+        if not reader.is_output:
+            read.setdefault(reader.block, []).append(reader.port)
+    blocks = {path: block for path, ports in read.items() if (block := ShiftedBlock.of(flat, path, ports)) is not None}
+    for source, reader in on_loops:
+        if reader.is_output or reader.block not in blocks:
+            wire = table.wires.get((reader.block, reader.port))
+            index = None if reader.is_output or wire is None else wire.index
+            _add_entries(flat, found, (source.block, source.port), index)
     for (path, _), wire in table.wires.items():
         block = table.blocks[path]
         if hasattr(block, "guards") or block.stops:
             _add_entries(flat, found, (wire.block, wire.port), wire.index)
     taps = [Tap(join(*port), port, tuple(sorted(entries)), ()) for port, entries in sorted(found.items())]
-    return [*taps, *(find_signal(flat, name) for name in dict.fromkeys(required))]
+    return [*taps, *(find_signal(flat, name) for name in dict.fromkeys(required))], list(blocks.values())
 
 
 Port = tuple[str, str]
@@ -416,9 +438,11 @@ class _Look:
         local: LocalDerivatives,
         instants: Sequence[_Instant],
         plants: Sequence[_PlantStep],
+        blocks: Sequence[ShiftedBlock],
         nominals: np.ndarray,
         noise: float,
     ):
+        self.blocks = blocks
         self.flat, self.local, self.instants, self.plants = flat, local, instants, plants
         self.nominals, self.noise = nominals, noise
         self.error, noise_of_slopes = noise_of(local.evaluators)
@@ -430,12 +454,13 @@ class _Look:
     def of(cls, model: ClosedModel, required: Iterable[str], kept: list[int], noise: float) -> _Look:
         """Return the look at a linear model's diagram; ``kept`` are the states that are no memory."""
         flat, at = model.wired.flatten_like(model.point), model.point
-        watched, cut = _watched(flat, model, required), [find_signal(flat, wire) for wire in model.openings]
+        watched, blocks = _watched(flat, model, required)
+        cut, inputs = [find_signal(flat, wire) for wire in model.openings], [t for b in blocks for t in b.taps.values()]
         means = replace_stairs(model.wired, flat, at, model.stairs)
-        local = LocalDerivatives(flat, (), watched, cut, evaluators_at(flat, at), means)
+        local = LocalDerivatives(flat, (), [*watched, *inputs], cut, evaluators_at(flat, at), means)
         make = _look_at_period if model.dt else _look_at_flow
-        instants, plants = make(model, flat, local, kept)
-        return cls(flat, local, instants, plants, _nominals(flat, model, kept), noise)
+        instants, plants = make(model, flat, local, kept, np.arange(_count(watched)))
+        return cls(flat, local, instants, plants, blocks, _nominals(flat, model, kept), noise)
 
     def seen(self, directions: np.ndarray, balance: np.ndarray) -> np.ndarray:
         """Return what the linear model sees of some directions: rows of size 1, of which rounding is left out.
@@ -473,7 +498,7 @@ class _Look:
         unit = 1.0 / float(np.max(np.abs(v) / self.nominals))
         alone: dict[str, None] = {}
         try:
-            if not all(self._holds_at(instant, v, unit) for instant in self.instants):
+            if not all(self._holds_at(instant, v, unit) and self._absorbs(instant, v) for instant in self.instants):
                 return False, ()
         except LoopwrightError:  # a shifted state that a block refuses
             return False, ()
@@ -491,8 +516,9 @@ class _Look:
             return True
         t, acting, evaluate = instant.t, instant.acting, self.local.evaluate
         before = evaluate(acting, t, instant.x, instant.w)
-        stairs = before["v"], before["s"]
-        for far in (sign * unit * s for s in self.sizes for sign in (1.0, -1.0)):
+        quantum = self._find_quantum(instant, vx, vw, before, unit)
+        sizes, stairs = (self.sizes, (before["v"], before["s"])) if quantum is None else (QUANTA, None)
+        for far in (sign * (quantum or unit) * s for s in sizes for sign in (1.0, -1.0)):
             x, w = instant.x + far * vx, instant.w + far * vw
             after = evaluate(acting, t, x, w, beside=stairs)
             for name, rows in instant.rows.items():
@@ -505,6 +531,40 @@ class _Look:
             if not self._has_same_events(t, instant, x, w):
                 return False
         return self._has_same_slopes(instant, vx, vw, unit)
+
+    def _find_quantum(
+        self, instant: _Instant, vx: np.ndarray, vw: np.ndarray, before: Numbers, unit: float
+    ) -> float | None:
+        """Return the shift that moves all rounded inputs by one quantum; None where none moves, or they differ."""
+        stairs, found = self.local.stairs, set[float]()
+        moved = self.local.evaluate(instant.acting, instant.t, instant.x + unit * vx, instant.w + unit * vw)["v"]
+        moved = np.abs(moved - before["v"]) / unit
+        for i, stair in enumerate(stairs.stairs):
+            shift = moved[stairs.v.slices[str(i)]]
+            block = self.flat.table.blocks[stair.path]
+            if shift.any() and stair.source not in block.quanta:
+                return None
+            if shift.any():
+                quantum = np.broadcast_to(np.ravel(getattr(block, block.quanta[stair.source])), shift.shape)
+                found |= set((quantum[shift > 0.0] / shift[shift > 0.0]).tolist())
+        return max(found) if found and max(found) - min(found) <= 1e-9 * max(found) else None
+
+    def _absorbs(self, instant: _Instant, v: np.ndarray) -> bool:
+        """Return whether the blocks with states on loops answer a shift of their inputs alike at every point."""
+        vx = self._shift(instant.Vx, v)
+        by_x, by_w = instant.numbers["y", "x"], instant.numbers["y", "w"]
+        shift = self._clean(
+            (by_x @ instant.Vx + by_w @ instant.Vw) @ v,
+            (np.abs(by_x) @ np.abs(instant.Vx) + np.abs(by_w) @ np.abs(instant.Vw)) @ np.abs(v),
+        )
+        first = _count(self.local.outputs) - _count(tap for block in self.blocks for tap in block.taps.values())
+        for block in self.blocks:
+            inputs = {}
+            for name, tap in block.taps.items():
+                inputs[name], first = shift[first : first + len(tap.entries)], first + len(tap.entries)
+            if not block.absorbs(self.flat, instant.t, vx[self.flat.states.slices[block.path]], inputs):
+                return False
+        return True
 
     def _has_same_slopes(self, instant: _Instant, vx: np.ndarray, vw: np.ndarray, unit: float) -> bool:
         """Return whether the linear model is the same after a shift to either side."""
@@ -581,7 +641,7 @@ def _nominals(flat: FlatDiagram, model: ClosedModel, kept: list[int]) -> np.ndar
 
 
 def _look_at_flow(
-    model: ClosedModel, flat: FlatDiagram, local: LocalDerivatives, kept: list[int]
+    model: ClosedModel, flat: FlatDiagram, local: LocalDerivatives, kept: list[int], watched: np.ndarray
 ) -> tuple[list[_Instant], list[_PlantStep]]:
     """Return the one instant of a diagram without sampling, and steps of its FMUs from there."""
     at = model.point
@@ -594,7 +654,7 @@ def _look_at_flow(
     loop = np.eye(len(at.w)) - Dp @ J["z", "w"]
     Vw = np.linalg.solve(loop, Dp @ J["z", "x"] @ Vx + Cp @ Vp)
     Vx, Vw, Vp = Vx[:, kept], Vw[:, kept], Vp[:, kept]
-    rows = {name: np.arange(len(J[name])) for name in ("dx", "y", "z")}
+    rows = {"dx": np.arange(len(J["dx"])), "y": watched, "z": np.arange(len(J["z"]))}
     still = delay_channels(flat).inputs
     instants = [_Instant(NONE, at.t, at.x, at.w, Vx, Vw, J, rows, still)]
     needed = np.any(np.vstack([J[name, "w"] != 0.0 for name in rows]), axis=0)
@@ -608,7 +668,7 @@ def _look_at_flow(
 
 
 def _look_at_period(
-    model: ClosedModel, flat: FlatDiagram, local: LocalDerivatives, kept: list[int]
+    model: ClosedModel, flat: FlatDiagram, local: LocalDerivatives, kept: list[int], watched: np.ndarray
 ) -> tuple[list[_Instant], list[_PlantStep]]:
     """Return the instants at the ticks of a period and between them, and the steps of FMUs."""
     chain = Chain(flat, local, model.point, model.plants, period_of(flat))
@@ -627,7 +687,7 @@ def _look_at_period(
         whole = M @ whole
     for _ in range(2):  # what nothing of the model depends on follows its states
         V[others] = (whole @ V)[others]
-    rows = {"x": needed[needed < nx], "z": np.arange(flat.plant_inputs.total), "y": np.arange(_count(local))}
+    rows = {"x": needed[needed < nx], "z": np.arange(flat.plant_inputs.total), "y": watched}
     between = {"dx": np.arange(len(flat.continuous)), "y": rows["y"]}
     instants, plants = list[_Instant](), list[_PlantStep]()
     equations: dict[tuple[str, int], tuple[np.ndarray, np.ndarray] | None] = {}
@@ -646,8 +706,8 @@ def _look_at_period(
     return instants, plants
 
 
-def _count(local: LocalDerivatives) -> int:
-    return sum(len(tap.entries) for tap in local.outputs)
+def _count(taps: Iterable[Tap]) -> int:
+    return sum(len(tap.entries) for tap in taps)
 
 
 def _begun_steps(

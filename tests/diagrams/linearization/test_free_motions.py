@@ -162,10 +162,107 @@ def encoder_drive(rates):
     return Diagram("d", angle(motor(controller(encoder(angle.y, motor.y)))))
 
 
+@pytest.mark.parametrize("stairs", [None, "gain"])
 @pytest.mark.parametrize("rates", [(1e-2, 1e-2), (1e-2, 1e-3)], ids=["one rate", "two rates"])
-def test_an_angle_that_an_encoder_feeds_back_is_on_a_loop(rates):
-    # its speed is a difference of angles, so that no speed shows a shift; the wire of the angle does
-    assert states_of(encoder_drive(rates), at=0.02, stairs="gain") == ()
+def test_a_speed_that_an_encoder_takes_from_the_angle_leaves_it_free(rates, stairs):
+    model = encoder_drive(rates).linearize(0.02, stairs=stairs)
+    free = model.free_motions()
+    (motion,) = free.motions
+    assert motion.state == "angle.y"
+    assert {name for name, _ in motion.entries} == {"angle.y", "encoder.encoder.last"}
+    assert np.max(np.abs(model.poles_without(free))) < 1.0 - 1e-3
+    assert len(model.poles_without(free)) == len(model.poles) - 1
+
+
+def test_the_poles_of_a_drive_without_its_angle_are_those_of_the_speed_alone():
+    """A drive 1/(s + 1) with u = −2 (p[k] − p[k−1])/T, by hand in the speed and the mean speed of the last sample."""
+    motor, angle, T = (
+        TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="motor"),
+        Integrator(name="angle"),
+        0.1,
+    )
+
+    @subsystem(sample_time=T)
+    def controller(position, velocity):
+        return Gain(gain=-2.0, name="kp")(Encoder(quantum=1e-4, name="encoder")(position, velocity).measured_velocity)
+
+    model = Diagram("d", angle(motor(controller(angle.y, motor.y)))).linearize(0.5)
+    a = np.exp(-T)
+    # v⁺ = a v + (1 − a) u, m⁺ = ((1 − a) v + (T − 1 + a) u)/T with u = −2 m
+    by_hand = [[a, -2.0 * (1.0 - a)], [(1.0 - a) / T, -2.0 * (T - 1.0 + a) / T]]
+    found = model.poles_without(model.free_motions())
+    assert_poles(found[np.abs(found) > 1e-6], np.linalg.eigvals(by_hand))
+
+
+def test_a_position_that_an_encoder_measures_and_a_loop_uses_is_not_free():
+    """The dead zone hides the feedback of the position at this point, not that of the speed."""
+    motor, angle = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="motor"), Integrator(name="angle")
+
+    @subsystem(sample_time=0.01)
+    def controller(position, velocity):
+        p, v = Encoder(quantum=1e-3, name="encoder")(position, velocity)
+        return -2.0 * v - 5.0 * DeadZone(lower=-10.0, upper=10.0, name="play")(p)
+
+    assert states_of(Diagram("d", angle(motor(controller(angle.y, motor.y)))), at=0.02) == ()
+
+
+class HiddenDeadZone(Block):
+    """A dead zone with a memory of its input: no answer to a shift of both at this point only."""
+
+    u = Input(unit="1")
+    y = Output(unit="1")
+    last = State(unit="1")
+
+    def output(self, t, x, u):
+        d = u.u - 0.5 * x.last
+        return np.where(np.abs(d) < 10.0, 0.0, d)
+
+    def update(self, t, x, u):
+        return u.u
+
+
+class DifferenceWithADeadZone(HiddenDeadZone):
+    """A dead zone of the difference of an input and the last one: the same answer to a shift of both everywhere."""
+
+    def output(self, t, x, u):
+        d = u.u - x.last
+        return np.where(np.abs(d) < 10.0, 0.0, d)
+
+
+class GatedPosition(Block):
+    """A position that is fed back at speeds beyond 1 only: at rest no shift of it has any answer, nor any slope."""
+
+    u = Input(unit="1")
+    speed = Input(unit="1")
+    y = Output(unit="1")
+    last = State(unit="1")
+
+    def output(self, t, x, u):
+        return u.u * np.maximum(0.0, u.speed - 1.0)
+
+    def update(self, t, x, u):
+        return u.u
+
+
+def test_a_feedback_of_the_position_at_other_speeds_alone_is_one():
+    motor, angle = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="motor"), Integrator(name="angle")
+
+    @subsystem(sample_time=0.01)
+    def controller(position, velocity):
+        return -2.0 * velocity - 5.0 * GatedPosition(name="gated")(position, velocity)
+
+    assert states_of(Diagram("d", angle(motor(controller(angle.y, motor.y)))), at=0.02) == ()
+
+
+@pytest.mark.parametrize(("block", "found"), [(HiddenDeadZone, ()), (DifferenceWithADeadZone, ("angle.y",))])
+def test_a_shift_has_to_be_answered_alike_at_every_point(block, found):
+    motor, angle = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="motor"), Integrator(name="angle")
+
+    @subsystem(sample_time=0.01)
+    def controller(position, velocity):
+        return -2.0 * velocity - 5.0 * block(name="block")(position)
+
+    assert states_of(Diagram("d", angle(motor(controller(angle.y, motor.y)))), at=0.02) == found
 
 
 @pytest.mark.parametrize("rates", [(1e-2, 1e-2), (1e-2, 1e-3)], ids=["one rate", "two rates"])
