@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
-from ....blocks.core import LoopwrightError
+from ....blocks.core import BetweenTicksError, LoopwrightError, PeriodicLoopError
 from ...frequency import Number
 from ...studies import Sensitivities, Sensitivity, confirm_parameter, sensitivities_of
 from .. import figures
@@ -33,6 +33,9 @@ def sensitivity(case: Case) -> Section | None:
         case.tell(f"sensitivity at {wire}")
         try:
             found = sensitivities_of(variant.model, (wire,))
+        except (PeriodicLoopError, BetweenTicksError) as error:
+            text.append(TEXTS.line("no_loop", wire=wire, between=isinstance(error, BetweenTicksError)))
+            continue
         except LoopwrightError as error:
             text.append(TEXTS.line("left_out", wire=wire, message=error.message))
             continue

@@ -82,6 +82,9 @@ class StepTest:
     output: str = ""
     limits: StepLimits | None = None
 
+    def __str__(self) -> str:
+        return f"{self.wire} → {self.output}" if self.output else self.wire
+
 
 def step_tests(case: Case, v: Variant) -> Iterator[StepTest]:
     """Yield the steps that are tried in a variant: at the wire of each loop, and those that are required besides."""
@@ -115,7 +118,7 @@ def steps(case: Case) -> Section | None:
             text.append(TEXTS.line("unstable", variant=v.title))
             continue
         for test in step_tests(case, v):
-            case.tell(f"step at {_said(test)}, {v.title}")
+            case.tell(f"step at {test!s}, {v.title}")
             try:
                 ran = _run(case, v, test)
             except LoopwrightError as error:
@@ -132,19 +135,19 @@ def steps(case: Case) -> Section | None:
             for name, said in NAMES.items():
                 linear = own.get(f"linear.{name}")
                 if name != "peak":
-                    rows.append((_said(test), v.title, said, own[name], linear))
+                    rows.append((str(test), v.title, said, own[name], linear))
             saturated = _limits_reached(v.diagram, got)
             for name, before, change, off in _effort(got, test, slowest):
                 key = f"effort.{name.replace('.', '_')}"
                 unit = unit_at(v.diagram, name)
                 numbers[f"{where}.{key}"] = Number(change, unit, off, _how(got))
                 at_first = Number(before, unit, 1e-9 * abs(before), "the run before the step", given=True)
-                effort.append((_said(test), v.title, name, at_first, numbers[f"{where}.{key}"]))
+                effort.append((str(test), v.title, name, at_first, numbers[f"{where}.{key}"]))
             text += [TEXTS.line("saturated", variant=v.title, wire=test.wire, blocks=saturated)] if saturated else []
             text += _said_of_quanta(v, test, got, quantized, saturated)
             for name, number in quantized.oscillations.items():
                 numbers[f"{where}.{name.replace('.', '_')}.oscillation"] = number
-                resting.append((_said(test), v.title, name, number))
+                resting.append((str(test), v.title, name, number))
             if got.prediction is None:
                 text.append(TEXTS.line("unpredicted", variant=v.title, wire=test.wire))
             if not own["settled"].value:
@@ -176,17 +179,13 @@ def steps(case: Case) -> Section | None:
         text.insert(0, TEXTS.line("resting"))
     same = _find_same_curves(found)
     plots = [
-        _plot(case, test, curves, [_said(other) for other in same if same[other] == test])
+        _plot(case, test, curves, [str(other) for other in same if same[other] == test])
         for test, curves in found.items()
         if test not in same
     ]
     overview = tuple(plot for test, curves in found.items() for plot in _overview(case, test, curves))
     whole = (*TEXTS.paragraphs("responses"), *dict.fromkeys(text))
     return Section("steps", TITLE, whole, tuple(tables), tuple(plots), numbers, overview=overview, absent=absent)
-
-
-def _said(test: StepTest) -> str:
-    return f"{test.wire} → {test.output}" if test.output else test.wire
 
 
 @dataclass(frozen=True)
@@ -521,7 +520,7 @@ def _is_alike(one: StepResponse, other: StepResponse, test: StepTest) -> bool:
 
 
 def _plot(case: Case, test: StepTest, curves: Mapping[str, StepResponse], others: list[str]) -> Plot:
-    said = " and ".join([_said(test), *others])
+    said = " and ".join([str(test), *others])
     titles = {key: case.variants[key].title for key in curves}
     caption = TEXTS.line("figure_to", said=said) if test.output else TEXTS.line("figure", said=said)
     return Plot(
@@ -533,4 +532,4 @@ def _overview(case: Case, test: StepTest, curves: Mapping[str, StepResponse]) ->
     """Yield the small figure of the diagram as it is."""
     actual = {key: got for key, got in curves.items() if case.variants[key].is_actual}
     if actual:
-        yield figures.overview_step(test.key, _said(test), actual, case.looks, to_output=bool(test.output))
+        yield figures.overview_step(test.key, str(test), actual, case.looks, to_output=bool(test.output))

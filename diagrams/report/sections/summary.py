@@ -22,7 +22,7 @@ from .contacts import KEY as CONTACT
 from .loops import ROWS
 from .measured_loops import MEASURED
 from .poles import unstable_first
-from .step_responses import NAMES
+from .step_responses import APART, NAMES, step_tests
 from .worst_case import KEY as WORST_CASE
 from .worst_case import MissingWorstCase, ReportedWorstCase
 
@@ -305,6 +305,7 @@ def _not_analysed(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
         if "inner" in case.keys and key not in found:
             elsewhere, judged = actual.loops_elsewhere(wire, analysed), case.requirements is not None
             yield TEXTS.line("loop_left_out", wire=wire, elsewhere=elsewhere, judged=judged)
+    yield from _apart(case, numbers)
     model = _model(actual)
     if model is not None and not actual.rests and not actual.moving_alone:
         yield TEXTS.line("moving", largest=actual.point.largest)
@@ -319,6 +320,16 @@ def _not_analysed(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
     for key in ("steps", "injection"):
         if key in case.keys and not any(path.split(".")[0] == key for path in numbers):
             yield TEXTS.line("no_run", key=key, several=several, sampled=sampled)
+
+
+def _apart(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
+    """Yield a line on each response that is limited and that the linear model does not have."""
+    for v in case.judged():
+        for test in step_tests(case, v) if not v.problem else ():
+            difference = numbers.get(f"steps.{test.key}.{v.key}.difference")
+            if test.limits is not None and difference is not None and difference.value > APART:
+                variant = "" if v.is_actual else v.title
+                yield TEXTS.line("apart", step=str(test), variant=variant, difference=difference.value)
 
 
 def _model(v: Variant) -> Linearization | None:

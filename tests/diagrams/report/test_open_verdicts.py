@@ -132,3 +132,17 @@ def test_the_limit_of_a_largest_change_that_was_not_measured_has_the_unit_of_its
     step = {"input": "y", "output": "way.y", "peak": 5.0}
     report = diagram.report(only=("steps",), requirements=Requirements(stable=False, step=step))
     assert [(r.verdict, r.required) for r in report.review.results] == [(Verdict.UNDECIDED, "≤ 5 m")]
+
+
+@pytest.mark.parametrize(("size", "holds"), [(1e-4, True), (1.0, False)])
+def test_a_required_response_that_the_linear_model_does_not_have_is_named_on_the_first_page(size, holds):
+    """The drive reaches its limit of 0.4 at a step of 0.01 and more: its acceleration is 40 of the step, at first."""
+    step = {"input": "wish.y", "output": "place.y", "size": size, "overshoot": 1.0}
+    report = limited(0.4).report(only=("steps",), requirements=Requirements(stable=False, step=step))
+    difference = report.numbers()["steps.wish_y_to_place_y.continuous.difference"].value
+    lines = [text for text in report.sections[0].text if "does not hold at this step" in text]
+    assert (difference < 0.01) == holds
+    said = (
+        f"- wish.y → place.y: the linear model does not hold at this step; it differs from the run by {difference:.2g}"
+    )
+    assert lines == ([] if holds else [f"{said} of the largest change."])

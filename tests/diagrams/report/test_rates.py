@@ -126,3 +126,11 @@ def test_the_operating_point_is_called_at_as_everywhere():
     assert [s.text for s in at.sections] == [s.text for s in point.sections]
     with pytest.raises(OptionError, match="at: found at and point, two names of one option"):
         analyse(cascade(), at=0.01, point=0.01)
+
+
+def test_sensitivities_say_which_wires_have_none_without_programs_text():
+    section = next(s for s in analyse(cascade(), only=("sensitivity",)).sections if s.key == "sensitivity")
+    assert [part.key for part in section.sections] == ["current_wanted"]
+    (line,) = (text for text in section.text if "voltage" in text)
+    assert line.endswith("Sensitivities exist for wires that are renewed once in it.")
+    assert "(" not in line
