@@ -23,6 +23,10 @@ OFF_THE_PAGE = 1e3
 """Size of L from which on it is not drawn in the complex plane: beyond lies the other branch of a resonance."""
 
 
+FINEST = 5
+"""Smallest step in degrees between the ticks of a phase."""
+
+
 class DrawnLoops(NamedTuple):
     """Loops at a wire, as their figures draw them: by their keys.
 
@@ -101,10 +105,10 @@ def draw_bode(of: DrawnLoops, height: float, width: float) -> Figure:
             if L.dt:
                 for ax in (top, bottom):
                     ax.axvline(of.axes.frequency(np.pi / L.dt), color=GREY, linewidth=0.6, linestyle=":")
-        set_magnitudes(top, of.axes, 3 if is_small else 6)
+        set_magnitudes(top, of.axes, 5 if is_small else 6)
         top.axhline(of.axes.magnitude(1.0), color=DARK, linewidth=0.6)
         bottom.axhline(-180, color=DARK, linewidth=0.6)
-        _degrees(bottom, few=is_small)
+        set_degrees(bottom, few=is_small)
         set_frequencies(bottom, 5 if is_small else 9)
         top.set_ylabel(of.axes.magnitude_label("|L|"))
         bottom.set_ylabel(with_unit("phase" if is_small else "phase of L", "deg"))
@@ -113,13 +117,15 @@ def draw_bode(of: DrawnLoops, height: float, width: float) -> Figure:
     return figure
 
 
-def _degrees(ax: Axes, *, few: bool) -> None:
+def set_degrees(ax: Axes, *, few: bool) -> None:
     """Set ticks of a phase at multiples of 45° or 90°; at few of them in a small figure."""
     from matplotlib.ticker import MultipleLocator
 
     low, high = ax.get_ylim()
     steps = {200: 90, 600: 180} if few else {300: 45, 600: 90, 1400: 180}
     step = next((step for span, step in steps.items() if high - low < span), 360)
+    while step > FINEST and np.floor(high / step) - np.ceil(low / step) < 1:  # a scale has two labels
+        step = next(finer for finer in (90, 45, 15, FINEST) if finer < step)
     ax.yaxis.set_major_locator(MultipleLocator(step, 180 if step == 360 else 0))  # −180° has a tick
 
 

@@ -17,6 +17,12 @@ if TYPE_CHECKING:
     from ...measure import StepResponse
 
 
+RESTS = 0.02
+"""Distance from the last sample, relative to the whole range, within which a response has settled."""
+SHOWN = 4.0
+"""Length of the time axis at most, in times until all responses have settled: a record may be many times as long."""
+
+
 def draw_answer(
     curves: Mapping[str, StepResponse],
     looks: Mapping[str, dict[str, Any]],
@@ -71,16 +77,29 @@ def _draw(
     to_output: bool,
 ) -> None:
     """Draw the answers, or with a whole of 1 what is left of the step, with the linear model's as dots."""
+    end = shown_time(curves, to_output=to_output)
     for name, got in curves.items():
         look, title = looks[name], titles[name]
         begins = int(np.argmax(got.d != 0.0))
         t = got.t - got.t[begins]
-        few = np.unique(np.linspace(0, len(t) - 1, 40).astype(int))
+        last = int(np.searchsorted(t, end, side="right"))
+        few = np.unique(np.linspace(0, last - 1, 40).astype(int))
         y = got.answer(to_output)
         shown = whole * (got.d != 0.0) - y if whole else y
         drawn: dict[str, Any] = {"drawstyle": "steps-post"} if got.held else {}
-        ax.plot(t, shown, label=title, **look, **drawn)
+        ax.plot(t[:last], shown[:last], label=title, **look, **drawn)
         if got.prediction is not None:
             p = got.answer(to_output, linear=True)
             dots = (whole * (got.d != 0.0) - p if whole else p)[few]
             ax.plot(t[few], dots, "o", color=look["color"], markersize=2.5)
+
+
+def shown_time(curves: Mapping[str, StepResponse], *, to_output: bool) -> float:
+    """Return the time in s after a step up to which responses are drawn: some times of that until all of them rest."""
+    ends = []
+    for got in curves.values():
+        t, y = got.t - got.t[int(np.argmax(got.d != 0.0))], got.answer(to_output)
+        moving = np.flatnonzero(np.abs(y - y[-1]) > RESTS * np.ptp(y))
+        rests = float(t[min(moving[-1] + 1, len(t) - 1)]) if moving.size else 0.0
+        ends.append(SHOWN * rests if rests > 0.0 else float(t[-1]))
+    return min(max(ends), max(float(got.t[-1] - got.t[int(np.argmax(got.d != 0.0))]) for got in curves.values()))

@@ -2,6 +2,7 @@
 
 import re
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from loopwright.blocks import Constant, Gain, Integrator, StateSpace, TransferFu
 from loopwright.diagrams import Diagram, Number, Report, Section, Table, Verdict, analyse
 from loopwright.diagrams.report.case import Case
 from loopwright.diagrams.report.figures import AxisUnits, MeasuredCurve, contact_admittance, contact_map, measured
-from loopwright.diagrams.report.figures.loop_figures import DrawnLoops, bode, nyquist
+from loopwright.diagrams.report.figures.loop_figures import DrawnLoops, bode, nyquist, set_degrees
+from loopwright.diagrams.report.figures.step_figures import draw_answer
 from loopwright.diagrams.report.pages import Judged
 from loopwright.diagrams.report.pages.definitions import definition
 from loopwright.diagrams.report.pages.html import to_html
@@ -230,3 +232,26 @@ def test_maps_and_admittances_have_no_transparent_faces_whose_edges_a_pdf_shows(
     (ax, bar) = contact_map("m", "hand", k, b, 50.0 * stable).figure.axes
     assert ax.get_ylabel() == "damping bₑ [N·s/m]"
     assert "−100" in [text.get_text() for text in bar.get_yticklabels()]
+
+
+@pytest.mark.parametrize(("record", "shown"), [(100.0, 4.0 * np.log(50.0)), (6.0, 6.0)])
+def test_a_step_that_has_settled_is_not_drawn_to_the_end_of_a_long_record(record, shown):
+    """1 − exp(−t/τ) is within 2 % from t = τ log 50 on; the record has so many time constants τ = 3 s."""
+    t = np.linspace(0.0, 3.0 * record, 20001)
+    y = 1.0 - np.exp(-t / 3.0)
+    got = SimpleNamespace(t=t, d=np.ones_like(t), held=False, prediction=y, answer=lambda to_output, linear=False: y)
+    figure = draw_answer({"it": got}, {"it": {"color": BLUE}}, 2.0, 3.0, to_output=True)
+    for line in figure.axes[0].lines[:2]:
+        assert max(line.get_xdata()) == pytest.approx(3.0 * shown, rel=1e-3)
+
+
+@pytest.mark.parametrize("few", [True, False])
+@pytest.mark.parametrize("ends", [(-183.0, -96.0), (-172.0, -100.0), (-100.0, -60.0), (-200.0, 20.0), (-95.0, -84.0)])
+def test_a_phase_has_two_labels_at_least(ends, few):
+    from matplotlib.figure import Figure
+
+    ax = Figure().subplots()
+    ax.set_ylim(*ends)
+    set_degrees(ax, few=few)
+    ticks = [tick for tick in ax.get_yticks() if ends[0] <= tick <= ends[1]]
+    assert 2 <= len(ticks) <= 8
