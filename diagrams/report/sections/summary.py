@@ -90,13 +90,25 @@ def all_requirements(case: Case, reviewed: Review | None) -> Section | None:
 def _requirements(case: Case, reviewed: Review, most: int) -> Table:
     """Return the table of so many requirements: those that fail first, then those that are not decided."""
     ranked = sorted(reviewed.results, key=lambda r: (ORDER.index(r.verdict), _relative(r)))
-    rows = tuple(_row(case, result) for result in ranked[:most])
+    rows = tuple(_row(case, result) for result in by_loop(ranked[:most]))
     columns = ("verdict", "requirement", "at", "variant", "required", "found", "distance")
     note = TEXTS.line("distance")
     if len(ranked) > most:
         note = TEXTS.line("more_requirements", shown=most, total=len(ranked)) + f" {note}"
     terms = {"distance": "distance_to_limit"}
     return Table("Requirements", columns, rows, note, digits=DIGITS, terms=terms, brief=True)
+
+
+def by_loop(ranked: Sequence[RequirementResult]) -> list[RequirementResult]:
+    """Return results with those of a loop together behind the failed ones, in the order of the loops' first ones."""
+    places = [(result.loop, result.place) for result in ranked]
+
+    def key(i: int) -> tuple[int, int]:
+        verdict = ranked[i].verdict
+        first = next(j for j in range(i + 1) if ranked[j].verdict is verdict and places[j] == places[i])
+        return ORDER.index(verdict), i if verdict is Verdict.FAILED else first
+
+    return [ranked[i] for i in sorted(range(len(ranked)), key=key)]
 
 
 def _overview(

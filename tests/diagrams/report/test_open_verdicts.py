@@ -8,6 +8,7 @@ from loopwright.blocks import Constant, Gain, Integrator, Saturation, StateSpace
 from loopwright.diagrams import Diagram, Requirements
 from loopwright.diagrams.cli.report import verdict_text
 from loopwright.diagrams.report.pages.tables import Numbered
+from loopwright.diagrams.report.sections.summary import by_loop
 from loopwright.diagrams.requirements import Limit, Reason, RequirementResult, Verdict
 
 
@@ -146,3 +147,14 @@ def test_a_required_response_that_the_linear_model_does_not_have_is_named_on_the
         f"- wish.y → place.y: the linear model does not hold at this step; it differs from the run by {difference:.2g}"
     )
     assert lines == ([] if holds else [f"{said} of the largest change."])
+
+
+def test_requirements_of_a_loop_stand_together_behind_those_that_fail():
+    def result(loop, distance, verdict=Verdict.PASSED):
+        return RequirementResult("ms", loop, "", Limit(-np.inf, 1.0), verdict, Reason.COMPARED, distance)
+
+    failed = [result("b", -0.3, Verdict.FAILED), result("a", -0.2, Verdict.FAILED), result("b", -0.1, Verdict.FAILED)]
+    passed = [result("a", 0.1), result("b", 0.2), result("a", 0.3), result("c", 0.4), result("b", 0.5)]
+    found = by_loop([*failed, *passed])
+    assert found[:3] == failed
+    assert [(r.loop, r.distance) for r in found[3:]] == [("a", 0.1), ("a", 0.3), ("b", 0.2), ("b", 0.5), ("c", 0.4)]
