@@ -354,8 +354,8 @@ def _watched(flat: FlatDiagram, model: ClosedModel, required: Iterable[str]) -> 
             index = None if reader.is_output or wire is None else wire.index
             _add_entries(flat, found, (source.block, source.port), index)
     for (path, _), wire in table.wires.items():
-        block = table.blocks[path]
-        if hasattr(block, "guards") or block.stops:
+        reading = table.blocks[path]
+        if hasattr(reading, "guards") or reading.stops:
             _add_entries(flat, found, (wire.block, wire.port), wire.index)
     taps = [Tap(join(*port), port, tuple(sorted(entries)), ()) for port, entries in sorted(found.items())]
     return [*taps, *(find_signal(flat, name) for name in dict.fromkeys(required))], list(blocks.values())
