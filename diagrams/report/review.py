@@ -43,6 +43,12 @@ HAS_NONE = (
 )
 """Reason why a periodically time-varying loop lacks a number, with a next step."""
 
+NO_LOOP = "No wire on a loop has a name or a margin: is a feedback wire missing? Name a wire of the loop, .named(…)"
+SEVERAL_ENTRIES = (
+    "No loop has it, as a wire with several entries has a disk margin only. "
+    "Limit disk_margin, or name a wire of one entry"
+)
+
 
 def check_names(case: Case, asked: Requirements, measured: Collection[str] = ()) -> None:
     """Refuse names in requirements that the diagram does not have."""
@@ -117,7 +123,7 @@ def _results(
     wires = case.loop_wires()
     loops = {**case.names_of_loops(), **{key: (key,) for key in case.extra_loops()}}
     for v in judged:
-        state = _State.of(v)
+        state, seen = _State.of(v), set[str]()
         if asked.stable:
             yield _stable(v, state, numbers)
         for key, names in loops.items():
@@ -136,14 +142,30 @@ def _results(
                 detail = (said or reason_of(absent, f"inner.{key}.{v.key}")) if found is None else ""
                 result = RequirementResult(name, key, v.key, limit, Verdict.UNDECIDED, reason, detail=detail)
                 yield _with(state, result, found, _refuted(numbers, key, v.key))
+                seen.add(name)
             step = asked.step_of(names, v.key)
             if step is not None and key in wires:
                 others = _wires_stepped(case, asked, numbers, v, step)
                 if step is not asked.step_named(names, v.key) and v.loops_elsewhere(wires[key], others):
                     continue  # a general limit, judged at other wires of the loop
                 yield from _step(case, v, state, key, step, numbers, absent)
+                seen |= {f"step.{name}" for name in step.limits}
+        if v.is_actual:
+            yield from _nowhere(asked, v, state, seen, bool(loops))
         for step in asked.steps:
             yield from _step(case, v, state, key_of_step(step), step, numbers, absent, loop="")
+
+
+def _nowhere(
+    asked: Requirements, v: Variant, state: _State, seen: Collection[str], has_loops: bool
+) -> Iterator[RequirementResult]:
+    """Yield the general limits that no loop was judged by: what is required and found nowhere is not met."""
+    step = {} if asked.step is None else asked.step.limits
+    for name, limit in {**asked.limits, **{f"step.{name}": limit for name, limit in step.items()}}.items():
+        if name not in seen:
+            detail = SEVERAL_ENTRIES if has_loops else NO_LOOP
+            result = RequirementResult(name, "", v.key, limit, Verdict.UNDECIDED, Reason.NO_NUMBER, detail=detail)
+            yield _with(state, result, None)
 
 
 def _wires_judged(

@@ -158,3 +158,25 @@ def test_requirements_of_a_loop_stand_together_behind_those_that_fail():
     found = by_loop([*failed, *passed])
     assert found[:3] == failed
     assert [(r.loop, r.distance) for r in found[3:]] == [("a", 0.1), ("a", 0.3), ("b", 0.2), ("b", 0.5), ("c", 0.4)]
+
+
+def test_a_required_margin_that_no_loop_has_is_open_where_a_feedback_wire_is_missing():
+    plant = StateSpace(A=[[-1.0]], B=[[1.0]], C=[[1.0]], name="plant")
+    diagram = Diagram("open", plant(Gain(gain=2.0, name="kp")(Constant(value=(0.0,), name="wish")).named("u")))
+    review = diagram.report(only=("inner", "poles"), requirements=Requirements(phase_margin_deg=45)).review
+    (margin,) = (result for result in review.results if result.quantity == "phase_margin_deg")
+    assert (margin.verdict, margin.reason) == (Verdict.UNDECIDED, Reason.NO_NUMBER)
+    assert "is a feedback wire missing?" in verdict_text(review)
+
+
+def test_a_required_margin_that_a_loop_of_several_entries_has_not_is_open():
+    """Two axes, L = 2/(s (s + 0.2)) each: 8 degrees of phase margin by hand, which nobody would see."""
+    speed = StateSpace(A=np.zeros((2, 2)), B=np.eye(2), C=np.eye(2), name="speed")
+    place = StateSpace(A=np.zeros((2, 2)), B=np.eye(2), C=np.eye(2), name="place")
+    diagram = Diagram("axes", speed((-2.0 * place.y).named("force") - 0.2 * speed.y), place(speed.y))
+    review = diagram.report(only=("inner", "poles"), requirements=Requirements(phase_margin_deg=45, ms=2.0)).review
+    found = {result.quantity: (result.verdict, result.reason) for result in review.results}
+    assert found["phase_margin_deg"] == (Verdict.UNDECIDED, Reason.NO_NUMBER)
+    assert review.verdict is not Verdict.PASSED
+    asked = Requirements(disk_margin=0.05)
+    assert diagram.report(only=("inner", "poles"), requirements=asked).review.verdict is Verdict.PASSED
