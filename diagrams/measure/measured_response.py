@@ -233,7 +233,8 @@ class FrequencyResponse:
         found = []
         for k, at in enumerate(s):
             exact = np.asarray(model(at, squeeze=False)).reshape(model.noutputs, model.ninputs)
-            found.append(np.linalg.norm(measured[:, :, k] - exact, 2) / np.linalg.norm(exact, 2))
+            off, size = np.linalg.norm(measured[:, :, k] - exact, 2), np.linalg.norm(exact, 2)
+            found.append(off / size if size else np.inf if off else 0.0)
         return np.array(found)
 
     def compare(self, linearization: Linearization, of: str | None = None) -> float:
