@@ -240,7 +240,7 @@ class _State:
             return cls(Verdict.UNDECIDED, Reason.NOT_ANALYSED, error.message)
         if stability is Stability.UNSTABLE:
             return cls(Verdict.FAILED, Reason.UNSTABLE)
-        return cls(Verdict.UNDECIDED, Reason.MOVING, v.point.largest) if _moves(v) else cls()
+        return cls(Verdict.UNDECIDED, Reason.MOVING, v.moves_most) if _moves(v) else cls()
 
 
 def _moves(v: Variant) -> bool:

@@ -197,6 +197,14 @@ class Variant:
         return moves < AT_REST
 
     @property
+    def moves_most(self) -> str:
+        """State that moves most at its operating point, free motions aside."""
+        if not self.free:
+            return self.point.largest
+        V, affine = self.free.V, self.model.affine
+        return str(self.model.states[int(np.argmax(np.abs(affine - V @ np.linalg.lstsq(V, affine)[0])))])
+
+    @property
     def moving_alone(self) -> tuple[str, ...]:
         """States that move at its operating point though nothing depends on them; empty where others move as well."""
         model = self.model

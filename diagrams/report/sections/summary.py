@@ -320,7 +320,7 @@ def _not_analysed(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
     yield from _apart(case, numbers)
     model = _model(actual)
     if model is not None and not actual.rests and not actual.moving_alone:
-        yield TEXTS.line("moving", largest=actual.point.largest)
+        yield TEXTS.line("moving", largest=actual.moves_most)
     for finding in () if model is None else model.findings:
         yield str(finding)
     if "inner" in case.keys and not case.loop_wires():

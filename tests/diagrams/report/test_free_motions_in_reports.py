@@ -194,3 +194,15 @@ def test_signals_on_which_something_is_required():
     assert asked.signals == ("wanted", "angle", "voltage", "current")
     assert not asked.every_state
     assert not math.isnan(stable_of(judge(drive(), loops={"voltage": {"ms": 1.6}})).number.value)
+
+
+def test_what_moves_besides_a_free_motion_is_named():
+    """After 0.5 s of a speed from 5 on, both the speed and the angle move, the angle faster: it may."""
+    motor = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="motor")
+    pi = PID(kp=2.0, ki=5.0, name="pi")(Constant(value=5.0, name="r"), motor.y).named("voltage")
+    angle = Integrator(name="angle")
+    review = analyse(Diagram("d", angle(motor(pi))), only=("poles",), at=4.0, requirements=Requirements(ms=2.0)).review
+    assert {str(motion) for motion in review.free} == {DRIFTS}
+    details = {result.detail for result in review.results if result.reason is Reason.MOVING}
+    assert details
+    assert details <= {"motor.x[1]", "pi.integral"}
