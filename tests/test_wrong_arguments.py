@@ -39,6 +39,7 @@ LONG = {
 }
 """Arguments that are right, and take long."""
 RESULTS = {
+    "ApproximateDelay",
     "Array",
     "BlockReport",
     "Call",
@@ -59,6 +60,8 @@ RESULTS = {
     "Fig3Diagram",
     "FlatDiagram",
     "Frame",
+    "FreeMotion",
+    "FreeMotions",
     "FrequencyResponse",
     "GainCrossover",
     "GangOfFour",
@@ -66,6 +69,7 @@ RESULTS = {
     "Input",
     "Kink",
     "Layout",
+    "LinearDelays",
     "Linearization",
     "Margins",
     "MeanSlope",

@@ -307,6 +307,6 @@ def _poles_of(system: DelayMatrices) -> list[complex]:
 
 def realize(loop: Any, *, delay: int = 0) -> Realization | DelayedRealization:
     """Return the realization of a loop, with delays or without."""
-    if hasattr(loop, "characteristic") and hasattr(loop, "delays"):
+    if hasattr(loop, "noutputs") and hasattr(loop, "delays"):  # a system of python-control, with delays
         return DelayedRealization.of(loop, delay=delay)
     return Realization.of(loop, delay=delay)

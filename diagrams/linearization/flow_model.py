@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ...blocks.core import Finding, OptionError, left_of
+from ...blocks.core import Finding, OptionError, explain_calls, left_of
 from ...fmus.running import Derivation
 from ..flat import NONE, FlatDiagram, WiredDiagram, announcers
 from ..frequency import FourMatrices, find_pade_limit, hold_inputs, replace_delays
@@ -23,6 +23,7 @@ STAGES = (1.0, 0.6, 0.2816, 0.857, 0.0526, 0.3333, 0.6513, 0.1184, 0.25, 0.3077,
 """Instants within a step at which DOP853 asks for rates, as parts of the step; the end comes first."""
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class LinearDelays:
     """The delays of a continuous linear model, closed around its matrices.

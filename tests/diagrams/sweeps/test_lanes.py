@@ -200,7 +200,7 @@ def test_why_each_run_needs_a_set_up_of_its_own_is_told():
     table = [{"kp.gain": 1.0}, {"kp.gain": 1.5}]
     isolated = loop()
     isolated = isolated.replace({"plant": isolated["plant"].replace(isolate=True)})
-    assert "plant was not built by Loopwright on this machine, or runs in a process" in notes(isolated, table)
+    assert "plant was not built by Loopwright on this machine, or runs in its own process" in notes(isolated, table)
     assert "they continue from a state" in notes(loop(), table, start=loop().operating_point(0.05))
 
 
