@@ -95,6 +95,6 @@ def small_fmu(folder, prefix, source, description, *, name="small", states=0, in
     platform = here if prefix == "fmi3" else {"x86_64-linux": "linux64"}.get(here, here)
     path = folder / f"{name}_{hashlib.sha256((text + xml).encode()).hexdigest()[:8]}.fmu"
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("modelDescription.xml", xml)
-        archive.writestr(f"binaries/{platform}/{name}.so", library.read_bytes())
+        archive.writestr(zipfile.ZipInfo("modelDescription.xml"), xml)
+        archive.writestr(zipfile.ZipInfo(f"binaries/{platform}/{name}.so"), library.read_bytes())
     return path

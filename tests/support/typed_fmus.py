@@ -211,6 +211,8 @@ def typed_fmu(folder, fmi, text=None, *, complete=False, change=None):
     path = folder / f"typed{fmi}_{len(list(folder.iterdir()))}.fmu"
     platform = native_platform() if fmi == 3 else {"x86_64-linux": "linux64"}.get(native_platform(), native_platform())
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("modelDescription.xml", text or (description3() if fmi == 3 else description2()))
-        archive.writestr(f"binaries/{platform}/typed.so", library.read_bytes())
+        archive.writestr(
+            zipfile.ZipInfo("modelDescription.xml"), text or (description3() if fmi == 3 else description2())
+        )
+        archive.writestr(zipfile.ZipInfo(f"binaries/{platform}/typed.so"), library.read_bytes())
     return path

@@ -79,6 +79,6 @@ def zoo_fmu(folder, fmi, fault="", *, missing="", keep=1.0):
     slug = "_".join((fault or "sound").replace(".", "").split()) + f"_{missing}" * bool(missing)
     path = Path(folder) / f"{slug}_{fmi}_{round(100 * keep)}.fmu"
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("modelDescription.xml", _DESCRIPTIONS[fmi])
-        archive.writestr(f"binaries/{platform}/zoo.so", data[: round(keep * len(data))])
+        archive.writestr(zipfile.ZipInfo("modelDescription.xml"), _DESCRIPTIONS[fmi])
+        archive.writestr(zipfile.ZipInfo(f"binaries/{platform}/zoo.so"), data[: round(keep * len(data))])
     return path
