@@ -1,7 +1,8 @@
 """Coupling schemes of FMUs measured, and estimates for adaptive steps compared: python benchmarks/coupling.py.
 
-It makes the tables and the figure of docs/coupling.md again. The schemes run on two FMUs of the library; the estimates
-are compared in NumPy, on two masses with exact solutions under held forces, so that nothing but the coupling errs.
+It makes the tables and the figure of docs/explanation/coupling.md again. The schemes run on two FMUs of the library;
+the estimates are compared in NumPy, on two masses with exact solutions under held forces, so that nothing but the
+coupling errs.
 """
 
 from __future__ import annotations

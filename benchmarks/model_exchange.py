@@ -1,4 +1,4 @@
-"""CPU time of an event in model exchange, with its search and the restart of the solver, and of a tick: docs/fmus.md.
+"""CPU time of an event in model exchange, with its search and the restart of the solver, and of a tick.
 
 python benchmarks/model_exchange.py
 """

@@ -244,7 +244,7 @@ class Diagram:
     def simulate(self, duration: float, *, progress: bool | None = None, **options: Unpack[RunKeywords]) -> Run:
         """Run the diagram and return what it recorded: from t = 0, or from a saved state.
 
-        The page docs/architecture.md says what happens in which order.
+        The page docs/explanation/architecture.md says what happens in which order.
 
         Parameters
         ----------
@@ -293,7 +293,7 @@ class Diagram:
     def report_coupling(
         self, coupling: str | Coupling = "jacobi", *, step: float | Fraction | None = None
     ) -> CouplingReport:
-        """List the delay of every connection from and to an FMU; see docs/coupling.md.
+        """List the delay of every connection from and to an FMU; see docs/explanation/coupling.md.
 
         Parameters
         ----------
@@ -333,7 +333,7 @@ class Diagram:
         lanes: bool | int = False,
         **options: Unpack[KeptKeywords],
     ) -> Sweep:
-        """Run the diagram with many values of its parameters, on every core; see docs/sweeps.md.
+        """Run the diagram with many values of its parameters, on every core; see docs/howto/sweeps.md.
 
         Without ``lanes`` each run is, to the last bit, that of ``diagram.replace(parameters).simulate(duration)`` with
         the same options and ``compile=True``, whoever makes it, and however many workers there are. A run that fails
@@ -373,7 +373,7 @@ class Diagram:
         lanes : bool or {2, 4, 8, 16}, optional
             Make so many runs side by side in the lanes of the processor's vectors, 8 for True: some times as fast.
             Their values then differ from those of single runs by rounding, and the sweep's messages say so. A motion
-            that magnifies small differences (a limit cycle, sticking) magnifies these, too; see docs/sweeps.md.
+            that magnifies small differences (a limit cycle, sticking) magnifies these, too; see docs/howto/sweeps.md.
             Every FMU must have been built by Loopwright on this machine, with steps of fixed length and without events;
             runs that can't go so are made one after the other, which a message says.
         **options
@@ -556,7 +556,7 @@ class Diagram:
         Linearization
             With `Linearization.system`, a `control.StateSpace` with names, and the loops: ``.loop("v_perp")``. Of a
             continuous diagram with transport delays these are systems with delays, which evaluate exactly and have no
-            matrices; see docs/frequency.md.
+            matrices; see docs/howto/frequency.md.
 
         Raises
         ------
@@ -616,7 +616,7 @@ class Diagram:
         """Measure a frequency response on the running diagram: a test signal d is added at a wire.
 
         With v the output of the wire's port and u = v + d the signal that all its consumers get, S = u/d, T = −v/d and
-        L = −v/u, as of `Linearization`. They are sampled where the linear model is; see docs/frequency.md.
+        L = −v/u, as of `Linearization`. They are sampled where the linear model is; see docs/howto/frequency.md.
 
         The signal is ramped in; then windows of whole periods follow until two agree. Let the references stand still.
 
@@ -724,7 +724,7 @@ class Diagram:
         skew: float = 0.0,
         **options: Any,
     ) -> Sensitivities:
-        """Return the derivatives of a loop's margins by parameters of the diagram; see docs/worst_case.md.
+        """Return the derivatives of a loop's margins by parameters of the diagram; see docs/howto/worst_case.md.
 
         They are exact derivatives of the linear model, hold and delay included: of its matrices by CasADi, of the
         margins by implicit differentiation at their crossings and peaks. By an FMU's parameter they are differences,
@@ -856,7 +856,7 @@ class Diagram:
         paper: str = "A4",
         **options: Any,
     ) -> Report:
-        """Analyse the diagram for design, and write the report; see docs/reports.md.
+        """Analyse the diagram for design, and write the report; see docs/howto/reports.md.
 
         Parameters
         ----------

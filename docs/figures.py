@@ -45,7 +45,7 @@ def main(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with chdir(folder):
         exec(first_example(HERE.parent / "README.md"), {})  # it writes loop.png
-        exec(first_example(HERE / "sweeps.md"), {})  # sweep.png
+        exec(first_example(HERE / "howto" / "sweeps.md"), {})  # sweep.png
     experiment = experiments.hand_guiding()
     plot_path(experiment, experiment.simulate(progress=False)).savefig(folder / "C_path.png", dpi=120)
     bode().savefig(folder / "frequency.png", dpi=120)

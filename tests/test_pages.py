@@ -93,7 +93,7 @@ def test_the_readme_opens_with_a_closed_loop_in_ten_lines_that_runs(tmp_path):
 
 @pytest.mark.slow
 def test_the_page_on_diagrams_runs(tmp_path):
-    run_page("diagrams", tmp_path)
+    run_page("howto/diagrams", tmp_path)
 
 
 def as_in_a_table(value):
@@ -102,7 +102,10 @@ def as_in_a_table(value):
 
 @pytest.mark.slow
 def test_the_page_on_frequencies_runs_and_its_numbers_are_those_it_gives(tmp_path):
-    text, scope = (ROOT / "docs" / "frequency.md").read_text(encoding="utf-8"), run_page("frequency", tmp_path)
+    text, scope = (
+        (ROOT / "docs" / "howto" / "frequency.md").read_text(encoding="utf-8"),
+        run_page("howto/frequency", tmp_path),
+    )
     for name, cells in re.findall(r"^\| `([\w.]+)` \|(.*)\|$", text, re.MULTILINE):
         told = [c.strip() for c in re.split(r"(?<!\\)\|", cells)]
         if name in scope["limits"]:
@@ -120,11 +123,11 @@ def test_the_page_on_frequencies_runs_and_its_numbers_are_those_it_gives(tmp_pat
 @pytest.mark.parametrize(
     "page",
     [
-        "coupling",
-        pytest.param("other_tools", marks=pytest.mark.slow),
-        pytest.param("reports", marks=pytest.mark.slow),
-        pytest.param("worst_case", marks=pytest.mark.slow),
-        pytest.param("sweeps", marks=pytest.mark.slow),
+        "explanation/coupling",
+        pytest.param("reference/other_tools", marks=pytest.mark.slow),
+        pytest.param("howto/reports", marks=pytest.mark.slow),
+        pytest.param("howto/worst_case", marks=pytest.mark.slow),
+        pytest.param("howto/sweeps", marks=pytest.mark.slow),
     ],
 )
 def test_the_page_runs(cache, tmp_path, page):
@@ -133,7 +136,7 @@ def test_the_page_runs(cache, tmp_path, page):
 
 @pytest.mark.slow
 def test_the_page_on_export_runs(tmp_path):
-    text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "howto" / "export.md").read_text(encoding="utf-8")
     model, *more = blocks_of_code(text)
     (tmp_path / "thermostat.py").write_text(model, encoding="utf-8")
     (tmp_path / "page.py").write_text("\n".join(more), encoding="utf-8")  # in a process, as a file
@@ -150,7 +153,7 @@ def test_the_page_on_export_tells_the_flags_as_they_are(fmi, model, tmp_path, un
     path = getattr(loopwright.fmus, model).build(out=tmp_path, fmi=fmi)
     with zipfile.ZipFile(path) as archive:
         tree = ET.fromstring(archive.read("modelDescription.xml"))
-    text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "howto" / "export.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(\w+)`(?: \(2\.0: `(\w+)`\))? \|(.*)\|$", text.split("## Integrators")[0], re.MULTILINE)
     with_events = "true" if model == "bouncing_ball" else "false"
     spelling = {

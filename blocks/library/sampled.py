@@ -70,7 +70,7 @@ class Encoder(Block):
     p = Δ ⌊position / Δ + ½⌋, v = (p[k] − p[k − 1]) / T; at the first tick v is the true velocity. An operating point at
     the start is past that tick: p[k − 1] = p[k] − T v. Linear models have the mean slopes of the stairs, 1 and, from
     one tick to the next, 1/T, which hold for motions of many quanta. The block is part of the rig
-    (docs/experiments.md), not of the paper.
+    (docs/reference/experiments.md), not of the paper.
 
     Raises
     ------

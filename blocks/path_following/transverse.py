@@ -1,8 +1,8 @@
 """Path following by transverse feedback linearization: section III of Flixeder, Glück, Böck, Kugi (2014).
 
-Numbers in parentheses are the paper's equations, E1 to E27 its errata (docs/paper.md). F is the force on the robot, t
-and n the unit tangent and normal (to the left), κ the signed curvature (the paper's φ′), κ_s its derivative with
-respect to the arc length, q = 1 − κ ξ₁.
+Numbers in parentheses are the paper's equations, E1 to E27 its errata (docs/explanation/paper.md). F is the force on
+the robot, t and n the unit tangent and normal (to the left), κ the signed curvature (the paper's φ′), κ_s its
+derivative with respect to the arc length, q = 1 − κ ξ₁.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ class Ellipse(Path):
     """Ellipse σ(θ) = c + (a cos θ, ± b sin θ), counter-clockwise (+) or clockwise (−), period 2π; equation (16).
 
     a and b are the semi-axes (E12). The normal points inwards if the direction is counter-clockwise (ξ > 0 is inside),
-    else outwards. The reach inwards is that of docs/paper.md, b²/a at the ends of the major axis.
+    else outwards. The reach inwards is that of docs/explanation/paper.md, b²/a at the ends of the major axis.
 
     Raises
     ------

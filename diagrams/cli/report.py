@@ -69,7 +69,7 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     report.add_argument("--pdf", action="store_true", help="the same as PDF next to it (pip install 'loopwright[pdf]')")
     report.add_argument("--json", action="store_true", help="all numbers as JSON next to it")
     report.add_argument(
-        "--requirements", metavar="FILE.toml", help="requirements on loops and responses; see docs/reports.md"
+        "--requirements", metavar="FILE.toml", help="requirements on loops and responses; see docs/howto/reports.md"
     )
     report.add_argument(
         "--measured",
@@ -83,13 +83,13 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--worst-case",
         metavar="FILE.toml",
         help="find a worst case over ranges of parameters, as the file's table [worst_case] says, which the file of "
-        "the requirements may have, too; see docs/worst_case.md",
+        "the requirements may have, too; see docs/howto/worst_case.md",
     )
     report.add_argument(
         "--contact",
         metavar="FILE.toml",
         help="contacts of environments with the plant, as the file's tables [contact.NAME] say, which the file of the "
-        "requirements may have, too; see docs/frequency.md",
+        "requirements may have, too; see docs/howto/frequency.md",
     )
     report.add_argument("--check", action="store_true", help="say by the exit status whether they are met")
     for name in ABOUT:

@@ -39,7 +39,7 @@ _POSITIVE = kinds.above_zero.where(math.isfinite)
 class Coupling:
     """Exchange of values between FMUs in a run: ``simulate(…, coupling=Coupling(scheme="iterated"))``.
 
-    The page docs/coupling.md says what each scheme costs, and which order it has.
+    The page docs/explanation/coupling.md says what each scheme costs, and which order it has.
 
     Attributes
     ----------

@@ -1,7 +1,7 @@
 /* Vectors of LANES numbers, one of each run, and functions of them without branches between lanes.
 
    What a lane holds depends on nothing in another one. Sums of a product are fused where one expression holds both and
-   the processor can. The errors of the functions are stated in docs/sweeps.md and tested. */
+   the processor can. The errors of the functions are stated in docs/howto/sweeps.md and tested. */
 
 #include <math.h>
 #include <stdbool.h>

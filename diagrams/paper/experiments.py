@@ -1,4 +1,4 @@
-"""Experiments A to D of the paper, with every profile fixed (docs/experiments.md).
+"""Experiments A to D of the paper, with every profile fixed (docs/reference/experiments.md).
 
 >>> from loopwright.diagrams import experiments
 >>> experiments.path_following(delay=1).options["delay"]

@@ -93,7 +93,7 @@ class RunOptions:
     coupling : str or Coupling
         Exchange of values between FMUs in a communication step: "jacobi", all step at once with the inputs of its
         beginning; "gauss_seidel", one after the other; "iterated", until they agree; or a `Coupling` with its options,
-        such as adaptive communication steps. See docs/coupling.md.
+        such as adaptive communication steps. See docs/explanation/coupling.md.
     start_exchange : {"agree", "once", "none"}
         Exchange of values with FMUs while they initialize: until inputs and outputs agree, one pass, or none, where
         inputs keep their start values until the first step. Tools differ in this.

@@ -167,7 +167,7 @@ def test_the_method_of_a_diagram_writes_the_same(folder, asked):
 
 
 def test_the_commands_of_the_page_on_reports_are_understood():
-    text = (Path(__file__).parents[3] / "docs" / "reports.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs" / "howto" / "reports.md").read_text(encoding="utf-8")
     lines = [line for part in re.findall(r"```sh\n(.*?)```", text, re.DOTALL) for line in part.splitlines()]
     commands = [shlex.split(line, comments=True)[1:] for line in lines]
     assert len(commands) == 5

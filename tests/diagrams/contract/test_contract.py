@@ -40,7 +40,7 @@ from loopwright.diagrams import check_block
 from loopwright.fmus import Fmu, mass_spring_damper
 from support.library import CASES, is_base
 
-PAGE = (Path(__file__).parents[3] / "docs" / "blocks.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "blocks.md").read_text(encoding="utf-8")
 
 
 def named(case):

@@ -14,7 +14,7 @@ from loopwright.diagrams.lanes.vector_code import write_vectors
 from loopwright.fmus.export import processor_flags
 
 BOUNDS = {"exp": 1.0, "expm1": 1.5, "tanh": 2.0, "log": 0.9, "sin": 0.8, "cos": 0.8}
-"""Largest errors in ulp that docs/sweeps.md states."""
+"""Largest errors in ulp that docs/howto/sweeps.md states."""
 CALLED = (*BOUNDS, "floor", "ceil", "sqrt")
 SPECIAL = [0.0, -0.0, np.inf, -np.inf, np.nan, 1e-310, -1e-310, 710.0, -750.0, 1e300, -1e300, 2.5, -2.5, 0.3, 4.6e15]
 

@@ -31,7 +31,7 @@ LANES = 4
 NEAR = 1e-12
 """Difference of a run in a lane from a single one, of the largest value: some thousand roundings of a stable loop."""
 PAPER = 1e-10
-"""The difference that docs/sweeps.md states for the experiments of the paper, whose friction is steep near rest."""
+"""The difference that docs/howto/sweeps.md states for the experiments of the paper, whose friction is steep near rest."""
 
 
 def exact_states(gain, lag, kp, ticks):

@@ -438,7 +438,7 @@ def test_directional_derivatives_are_refused_by_name(motor, tmp_path):
 
 
 def test_the_page_on_fmus_runs(cache):
-    text = (Path(__file__).parents[3] / "docs" / "fmus.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs" / "reference" / "fmus.md").read_text(encoding="utf-8")
     scope = {}
     for snippet in re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
         exec(snippet, scope)
