@@ -68,6 +68,12 @@ class LoopwrightError(Exception):
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuild, (type(self), self.__dict__.copy())
 
+    def _render_traceback_(self) -> list[str]:
+        """Return the traceback as IPython prints it, which calls this."""
+        from .shown_errors import render
+
+        return render(self)
+
     def at(self, *, block: str | None = None, port: str | None = None, t: float | None = None) -> Self:
         """Fill in block, port and time where they are not known yet, and return self."""
         self.block, self.port = self.block or block, self.port or port
