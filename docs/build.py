@@ -1,0 +1,77 @@
+"""Build the documentation's site: python docs/build.py [FOLDER], by default out/site; FOLDER/index.html opens it.
+
+Pages, notebooks and generated pages of the reference are staged in a temporary folder, which Sphinx then reads. Every
+warning is an error. Nothing is asked of a network, neither here nor by the pages.
+"""
+
+from __future__ import annotations
+
+import argparse
+import posixpath
+import re
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent
+LINK = re.compile(r"(?<=\]\()([^)#\s:]+)(?=[)#])")
+
+
+def _on_site(path: str) -> str:
+    """Return where a file of the repository is on the site, whose root is docs/."""
+    return "." if path == "docs" else path.removeprefix("docs/")
+
+
+def _restaged(page: Path, text: str) -> str:
+    """Change the links of a page to files outside docs/, and from there into it."""
+    folder = page.parent.relative_to(ROOT).as_posix()
+
+    def change(match: re.Match[str]) -> str:
+        target = posixpath.normpath(posixpath.join(folder, match[0]))
+        return posixpath.relpath(_on_site(target), _on_site(folder))
+
+    return LINK.sub(change, text)
+
+
+def stage(folder: Path) -> None:
+    """Write all sources of the site into a folder."""
+    pages = [
+        *HERE.rglob("*.md"),
+        *(ROOT / "notebooks").glob("*.ipynb"),
+        ROOT / "CHANGELOG.md",
+        ROOT / "CONTRIBUTING.md",
+    ]
+    for page in pages:
+        place = folder / page.relative_to(HERE if HERE in page.parents else ROOT)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_text(_restaged(page, page.read_text(encoding="utf-8")), encoding="utf-8")
+    for pictures in (HERE / "images", ROOT / "benchmarks" / "images"):
+        shutil.copytree(pictures, folder / pictures.relative_to(HERE if HERE in pictures.parents else ROOT))
+
+
+def build(folder: Path) -> int:
+    """Build the site in a folder, and return Sphinx's exit status: 0 where there was no warning."""
+    from sphinx.cmd.build import main as sphinx
+
+    with tempfile.TemporaryDirectory() as temporary:
+        sources, trees = Path(temporary) / "pages", Path(temporary) / "trees"
+        stage(sources)
+        options = ["-W", "--keep-going", "-q", "-j", "auto", "-d", str(trees), "-c", str(HERE / "site")]
+        return sphinx([*options, str(sources), str(folder)])
+
+
+def main() -> int:
+    """Parse the command line, and build."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "out" / "site", help="where the site goes")
+    folder = parser.parse_args().folder
+    status = build(folder)
+    if status == 0:
+        print(f"{folder / 'index.html'}")
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())
