@@ -47,7 +47,7 @@ def main(folder: Path) -> None:
         exec(first_example(HERE.parent / "README.md"), {})  # it writes loop.png
         exec(first_example(HERE / "howto" / "sweeps.md"), {})  # sweep.png
     experiment = experiments.hand_guiding()
-    plot_path(experiment, experiment.simulate(progress=False)).savefig(folder / "C_path.png", dpi=120)
+    plot_path(experiment, experiment.simulate(progress=False), is_shown=False).savefig(folder / "C_path.png", dpi=120)
     bode().savefig(folder / "frequency.png", dpi=120)
 
 

@@ -48,6 +48,14 @@ def both_tiers(request):
         yield
 
 
+@pytest.fixture(autouse=True)
+def closed_figures():
+    """Close the figures that a test has shown, which pyplot keeps."""
+    yield
+    if pyplot := sys.modules.get("matplotlib.pyplot"):
+        pyplot.close("all")
+
+
 @pytest.fixture(scope="session")
 def disturbance():
     """Linear algebra that can be disturbed, see `support.disturbed`."""
@@ -223,8 +231,8 @@ def undrawn(monkeypatch):
         return files
 
     for name in ("plot_path", "plot_experiment"):
-        monkeypatch.setattr(f"loopwright.diagrams.paper.{name}", lambda *_: None)
-    monkeypatch.setattr("loopwright.diagrams.results.save", save)
+        monkeypatch.setattr(f"loopwright.diagrams.paper.{name}", lambda *_, **__: None)
+    monkeypatch.setattr("loopwright.diagrams.plotting.save", save)
 
 
 @pytest.fixture(scope="session")

@@ -234,7 +234,7 @@ def _write(
     They take the place of older ones all together, at the end; if one can't be written, the older ones stay.
     """
     from ..paper import plot_experiment, plot_path
-    from ..results import save
+    from ..plotting import save
 
     letter = experiment.letter
     numbers = key_numbers(experiment, run)
@@ -247,7 +247,7 @@ def _write(
         run.to_csv(new / f"{letter}.csv", *SIGNALS)
         write_text(new / f"{letter}.json", json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
         for name, plot in (("path", plot_path), ("signals", plot_experiment)):
-            save(plot(experiment, run), new / f"{letter}_{name}")
+            save(plot(experiment, run, is_shown=False), new / f"{letter}_{name}")
         for name in names:
             (new / name).replace(folder / name)
     return numbers, names

@@ -10,7 +10,7 @@ from control import StateSpace, feedback
 from numpy.typing import ArrayLike
 
 from ...blocks.core import OptionError, accepts, brief, count_of, explain_calls, kinds, shorten, with_unit
-from ..results import BLUE, DARK, GREEN, GREY, PURPLE, STONE, VERMILION, legend_above, new_figure, style
+from ..plotting import BLUE, DARK, GREEN, GREY, PURPLE, STONE, VERMILION, legend_above, shown_figure
 from .delayed_realization import DelayedRealization, realize
 from .delayed_system import DelayedSystem
 
@@ -402,8 +402,7 @@ def _legend(figure: Figure, axes: Axes) -> None:
 def _plot_bode(loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | None, *, db: bool, hz: bool) -> Figure:
     """Return the gain and the phase over frequency; see `LoopTransfer.bode`."""
     unit = 2.0 * np.pi if hz else 1.0
-    with style():
-        figure = new_figure(4.4)
+    with shown_figure(4.4) as figure:
         gain, phase = figure.subplots(2, 1, sharex=True)
         for i, (loop, w) in enumerate(zip(loops, _span(loops, omega), strict=True)):
             values = _response(loop, w)
@@ -429,8 +428,7 @@ def _plot_bode(loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | No
 def _plot_nyquist(loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | None) -> Figure:
     """Return the loci of the loops around −1; see `LoopTransfer.nyquist`."""
     reach = 1.6
-    with style():
-        figure = new_figure(5.0)
+    with shown_figure(5.0) as figure:
         axes = figure.subplots()
         axes.plot(np.cos(turn := np.linspace(0, 2 * np.pi, 200)), np.sin(turn), color=GREY, linewidth=0.8, zorder=0)
         for i, (loop, w) in enumerate(zip(loops, _span(loops, omega), strict=True)):
@@ -464,8 +462,7 @@ def _plot_nyquist(loops: Sequence[Any], names: Sequence[str], omega: ArrayLike |
 
 def _plot_nichols(loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | None) -> Figure:
     """Return gain over phase, with contours of |T|; see `LoopTransfer.nichols`."""
-    with style():
-        figure = new_figure(4.6)
+    with shown_figure(4.6) as figure:
         axes = figure.subplots()
         for i, (loop, w) in enumerate(zip(loops, _span(loops, omega), strict=True)):
             values = _response(loop, w)
@@ -493,8 +490,7 @@ def _plot_step(closed: Sequence[Any], names: Sequence[str], times: ArrayLike | N
     """Return the step responses of closed loops; see `LoopTransfer.step`."""
     import control
 
-    with style():
-        figure = new_figure(3.4)
+    with shown_figure(3.4) as figure:
         axes = figure.subplots()
         end = horizon if times is None else float(np.max(np.asarray(times, dtype=float)))
         if not 0.0 < end < np.inf:
@@ -515,8 +511,7 @@ def _plot_step(closed: Sequence[Any], names: Sequence[str], times: ArrayLike | N
 
 def _plot_gang_of_four(systems: Sequence[Mapping[str, Any]], names: Sequence[str], omega: ArrayLike | None) -> Figure:
     """Return the gains of S, T, PS and CS; see `LoopTransfer.gang_of_four`."""
-    with style():
-        figure = new_figure(4.8)
+    with shown_figure(4.8) as figure:
         panels = figure.subplots(2, 2, sharex=True)
         for axes, key in zip(np.ravel(panels), ("S", "PS", "CS", "T"), strict=True):
             own = [found[key] for found in systems]

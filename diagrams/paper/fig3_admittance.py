@@ -18,6 +18,7 @@ from ...blocks.core import ConfirmationError, LoopwrightError, OptionError
 from ..contact import SIDES, Contact, ContactLimit, PortNames, make_contact, try_limit
 from ..frequency import Number
 from ..linearization import StepsOnly
+from ..plotting import legend_above, new_figure, style
 from ..report import (
     DOTTED,
     Implementation,
@@ -31,7 +32,6 @@ from ..report import (
     look_of,
 )
 from ..report.sections import contacts
-from ..results import legend_above, new_figure, style
 from .compliance_loop import AdmittanceLoop
 from .coupled_stability import growth_rate
 from .fig3_case import Fig3Case

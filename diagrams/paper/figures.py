@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..results import BLUE, DARK, GREEN, GREY, VERMILION, WIDTH, limit_time, marker_of, new_figure, style
+from ..plotting import BLUE, DARK, GREEN, GREY, VERMILION, WIDTH, limit_time, marker_of, shown_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # --- the plane ------------------------------------------------------------------------------------------------------
 
 
-def plot_path(experiment: Experiment, run: Run) -> Figure:
+def plot_path(experiment: Experiment, run: Run, *, is_shown: bool = True) -> Figure:
     """Draw the plane: the path, the trace of the end effector, the path reference, and the measured force along it.
 
     Parameters
@@ -30,6 +30,8 @@ def plot_path(experiment: Experiment, run: Run) -> Figure:
         The experiment.
     run : Run
         Its run, a complete one or what ``error.run`` holds.
+    is_shown : bool
+        Whether pyplot has the figure, for a person; False for a program that keeps it.
     """
     path, position = experiment.path, run["position"]
     theta = np.linspace(*((0.0, path.period) if path.period is not None else path.domain or (0.0, 1.0)), 721)
@@ -40,10 +42,8 @@ def plot_path(experiment: Experiment, run: Run) -> Figure:
     tips = position[ticks] + run["force"][ticks] * scale
     points = np.hstack([curve, position.T, reference, tips.T])
     low, high = points.min(axis=1) - 0.04 * size, points.max(axis=1) + 0.04 * size
-    with style():
-        figure = new_figure(
-            min((1.2 if ticks else 1.0) + (WIDTH - 0.62) * float((high[1] - low[1]) / (high[0] - low[0])), 8.5)
-        )
+    height = min((1.2 if ticks else 1.0) + (WIDTH - 0.62) * float((high[1] - low[1]) / (high[0] - low[0])), 8.5)
+    with shown_figure(height, is_shown=is_shown) as figure:
         ax = figure.subplots()
         ax.set_aspect("equal")
         ax.set_xlim(low[0], high[0])
@@ -149,7 +149,7 @@ _PATH_REFERENCE: Mapping[str, Any] = MappingProxyType({"color": VERMILION, "line
 _DESIRED: Mapping[str, Any] = MappingProxyType({"color": DARK, "linewidth": 1.0, "linestyle": (0, (1, 1.5))})
 
 
-def plot_experiment(experiment: Experiment, run: Run) -> Figure:
+def plot_experiment(experiment: Experiment, run: Run, *, is_shown: bool = True) -> Figure:
     """Draw the signals of an experiment in the manner of the paper's Fig. 4 to 6.
 
     Left the direction along the path, right the one across it; from top to bottom the coordinate with its references,
@@ -162,6 +162,8 @@ def plot_experiment(experiment: Experiment, run: Run) -> Figure:
         The experiment.
     run : Run
         Its run, a complete one or what ``error.run`` holds.
+    is_shown : bool
+        Whether pyplot has the figure, for a person; False for a program that keeps it.
     """
     from matplotlib.lines import Line2D
 
@@ -170,8 +172,7 @@ def plot_experiment(experiment: Experiment, run: Run) -> Figure:
     has_force = bool(np.any(forces)) or any(f is not None for f in wanted)
     admittance = "controller.admittance_par.path_reference" in run
     rows = 5 if has_force else 4
-    with style():
-        figure = new_figure(0.75 + 1.4 * rows)
+    with shown_figure(0.75 + 1.4 * rows, is_shown=is_shown) as figure:
         axes = figure.subplots(rows, 2, sharex=True)
         for column, side, coordinate, symbol in ((0, "par", "eta", r"\eta"), (1, "perp", "xi", r"\xi")):
             end = {"par": r"\parallel", "perp": r"\perp"}[side]

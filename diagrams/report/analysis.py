@@ -11,12 +11,12 @@ from ...blocks.core import Kind, OptionError, accepts, kinds, offer_elsewhere, o
 from ...fmus.running import Fmu
 from ..flat import WiredDiagram
 from ..linearization import find_signal
+from ..plotting import AxisUnits
 from ..requirements import Requirements, TomlFile, read_requirements
 from ..studies import ContactTask, WorstCase, WorstCaseTask
 from ..sweeps import processors
 from .case import Case, ReportedExperiment
 from .content_hash import content_hash
-from .figures import AxisUnits
 from .pages import DEFINITIONS, Report
 from .points import STEP
 from .report_parts import ReportKind, ReportPart

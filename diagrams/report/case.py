@@ -11,9 +11,9 @@ import numpy as np
 from ...blocks.core import LoopwrightError, SampleTimeError
 from ..flat import WiredDiagram
 from ..linearization import UnusualStart
+from ..plotting import AxisUnits
 from ..requirements import Requirements
 from ..studies import LoopPlace, cut_places, find_places
-from .figures import AxisUnits
 from .pages import Texts
 from .variant import Implementation, Variant, in_s, look_of
 from .wires import wires_on_loops

@@ -15,11 +15,11 @@ from typing import Any, Generic, TypeVar, cast
 
 from ...blocks.core import OptionError
 from ..flat import WiredDiagram
+from ..plotting import AxisUnits
 from ..requirements import Requirements
 from ..results import Snapshot
 from ..second_process import SecondProcess
 from .case import Case, ReportedExperiment
-from .figures import AxisUnits
 from .pages import Section, draw_section, keep_drawings
 from .review import check_names
 

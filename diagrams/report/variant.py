@@ -13,7 +13,8 @@ import numpy as np
 from ...blocks.core import BetweenTicksError, Finding, LoopwrightError, PeriodicLoopError
 from ..flat import FlatDiagram, WiredDiagram
 from ..linearization import FreeMotions, Linearization, find_signal, linearize
-from ..results import BLUE, DARK, GREEN, PURPLE, STONE, VERMILION, OperatingPoint
+from ..plotting import BLUE, DARK, GREEN, PURPLE, STONE, VERMILION
+from ..results import OperatingPoint
 from .points import point_of
 from .wires import ways_through
 

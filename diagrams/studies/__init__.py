@@ -6,6 +6,7 @@ from .contact_task import ContactTask
 from .loop_places import LoopPlace, cut_places, find_places
 from .sensitivity import Sensitivities, Sensitivity, find_sensitivities, sensitivities_of
 from .worst_case import WorstCase, find_worst_case
+from .worst_case_plot import plot_cases
 from .worst_case_task import WorstCaseTask
 
 __all__ = [
@@ -27,5 +28,6 @@ __all__ = [
     "find_places",
     "find_sensitivities",
     "find_worst_case",
+    "plot_cases",
     "sensitivities_of",
 ]

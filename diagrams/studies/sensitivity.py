@@ -14,7 +14,8 @@ from ...blocks.core import LoopwrightError, UnknownNameError, accepts, brief, en
 from ..flat import WiredDiagram
 from ..frequency import MarginSlope, Number, margin_slopes, margins, order_key
 from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize, rational_loop
-from ..results import BLUE, DARK, VERMILION, OperatingPoint, new_figure, style
+from ..plotting import BLUE, DARK, VERMILION, shown_figure
+from ..results import OperatingPoint
 from .parameters import check_parameters, list_parameters, unit_of
 
 if TYPE_CHECKING:
@@ -208,15 +209,13 @@ class Sensitivities(Sequence[Sensitivity]):
         mine = self.of(quantity, count)[::-1]
         values = [row.per_percent.value for row in mine]
         unit = "" if not mine or mine[0].number.unit == "1" else f" in {mine[0].number.unit}"
-        with style():
-            figure = new_figure(0.7 + 0.27 * max(len(mine), 1))
+        with shown_figure(0.7 + 0.27 * max(len(mine), 1)) as figure:
             axes = figure.subplots()
             axes.barh([row.parameter for row in mine], values, color=[BLUE if v >= 0 else VERMILION for v in values])
             axes.axvline(0.0, color=DARK, linewidth=0.8)
             axes.set_xlabel(f"change of {quantity}{unit} per 1 % of the parameter")
             axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
             axes.grid(visible=False, axis="y")
-            figure.canvas.draw()  # sizes of letters are those of the style at the first drawing
         return figure
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import OptionError, accepts, kinds, near, with_unit
-from ..results import BLUE, DARK, GREEN, PURPLE, VERMILION, legend_above, new_figure, style
+from ..plotting import BLUE, DARK, GREEN, PURPLE, VERMILION, legend_above, shown_figure
 from ..sweeps import Box
 from .cases import CaseOrigin, CaseState, Goal, StudyCase
 
@@ -24,6 +24,8 @@ def plot_cases(
     goal: Goal,
     boxes: Mapping[str, Box],
     parameters: Sequence[str] | None = None,
+    *,
+    is_shown: bool = True,
 ) -> Figure:
     """Return a scatter of the number over each parameter; see `WorstCase.plot`."""
     every = [name for name, value in worst.parameters.items() if isinstance(value, float | int)]
@@ -38,8 +40,7 @@ def plot_cases(
         raise OptionError("found no parameter with one number; expected one to draw over. Look at table().")
     loop, quantity = _drawn(worst, goal)
     rows, columns = math.ceil(len(names) / 3), min(len(names), 3)
-    with style():
-        figure = new_figure(0.3 + 2.4 * rows)
+    with shown_figure(0.3 + 2.4 * rows, is_shown=is_shown) as figure:
         grid = figure.subplots(rows, columns, squeeze=False)
         looks = {
             CaseOrigin.SAMPLE: (BLUE, 12, "samples"),

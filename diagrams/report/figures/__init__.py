@@ -1,6 +1,6 @@
 """Figures of a design report, drawn without pyplot."""
 
-from .axes import AxisUnits
+from ...plotting import AxisUnits
 from .contact_figures import DOTTED, contact_admittance, contact_map, draw_admittances, fill_growth
 from .drawings import with_drawing
 from .loop_figures import DrawnLoops, bode, gang, nyquist, response, sensitivities

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ....blocks.core import with_unit
-from ...results import BLUE, DARK, VERMILION, legend_above, new_figure, style
+from ...plotting import BLUE, DARK, VERMILION, legend_above, new_figure, set_frequencies, set_powers, style
 from ..pages import Plot, Texts
-from .axes import set_frequencies, set_powers
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

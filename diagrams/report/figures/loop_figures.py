@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ....blocks.core import with_unit
-from ...results import DARK, GREY, WIDTH, legend_above, new_figure, style
+from ...plotting import DARK, GREY, WIDTH, AxisUnits, legend_above, new_figure, set_frequencies, set_magnitudes, style
 from ..pages import Plot, Texts
-from .axes import AxisUnits, set_frequencies, set_magnitudes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ...results import WIDTH
+from ...plotting import WIDTH
 from ..pages import Plot, Texts
 from .loop_figures import DrawnLoops, draw_bode
 from .step_figures import draw_answer

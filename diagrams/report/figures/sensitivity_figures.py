@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ...results import BLUE, DARK, VERMILION, new_figure, style
+from ...plotting import BLUE, DARK, VERMILION, new_figure, style
 from ..pages import Plot, Texts
 
 TEXTS = Texts(__package__, "figures")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ....blocks.core import with_unit
-from ...results import DARK, GREY, legend_above, new_figure, style
+from ...plotting import DARK, GREY, legend_above, new_figure, style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,7 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
-from ...results import lay_out
+from ...plotting import lay_out
 
 if TYPE_CHECKING:
     from markupsafe import Markup

@@ -23,6 +23,7 @@ from ...studies import (
     WorstCase,
     WorstCaseTask,
     cut_places,
+    plot_cases,
 )
 from ..content_hash import content_hash
 from ..pages import Plot, Section, Table, Texts
@@ -259,5 +260,11 @@ def worst_case_of(reported: ReportedWorstCase | MissingWorstCase) -> Section:
     tables.append(_ranges(found))
     plots = []
     if any(np.ndim(value) == 0 for value in worst.parameters.values()):
-        plots.append(Plot("worst_case", TEXTS.line("scatter"), found.plot()))
+        plots.append(
+            Plot(
+                "worst_case",
+                TEXTS.line("scatter"),
+                plot_cases(found.cases, found.worst, found.goal, found.boxes, is_shown=False),
+            )
+        )
     return Section(KEY, "Worst case", tuple(text), tuple(tables), tuple(plots), numbers)

@@ -18,7 +18,7 @@ from loopwright.diagrams.cli import options as _cli_options
 from loopwright.diagrams.cli.command_line import main
 from loopwright.diagrams.paper.experiment_numbers import DEFINITIONS, key_numbers
 from loopwright.diagrams.paper.figures import plot_experiment, plot_path
-from loopwright.diagrams.results.plots import STYLE, save
+from loopwright.diagrams.plotting.style import STYLE, save
 from support.waiting import FAR
 
 HEADER = (

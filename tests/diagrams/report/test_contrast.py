@@ -7,10 +7,10 @@ import pytest
 
 from loopwright.diagrams.drawing import shapes, svg
 from loopwright.diagrams.frequency.loop_transfer import COLORS
+from loopwright.diagrams.plotting import DARK, STONE
+from loopwright.diagrams.plotting.style import STYLE
 from loopwright.diagrams.report import pages
 from loopwright.diagrams.report.variant import LOOKS, OTHER, look_of
-from loopwright.diagrams.results import DARK, STONE
-from loopwright.diagrams.results.plots import STYLE
 
 CSS = (Path(pages.__file__).parent / "templates" / "style.css").read_text(encoding="utf-8")
 TEXT, GRAPHIC = 4.5, 3.0

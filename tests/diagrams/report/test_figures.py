@@ -9,6 +9,7 @@ import pytest
 
 from loopwright.blocks import Constant, Gain, Integrator, StateSpace, TransferFunction
 from loopwright.diagrams import Diagram, Number, Report, Section, Table, Verdict, analyse
+from loopwright.diagrams.plotting import BLUE
 from loopwright.diagrams.report.case import Case
 from loopwright.diagrams.report.figures import AxisUnits, MeasuredCurve, contact_admittance, contact_map, measured
 from loopwright.diagrams.report.figures.loop_figures import DrawnLoops, bode, nyquist, set_degrees
@@ -18,7 +19,6 @@ from loopwright.diagrams.report.pages.definitions import definition
 from loopwright.diagrams.report.pages.html import to_html
 from loopwright.diagrams.report.pages.svg import embedded
 from loopwright.diagrams.report.sections.loops import gang_of_four
-from loopwright.diagrams.results import BLUE
 from support import reviewed
 
 

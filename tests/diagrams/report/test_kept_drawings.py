@@ -2,9 +2,9 @@
 
 import pickle
 
+from loopwright.diagrams.plotting import new_figure
 from loopwright.diagrams.report.pages import Plot, Section, draw_section, keep_drawings
 from loopwright.diagrams.report.pages.svg import embedded
-from loopwright.diagrams.results import new_figure
 
 
 def make_section():

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ....blocks.core import with_unit
+from ...blocks.core import with_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

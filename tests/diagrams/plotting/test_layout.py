@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from loopwright.diagrams.results import WIDTH, lay_out, legend_above, new_figure, style
+from loopwright.diagrams.plotting import WIDTH, lay_out, legend_above, new_figure, style
 
 SLACK = 1.5
 """Pixels by which rounding may move a label."""

@@ -1,0 +1,44 @@
+"""Figures: their style, axes, layout, and whether pyplot has them."""
+
+from .axes import AxisUnits, set_frequencies, set_magnitudes, set_powers
+from .figures import new_figure, save, shown_figure
+from .layout import lay_out
+from .style import (
+    BLUE,
+    DARK,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    STONE,
+    VERMILION,
+    WIDTH,
+    legend_above,
+    limit_time,
+    marker_of,
+    style,
+)
+
+__all__ = [
+    "BLUE",
+    "DARK",
+    "GREEN",
+    "GREY",
+    "ORANGE",
+    "PURPLE",
+    "STONE",
+    "VERMILION",
+    "WIDTH",
+    "AxisUnits",
+    "lay_out",
+    "legend_above",
+    "limit_time",
+    "marker_of",
+    "new_figure",
+    "save",
+    "set_frequencies",
+    "set_magnitudes",
+    "set_powers",
+    "shown_figure",
+    "style",
+]
