@@ -18,7 +18,8 @@ from loopwright.diagrams.cli import options as _cli_options
 from loopwright.diagrams.cli.command_line import main
 from loopwright.diagrams.paper.experiment_numbers import DEFINITIONS, key_numbers
 from loopwright.diagrams.paper.figures import plot_experiment, plot_path
-from loopwright.diagrams.plotting.style import STYLE, save
+from loopwright.diagrams.plotting import save
+from loopwright.diagrams.plotting.style import STYLE
 from support.waiting import FAR
 
 HEADER = (
@@ -369,7 +370,7 @@ def test_an_interrupt_while_figures_are_saved_leaves_the_earlier_files(tmp_path,
     def interrupt(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("loopwright.diagrams.results.save", interrupt)
+    monkeypatch.setattr("loopwright.diagrams.plotting.save", interrupt)
     capsys.readouterr()
     assert main(["run", "A", "B", "--out", str(tmp_path)]) == 130
     err = capsys.readouterr().err
@@ -407,7 +408,7 @@ def test_files_that_cannot_be_written_leave_the_earlier_ones(tmp_path, capsys, m
     def full(*arguments, **options):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("loopwright.diagrams.results.save", full)
+    monkeypatch.setattr("loopwright.diagrams.plotting.save", full)
     capsys.readouterr()
     assert main(["run", "A", "--out", str(tmp_path)]) == 1
     said = capsys.readouterr().err
