@@ -895,20 +895,25 @@ class Diagram:
         *,
         subsystem: str = "",
         closed: bool | Iterable[str] | None = None,
+        width: float = 1000.0,
     ) -> Drawing:
         """Draw the diagram itself: blocks, subsystems with their rates, wires with their names, FMUs marked.
 
-        Signals run from left to right; feedback runs back below. Nothing but Python is needed.
+        Signals run from left to right; feedback runs back below. What is much wider than ``width`` is broken into
+        rows, which are read like lines of text. Inside a block is its value, its transfer function, its
+        characteristic or its waveform; a block of your own says it by the property ``drawn_inside``.
 
         Parameters
         ----------
         path : path, optional
-            File to write, ``.svg``.
+            File to write: ``.svg``; ``.png`` and ``.pdf`` with the extra ``pdf``.
         subsystem : str
             Path of the subsystem whose inside is drawn; the whole diagram without it.
         closed : bool or list of str, optional
             Subsystems that are drawn closed: all of them, or those of the list. Without it all are open, in a diagram
             of more than 40 blocks closed.
+        width : float
+            Width in pixels that the drawing should have; by default that of a notebook.
 
         Returns
         -------
@@ -918,11 +923,11 @@ class Diagram:
         Raises
         ------
         OptionError
-            No such subsystem, a file that is no ``.svg``, or a folder that isn't there.
+            No such subsystem, a file of another ending, a folder that isn't there, or an extra that isn't installed.
         """
         from .drawing import Drawing, draw
 
-        drawing = Drawing(draw(self.structure, self.name, subsystem=subsystem, closed=closed))
+        drawing = Drawing(draw(self.structure, self.name, subsystem=subsystem, closed=closed, width=width))
         if path is not None:
             drawing.save(path)
         return drawing

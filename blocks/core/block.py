@@ -208,6 +208,11 @@ class Block(Value, Wireable):
         return type(self).__name__
 
     @property
+    def drawn_inside(self) -> str:
+        """Text that a drawing shows inside the block, such as ``"K / T s + 1"``, a fraction; empty for the usual."""
+        return ""
+
+    @property
     def absent_states(self) -> Mapping[str, str]:
         """Reason, and a next step, for each state that other parameters give the block, and its own leave out."""
         return {}

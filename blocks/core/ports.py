@@ -101,7 +101,8 @@ def _known(kind: str, limits: Mapping[str, Any], *more: str) -> dict[str, Any]:
 
 
 LIMITS = ("nominal", "minimum", "maximum")
-_TAKEN = frozenset({"name", "inputs", "outputs", "states", "events", "replace", "parameters", "stepped", "drawn_as"})
+_TAKEN = frozenset({"name", "inputs", "outputs", "states", "events", "replace", "parameters", "stepped"})
+_TAKEN |= {"drawn_as", "drawn_inside"}
 
 
 def check_port_names(cls: type) -> None:

@@ -1,8 +1,11 @@
 """Drawings of diagrams."""
 
-from .svg import Drawing, draw
+from .drawing import Drawing
+from .printer import printer
+from .svg import draw
 
 __all__ = [
     "Drawing",
     "draw",
+    "printer",
 ]

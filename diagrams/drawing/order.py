@@ -201,10 +201,21 @@ def place_layers(layers: list[list[Node]], links: Sequence[Link], *, gap: Callab
                 ]
                 wanted.append((_median(pulls), sum(w for _, w in pulls)) if pulls else (node.y, 0.1))
             _settle(layer, wanted, gap)
-    top = min((node.y for layer in layers for node in layer), default=0.0)
-    for layer in layers:
-        for node in layer:
-            node.y = round(node.y - top)
+    _close_up([node for layer in layers for node in layer], gap)
+
+
+def _close_up(nodes: Sequence[Node], gap: Callable[[Node, Node], float]) -> None:
+    """Shift nodes up where a band across the whole drawing is empty, and round their heights."""
+    lowest: Node | None = None
+    shift = 0.0
+    for node in sorted(nodes, key=lambda node: node.y):
+        if lowest is None:
+            shift = node.y
+        else:
+            shift += max(node.y - shift - (lowest.y + lowest.height) - gap(lowest, node), 0.0)
+        node.y = round(node.y - shift)
+        if lowest is None or node.y + node.height > lowest.y + lowest.height:
+            lowest = node
 
 
 def _stiffness(a: Node, b: Node) -> float:

@@ -2,63 +2,38 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from html import escape
-from pathlib import Path
 
-from ...blocks.core import OptionError, Sum, accepts, check_file, explain_calls, kinds, near, write_text
+from ...blocks.core import OptionError, Sum, accepts, kinds, near
 from ..wiring import Structure, stepped_blocks
-from .drawing_layout import Net, arrange
+from .drawing_layout import Net
 from .nets import Border, Nets, PinPlace
 from .order import Node, Pin
-from .shapes import BORDER, GREY, INK, NAME, PLANT, WIRE, line, rect, seconds, text_at, width
+from .rows import arrange_in_rows
+from .shapes import BORDER, GREY, INK, NAME, PLANT, WIRE, line, rect, seconds, style, text_at, width_of
+from .symbols import Symbol, symbol_of
 
 MANY = 40
 """Blocks above which subsystems are drawn closed by default."""
+
+WIDTH = 1000.0
+"""Width in pixels above which chains of blocks are broken into rows: that of a notebook's cell."""
 
 HEADER, MARGIN, PIN = 24.0, 14.0, 18.0
 TINTS = ("#eaf2fb", "#e6f5ec", "#f3ecfa", "#fdebec", "#e8f4f6", "#f6f2e2")
 """Colours of sampled subsystems, one for each sample time."""
 
 
-@explain_calls
-class Drawing:
-    """A diagram's drawing; a notebook shows it.
-
-    Attributes
-    ----------
-    svg : str
-        The drawing.
-    """
-
-    def __init__(self, svg: str):
-        self.svg = svg
-
-    def _repr_svg_(self) -> str:
-        return self.svg
-
-    def __repr__(self) -> str:
-        return f"<drawing, {len(self.svg)} characters of SVG>"
-
-    @accepts(path=kinds.path)
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the drawing to a file, ``.svg``, and return the file.
-
-        Raises
-        ------
-        OptionError
-            If the file has another ending, or its folder isn't there.
-        """
-        file = Path(path)
-        if file.suffix.lower() != ".svg":
-            raise OptionError(f"found {str(path)!r}; expected a file for SVG; name it {file.stem}.svg.")
-        write_text(check_file(file), self.svg)
-        return file
-
-
-@accepts(subsystem=kinds.text, closed=kinds.either(kinds.flag, kinds.names))
-def draw(table: Structure, name: str, *, subsystem: str = "", closed: bool | Iterable[str] | None = None) -> str:
+@accepts(subsystem=kinds.text, closed=kinds.either(kinds.flag, kinds.names), width=kinds.positive)
+def draw(
+    table: Structure,
+    name: str,
+    *,
+    subsystem: str = "",
+    closed: bool | Iterable[str] | None = None,
+    width: float = WIDTH,
+) -> str:
     """Return the drawing of a diagram, or of the inside of one of its subsystems, as SVG.
 
     Parameters
@@ -71,6 +46,8 @@ def draw(table: Structure, name: str, *, subsystem: str = "", closed: bool | Ite
         Path of the subsystem whose inside is drawn; the whole diagram without it.
     closed : bool or list of str, optional
         Subsystems that are drawn closed, all or some; by default all of them in a diagram of more than 40 blocks.
+    width : float
+        Width in pixels above which chains of blocks are broken into rows.
 
     Raises
     ------
@@ -83,7 +60,7 @@ def draw(table: Structure, name: str, *, subsystem: str = "", closed: bool | Ite
         raise OptionError(
             f"there is no subsystem {subsystem!r}. {near(subsystem, paths)}", block=name, port="subsystem"
         )
-    return _Picture(table, shut - {subsystem}).page(subsystem, subsystem or name)
+    return _Picture(table, shut - {subsystem}, width).page(subsystem, subsystem or name)
 
 
 def _find_closed(table: Structure, subsystem: str, closed: bool | Iterable[str] | None, *, diagram: str) -> set[str]:
@@ -106,12 +83,14 @@ def _find_closed(table: Structure, subsystem: str, closed: bool | Iterable[str] 
 class _Picture:
     """A drawing in the making."""
 
-    def __init__(self, table: Structure, closed: set[str]):
+    def __init__(self, table: Structure, closed: set[str], limit: float):
         self.table = table
+        self.limit = limit
         self.closed = closed
         rates = sorted({f.sample_time for f in table.subsystems.values() if f.sample_time is not None})
         self.tints = {rate: TINTS[i % len(TINTS)] for i, rate in enumerate(rates)}
         self.nets = Nets(table)
+        self.symbols: dict[str, Symbol | None] = {}
 
     # --- layout -----------------------------------------------------------------------------------------------------
 
@@ -123,7 +102,7 @@ class _Picture:
             texts = {
                 name: (side, text) for side, names in enumerate(self._pin_texts(subsystem)) for name, text in names
             }
-            wide = [max((width(text, 9) for side, text in texts.values() if side == i), default=0.0) for i in (0, 1)]
+            wide = [max((width_of(text, 9) for side, text in texts.values() if side == i), default=0.0) for i in (0, 1)]
             left, right, top = left + wide[0] + 16 + MARGIN, right + wide[1] + 16 + MARGIN, top + HEADER
             border = self._border(subsystem, -MARGIN, -HEADER, w + 2 * MARGIN, h + HEADER + MARGIN)
             for pin in pins:
@@ -135,13 +114,14 @@ class _Picture:
         w, h = w + left + right, h + top + 2 * MARGIN
         about = f"Block diagram of {title}: {len(self.table.blocks)} blocks."
         return (
-            f'<svg xmlns="http://www.w3.org/2000/svg" width="{w:g}" height="{h:g}" viewBox="0 0 {w:g} {h:g}" '
-            f'role="img" font-family="Helvetica, Arial, sans-serif" font-size="10" fill="{INK}">\n'
-            f"<title>{escape(about)}</title>\n"
+            f'<svg xmlns="http://www.w3.org/2000/svg" class="lw-drawing" width="{w:g}" height="{h:g}" '
+            f'viewBox="0 0 {w:g} {h:g}" style="max-width:100%;height:auto" role="img" '
+            f'font-family="Helvetica, Arial, sans-serif" font-size="10" fill="{INK}">\n'
+            f"<title>{escape(about)}</title>\n{style()}"
             f'<g transform="translate({left:g} {top:g})">\n{border}{body}</g>\n</svg>\n'
         )
 
-    def _lay_out(self, subsystem: str) -> tuple[str, float, float, list[Node]]:
+    def _lay_out(self, subsystem: str, depth: int = 0) -> tuple[str, float, float, list[Node]]:
         """Lay out the inside of a subsystem; return its drawing, its width and height, and the pins on its border."""
         table = self.table
         items = [p for p, f in table.subsystem_of.items() if f == subsystem]
@@ -154,8 +134,8 @@ class _Picture:
             elif path in self.closed:
                 nodes.append(self._closed_node(path))
             else:
-                body, w, h, pins = self._lay_out(path)
-                node = Node(path, max(w + 2 * MARGIN, width(self._header(path), 10, True) + 20), h + HEADER + MARGIN)
+                body, w, h, pins = self._lay_out(path, depth + 1)
+                node = Node(path, max(w + 2 * MARGIN, width_of(self._header(path), 10, True) + 20), h + HEADER + MARGIN)
                 node.ins = {name: p.y + HEADER for p in pins for name in p.outs}
                 node.outs = {name: p.y + HEADER for p in pins for name in p.ins}
                 self._place_control_pins(node)
@@ -173,11 +153,11 @@ class _Picture:
         for (place, pin), sinks in self.nets.of[subsystem].items():
             name = self.nets.label_at(place, pin, sinks)
             part = any(self.nets.is_part(*sink) for sink in sinks)
-            label = (width(name, 9) + 10 if name else 0.0) + (14.0 if part else 0.0)
+            label = (width_of(name, 9) + 10 if name else 0.0) + (14.0 if part else 0.0)
             ends = [(end.key(p), p) for end, p in sinks]
             nets.append(Net(f"{place} {pin}", (place.key(pin), pin), ends, label))
             names.append(name)
-        w, h = arrange([*borders, *nodes], nets)
+        w, h = arrange_in_rows([*borders, *nodes], nets, self.limit - depth * 2 * MARGIN)
         out = [self._wire(net) for net in nets]
         out += [self._item(node, drawn.get(node.key)) for node in nodes]
         out += [self._label(net, name, nodes) for net, name in zip(nets, names, strict=True)]
@@ -210,7 +190,9 @@ class _Picture:
         if isinstance(block, Sum):
             signs = [block.signs[declared_in.index(n.port)].replace("-", "−") for n in ins]
             return list(zip(ins, signs, strict=True)), [(n, "") for n in outs]
-        plain_in, plain_out = len(declared_in) == 1, len(declared_out) == 1
+        wired = {pin.port for pin in outs}
+        main = [n for n, port in block.outputs.items() if n in wired or not getattr(port, "secondary", False)]
+        plain_in, plain_out = (len(ports) == 1 and not block.stepped for ports in (declared_in, main))
         return [(n, "" if plain_in else n.port) for n in ins], [(n, "" if plain_out else n.port) for n in outs]
 
     def _block_node(self, path: str) -> Node:
@@ -221,23 +203,43 @@ class _Picture:
             node = Node(path, 34.0, max(rows * 16.0 + 4, 30.0))
             top, pitch = node.height / 2 - (rows - 1) * 8.0, 16.0
         else:
-            texts = width(title, 10.5, True), width(kind, 8.5)
+            inside = self._symbol(path)
+            wide, high = inside.size if inside else (0.0, 0.0)
+            texts = width_of(title, 10.5, True), width_of(kind, 8.5) if self._shows_kind(path) else 0.0
             rows = max(len(ins), len(outs), 1)
-            sides = max((width(t, 8.5) for _, t in ins), default=0) + max((width(t, 8.5) for _, t in outs), default=0)
-            named = any(t for _, t in [*ins, *outs])
-            node = Node(path, max(*texts, sides + 16) + 18, (34.0 if named else 22.0) + rows * PIN if named else 40.0)
-            top, pitch = (34.0 + PIN / 2, PIN) if named else (20.0, PIN)
+            if self._has_named_pins(path):
+                sides = [max((width_of(t, 8.5) for _, t in pins), default=0.0) for pins in (ins, outs)]
+                across = 2 * max(sides) + wide + 24 if inside else sum(sides) + 16
+                head = 34.0 if self._shows_kind(path) else 22.0
+                room = max(rows * PIN, high + 4)
+                node = Node(path, max(*texts, across) + 18, head + room)
+                top, pitch = head + PIN / 2 + (room - rows * PIN) / 2, PIN
+            else:
+                node = Node(path, max(*texts, wide) + 18, 27.0 + high if inside else 40.0)
+                top, pitch = (21.0 + high / 2 if inside else 20.0), PIN
         node.ins = {n: top + i * pitch for i, (n, _) in enumerate(ins)}
         node.outs = {n: top + i * pitch for i, (n, _) in enumerate(outs)}
         if isinstance(self.table.blocks[path], Sum):
             node.outs = dict.fromkeys(node.outs, round(node.height / 2))
         return node
 
+    def _symbol(self, path: str) -> Symbol | None:
+        if path not in self.symbols:
+            self.symbols[path] = symbol_of(self.table.blocks[path])
+        return self.symbols[path]
+
+    def _shows_kind(self, path: str) -> bool:
+        """Whether the block's kind is written below its name: its symbol says it as well."""
+        return self._symbol(path) is None
+
+    def _has_named_pins(self, path: str) -> bool:
+        return any(text for pins in self._pin_texts(path) for _, text in pins)
+
     def _closed_node(self, path: str) -> Node:
         ins, outs = self._pin_texts(path)
         rows = max(len(ins), len(outs), 1)
-        sides = max((width(t, 8.5) for _, t in ins), default=0) + max((width(t, 8.5) for _, t in outs), default=0)
-        node = Node(path, max(width(self._header(path), 10, True), sides + 16) + 24, 40.0 + rows * PIN)
+        sides = sum(max((width_of(t, 8.5) for _, t in pins), default=0.0) for pins in (ins, outs))
+        node = Node(path, max(width_of(self._header(path), 10, True), sides + 16) + 24, 40.0 + rows * PIN)
         node.ins = {n: 40.0 + i * PIN for i, (n, _) in enumerate(ins)}
         node.outs = {n: 40.0 + i * PIN for i, (n, _) in enumerate(outs)}
         return node
@@ -285,12 +287,17 @@ class _Picture:
         """Return the border of a subsystem, with its texts."""
         rate = self.table.rate(path)
         tint = self.tints[rate] if rate is not None else "#f5f6f7"
+        kind = f"lw-rate{TINTS.index(tint)}" if rate is not None else "lw-plain"
         name, *rest = self._headings(path)
-        more = f'<tspan fill="{GREY}" font-weight="normal"> · {escape(" · ".join(rest))}</tspan>' if rest else ""
+        more = (
+            f'<tspan class="lw-grey" fill="{GREY}" font-weight="normal"> · {escape(" · ".join(rest))}</tspan>'
+            if rest
+            else ""
+        )
         dash = ' stroke-dasharray="5 3"' if self.table.subsystems[path].control else ""
         return (
-            f'<g><title>{escape(path)}</title><rect x="{x:g}" y="{y:g}" width="{w:g}" height="{h:g}" rx="5" '
-            f'fill="{tint}" stroke="{BORDER}"{dash}/>\n'
+            f'<g><title>{escape(path)}</title><rect class="{kind}" x="{x:g}" y="{y:g}" width="{w:g}" height="{h:g}" '
+            f'rx="5" fill="{tint}" stroke="{BORDER}"{dash}/>\n'
             f'<text x="{x + 10:g}" y="{y + 16:g}" font-weight="bold">{escape(name)}{more}</text></g>\n'
         )
 
@@ -308,10 +315,14 @@ class _Picture:
             out.append(rect(x, y, w, h, PLANT if plant else "#ffffff", 3, 1.4 if plant else 1))
             if plant:
                 out.append(rect(x + 2.5, y + 2.5, w - 5, h - 5, "none", 2, 0.7))
-            named = any(t for pins in self._pin_texts(path) for _, t in pins)
-            top = y + (16 if named else h / 2 - 2.5)
+            inside, named, shown = self._symbol(path), self._has_named_pins(path), self._shows_kind(path)
+            top = y + (h / 2 - 2.5 if not named and not inside else 16)
             out.append(text_at(middle, top, title, 10.5, anchor="middle", bold=True))
-            out.append(text_at(middle, top + 11.5, kind, 8.5, anchor="middle", fill=GREY))
+            if shown:
+                out.append(text_at(middle, top + 11.5, kind, 8.5, anchor="middle", fill=GREY))
+            if inside:
+                head = 34.0 if shown and named else 22.0
+                out.append(inside.draw(middle, y + (head + (h - head) / 2 - 1 if named else 21 + inside.size[1] / 2)))
         out.append(self._pin_marks(node) + "</g>\n")
         return "".join(out)
 
@@ -327,7 +338,7 @@ class _Picture:
 
     def _wire(self, net: Net) -> str:
         out = [line(*net.runs)] if net.runs else []
-        out += [f'<circle cx="{x:g}" cy="{y:g}" r="2.2" fill="{WIRE}"/>\n' for x, y in net.dots]
+        out += [f'<circle class="lw-mark" cx="{x:g}" cy="{y:g}" r="2.2" fill="{WIRE}"/>\n' for x, y in net.dots]
         return "".join(out)
 
     def _label(self, net: Net, name: str, nodes: list[Node]) -> str:
@@ -343,7 +354,7 @@ class _Picture:
             if item in by_key:
                 node = by_key[item]
                 x, y = node.x, node.y + node.ins[pin]
-                out.append(f'<path d="M{x:g} {y:g}l-6.5 -3v6z" fill="{WIRE}"/>\n')
+                out.append(f'<path class="lw-mark" d="M{x:g} {y:g}l-6.5 -3v6z" fill="{WIRE}"/>\n')
                 part = self.nets.parts.get((item, pin))
                 if part is not None:
                     out.append(text_at(x - 8, y - 3.5, part, 8, anchor="end", fill=GREY))

@@ -6,21 +6,14 @@ import os
 from pathlib import Path
 from typing import Any
 
-from ....blocks.core import OptionError, accepts, kinds
+from ....blocks.core import accepts, kinds
+from ...drawing import printer
 from .filled_pages import fill_pages, fit_summary
 
 
-def printer() -> Any:
-    """Return the library that lays pages out."""
-    try:
-        import plutoprint
-    except ImportError as error:
-        raise OptionError(
-            'a PDF needs PlutoPrint, which is not installed. Install it: pip install "loopwright[pdf]"; or print the '
-            "HTML page from a browser.",
-            port="pdf",
-        ) from error
-    return plutoprint
+def pdf_printer() -> Any:
+    """Return the library that lays a report out for print, or raise an error that says how to install it."""
+    return printer("a PDF", "print the HTML page from a browser", "pdf")
 
 
 PAPERS = ("A4", "letter")
@@ -30,7 +23,7 @@ PAPER = kinds.choice(*PAPERS).worded(f"one of {', '.join(PAPERS)}", "Choose one 
 @accepts(None, paper=PAPER)
 def write_pdf(html: str, path: str | os.PathLike[str], paper: str = "A4") -> int:
     """Write a page as PDF; return the number of its pages."""
-    library = printer()
+    library = pdf_printer()
     size = library.PAGE_SIZE_LETTER if paper == "letter" else library.PAGE_SIZE_A4
 
     def lay_out(page: str) -> Any:

@@ -11,7 +11,7 @@ from ....blocks.core import OptionError, accepts, check_file, explain_calls, rep
 from .document import Document
 from .html import to_html
 from .json import to_json
-from .pdf import PAPER, printer, write_pdf
+from .pdf import PAPER, pdf_printer, write_pdf
 
 
 @explain_calls
@@ -56,7 +56,7 @@ def check_files(path: str | os.PathLike[str] | None, *, pdf: bool, json: bool, p
         raise OptionError(f"found {str(path)!r}; expected a file that ends in .html.{step}", port="path")
     check_file(path)
     if pdf:
-        printer()
+        pdf_printer()
 
 
 def write_report(
