@@ -199,7 +199,7 @@ PUBLIC = {
         GuardError HandForce HandProfile Hold IIR Input Integrator Latch LimitedIntegrator Line Lookup1D
         Lookup2D LoopwrightError Maximum Minimum MovingAverage NonFiniteError Not OptionError Or Output PID
         PadeDelay ParameterError Path PathDomainError PathProjection PathSpring PathTracking PeriodicLoopError PiecewiseLinear
-        PlanarModel Product Pulse PulseTrain PythonFunction Quantizer Ramp RateLimiter Recorded Reference Relay
+        PlanarModel Power Product Pulse PulseTrain PythonFunction Quantizer Ramp RateLimiter Recorded Reference Relay
         Requirement ResettableIntegrator SampleTimeError Saturation ShapeError Signal SimulationError Sine
         SmoothStep SpringDamper Stack State StateMachine StateSpace Step StopCondition Sum Switch TraceError
         TransferFunction TransportDelay TransverseTransform Unit UnitConversion UnitDelay UnitError UnknownNameError

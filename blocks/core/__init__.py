@@ -51,6 +51,7 @@ from .findings import Finding
 from .frozen import FrozenMapping
 from .instants import FINEST, is_before, left_of, move_earlier, next_edge, period_of, read_time, right_of
 from .layout import Layout, elements, lay_out
+from .numpy_functions import Units, result_unit
 from .one_thread import on_one_thread, one_thread
 from .outside import EvaluationVectors, Wanted
 from .parameters import ParameterSpec
@@ -65,6 +66,7 @@ from .units import (
     describe_mismatch,
     parse_unit,
     print_unit,
+    raise_unit,
     rate_of,
     same_dimension,
     same_unit,
@@ -127,6 +129,7 @@ __all__ = [
     "TraceError",
     "Unit",
     "UnitError",
+    "Units",
     "UnknownArgumentError",
     "UnknownAttributeError",
     "UnknownNameError",
@@ -170,10 +173,12 @@ __all__ = [
     "period_of",
     "primary_outputs",
     "print_unit",
+    "raise_unit",
     "rate_of",
     "read_time",
     "recorder",
     "replace_file",
+    "result_unit",
     "right_of",
     "same_dimension",
     "same_unit",

@@ -1,4 +1,4 @@
-"""Blocks that operators on signals make: sum, gain and product, and the stack that a list of signals makes."""
+"""Blocks of arithmetic, which operators on signals make: sum, gain and product, and the stack of a list of signals."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 from . import arguments as kinds
 from .block import Block
 from .errors import ShapeError
-from .ports import Input, Output, Shape, number_inputs
-from .signals import register_operator_block
+from .numpy_functions import Units, follow_entries, multiply_units
+from .ports import Input, Output, PortUnit, Shape, number_inputs
+from .units import same_unit
 from .values import Array, parameter
 
 
@@ -38,7 +39,6 @@ def check_shapes(**values: Array) -> None:
             )
 
 
-@register_operator_block("sum")
 class Sum(Block):
     """Sum with signs: y = ± u₁ ± u₂ ….
 
@@ -77,7 +77,6 @@ class Sum(Block):
         return total
 
 
-@register_operator_block("gain")
 class Gain(Block):
     """Gain: y = k u, element by element, or the matrix product y = K u for a matrix K.
 
@@ -112,7 +111,6 @@ class Gain(Block):
         return self.gain @ u.u if getattr(self.gain, "ndim", 0) == 2 else self.gain * u.u
 
 
-@register_operator_block("product")
 class Product(Block):
     """Product, element by element: y = u₁ u₂.
 
@@ -131,22 +129,29 @@ class Product(Block):
         check_shapes(**u._asdict())
         return u.u1 * u.u2
 
+    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
+        """Return the product of the factors' units."""
+        known = {name: unit for name, unit in units.items() if unit is not None}
+        return {"y": follow_entries(multiply_units, known, "multiply")} if len(known) == 2 else {}
 
-@register_operator_block("stack")
+
 class Stack(Block):
-    """Vector of the entries of its inputs, in a row.
+    """Vector of the entries of its inputs, in a row; other tools call it a mux.
 
     A tuple or a list of signals in a call makes one: ``observer((u, y))`` is ``observer(Stack()(u, y))``.
+    `Demux` is its reverse.
 
-    Inputs ``u1``, ``u2``, … are scalars or vectors. The output ``y`` has as many entries as all of them together.
+    Inputs ``u1``, ``u2``, … are scalars or vectors. The output ``y`` has as many entries as all of them together. With
+    ``rows=True``, as ``np.stack`` makes it, vectors are the rows of a matrix, and scalars the entries of a vector.
 
     Raises
     ------
     ShapeError
-        For a matrix as input, when the diagram is built.
+        For a matrix as input, and for rows of different shapes, when the diagram is built.
     """
 
     count: int = parameter(default=2, minimum=1, description="number of inputs")
+    rows: bool = parameter(default=False, description="True for one row of a matrix by each vector")
     y = Output(shape=None, description="the entries of all inputs")
 
     @property
@@ -161,4 +166,18 @@ class Stack(Block):
                 raise ShapeError(
                     f"found shape {shape_of(value)}; expected a scalar or a vector. Wire a part of it.", port=name
                 )
+            if self.rows and shape_of(value) != shape_of(u[0]):
+                raise ShapeError(
+                    f"found shape {shape_of(value)} next to {shape_of(u[0])}; expected rows of one shape. Write "
+                    "np.concatenate, or a list of the signals, for their entries in a row.",
+                    port=name,
+                )
+        if self.rows and shape_of(u[0]):
+            return np.stack(u)
         return np.concatenate([value if shape_of(value) else np.stack([value]) for value in u])
+
+    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
+        """Return the unit that all entries have."""
+        first = units["u1"]
+        alike = isinstance(first, str) and all(isinstance(u, str) and same_unit(u, first) for u in units.values())
+        return {"y": first} if alike else {}

@@ -19,7 +19,7 @@ from .errors import (
     WiringError,
     near,
 )
-from .ports import Event, Input, Output, Port, State, check_port_names
+from .ports import Event, Input, Output, Port, PortUnit, State, check_port_names
 from .signals import (
     Call,
     Signal,
@@ -255,6 +255,23 @@ class Block(Value, Wireable):
         mapping of str to ndarray of bool
             By input, and by ``"t"`` and ``"x"`` for time and all states: which entries of the equation depend on which
             of these.
+        """
+        return {}
+
+    def output_units(self, units: Mapping[str, PortUnit]) -> Mapping[str, PortUnit]:
+        """Return the units of outputs that follow from those of the inputs, as of a product; none, unless overridden.
+
+        It goes without saying for an output that is ``like`` an input.
+
+        Parameters
+        ----------
+        units : mapping of str to unit
+            Unit of each input; None where it is not known.
+
+        Raises
+        ------
+        UnitError
+            For units that the block does not take. Its port is the input, and its text begins with "expected".
         """
         return {}
 

@@ -6,88 +6,29 @@ one. Both can be wired on, indexed, unpacked, named, and used in ``+``, ``-`` an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from contextvars import ContextVar
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from .errors import (
     LoopwrightError,
-    ShapeError,
     UnknownNameError,
     WiringError,
     near,
 )
 from .explained_calls import explain_calls
 from .index import as_index
-from .numpy_guard import NoNumber
-
-B = TypeVar("B")
-
-
-_OPERATOR_BLOCKS: dict[str, Callable[..., Any]] = {}
-
-
-def register_operator_block(name: str) -> Callable[[type[B]], type[B]]:
-    """Register the class of the blocks that an operator on signals makes.
-
-    The names are ``sum``, ``gain``, ``product``, ``stack`` and ``constant``. Blocks need signals, and operators on
-    signals make blocks: registering keeps the imports one way.
-    """
-
-    def register(cls: type[B]) -> type[B]:
-        made: Any = cls
-        _OPERATOR_BLOCKS[name] = made
-        return cls
-
-    return register
-
+from .operators import Operators, concatenate, has_signals, operate
 
 recorder: ContextVar[list[Any] | None] = ContextVar("loopwright_calls", default=None)
 """Calls made while a subsystem's function runs: a call that closes a loop counts even if its result is not used."""
 
 
-class Wireable(NoNumber):
+class Wireable(Operators["Signal"]):
     """Source of a wire: a signal, a call, or a block with one output."""
-
-    def _signal(self) -> Signal:
-        raise NotImplementedError
-
-    def __add__(self, other: Any) -> Signal:
-        return _sum(self, other, "++")
-
-    def __radd__(self, other: Any) -> Signal:
-        return _sum(other, self, "++")
-
-    def __sub__(self, other: Any) -> Signal:
-        return _sum(self, other, "+-")
-
-    def __rsub__(self, other: Any) -> Signal:
-        return _sum(other, self, "+-")
-
-    def __neg__(self) -> Signal:
-        # a sum keeps the unit, which a gain would not
-        return _operate("sum", f"minus_{_operand(self, 'constant')}", self, signs="-")
-
-    def __mul__(self, other: Any) -> Signal:
-        return _product(self, other)
-
-    def __rmul__(self, other: Any) -> Signal:
-        return _product(self, other)
-
-    def __rmatmul__(self, matrix: Any) -> Signal:
-        return _operate("gain", f"gain_of_{_operand(self, 'constant')}", self, gain=matrix)
-
-    def __truediv__(self, other: Any) -> Signal:
-        if isinstance(other, Wireable):
-            raise WiringError(
-                "a signal can't be divided by a signal; use Function(np.divide)(a, b), or write a Block whose equation "
-                "does it.",
-                block=self._source_name(),
-            )
-        return self * (1.0 / np.asarray(other, dtype=float))
 
     def __getitem__(self, index: int | slice) -> Signal:
         return self._signal()[index]
@@ -107,26 +48,27 @@ class Wired(Wireable):
 
     __hash__ = object.__hash__
 
-    def _decision_error(self, quantity: str) -> WiringError:
+    def _decision_error(self, quantity: str, instead: str) -> WiringError:
         """Return the error of a decision that needs numbers."""
         return WiringError(
-            f"{self!r} has no {quantity} while the diagram is wired: its values come with the run. Write the decision "
-            "as a block's equation, with np.where(…).",
+            f"{self!r} has no {quantity} while the diagram is wired: its values come with the run. {instead}",
             block=self._source_name(),
         )
 
     def __bool__(self) -> bool:
-        raise self._decision_error("truth value")
+        raise self._decision_error(
+            "truth value",
+            "Write np.where(condition, then, otherwise) for if, np.minimum and np.maximum for min and max, &, | and ~ "
+            "for and, or and not, and (low < u) & (u < high) for low < u < high.",
+        )
 
     def __eq__(self, other: object) -> bool:
         if isinstance(other, int | float | np.number | np.ndarray):
-            raise self._decision_error("value to compare")
+            raise self._decision_error(
+                "value to compare",
+                "Write abs(u - value) < tolerance: a signal that varies continuously has a value at single instants.",
+            )
         return self is other
-
-    def __lt__(self, other: object) -> bool:
-        raise self._decision_error("value to compare")
-
-    __le__ = __gt__ = __ge__ = __lt__
 
 
 @explain_calls
@@ -284,12 +226,11 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
     """
     if isinstance(value, Wireable):
         return value._signal()
-    if _has_signals(value):
+    if has_signals(value):
         return _stack(value, block, port)
     if isinstance(value, int | float | np.number | np.ndarray | list | tuple) and not isinstance(value, bool):
         with suppress(ValueError):
-            constant: Signal = _OPERATOR_BLOCKS["constant"](value=value)._signal()
-            return constant
+            return operate("Constant", "constant", value=value)
     raise WiringError(
         f"found {value!r}; expected a signal, a call, a block with one output, numbers, or a list of these.",
         block=block,
@@ -297,59 +238,14 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
     )
 
 
-def _has_signals(value: Any) -> bool:
-    """Return whether a value is a collection with a signal in it."""
-    if isinstance(value, np.ndarray):
-        return value.dtype == object and any(isinstance(entry, Wireable) for entry in value.flat)
-    return isinstance(value, list | tuple) and any(isinstance(v, Wireable) or _has_signals(v) for v in value)
-
-
 def _stack(values: Any, block: str, port: str) -> Signal:
     """Return the signal with the entries of signals and numbers in a row."""
     parts = list(values)
-    if any(_has_signals(part) for part in parts):
+    if any(has_signals(part) and not isinstance(part, Wireable) for part in parts):
         raise WiringError(
             "found a list of lists with signals in it; expected one list, as a signal is a vector. Write the signals "
             "one after the other.",
             block=block,
             port=port,
         )
-    signals = [as_signal(part, block=block, port=port) for part in parts]
-    name = "_and_".join(_operand(part, "constant") for part in parts)
-    return _operate("stack", name, *signals, count=len(signals))
-
-
-def _operand(value: Any, default: str) -> str:
-    signal = value._signal() if isinstance(value, Wireable) else None
-    if signal is None:
-        return default
-    if signal.wire:
-        return signal.wire
-    outputs = getattr(signal.source, "outputs", ())
-    return signal.source.label if len(outputs) == 1 else signal.port
-
-
-def _operate(kind: str, name: str, *operands: Any, **parameters: Any) -> Signal:
-    """Return the output of a block that an operator makes; its name is numbered where it repeats."""
-    block = _OPERATOR_BLOCKS[kind](**parameters)
-    object.__setattr__(block, "_hint", name)
-    signal: Signal = block(*operands)._signal()
-    return signal
-
-
-def _sum(left: Any, right: Any, signs: str) -> Signal:
-    word = {"++": "plus", "+-": "minus"}[signs]
-    name = f"{_operand(left, 'constant')}_{word}_{_operand(right, 'constant')}"
-    return _operate("sum", name, left, right, signs=signs)
-
-
-def _product(left: Any, right: Any) -> Signal:
-    if isinstance(right, Wireable):
-        name = f"{_operand(left, 'constant')}_times_{_operand(right, 'constant')}"
-        return _operate("product", name, left, right)
-    if not isinstance(right, int | float | np.number | np.ndarray) or np.ndim(right) > 1:
-        raise ShapeError(
-            f"found a factor of shape {np.shape(right)}; expected a number, a vector or another signal. Apply a matrix "
-            "as K @ signal."
-        )
-    return _operate("gain", f"gain_of_{_operand(left, 'constant')}", left, gain=right)
+    return concatenate([as_signal(part, block=block, port=port) for part in parts])

@@ -11,7 +11,6 @@ from .block import Block
 from .errors import UnitError
 from .instants import move_earlier
 from .ports import Output, PortUnit
-from .signals import register_operator_block
 from .units import parse_unit, rate_of
 from .values import Array, parameter
 
@@ -52,7 +51,6 @@ class Source(Block):
         return float(np.min(times[move_earlier(times) > t], initial=math.inf))
 
 
-@register_operator_block("constant")
 class Constant(Source):
     """Constant number or array."""
 

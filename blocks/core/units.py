@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import lru_cache
 
 from .errors import UnitError, near
@@ -261,6 +262,91 @@ def describe_mismatch(a: Unit | str, b: Unit | str) -> str:
         return f"{a.text} and {b.text} differ by an offset of {offset:.12g}: give both in {b.base_text}"
     gain = f"{a.factor / b.factor:.12g}"
     return f"{a.text} and {b.text} differ by a factor of {gain}: put Gain(gain={gain}) between"
+
+
+def combine_units(*factors: tuple[str, int]) -> str | None:
+    """Return the unit of a product of powers, such as ``m/s`` of m and s⁻¹; None where a factor has an offset.
+
+    Numbers in it count as angles as well as not, if an angle is among the factors: the speed r ω is in m/s.
+
+    Examples
+    --------
+    >>> combine_units(("m/s", 1), ("s", -1)), combine_units(("N", 1), ("m", 1)), combine_units(("m", 1), ("mm", -1))
+    ('m/s2', 'N.m', 'm/mm')
+    """
+    read = [(parse_unit(text), power) for text, power in factors]
+    if any(unit.offset and not unit.relative for unit, _ in read):
+        return None
+    powers: dict[str, int] = {}
+    for unit, power in read:
+        for symbol, n in _symbol_powers(unit):
+            powers[symbol] = powers.get(symbol, 0) + n * power
+    text = _write_unit({symbol: n for symbol, n in powers.items() if n})
+    kg, m, s, A, K, mol, cd, rad = (sum(u.exponents[i] * n for u, n in read) for i in range(len(BASE_UNITS)))
+    made = Unit(text, (kg, m, s, A, K, mol, cd, rad), math.prod(u.factor**n for u, n in read))
+    loose = any(unit.exponents[-1] or unit.loose_angle for unit, _ in read)
+    if not loose and not any(isinstance(factor, DefinedUnit) for factor, _ in factors):
+        return text
+    return DefinedUnit(replace(made, loose_angle=loose))
+
+
+def root_unit(text: str, degree: int) -> str | None:
+    """Return the unit of a root, such as ``m`` of ``m2``; None where it has none, as of ``m``.
+
+    Examples
+    --------
+    >>> root_unit("m2/s2", 2), root_unit("m", 2)
+    ('m/s', None)
+    """
+    unit = parse_unit(text)
+    powers = dict(_symbol_powers(unit))
+    if unit.offset or any(n % degree for n in (*powers.values(), *unit.exponents)):
+        return None
+    written = _write_unit({symbol: n // degree for symbol, n in powers.items()})
+    if not isinstance(text, DefinedUnit):
+        return written
+    kg, m, s, A, K, mol, cd, rad = (n // degree for n in unit.exponents)
+    made = Unit(written, (kg, m, s, A, K, mol, cd, rad), unit.factor ** (1 / degree), loose_angle=unit.loose_angle)
+    return DefinedUnit(made)
+
+
+def raise_unit(text: str, exponent: float) -> str | None:
+    """Return the unit of a power, such as ``m2`` of m with exponent 2; None where it has none, as of m with 0.3.
+
+    Examples
+    --------
+    >>> raise_unit("m", 2), raise_unit("m2", 1.5), raise_unit("s", -1), raise_unit("m", 0.3)
+    ('m2', 'm3', '1/s', None)
+    """
+    ratio = Fraction(exponent).limit_denominator(12)
+    if not math.isclose(ratio, exponent, rel_tol=1e-12):
+        return None
+    whole = combine_units((text, ratio.numerator))
+    return whole if whole is None or ratio.denominator == 1 else root_unit(whole, ratio.denominator)
+
+
+def _symbol_powers(unit: Unit) -> list[tuple[str, int]]:
+    """Return the symbols of a unit with their powers; a name that is defined elsewhere is one symbol."""
+    try:
+        if not same_unit(_parse(unit.text), replace(unit, relative=False)):
+            return [(unit.text, 1)]
+    except UnitError:
+        return [(unit.text, 1)]
+    top, _, bottom = unit.text.partition("/")
+    found = []
+    for part, sign in ((top, 1), (bottom.strip().strip("()"), -1)):
+        for word in re.split(r"[.·*\s]+", part.strip()) if part else []:
+            match = _FACTOR.fullmatch(word)
+            if match is not None and match[1] != "1":
+                found.append((match[1], sign * int(match[2] or 1)))
+    return found
+
+
+def _write_unit(powers: dict[str, int]) -> str:
+    top = [s if n == 1 else f"{s}{n}" for s, n in powers.items() if n > 0]
+    bottom = [s if n == -1 else f"{s}{-n}" for s, n in powers.items() if n < 0]
+    below = "" if not bottom else f"/{bottom[0]}" if len(bottom) == 1 else f"/({'.'.join(bottom)})"
+    return f"{'.'.join(top) or '1'}{below}"
 
 
 _POWERS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

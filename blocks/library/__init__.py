@@ -1,6 +1,6 @@
 """Blocks of everybody's diagrams."""
 
-from .algebra import DeadZone, Maximum, Minimum, Saturation
+from .algebra import DeadZone, Maximum, Minimum, Power, Saturation
 from .contact import HandProfile, SpringDamper, Wall
 from .delays import Delay, PadeDelay, TransportDelay
 from .filters import FIR, IIR, DiscreteIntegrator, MovingAverage
@@ -58,6 +58,7 @@ __all__ = [
     "Or",
     "PadeDelay",
     "PiecewiseLinear",
+    "Power",
     "Pulse",
     "PulseTrain",
     "PythonFunction",

@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from ..core import Array, Block, Input, Output, ParameterError, check_shapes, parameter, shorten
+from ..core import (
+    Array,
+    Block,
+    Input,
+    Output,
+    ParameterError,
+    PortUnit,
+    Units,
+    check_shapes,
+    parameter,
+    raise_unit,
+    shorten,
+)
 from .branching import NumberedInputs
 
 
@@ -42,6 +55,30 @@ class Maximum(NumberedInputs):
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the largest."""
         return self.fold(u, lambda a, b: np.where(a > b, a, np.where(b >= a, b, a + b)))
+
+
+class Power(Block):
+    """Power with a constant exponent, element by element: y = uⁿ; ``u**2`` makes one.
+
+    A number that is not whole takes no negative u: the result is NaN, which stops the run. The unit of y is the power
+    of the input's where FMI can write it: m2 of m, but none of m with the exponent 0.3.
+    """
+
+    exponent: float = parameter(structural=True, description="exponent n")
+    u = Input(shape=None, description="base, of any shape")
+    y = Output(shape=None, description="the power")
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the power."""
+        return u.u**self.exponent
+
+    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
+        """Return the power of the input's unit."""
+        unit = units["u"]
+        if isinstance(unit, tuple):
+            powers = [raise_unit(entry, self.exponent) for entry in unit]
+            return {} if None in powers else {"y": tuple(power for power in powers if power is not None)}
+        return {} if unit is None else {"y": raise_unit(unit, self.exponent)}
 
 
 class Limited(Block):

@@ -9,7 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, Block, Input, Output, ParameterError, Shape, Signal, kinds, parameter, shorten
+from ..core import (
+    Array,
+    Block,
+    Input,
+    Output,
+    ParameterError,
+    PortUnit,
+    Shape,
+    Signal,
+    Units,
+    kinds,
+    parameter,
+    result_unit,
+    shorten,
+)
 
 
 class Function(Block):
@@ -17,10 +31,11 @@ class Function(Block):
 
     ``Function(np.sin)(u)``, ``Function(lambda a, b: a * b)(a, b)``. The inputs have the names of the function's
     arguments, except arguments with a default, which keep it. The inputs of a NumPy function are ``u``, or ``u1``,
-    ``u2``, …. A function that can't be traced is refused when the diagram is built; `PythonFunction` takes any. Two
-    such blocks are equal if their functions are one object. The block can be pickled if the function can, which needs a
-    name in a module. In a trace ``np.minimum``, ``np.maximum`` and ``np.clip`` replace a NaN by their other argument:
-    write ``np.where`` instead.
+    ``u2``, …; its result has the unit that follows from theirs. ``np.sin(u)`` of a signal makes such a block, ``a / b``
+    makes ``Function(np.divide)``. A function that can't be traced is refused when the diagram is built;
+    `PythonFunction` takes any. Two such blocks are equal if their functions are one object. The block can be pickled if
+    the function can, which needs a name in a module. In a trace ``np.minimum``, ``np.maximum`` and ``np.clip`` replace
+    a NaN by their other argument: write ``np.where`` instead.
 
     Raises
     ------
@@ -81,6 +96,10 @@ class Function(Block):
     def output(self, t: Array, x: Any, u: Any) -> Any:
         """Return the function's result."""
         return self.function(*u)  # type: ignore[operator]
+
+    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
+        """Return the unit of a NumPy function's result."""
+        return dict.fromkeys(self.outputs, result_unit(self.function, units)) if len(self.outputs) == 1 else {}
 
     def _refuse(self, port: str, found: str, expected: str) -> ParameterError:
         return ParameterError(f"found {found}; expected {expected}.", block=self.label, port=port)

@@ -12,7 +12,22 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, Block, Event, Input, Output, State, check_shapes, kinds, parameter
+from ..core import (
+    Array,
+    Block,
+    Event,
+    Input,
+    Output,
+    PortUnit,
+    State,
+    UnitError,
+    Units,
+    check_shapes,
+    describe_mismatch,
+    kinds,
+    parameter,
+    same_unit,
+)
 from .branching import NumberedInputs, check_fits, expect_scalar, truth
 
 _OPERATORS = {">": (1.0, 1.0), "<": (-1.0, 1.0), "<=": (1.0, 0.0), ">=": (-1.0, 0.0)}
@@ -185,6 +200,14 @@ class Switch(Block):
         check_shapes(then=u.then, otherwise=u.otherwise, condition=u.condition)
         other = np.where(u.condition <= 0.5, u.otherwise, u.condition)
         return np.where(u.condition > 0.5, u.then, other)
+
+    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
+        """Return the unit that both branches have."""
+        then, other = units["then"], units["otherwise"]
+        if isinstance(then, str) and isinstance(other, str) and not same_unit(then, other):
+            step = describe_mismatch(other, then)
+            raise UnitError(f"expected {then} as `then` next to it is: {step}", port="otherwise")
+        return {"y": other if then is None else then}
 
     def indicators(self, t: Array, x: Any, u: Any) -> Array:
         """Return the distance of the condition above 0.5."""

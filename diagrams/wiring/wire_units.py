@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 
-from ...blocks.core import PortUnit, UnitError, describe_mismatch, same_dimension, same_unit
+from ...blocks.core import Block, PortUnit, UnitError, describe_mismatch, same_dimension, same_unit
 from ...blocks.library import UnitConversion
 from .structure import Structure, Wire, join
 
@@ -35,9 +36,21 @@ def follow_units(table: Structure, converted: Mapping[Port, Unit]) -> dict[Port,
             wire = table.wires.get((path, like)) if like and not hasattr(port, "start") else None
             if wire is not None and (path, name) not in units:
                 followers.setdefault((wire.block, wire.port), []).append(((path, name), (path, str(like)), wire))
+    rules: dict[Port, list[str]] = {}  # blocks whose outputs have units that follow from several inputs
+    for path in _with_rules(table):
+        for name in table.blocks[path].inputs:
+            if (wire := table.wires.get((path, name))) is not None:
+                rules.setdefault((wire.block, wire.port), []).append(path)
     waiting = list(units)
     while waiting:
-        for output, end, wire in followers.get(waiting.pop(), ()):
+        source = waiting.pop()
+        for path in rules.get(source, ()):
+            with suppress(UnitError):  # check_units raises it
+                for name, unit in table.blocks[path].output_units(_input_units(table, units, converted, path)).items():
+                    if unit is not None and (path, name) not in units:
+                        units[path, name] = unit
+                        waiting.append((path, name))
+        for output, end, wire in followers.get(source, ()):
             unit = converted.get(end) or _part_unit(units, wire)
             if unit is not None:
                 units[output] = unit
@@ -77,7 +90,30 @@ def check_units(table: Structure) -> dict[Port, Unit]:
                     block=path,
                     port=name,
                 )
+    for path in _with_rules(table):
+        try:
+            table.blocks[path].output_units(_input_units(table, units, {}, path))
+        except UnitError as error:
+            wire = table.wires[path, str(error.port)]
+            error.message = f"{wire} is in {_text(_part_unit(units, wire))}; {error.message}"
+            raise error.blame(path) from None
     return units
+
+
+def _with_rules(table: Structure) -> Iterator[str]:
+    """Yield the blocks whose outputs have units that follow from those of their inputs by a rule."""
+    yield from (p for p, block in sorted(table.blocks.items()) if type(block).output_units is not Block.output_units)
+
+
+def _input_units(
+    table: Structure, units: Mapping[Port, Unit], converted: Mapping[Port, Unit], path: str
+) -> dict[str, Unit]:
+    """Return the unit of each input of a block, None where it is not known."""
+    wires = {name: table.wires.get((path, name)) for name in table.blocks[path].inputs}
+    return {
+        name: converted.get((path, name)) or (None if wire is None else _part_unit(units, wire))
+        for name, wire in wires.items()
+    }
 
 
 def add_unit_conversions(table: Structure) -> Structure:

@@ -9,7 +9,6 @@ import pytest
 from loopwright.blocks import (
     Block,
     Constant,
-    Function,
     Gain,
     Input,
     Output,
@@ -161,14 +160,16 @@ def test_an_output_like_an_input_has_its_unit_and_the_shape_of_the_equations():
         lambda s: s and 1,
         lambda s: s == 0,
         lambda s: s != 0.0,
-        lambda s: s > 0,
-        lambda s: s <= 0,
-        lambda s: s < s,
+        lambda s: 0.0 < s < 1.0,
+        lambda s: min(s, 2.0),
+        lambda s: np.max([s, s]),
     ],
 )
 @pytest.mark.parametrize("signal", [Constant(value=1.0).y, Gain(gain=2.0)(1.0)], ids=["signal", "call"])
 def test_nothing_is_decided_on_a_signal_while_wiring(decide, signal):
-    with pytest.raises(WiringError, match=r"while the diagram is wired: its values come with the run.*np\.where"):
+    with pytest.raises(
+        WiringError, match=r"while the diagram is wired: its values come with the run. Write (np\.where|abs)"
+    ):
         decide(signal)
 
 
@@ -210,19 +211,21 @@ def test_a_source_names_its_wire():
 @pytest.mark.parametrize(
     ("act", "instead"),
     [
-        (lambda y: y**2, r"Function(lambda u: u**2)(u)"),
-        (lambda y: y**y, r"Function(np.power)(a, b)"),
-        (lambda y: 2.0**y, r"Function(lambda u: 2.0**u)(u)"),
-        (lambda y: np.ones(2) ** y, r"Function(lambda u: array([1., 1.])**u)(u)"),
-        (lambda y: 1.0 / y, r"Function(lambda u: 1.0 / u)(u)"),
-        (lambda y: y / y, r"Function(np.divide)(a, b)"),
-        (abs, r"Function(np.abs)(u)"),
-        (lambda y: y % 2.0, r"Function(lambda u: np.mod(u, …))(u)"),
-        (lambda y: y // 2.0, r"Function(lambda u: np.floor(u / …))(u)"),
-        (np.sin, r"np.sin can't be applied to a signal: its values come with the run. Use Function(np.sin)(u), or"),
-        (lambda y: np.hypot(y, 2.0), r"Function(np.hypot)(a, b)"),
-        (lambda y: np.hypot(2.0, y), r"Function(np.hypot)(a, b)"),
-        (lambda y: np.sin(y, out=np.zeros(1)), r"Function(np.sin)(u)"),
+        (lambda y: y % 2.0, r"Function(lambda u: np.mod(u, …))(u) in a sampled subsystem"),
+        (lambda y: y // 2.0, r"Function(lambda u: np.floor(u / …))(u) in a sampled subsystem"),
+        (np.floor, r"np.floor can't be applied to a signal: its values come with the run. It jumps, where a solver"),
+        (np.sign, r"Write (u > 0.0) - (u < 0.0), whose"),
+        (np.round, r"Use Quantizer(interval=1.0)(u)"),
+        (lambda y: np.interp(y, [0, 1], [0, 1]), r"Use Lookup1D(breakpoints=…, values=…)(u)"),
+        (np.shape, r"Its shape follows when the diagram is built"),
+        (lambda y: np.sin(y, out=np.zeros(1)), r"np.sin can't be applied to a signal"),
+        (np.add.reduce, r"np.add.reduce can't be applied to a signal"),
+        (
+            np.fft.fft,
+            r"np.fft can't be applied to a signal: its values come with the run. Write it as the function of a",
+        ),
+        (np.where, r"Write np.where(condition, then, otherwise)"),
+        (float, r"Use NumPy's functions, which make blocks: np.sin(u) for math.sin"),
     ],
 )
 def test_what_can_be_done_with_numbers_only_says_what_to_write_instead(act, instead):
@@ -232,26 +235,6 @@ def test_what_can_be_done_with_numbers_only_says_what_to_write_instead(act, inst
         with pytest.raises(WiringError, match=re.escape(instead)) as error:
             act(signal)
         assert error.value.block == "k"
-
-
-def test_what_an_error_says_to_write_can_be_built():
-    u, c = Constant(value=3.0), Constant(value=2.0)
-    made = [
-        Function(np.power)(u, c).named("power"),
-        Function(lambda u: u**2)(u).named("square"),
-        Function(lambda u: 2.0**u)(u).named("exp2"),
-        Function(lambda u: 1.0 / u)(u).named("inverse"),
-        Function(np.divide)(u, c).named("ratio"),
-        Function(np.abs)(-1.0 * u).named("size"),
-        Function(lambda u: np.mod(u, 2.0))(u).named("rest"),
-        Function(lambda u: np.floor(u / 2.0))(u).named("times"),
-        Function(lambda a, b: np.stack([a, b]))(u, c).named("pair"),
-    ]
-    run = Diagram("d", *made).simulate(1.0, step=1.0, progress=False)
-    found = {name: run[name][-1].tolist() for name in ("power", "square", "exp2", "inverse", "ratio", "size", "rest")}
-    assert found == {"power": 9, "square": 9, "exp2": 8, "inverse": 1 / 3, "ratio": 1.5, "size": 3, "rest": 1}
-    assert run["times"][-1] == 1
-    assert run["pair"][-1].tolist() == [3, 2]
 
 
 def test_arrays_and_numpys_numbers_work_with_signals_from_either_side():
@@ -279,7 +262,7 @@ def test_arrays_and_numpys_numbers_work_with_signals_from_either_side():
         "matrix": w * x,
     }
     assert {name: run[name][-1].tolist() for name in made} == {name: value.tolist() for name, value in want.items()}
-    for act in (lambda: w > a.y, lambda: w <= a(), lambda: w == a.y, lambda: a.y != w):
+    for act in (lambda: w == a.y, lambda: a.y != w):
         with pytest.raises(WiringError, match="has no value to compare while the diagram is wired"):
             act()
     assert (w == a) is False  # a block is a value, and no array
