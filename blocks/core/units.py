@@ -2,7 +2,9 @@
 
 The grammar is that of the Modelica specification (chapter 19), which FMI 3.0 (2.4.3, Units) builds on: factors joined
 by a dot (``N.s/m``), one ``/`` at most, a denominator of several factors in parentheses (``J/(kg.K)``), integer
-exponents with or without ``^`` (``m/s2``, ``m^2``, ``s-1``). A space or ``*`` between two factors is read as a dot.
+exponents with or without ``^`` (``m/s2``, ``m^2``, ``s-1``). Beyond it are read: a space, ``*`` or ``·`` between two
+factors as a dot, raised digits (``m³/s``), a quotient as the denominator (``N/(m/s)``), and what everybody writes
+without the dot: ``Nm``, ``Wh``, ``Ah``, ``VA``.
 """
 
 from __future__ import annotations
@@ -105,7 +107,13 @@ _PREFIXED = {
     "T": _unit(kg=1, s=-2, A=-1),
     "Hz": _unit(s=-1),
     "l": _unit(1e-3, m=3),
+    "L": _unit(1e-3, m=3),
     "bar": _unit(1e5, kg=1, m=-1, s=-2),
+    "Nm": _unit(kg=1, m=2, s=-2),
+    "Wh": _unit(3600.0, kg=1, m=2, s=-2),
+    "Ah": _unit(3600.0, s=1, A=1),
+    "VA": _unit(kg=1, m=2, s=-3),
+    "rpm": _unit(2 * math.pi / 60, rad=1, s=-1),
 }
 _PLAIN = {
     "kg": _unit(kg=1),
@@ -114,7 +122,8 @@ _PLAIN = {
     "deg": _unit(math.pi / 180, rad=1),
     "°": _unit(math.pi / 180, rad=1),
     "rev": _unit(2 * math.pi, rad=1),
-    "rpm": _unit(2 * math.pi / 60, rad=1, s=-1),
+    "t": _unit(1e3, kg=1),
+    "ppm": _unit(1e-6),
     "min": _unit(60.0, s=1),
     "h": _unit(3600.0, s=1),
     "d": _unit(86400.0, s=1),
@@ -139,13 +148,28 @@ def _symbol(symbol: str, text: str) -> Unit:
     raise UnitError(f"the unit {text!r} has an unknown symbol {symbol!r}. {hint} {_NEXT}")
 
 
-def _factors(part: str, text: str) -> list[tuple[Unit, int]]:
-    found = []
-    for word in re.split(r"[.·*\s]+", part.strip()):
-        match = _FACTOR.fullmatch(word)
-        if match is None:
-            raise UnitError(f"the unit {text!r} can't be read at {word!r}. {_NEXT}")
-        found.append((_symbol(match[1], text), int(match[2] or 1)))
+_RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+
+
+def _powers(text: str) -> list[tuple[str, int]]:
+    """Return the symbols of a unit with their powers, in the order in which they are written."""
+    found: list[tuple[str, int]] = []
+    rest, sign = text.translate(_RAISED), 1
+    while rest:
+        top, slash, bottom = rest.partition("/")
+        bottom = bottom.strip()
+        whole = bottom.startswith("(") and bottom.endswith(")")
+        if slash and not whole and len(re.split(r"[.·*/\s]+", bottom)) > 1:
+            hint = "Put a denominator of several factors in parentheses: 'J/(kg.K)'."
+            raise UnitError(f"the unit {text!r} is ambiguous after '/'. {hint}")
+        for word in re.split(r"[.·*\s]+", top.strip()):
+            match = _FACTOR.fullmatch(word)
+            if match is None:
+                raise UnitError(f"the unit {text!r} can't be read at {word!r}. {_NEXT}")
+            found.append((match[1], sign * int(match[2] or 1)))
+        if slash and not bottom.strip("() "):
+            raise UnitError(f"the unit {text!r} can't be read at {bottom!r}. {_NEXT}")
+        rest, sign = bottom[1:-1] if whole else bottom, -sign
     return found
 
 
@@ -181,14 +205,9 @@ def parse_unit(text: str) -> Unit:
 
 @lru_cache(maxsize=1024)
 def _parse(text: str) -> Unit:
-    top, slash, bottom = text.partition("/")
-    bottom = bottom.strip()
-    if slash and bottom.startswith("(") and bottom.endswith(")"):
-        bottom = bottom[1:-1]
-    elif slash and len(re.split(r"[.·*/\s]+", bottom)) > 1:
-        hint = "Put a denominator of several factors in parentheses: 'J/(kg.K)'."
-        raise UnitError(f"the unit {text!r} is ambiguous after '/'. {hint}")
-    factors = _factors(top, text) + [(unit, -power) for unit, power in (_factors(bottom, text) if slash else [])]
+    factors = [(_symbol(symbol, text), power) for symbol, power in _powers(text)]
+    if not factors:
+        raise UnitError(f"the unit {text!r} can't be read at ''. {_NEXT}")
     if len(factors) > 1 and any(unit.offset for unit, _ in factors):
         raise UnitError(f"the unit {text!r} has a temperature with an offset as a factor. Use 'K' for differences.")
     exponents = [sum(unit.exponents[i] * power for unit, power in factors) for i in range(len(BASE_UNITS))]
@@ -277,11 +296,7 @@ def combine_units(*factors: tuple[str, int]) -> str | None:
     read = [(parse_unit(text), power) for text, power in factors]
     if any(unit.offset and not unit.relative for unit, _ in read):
         return None
-    powers: dict[str, int] = {}
-    for unit, power in read:
-        for symbol, n in _symbol_powers(unit):
-            powers[symbol] = powers.get(symbol, 0) + n * power
-    text = _write_unit({symbol: n for symbol, n in powers.items() if n})
+    text = _write_unit([(symbol, n * power) for unit, power in read for symbol, n in _symbol_powers(unit)])
     kg, m, s, A, K, mol, cd, rad = (sum(u.exponents[i] * n for u, n in read) for i in range(len(BASE_UNITS)))
     made = Unit(text, (kg, m, s, A, K, mol, cd, rad), math.prod(u.factor**n for u, n in read))
     loose = any(unit.exponents[-1] or unit.loose_angle for unit, _ in read)
@@ -302,7 +317,7 @@ def root_unit(text: str, degree: int) -> str | None:
     powers = dict(_symbol_powers(unit))
     if unit.offset or any(n % degree for n in (*powers.values(), *unit.exponents)):
         return None
-    written = _write_unit({symbol: n // degree for symbol, n in powers.items()})
+    written = _write_unit([(symbol, n // degree) for symbol, n in powers.items()])
     if not isinstance(text, DefinedUnit):
         return written
     kg, m, s, A, K, mol, cd, rad = (n // degree for n in unit.exponents)
@@ -332,24 +347,20 @@ def _symbol_powers(unit: Unit) -> list[tuple[str, int]]:
             return [(unit.text, 1)]
     except UnitError:
         return [(unit.text, 1)]
-    top, _, bottom = unit.text.partition("/")
-    found = []
-    for part, sign in ((top, 1), (bottom.strip().strip("()"), -1)):
-        for word in re.split(r"[.·*\s]+", part.strip()) if part else []:
-            match = _FACTOR.fullmatch(word)
-            if match is not None and match[1] != "1":
-                found.append((match[1], sign * int(match[2] or 1)))
-    return found
+    return [(symbol, power) for symbol, power in _powers(unit.text) if symbol != "1"]
 
 
-def _write_unit(powers: dict[str, int]) -> str:
+def _write_unit(factors: list[tuple[str, int]]) -> str:
+    powers: dict[str, int] = {}
+    for symbol, n in factors:
+        powers[symbol] = powers.get(symbol, 0) + n
     top = [s if n == 1 else f"{s}{n}" for s, n in powers.items() if n > 0]
     bottom = [s if n == -1 else f"{s}{-n}" for s, n in powers.items() if n < 0]
     below = "" if not bottom else f"/{bottom[0]}" if len(bottom) == 1 else f"/({'.'.join(bottom)})"
     return f"{'.'.join(top) or '1'}{below}"
 
 
-_POWERS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_WRITTEN = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _PRINTED = {"1": "", "deg": "°"}
 
 
@@ -363,7 +374,7 @@ def print_unit(text: str) -> str:
     """
     if text in _PRINTED:
         return _PRINTED[text]
-    raised = re.sub(r"(?<=[A-Za-z])(-?\d+)", lambda m: m[1].translate(_POWERS), text)
+    raised = re.sub(r"(?<=[A-Za-z])(-?\d+)", lambda m: m[1].translate(_WRITTEN), text)
     return re.sub(r"(?<=[^\s\d])[.*](?=[^\s\d])", "·", raised)
 
 
@@ -386,6 +397,8 @@ def rate_of(text: str) -> str:
     top, slash, bottom = (part.strip() for part in text.partition("/"))
     if not slash:
         return f"{top}/s"
+    if "/" in bottom:
+        return _write_unit([*_symbol_powers(parse_unit(text)), ("s", -1)])
     factors = re.split(r"[.·*\s]+", bottom.strip("()"))
     for i, word in enumerate(factors):
         if (match := re.fullmatch(r"s(?:\^?(\d+))?", word)) is not None:

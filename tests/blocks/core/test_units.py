@@ -5,7 +5,15 @@ import math
 import pytest
 
 from loopwright.blocks.core.errors import UnitError
-from loopwright.blocks.core.units import Unit, describe_mismatch, parse_unit, rate_of, same_unit
+from loopwright.blocks.core.units import (
+    Unit,
+    combine_units,
+    describe_mismatch,
+    parse_unit,
+    rate_of,
+    root_unit,
+    same_unit,
+)
 
 # By hand, from the definitions of the SI units: (kg, m, s, A, K, mol, cd, rad), factor.
 KNOWN = {
@@ -40,6 +48,27 @@ KNOWN = {
     "min": ((0, 0, 1, 0, 0, 0, 0, 0), 60.0),
     "ms": ((0, 0, 1, 0, 0, 0, 0, 0), 1e-3),
     "m.s": ((0, 1, 1, 0, 0, 0, 0, 0), 1.0),
+    "Nm": ((1, 2, -2, 0, 0, 0, 0, 0), 1.0),
+    "mNm": ((1, 2, -2, 0, 0, 0, 0, 0), 1e-3),
+    "N·m": ((1, 2, -2, 0, 0, 0, 0, 0), 1.0),
+    "N*m": ((1, 2, -2, 0, 0, 0, 0, 0), 1.0),
+    "Nm/rad": ((1, 2, -2, 0, 0, 0, 0, -1), 1.0),
+    "m³/s": ((0, 3, -1, 0, 0, 0, 0, 0), 1.0),
+    "m·s⁻²": ((0, 1, -2, 0, 0, 0, 0, 0), 1.0),
+    "W/(m²·K)": ((1, 0, -3, 0, -1, 0, 0, 0), 1.0),
+    "N/(m/s)": ((1, 0, -1, 0, 0, 0, 0, 0), 1.0),
+    "V/krpm": ((1, 2, -2, -1, 0, 0, 0, -1), 0.03 / math.pi),
+    "m3/h": ((0, 3, -1, 0, 0, 0, 0, 0), 1 / 3600),
+    "l/min": ((0, 3, -1, 0, 0, 0, 0, 0), 1e-3 / 60),
+    "L/min": ((0, 3, -1, 0, 0, 0, 0, 0), 1e-3 / 60),
+    "mbar": ((1, -1, -2, 0, 0, 0, 0, 0), 100.0),
+    "kW": ((1, 2, -3, 0, 0, 0, 0, 0), 1e3),
+    "kWh": ((1, 2, -2, 0, 0, 0, 0, 0), 3.6e6),
+    "mAh": ((0, 0, 1, 1, 0, 0, 0, 0), 3.6),
+    "km/h": ((0, 1, -1, 0, 0, 0, 0, 0), 1 / 3.6),
+    "t": ((1, 0, 0, 0, 0, 0, 0, 0), 1e3),
+    "%": ((0, 0, 0, 0, 0, 0, 0, 0), 1e-2),
+    "ppm": ((0, 0, 0, 0, 0, 0, 0, 0), 1e-6),
 }
 
 
@@ -60,7 +89,9 @@ def test_temperature_has_an_offset():
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        ("Nm", "unknown symbol 'Nm'. Did you mean"),
+        ("Nmm", "unknown symbol 'Nmm'. Did you mean 'Nm'"),
+        ("m/", "can't be read at ''"),
+        ("N/(m/s", "ambiguous after '/'"),
         ("foo", "Write it as FMI does: 'm/s2'"),
         ("", "can't be read at ''"),
         ("m/s/s", "ambiguous after '/'"),
@@ -104,3 +135,34 @@ def test_rate_is_a_unit_per_second(text):
 
 def test_rate_reads_well():
     assert [rate_of(u) for u in ("m", "m/s", "m/s2", "1", "N.s/m")] == ["m/s", "m/s2", "m/s3", "1/s", "N.s/(m.s)"]
+
+
+@pytest.mark.parametrize(
+    ("factors", "text"),
+    [
+        ((("N/(m/s)", 1), ("m/s", 1)), "N"),
+        ((("m³/s", 1), ("s", 1)), "m3"),
+        ((("Nm", 1), ("rad/s", 1)), "Nm.rad/s"),
+        ((("kg.m2", 1), ("s", -3), ("A", -1)), "kg.m2/(s3.A)"),
+        ((("m", 1), ("m", -1)), "1"),
+        ((("s", -1),), "1/s"),
+    ],
+)
+def test_products_of_units_are_written_as_fmi_does(factors, text):
+    made = combine_units(*factors)
+    assert made == text
+    want = [sum(parse_unit(u).exponents[i] * n for u, n in factors) for i in range(8)]
+    assert list(parse_unit(text).exponents) == want
+    assert math.isclose(parse_unit(made).factor, math.prod(parse_unit(u).factor ** n for u, n in factors))
+
+
+def test_units_that_have_no_product_or_root():
+    assert combine_units(("degC", 1), ("W", 1)) is None
+    assert root_unit("m.s2", 2) is None
+    assert rate_of("N/(m/s)") == "N/m"
+
+
+def test_power_with_an_angle_is_power_without_one():
+    assert same_unit(combine_units(("N.m", 1), ("rad/s", 1)), "W")
+    assert not same_unit(combine_units(("N.m", 1), ("rpm", 1)), "W")
+    assert not same_unit(combine_units(("N.m", 1), ("1/s", 1)), "W.rad")
