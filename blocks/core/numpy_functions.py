@@ -131,7 +131,7 @@ def _power(n: int) -> Rule:
 
 
 def _root(degree: int) -> Rule:
-    return lambda units, name: root_unit(*units.values(), degree)
+    return lambda units, name: root_unit(next(iter(units.values())), degree)
 
 
 def _raised(units: Mapping[str, str], name: str) -> str | None:
@@ -181,7 +181,7 @@ _AS_A_WHOLE: dict[Any, Rule] = {
     np.vdot: multiply_units,
     np.var: _power(2),
     np.linalg.inv: _power(-1),
-    np.linalg.solve: lambda units, name: _quotient(dict(reversed(units.items())), name),
+    np.linalg.solve: lambda units, name: _quotient(dict(reversed(list(units.items()))), name),
     np.linalg.det: _unknown,
     np.prod: _unknown,
     np.polyval: _unknown,

@@ -230,7 +230,8 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
         return _stack(value, block, port)
     if isinstance(value, int | float | np.number | np.ndarray | list | tuple) and not isinstance(value, bool):
         with suppress(ValueError):
-            return operate("Constant", "constant", value=value)
+            constant: Signal = operate("Constant", "constant", value=value)
+            return constant
     raise WiringError(
         f"found {value!r}; expected a signal, a call, a block with one output, numbers, or a list of these.",
         block=block,
@@ -248,4 +249,5 @@ def _stack(values: Any, block: str, port: str) -> Signal:
             block=block,
             port=port,
         )
-    return concatenate([as_signal(part, block=block, port=port) for part in parts])
+    made: Signal = concatenate([as_signal(part, block=block, port=port) for part in parts])
+    return made

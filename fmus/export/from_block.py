@@ -215,7 +215,7 @@ def build(
     return build_fmu(spec, out, fmi=fmi, arrays=arrays, platform=platform, documentation=text, notify=notify)
 
 
-def _check_exportable(block: Block, name: str) -> None:
+def _check_exportable(block: object, name: str) -> None:
     """Refuse a block with parts that an FMU would leave out silently."""
     if isinstance(block, type) or not isinstance(block, Block):
         called = f"the class {block.__name__}" if isinstance(block, type) else repr(block)
