@@ -193,11 +193,11 @@ PUBLIC = {
     "blocks": """
         AdmittanceFilter AlgebraicLoopError And Array Backlash BandLimitedNoise BetweenTicksError Block Call Chirp Circle Clock
         Compare CompilerError ConfirmationError Constant Counter CubicSpline DeadZone DefinitionError Delay
-        DiscreteIntegrator DiscreteStateSpace DiscreteTransferFunction DiscreteZeroPoleGain DiskError DoubleDriveError
+        Demux DiscreteIntegrator DiscreteStateSpace DiscreteTransferFunction DiscreteZeroPoleGain DiskError DoubleDriveError
         DuplicateNameError EdgeDetector Ellipse Encoder ErrorDynamics Event FIR FeedbackLinearization
         FilteredDerivative FmuEnd FmuError FmuFileError FmuProcessError FmuRuntimeError ForceProjection ForceSensor Frame Function Gain
         GuardError HandForce HandProfile Hold IIR Input Integrator Latch LimitedIntegrator Line Lookup1D
-        Lookup2D LoopwrightError Maximum Minimum MovingAverage NonFiniteError Not OptionError Or Output PID
+        Lookup2D LoopwrightError Maximum Minimum MovingAverage Mux NonFiniteError Not OptionError Or Output PID
         PadeDelay ParameterError Path PathDomainError PathProjection PathSpring PathTracking PeriodicLoopError PiecewiseLinear
         PlanarModel Power Product Pulse PulseTrain PythonFunction Quantizer Ramp RateLimiter Recorded Reference Relay
         Requirement ResettableIntegrator SampleTimeError Saturation ShapeError Signal SimulationError Sine

@@ -3,7 +3,7 @@
 from . import arguments as kinds
 from . import arithmetic, source
 from .arguments import Kind, accepts, check_argument, shorten
-from .arithmetic import Gain, Product, Stack, Sum, check_shapes, shape_of
+from .arithmetic import Demux, Gain, Mux, Product, Stack, Sum, check_shapes, shape_of
 from .block import SOLVED, Block
 from .brief import brief, count_of, enumerate_some
 from .collection import without_collection
@@ -89,6 +89,7 @@ __all__ = [
     "Constant",
     "DefinedUnit",
     "DefinitionError",
+    "Demux",
     "DiskError",
     "DoubleDriveError",
     "DuplicateNameError",
@@ -107,6 +108,7 @@ __all__ = [
     "Kind",
     "Layout",
     "LoopwrightError",
+    "Mux",
     "NonFiniteError",
     "OptionError",
     "Output",

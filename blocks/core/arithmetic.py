@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from . import arguments as kinds
+from .arguments import shorten
 from .block import Block
-from .errors import ShapeError
+from .errors import ParameterError, ShapeError
 from .numpy_functions import Units, follow_entries, multiply_units
 from .ports import Input, Output, PortUnit, Shape, number_inputs
 from .units import same_unit
@@ -181,3 +182,74 @@ class Stack(Block):
         first = units["u1"]
         alike = isinstance(first, str) and all(isinstance(u, str) and same_unit(u, first) for u in units.values())
         return {"y": first} if alike else {}
+
+
+Mux = Stack
+"""The name by which users of other tools look for `Stack`."""
+
+
+class Demux(Block):
+    """Parts of a vector, as signals: y₁ has its first entries, y₂ the next ones, and so on.
+
+    ``a, b = Demux(2)(vector)`` are two scalars, ``position, speed = Demux((3, 1))(vector)`` a vector of three entries
+    and a scalar. A part of a signal needs no block: ``vector[0]``, ``vector[1:3]``. `Stack` is its reverse.
+
+    Raises
+    ------
+    ParameterError
+        For sizes that are not whole numbers of one or more.
+    ShapeError
+        For a signal that is no vector of as many entries, when the diagram is built.
+    """
+
+    sizes: object = parameter(
+        kw_only=False, description="number of scalars, or the number of entries of each output; 1 makes a scalar"
+    )
+    u = Input(shape=None, description="vector")
+
+    def check(self) -> None:
+        """Refuse sizes that are no whole numbers."""
+        sizes = self.sizes if isinstance(self.sizes, tuple) else (self.sizes,)
+        if not sizes or not all(isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 1 for n in sizes):
+            raise ParameterError(
+                f"found {shorten(self.sizes)}; expected the number of scalars, such as 3, or the entries of each "
+                "output, such as (2, 1). Give whole numbers of one or more.",
+                block=self.label,
+                port="sizes",
+            )
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Number of entries of each output."""
+        sizes: Any = self.sizes
+        return tuple(map(int, sizes)) if isinstance(sizes, tuple) else (1,) * int(sizes)
+
+    @property
+    def outputs(self) -> Mapping[str, Output]:  # type: ignore[override]
+        """One output for each part: ``y1``, ``y2``, …."""
+        shapes = [() if n == 1 else (n,) for n in self.counts]
+        return {f"y{i}": Output(shape, name=f"y{i}", description="a part") for i, shape in enumerate(shapes, 1)}
+
+    def _parts(self) -> list[int | slice]:
+        ends = np.cumsum(self.counts).tolist()
+        return [end - 1 if n == 1 else slice(end - n, end) for n, end in zip(self.counts, ends, strict=True)]
+
+    def output(self, t: Array, x: Any, u: Any) -> tuple[Array, ...] | Array:
+        """Return the parts."""
+        if shape_of(u.u) != (sum(self.counts),):
+            raise ShapeError(
+                f"found shape {shape_of(u.u)}; expected a vector of {sum(self.counts)} entries, one for each of sizes="
+                f"{self.sizes}. Wire another signal, or give other sizes.",
+                port="u",
+            )
+        parts = tuple(u.u[part] for part in self._parts())
+        return parts if len(parts) > 1 else parts[0]
+
+    def output_units(self, units: Units) -> Mapping[str, PortUnit]:
+        """Return the units of the parts."""
+        unit = units["u"]
+        if not isinstance(unit, tuple):
+            return dict.fromkeys(self.outputs, unit)
+        if len(unit) != sum(self.counts):
+            return {}
+        return {name: unit[part] for name, part in zip(self.outputs, self._parts(), strict=True)}

@@ -294,6 +294,8 @@ class Block(Value, Wireable):
             raise AttributeError(name)  # optional equations are probed with hasattr; anything else would recurse
         if isinstance(port := getattr(type(self), name, None), Port):
             return port.__get__(self)  # type: ignore[attr-defined]  # raises the port's own error: it is no signal
+        if name in self.outputs:  # outputs that follow from the parameters
+            return Signal(self, name)
         known = {*self.outputs, *self.parameter_specs}
         raise UnknownAttributeError(f"it has no output or parameter {name!r}. {near(name, known)}", block=self.label)
 

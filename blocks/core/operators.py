@@ -28,110 +28,85 @@ class Operators(Generic[S]):
     def _signal(self) -> S:
         raise NotImplementedError
 
-    def _make(self, block: str, name: str, *operands: Any, **parameters: Any) -> S:
-        made: S = operate(block, name, *operands, **parameters)
-        return made
-
-    def _add(self, left: Any, right: Any, signs: str) -> S:
-        word = {"++": "plus", "+-": "minus"}[signs]
-        return self._make("Sum", f"{_operand(left)}_{word}_{_operand(right)}", left, right, signs=signs)
-
-    def _multiply(self, other: Any) -> S:
-        if has_signals(other):
-            return self._make("Product", f"{_operand(self)}_times_{_operand(other)}", self, other)
-        other = np.asarray(other) if isinstance(other, list | tuple) else other
-        if not isinstance(other, int | float | np.number | np.ndarray) or np.ndim(other) > 1:
-            raise ShapeError(
-                f"found a factor of shape {np.shape(other)}; expected a number, a vector or another signal. Apply a "
-                "matrix as K @ signal."
-            )
-        return self._make("Gain", f"gain_of_{_operand(self)}", self, gain=other)
-
-    def _divide(self, left: Any, right: Any) -> S:
-        return self._make("Function", f"{_operand(left)}_over_{_operand(right)}", left, right, function=np.divide)
-
-    def _compare(self, other: Any, relation: str, word: str) -> S:
-        return self._make("Compare", f"{_operand(self)}_{word}_{_operand(other)}", self, other, relation=relation)
-
     def __add__(self, other: Any) -> S:
-        return self._add(self, other, "++")
+        return _add(self, self, other, "++")
 
     def __radd__(self, other: Any) -> S:
-        return self._add(other, self, "++")
+        return _add(self, other, self, "++")
 
     def __sub__(self, other: Any) -> S:
-        return self._add(self, other, "+-")
+        return _add(self, self, other, "+-")
 
     def __rsub__(self, other: Any) -> S:
-        return self._add(other, self, "+-")
+        return _add(self, other, self, "+-")
 
     def __neg__(self) -> S:
         # a sum keeps the unit, which a gain would not
-        return self._make("Sum", f"minus_{_operand(self)}", self, signs="-")
+        return _make(self, "Sum", f"minus_{_operand(self)}", self, signs="-")
 
     def __pos__(self) -> S:
         return self._signal()
 
     def __mul__(self, other: Any) -> S:
-        return self._multiply(other)
+        return _multiply(self, other)
 
     def __rmul__(self, other: Any) -> S:
-        return self._multiply(other)
+        return _multiply(self, other)
 
     def __matmul__(self, other: Any) -> S:
-        return self._make("Function", f"{_operand(self)}_times_{_operand(other)}", self, other, function=np.matmul)
+        return _make(self, "Function", f"{_operand(self)}_times_{_operand(other)}", self, other, function=np.matmul)
 
     def __rmatmul__(self, other: Any) -> S:
         if not has_signals(other) and np.ndim(other) == 2:
-            return self._make("Gain", f"gain_of_{_operand(self)}", self, gain=other)
-        return self._make("Function", f"{_operand(other)}_times_{_operand(self)}", other, self, function=np.matmul)
+            return _make(self, "Gain", f"gain_of_{_operand(self)}", self, gain=other)
+        return _make(self, "Function", f"{_operand(other)}_times_{_operand(self)}", other, self, function=np.matmul)
 
     def __truediv__(self, other: Any) -> S:
         if has_signals(other):
-            return self._divide(self, other)
+            return _divide(self, self, other)
         return self * (1.0 / np.asarray(other, dtype=float))
 
     def __rtruediv__(self, other: Any) -> S:
-        return self._divide(other, self)
+        return _divide(self, other, self)
 
     def __pow__(self, other: Any) -> S:
         if not has_signals(other) and np.ndim(other) == 0:
             words = {2.0: "square", 3.0: "cube", 0.5: "root", -1.0: "inverse"}
-            return self._make("Power", f"{words.get(float(other), 'power')}_of_{_operand(self)}", self, exponent=other)
-        return self._make("Function", f"power_of_{_operand(self)}", self, other, function=np.power)
+            return _make(self, "Power", f"{words.get(float(other), 'power')}_of_{_operand(self)}", self, exponent=other)
+        return _make(self, "Function", f"power_of_{_operand(self)}", self, other, function=np.power)
 
     def __rpow__(self, other: Any) -> S:
-        return self._make("Function", f"power_of_{_operand(other)}", other, self, function=np.power)
+        return _make(self, "Function", f"power_of_{_operand(other)}", other, self, function=np.power)
 
     def __abs__(self) -> S:
-        return self._make("Function", f"abs_of_{_operand(self)}", self, function=np.absolute)
+        return _make(self, "Function", f"abs_of_{_operand(self)}", self, function=np.absolute)
 
     def __lt__(self, other: Any) -> S:
-        return self._compare(other, "<", "below")
+        return _compare(self, other, "<", "below")
 
     def __le__(self, other: Any) -> S:
-        return self._compare(other, "<=", "at_most")
+        return _compare(self, other, "<=", "at_most")
 
     def __gt__(self, other: Any) -> S:
-        return self._compare(other, ">", "above")
+        return _compare(self, other, ">", "above")
 
     def __ge__(self, other: Any) -> S:
-        return self._compare(other, ">=", "at_least")
+        return _compare(self, other, ">=", "at_least")
 
     def __and__(self, other: Any) -> S:
-        return self._make("And", f"{_operand(self)}_and_{_operand(other)}", self, other)
+        return _make(self, "And", f"{_operand(self)}_and_{_operand(other)}", self, other)
 
     def __rand__(self, other: Any) -> S:
-        return self._make("And", f"{_operand(other)}_and_{_operand(self)}", other, self)
+        return _make(self, "And", f"{_operand(other)}_and_{_operand(self)}", other, self)
 
     def __or__(self, other: Any) -> S:
-        return self._make("Or", f"{_operand(self)}_or_{_operand(other)}", self, other)
+        return _make(self, "Or", f"{_operand(self)}_or_{_operand(other)}", self, other)
 
     def __ror__(self, other: Any) -> S:
-        return self._make("Or", f"{_operand(other)}_or_{_operand(self)}", other, self)
+        return _make(self, "Or", f"{_operand(other)}_or_{_operand(self)}", other, self)
 
     def __invert__(self) -> S:
-        return self._make("Not", f"not_{_operand(self)}", self)
+        return _make(self, "Not", f"not_{_operand(self)}", self)
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
         if method == "__call__" and not options:
@@ -258,6 +233,36 @@ def _operand(value: Any) -> str:
         return str(signal.wire)
     outputs = getattr(signal.source, "outputs", ())
     return str(signal.source.label if len(outputs) == 1 else signal.port)
+
+
+def _make(owner: Operators[S], block: str, name: str, *operands: Any, **parameters: Any) -> S:
+    made: S = operate(block, name, *operands, **parameters)
+    return made
+
+
+def _add(owner: Operators[S], left: Any, right: Any, signs: str) -> S:
+    word = {"++": "plus", "+-": "minus"}[signs]
+    return _make(owner, "Sum", f"{_operand(left)}_{word}_{_operand(right)}", left, right, signs=signs)
+
+
+def _multiply(left: Operators[S], other: Any) -> S:
+    if has_signals(other):
+        return _make(left, "Product", f"{_operand(left)}_times_{_operand(other)}", left, other)
+    other = np.asarray(other) if isinstance(other, list | tuple) else other
+    if not isinstance(other, int | float | np.number | np.ndarray) or np.ndim(other) > 1:
+        raise ShapeError(
+            f"found a factor of shape {np.shape(other)}; expected a number, a vector or another signal. Apply a "
+            "matrix as K @ signal."
+        )
+    return _make(left, "Gain", f"gain_of_{_operand(left)}", left, gain=other)
+
+
+def _divide(owner: Operators[S], left: Any, right: Any) -> S:
+    return _make(owner, "Function", f"{_operand(left)}_over_{_operand(right)}", left, right, function=np.divide)
+
+
+def _compare(left: Operators[S], other: Any, relation: str, word: str) -> S:
+    return _make(left, "Compare", f"{_operand(left)}_{word}_{_operand(other)}", left, other, relation=relation)
 
 
 def _function(function: Any, word: str, *operands: Any) -> Any:

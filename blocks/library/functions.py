@@ -17,7 +17,6 @@ from ..core import (
     ParameterError,
     PortUnit,
     Shape,
-    Signal,
     Units,
     kinds,
     parameter,
@@ -87,11 +86,6 @@ class Function(Block):
     def outputs(self) -> Mapping[str, Output]:  # type: ignore[override]
         """One output for each result."""
         return {n: Output(shape, name=n) for n, shape in self._shapes("results", self.results).items()}
-
-    def __getattr__(self, name: str) -> Any:
-        if not name.startswith("_") and "results" in self.__dict__ and name in self.outputs:
-            return Signal(self, name)
-        return super().__getattr__(name)
 
     def output(self, t: Array, x: Any, u: Any) -> Any:
         """Return the function's result."""

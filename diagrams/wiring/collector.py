@@ -15,6 +15,7 @@ from ...blocks.core import (
     Wireable,
     WiringError,
 )
+from .buses import Bus
 from .structure import Structure, SubsystemSettings, Wire, join
 from .subsystems import SubsystemCall, SubsystemInput
 
@@ -104,6 +105,8 @@ class Collector:
                 self.stack.extend((s, item) for s in reversed(list(item.wires.values())))
         elif isinstance(item, Block):
             self._add_block(item, consumer)
+        elif isinstance(item, Bus):
+            self.stack.extend((s, consumer) for s in reversed(list(item.values())))
 
     def _add_block(self, block: Block, consumer: _Consumer) -> None:
         self.blocks.setdefault(id(block), block)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, KeysView
 from fractions import Fraction
-from typing import SupportsFloat, TypedDict, Unpack, overload
+from typing import Any, SupportsFloat, TypedDict, Unpack, overload
 
 from ...blocks.core import (
     Call,
@@ -25,6 +25,7 @@ from ...blocks.core import (
     recorder,
 )
 from ...blocks.tracing import check_method
+from .buses import Bus, flatten, is_bus, name_ports, nest
 
 ENABLED, TRIGGERED = ("held", "reset"), ("rising", "falling", "both")
 
@@ -208,7 +209,15 @@ class Subsystem:
                 block=self.name,
                 port=missing[0],
             )
-        return SubsystemCall(self, {k: as_signal(v, block=self.name, port=k) for k, v in given.items()})
+        buses: dict[str, dict[tuple[str, ...], str]] = {}
+        plain = {k: v for k, v in given.items() if not _is_given_as_bus(v)}
+        wires = {k: as_signal(v, block=self.name, port=k) for k, v in plain.items()}
+        for key in (k for k in given if k not in plain):
+            value = given[key]
+            signals = flatten(value.bus if isinstance(value, SubsystemCall) else value, self.name, key)
+            buses[key] = name_ports(signals, self.name, key, {**given, **wires})
+            wires |= {port: signals[path] for path, port in buses[key].items()}
+        return SubsystemCall(self, wires, buses)
 
     def __repr__(self) -> str:
         rate = "" if self.sample_time is None else f", sample_time={float(self.sample_time):g}"
@@ -218,14 +227,20 @@ class Subsystem:
 class SubsystemCall(Wireable):
     """A subsystem with its inputs, and the calls that its function made."""
 
-    def __init__(self, subsystem: Subsystem, wires: dict[str, Signal]):
+    def __init__(
+        self, subsystem: Subsystem, wires: dict[str, Signal], buses: dict[str, dict[tuple[str, ...], str]] | None = None
+    ):
         self.subsystem, self.wires, self.label = subsystem, wires, subsystem.name
+        self.bus: Bus | None = None
         calls: list[Call | SubsystemCall] = []
         token = recorder.set(calls)
         try:
             own = {p.name for p in subsystem.parameters}
             inside = [k for k in wires if k in own or k != subsystem.control_input]
-            result = subsystem.function(**{k: Signal(SubsystemInput(self, k), k) for k in inside})
+            arguments: dict[str, Signal | Bus] = {k: Signal(SubsystemInput(self, k), k) for k in inside}
+            for name, ports in (buses or {}).items():
+                arguments[name] = nest({path: arguments.pop(port) for path, port in ports.items()}, self.label)
+            result = subsystem.function(**arguments)
         finally:
             recorder.reset(token)
         self.calls = calls
@@ -238,8 +253,11 @@ class SubsystemCall(Wireable):
     def _name_results(self, result: object) -> dict[str, Signal]:
         if result is None:
             return {}
-        if isinstance(result, dict):
-            return {check_name(k): as_signal(v, block=self.label, port=str(k)) for k, v in result.items()}
+        if is_bus(result):
+            signals = flatten(result, self.label, "")
+            ports = name_ports(signals, self.label, "", {})
+            self.bus = nest({path: Signal(self, port, None, None, self) for path, port in ports.items()}, self.label)
+            return {ports[path]: signal for path, signal in signals.items()}
         if isinstance(result, Call) and len(result.primary) != 1:
             result = tuple(result)
         parts = result if isinstance(result, tuple | list) else (result,)
@@ -280,9 +298,26 @@ class SubsystemCall(Wireable):
     def __getattr__(self, name: str) -> Signal:
         if name.startswith("_") or "outputs" not in self.__dict__:
             raise AttributeError(name)
+        if self.bus is not None and name in self.bus:
+            part: Signal = self.bus[name]
+            return part
         if name in self.outputs:
             return Signal(self, name, None, None, self)
         raise UnknownAttributeError(f"it has no output {name!r}. {near(name, self.outputs)}", block=self.label)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, str):
+            return getattr(self, index) if index in self.outputs or self.bus is None else self.bus[index]
+        return self._signal()[index]
+
+    def keys(self) -> KeysView[str]:
+        """Return the names of the outputs, so that ``{**call}`` is a bus of them."""
+        return dict.fromkeys(self.outputs if self.bus is None else self.bus.keys()).keys()
+
+
+def _is_given_as_bus(value: object) -> bool:
+    """Whether an argument is a bus: a mapping, or a call of a subsystem that returns one."""
+    return is_bus(value) or (isinstance(value, SubsystemCall) and value.bus is not None)
 
 
 @overload
@@ -312,6 +347,9 @@ def subsystem(
     triggered: str | None = None,
 ) -> Subsystem | Callable[[Callable[..., object]], Subsystem]:
     """Make a subsystem of a function of signals.
+
+    An argument may be a bus, a mapping of signals by name, and so may the result: each signal is a port of the
+    subsystem.
 
     Parameters
     ----------
