@@ -232,7 +232,8 @@ def _operand(value: Any) -> str:
     if signal.wire:
         return str(signal.wire)
     outputs = getattr(signal.source, "outputs", ())
-    return str(signal.source.label if len(outputs) == 1 else signal.port)
+    primary = [p for p in outputs if not (isinstance(outputs, Mapping) and getattr(outputs[p], "secondary", False))]
+    return str(signal.source.label if len(primary) == 1 else signal.port)
 
 
 def _make(owner: Operators[S], block: str, name: str, *operands: Any, **parameters: Any) -> S:
