@@ -125,6 +125,7 @@ def test_the_page_on_frequencies_runs_and_its_numbers_are_those_it_gives(tmp_pat
     [
         "explanation/coupling",
         pytest.param("reference/other_tools", marks=pytest.mark.slow),
+        pytest.param("howto/plots", marks=pytest.mark.slow),
         pytest.param("howto/reports", marks=pytest.mark.slow),
         pytest.param("howto/worst_case", marks=pytest.mark.slow),
         pytest.param("howto/sweeps", marks=pytest.mark.slow),

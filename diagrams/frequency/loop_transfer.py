@@ -10,7 +10,7 @@ from control import StateSpace, feedback
 from numpy.typing import ArrayLike
 
 from ...blocks.core import OptionError, accepts, brief, count_of, explain_calls, kinds, shorten, with_unit
-from ..plotting import BLUE, DARK, GREEN, GREY, PURPLE, STONE, VERMILION, legend_above, shown_figure
+from ..plotting import COLORS, DARK, GREY, LINES, STONE, legend_above, shown_figure
 from .delayed_realization import DelayedRealization, realize
 from .delayed_system import DelayedSystem
 
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-COLORS = (BLUE, VERMILION, GREEN, PURPLE, DARK)
-LINES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
 POINTS = 800
 BELOW = 1 - 1e-6
 """Part of π/T up to which a sampled loop is drawn."""

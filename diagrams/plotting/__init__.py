@@ -5,9 +5,11 @@ from .figures import new_figure, save, shown_figure
 from .layout import lay_out
 from .style import (
     BLUE,
+    COLORS,
     DARK,
     GREEN,
     GREY,
+    LINES,
     ORANGE,
     PURPLE,
     STONE,
@@ -21,9 +23,11 @@ from .style import (
 
 __all__ = [
     "BLUE",
+    "COLORS",
     "DARK",
     "GREEN",
     "GREY",
+    "LINES",
     "ORANGE",
     "PURPLE",
     "STONE",

@@ -18,6 +18,11 @@ BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "
 GREY, STONE, DARK = "#A6A6A6", "#6E6E6E", "#333333"
 """Helping lines; curves and texts in the background; texts."""
 
+COLORS = (BLUE, VERMILION, GREEN, PURPLE, DARK)
+"""Colors of curves, in their order."""
+LINES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
+"""Lines of curves, in their order."""
+
 WIDTH = 170 / 25.4
 """Width of a figure in inches: the text of an A4 page."""
 

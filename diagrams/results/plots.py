@@ -1,42 +1,84 @@
-"""Plots of a run's signals over time."""
+"""Plots of runs: signals over time, and a path in the plane."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import cycle
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...blocks.core import OptionError, print_unit
-from ..plotting import limit_time, marker_of, shown_figure, style
+from ..plotting import COLORS, DARK, LINES, STONE, WIDTH, legend_above, limit_time, marker_of, shown_figure, style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from .stored import Occurrence
+
 LONG = 21
 """Letters of a name with its unit that fit next to the axes of one signal; a longer one is written above them."""
+DASHES: Any = (0, (4, 2))
+"""Line of a set-point."""
+TICKS = 2000
+"""Events are marked so far apart at least, as a part of the time that is shown."""
 
 
-class DrawnSignal(NamedTuple):
-    """A signal to draw: its name, its samples (N, …), and the unit of each entry."""
+@dataclass(frozen=True)
+class DrawnSignal:
+    """A signal to draw.
+
+    Attributes
+    ----------
+    name, run : str
+        Names of the signal and of its run; "" where there is one run.
+    t, values : ndarray
+        Times in s, shape (N,), and samples, (N, …).
+    units : sequence of str
+        Unit of each entry.
+    is_set_point : bool
+        Whether it comes from a source: nothing in the diagram changes it.
+    is_held : bool
+        Whether it is held between its samples.
+    limits : tuple of float
+        Limits that it is kept within.
+    """
 
     name: str
+    t: np.ndarray
     values: np.ndarray
     units: Sequence[str]
+    run: str = ""
+    is_set_point: bool = False
+    is_held: bool = False
+    limits: tuple[float, ...] = ()
 
 
-def plot_signals(t: np.ndarray, signals: Sequence[DrawnSignal], axes: Sequence[Axes] | None = None) -> Figure:
-    """Draw signals over time, one below the other; see `Run.plot`."""
-    if not signals:
+Panel = Sequence[DrawnSignal]
+"""The signals of one axis: those of the first run, then those of the next one."""
+
+
+def plot_signals(
+    panels: Sequence[Panel],
+    events: Sequence[Occurrence] = (),
+    axes: Sequence[Axes] | None = None,
+    xlim: tuple[float, float] | None = None,
+) -> Figure:
+    """Draw signals over time, one axis below the other; see `Run.plot`."""
+    if not panels:
         raise OptionError('found no signal to draw; expected names, such as run.plot("eta", "xi").')
-    signals = [one._replace(units=[print_unit(unit) for unit in one.units]) for one in signals]
     if axes is not None:
         with style():
-            return _draw_panels(_check_axes(axes, len(signals)), t, signals)
-    height = 0.5 + 1.35 * len(signals) + 0.2 * sum(_is_long(name, units) for name, _, units in signals)
+            return _draw_panels(_check_axes(axes, len(panels)), panels, events, xlim)
+    height = 0.5 + 1.35 * len(panels) + 0.2 * sum(_is_long(panel) for panel in panels)
     with shown_figure(height) as figure:
-        return _draw_panels(list(figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]), t, signals)
+        rows = list(figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0])
+        drawn = _draw_panels(rows, panels, events, xlim)
+        if all(_has_legend_of_runs(panel) for panel in panels):
+            legend_above(figure, rows[0])
+        return drawn
 
 
 def _check_axes(axes: Sequence[Axes], count: int) -> list[Axes]:
@@ -49,37 +91,160 @@ def _check_axes(axes: Sequence[Axes], count: int) -> list[Axes]:
     return rows
 
 
-def _draw_panels(rows: Sequence[Axes], t: np.ndarray, signals: Sequence[DrawnSignal]) -> Figure:
-    """Draw each signal into its axes, and return their figure."""
-    for ax, (name, values, units) in zip(rows, signals, strict=True):
-        long, vector = _is_long(name, units), values.ndim > 1
-        columns = values.reshape(len(values), int(np.prod(values.shape[1:])))
-        for i, column in enumerate(columns.T):
-            unit = f" [{units[i]}]" if vector and len(set(units)) > 1 and units[i] else ""
-            entry = f"{'' if long else name}[{i + 1}]{unit}"
-            ax.plot(t, column, marker=marker_of(t), label=entry if vector else name)
-        common = _common(units)
-        if long:  # next to the axes it would run into its neighbours
-            ax.set_title(name, loc="left", fontsize="medium")
-            ax.set_ylabel(common)
-        else:
-            ax.set_ylabel(f"{name} {common}".rstrip())
-        if vector:
-            ax.legend(loc="best", ncols=min(columns.shape[1], 3))
+def _draw_panels(
+    rows: Sequence[Axes], panels: Sequence[Panel], events: Sequence[Occurrence], xlim: tuple[float, float] | None
+) -> Figure:
+    """Draw each panel into its axes, and return their figure."""
+    every = [one for panel in panels for one in panel]
+    times = [one.t for one in every if len(one.t)]
+    ends = np.array([min(t[0] for t in times), max(t[-1] for t in times)]) if times else np.zeros(0)
+    shown = np.array(ends if xlim is None else xlim)
+    shared = all(_has_legend_of_runs(panel) for panel in panels)
+    for ax, panel in zip(rows, panels, strict=True):
+        _draw_panel(ax, panel, shown)
+        if _has_legend(panel) and not (shared and _has_legend_of_runs(panel)):
+            ax.legend(loc="best", ncols=min(len(ax.get_legend_handles_labels()[1]), 3))
+        if xlim is not None:
+            _fit(ax, panel, xlim)
+        limit_time(ax, shown)
+        if xlim is not None:
+            ax.set_xlim(*xlim)
+    _mark_events(rows, events, shown)
     rows[-1].set_xlabel("t [s]")
-    for ax in rows:
-        limit_time(ax, t)
     top: Any = rows[0].figure  # a figure, or a part of one
     result: Figure = top
     result.align_ylabels()
     return result
 
 
-def _common(units: Sequence[str]) -> str:
-    """Return the unit of all entries in brackets; "" where they differ, or have none."""
-    return f"[{units[0]}]" if units and units[0] and len(set(units)) == 1 else ""
+def _draw_panel(ax: Axes, panel: Panel, shown: np.ndarray) -> None:
+    """Draw the signals of one axis, with their limits where these are near."""
+    single, is_long, common = _only_name(panel), _is_long(panel), _common(panel)
+    runs = list(dict.fromkeys(one.run for one in panel))
+    by_run = _has_legend_of_runs(panel)
+    colors: dict[object, str] = {}
+    wheel = cycle(COLORS)
+    mixed = {one.is_set_point for one in panel} == {True, False}
+    for number, one in enumerate(panel):
+        dashed = mixed and one.is_set_point
+        if dashed and any(_is_same(one, earlier) for earlier in panel[:number]):
+            continue  # the set-point of all runs
+        for label, column, key in _columns(one, short=is_long, common=common):
+            color = colors.setdefault(one.run if by_run else key, "") or next(wheel)
+            colors[one.run if by_run else key] = color
+            line = DASHES if dashed else LINES[0 if by_run else runs.index(one.run) % len(LINES)]
+            is_shared = dashed and all(_is_same(one, other) for other in panel if other.name == one.name)
+            name = one.run if by_run else ", ".join(filter(None, [label, "" if is_shared else one.run]))
+            drawn = "steps-post" if one.is_held else "default"
+            look: dict[str, Any] = {"color": color, "linestyle": line, "drawstyle": drawn, "marker": marker_of(one.t)}
+            ax.plot(one.t, column, label=name, zorder=2.1 if dashed else 2.0, **look)
+    if is_long:  # next to the axes it would run into its neighbours
+        ax.set_title(panel[0].name, loc="left", fontsize="medium")
+        ax.set_ylabel(common)
+    else:
+        ax.set_ylabel(f"{panel[0].name if single else ''} {common}".strip())
+    low, high = ax.get_ylim()
+    for limit in dict.fromkeys(limit for one in panel for limit in one.limits):
+        if low - 0.5 * (high - low) <= limit <= high + 0.5 * (high - low):
+            ax.axhline(limit, color=STONE, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=1.5)
 
 
-def _is_long(name: str, units: Sequence[str]) -> bool:
-    """Whether a name with its unit is too long for the side of the axes."""
-    return len(f"{name} {_common(units)}") > LONG
+def _columns(one: DrawnSignal, *, short: bool, common: str) -> Iterator[tuple[str, np.ndarray, object]]:
+    """Yield the label, the samples and a key of each entry of a signal."""
+    units = [print_unit(unit) for unit in one.units]
+    columns = one.values.reshape(len(one.values), int(np.prod(one.values.shape[1:])))
+    for i, column in enumerate(columns.T):
+        unit = f" [{units[i]}]" if not common and units[i] else ""
+        entry = f"[{i + 1}]" if one.values.ndim > 1 else ""
+        yield ("" if short and entry else one.name) + entry + unit, column, (one.name, i)
+
+
+def _only_name(panel: Panel) -> bool:
+    """Whether an axis has one signal, of one or several runs."""
+    return len({one.name for one in panel}) == 1
+
+
+def _has_legend_of_runs(panel: Panel) -> bool:
+    """Whether the curves of an axis differ in their runs alone."""
+    return _only_name(panel) and len({one.run for one in panel}) > 1 and all(one.values.ndim == 1 for one in panel)
+
+
+def _has_legend(panel: Panel) -> bool:
+    return len(panel) > 1 or any(one.values.ndim > 1 for one in panel)
+
+
+def _common(panel: Panel) -> str:
+    """Return the unit of all curves in brackets; "" where they differ, or have none."""
+    units = {print_unit(unit) for one in panel for unit in one.units}
+    return f"[{next(iter(units))}]" if len(units) == 1 and next(iter(units)) else ""
+
+
+def _is_long(panel: Panel) -> bool:
+    """Whether the name of an axis with its unit is too long for its side."""
+    return _only_name(panel) and len(f"{panel[0].name} {_common(panel)}") > LONG
+
+
+def _is_same(one: DrawnSignal, other: DrawnSignal) -> bool:
+    return one.name == other.name and np.array_equal(one.t, other.t) and np.array_equal(one.values, other.values)
+
+
+def _fit(ax: Axes, panel: Panel, xlim: tuple[float, float]) -> None:
+    """Let an axis span the values within some times, with those next to the ends."""
+    found = []
+    for one in panel:
+        first = max(int(np.searchsorted(one.t, xlim[0], side="right")) - 1, 0)
+        last = int(np.searchsorted(one.t, xlim[1])) + 1
+        found.append(np.ravel(one.values[first:last]))
+    values = np.concatenate(found)
+    values = values[np.isfinite(values)]
+    if values.size and (span := float(np.ptp(values))) > 0.0:
+        ax.set_ylim(float(values.min()) - 0.05 * span, float(values.max()) + 0.05 * span)
+
+
+def _mark_events(rows: Sequence[Axes], events: Sequence[Occurrence], shown: np.ndarray) -> None:
+    """Mark events by ticks at the lower end of each axis, with the names of their blocks above the first one."""
+    mine = [event for event in events if len(shown) and shown[0] <= event.t <= shown[-1]]
+    if not mine:
+        return
+    step = max(float(shown[-1] - shown[0]) / TICKS, 1e-300)
+    times = list({round(event.t / step): event.t for event in mine}.values())
+    for ax in rows:
+        ax.vlines(times, 0.0, 0.05, transform=ax.get_xaxis_transform(), color=DARK, linewidth=0.8, gid="events")
+    blocks = list(dict.fromkeys(event.block for event in mine))
+    named = ", ".join(blocks[:3]) + ("" if len(blocks) <= 3 else f" and {len(blocks) - 3} more")
+    rows[0].set_title(f"ticks: events of {named}", loc="right", fontsize="small", color=STONE)
+
+
+def plot_curve(
+    curves: Mapping[str, tuple[np.ndarray, np.ndarray]], labels: tuple[str, str], axes: Axes | None, *, is_equal: bool
+) -> Figure:
+    """Draw paths in the plane, by the names of their runs; see `Run.plot_path`."""
+    if axes is not None:
+        with style():
+            return _draw_curve(axes, curves, labels, is_equal=is_equal)
+    points = [np.stack(pair) for pair in curves.values()]
+    spans = np.ptp(np.hstack(points), axis=1) if any(p.size for p in points) else np.ones(2)
+    ratio = float(spans[1] / spans[0]) if is_equal and spans[0] > 0.0 else 0.6
+    with shown_figure(float(np.clip(0.5 + (WIDTH - 0.6) * ratio, 2.0, 6.0))) as figure:
+        drawn = _draw_curve(figure.subplots(), curves, labels, is_equal=is_equal)
+        legend_above(figure, figure.axes[0])
+        return drawn
+
+
+def _draw_curve(
+    ax: Axes, curves: Mapping[str, tuple[np.ndarray, np.ndarray]], labels: tuple[str, str], *, is_equal: bool
+) -> Figure:
+    """Draw paths into axes: each begins at an open circle and ends at a full one."""
+    single = len(curves) == 1
+    for (name, (x, y)), color in zip(curves.items(), cycle(COLORS), strict=False):
+        ax.plot(x, y, color=color, label=None if single else name)
+        ends: dict[str, Any] = {"marker": "o", "markersize": 5.0, "color": color, "linestyle": "none"}
+        start = "start" if single else None
+        ax.plot(x[:1], y[:1], markerfacecolor="white", markeredgewidth=1.1, label=start, **ends)
+        ax.plot(x[-1:], y[-1:], label="end" if single else None, **ends)
+    if is_equal:
+        ax.set_aspect("equal", adjustable="datalim")
+    ax.set(xlabel=labels[0], ylabel=labels[1])
+    top: Any = ax.figure
+    result: Figure = top
+    return result

@@ -21,6 +21,8 @@ from ...blocks.core import (
     enumerate_some,
     explain_calls,
     kinds,
+    shorten,
+    with_unit,
 )
 from ..wiring import Wire, index_of, split_entry
 from .signal_names import Place, Places, entries, place_of, resolve
@@ -33,9 +35,13 @@ if TYPE_CHECKING:
     from pandas import DataFrame
     from xarray import Dataset
 
+    from .plots import DrawnSignal
     from .saved_state import RunState
 
 
+_TIMES = kinds.row.where(lambda value: len(value) == 2 and value[0] < value[1]).worded(
+    "two times in s, the first one below the other", "Give them: xlim=(0, 5)."
+)
 _MESSAGES = 3
 """Messages that the short text of a run shows; the others are counted."""
 
@@ -350,46 +356,165 @@ class Run:
         first = self.layout.total if self.columns is None else int(np.searchsorted(self.columns, self.layout.total))
         return Snapshot(float(self.t[k]), k, values, row[first:].copy(), dict(self.wires), self)
 
-    def plot(self, *names: str | Iterable[str], axes: Sequence[Axes] | None = None) -> Figure:
-        """Draw signals over time, one below the other, and return the figure.
+    def plot(
+        self,
+        *names: str | Iterable[str],
+        against: Run | Mapping[str, Run] | None = None,
+        label: str = "this run",
+        xlim: tuple[float, float] | None = None,
+        axes: Sequence[Axes] | None = None,
+    ) -> Figure:
+        """Draw signals over time, one axis below the other, and return the figure.
+
+        A set-point (the output of a source) next to other signals is dashed. Dotted lines are limits near the
+        signals: of a `Saturation`, a `PID`, an integrator or a `Requirement`. Short ticks at the lower end are events.
+        What is held between samples is drawn in steps. A run from disk has no diagram, and so none of these marks but
+        events.
 
         Parameters
         ----------
-        *names : str
-            Signals or entries of them, ``"q[1]"``, also in a list; a vector's entries share an axis. Without any, all
-            named wires.
+        *names : str or list of str
+            Signals or entries of them, ``"q[1]"``, each in an axis of its own; those of a list share one, and so do
+            a vector's entries: ``run.plot("speed", ["reference", "angle"])``. Without any, all named wires.
+        against : Run or mapping of str to Run, optional
+            Runs to be drawn over this one, by the names that the legend has: ``{"kp = 10": other}``.
+        label : str
+            Name of this run in the legend.
+        xlim : (float, float), optional
+            Times in s that are shown; the values within them fill the axes.
         axes : sequence of matplotlib axes, optional
-            Axes to draw into, one per name.
+            Axes to draw into, one per axis of the figure that would be made.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            One of pyplot's, but in threads other than the main one; see docs/howto/plots.md.
 
         Raises
         ------
         UnknownNameError
             For a name that was not recorded.
+        OptionError
+            For something else than names and runs, and times that are no range.
         """
-        from .plots import DrawnSignal, plot_signals
+        from .plots import plot_signals
 
-        drawn = [DrawnSignal(name, self[name], self._units(name)) for name in self._names_to_draw(names)]
-        return plot_signals(self.t, drawn, axes)
+        groups = self._groups_to_draw(names)
+        runs = self._runs_to_draw(against, label)
+        if xlim is not None:
+            check_argument(xlim, _TIMES, "xlim", "Run.plot")
+        panels = [[run.drawn(name, of) for of, run in runs.items() for name in group] for group in groups]
+        return plot_signals(panels, self.events if len(runs) == 1 else (), axes, xlim)
 
-    def _names_to_draw(self, names: Iterable[object]) -> list[str]:
-        """Return names that are given one by one or in lists; without any, those of all named wires."""
-        found: list[str] = []
-        for name in names:
-            several = name if isinstance(name, list | tuple | set | np.ndarray) else [name]
-            for one in several:
-                if not isinstance(one, str):
-                    raise OptionError(
-                        f'found {one!r} to draw; expected the name of a signal, as in run.plot("eta"). Name the wire '
-                        'with .named("…"), or give the path of the port.'
-                    )
-                found.append(str(one))
-        if found:
+    def plot_path(
+        self,
+        x: str,
+        y: str | None = None,
+        *,
+        against: Run | Mapping[str, Run] | None = None,
+        label: str = "this run",
+        axes: Axes | None = None,
+    ) -> Figure:
+        """Draw one signal over another one, and return the figure.
+
+        Both axes have the same scale where both signals have the same unit, as positions in a plane.
+
+        Parameters
+        ----------
+        x, y : str
+            Two signals, ``"angle", "speed"``, or one with two entries, ``"position"``: its second over its first.
+        against, label, axes
+            As of `plot`.
+
+        Raises
+        ------
+        UnknownNameError, OptionError
+            For a name that was not recorded; for signals that are not two numbers together.
+        """
+        from .plots import plot_curve
+
+        runs = self._runs_to_draw(against, label)
+        pairs = {of: run._pair(x, y) for of, run in runs.items()}
+        first, second = next(iter(pairs.values()))
+        labels = tuple(with_unit(one.name, one.units[0]) for one in (first, second))
+        curves = {of or label: (one.values, two.values) for of, (one, two) in pairs.items()}
+        return plot_curve(curves, (labels[0], labels[1]), axes, is_equal=first.units == second.units)
+
+    def _pair(self, x: str, y: str | None) -> tuple[DrawnSignal, DrawnSignal]:
+        """Return two signals with a number each."""
+        first = self.drawn(x)
+        if y is None and first.values.shape[1:] == (2,):
+            return self.drawn(f"{x}[1]"), self.drawn(f"{x}[2]")
+        second = first if y is None else self.drawn(y)
+        shapes = [one.values.shape[1:] for one in (first, second)]
+        if y is None or shapes != [(), ()]:
+            counts = [int(np.prod(shape)) for shape in (shapes[:1] if y is None else shapes)]
+            raise OptionError(
+                f"found signals of {' and '.join(map(str, counts))} numbers; expected one signal with two entries, or "
+                "two with one each. Name two, as in "
+                f'run.plot_path("{x if y is None or shapes[0] == () else x + "[1]"}", "speed").',
+                block=self.diagram_name,
+                port=x if y is None else f"{x}, {y}",
+            )
+        return first, second
+
+    def drawn(self, name: str, run: str = "") -> DrawnSignal:
+        """Return a signal as plots draw it."""
+        from .plots import DrawnSignal
+        from .signal_marks import is_held, is_set_point, limits_of
+
+        full, _ = split_entry(self._resolve(name), {*self.wires, *self.layout.slices})
+        wire = self.wires.get(full)
+        port = (wire.block, wire.port) if wire is not None else (full.rpartition(".")[0], full.rpartition(".")[2])
+        own = self.diagram
+        return DrawnSignal(
+            name,
+            self.t,
+            self[name],
+            self._units(name),
+            run,
+            is_set_point=is_set_point(own, port),
+            is_held=is_held(own, port),
+            limits=limits_of(own, port),
+        )
+
+    def _runs_to_draw(self, against: Run | Mapping[str, Run] | None, label: str) -> dict[str, Run]:
+        """Return this run and others by their labels; "" alone where there are no others."""
+        check_argument(label, kinds.text, "label", "Run.plot")
+        if against is None:
+            return {"": self}
+        given = {"other run": against} if isinstance(against, Run) else against
+        others = dict(given) if isinstance(given, Mapping) else {}
+        if not others or not all(isinstance(name, str) and isinstance(run, Run) for name, run in others.items()):
+            raise OptionError(
+                f'found {shorten(against)}; expected runs by their names, such as against={{"kp = 10": other}}.',
+                block="Run.plot",
+                port="against",
+            )
+        if label in others:
+            raise OptionError(
+                f"found {label!r} twice; expected a name for each run. Give this one another: label=….",
+                block="Run.plot",
+                port="against",
+            )
+        return {label: self, **others}
+
+    def _groups_to_draw(self, names: Iterable[object]) -> list[list[str]]:
+        """Return the names of the signals of each axis; without any names, those of all named wires."""
+        groups = [list(name) if isinstance(name, list | tuple | set | np.ndarray) else [name] for name in names]
+        for name in (one for group in groups for one in group):
+            if not isinstance(name, str):
+                raise OptionError(
+                    f'found {name!r} to draw; expected the name of a signal, as in run.plot("eta"). Name the wire '
+                    'with .named("…"), or give the path of the port.'
+                )
+        if found := [list(dict.fromkeys(map(str, group))) for group in groups if group]:
             return found
         wires = [name for name in self.names if name in self.wires]
         if not wires:
             some = ", ".join(map(repr, self.names[:6]))
             raise OptionError(f"found no signal to draw, and no wire has a name; expected names, such as {some}.")
-        return wires
+        return [[name] for name in wires]
 
     # --- for other tools: all named wires (where none has a name, all ports) if no signal is given -------------------
 

@@ -14,6 +14,7 @@ from .outcome import Failure, SampleOutcome
 from .samples import Samples
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from xarray import Dataset
 
 
@@ -100,6 +101,28 @@ class Sweep:
         if name in self._signals:
             return self._stack_samples(name)
         raise UnknownNameError(f"the sweep holds no {name!r}. {near(name, self.names)}", block=self.diagram_name)
+
+    def plot(self, *names: str, xlim: tuple[float, float] | None = None) -> Figure:
+        """Draw signals of all runs over each other, one axis for each number, and return the figure.
+
+        The legend has the samples' parameters; of more than five runs with one parameter, a scale of colors. A cross
+        is the end of a run that failed.
+
+        Parameters
+        ----------
+        *names : str
+            Signals that were kept; all of them without any.
+        xlim : (float, float), optional
+            Times in s that are shown.
+
+        Raises
+        ------
+        OptionError
+            If no signal was kept, or none of such a name.
+        """
+        from .sweep_plot import DrawnSweep, plot_sweep
+
+        return plot_sweep(DrawnSweep(self.samples, self.outcomes, self.units, self.diagram_name), names, xlim)
 
     def _stack(self, name: str, values: Sequence[np.ndarray | None]) -> np.ndarray:
         shapes = {value.shape for value in values if value is not None}

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from loopwright.diagrams.drawing import shapes, svg
-from loopwright.diagrams.frequency.loop_transfer import COLORS
-from loopwright.diagrams.plotting import DARK, STONE
+from loopwright.diagrams.plotting import COLORS, DARK, STONE
 from loopwright.diagrams.plotting.style import STYLE
 from loopwright.diagrams.report import pages
 from loopwright.diagrams.report.variant import LOOKS, OTHER, look_of
