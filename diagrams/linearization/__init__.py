@@ -24,7 +24,13 @@ from .flow_model import LinearDelays
 from .free_motions import FreeMotion, FreeMotions, deflate
 from .inserted_blocks import find_inputs, name_wire_to, with_passed_values
 from .kinks import find_kinks_between
-from .linear_model import Linearization, linearize, linearize_batch
+from .linear_model import (
+    Linearization,
+    find_flow_poles,
+    linearize,
+    linearize_batch,
+    linearize_within,
+)
 from .operating_points import (
     RUN_OPTIONS,
     PointLike,
@@ -33,6 +39,7 @@ from .operating_points import (
     copy_point,
     hold_sources,
     operating_point,
+    refine_ticks,
     run_to,
 )
 from .over_a_period import TickModel, model_ticks, ticks_between_renewals, ticks_to_renewal
@@ -78,6 +85,7 @@ __all__ = [
     "copy_point",
     "deflate",
     "differentiate_loop",
+    "find_flow_poles",
     "find_inputs",
     "find_kinks_between",
     "find_signal",
@@ -87,6 +95,7 @@ __all__ = [
     "linearize_batch",
     "linearize_block",
     "linearize_plant",
+    "linearize_within",
     "loop_of_variant",
     "model_ticks",
     "moves_between_ticks",
@@ -94,6 +103,7 @@ __all__ = [
     "operating_point",
     "point_from_states",
     "rational_loop",
+    "refine_ticks",
     "run_to",
     "ticks_between_renewals",
     "ticks_to_renewal",

@@ -44,7 +44,7 @@ from .free_motions import ClosedModel, FreeMotions, find_free_motions
 from .inserted_blocks import find_cut_findings, name_inputs, split_consumers, split_inputs
 from .kinks import find_kinks
 from .mean_stairs import replace_stairs
-from .operating_points import PointLike, check_options, operating_point
+from .operating_points import PointLike, check_options, operating_point, refine_ticks
 from .over_a_period import begin_loop, confirm_loop, model_loop, model_period
 from .plant_models import EQUILIBRIUM
 from .signal_paths import SignalPaths
@@ -430,6 +430,65 @@ def linearize(
     return replace(made, inputs=name_inputs(made.inputs, ports), outputs=name_inputs(made.outputs, ports))
 
 
+def linearize_within(
+    diagram: WiredDiagram,
+    point: OperatingPoint,
+    parts: int,
+    *,
+    inputs: Iterable[str],
+    outputs: Iterable[str],
+    stairs: str | None = None,
+) -> Linearization:
+    """Return the model over the period of all clocks, with its outputs at all ticks and between them.
+
+    Parameters
+    ----------
+    diagram : WiredDiagram
+        A diagram with a clock, or with FMUs that step.
+    point : OperatingPoint
+        The operating point, on the diagram's ticks.
+    parts : int
+        Parts of the time from one tick to the next: outputs are read at the beginning of each. FMUs step by each.
+    inputs, outputs, stairs
+        As of `linearize`; names of wires and ports alone.
+
+    Returns
+    -------
+    Linearization
+        Its inputs are held over the period; its outputs are those of the first instant, then those of the next one, ….
+
+    Raises
+    ------
+    LoopwrightError
+        As of `linearize`.
+    """
+    return _linearize(
+        diagram,
+        refine_ticks(diagram, point, parts),
+        inputs,
+        outputs,
+        (),
+        plants=None,
+        step=None,
+        stairs=stairs,
+        read_each=True,
+    )
+
+
+def find_flow_poles(diagram: WiredDiagram, point: OperatingPoint) -> np.ndarray:
+    """Return the poles in 1/s of what moves on between two ticks, with everything sampled held.
+
+    Raises
+    ------
+    LoopwrightError
+        An FMU that gives no linear model of its equations.
+    """
+    between = refine_ticks(diagram, point, 2)  # with ticks at which nothing acts, x holds all that is held there
+    flat = diagram.flatten_like(between)
+    local = LocalDerivatives(flat, (), (), (), evaluators_at(flat, between))
+    return _sorted_poles(model_continuous(diagram, flat, local, between, None).matrices[0])
+
+
 def _refuse_lost(diagram: WiredDiagram, at: OperatingPoint) -> None:
     """Refuse a point at which an FMU's output is no number: a run may have one that nothing reads, a model may not."""
     flat = diagram.flatten_like(at)
@@ -459,6 +518,7 @@ def _linearize(
     loop: str = "",
     frozen: frozenset[TickPattern] = NONE,
     findings: tuple[Finding, ...] | None = None,
+    read_each: bool = False,
 ) -> Linearization:
     if step is not None and exact_time(step, block=diagram.name) != at.base and (diagram.has_clock or diagram.has_fmu):
         raise OptionError(
@@ -484,7 +544,7 @@ def _linearize(
         if loop and period_of(flat) > 1:
             model, channels = model_loop(flat, local, at, plants, lifted=loop == "lifted", frozen=frozen)
         else:
-            model = model_period(flat, local, at, plants, frozen)
+            model = model_period(flat, local, at, plants, frozen, read_each=read_each)
     else:
         model = model_continuous(diagram, flat, local, at, plants)
         model = approximate_delays(model, pade) if pade else model
@@ -492,6 +552,8 @@ def _linearize(
     n, ins, outs = len(A), *(tuple(e for s in group for e in s.labels) for group in found[:2])
     if channels:
         ins = outs = tuple(channels)
+    if read_each:
+        outs = tuple(f"{e}@{k}" for k in range(len(C) // max(1, len(outs))) for e in outs)
     known = means.replace_findings(find_kinks(flat, at)) if findings is None else findings
     entries = (EntryTaken(s.name, s.entry) for group in found for s in group if s.entry)
     methods, error = derivations_at(flat, at, model.derivations)

@@ -261,6 +261,26 @@ def _choose_step(diagram: WiredDiagram, t: float) -> Fraction:
     return Fraction(max(1, round(t * 10**9)), 10**9)
 
 
+def refine_ticks(diagram: WiredDiagram, point: OperatingPoint, parts: int) -> OperatingPoint:
+    """Return an operating point on ticks that divide the time between two of its own; FMUs step to each of them.
+
+    Between ticks at which something acts, more signals are held than without such ticks: they have their values at the
+    point.
+    """
+    from ..simulation import copy_states
+
+    if parts == 1:
+        return point
+    made = replace(point, base=point.base / parts, tick=point.tick * parts, asked=True)
+    old, new = diagram.flatten_like(point), diagram.flatten_like(made)
+    x = new.x0.copy()
+    copy_states(point.x, old, new, x)
+    for name, where in new.held.slices.items():
+        if name in point.values and name not in old.held.slices:
+            x[where] = np.ravel(point.values[name])
+    return replace(made, x=x, layout=layout_of(new) if point.layout else point.layout)
+
+
 def copy_point(diagram: WiredDiagram, point: OperatingPoint, other: WiredDiagram) -> OperatingPoint:
     """Return the operating point of another diagram with the states of a point, wherever a name is in both.
 

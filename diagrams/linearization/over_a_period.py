@@ -39,18 +39,18 @@ SAME_POLES = 1e-6
 """Relative difference up to which two characteristic polynomials count as the same."""
 
 
-def lift(steps: Sequence[FourMatrices], *, each_tick: bool) -> FourMatrices:
+def lift(steps: Sequence[FourMatrices], *, each_tick: bool, read_each: bool = False) -> FourMatrices:
     """Return the matrices over all ticks of a period, from those of each tick.
 
     With ``each_tick`` the inputs and outputs of all ticks follow one another. Else an input is held over the
-    whole period, and the outputs are those of the first tick.
+    whole period, and the outputs are those of the first tick; with ``read_each`` those of all ticks.
     """
     n, m = steps[0][1].shape
     X, U = np.eye(n), np.zeros((n, m * len(steps) if each_tick else m), dtype=steps[0][1].dtype)
     C, D = [], []
     for k, (M, N, Cy, Dy) in enumerate(steps):
         own = slice(k * m, (k + 1) * m) if each_tick else slice(0, m)
-        if each_tick or not k:
+        if each_tick or read_each or not k:
             by_d = Cy @ U
             by_d[:, own] += Dy
             C.append(Cy @ X)
@@ -111,12 +111,16 @@ def model_period(
     frozen: frozenset[TickPattern] = NONE,
     *,
     with_findings: bool = True,
+    read_each: bool = False,
 ) -> Model:
-    """Return the model over the least common period of all clocks; those that are frozen do not act."""
+    """Return the model over the least common period of all clocks; those that are frozen do not act.
+
+    With ``read_each`` it has the outputs of all ticks, one tick after the other.
+    """
     period = period_of(flat, frozen)
-    chain = Chain(flat, local, at, way, period, frozen)
+    chain = Chain(flat, local, at, way, period, frozen, every=read_each)
     chain.go_on()
-    whole = lift(chain.steps, each_tick=False)
+    whole = lift(chain.steps, each_tick=False, read_each=read_each)
     names = chain.labels
     keep = find_needed([whole], own_states(flat, chain))
     memory, findings = _find_memory(flat, whole[0], names)

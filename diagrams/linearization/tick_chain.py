@@ -48,12 +48,12 @@ def period_of(flat: FlatDiagram, frozen: frozenset[TickPattern] = NONE) -> int:
     return math.lcm(*(clock.every for clock in {*flat.distinct} | plants if clock not in frozen))
 
 
-def ticks_of_period(flat: FlatDiagram, first: int, period: int) -> Iterator[tuple[int, int]]:
+def ticks_of_period(flat: FlatDiagram, first: int, period: int, *, every: bool = False) -> Iterator[tuple[int, int]]:
     """Yield the ticks of a period, each with the next one.
 
-    They are the first one, and those at which a clock acts or an FMU steps.
+    They are the first one, and those at which a clock acts or an FMU steps; or all of them.
     """
-    ticks = [k for k in range(first, first + period) if k == first or any(c.acts(k) for c in flat.visited)]
+    ticks = [k for k in range(first, first + period) if every or k == first or any(c.acts(k) for c in flat.visited)]
     yield from zip(ticks, [*ticks[1:], first + period], strict=True)
 
 
@@ -97,6 +97,8 @@ class Chain:
 
     An FMU goes from one of its communication points to the next, with the inputs of the first one. Between them its
     outputs are held: where an FMU has fewer of them than there are ticks, these outputs are states, too.
+
+    Ticks at which nothing acts are left out, unless the chain is to go through ``every`` tick.
     """
 
     def __init__(
@@ -107,12 +109,14 @@ class Chain:
         way: str | None,
         count: int,
         frozen: frozenset[TickPattern] = NONE,
+        *,
+        every: bool = False,
     ):
         check_way(way)
         self._coupled = coupling_at(flat, local, at)
         self.flat, self.local, self.way, self.frozen = flat, local, way, frozen
         self.first = self.here = at
-        self.ticks = list(ticks_of_period(flat, at.tick, count))
+        self.ticks = list(ticks_of_period(flat, at.tick, count, every=every))
         self._end = at.tick + count
         self.paths = plant_paths(flat)
         self._until = dict.fromkeys(self.paths, at.tick)

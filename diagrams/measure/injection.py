@@ -261,11 +261,12 @@ class InjectionRun:
         view = self.simulation.view
         return np.concatenate([view.x_next[: self.flat.states.total], view.w])
 
-    def record(self, count: int, every: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def record(self, count: int, every: int, parts: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Advance the run by ``count`` samples of ``every`` ticks, and return v, u and the outputs.
 
         v is the port's signal, u that of its consumers: v plus the test signal. Each has a row for each sample, both
-        ends included, and a column for each entry.
+        ends included, and a column for each entry. With several ``parts``, which divide ``every``, there is a row for
+        each part of a sample.
         """
         simulation = self.simulation
         simulation.run(final=False)  # discards earlier records
@@ -273,7 +274,7 @@ class InjectionRun:
         simulation.record_instant()
         self.go(count, every)
         run = simulation.run(final=False)
-        times = times_of(range(first, first + count * every + 1, every), self.flat.base)
+        times = times_of(range(first, first + count * every + 1, every // parts), self.flat.base)
         rows = np.searchsorted(run.t, times * (1.0 + 1e-15), side="right") - 1
 
         if every > 1:
@@ -284,12 +285,12 @@ class InjectionRun:
             self.held &= bool(np.all(all_ticks == all_ticks[:, :1]))
 
         def read(port: tuple[str, str], entries: tuple[int, ...]) -> np.ndarray:
-            data = np.asarray(run[".".join(port)])[rows].reshape(count + 1, -1)
+            data = np.asarray(run[".".join(port)])[rows].reshape(len(rows), -1)
             return np.array(data[:, list(entries)])
 
         v, u = (read(port, self.signal.entries) for port in (self.signal.port, (self.made.sum, "y")))
         y = [read(o.port, o.entries) for o in self.outputs]
-        return v, u, np.hstack([np.zeros((count + 1, 0)), *y])
+        return v, u, np.hstack([np.zeros((len(rows), 0)), *y])
 
 
 def times_of(ticks: range, base: Fraction) -> np.ndarray:

@@ -39,7 +39,7 @@ class ExpectedStep:
     low, high : float
         Smallest and largest change after the last sample.
     between : float
-        Largest size between the samples, less that at the samples.
+        Largest size between the samples, less that at the samples; NaN where it is not known.
     """
 
     response: np.ndarray
@@ -113,7 +113,8 @@ def measure_step(
     tail = arrived[int(0.9 * len(r)) :]
     final = float(np.mean(tail))
     spread = float(np.max(np.abs(tail - final))) + _remainder(t, arrived, slowest)
-    bend = _bend(r) if expected is None else expected.between + _bend(r - expected.response)
+    unknown = expected is None or math.isnan(expected.between)
+    bend = _bend(r) if expected is None or unknown else expected.between + _bend(r - expected.response)
     bend = 0.0 if held else bend
     later = 0.0  # size after the record; of one that does not rest, the peak is that of the record
     if is_at_rest(t, r, expected, slowest):

@@ -27,10 +27,13 @@ from ..linearization import (
     hold_sources,
     linearize,
     operating_point,
+    refine_ticks,
     ticks_between_renewals,
     ticks_to_renewal,
 )
+from ..wiring import stepped_blocks
 from .beginning import can_start_at, with_ticks
+from .between_samples import BETWEEN, SMOOTH, Instants, WithinSamples, can_step_finer, choose_instants
 from .injection import InjectionRun, inject_signal
 from .step_measures import ExpectedStep
 
@@ -74,7 +77,8 @@ class StepResponse:
     size : float
         Height of the step.
     t : (N,) ndarray
-        Time since the step in s. The first sample is that before the step.
+        Time since the step in s. The first sample is that before the step. Where a signal moves on between the samples
+        of a sampled diagram, there are several instants in each sample.
     d : (N,) ndarray
         The step as the consumers got it.
     v : (N,) ndarray
@@ -90,7 +94,7 @@ class StepResponse:
     moved : float
         Largest change of the wire and of the outputs without the step, relative to 1 + their sizes.
     dt : float
-        Seconds between two samples.
+        Seconds between two samples; a whole number of the steps of t.
     held : bool
         Whether the wire's signal is held between the samples, so that no peak lies between them.
     prediction : (N, 1 + K) ndarray, optional
@@ -101,12 +105,14 @@ class StepResponse:
     later : (2, 1 + K) ndarray, optional
         Smallest and largest values of the linear model's v and outputs after the record; None without a prediction.
     between : (1 + K,) ndarray, optional
-        Largest size of the linear model's v and outputs between the samples, less that at the samples; 0 where the
-        model is sampled. None without a prediction.
+        Largest size of the linear model's v and outputs between the instants of t, less that at these; 0 of signals
+        that are held, NaN where it is not known. None without a prediction.
     steady : (1 + K,) ndarray of bool, optional
         Whether v and the outputs are held between the samples; without it as ``held`` says of v, and no output is.
     solved : bool
         Whether a solver of variable step has a part in it, whose error is more than rounding.
+    unread : tuple of str
+        FMUs that move on between their communication points, as the linear model shows, where a run has no outputs.
     """
 
     wire: str
@@ -127,6 +133,7 @@ class StepResponse:
     between: np.ndarray | None = None
     steady: np.ndarray | None = None
     solved: bool = False
+    unread: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         facts = (
@@ -247,8 +254,22 @@ def step_response(
     wait = ticks_to_renewal(flat, [signal.port], point.tick) if sampled and every > 1 else 0
     held = (period, ((point.tick + wait) % every) * base) if sampled else None
     made = inject_signal(variant, signal, 1, held)
-    count = max(2, math.ceil(length / float(period)) + 1)
-    options: dict[str, Any] = {"step": None if diagram.has_clock else base}
+    count = max(2, math.ceil(length / float(period)) + sampled)  # a step that is held begins a sample later
+    entries = 1 + sum(len(tap.labels) for tap in taps)
+    follows = [_follows_states(flat, tap.port) for tap in (signal, *taps)]
+    moves = np.repeat(follows, [1, *(len(tap.labels) for tap in taps)]) if sampled else np.zeros(entries, dtype=bool)
+    instants, within, unread = Instants(), None, tuple[str, ...]()
+    if moves.any():
+        instants = choose_instants(variant, begins, every, count)
+        if not wait and slow == 1 and (not diagram.has_fmu or instants.turns > SMOOTH):
+            within = WithinSamples.of(variant, begins, instants.looked, wire, names, entries, stairs)
+        if diagram.has_fmu:
+            moving = within is not None and within.moves_by(count, moves) > BETWEEN
+            unread = tuple(stepped_blocks(diagram.structure)) if moving else ()
+            instants = instants if moving and can_step_finer(diagram) else Instants()
+    begins, parts = refine_ticks(variant, begins, instants.finer), instants.count
+    ticks = every * instants.finer  # of the run, in a sample
+    options: dict[str, Any] = {"step": None if diagram.has_clock and instants.finer == 1 else begins.base}
     if flat.hybrid:
         options |= {"rtol": 1e-9, "atol": 1e-12}
         if sampled and count * every >= LONG:
@@ -257,15 +278,17 @@ def step_response(
     def run_with(height: float) -> tuple[np.ndarray, np.ndarray, bool]:
         with InjectionRun(variant, made, signal, taps, begins, options) as run:
             if wait:
-                run.go(wait, 1)
-            first = run.record(1, every)
-            parts = [tuple(part[:1] for part in first)]
+                run.go(wait * instants.finer, 1)
+            first = run.record(1, ticks, parts)
+            found = [tuple(part[:1] for part in first)]
             if height:
                 run.step(height, signal.entries[0])
             largest = GROWN * max(abs(size), float(np.max(np.abs(first[0]))))
-            while (done := sum(len(part[0]) for part in parts)) <= count:
-                some = run.record(min(CHUNK, count + 1 - done), every)
-                parts.append(tuple(part[1:] for part in some) if len(parts) > 1 else some)
+            done = 0
+            while done < count:
+                some = run.record(min(CHUNK, count - done), ticks, parts)
+                done += min(CHUNK, count - done)
+                found.append(tuple(part[1:] for part in some) if len(found) > 1 else some)
                 if not float(np.max(np.abs(some[0]))) <= largest:
                     raise SimulationError(
                         f"found a response that has grown to {float(np.max(np.abs(some[0]))):.3g} after a step of "
@@ -275,13 +298,13 @@ def step_response(
                         port=signal.port[1],
                         t=run.t,
                     )
-            v, u, y = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+            v, u, y = (np.concatenate(columns) for columns in zip(*found, strict=True))
             return np.hstack([v, y])[1:], (u - v)[1:, 0], run.held
 
     rest, _, _ = run_with(0.0)
     stepped, d, steady = run_with(size)
     change = stepped - rest
-    t = float(period) * np.arange(len(change))
+    t = float(period / parts) * np.arange(len(change))
     if not sampled:
         d = np.full(len(t), size)
     moved = float(np.max(np.abs(rest - rest[0]) / (1.0 + np.abs(rest[0])), initial=0.0))
@@ -295,8 +318,15 @@ def step_response(
         if slow > 1:
             raise OptionError("the wire is renewed within the model's period. Measure another one.", port=wire)
         model = linearize(variant, point, inputs=[wire], outputs=[wire, *names], stairs=stairs)
-        prediction, later, between = predict(model, d, t)
+        if parts > 1 and within is None:
+            raise OptionError("there is no linear model between the samples. Measure another wire.", port=wire)
+        prediction, later, between = predict(model, d[::parts], t[::parts])
         final = size * find_final(model)
+        if within is not None:
+            shown, later, between = predict_within(within, d[::parts], parts)
+            prediction = shown if parts > 1 else prediction
+        if sampled:
+            between = np.where(moves, math.nan if within is None else between, 0.0)
     except LoopwrightError:
         pass
     labels = tuple(label for tap in taps for label in tap.labels)
@@ -324,6 +354,7 @@ def step_response(
         between,
         np.array(columns),
         flat.hybrid,
+        unread,
     )
 
 
@@ -363,6 +394,18 @@ def predict(model: Linearization, d: np.ndarray, t: np.ndarray) -> tuple[np.ndar
             inside = states @ (C @ move[:n]).T + np.outer(d, D)
             between = np.maximum(between, np.max(np.abs(inside), axis=0) - size)
     return rows, later, between
+
+
+def predict_within(within: WithinSamples, d: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what `predict` returns, with ``count`` instants in each sample, over each of which d is held."""
+    rows, state = within.respond(d)
+    end, model = np.append(state, d[-1]), within.model
+    later = _find_extremes(model, _advance_by(model, model.dt), end, model.dt).reshape(2, -1, within.outputs)
+    return (
+        within.read(rows, count),
+        np.stack([later[0].min(axis=0), later[1].max(axis=0)]),
+        within.between(rows, count),
+    )
 
 
 def _predict_with_delays(

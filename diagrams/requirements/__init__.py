@@ -1,7 +1,7 @@
 """Requirements on a design, and the verdicts on its numbers."""
 
 from .contact_limits import ContactLimits, read_contact_limits
-from .explanations import explain
+from .explanations import UNREAD, explain
 from .number_limits import SENSES, STEP_UNITS, Limit, Reason, Sense, Verdict, is_doubtful, judge, judge_interval
 from .requirements import LoopLimits, Requirements, StepLimits
 from .results import RequirementResult, Review
@@ -12,6 +12,7 @@ __all__ = [
     "SENSES",
     "STEP_UNITS",
     "STUDIES",
+    "UNREAD",
     "ContactLimits",
     "Limit",
     "LoopLimits",

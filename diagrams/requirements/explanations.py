@@ -8,6 +8,8 @@ from ..frequency import Number
 from .number_limits import Reason, Verdict
 from .results import RequirementResult
 
+UNREAD = "the communication points"
+"""Words in a step response's confirmation that say that nothing is known between them."""
 MEASURED, WORST_CASE, CONTACT = "measured", "worst_case", "contact"
 """Keys of results that belong to no variant of the diagram: of measured loops, searches and contacts."""
 
@@ -99,6 +101,8 @@ def _sharpen(result: RequirementResult) -> str:
     """Return how the tolerance of a number gets smaller."""
     if result.variant == MEASURED:
         return "measure more points, or with less uncertainty"
+    if result.is_step and result.number is not None and UNREAD in result.number.confirmed_by:
+        return "give the FMU shorter communication steps, which show what it does between its points"
     if result.is_step:
         return "give a longer length or a larger size, or a limit farther away"
     why = "" if result.number is None else result.number.confirmed_by

@@ -125,17 +125,23 @@ def test_a_response_that_ends_off_its_target_never_settles():
 def test_a_sampled_loop_is_its_recurrence(delay):
     found = step_response(sampled(delay=delay).wired, "controller.u", size=0.1, length=2.0, outputs=["lag.y"])
     assert found.held
-    y, v, before = np.zeros(len(found.t)), np.zeros(len(found.t)), 0.0
-    for k in range(len(y)):
+    many = round(found.dt / found.t[1])  # instants in a sample: the integrator is a straight line there
+    d, samples = found.d[::many], len(found.t[::many])
+    y, v, before = np.zeros(samples), np.zeros(samples), 0.0
+    for k in range(samples):
         command = -3.0 * y[k]
         v[k], before = (before, command) if delay else (command, before)
-        if k + 1 < len(y):
-            y[k + 1] = y[k] + 0.01 * (v[k] + found.d[k])
-    np.testing.assert_allclose(found.y[:, 0], y, atol=1e-13)
-    np.testing.assert_allclose(found.v, v, atol=1e-13)
-    np.testing.assert_allclose(found.prediction[:, 0], v, atol=1e-13)
-    assert found.d[0] == 0.0
-    assert np.all(found.d[1:] == 0.1)
+        if k + 1 < samples:
+            y[k + 1] = y[k] + 0.01 * (v[k] + d[k])
+    np.testing.assert_allclose(found.y[::many, 0], y, atol=1e-13)
+    np.testing.assert_allclose(found.v[::many], v, atol=1e-13)
+    np.testing.assert_allclose(found.prediction[::many, 0], v, atol=1e-13)
+    between = np.interp(found.t, found.t[::many], y)
+    np.testing.assert_allclose(found.y[:, 0], between, atol=1e-13)
+    np.testing.assert_allclose(found.prediction[:, 1], between, atol=1e-13)
+    assert np.array_equal(found.v[:-1], np.repeat(found.v[:-1:many], many))
+    assert d[0] == 0.0
+    assert np.all(d[1:] == 0.1)
 
 
 def test_a_diagram_that_moves_by_itself_gives_the_steps_part_alone():
