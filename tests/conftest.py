@@ -138,11 +138,11 @@ def pytest_collection_modifyitems(items):
     """Sort by file, so that all workers have one order; before the others those that take longest."""
     longest = ("tests/test_project.py", "tests/fmus/", "tests/test_pages.py")
 
-    def place(item):
-        first = next((i for i, name in enumerate(longest) if item.nodeid.startswith(name)), len(longest))
-        return first, item.nodeid.partition("::")[0]
+    @keep
+    def place(file):
+        return next((i for i, name in enumerate(longest) if file.startswith(name)), len(longest)), file
 
-    items.sort(key=place)
+    items.sort(key=lambda item: place(item.nodeid.partition("::")[0]))
 
 
 def pytest_collection(session):
