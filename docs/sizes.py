@@ -46,10 +46,15 @@ def measure(folder):
     return len(python) + len(c), lines[0], sum(map(count_code, python)), lines[1], names_outside(folder)
 
 
-def table():
+def list_folders(rooms=ROOMS):
+    """Return the folders that may have code."""
+    folders = [folder for room in rooms for folder in (ROOT / room, *sorted((ROOT / room).rglob("*/")))]
+    return [folder for folder in folders if "." not in folder.name]
+
+
+def table(rooms=ROOMS):
     """Return a row for each sub-package that has code, by its folder, and one for all."""
-    folders = [folder for room in ROOMS for folder in (ROOT / room, *sorted((ROOT / room).rglob("*/")))]
-    rows = {str(folder.relative_to(ROOT)): measure(folder) for folder in folders if "." not in folder.name}
+    rows = {str(folder.relative_to(ROOT)): measure(folder) for folder in list_folders(rooms)}
     rows = {name: row for name, row in rows.items() if row[0]}
     return {**rows, "all": tuple(map(sum, zip(*rows.values(), strict=True)))}
 

@@ -119,7 +119,7 @@ def pytest_pycollect_makeitem(collector, name, obj):
 def pytest_xdist_make_scheduler(config, log):
     """Give each file to one worker, so that what its tests share is made once; the longest first.
 
-    Few workers take all files on FMUs as one, since they share builds.
+    Few workers take all files on FMUs as one, since they share builds; two files share the trees of all sources.
     """
     from xdist.scheduler import LoadFileScheduling
 
@@ -128,6 +128,8 @@ def pytest_xdist_make_scheduler(config, log):
             exported = nodeid.startswith("tests/fmus/") and self.numnodes <= 3
             if exported:
                 return "tests/fmus"
+            if nodeid.startswith(("tests/test_architecture.py", "tests/test_house.py")):
+                return "tests/test_architecture.py"
             return nodeid if nodeid.startswith("tests/test_other_machines.py") else super()._split_scope(nodeid)
 
     config.option.loadscopereorder = False

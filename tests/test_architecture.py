@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+from support.sources import ROOMS, ROOT, SOURCES, find_nodes
+
 PAGE = ROOT / "docs" / "explanation" / "architecture.md"
-ROOMS = ("blocks", "fmus", "diagrams")
-FILES = sorted(p.relative_to(ROOT) for room in ROOMS for p in (ROOT / room).rglob("*.py"))
+FILES = [path.relative_to(ROOT) for path in SOURCES]
 STUBS = sorted(
     p.relative_to(ROOT) for room in ROOMS for p in (ROOT / room).rglob("*.pyi")
 )  # names that are loaded when they are used
@@ -31,7 +31,7 @@ def imports():
     found = []
     for file in (*FILES, *STUBS):
         path = file.with_suffix(".py")
-        for node in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))):
+        for node in find_nodes(ROOT / file, ast.Import, ast.ImportFrom):
             if isinstance(node, ast.Import):
                 assert not any(a.name.startswith("loopwright") for a in node.names), f"{path}: rooms import relatively"
             if not isinstance(node, ast.ImportFrom):
@@ -177,12 +177,11 @@ def test_the_page_names_what_exists():
     calls = re.findall(r"`([\w/]+\.py)`:? `([\w.]+)`", text)
     assert len(calls) > 15
     for file, function in calls:
-        tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
         found = set()
-        for node in ast.walk(tree):
+        for node in find_nodes(ROOT / file, ast.ClassDef, ast.FunctionDef):
             if isinstance(node, ast.ClassDef):
                 found |= {f"{node.name}.{n.name}" for n in node.body if isinstance(n, ast.FunctionDef)} | {node.name}
-            elif isinstance(node, ast.FunctionDef):
+            else:
                 found.add(node.name)
         assert function in found, f"{file} has no {function}"
 
@@ -240,8 +239,9 @@ def test_public_names_are_those_that_users_know(room):
 
 def test_the_table_of_sizes_has_every_sub_package_and_counts_its_lines():
     sizes = runpy.run_path(str(ROOT / "docs" / "sizes.py"))
-    rows = sizes["table"]()
-    assert {str(file.parent) for file in FILES} <= set(rows)
+    assert {str(file.parent) for file in FILES} <= {str(folder.relative_to(ROOT)) for folder in sizes["list_folders"]()}
+    rows = sizes["table"](("fmus/models", "install"))
+    assert set(rows) == {"fmus/models", "install", "all"}
     files, python, code, c, names = rows["fmus/models"]
     texts = [p.read_text(encoding="utf-8") for p in (ROOT / "fmus" / "models").iterdir() if p.suffix in {".py", ".pyi"}]
     assert (files, python, c) == (len(texts), sum(text.count("\n") for text in texts), 0)

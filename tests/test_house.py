@@ -4,12 +4,10 @@ import ast
 import importlib
 import re
 from functools import cache
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
-SOURCES = sorted(path for room in ("blocks", "fmus", "diagrams") for path in (ROOT / room).rglob("*.py"))
+from support.sources import ROOMS, ROOT, SOURCES, find_nodes, nodes_of
 
 SEARCHES = {
     "count",
@@ -47,6 +45,14 @@ ALLOWED = {
 """Literals that may be searched for, by file: the texts are not for people, or foreign code gives nothing else."""
 
 
+@pytest.fixture(scope="module", autouse=True)
+def trees_are_let_go():
+    """Let the trees of all sources go, some 200 MB; this file is read after that on architecture, which has them made."""
+    yield
+    nodes_of.cache_clear()
+    constants.cache_clear()
+
+
 def literals(node):
     """Yield the texts within an expression that are searched for: constants, tuples of them, parts of f-strings."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
@@ -62,7 +68,7 @@ def literals(node):
 def constants():
     found = {}
     for source in SOURCES:
-        for statement in ast.parse(source.read_text(encoding="utf-8")).body:
+        for statement in find_nodes(source, ast.Module)[0].body:
             if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
                 found[statement.targets[0].id] = statement.value
     return found
@@ -78,9 +84,9 @@ def is_text(node):
     return False
 
 
-def prose_read(tree):
+def prose_read(nodes):
     """Yield (line, literal) wherever a text is searched for words, or compared with some."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Compare):
             sides = [node.left, *node.comparators]
             within = isinstance(node.ops[0], ast.In | ast.NotIn)
@@ -101,7 +107,7 @@ def prose_read(tree):
 
 
 def found_in(name):
-    return list(prose_read(ast.parse((ROOT / name).read_text(encoding="utf-8"))))
+    return list(prose_read(find_nodes(ROOT / name, ast.Compare, ast.Call)))
 
 
 def test_nothing_depends_on_words_of_a_text():
@@ -135,7 +141,7 @@ def test_every_exception_is_still_needed():
 )
 def test_the_rule_sees_what_it_is_about(line, monkeypatch):
     monkeypatch.setitem(constants(), "WAYS_OF_A_TEST", ast.parse('("differences", "identified")', mode="eval").body)
-    assert list(prose_read(ast.parse(line)))
+    assert list(prose_read(ast.walk(ast.parse(line))))
 
 
 @pytest.mark.parametrize(
@@ -150,7 +156,7 @@ def test_the_rule_sees_what_it_is_about(line, monkeypatch):
     ],
 )
 def test_the_rule_leaves_names_alone(line):
-    assert not list(prose_read(ast.parse(line)))
+    assert not list(prose_read(ast.walk(ast.parse(line))))
 
 
 # --- names in texts ----------------------------------------------------------------------------------------------------
@@ -185,9 +191,9 @@ def test_every_name_of_ours_in_a_text_exists():
     assert {where: name for name, where in named.items() if not exists(name)} == {}
 
 
-def unstable_sorts(tree):
+def unstable_sorts(nodes):
     """Yield the lines that ask for an order of sorting in which equal values stand as the processor leaves them."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "argsort":
             kinds = [k.value.value for k in node.keywords if k.arg == "kind" and isinstance(k.value, ast.Constant)]
             if kinds != ["stable"]:
@@ -195,22 +201,23 @@ def unstable_sorts(tree):
 
 
 def test_no_order_of_equal_values_hangs_on_the_processor():
-    trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in SOURCES}
-    found = [(path.relative_to(ROOT).as_posix(), line) for path, tree in trees.items() for line in unstable_sorts(tree)]
+    found = [
+        (path.relative_to(ROOT).as_posix(), line)
+        for path in SOURCES
+        for line in unstable_sorts(find_nodes(path, ast.Call))
+    ]
     assert not found, (
         f"NumPy sorts by the processor's vectors; give argsort kind='stable', or lexsort a second key: {found}"
     )
-    assert [*unstable_sorts(ast.parse("np.argsort(x)\nx.argsort(kind='quicksort')\nnp.argsort(x, kind='stable')"))] == [
-        1,
-        2,
-    ]
+    seen = ast.walk(ast.parse("np.argsort(x)\nx.argsort(kind='quicksort')\nnp.argsort(x, kind='stable')"))
+    assert [*unstable_sorts(seen)] == [1, 2]
 
 
 def test_no_file_has_the_name_of_what_its_package_hands_out_of_it():
     """Names are loaded when they are used: once somebody has imported such a file, the package would have that."""
     hidden = [
         (stub.relative_to(ROOT).as_posix(), node.module)
-        for room in ("blocks", "fmus", "diagrams")
+        for room in ROOMS
         for stub in (ROOT / room).rglob("__init__.pyi")
         for node in ast.walk(ast.parse(stub.read_text(encoding="utf-8")))
         if isinstance(node, ast.ImportFrom) and node.module in {name.name for name in node.names}
@@ -221,18 +228,19 @@ def test_no_file_has_the_name_of_what_its_package_hands_out_of_it():
 def test_a_name_of_a_class_means_one_thing():
     found = {}
     for source in SOURCES:
-        for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ClassDef):
-                found.setdefault(node.name, []).append(str(source.relative_to(ROOT)))
+        for node in find_nodes(source, ast.ClassDef):
+            found.setdefault(node.name, []).append(str(source.relative_to(ROOT)))
     assert not {name: files for name, files in found.items() if len(files) > 1}
 
 
 def test_tests_share_nothing_but_what_stands_in_support():
     """Older pytests know no package `tests`, and no neighbours of a test's file."""
+    suspect = re.compile(r"\bfrom\s+(?:\.|tests\b)")  # few files are worth parsing
     wrong = [
         (path.relative_to(ROOT).as_posix(), node.lineno)
         for path in (ROOT / "tests").rglob("test_*.py")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if suspect.search(text := path.read_text(encoding="utf-8"))
+        for node in ast.walk(ast.parse(text))
         if isinstance(node, ast.ImportFrom) and (node.level or (node.module or "").split(".")[0] == "tests")
     ]
     assert not wrong
