@@ -62,7 +62,7 @@ def observed(boxed=True):
 
 
 def observed_by_hand(s):
-    """Return L = K (s I − A + B K + L C)⁻¹ L · C (s I − A)⁻¹ B, the loop at the plant's input."""
-    eye = np.eye(2)
-    law = K @ np.linalg.solve(s * eye - A + B @ K + L @ C, L)
-    return complex((law @ C @ np.linalg.solve(s * eye - A, B)).item())
+    """Return L = K (s I − A + B K + L C)⁻¹ L · C (s I − A)⁻¹ B, the loop at the plant's input, for each s of an array."""
+    s_eye = np.multiply.outer(s, np.eye(2))
+    law = K @ np.linalg.solve(s_eye - A + B @ K + L @ C, L)
+    return (law @ C @ np.linalg.solve(s_eye - A, B))[..., 0, 0]

@@ -49,6 +49,7 @@ def exact_lags(t):
 
 @pytest.mark.parametrize("solver", METHODS)
 @pytest.mark.parametrize("rtol", [1e-5, 1e-9])
+@pytest.mark.drawn
 def test_lags_behind_a_sine_are_those_of_the_matrix_exponential(solver, rtol):
     slow, machine, code = forms(driven_lags(), 3.0, step=0.01, solver=solver, rtol=rtol, atol=rtol)
     for run in (machine, code):
@@ -158,6 +159,7 @@ def failures(made, duration, **options):
 
 
 @pytest.mark.parametrize("solver", METHODS)
+@pytest.mark.drawn(2)
 def test_growth_beyond_all_bounds_says_the_same_and_keeps_the_same(solver):
     x = Integrator(name="x", initial_value=1.0)
     error = failures(Diagram("d", x(Function(lambda x: x**2, name="square")(x.y))), 2.0, step=0.01, solver=solver)
@@ -189,6 +191,7 @@ def test_an_error_of_a_python_function_is_that_of_the_run(solver):
 
 @pytest.mark.parametrize("solver", METHODS)
 @pytest.mark.parametrize("place", ["rates", "between"])
+@pytest.mark.drawn
 def test_ctrl_c_ends_it_and_keeps_what_was_recorded(solver, place):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     seen = []

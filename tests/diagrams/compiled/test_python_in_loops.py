@@ -148,6 +148,7 @@ def test_a_root_that_fails_within_a_loop_is_told(form):
 
 @pytest.mark.parametrize("solver", ["RK45", "Radau"])
 @pytest.mark.parametrize("isolate", [False, True])
+@pytest.mark.drawn
 def test_a_function_of_python_beside_an_fmu_in_model_exchange(all_in_c, solver, isolate):
     """A force by Python that damps the mass further, 3 N s/m: the exponential of the matrix."""
     plant = Fmu(mass_spring_damper.build(), interface="model_exchange", name="plant", isolate=isolate)

@@ -81,6 +81,7 @@ def test_mass_limits_of_the_rigid_gantry_are_those_by_hand(side):
 
 @SIDE
 @pytest.mark.parametrize("name", IMPLEMENTATIONS)
+@pytest.mark.drawn
 def test_admittance_and_passivity_of_the_rigid_gantry_are_those_by_hand(side, name):
     here, loop = contact(name, side), by_hand(name, side)
     omega = np.geomspace(0.1, 3000.0, 41)

@@ -49,6 +49,7 @@ MORE_FRICTION = ROUGH.replace(coulomb_scale=1.2)
 @SIDE
 @pytest.mark.parametrize("share", [1.0, 0.4])
 @pytest.mark.parametrize("xi", [0.0, -0.025])
+@pytest.mark.drawn
 def test_continuous_poles_are_the_roots_of_the_characteristic_polynomial(side, share, xi):
     # M p̈ = M̂ q v + (Ĉ − C) ṗ + F − β F_meas, all by polynomials in s: p times each of them
     plant = ROUGH.replace(coulomb_scale=1.3, translational_mass=(9.0, 5.0))
@@ -174,6 +175,7 @@ ENVIRONMENTS = (
 
 @SIDE
 @pytest.mark.parametrize("name", [*VARIANTS, *OTHERS])
+@pytest.mark.drawn
 def test_growth_and_admittance_are_those_of_the_reduction_by_hand(side, name):
     model = loop(side, **{**VARIANTS, **OTHERS}[name])
     for environment in ENVIRONMENTS:
@@ -222,6 +224,7 @@ def test_growth_rates_of_arrays_are_those_of_their_numbers():
 
 
 @pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.drawn(4)
 def test_python_controls_interconnection_has_the_same_growth(name):
     model = loop(**VARIANTS[name])
     for k in (100.0, 5000.0, 1e5):
@@ -576,6 +579,7 @@ def test_force_tracking_keeps_the_damping():
     "environment",
     [{"damping": math.nan}, {"damping": -100.0}, {"mass": -50.0}, {"tool_mass": -1.0}, {"mass": math.inf}],
 )
+@pytest.mark.drawn
 def test_an_environment_that_is_none_is_refused(implementation, environment):
     (name,) = environment
     made = loop().replace(implementation=implementation)
@@ -586,6 +590,7 @@ def test_an_environment_that_is_none_is_refused(implementation, environment):
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("limit", [math.inf, 100.0, 123.4])
+@pytest.mark.drawn
 def test_a_rate_that_is_zero_but_for_rounding_is_not_unstable(limit, seed):
     """σ is 0, up to rounding of either sign that differs between a stack of values and a single one; then it grows."""
     noise, grid = 1e-13, np.geomspace(1e-2, 1e4, 241)  # 100 is a point of the grid

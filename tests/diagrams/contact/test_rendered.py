@@ -115,6 +115,7 @@ def test_the_response_is_an_object_of_python_control():
 @SIDE
 @pytest.mark.parametrize("delay", [0, 1])
 @pytest.mark.parametrize("method", ["exact", "semi_implicit"])
+@pytest.mark.drawn
 def test_sampling_costs_the_first_order_in_the_sample_time(side, delay, method):
     omega = np.geomspace(0.1, 60.0, 20)
     target = target_admittance(loop(side), omega)

@@ -200,6 +200,7 @@ def test_roots_of_a_delayed_integrator_are_those_of_lamberts_w(k):
 
 
 @pytest.mark.parametrize(("k", "count"), [(0.9, 1), (1.1, 0), (3.2, 0), (6.0, 2), (40.0, 4)])
+@pytest.mark.drawn(3)
 def test_the_count_includes_the_poles_of_the_loop_itself(k, count):
     """(s − 1) + k e^(−0.3 s), whose roots mpmath finds: the plant alone is unstable."""
     plant = rational([1.0], [1.0, -1.0], "plant")

@@ -60,6 +60,7 @@ def test_of_two_equal_lags_in_parallel_one_mode_stays_unstable(dt, gain):
 @pytest.mark.parametrize("rotated", [False, True])
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize(("dt", "poles"), [(0, [3.0]), (0, [0.5, -4.0, 2.0]), (0.1, [1.3]), (0.1, [-1.1, 0.5, 1.05])])
+@pytest.mark.drawn
 def test_hidden_unstable_modes_count_in_the_open_and_in_the_closed_loop(dt, poles, way, rotated, coupling):
     seen = control.ss(SEEN[dt])
     for gain in (0.1, 1.0):
@@ -142,6 +143,7 @@ def test_a_loop_of_a_diagram_counts_a_mode_that_its_wire_does_not_see(dt, driven
 
 @pytest.mark.parametrize("pole", [-3.0, -1e4, 1.5])
 @pytest.mark.parametrize("seed", range(8))
+@pytest.mark.drawn
 def test_an_integrator_stays_on_the_limit_beside_a_hidden_mode_in_rotated_states(pole, seed):
     # L = −1/s: the open loop is on the limit, which doesn't count, the closed loop s − 1 is beyond it, with N = 1
     Q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(2, 2)))

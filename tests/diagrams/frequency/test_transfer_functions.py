@@ -31,6 +31,7 @@ def held_triple_states(T):
 
 @pytest.mark.parametrize("T", [1e-2, 1e-4, 1e-5, 1e-6])
 @pytest.mark.parametrize("factor", [1.0, 0.1])
+@pytest.mark.drawn
 def test_three_integrators_sampled_fast_have_the_margins_of_their_state_space(T, factor):
     found, exact = margins(held_triple(T, factor)), margins(held_triple_states(T))
     # rounding of the numerator's coefficients, 3 P T each, relative to its value 3 P T (ω T)² at the crossing
@@ -147,14 +148,20 @@ def test_a_filter_of_delays_alone_has_its_margins():
     """L = K (1 + z⁻¹ + … + z⁻²⁹)/30 · z⁻¹: at z = 1 it is K, and 1/M_t = 1 + 1/K there."""
     K = 0.5
     found = margins(control.tf(K * np.ones(30) / 30, [1.0, *[0.0] * 30], 0.01))
-    theta = np.linspace(1e-6, np.pi, 2_000_001)
-    L = K * np.exp(-1j * theta) * (1 - np.exp(-30j * theta)) / (30 * (1 - np.exp(-1j * theta)))
-    assert found.ms.value == pytest.approx(np.max(1 / np.abs(1 + L)), rel=1e-9)
-    assert found.mt.value == pytest.approx(np.max(np.abs(L / (1 + L))), rel=1e-9)
+    theta = np.linspace(1e-6, np.pi, 20_001)
+
+    def L(theta):
+        return K * np.exp(-1j * theta) * (1 - np.exp(-30j * theta)) / (30 * (1 - np.exp(-1j * theta)))
+
+    k = int(np.argmin(np.abs(1 + L(theta))))
+    near = {"bounds": theta[[k - 1, k + 1]], "method": "bounded", "options": {"xatol": 1e-12}}
+    assert found.ms.value == pytest.approx(1 / minimize_scalar(lambda x: np.abs(1 + L(x)), **near).fun, rel=1e-9)
+    assert found.mt.value == pytest.approx(np.max(np.abs(L(theta) / (1 + L(theta)))), rel=1e-9)  # at 0
 
 
 @pytest.mark.parametrize("T", [1e-4, 1e-5, 1e-6])
 @pytest.mark.parametrize("form", ["as it is", "observable", "turned"])
+@pytest.mark.drawn
 def test_a_companion_form_of_integrators_that_are_sampled_fast_has_its_margins(T, form):
     """L = k (z − q)²/(z − 1)³ with q = 1 − P T, as `ss(zpk(…))` makes it: exact with w = z − 1 = exp(jωT) − 1."""
     P, k = 20.0, 60.0 * T

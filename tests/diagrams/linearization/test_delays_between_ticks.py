@@ -74,6 +74,7 @@ def loop_of(theta, where):
 
 @pytest.mark.parametrize("where", ["before", "behind", "both"])
 @pytest.mark.parametrize("theta", [0.2, 0.25, 0.033, 1.2345])
+@pytest.mark.drawn
 def test_a_lag_with_dead_time_has_the_modified_z_transform(theta, where):
     L = loop_of(theta, where).linearize().loop("u")
     none = Diagram("d", (plant := lag(2.0, 1.0, "lag"))(sampled_pi(plant.y))).linearize().loop("u")

@@ -27,6 +27,7 @@ def file3(tmp_path_factory):
 
 
 @pytest.mark.parametrize("interface", WAYS)
+@pytest.mark.drawn
 def test_the_uncertainty_is_the_error_of_the_derivatives(file, interface):
     whole = np.block([[A, B], [np.eye(2), np.zeros((2, 1))], [A[1:], B[1:]]])
     for e in (0.0, 5e-9, 1e-7, 1e-5):
@@ -118,6 +119,7 @@ def test_a_trim_and_a_stiff_run_do_not_depend_on_wrong_derivatives(file3):
 
 @pytest.mark.parametrize("interface", WAYS)
 @pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.drawn
 def test_local_variables_as_ports_have_slopes_though_the_fmu_may_not_be_asked_for_them(tmp_path, fmi, interface):
     file = misstated_fmu(tmp_path, fmi, hides_state=True)
     plant = Fmu(file, interface=interface, ports=["u", "v", "x", "w"], name="plant")

@@ -171,7 +171,7 @@ diagram = cart_diagram()
 """
 
 
-@pytest.mark.parametrize(("share", "verdict"), [(0.9, "passed"), (1.1, "failed")])
+@pytest.mark.parametrize(("share", "verdict"), [pytest.param(0.9, "passed", marks=pytest.mark.slow), (1.1, "failed")])
 def test_page_one_and_the_json_say_the_same(untried, tmp_path, share, verdict):
     file = write(tmp_path / "c.toml", TABLE, "[contact.hand.requirements]", f"stiffness = {share * SOFT}")
     out = tmp_path / "page.html"

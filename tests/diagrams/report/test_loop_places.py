@@ -45,7 +45,7 @@ def test_a_report_has_the_loop_at_the_plants_input_and_says_what_the_wire_has():
 @pytest.mark.parametrize("to", ["plant.u", ["plant.u"], []])
 def test_requirements_name_the_place(to):
     w = np.geomspace(0.01, 100.0, 40001)
-    by_hand = peak(np.array([observed_by_hand(1j * each) for each in w]))
+    by_hand = peak(observed_by_hand(1j * w))
     asked = Requirements(loops={"u": {"ms": 1.2, "to": to}})
     report = observed(boxed=False).report(only=INNER, requirements=asked)
     number = report.numbers()["inner.u.continuous.ms"]

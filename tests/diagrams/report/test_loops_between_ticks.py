@@ -2,12 +2,15 @@
 
 import cmath
 import math
+from functools import cache
 
 import pytest
 from scipy.optimize import brentq
 
 from loopwright.blocks import PID, BetweenTicksError, Gain, Step, TransferFunction, TransportDelay
 from loopwright.diagrams import Diagram, Requirements, subsystem
+from loopwright.diagrams.report.case import Case
+from loopwright.diagrams.report.review import review
 from loopwright.diagrams.requirements import Reason, Verdict
 
 T, LAG, GAIN, DEAD_TIME, KP, KI = 1.0, 60.0, 1.5, 7.3, 2.0, 0.03
@@ -36,6 +39,19 @@ def response(w):
     return (KP + KI * T / (z - 1)) * plant
 
 
+@cache
+def analysed():
+    return process().report(only=("poles", "inner"))
+
+
+def judged(**limits):
+    """Judge the numbers of one report by limits, as a report does."""
+    case, asked = Case(process().wired), Requirements(**limits)
+    case.requirements = asked
+    found = review(case, asked, analysed().numbers(), absent=analysed().absent())
+    return found, {(r.loop, r.quantity): r for r in found.results}
+
+
 def results_of(diagram, **limits):
     report = diagram.report(only=("poles", "inner"), requirements=Requirements(**limits))
     return report, {(r.loop, r.quantity): r for r in report.review.results}
@@ -57,14 +73,14 @@ def test_a_general_limit_does_not_apply_between_ticks_where_the_loop_is_judged_a
 
 
 def test_the_limit_at_the_other_wire_fails_where_the_margin_is_smaller():
-    report, results = results_of(process(), phase_margin_deg=75)
-    assert report.review.verdict is Verdict.FAILED
+    found, results = judged(phase_margin_deg=75)
+    assert found.verdict is Verdict.FAILED
     assert [key[0] for key, result in results.items() if result.verdict is Verdict.FAILED] == ["power"]
 
 
 def test_a_limit_of_the_very_wire_stays_open():
-    report, results = results_of(process(), phase_margin_deg=45, loops={"temperature": {"phase_margin_deg": 45}})
-    assert report.review.verdict is Verdict.UNDECIDED
+    found, results = judged(phase_margin_deg=45, loops={"temperature": {"phase_margin_deg": 45}})
+    assert found.verdict is Verdict.UNDECIDED
     result = results["temperature", "phase_margin_deg"]
     assert (result.verdict, result.reason) == (Verdict.UNDECIDED, Reason.NO_NUMBER)
     assert "'temperature' changes between ticks" in result.detail

@@ -179,7 +179,7 @@ def write_csv(path, gain=4.0, uncertainty=0.05):
     path.write_text("omega,real,imag,uncertainty\n" + "\n".join(rows))
 
 
-@pytest.mark.parametrize(("gain", "status"), [(4.0, 0), (24.0, 3)])
+@pytest.mark.parametrize(("gain", "status"), [(4.0, 0), pytest.param(24.0, 3, marks=pytest.mark.slow)])
 def test_the_command_line_takes_measured_loops(tmp_path, monkeypatch, capsys, gain, status):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "loop.py").write_text(FILE, encoding="utf-8")

@@ -47,13 +47,16 @@ def said(name):
     return " ".join(report(name).sections[0].text)
 
 
-@pytest.mark.drawn(2)
 @pytest.mark.parametrize(
     ("name", "keys"),
     [
         ("open", ["summary", "subject", "operating_points", "poles", "limits"]),
         ("static", ["summary", "subject", "operating_points", "limits"]),
-        ("channels", ["summary", "subject", "operating_points", "poles", "inner", "sensitivity", "limits"]),
+        pytest.param(
+            "channels",
+            ["summary", "subject", "operating_points", "poles", "inner", "sensitivity", "limits"],
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_sections_that_do_not_apply_do_not_appear(name, keys):

@@ -37,6 +37,11 @@ def made():
     return analyse(loop(), only=PARTS, requirements=Requirements(phase_margin_deg=45, ms=1.8))
 
 
+@cache
+def page_of_made():
+    return to_html(made())
+
+
 def tree_of(report):
     return html5lib.parse(to_html(report), namespaceHTMLElements=False)
 
@@ -51,7 +56,7 @@ def sheets(report, folder):
 
 
 def test_verdicts_come_first_then_the_contents_the_chapters_and_the_appendix():
-    page = to_html(made())
+    page = page_of_made()
     places = ["Verdict: passed.", 'id="f-overview_e_bode"', "<nav", 'id="s-poles"', 'id="s-steps"', 'id="numbers"']
     found = [page.index(place) for place in places]
     assert found == sorted(found)
@@ -94,7 +99,7 @@ def test_without_the_appendix_the_report_ends_with_its_chapters():
     assert "appendix" not in page
     ids, links = set(re.findall(r'\bid="([^"]+)"', page)), set(re.findall(r'(?:href="|url\()#([^")]+)', page))
     assert links <= ids
-    whole = to_html(made())
+    whole = page_of_made()
     assert page.count("<table") < whole.count("<table")
     assert page.count("<figure") == whole.count("<figure")
     assert to_json(report) == to_json(made())
@@ -190,7 +195,7 @@ def small(height):
     return figure
 
 
-@pytest.mark.parametrize("rows", [30, 48])
+@pytest.mark.parametrize("rows", [pytest.param(30, marks=pytest.mark.slow), 48])
 def test_a_summary_has_two_sheets_where_smaller_figures_suffice_and_is_whole(rows, tmp_path):
     plots = tuple(Plot(f"p{i}{k}", f"Caption {i}{k}.", small(1.4), group=str(i)) for i in range(6) for k in "ab")
     table = Table("T", ("name", "value"), tuple((f"row{i}", float(i)) for i in range(rows)))

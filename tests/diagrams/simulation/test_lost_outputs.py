@@ -125,7 +125,13 @@ def test_ports_leave_it_out(file):
 @TIERS
 def test_a_sweep_goes_on_as_a_run(file, compiled):
     found = driven(file).sweep(
-        {"one.value": (1.0, 2.0)}, END, step=H, signals=["plant.x", "plant.lost"], progress=False, compile=compiled
+        {"one.value": (1.0, 2.0)},
+        END,
+        step=H,
+        signals=["plant.x", "plant.lost"],
+        progress=False,
+        compile=compiled,
+        workers=1,
     )
     assert not found.failures
     for i, slope in enumerate((1.0, 2.0)):

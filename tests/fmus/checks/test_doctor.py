@@ -271,6 +271,7 @@ def test_a_trial_run_that_hangs_is_announced(tmp_path, monkeypatch, capsys, fmi)
 
 @pytest.mark.parametrize("name", ["true", "false", "12", "1e3"])
 @pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.drawn
 def test_a_model_identifier_is_a_text_whatever_it_reads_as(tmp_path, fmi, name):
     """No C identifier, which is said; the library has that name nevertheless, and is found."""
     sound = zoo_fmu(tmp_path, fmi)

@@ -46,6 +46,7 @@ python_fmu.build_python(MassSpringDamper(), {!r})
 @pytest.mark.parametrize(
     ("script", "when"), [(COMPILED, "version"), (COMPILED, "compile"), (PLANT, "compile"), (PYTHON, "pack")]
 )
+@pytest.mark.drawn
 def test_a_build_ends_with_its_host(tmp_path, number, script, when):
     """The compiler and the process that it has started, and all folders in which they work are removed."""
     (tmp_path / "sleep.py").write_text(COMPILER)
@@ -92,7 +93,7 @@ def test_a_fork_of_the_host_neither_ends_its_children_nor_keeps_them():
 def test_nothing_of_a_group_is_left_when_it_has_ended(tmp_path):
     """Not even a zombie: the process that keeps it, here for another group, too, says when it is gone."""
     with ProcessGroup():
-        for _ in range(20):
+        for _ in range(5):
             with ProcessGroup() as group:
                 run_in_group([sys.executable, "-c", ""], seconds=60)
                 (number,) = [one for _, one in group._groups]
@@ -145,6 +146,7 @@ with ProcessGroup() as group:
 
 @SIGNALS
 @pytest.mark.parametrize("killed", ["first", "keeper"])
+@pytest.mark.drawn
 def test_a_group_goes_on_where_its_first_process_or_the_keeper_was_killed(tmp_path, number, killed):
     (temporary := tmp_path / "temporary").mkdir()
     with Host(KEPT_AGAIN, killed, str(tmp_path / "begun"), TMPDIR=str(temporary)) as host:

@@ -79,7 +79,7 @@ def test_all_elements_of_an_array_must_be_given(file, cache):
 @TIERS
 def test_a_sweep_and_a_variant_change_it(file, name, compiled):
     found = held(file).sweep(
-        {name: (1.0, 2.0)}, 0.5, step=0.1, signals=["plant.high"], progress=False, compile=compiled
+        {name: (1.0, 2.0)}, 0.5, step=0.1, signals=["plant.high"], progress=False, compile=compiled, workers=1
     )
     assert not found.failures
     for i, pump in enumerate((1.0, 2.0)):

@@ -122,7 +122,7 @@ def test_a_linear_model_is_the_matrix_exponential(file):
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize("name", ["plant.start.level[2]", "plant.start.high", "plant.high"])
 def test_a_sweep_of_an_element_by_its_path(file, name):
-    found = driven(file).sweep({name: (-3.0, 1.0)}, 0.5, step=0.1, signals=["plant.level"], progress=False)
+    found = driven(file).sweep({name: (-3.0, 1.0)}, 0.5, step=0.1, signals=["plant.level"], progress=False, workers=1)
     assert not found.failures
     for i, start in enumerate((-3.0, 1.0)):
         want = levels(found.t, FLOW, (0.5, start))

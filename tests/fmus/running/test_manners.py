@@ -213,7 +213,7 @@ print("done", 1 / 3 + 1 / 7)
 )
 @pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
 @pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.drawn
+@pytest.mark.drawn(2)
 def test_nothing_is_computed_with_the_traps_of_an_fmu(cache, tmp_path, fmi, traps, interface, compiled):
     """A process of its own, as a trap that is set off ends it: in FMI 2.0 a step's end is compared with no number."""
     ends = [

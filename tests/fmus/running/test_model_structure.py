@@ -38,6 +38,7 @@ def test_an_input_that_is_left_out_is_named(tmp_path, fmi):
 
 @pytest.mark.parametrize("kept", ["5", "2 5"])
 @pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.drawn
 def test_states_that_are_left_out_change_neither_a_run_nor_a_linear_model(tmp_path, fmi, kept):
     changes = [(given[fmi], given[fmi].replace("1 2 5", kept)) for given in (RATE, OUTPUT)]
     file = misstated_fmu(tmp_path, fmi, changes)
@@ -147,6 +148,7 @@ BY_ITSELF = {
 @pytest.mark.one_tier  # a second run reads other values of y2
 @pytest.mark.parametrize("fmi", [2, 3])
 @pytest.mark.parametrize("kind", BY_ITSELF)
+@pytest.mark.drawn
 def test_an_output_that_changes_by_itself_is_not_the_structures_fault(tmp_path, fmi, kind):
     equations = f"dx[0] = -x[0] + u[0]; y[0] = 2 * x[0]; {BY_ITSELF[kind]}"
     stated = {"dx1": "x1 u1", "y1": "x1", "y2": ""}
@@ -172,6 +174,7 @@ def test_a_wrong_structure_beside_an_output_that_changes_by_itself_is_named(tmp_
 
 @pytest.mark.parametrize("in_c", [False, True], ids=["interpreted", "compiled"])
 @pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.drawn
 def test_a_wrong_structure_is_left_aside_where_everything_may_depend_on_everything(tmp_path, fmi, in_c):
     """The structure leaves out the feedthrough, and the way from the state to its derivative."""
     equations = "dx[0] = -x[0] + u[0]; y[0] = 2 * x[0] + 0.5 * u[0];"

@@ -60,6 +60,7 @@ def make(cache, tmp_path_factory):
 
 @pytest.mark.parametrize("isolate", [False, True])
 @pytest.mark.parametrize("restore", RESTORES, ids=NAMES)
+@pytest.mark.drawn
 def test_a_step_has_its_derivatives_whatever_the_fmu_restores(make, restore, isolate):
     lag = make(restore, True, isolate=isolate)
     found = lag.step_difference(H, state={"y": 0.3}, inputs={"u": 0.7})
