@@ -135,6 +135,7 @@ def crossings(block, begin, end):
 
 @pytest.mark.parametrize("size", [3e-16, 3e-13])
 @pytest.mark.parametrize("restart", [1e-12, 1e-9, 1e-6, 1e-3, 0.1])
+@pytest.mark.drawn
 def test_an_indicator_with_rounding_errors_crosses_zero_once_however_short_the_next_step_is(restart, size):
     for seed in range(8):
         draw = np.random.default_rng(seed)
@@ -146,6 +147,7 @@ def test_an_indicator_with_rounding_errors_crosses_zero_once_however_short_the_n
 
 @pytest.mark.parametrize("apart", [1e-3, 1e-5, 1e-7])
 @pytest.mark.parametrize("restart", [1e-9, 1e-6, 0.1])
+@pytest.mark.drawn
 def test_a_second_crossing_soon_after_is_found(restart, apart):
     """(t − a)(a + d − t), with errors of 1e-12 d²: the second one is where it is to 1e-12 d, and to ulps of the time."""
     for seed in range(5):

@@ -24,6 +24,7 @@ def lag_loop():
 
 @pytest.mark.parametrize("t", [1000.0, 0.37, 1e-3, 1 / 3])
 @pytest.mark.parametrize("length", [2.0, 0.002, 30.0])
+@pytest.mark.drawn
 def test_a_continuous_diagram_answers_a_step_at_any_time(t, length):
     """T = 2 / (s + 3): 2/3 (1 − e^(−3 t)), whatever has gone before."""
     found = step_response(lag_loop().wired, "u", size=0.1, length=length, at=t, outputs=["plant.y"])
@@ -137,6 +138,7 @@ def test_a_report_at_a_trimmed_point_injects_there():
 
 
 @pytest.mark.parametrize("at", [1000.0, 0.0])
+@pytest.mark.drawn(1)
 def test_a_report_has_the_steps_of_a_continuous_diagram_at_any_time(at):
-    numbers = lag_loop().report(at=at).numbers()
+    numbers = lag_loop().report(at=at, only=("steps",)).numbers()
     assert numbers["steps.u.continuous.rise"].value == pytest.approx(np.log(9.0) / 3.0, rel=1e-3)

@@ -87,6 +87,7 @@ class NoisyWindows(Windows):
 
 
 @pytest.mark.parametrize("deviation", [1e-4, 1e-2])
+@pytest.mark.drawn(1)
 def test_the_noise_in_an_uncertainty_covers_the_true_value_in_its_share_of_draws(deviation):
     """The share is 95 %, of v; that of L is more, as the errors of v and u add up, which are one noise."""
     (part,) = plan_signal("sine", np.array([20.0]), 0.01, 1.0)
@@ -120,6 +121,7 @@ def noisy_loop(variance, seed):
 
 
 @pytest.mark.parametrize("variance", [1e-8, 1e-4])
+@pytest.mark.drawn(1)
 def test_a_loop_with_noise_settles_with_an_uncertainty_that_holds(variance):
     for seed in (1, 2):
         found = noisy_loop(variance, seed).frequency_response("u", [8.0], amplitude=1.0)

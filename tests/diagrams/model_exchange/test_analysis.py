@@ -113,6 +113,7 @@ def test_an_fmu_that_cannot_save_its_state_says_so(file, monkeypatch):
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.drawn(1)
 def test_fig3_with_a_plant_in_model_exchange_is_fig3_with_the_plant_as_a_block(cache, tmp_path, fmi):
     path = gantry.build(out=tmp_path / "gantry.fmu", fmi=fmi)
     swapped = experiments.hand_guiding(plant=Fmu(path, interface="model_exchange")).diagram
@@ -164,6 +165,7 @@ def test_a_report_of_fig3_has_the_numbers_of_co_simulation(cache, tmp_path):
         assert exchanged[name] == pytest.approx(value, rel=1e-9, abs=1e-12), name
 
 
+@pytest.mark.drawn(1)
 def test_a_loop_has_its_slopes_by_the_parameters_of_its_controller(file):
     plant = Fmu(file, interface="model_exchange", name="plant")
 
