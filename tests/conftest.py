@@ -57,12 +57,12 @@ def closed_figures():
 
 
 @pytest.fixture(scope="session")
-def disturbance():
+def disturbance(cache, tmp_path_factory):
     """Linear algebra that can be disturbed, see `support.disturbed`."""
     from support.disturbed import Disturbance
 
     with pytest.MonkeyPatch.context() as patch:
-        found = Disturbance()
+        found = Disturbance(tmp_path_factory.mktemp("disturbed"))
         found.install(patch)
         yield found
 

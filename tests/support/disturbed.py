@@ -11,16 +11,20 @@ norm alone made a hundred numbers wrong that every machine computes rightly, suc
 
 Equal arguments are disturbed equally, as a machine repeats itself; a stack of matrices is disturbed otherwise than the
 same matrices one by one, as its entries have come out of other sums.
+
+Its loops are C (``disturbed.c``): by NumPy, with a dozen calls for a small matrix, they took a tenth of the quick set.
 """
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import importlib
 import sys
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -110,9 +114,6 @@ HOLDERS = ("loopwright", "control", "scipy.signal", "numpy.lib", "numpy.polynomi
 """Modules that may hold such a function by its own name."""
 
 
-AT_ONCE = 1 << 15
-"""Entries of a stack that are disturbed together: all that is computed of them stays in the processor's cache."""
-
 MOST_READ = 1000
 """Entries of an argument of which its disturbance depends: equal arguments have equal ones."""
 
@@ -127,87 +128,23 @@ POOL = 1 << 18
 class _Draw:
     """The random numbers of one call: those of the pool from a place on, around in a circle; none is 0, and all are below 1e-15."""
 
-    def __init__(self, pool: np.ndarray, place: int):
-        self._pool, self._place = pool, place % POOL
+    def __init__(self, pool: np.ndarray, address: int, place: int):
+        self._pool, self.address, self.place = pool, address, place % POOL
 
     def take(self, count: int) -> np.ndarray:
         """Return the next numbers."""
-        first, self._place = self._place, (self._place + count) % POOL
+        first, self.place = self.place, (self.place + count) % POOL
         if first + count <= POOL:
             return self._pool[first : first + count]
         return self._pool.take(np.arange(first, first + count), mode="wrap")
 
 
 @functools.cache
-def _make_pool(seed: int) -> np.ndarray:
+def _make_pool(seed: int) -> tuple[np.ndarray, int]:
+    """Return the numbers of a seed, and their address."""
     pool = (np.random.default_rng(seed).integers(-128, 128, size=POOL) + 0.5) * (SIZE / 128)
     pool.flags.writeable = False
-    return pool
-
-
-def _norm_sizes(sizes: np.ndarray) -> np.ndarray:
-    """Return the norm of each matrix, or vector; the last axis is that of the stack."""
-    axes = tuple(range(sizes.ndim - 1))
-    return np.asarray(np.sqrt(np.add.reduce(sizes**2, axis=axes, keepdims=True) * (sizes.shape[-1] / sizes.size)))
-
-
-def _scaled_sizes(sizes: np.ndarray) -> np.ndarray:
-    """Return the largest size in the row or in the column of each entry, whichever is less; square ones are balanced.
-
-    LAPACK balances a matrix before it looks for eigenvalues, and elimination works with columns and rows: a disturbance
-    by the norm alone would shake small entries beside large ones as no machine does. An entry of a square matrix stays
-    0 where all its powers have 0, as sums of products leave it so. The last axis is that of the stack.
-    """
-    if sizes.ndim == 2:  # vectors
-        return sizes
-    if sizes.shape[0] != sizes.shape[1]:
-        return np.asarray(np.where(sizes > 0.0, _least_sizes(sizes), 0.0))
-    largest = sizes[:, :, 0] if sizes.shape[2] == 1 else np.maximum.reduce(sizes, axis=2)
-    found = _least_sizes(sizes)
-    scale = _BALANCE(largest, scale=1, permute=0)[3]  # one balance for a stack: each takes too long
-    if np.count_nonzero(scale != scale[0]):
-        factors = (scale / scale[:, None])[:, :, None]
-        with np.errstate(all="ignore"):  # factors may be as large as numbers get
-            balanced = _least_sizes(sizes * factors)
-            balanced /= factors
-        np.fmin(found, balanced, out=found)
-    if np.count_nonzero(largest) < largest.size:
-        connected = (largest > 0.0).astype(float)
-        for _ in range(int(sizes.shape[0]).bit_length()):
-            connected = ((connected + connected @ connected) > 0.0).astype(float)
-        found *= connected[:, :, None]
-    return found
-
-
-def _least_sizes(sizes: np.ndarray) -> np.ndarray:
-    largest = np.maximum.reduce
-    return np.asarray(np.minimum(largest(sizes, axis=1, keepdims=True), largest(sizes, axis=0, keepdims=True)))
-
-
-_BALANCE = scipy.linalg.lapack.dgebal
-NORMWISE, SCALED = _norm_sizes, _scaled_sizes
-
-
-def _is_symmetric(stack: np.ndarray) -> bool:
-    """Whether all matrices of a stack equal their conjugate transposes; the corners of the first one answer for most."""
-    if stack.ndim != 3 or stack.shape[1] != stack.shape[2]:
-        return False
-    if stack.item(0, 0, -1) != stack.item(0, -1, 0).conjugate():
-        return False
-    return all(np.array_equal(some, np.conj(np.swapaxes(some, 1, 2))) for some in (stack[:1], stack))
-
-
-def _disturb(values: np.ndarray, sizes: Callable[[np.ndarray], np.ndarray], draw: _Draw, turn: float) -> None:
-    """Add a disturbance to real values, with the axis of the stack at last.
-
-    That of a symmetric matrix is symmetric, with ``turn`` 1, or antisymmetric with -1 (its imaginary part); 0 for others.
-    """
-    if not np.count_nonzero(values):  # such as the imaginary parts of a real right side
-        return
-    change = draw.take(values.size).reshape(values.shape)
-    if turn:
-        change = 0.5 * (change + turn * np.swapaxes(change, 0, 1))
-    values += change * sizes(np.abs(values))
+    return pool, pool.ctypes.data
 
 
 def _flip(draw: _Draw, count: int) -> np.ndarray:
@@ -228,7 +165,16 @@ def _shuffle(draw: _Draw, values: np.ndarray) -> np.ndarray:
 class Disturbance:
     """Disturbs linear algebra while it is on; ``seed`` None leaves everything as it is."""
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path) -> None:
+        """Compile the C part into a folder."""
+        from loopwright.fmus.export import compile_shared  # only where it disturbs
+
+        library = folder / "disturbed"
+        compile_shared({"disturbed.c": Path(__file__).with_suffix(".c").read_text(encoding="utf-8")}, library)
+        self._disturb = ctypes.CDLL(str(library)).disturb
+        address, number = ctypes.c_void_p, ctypes.c_long
+        self._disturb.restype = number
+        self._disturb.argtypes = [address, number, number, number, number, number, address, number, number]
         self.seed: int | None = None
         self.calls = 0
         self.numpy: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {}
@@ -243,28 +189,26 @@ class Disturbance:
             self.seed = before
 
     def argument(self, name: str, value: Any, draw: _Draw) -> Any:
-        """Return an argument with a disturbance, matrix by matrix; what is no array of floats stays."""
+        """Return an argument with a disturbance, matrix by matrix; what is no array of finite floats stays."""
         array = np.asarray(value) if isinstance(value, KINDS) else None
-        if array is None or array.dtype.kind not in "fc" or array.ndim == 0 or not array.size:
+        if array is None or array.dtype.char not in "dD" or array.ndim == 0 or not array.size:
             return value
-        if not np.logical_and.reduce(np.isfinite(array), axis=None):
+        changed = np.array(array, order="C")
+        rows, columns = (0, *array.shape)[-2:]
+        used = self._disturb(
+            changed.ctypes.data,
+            array.size // (columns * max(rows, 1)),
+            rows,
+            columns,
+            1 if array.dtype.char == "d" else 2,
+            name in ORTHOGONAL,
+            draw.address,
+            POOL,
+            draw.place,
+        )
+        if used < 0:
             return value
-        sizes = NORMWISE if name in ORTHOGONAL else SCALED
-        stack = array.reshape(-1, *array.shape[-2:]) if array.ndim > 1 else array[None]
-        symmetric = _is_symmetric(stack)
-        to_last, to_first = ((1, 2, 0), (2, 0, 1)) if array.ndim > 1 else ((1, 0), (1, 0))
-        parts = []
-        count = max(1, AT_ONCE // stack[0].size)
-        for first in range(0, len(stack), count):
-            values = stack[first : first + count].transpose(to_last).copy()  # long rows are quick to go through
-            if array.dtype.kind == "c":
-                # Parts apart: a product adds up parts, and an imaginary one may be 1e-30 of the real.
-                _disturb(values.real, sizes, draw, 1.0 if symmetric else 0.0)
-                _disturb(values.imag, sizes, draw, -1.0 if symmetric else 0.0)
-            else:
-                _disturb(values, sizes, draw, 1.0 if symmetric else 0.0)
-            parts.append(values.transpose(to_first))
-        changed = (parts[0] if len(parts) == 1 else np.concatenate(parts)).reshape(array.shape)
+        draw.place = (draw.place + used) % POOL
         return changed.view(type(value)) if isinstance(value, np.ndarray) else changed
 
     def result(self, name: str, found: Any, draw: _Draw) -> Any:
@@ -302,12 +246,12 @@ class Disturbance:
                 return function(*arguments, **options)
             self.calls += 1
             digest = zlib.crc32(f"{self.seed} {name}".encode())
-            for value in (*arguments, *options.values()):
+            for value in (*arguments, *options.values()) if options else arguments:
                 if isinstance(value, KINDS):
                     array = np.asarray(value)
-                    some = array.reshape(-1)[:: 1 + array.size // MOST_READ]
+                    some = array if array.size < MOST_READ else array.reshape(-1)[:: 1 + array.size // MOST_READ]
                     digest = zlib.crc32(some.tobytes(), zlib.crc32(str(array.shape).encode(), digest))
-            draw = _Draw(_make_pool(self.seed), digest)
+            draw = _Draw(*_make_pool(self.seed), digest)
             changed = [self.argument(name, value, draw) for value in arguments]
             return self.result(name, function(*changed, **options), draw)
 
