@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from loopwright.diagrams import Contact, Fig3Diagram, experiments
+from loopwright.diagrams import Fig3Diagram, experiments
 from loopwright.fmus import gantry, gantry_elastic, gantry_stiction
+from loopwright.types import Contact
 
 PLANTS = {"rigid": gantry, "elastic": gantry_elastic, "bristles": gantry_stiction}
 PUSH = {"rigid": 1e-6, "elastic": 1e-6, "bristles": 1e-8}

@@ -20,8 +20,9 @@ from pathlib import Path
 from scaling import chain, measured_in_c, seconds
 
 from loopwright.blocks import Block, Constant, Event, Gain, Integrator, State, parameter
-from loopwright.diagrams import Diagram, experiments, final, subsystem
+from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.fmus import Fmu, dc_motor
+from loopwright.sweeps import final
 
 BLOCKS = (10, 30, 100, 300, 1000, 3000, 10000)
 FMUS = (1, 2, 4, 8, 16, 32, 64)

@@ -23,7 +23,8 @@ from pathlib import Path
 import numpy as np
 from handwritten import FORMS, TICKS, compile_by_hand, run_by_hand
 
-from loopwright.diagrams import experiments, final, maximum
+from loopwright.diagrams import experiments
+from loopwright.sweeps import final, maximum
 
 PARAMETERS = {"plant.coulomb_scale": (0.5, 1.5), "controller.admittance_perp.stiffness": (100.0, 300.0)}
 KEPT = {"xi": final("xi"), "force": maximum("motor_force")}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
-from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
@@ -15,7 +14,7 @@ _PLANTS = "bouncing_ball|dc_motor|gantry|gantry_contact|gantry_elastic|gantry_st
 _BEFORE = re.compile(rf"loopwright\.(blocks|fmus|diagrams)\.(_[a-z]\w*|fig3|experiments|{_PLANTS})")
 
 
-class _FinderOfMovedModules(MetaPathFinder):
+class _FinderOfMovedModules:
     """Last finder of modules: it finds none, and raises an error for modules that have moved."""
 
     def find_spec(

@@ -1,7 +1,5 @@
 """Diagrams: wiring, scheduling, simulation; linearization and margins; Fig. 3 and its experiments; the command line."""
 
-from lazy_loader import attach_stub as _load_on_use
-
-from ..blocks import moved as _moved  # noqa: F401  gives old pickles, which name modules of this room, an error
+from ..blocks.public_names import load_on_use as _load_on_use
 
 __getattr__, __dir__, __all__ = _load_on_use(__name__, __file__)  # the names are in __init__.pyi

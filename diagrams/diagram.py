@@ -219,7 +219,7 @@ class Diagram:
         sample_time : float or Fraction
             Sample time in s. Subsystems with their own sample time keep it.
         method : {"exact", "forward", "semi_implicit", "trapezoidal"}
-            Discretization of the blocks that were continuous; see `loopwright.blocks.hold`. As inputs are held,
+            Discretization of the blocks that were continuous; see `loopwright.hold`. As inputs are held,
             ``trapezoidal`` is not Tustin's method, python-control's ``c2d(…, "bilinear")``, which averages them too.
 
         Raises

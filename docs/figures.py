@@ -22,9 +22,10 @@ def first_example(page: Path) -> str:
 
 def bode() -> Figure:
     """Return the Bode diagram of Fig. 3's loop across the path, with its margins marked."""
-    from loopwright.diagrams import experiments, margins
+    from loopwright.diagrams import experiments
     from loopwright.diagrams.report.figures import AxisUnits, DrawnLoops, bode
     from loopwright.diagrams.report.variant import look_of
+    from loopwright.frequency import margins
 
     robot = experiments.compliance().diagram
     variants = {"continuous": robot.continuous(), "sampled_d0": robot}

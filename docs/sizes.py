@@ -10,7 +10,7 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-ROOMS = ("blocks", "fmus", "diagrams", "install")
+ROOMS = ("front", "blocks", "fmus", "diagrams", "install")
 NOT_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 
 

@@ -1,6 +1,18 @@
-from .archive import ArchiveLimits, FmuDescription, FmuFault, FmuFinding, FmuSeverity, FmuVariable, read_description
-from .calls import FmuInstance, FmuState, StepOptions, StepTime
-from .checks import FmuDiagnosis, FmuTrial, FmuVerdict, doctor
+from ..blocks.core import (
+    CompilerError,
+    DefinitionError,
+    DiskError,
+    FmuError,
+    FmuFileError,
+    FmuProcessError,
+    FmuRuntimeError,
+    ParameterError,
+    UnitError,
+    UnknownNameError,
+)
+from .archive import ArchiveLimits, read_description
+from .calls import StepOptions, StepTime
+from .checks import doctor
 from .export import ModelSpec, Variable, build, build_fmu, build_python, clear_cache, model_spec, tune
 from .isolation import Isolation
 from .models import (
@@ -13,26 +25,25 @@ from .models import (
     mass_spring_damper,
     scara,
 )
-from .running import Fmu, FmuLinearization
+from .running import Fmu
 
 __all__ = [
     "ArchiveLimits",
+    "CompilerError",
+    "DefinitionError",
+    "DiskError",
     "Fmu",
-    "FmuDescription",
-    "FmuDiagnosis",
-    "FmuFault",
-    "FmuFinding",
-    "FmuInstance",
-    "FmuLinearization",
-    "FmuSeverity",
-    "FmuState",
-    "FmuTrial",
-    "FmuVariable",
-    "FmuVerdict",
+    "FmuError",
+    "FmuFileError",
+    "FmuProcessError",
+    "FmuRuntimeError",
     "Isolation",
     "ModelSpec",
+    "ParameterError",
     "StepOptions",
     "StepTime",
+    "UnitError",
+    "UnknownNameError",
     "Variable",
     "bouncing_ball",
     "build",

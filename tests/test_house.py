@@ -249,6 +249,6 @@ def test_tests_share_nothing_but_what_stands_in_support():
 
 def test_the_formatter_lays_out_every_line():
     exempt = re.compile(r"# *fmt: *(?:skip|off)")
-    folders = ("benchmarks", "blocks", "diagrams", "docs", "fmus", "install", "tests")
+    folders = ("benchmarks", "blocks", "diagrams", "docs", "fmus", "front", "install", "tests")
     files = (file for folder in folders for file in (ROOT / folder).rglob("*.py"))
     assert [file for file in files if exempt.search(file.read_text(encoding="utf-8"))] == []

@@ -5,9 +5,7 @@ import inspect
 
 import pytest
 
-import loopwright.blocks
-import loopwright.diagrams
-import loopwright.fmus
+import loopwright
 from loopwright.blocks import Gain, Input, LoopwrightError, OptionError, Output, State, Value
 from loopwright.diagrams import Requirements, experiments, subsystem
 from loopwright.diagrams.frequency import loop_class
@@ -15,18 +13,25 @@ from loopwright.diagrams.paper.experiments import Experiment
 from support.carts import cart_contact
 from support.public_calls import calls, drive
 
-ROOMS = (loopwright.blocks, loopwright.diagrams, loopwright.fmus)
+PACKAGES = (
+    loopwright.blocks,
+    loopwright.diagrams,
+    loopwright.fmus,
+    loopwright.frequency,
+    loopwright.sweeps,
+    loopwright.types,
+)
 HOUSE = "loopwright."
 RETURNED = (loop_class(), Experiment)
-"""Classes of objects that public functions return, and that no room exports."""
-NO_SUBJECTS = (Exception, KeyboardInterrupt, enum.Enum, Value, loopwright.fmus.FmuInstance)
+"""Classes of objects that public functions return, and that no package exports."""
+NO_SUBJECTS = (Exception, KeyboardInterrupt, enum.Enum, Value, loopwright.types.FmuInstance)
 """Errors and choices; values, whose constructor tells it in words of its own; an FMU that a run alone calls."""
 
 
 def public_classes():
-    for room in ROOMS:
-        for name in room.__all__:
-            value = getattr(room, name)
+    for package in PACKAGES:
+        for name in package.__all__:
+            value = getattr(package, name)
             if inspect.isclass(value) and not issubclass(value, NO_SUBJECTS):
                 yield value
     yield from RETURNED
@@ -48,9 +53,9 @@ def callables_of(cls):
 def public_callables():
     """Return all that takes arguments by name, and whether it takes names of any kind."""
     found = {}
-    for room in ROOMS:
-        for name in room.__all__:
-            value = getattr(room, name)
+    for package in PACKAGES:
+        for name in package.__all__:
+            value = getattr(package, name)
             if inspect.isfunction(value):
                 found[name] = value
     for module in (loopwright.diagrams.experiments,):

@@ -1,4 +1,4 @@
-"""The project itself: walls between rooms, public names, lint, types, the wheel, doctests."""
+"""The project itself: walls between packages, public names, lint, types, the wheel, doctests."""
 
 import doctest
 import importlib
@@ -14,28 +14,37 @@ from pathlib import Path
 
 import pytest
 
-import loopwright.blocks
-import loopwright.diagrams
-import loopwright.fmus
+import loopwright
 from support.kept import kept_folder, kept_tree
 
 ROOT = Path(__file__).parent.parent
-ROOMS = {"blocks": set(), "fmus": {"blocks"}, "diagrams": {"blocks", "fmus"}}
-SOURCES = sorted(p for room in ROOMS for p in (ROOT / room).rglob("*.py"))
+FOLDERS = {"front": "loopwright", **{name: f"loopwright.{name}" for name in ("blocks", "fmus", "diagrams")}}
+PUBLIC = (
+    "loopwright",
+    *(f"loopwright.{name}" for name in ("blocks", "fmus", "diagrams", "frequency", "sweeps", "types")),
+)
+SOURCES = sorted(p for folder in FOLDERS for p in (ROOT / folder).rglob("*.py"))
+
+
+def module_of(path):
+    """Return the name by which a source is imported."""
+    folder, *inner = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join((FOLDERS[folder], *inner)).removesuffix(".__init__")
 
 
 def call(*arguments, **options):
     return subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=False, **options)
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_everything_public_is_exported_on_purpose_and_documented(room):
-    module = importlib.import_module(f"loopwright.{room}")
+@pytest.mark.parametrize("name", PUBLIC)
+def test_everything_public_is_exported_on_purpose_and_documented(name):
+    module = importlib.import_module(name)
     assert module.__all__ == sorted(module.__all__)
     public = {n for n, v in vars(module).items() if not n.startswith("_") and not inspect.ismodule(v)}
     assert public - {"annotations"} <= set(module.__all__) == set(dir(module))
-    for name in module.__all__:
-        assert inspect.getdoc(getattr(module, name)) or name == "Array", f"{room}.{name} has no docstring"
+    for public in module.__all__:
+        documented = inspect.getdoc(getattr(module, public)) or public in ("Array", "__version__")
+        assert documented, f"{name}.{public} has no docstring"
 
 
 def test_every_parameter_of_a_block_is_described_and_has_bounds_or_a_unit_where_it_is_physical():
@@ -76,23 +85,24 @@ def test_deprecations_are_errors_where_our_code_or_a_users_causes_them(module, e
 def test_types(tmp_path):
     """Mypy's cache stays for all checkouts: an entry counts only for the file's very content, wherever it is."""
     (tmp_path / "loopwright").mkdir()
-    for room in ROOMS:
-        (tmp_path / "loopwright" / room).symlink_to(ROOT / room)
-    packages = [argument for room in ROOMS for argument in ("-p", f"loopwright.{room}")]
+    for file in (ROOT / "front").iterdir():
+        (tmp_path / "loopwright" / file.name).symlink_to(file)
+    for folder in FOLDERS.keys() - {"front"}:
+        (tmp_path / "loopwright" / folder).symlink_to(ROOT / folder)
     environment = {**os.environ, "MYPYPATH": str(tmp_path)}
     here = ".".join(map(str, sys.version_info[:2]))  # NumPy's stubs may need it, where it is newer than the lowest
     kept = kept_folder("types")
     archive = kept and kept / f"mypy-{importlib.metadata.version('mypy')}-python-{here}.tar"
     with kept_tree(archive, tmp_path / "cache") as cache:
         options = ("--python-version", here, "--cache-dir", str(cache))
-        done = call(sys.executable, "-m", "mypy", *packages, *options, env=environment)
+        done = call(sys.executable, "-m", "mypy", "-p", "loopwright", *options, env=environment)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_every_subpackage_is_listed_for_the_wheel():
     setup = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
-    folders = {str(p.parent.relative_to(ROOT)).replace(os.sep, ".") for p in SOURCES}
-    assert {f"loopwright.{f}" for f in folders} == set(setup["packages"])
+    assert {module_of(path.parent / "__init__.py") for path in SOURCES} == set(setup["packages"])
+    assert setup["package-dir"] == {package: folder for folder, package in FOLDERS.items()}
     assert importlib.metadata.version("loopwright")
 
 
@@ -114,6 +124,7 @@ def test_the_root_holds_what_belongs_there():
         "diagrams",
         "docs",
         "fmus",
+        "front",
         "install",
         "notebooks",
         "tests",
@@ -122,13 +133,14 @@ def test_the_root_holds_what_belongs_there():
 
 def test_every_file_that_is_no_code_is_listed_for_the_wheel():
     setup = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
+    folders = {module_of(path.parent / "__init__.py"): path.parent for path in SOURCES}
     listed = {
         file
         for package, patterns in setup["package-data"].items()
         for pattern in patterns
-        for file in (ROOT / package.removeprefix("loopwright.").replace(".", os.sep)).glob(pattern)
+        for file in folders[package].glob(pattern)
     }
-    kept = call("git", "ls-files", *ROOMS).stdout.splitlines()
+    kept = call("git", "ls-files", *FOLDERS).stdout.splitlines()
     made = {file for file in listed if file.parent.name == "built"}  # by the installation
     assert {ROOT / name for name in kept if not name.endswith(".py")} == listed - made
 
@@ -162,11 +174,11 @@ def test_the_built_wheel_imports_runs_and_holds_the_c_runtime(tmp_path):
     done = call(sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", str(site), str(wheel))
     assert done.returncode == 0, done.stdout + done.stderr
     script = (
-        "import loopwright.blocks, loopwright.fmus, loopwright.diagrams as d, sys; "
-        f"assert d.__file__.startswith({str(site)!r}), d.__file__; "
-        "run = d.experiments.path_following().diagram.simulate(0.1, progress=False); print(run['eta'][0, 0]); "
+        "import loopwright as lw; "
+        f"assert lw.__file__.startswith({str(site)!r}), lw.__file__; "
+        "run = lw.experiments.path_following().diagram.simulate(0.1, progress=False); print(run['eta'][0, 0]); "
         "from loopwright.blocks import Constant, Integrator; "
-        "d.Diagram('small', Integrator()(Constant(value=1.0))).report('small.html')"
+        "lw.Diagram('small', Integrator()(Constant(value=1.0))).report('small.html')"
     )
     (runtime,) = (site / "loopwright" / "fmus" / "runtime" / "built").iterdir()
     assert "none-any" not in wheel.name, runtime
@@ -177,8 +189,10 @@ def test_the_built_wheel_imports_runs_and_holds_the_c_runtime(tmp_path):
     assert done.returncode == 0, done.stderr
     assert float(done.stdout) == pytest.approx(0.1, abs=1e-12)
     assert "Design report: small" in (tmp_path / "small.html").read_text(encoding="utf-8")
-    for room in ROOMS:
-        assert (site / "loopwright" / room / "py.typed").is_file()
+    assert (site / "loopwright" / "py.typed").is_file()
+    command = (sys.executable, "-m", "loopwright", "--version")
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout.split() == ["loopwright", loopwright.__version__], done.stderr
 
 
 @pytest.mark.slow
@@ -203,16 +217,17 @@ try:
     pickle.loads(b"cloopwright.diagrams.fig3\\nChannel\\n.")
 except ModuleNotFoundError as error:
     assert "before 0.2.0" in str(error)  # before anything else is loaded
-import loopwright.blocks, loopwright.fmus, loopwright.diagrams
+import loopwright
+assert "loopwright.blocks.core" not in sys.modules  # a name is loaded when it is used
 wave = loopwright.blocks.Sine(frequency=1.0)()
-loopwright.diagrams.Diagram("wave", wave).simulate(1.0, step=0.5, progress=False)
+loopwright.Diagram("wave", wave).simulate(1.0, step=0.5, progress=False)
 needed = {"compiled", "coupling", "diagram", "events", "flat", "model_exchange", "results", "simulation", "solvers", "wiring"}  # a run pays for nothing else
 assert {m.split(".")[2] for m in sys.modules if m.startswith("loopwright.diagrams.")} == needed
-loopwright.diagrams.experiments.path_following().diagram.simulate(0.01, progress=False)
+loopwright.experiments.path_following().diagram.simulate(0.01, progress=False)
 late = [m for m in ("control", "matplotlib.pyplot", "scipy.integrate") if m in sys.modules]
 assert not late, late
-for room in (loopwright.blocks, loopwright.fmus, loopwright.diagrams):
-    assert all(hasattr(room, name) for name in room.__all__)
+for package in (loopwright, loopwright.blocks, loopwright.fmus, loopwright.diagrams, loopwright.frequency, loopwright.sweeps, loopwright.types):
+    assert all(hasattr(package, name) for name in package.__all__)
 assert state() == before
 """
     done = call(sys.executable, "-c", script)
@@ -223,7 +238,7 @@ def test_doctests(monkeypatch):
     monkeypatch.setattr("linecache.checkcache", lambda filename=None: None)  # for each docstring it looks for all files
     results = []
     for path in SOURCES:
-        name = ".".join(("loopwright", *path.relative_to(ROOT).with_suffix("").parts)).removesuffix(".__init__")
+        name = module_of(path)
         if not name.endswith("__main__"):
             results.append(doctest.testmod(importlib.import_module(name)))
     assert sum(r.failed for r in results) == 0

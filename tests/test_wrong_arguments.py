@@ -8,15 +8,20 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-import loopwright.blocks
-import loopwright.diagrams
-import loopwright.fmus
+import loopwright
 from loopwright.blocks import Block, LoopwrightError, OptionError, Value
 from loopwright.diagrams import Diagram
 from support.library import CASES
 from support.public_calls import calls
 
-ROOMS = (loopwright.blocks, loopwright.diagrams, loopwright.fmus)
+PACKAGES = (
+    loopwright.blocks,
+    loopwright.diagrams,
+    loopwright.fmus,
+    loopwright.frequency,
+    loopwright.sweeps,
+    loopwright.types,
+)
 WRONG = {
     "None": None,
     "text": "nonsense",
@@ -147,9 +152,9 @@ def is_class_of_another_kind(value):
 
 def public_callables():
     found = set()
-    for room in ROOMS:
-        for name in room.__all__:
-            value = getattr(room, name)
+    for package in PACKAGES:
+        for name in package.__all__:
+            value = getattr(package, name)
             if inspect.ismodule(value) or not callable(value):
                 continue
             if inspect.isclass(value) and is_class_of_another_kind(value) and value not in (loopwright.fmus.Fmu,):
@@ -209,12 +214,12 @@ def test_a_wrong_parameter_of_a_block_ends_in_an_error_of_our_own_or_a_block(blo
     ("ask", "message"),
     [
         (
-            lambda d: loopwright.diagrams.margins(d.linearize().loop("u"), delay="2"),
+            lambda d: loopwright.frequency.margins(d.linearize().loop("u"), delay="2"),
             r"margins.delay: found '2'; expected",
         ),
-        (lambda d: loopwright.diagrams.maximum("y", since=None), r"maximum.since: found None; expected a number"),
+        (lambda d: loopwright.sweeps.maximum("y", since=None), r"maximum.since: found None; expected a number"),
         (
-            lambda d: loopwright.diagrams.read_frequency_data(True),
+            lambda d: loopwright.frequency.read_frequency_data(True),
             r"read_frequency_data.file: found True; expected a path",
         ),
         (lambda d: d.sensitivity("u", 3), r"parameters: found 3; expected a name, or a list of names"),
@@ -223,7 +228,7 @@ def test_a_wrong_parameter_of_a_block_ends_in_an_error_of_our_own_or_a_block(blo
         (lambda d: d.draw(subsystem="contrl"), r"no subsystem 'contrl'. Did you mean 'control'"),
         (lambda d: d.sweep({"kp.gain": (1.0,)}, 0.1, signals=3), r"signals: found 3; expected a name, or a list"),
         (
-            lambda d: loopwright.diagrams.place(np.eye(2), [[1.0], [1.0]], None),
+            lambda d: loopwright.frequency.place(np.eye(2), [[1.0], [1.0]], None),
             r"place.poles: found None; expected a list",
         ),
     ],

@@ -282,7 +282,7 @@ class FmuFileError(FmuError):
     Attributes
     ----------
     fault : str, optional
-        Kind of the fault, a `loopwright.fmus.FmuFault`; None where no kind is known.
+        Kind of the fault, a `loopwright.types.FmuFault`; None where no kind is known.
     subject : str, optional
         File of the archive, variable, library or attribute concerned.
     """

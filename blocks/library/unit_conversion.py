@@ -20,8 +20,8 @@ class UnitConversion(Block):
 
     Examples
     --------
+    >>> from loopwright import Diagram
     >>> from loopwright.blocks import Constant, UnitConversion
-    >>> from loopwright.diagrams import Diagram
     >>> warm = UnitConversion(from_unit="degC", to_unit="K")(Constant(value=20.0, unit="degC"))
     >>> Diagram("d", warm.named("T")).simulate(0.1, step=0.1, progress=False)["T"]
     array([293.15, 293.15])

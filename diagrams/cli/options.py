@@ -55,7 +55,7 @@ def parse_options(arguments: argparse.Namespace) -> dict[str, Any]:
         if name == "path":
             raise OptionError(
                 "a path can't be given on the command line; take Python: "
-                "loopwright.diagrams.experiments.path_following(path=…).simulate().",
+                "loopwright.experiments.path_following(path=…).simulate().",
                 port="--option path",
             )
         if name in options:

@@ -147,8 +147,8 @@ def check_block(
 
     Examples
     --------
+    >>> from loopwright import check_block
     >>> from loopwright.blocks import Saturation
-    >>> from loopwright.diagrams import check_block
     >>> report = check_block(Saturation(limit=1.0), shapes={"u": (2,)})
     >>> report.kinds
     {'sampled': 'checked', 'continuous': 'checked'}

@@ -67,7 +67,7 @@ class Stepped(Protocol):
     def instantiate(
         self, wired: Sequence[str], stop_time: float | None, *, start_time: float
     ) -> AbstractContextManager[Plant]:
-        """Load the plant for a run; see `loopwright.blocks.Block`."""
+        """Load the plant for a run; see `loopwright.Block`."""
 
 
 def note_steps(flat: FlatDiagram, *, step: object) -> tuple[str, ...]:

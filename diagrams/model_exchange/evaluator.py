@@ -112,7 +112,7 @@ class HasModelExchange(Protocol):
     """A block whose class says ``evaluated_outside``: an `Fmu`, or one that a user has written."""
 
     def exchange(self, wired: Sequence[str], *, start_time: float) -> AbstractContextManager[ModelExchangeBlock]:
-        """Load it for a run; see `loopwright.blocks.Block`."""
+        """Load it for a run; see `loopwright.Block`."""
 
 
 OWN_EVENTS = INPUT_EVENT, TIME_EVENT, STEP_EVENT = "input_event", "time_event", "step_event"

@@ -52,7 +52,6 @@ from ...blocks import (
     ErrorDynamics,
     FeedbackLinearization,
     ForceSensor,
-    Frame,
     Gain,
     Line,
     Path,
@@ -61,6 +60,7 @@ from ...blocks import (
 )
 from ...blocks.core import Array, Finding, ParameterError, UnknownNameError, Value, kinds, parameter
 from ...blocks.path_following import A_MODEL, A_PATH, planar_slopes
+from ...blocks.paths import Frame
 from ...blocks.tracing import check_method
 from ..contact import SIDES, Contact, PortNames, Tool, make_contact, restrict
 from ..diagram import Diagram

@@ -1,6 +1,6 @@
 """Experiments A to D of the paper, with every profile fixed (docs/reference/experiments.md).
 
->>> from loopwright.diagrams import experiments
+>>> from loopwright import experiments
 >>> experiments.path_following(delay=1).options["delay"]
 1
 """

@@ -59,7 +59,7 @@ class Recorder:
         Whether the vector has one more entry at its end: the residual of the algebraic loops. It is always kept, apart
         from the data.
     to : path, optional
-        Folder for a run on disk; see `loopwright.diagrams.Run.open`.
+        Folder for a run on disk; see `loopwright.Run.open`.
     header : mapping, optional
         Header of the run on disk (`stored.header`); needed with ``to``.
     overwrite : bool

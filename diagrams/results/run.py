@@ -108,8 +108,8 @@ class Run:
 
     Examples
     --------
+    >>> from loopwright import Diagram
     >>> from loopwright.blocks import Gain, Step
-    >>> from loopwright.diagrams import Diagram
     >>> step = Step(times=0.2, values=3.0)
     >>> run = Diagram("step", Gain(gain=2.0)(step).named("y")).simulate(0.4, step=0.2, progress=False)
     >>> run.t

@@ -46,8 +46,8 @@ class Simulation:
 
     Examples
     --------
+    >>> from loopwright import Diagram
     >>> from loopwright.blocks import Constant, Integrator
-    >>> from loopwright.diagrams import Diagram
     >>> diagram = Diagram("ramp", Integrator()(Constant(value=1.0)).named("y"))
     >>> with diagram.simulation(step=0.25) as simulation:
     ...     simulation.advance(0.5)

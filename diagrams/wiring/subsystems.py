@@ -362,7 +362,7 @@ def subsystem(
         Discretization of continuous blocks inside. ``exact`` is the zero-order hold for blocks that are linear in
         their states, forward Euler for others. ``trapezoidal`` is of second order; where a block is not linear,
         Newton's method solves each step, and the run stops at a step that it does not solve. See
-        `loopwright.blocks.hold`. Without one, the method of the surroundings holds, or ``exact``. Each block is
+        `loopwright.hold`. Without one, the method of the surroundings holds, or ``exact``. Each block is
         discretized by itself, with its inputs held over the sample. So several `Integrator` blocks in a row are
         forward Euler between them whatever the method; put them into one block, such as a `StateSpace`, for the method
         to act on the whole. For the same reason ``trapezoidal`` is not Tustin's method, ``c2d(…, "bilinear")``, which

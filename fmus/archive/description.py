@@ -122,9 +122,7 @@ class FmuDescription:
     def __repr__(self) -> str:
         kinds = "co-simulation" * self.co_simulation, "model exchange" * bool(self.model_exchange)
         facts = f"FMI {self.fmi}", " and ".join(filter(None, kinds)), f"{len(self.variables)} variables"
-        return brief(
-            f"description of {self.file.name!r}", *facts, then=".variables, .states, loopwright.fmus.doctor(file)"
-        )
+        return brief(f"description of {self.file.name!r}", *facts, then=".variables, .states, loopwright.doctor(file)")
 
     def layout(self, names: Iterable[str]) -> Layout:
         """Return the layout of some variables in a flat vector, one after the other."""

@@ -79,7 +79,7 @@ def doctor(
 
     Examples
     --------
-    >>> from loopwright.fmus import doctor
+    >>> from loopwright import doctor
     >>> print(doctor("absent.fmu").headline)
     is refused: there is no file 'absent.fmu'; expected an FMU
     """

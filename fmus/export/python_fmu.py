@@ -1,7 +1,7 @@
 """FMUs with Python inside, made by the package PythonFMU, for equations that can't be traced.
 
 They need an interpreter with NumPy and Loopwright where they run, and their description says so. Build a block that can
-be traced with `loopwright.fmus.build`: such an FMU needs no other software.
+be traced with `loopwright.build`: such an FMU needs no other software.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ def tune(path: str | os.PathLike[str]) -> Path:
     if not is_built_here(hashlib.sha256(content).hexdigest()):
         raise FmuError(
             f"Loopwright has not built {str(file)!r} on this machine, and compiles no sources of others; expected an "
-            "FMU of loopwright.fmus.build. Run it as it is, without fuse=True.",
+            "FMU of loopwright.build. Run it as it is, without fuse=True.",
         )
     compiler, target, flags = find_compiler(), native_platform(), processor_flags()
     parts = (*describe_compiler(target), *flags, describe_processor())

@@ -66,5 +66,5 @@ def build(
     internal_step: float = 1e-2,
     **options: Any,
 ) -> Path:
-    """Export it as an FMU, ``bouncing_ball.fmu``, and return the file; ``options`` as `loopwright.fmus.build`."""
+    """Export it as an FMU, ``bouncing_ball.fmu``, and return the file; ``options`` as `loopwright.build`."""
     return _build(model, out, name=name, internal_step=internal_step, stop_time=3.0, **options)

@@ -61,5 +61,5 @@ def build(
     internal_step: float = 1e-4,
     **options: Any,
 ) -> Path:
-    """Export it as an FMU, ``dc_motor.fmu``, and return the file; ``options`` as `loopwright.fmus.build`."""
+    """Export it as an FMU, ``dc_motor.fmu``, and return the file; ``options`` as `loopwright.build`."""
     return _build(model, out, name=name, internal_step=internal_step, stop_time=0.2, **options)

@@ -131,6 +131,6 @@ def build(
     notify : callable, optional
         Called with a line of text when a compilation starts.
     **options
-        Further options of `loopwright.fmus.build`.
+        Further options of `loopwright.build`.
     """
     return _build(model, out, name=name, internal_step=internal_step, stop_time=11.0, notify=notify, **options)

@@ -105,5 +105,5 @@ def build(
     internal_step: float = INTERNAL_STEP,
     **options: Any,
 ) -> Path:
-    """Export it as an FMU, ``gantry_elastic.fmu``, and return the file; ``options`` as `loopwright.fmus.build`."""
+    """Export it as an FMU, ``gantry_elastic.fmu``, and return the file; ``options`` as `loopwright.build`."""
     return _build(model, out, name=name, internal_step=internal_step, stop_time=11.0, **options)

@@ -129,5 +129,5 @@ def build(
     integrator: Integrator = "rodas",
     **options: Any,
 ) -> Path:
-    """Export it as an FMU, ``gantry_stiction.fmu``, and return the file; ``options`` as `loopwright.fmus.build`."""
+    """Export it as an FMU, ``gantry_stiction.fmu``, and return the file; ``options`` as `loopwright.build`."""
     return _build(model, out, name=name, internal_step=internal_step, integrator=integrator, stop_time=11.0, **options)

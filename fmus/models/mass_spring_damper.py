@@ -46,5 +46,5 @@ def build(
     internal_step: float = 1e-3,
     **options: Any,
 ) -> Path:
-    """Export it as an FMU, ``mass_spring_damper.fmu``, and return the file; ``options`` as `loopwright.fmus.build`."""
+    """Export it as an FMU, ``mass_spring_damper.fmu``, and return the file; ``options`` as `loopwright.build`."""
     return _build(model, out, name=name, internal_step=internal_step, stop_time=10.0, **options)

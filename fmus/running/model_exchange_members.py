@@ -117,7 +117,7 @@ class ModelExchangeMembers(PortMembers):
         return events_of(self) if self.evaluated_outside else {}
 
     def dependence(self, equation: str) -> Mapping[str, Array]:
-        """Return what depends on what in model exchange, by the model structure; see `loopwright.blocks.Block`."""
+        """Return what depends on what in model exchange, by the model structure; see `loopwright.Block`."""
         return dependence(self, equation, NEXT)
 
     @contextmanager

@@ -203,8 +203,7 @@ def test_processes_that_build_one_plant_at_once(tmp_path, monkeypatch):
 
 TEMPORARY = """
 import os, sys, tempfile
-from loopwright.blocks import FmuError
-from loopwright.fmus import mass_spring_damper
+from loopwright.fmus import FmuError, mass_spring_damper
 resource = __import__("resource")
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, resource.RLIM_INFINITY))
 try:

@@ -4,10 +4,11 @@ from functools import cache
 
 import numpy as np
 
-from loopwright.blocks import AdmittanceFilter, Array, ErrorDynamics, Line, Output, Reference, Step, parameter
+from loopwright.blocks import AdmittanceFilter, ErrorDynamics, Line, Output, Reference, Step, parameter
 from loopwright.diagrams import AdmittanceLoop, Channel, Rig, fig3
 from loopwright.diagrams.paper.wires import IMPEDANCE_PAR, IMPEDANCE_PERP, POLES_PAR, POLES_PERP
 from loopwright.fmus import Fmu, build, gantry
+from loopwright.types import Array
 
 PATH = Line(start=(-1.0, 0.0), end=(1.0, 0.0))  # the tangent is the axis y, the normal the axis z
 SIDES = ("par", "perp")

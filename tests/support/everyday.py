@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import SimulationError
-from loopwright.diagrams import Diagram, Requirements, Verdict
+from loopwright.diagrams import Diagram, Requirements
+from loopwright.types import Verdict
 
 from .by_hand import step_numbers
 

@@ -12,7 +12,8 @@ import struct
 import zipfile
 from dataclasses import dataclass, field
 
-from loopwright.fmus import ArchiveLimits, FmuFault
+from loopwright.fmus import ArchiveLimits
+from loopwright.types import FmuFault
 
 XML = "modelDescription.xml"
 

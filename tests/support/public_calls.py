@@ -8,6 +8,9 @@ import numpy as np
 import loopwright.blocks as blocks
 import loopwright.diagrams as diagrams
 import loopwright.fmus as fmus
+import loopwright.frequency as frequency
+import loopwright.sweeps as sweeps
+import loopwright.types as types
 from loopwright.blocks import Gain, Integrator, StateSpace, Step
 from loopwright.diagrams import Diagram, Requirements, experiments, subsystem
 
@@ -173,7 +176,7 @@ def calls():
                 "seed": 0,
                 "seeds": (),
                 "signals": "y",
-                "reduce": {"end": diagrams.final("y")},
+                "reduce": {"end": sweeps.final("y")},
                 "to": None,
                 "overwrite": False,
                 "client": None,
@@ -232,38 +235,38 @@ def calls():
         "Sensitivities.of": lambda: (sensitivities().of, {"quantity": "ms", "count": 1}),
         "Sensitivities.plot": lambda: (sensitivities().plot, {"quantity": "ms", "count": 1}),
         "WorstCase.plot": lambda: (worst().plot, {"parameters": ["kp.gain"]}),
-        "margins": lambda: (diagrams.margins, {"loop": loop(), "delay": 0, "skew": 0.0}),
-        "disk_margin": lambda: (diagrams.disk_margin, {"loop": loop(), "delay": 0, "skew": 0.0}),
-        "mimo_disk_margin": lambda: (diagrams.mimo_disk_margin, {"loop": loop(), "delay": 0, "skew": 0.0}),
-        "periodic_margins": lambda: (diagrams.periodic_margins, {"loop": loop()}),
-        "nyquist_count": lambda: (diagrams.nyquist_count, {"loop": loop(), "delay": 0}),
-        "sensitivity": lambda: (diagrams.sensitivity, {"loop": loop()}),
-        "complementary": lambda: (diagrams.complementary, {"loop": loop()}),
-        "gang_of_four": lambda: (diagrams.gang_of_four, {"plant": plain(), "controller": plain()}),
-        "compare_with_control": lambda: (diagrams.compare_with_control, {"loop": loop(), "delay": 0}),
-        "measured_margins": lambda: (diagrams.measured_margins, {"data": data(), "uncertainty": 0.01}),
-        "delayed_hold": lambda: (diagrams.delayed_hold, {"plant": plain(), "sample_time": 0.1, "delay": 0.05}),
+        "margins": lambda: (frequency.margins, {"loop": loop(), "delay": 0, "skew": 0.0}),
+        "disk_margin": lambda: (frequency.disk_margin, {"loop": loop(), "delay": 0, "skew": 0.0}),
+        "mimo_disk_margin": lambda: (frequency.mimo_disk_margin, {"loop": loop(), "delay": 0, "skew": 0.0}),
+        "periodic_margins": lambda: (frequency.periodic_margins, {"loop": loop()}),
+        "nyquist_count": lambda: (frequency.nyquist_count, {"loop": loop(), "delay": 0}),
+        "sensitivity": lambda: (frequency.sensitivity, {"loop": loop()}),
+        "complementary": lambda: (frequency.complementary, {"loop": loop()}),
+        "gang_of_four": lambda: (frequency.gang_of_four, {"plant": plain(), "controller": plain()}),
+        "compare_with_control": lambda: (frequency.compare_with_control, {"loop": loop(), "delay": 0}),
+        "measured_margins": lambda: (frequency.measured_margins, {"data": data(), "uncertainty": 0.01}),
+        "delayed_hold": lambda: (frequency.delayed_hold, {"plant": plain(), "sample_time": 0.1, "delay": 0.05}),
         "delayed_hold_margin": lambda: (
-            diagrams.delayed_hold_margin,
+            frequency.delayed_hold_margin,
             {"plant": plain(), "controller": control.ss([], [], [], [[0.5]], 0.1), "largest": 20.0},
         ),
-        "loop_at": lambda: (diagrams.loop_at, {"plant": plain(), "controller": plain(), "where": "input"}),
-        "place": lambda: (diagrams.place, lag),
+        "loop_at": lambda: (frequency.loop_at, {"plant": plain(), "controller": plain(), "where": "input"}),
+        "place": lambda: (frequency.place, lag),
         "sampled_gains": lambda: (
-            diagrams.sampled_gains,
+            frequency.sampled_gains,
             {"poles": [-2.0, -3.0, -4.0], "sample_time": 0.01, "delay": 0, "integral": "forward"},
         ),
         "sampled_poles": lambda: (
-            diagrams.sampled_poles,
+            frequency.sampled_poles,
             {"gains": [24.0, 26.0, 9.0], "sample_time": 0.01, "delay": 0, "integral": "forward"},
         ),
-        "read_frequency_data": lambda: (diagrams.read_frequency_data, {"file": "/nowhere.csv", "dt": 0.0}),
-        "final": lambda: (diagrams.final, {"signal": "y"}),
-        "maximum": lambda: (diagrams.maximum, {"signal": "y", "since": 0.0}),
-        "minimum": lambda: (diagrams.minimum, {"signal": "y", "since": 0.0}),
-        "mean": lambda: (diagrams.mean, {"signal": "y", "since": 0.0}),
-        "settling_time": lambda: (diagrams.settling_time, {"signal": "y", "band": 0.1, "target": 0.0, "since": 0.0}),
-        "Box": lambda: (diagrams.Box, {"low": 1.0, "high": 2.0, "scale": "log"}),
+        "read_frequency_data": lambda: (frequency.read_frequency_data, {"file": "/nowhere.csv", "dt": 0.0}),
+        "final": lambda: (sweeps.final, {"signal": "y"}),
+        "maximum": lambda: (sweeps.maximum, {"signal": "y", "since": 0.0}),
+        "minimum": lambda: (sweeps.minimum, {"signal": "y", "since": 0.0}),
+        "mean": lambda: (sweeps.mean, {"signal": "y", "since": 0.0}),
+        "settling_time": lambda: (sweeps.settling_time, {"signal": "y", "band": 0.1, "target": 0.0, "since": 0.0}),
+        "Box": lambda: (sweeps.Box, {"low": 1.0, "high": 2.0, "scale": "log"}),
         "Coupling": lambda: (
             diagrams.Coupling,
             {"scheme": "iterated", "order": (), "tolerance": 1e-9, "passes": 5, "error": None, "shortest": 1e-9},
@@ -281,7 +284,7 @@ def calls():
             },
         ),
         "RunOptions.of": lambda: (
-            lambda options: diagrams.RunOptions.of(options, block="d"),
+            lambda options: types.RunOptions.of(options, block="d"),
             {"options": {"step": 0.1}},
         ),
         "subsystem": lambda: (

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from loopwright import blocks as lw
-from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams import AlgebraicLoopError, Diagram, subsystem
 from loopwright.fmus import Fmu, StepOptions, build
 
 from .plain_blocks import HUNDREDTH, KINDS, Draw, Pendulum
@@ -76,7 +75,7 @@ def make_if_possible(family, seed):
     """Return the diagram with this number; None where its initial values depend on each other."""
     try:
         return make(family, seed)
-    except lw.AlgebraicLoopError:
+    except AlgebraicLoopError:
         return None
 
 

@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent.parent
-ROOMS = ("blocks", "fmus", "diagrams")
+ROOMS = ("blocks", "fmus", "diagrams", "front")  # the last is the package `loopwright` itself
 SOURCES = sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
 
 

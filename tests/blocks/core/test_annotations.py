@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import (
-    Array,
     Block,
     DefinitionError,
     Ellipse,
@@ -17,6 +16,7 @@ from loopwright.blocks import (
     parameter,
 )
 from loopwright.fmus import model_spec
+from loopwright.types import Array
 
 
 class Mass(Block):

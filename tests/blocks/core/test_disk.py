@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from loopwright.blocks import DiskError, OptionError
+from loopwright.blocks import OptionError
 from loopwright.blocks.core import (
     check_file,
     describe_disk_error,
@@ -17,6 +17,7 @@ from loopwright.blocks.core import (
     find_disk_error,
     write_text,
 )
+from loopwright.diagrams import DiskError
 from support.failing_disk import fail_below
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="limits and users of POSIX")
@@ -115,7 +116,7 @@ def test_a_full_device(tmp_path):
 
 LIMITED = """
 import resource, sys
-from loopwright.blocks import DiskError
+from loopwright.diagrams import DiskError
 from loopwright.blocks.core import write_text
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, resource.RLIM_INFINITY))
 try:

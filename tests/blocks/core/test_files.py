@@ -6,8 +6,8 @@ import stat
 
 import pytest
 
-from loopwright.blocks import DiskError
 from loopwright.blocks.core import replace_file, write_text
+from loopwright.diagrams import DiskError
 
 
 @pytest.fixture

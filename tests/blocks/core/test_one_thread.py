@@ -9,8 +9,8 @@ import scipy.linalg  # noqa: F401 - its BLAS must be loaded to be seen
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from loopwright.blocks.core import on_one_thread, one_thread
-from loopwright.diagrams import margins
 from loopwright.diagrams.frequency import loop_margins as _margins
+from loopwright.frequency import margins
 
 
 def threads():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import (
-    Array,
     Block,
     Constant,
     DefinitionError,
@@ -17,6 +16,7 @@ from loopwright.blocks import (
     parameter,
 )
 from loopwright.diagrams import Diagram
+from loopwright.types import Array
 
 RATES = np.arange(3.0)
 

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import Array, Block, Constant, Gain, Input, Output, StateSpace, parameter
+from loopwright.blocks import Block, Constant, Gain, Input, Output, StateSpace, parameter
 from loopwright.blocks.tracing import has_large_product, trace
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.linearization import StepsOnly
+from loopwright.types import Array
 
 N = 500
 FEW = 50

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from loopwright.blocks import Block, Constant, GuardError, Input, NonFiniteError, SampleTimeError, State, hold
+from loopwright.blocks import Block, Constant, GuardError, Input, SampleTimeError, State, hold
 from loopwright.blocks.library.piecewise_functions import piecewise
 from loopwright.blocks.tracing.traced import trace
+from loopwright.diagrams import NonFiniteError
 from support.sampled import TICKS, Pendulum, Rotor, T, Wave, network, run_of, states, wave
 
 

@@ -729,7 +729,7 @@ def test_a_start_value_that_it_refuses(altered, name, capsys):
 @pytest.mark.slow
 def test_terminal_without_greek(lag):
     environment = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
-    command = [sys.executable, "-m", "loopwright.diagrams", "inspect", str(lag / "lag.fmu")]
+    command = [sys.executable, "-m", "loopwright", "inspect", str(lag / "lag.fmu")]
     result = subprocess.run(command, env=environment, capture_output=True, check=False)
     assert result.returncode == 0
     assert b"First-order lags: T ? = u - y [both]." in result.stdout
@@ -737,7 +737,7 @@ def test_terminal_without_greek(lag):
 
 @pytest.mark.slow
 def test_a_reader_that_has_had_enough(lag):
-    command = [sys.executable, "-m", "loopwright.diagrams", "inspect", str(lag / "lag.fmu")]
+    command = [sys.executable, "-m", "loopwright", "inspect", str(lag / "lag.fmu")]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     process.stdout.close()
     assert process.stderr.read() == b""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from loopwright.blocks import ConfirmationError
+from loopwright.diagrams import ConfirmationError
 from loopwright.diagrams.cli.command_line import _make_parser, main
 from loopwright.diagrams.frequency.number import Number
 from loopwright.diagrams.report.pages.document import Section

@@ -339,7 +339,7 @@ def test_a_stream_without_greek(tmp_path, monkeypatch, undrawn):
 @pytest.mark.slow
 def test_terminal_without_greek(tmp_path):
     environment = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
-    command = [sys.executable, "-m", "loopwright.diagrams", "run", "B", "--option", "tool_mass=5", "--out", "ö"]
+    command = [sys.executable, "-m", "loopwright", "run", "B", "--option", "tool_mass=5", "--out", "ö"]
     result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, check=False)
     assert result.returncode == 1
     assert b"peak_acceleration  | m/s2 |" in result.stdout
@@ -394,7 +394,7 @@ def test_an_interrupt_while_the_command_is_loaded_ends_without_a_traceback():
         "    def find_spec(self, name, path=None, target=None):\n"
         "        if name == 'loopwright.diagrams.cli': raise KeyboardInterrupt\n"
         "sys.meta_path.insert(0, Finder())\n"
-        "from loopwright.diagrams.__main__ import main\n"
+        "from loopwright.__main__ import main\n"
         "raise SystemExit(main())\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=FAR, check=False)

@@ -6,9 +6,9 @@ Events, clocks, rollback, slopes of inputs and texts; numbers by hand, and the b
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Constant, FmuRuntimeError, Gain, Output, Ramp, Sine
+from loopwright.blocks import Block, Constant, Gain, Output, Ramp, Sine
 from loopwright.diagrams import Diagram
-from loopwright.fmus import Fmu, StepOptions
+from loopwright.fmus import Fmu, FmuRuntimeError, StepOptions
 from loopwright.fmus.calls.step import InstanceStep
 from support.careful_fmus import (
     BETWEEN,

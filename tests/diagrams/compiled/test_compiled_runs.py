@@ -7,20 +7,18 @@ from scipy.linalg import expm
 from loopwright.blocks import (
     Clock,
     Compare,
-    FmuRuntimeError,
     Gain,
     GuardError,
     Lookup1D,
-    NonFiniteError,
     Product,
     Requirement,
     Sine,
     StopCondition,
     UnitDelay,
 )
-from loopwright.diagrams import Diagram, Interrupted, Run, experiments, subsystem
+from loopwright.diagrams import Diagram, Interrupted, NonFiniteError, Run, experiments, subsystem
 from loopwright.diagrams.compiled import compiled_libraries
-from loopwright.fmus import Fmu, dc_motor
+from loopwright.fmus import Fmu, FmuRuntimeError, dc_motor
 from loopwright.fmus.runtime import runtime_source
 from support.both_forms import assert_same_bits
 from support.random_cases import random_cases

@@ -6,9 +6,9 @@ import signal
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, FmuProcessError, FmuRuntimeError
+from loopwright.blocks import Constant
 from loopwright.diagrams import Diagram, Interrupted
-from loopwright.fmus import Fmu, Isolation, mass_spring_damper
+from loopwright.fmus import Fmu, FmuProcessError, FmuRuntimeError, Isolation, mass_spring_damper
 from loopwright.fmus.isolation import count_processes, end_idle
 from support.controlled_mass import exact_loop, pi_loop
 from support.eventful import eventful_fmu, exact

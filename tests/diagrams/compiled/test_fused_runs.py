@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import Clock, FmuError, FmuRuntimeError, Gain, Sine, TransferFunction
+from loopwright.blocks import Clock, Gain, Sine, TransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.compiled.reordered import reorder
-from loopwright.fmus import Fmu, dc_motor, gantry_contact
+from loopwright.fmus import Fmu, FmuError, FmuRuntimeError, dc_motor, gantry_contact
 
 QUIET = {"progress": False}
 BOUND = 1e-10  # of each signal's size where the motion doesn't magnify rounding, as docs/howto/diagrams.md states

@@ -8,7 +8,6 @@ from loopwright.blocks import (
     Clock,
     Compare,
     Constant,
-    FmuRuntimeError,
     Function,
     Gain,
     GuardError,
@@ -22,7 +21,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, Interrupted, Run, subsystem
-from loopwright.fmus import Fmu, dc_motor
+from loopwright.fmus import Fmu, FmuRuntimeError, dc_motor
 from support.zoo import zoo_fmu
 
 QUIET = {"progress": False}

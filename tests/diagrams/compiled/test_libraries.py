@@ -7,9 +7,10 @@ import sys
 
 import pytest
 
-from loopwright.blocks import CompilerError, Constant, UnitDelay
+from loopwright.blocks import Constant, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.compiled import compiled_libraries
+from loopwright.fmus import CompilerError
 
 SOURCE = '__attribute__((visibility("default"))) int seven(void) { return 7; }'
 posix = pytest.mark.skipif(os.name != "posix", reason="owners, modes and links are those of POSIX")
@@ -97,7 +98,7 @@ def test_a_run_without_room_for_its_code_is_interpreted_and_says_so(cache, monke
 
 LIMITED = """
 import resource, sys
-from loopwright.blocks import CompilerError
+from loopwright.fmus import CompilerError
 from loopwright.diagrams.compiled import load_compiled
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))
 try:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Function, Integrator, NonFiniteError, PythonFunction, Sine, TransferFunction
-from loopwright.diagrams import Diagram
+from loopwright.blocks import Function, Integrator, PythonFunction, Sine, TransferFunction
+from loopwright.diagrams import Diagram, NonFiniteError
 from loopwright.diagrams.compiled.step_outputs import may_fail_at_steps
 
 QUIET = {"progress": False}

@@ -16,8 +16,6 @@ from loopwright.blocks import (
     Clock,
     Compare,
     Constant,
-    FmuProcessError,
-    FmuRuntimeError,
     Gain,
     Integrator,
     Output,
@@ -30,7 +28,7 @@ from loopwright.diagrams import Coupling, Diagram, Interrupted, subsystem
 from loopwright.diagrams.flat import kinds_of
 from loopwright.diagrams.simulation import compiled_hand_over, compiled_hybrid, compiled_ticks
 from loopwright.diagrams.simulation.algebraic_loops import newton_options
-from loopwright.fmus import Fmu, StepOptions, build_fmu
+from loopwright.fmus import Fmu, FmuProcessError, FmuRuntimeError, StepOptions, build_fmu
 from support.both_forms import assert_same_bits, both
 from support.careful_fmus import EVENTS, MODEL, OUTPUTS
 from support.exported import mass_spring_damper

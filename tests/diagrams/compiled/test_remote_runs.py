@@ -8,20 +8,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import (
-    Block,
-    Compare,
-    FmuEnd,
-    FmuProcessError,
-    FmuRuntimeError,
-    Integrator,
-    Output,
-    Sine,
-    StopCondition,
-)
+from loopwright.blocks import Block, Compare, Integrator, Output, Sine, StopCondition
 from loopwright.diagrams import Diagram, Interrupted, subsystem
-from loopwright.fmus import Fmu, Isolation, build_fmu
+from loopwright.fmus import Fmu, FmuProcessError, FmuRuntimeError, Isolation, build_fmu
 from loopwright.fmus.isolation import count_processes, end_idle
+from loopwright.types import FmuEnd
 from support.exported import D, K, M, mass_spring_damper
 from support.typed_fmus import typed_fmu
 from support.waiting import Interruption

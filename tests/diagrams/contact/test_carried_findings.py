@@ -4,17 +4,9 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import AdmittanceFilter, Ellipse, Reference
-from loopwright.diagrams import (
-    AdmittanceLoop,
-    Channel,
-    Kink,
-    StepsOnly,
-    fig3,
-    passivity,
-    stability_limit,
-    stability_map,
-)
+from loopwright.diagrams import AdmittanceLoop, Channel, fig3, passivity, stability_limit, stability_map
 from loopwright.fmus import Fmu, gantry
+from loopwright.types import Kink, StepsOnly
 
 PATH = Ellipse(semi_axes=(0.3, 0.15), center=(0.5, 0.5))
 SMOOTH = {"coulomb_scale": 0.0, "viscous_scale": 0.0}

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopwright.blocks import AdmittanceFilter, ConfirmationError, Line, OptionError, Reference
-from loopwright.diagrams import Channel, Rig, experiments, fig3
+from loopwright.blocks import AdmittanceFilter, Line, OptionError, Reference
+from loopwright.diagrams import Channel, ConfirmationError, Rig, experiments, fig3
 from loopwright.diagrams.contact.confirmation import measure_growth
 from loopwright.diagrams.contact.moored_plant import LIBRARY, library_class
 from loopwright.diagrams.paper.wires import IMPEDANCE_PAR, IMPEDANCE_PERP

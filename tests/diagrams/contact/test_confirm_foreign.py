@@ -9,10 +9,11 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
-from loopwright.blocks import Block, ConfirmationError, Constant, Gain, Input, OptionError, Output, State
-from loopwright.diagrams import Diagram, TrialMethod, subsystem
+from loopwright.blocks import Block, Constant, Gain, Input, OptionError, Output, State
+from loopwright.diagrams import ConfirmationError, Diagram, subsystem
 from loopwright.diagrams.contact.confirmation import LimitTrials
 from loopwright.fmus import Fmu, build
+from loopwright.types import TrialMethod
 
 M, SHARE, DRAG, T, SUBSTEPS = 0.5, 8.0, 40.0, 5e-3, 10
 """Mass in kg, share of the measured force that the drive adds, drag in N s/m, sample time in s."""

@@ -13,16 +13,10 @@ from loopwright.blocks import (
     Reference,
 )
 from loopwright.blocks.core.errors import ShapeError, UnknownNameError
-from loopwright.diagrams import (
-    AdmittanceLoop,
-    MeanSlope,
-    StepsOnly,
-    experiments,
-    passivity,
-    target_admittance,
-)
+from loopwright.diagrams import AdmittanceLoop, experiments, passivity, target_admittance
 from loopwright.diagrams.paper.fig3_case import NO_FRICTION
 from loopwright.fmus import gantry, gantry_elastic
+from loopwright.types import MeanSlope, StepsOnly
 from support.contact import FORCE_TRACKING
 from support.plants import hidden, undirected
 from support.reduced_loop import growth_rate, negative_intervals, rendered_admittance, stability_limit

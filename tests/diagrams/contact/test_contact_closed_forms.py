@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from loopwright.blocks import Array, Block, Constant, Gain, Input, OptionError, Output, State, parameter
+from loopwright.blocks import Block, Constant, Gain, Input, OptionError, Output, State, parameter
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.types import Array
 from support.haptic import DRAG, HANDLE, MASS, T, haptic
 
 # --- a haptic device: Colgate and Schenkel, b > K T/2 + |B| ------------------------------------------------------------

@@ -7,20 +7,12 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
-from loopwright.blocks import (
-    Block,
-    Constant,
-    ForceSensor,
-    Gain,
-    Input,
-    OptionError,
-    Output,
-    TransferFunction,
-)
-from loopwright.diagrams import Diagram, TrialMethod, subsystem
+from loopwright.blocks import Block, Constant, ForceSensor, Gain, Input, OptionError, Output, TransferFunction
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.contact.loop import Modes
 from loopwright.diagrams.contact.stability_limits import growth_rounding
 from loopwright.fmus import Fmu, build, scara
+from loopwright.types import TrialMethod
 from support.carts import DRAG, SHARE, TAU, Cart, M, cart_contact, cart_diagram
 
 # --- another diagram: a cart whose drive lags behind the force that it shows -----------------------------------------

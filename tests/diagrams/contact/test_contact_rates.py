@@ -20,8 +20,9 @@ from loopwright.blocks import (
     TransferFunction,
     UnknownNameError,
 )
-from loopwright.diagrams import Diagram, TrialMethod, subsystem
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, StepOptions, build, scara
+from loopwright.types import TrialMethod
 
 M, KV, WEIGHT, DRAG = 3.0, 400.0, 1.5, 20.0
 """Mass of the cart in kg, gain of the servo in N s/m; mass in kg and damping in N s/m of the impedance."""

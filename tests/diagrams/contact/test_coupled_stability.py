@@ -8,10 +8,11 @@ import mpmath
 import numpy as np
 import pytest
 
-from loopwright.blocks import AdmittanceFilter, ConfirmationError, Ellipse, OptionError, ParameterError
+from loopwright.blocks import AdmittanceFilter, Ellipse, OptionError, ParameterError
 from loopwright.blocks.core.errors import UnknownNameError
 from loopwright.diagrams import (
     AdmittanceLoop,
+    ConfirmationError,
     experiments,
     growth_rate,
     poles,

@@ -7,9 +7,9 @@ pass over a step puts a.y beyond that by three quarters of the step.
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, FmuRuntimeError, Ramp
+from loopwright.blocks import Constant, Ramp
 from loopwright.diagrams import Coupling, Diagram
-from loopwright.fmus import Fmu
+from loopwright.fmus import Fmu, FmuRuntimeError
 from support.small_fmus import small_fmu, values
 
 SOURCE = (

@@ -6,9 +6,9 @@ The FMU is y' = u from y = 0, so that with u = 1 its output is its time. It ends
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, FmuError, FmuRuntimeError, Gain, Integrator
+from loopwright.blocks import Constant, Gain, Integrator
 from loopwright.diagrams import Coupling, Diagram, subsystem
-from loopwright.fmus import Fmu, StepOptions
+from loopwright.fmus import Fmu, FmuError, FmuRuntimeError, StepOptions
 from support.eventful import eventful_fmu
 from support.small_fmus import small_fmu, values
 

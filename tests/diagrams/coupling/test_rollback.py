@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import Constant, FmuRuntimeError, Gain, Step
+from loopwright.blocks import Constant, Gain, Step
 from loopwright.diagrams import Coupling, Diagram
-from loopwright.fmus import Fmu
+from loopwright.fmus import Fmu, FmuRuntimeError
 from support.small_fmus import small_fmu, values
 
 # y' = u − y over a step with u held; the gain is an output that follows u at once

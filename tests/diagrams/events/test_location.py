@@ -17,7 +17,6 @@ from loopwright.blocks import (
     Gain,
     Input,
     Integrator,
-    NonFiniteError,
     PiecewiseLinear,
     Relay,
     SimulationError,
@@ -26,7 +25,7 @@ from loopwright.blocks import (
     Step,
     parameter,
 )
-from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams import Diagram, NonFiniteError, subsystem
 from support.hybrid_blocks import TIGHT, Ball, Crossings, Falls, Lag, Takes
 
 METHODS = ["RK45", "RK23", "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "CVODE_Adams", "auto"]

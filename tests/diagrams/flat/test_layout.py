@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from loopwright.blocks import Array, Block, Constant, Input, Integrator, State, UnitDelay, parameter
+from loopwright.blocks import Block, Constant, Input, Integrator, State, UnitDelay, parameter
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.flat.flat_layout import StateLayout
+from loopwright.types import Array
 
 
 class Mixed(Block):

@@ -13,9 +13,10 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.special import lambertw
 
 from loopwright.blocks import Constant, Gain, Integrator, OptionError, Sum, TransferFunction, TransportDelay
-from loopwright.diagrams import Diagram, disk_margin, margins, nyquist_count
+from loopwright.diagrams import Diagram
 from loopwright.diagrams.frequency.delay_matrices import DelayMatrices
 from loopwright.diagrams.frequency.delayed_system import DelayedSystem
+from loopwright.frequency import disk_margin, margins, nyquist_count
 
 
 def rational(numerator, denominator, name):

@@ -6,8 +6,10 @@ import pytest
 from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize, minimize_scalar
 
-from loopwright.blocks import ConfirmationError, ParameterError
-from loopwright.diagrams import (
+from loopwright.blocks import ParameterError
+from loopwright.diagrams import ConfirmationError
+from loopwright.diagrams.frequency import disk_margins as disk
+from loopwright.frequency import (
     complementary,
     delayed_hold,
     delayed_hold_margin,
@@ -18,7 +20,6 @@ from loopwright.diagrams import (
     mimo_disk_margin,
     sensitivity,
 )
-from loopwright.diagrams.frequency import disk_margins as disk
 from support.loops import sampled_triple, triple
 from support.random_cases import random_cases
 

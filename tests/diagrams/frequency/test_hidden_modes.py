@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy.linalg import block_diag
 
 from loopwright.blocks import Constant, TransferFunction
-from loopwright.diagrams import Diagram, margins, nyquist_count, subsystem
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.frequency import margins, nyquist_count
 from support.loops import numbers, open_loops
 from support.random_cases import random_cases
 

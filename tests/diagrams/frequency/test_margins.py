@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import ConfirmationError, LoopwrightError, ParameterError
-from loopwright.diagrams import Number, margins, nyquist_count
+from loopwright.blocks import LoopwrightError, ParameterError
+from loopwright.diagrams import ConfirmationError
 from loopwright.diagrams.frequency import loop_margins, loop_scan, scan_refine_confirm
 from loopwright.diagrams.frequency.loop_scan import LoopScan
 from loopwright.diagrams.frequency.realization import Realization
 from loopwright.diagrams.frequency.sensitivity_peaks import confirm_peak
+from loopwright.frequency import Number, margins, nyquist_count
 from support.loops import open_loops, sampled_triple, stabilized_loops, triple
 from support.random_cases import random_cases
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import OptionError
-from loopwright.diagrams import measured_margins, read_frequency_data
+from loopwright.frequency import measured_margins, read_frequency_data
 
 
 def loop(w):
@@ -150,7 +150,8 @@ def test_data_that_do_not_fit_are_refused(data, uncertainty, message):
 def test_a_measured_diagram_has_the_margins_of_its_linear_model():
     """An integrator under a sampled proportional controller; its uncertainty is that of the measurement."""
     from loopwright.blocks import Constant, Gain, Integrator
-    from loopwright.diagrams import Diagram, margins, subsystem
+    from loopwright.diagrams import Diagram, subsystem
+    from loopwright.frequency import margins
 
     place = Integrator(name="place")
 

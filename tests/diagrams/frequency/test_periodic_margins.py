@@ -6,18 +6,10 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
-from loopwright.blocks import (
-    PID,
-    ConfirmationError,
-    Constant,
-    Gain,
-    OptionError,
-    ParameterError,
-    PeriodicLoopError,
-    TransferFunction,
-)
-from loopwright.diagrams import Diagram, disk_margin, margins, periodic_margins, subsystem
+from loopwright.blocks import PID, Constant, Gain, OptionError, ParameterError, TransferFunction
+from loopwright.diagrams import ConfirmationError, Diagram, PeriodicLoopError, subsystem
 from loopwright.diagrams.frequency.periodic_margins import PeriodicMarginFinder
+from loopwright.frequency import disk_margin, margins, periodic_margins
 from support.loops import open_loops
 from support.random_cases import random_cases
 

@@ -6,9 +6,10 @@ import pytest
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from loopwright.blocks import ConfirmationError, ErrorDynamics, ParameterError
-from loopwright.diagrams import delayed_hold, place, sampled_gains, sampled_poles
+from loopwright.blocks import ErrorDynamics, ParameterError
+from loopwright.diagrams import ConfirmationError
 from loopwright.diagrams.frequency import pole_placement as placement
+from loopwright.frequency import delayed_hold, place, sampled_gains, sampled_poles
 from support.random_cases import random_cases
 
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import ParameterError
-from loopwright.diagrams import compare_with_control, disk_margin, margins, nyquist_count, place
 from loopwright.diagrams.frequency.loop_scan import make_grid
 from loopwright.diagrams.frequency.poles_and_zeros import Features
 from loopwright.diagrams.frequency.python_control import _Judge, compare_margins, respond_at_once
 from loopwright.diagrams.frequency.realization import Realization
+from loopwright.frequency import compare_with_control, disk_margin, margins, nyquist_count, place
 from support.loops import sampled_triple, triple
 
 T = 1e-3

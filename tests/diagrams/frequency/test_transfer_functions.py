@@ -8,9 +8,9 @@ import pytest
 from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize_scalar
 
-from loopwright.blocks import ConfirmationError
-from loopwright.diagrams import margins
+from loopwright.diagrams import ConfirmationError
 from loopwright.diagrams.frequency.state_space import read_matrices
+from loopwright.frequency import margins
 from support.random_cases import random_cases
 
 P = 20.0

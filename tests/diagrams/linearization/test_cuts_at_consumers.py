@@ -21,8 +21,9 @@ from loopwright.blocks import (
     UnknownNameError,
     WiringError,
 )
-from loopwright.diagrams import Diagram, margins, subsystem
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.linearization import CutFromTracking, InertConsumer
+from loopwright.frequency import margins
 
 KP, KI = 3.0, 2.0
 PLANT = [1.0], [4.0, 5.0, 1.0]

@@ -19,7 +19,8 @@ from loopwright.blocks import (
     TransportDelay,
     UnitDelay,
 )
-from loopwright.diagrams import Diagram, margins, subsystem
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.frequency import margins
 from support.hybrid_blocks import TIGHT, Lag
 
 T = 0.1

@@ -10,7 +10,6 @@ from loopwright.blocks import (
     Constant,
     DiscreteStateSpace,
     Ellipse,
-    FmuError,
     Function,
     Gain,
     Integrator,
@@ -19,7 +18,7 @@ from loopwright.blocks import (
     Sum,
 )
 from loopwright.diagrams import Channel, Diagram, Rig, fig3, subsystem
-from loopwright.fmus import Fmu, dc_motor, gantry, mass_spring_damper
+from loopwright.fmus import Fmu, FmuError, dc_motor, gantry, mass_spring_damper
 from support.contact import parameters
 
 T = 1e-3

@@ -5,8 +5,9 @@ import pytest
 from scipy.linalg import expm
 
 from loopwright.blocks import Constant, Gain
-from loopwright.diagrams import Diagram, StepsOnly, subsystem
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu
+from loopwright.types import StepsOnly
 from support.closed_form import closed_form_fmu
 
 DT = 0.1

@@ -14,7 +14,6 @@ from loopwright.blocks import (
     Constant,
     DeadZone,
     Encoder,
-    FmuError,
     Gain,
     Input,
     Integrator,
@@ -33,7 +32,7 @@ from loopwright.blocks import (
     parameter,
 )
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus import Fmu, build, dc_motor
+from loopwright.fmus import Fmu, FmuError, build, dc_motor
 
 T = 0.01
 

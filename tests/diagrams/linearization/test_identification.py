@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import Constant, FmuError, Gain
+from loopwright.blocks import Constant, Gain
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.linearization import identification as _identification
 from loopwright.diagrams.linearization.identification import identify_step, realize
-from loopwright.fmus import Fmu, dc_motor, gantry, mass_spring_damper
+from loopwright.fmus import Fmu, FmuError, dc_motor, gantry, mass_spring_damper
 from support.plants import hidden
 
 H = 1e-3

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import PID, Constant, FmuError
-from loopwright.diagrams import Diagram, InexactDerivatives, RefutedDerivatives, margins, subsystem
+from loopwright.blocks import PID, Constant
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.linearization.exchanged import PointEvaluator
 from loopwright.diagrams.requirements import Limit, Reason, Verdict, judge
-from loopwright.fmus import Fmu
+from loopwright.fmus import Fmu, FmuError
+from loopwright.frequency import margins
+from loopwright.types import InexactDerivatives, RefutedDerivatives
 from support.misstated import A, B, misstated_fmu
 
 WAYS = ("model_exchange", "co_simulation")

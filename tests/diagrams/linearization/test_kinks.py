@@ -30,20 +30,11 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.blocks.core import Finding
-from loopwright.diagrams import (
-    Diagram,
-    Kink,
-    MeanSlope,
-    StepsOnly,
-    ZeroSlope,
-    disk_margin,
-    gang_of_four,
-    margins,
-    nyquist_count,
-    subsystem,
-)
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.frequency import Number, with_findings
 from loopwright.diagrams.requirements import Limit, Reason, Requirements, Verdict, judge
+from loopwright.frequency import disk_margin, gang_of_four, margins, nyquist_count
+from loopwright.types import Kink, MeanSlope, StepsOnly, ZeroSlope
 
 T = 0.01
 

@@ -5,9 +5,9 @@ import shutil
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, FmuError, Gain
+from loopwright.blocks import Constant, Gain
 from loopwright.diagrams import Diagram, experiments
-from loopwright.fmus import Fmu
+from loopwright.fmus import Fmu, FmuError
 
 
 @pytest.fixture

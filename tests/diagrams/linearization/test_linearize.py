@@ -20,7 +20,6 @@ from loopwright.blocks import (
     Function,
     Gain,
     Integrator,
-    NonFiniteError,
     OptionError,
     PathProjection,
     PythonFunction,
@@ -36,9 +35,10 @@ from loopwright.blocks import (
     UnknownNameError,
     WiringError,
 )
-from loopwright.diagrams import Diagram, Linearization, OperatingPoint, subsystem
+from loopwright.diagrams import Diagram, NonFiniteError, subsystem
 from loopwright.diagrams.linearization.findings import EventWithinPeriod, StepsOnly, UnusualStart
 from loopwright.fmus.running.derivation import Derivation, DerivativeMethod
+from loopwright.types import Linearization, OperatingPoint
 from support.linear import by_simulation, differences
 
 T = 0.05

@@ -6,9 +6,10 @@ import scipy.optimize
 
 from loopwright.blocks import PID, Constant, Gain, Integrator, TransferFunction
 from loopwright.blocks.core.errors import ConfirmationError, WiringError
-from loopwright.diagrams import Diagram, margins, subsystem
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.linearization.over_a_period import Model, confirm_loop, find_needed, lift
 from loopwright.diagrams.report.pages.definitions import definition
+from loopwright.frequency import margins
 
 
 def offset(phase, gain=1.0, behind=False):

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Gain, Integrator, TransferFunction, UnitDelay
-from loopwright.diagrams import Diagram, margins, subsystem
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.linearization import ParallelWays, SharedCut
+from loopwright.frequency import margins
 from support.predictors import DEAD, A, B, K, T, observed, observed_by_hand, smith, smith_by_hand
 
 

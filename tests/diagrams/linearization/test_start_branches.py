@@ -21,7 +21,8 @@ from loopwright.blocks import (
     State,
     Sum,
 )
-from loopwright.diagrams import Diagram, margins, subsystem
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.frequency import margins
 
 T, KP, KD = 1e-3, 400.0, 40.0
 

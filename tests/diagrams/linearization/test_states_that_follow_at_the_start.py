@@ -8,8 +8,9 @@ import pytest
 from scipy.linalg import expm
 
 from loopwright.blocks import Gain
-from loopwright.diagrams import Diagram, margins, subsystem
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu
+from loopwright.frequency import margins
 from support.misstated import A, B, misstated_fmu
 
 T = 0.02

@@ -5,10 +5,11 @@ import pytest
 from scipy.linalg import expm
 
 from loopwright.blocks import PID, Constant, Gain, StateSpace, Step, Sum, TransferFunction
-from loopwright.diagrams import Diagram, Requirements, Verdict, subsystem
+from loopwright.diagrams import Diagram, Requirements, subsystem
 from loopwright.diagrams.measure import measure_step, step_response
 from loopwright.diagrams.requirements import explain
 from loopwright.fmus import Fmu, StepOptions, mass_spring_damper
+from loopwright.types import Verdict
 
 T = 0.5
 W, ZETA = 0.999 * 2 * np.pi / T, 0.002

@@ -23,8 +23,9 @@ from loopwright.blocks import (
     TransferFunction,
     parameter,
 )
-from loopwright.diagrams import Diagram, MeanSlope, Requirements, subsystem
+from loopwright.diagrams import Diagram, Requirements, subsystem
 from loopwright.diagrams.measure import LEAST, LEAST_SINE, find_least_sine, find_least_step, find_quantum
+from loopwright.types import MeanSlope
 
 T, KP, KD, Q = 1e-3, 400.0, 40.0, 1e-5
 

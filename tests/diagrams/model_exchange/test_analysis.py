@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import PID, Constant, FmuError, Gain
+from loopwright.blocks import PID, Constant, Gain
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.linearization import differentiate_loop
 from loopwright.diagrams.report import analyse
-from loopwright.fmus import Fmu, bouncing_ball, gantry, mass_spring_damper
+from loopwright.fmus import Fmu, FmuError, bouncing_ball, gantry, mass_spring_damper
 
 K, D, M = 100.0, 1.0, 1.0
 A, B = np.array([[0.0, 1.0], [-K / M, -D / M]]), np.array([[0.0], [1.0 / M]])

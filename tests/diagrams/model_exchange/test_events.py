@@ -6,19 +6,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from loopwright.blocks import (
-    Constant,
-    FmuRuntimeError,
-    Gain,
-    Integrator,
-    Quantizer,
-    SimulationError,
-    Step,
-    Sum,
-    WiringError,
-)
+from loopwright.blocks import Constant, Gain, Integrator, Quantizer, SimulationError, Step, Sum, WiringError
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus import Fmu
+from loopwright.fmus import Fmu, FmuRuntimeError
 from support.eventful import eventful_fmu, exact
 
 

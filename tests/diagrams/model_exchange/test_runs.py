@@ -93,7 +93,7 @@ def test_an_algebraic_loop_through_the_fmu_is_solved_or_told(files, fmi):
         plant = Fmu(files[mass_spring_damper, fmi], interface="model_exchange", name="plant", start={"position": 0.1})
         return Diagram("loop", plant(force=Gain(gain=-0.5, name="inertia")(plant.acceleration)), **options)
 
-    from loopwright.blocks import AlgebraicLoopError
+    from loopwright.diagrams import AlgebraicLoopError
 
     with pytest.raises(AlgebraicLoopError, match=r"plant.force feeds through to plant.acceleration"):
         loop()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import (
-    Array,
     Block,
     Input,
     OptionError,
@@ -21,6 +20,7 @@ from loopwright.diagrams import experiments
 from loopwright.diagrams.cli.command_line import main
 from loopwright.diagrams.paper.experiments import path_following
 from loopwright.fmus import Fmu, build, gantry
+from loopwright.types import Array
 
 
 class Carriage(Block):

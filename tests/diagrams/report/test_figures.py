@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Constant, Gain, Integrator, StateSpace, TransferFunction
-from loopwright.diagrams import Diagram, Number, Report, Section, Table, Verdict, analyse
+from loopwright.diagrams import Diagram, Section, Table, analyse
 from loopwright.diagrams.plotting import BLUE
 from loopwright.diagrams.report.case import Case
 from loopwright.diagrams.report.figures import AxisUnits, MeasuredCurve, contact_admittance, contact_map, measured
@@ -19,6 +19,8 @@ from loopwright.diagrams.report.pages.definitions import definition
 from loopwright.diagrams.report.pages.html import to_html
 from loopwright.diagrams.report.pages.svg import embedded
 from loopwright.diagrams.report.sections.loops import gang_of_four
+from loopwright.frequency import Number
+from loopwright.types import Report, Verdict
 from support import reviewed
 
 
@@ -35,7 +37,7 @@ def drawn(diagram, wire, kind=bode):
     case = Case(diagram.wired)
     (v,) = case.usable()
     L = v.loop(wire)
-    from loopwright.diagrams import margins
+    from loopwright.frequency import margins
 
     of = DrawnLoops(wire, {v.key: L}, {v.key: margins(L)}, {v.key: v.title}, case.looks, AxisUnits())
     return kind("k", of).figure

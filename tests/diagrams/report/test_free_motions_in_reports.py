@@ -19,11 +19,12 @@ from loopwright.blocks import (
     TransferFunction,
     parameter,
 )
-from loopwright.diagrams import Diagram, Requirements, Verdict, analyse, subsystem
+from loopwright.diagrams import Diagram, Requirements, analyse, subsystem
 from loopwright.diagrams.cli.command_line import main
 from loopwright.diagrams.cli.report import verdict_text
 from loopwright.diagrams.report.pages.json import to_json
 from loopwright.diagrams.requirements import Reason
+from loopwright.types import Verdict
 
 DRIFTS = "angle.y drifts: nothing feeds it back"
 

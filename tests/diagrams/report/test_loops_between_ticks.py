@@ -7,8 +7,8 @@ from functools import cache
 import pytest
 from scipy.optimize import brentq
 
-from loopwright.blocks import PID, BetweenTicksError, Gain, Step, TransferFunction, TransportDelay
-from loopwright.diagrams import Diagram, Requirements, subsystem
+from loopwright.blocks import PID, Gain, Step, TransferFunction, TransportDelay
+from loopwright.diagrams import BetweenTicksError, Diagram, Requirements, subsystem
 from loopwright.diagrams.report.case import Case
 from loopwright.diagrams.report.review import review
 from loopwright.diagrams.requirements import Reason, Verdict

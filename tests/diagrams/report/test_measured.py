@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Constant, Integrator, OptionError, TransferFunction, UnknownNameError
-from loopwright.diagrams import Diagram, Requirements, Verdict, analyse
+from loopwright.diagrams import Diagram, Requirements, analyse
 from loopwright.diagrams.cli.command_line import main
 from loopwright.diagrams.report.pages.json import to_json
 from loopwright.diagrams.requirements import Limit, Reason, judge_interval
+from loopwright.types import Verdict
 
 
 def drive(gain=4.0):

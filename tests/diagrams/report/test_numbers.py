@@ -6,19 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from loopwright.blocks import (
-    PID,
-    ConfirmationError,
-    Constant,
-    ErrorDynamics,
-    Gain,
-    Integrator,
-    OptionError,
-    Sine,
-    Step,
-    TransferFunction,
-)
-from loopwright.diagrams import Diagram, analyse, experiments, subsystem
+from loopwright.blocks import PID, Constant, ErrorDynamics, Gain, Integrator, OptionError, Sine, Step, TransferFunction
+from loopwright.diagrams import ConfirmationError, Diagram, analyse, experiments, subsystem
 from loopwright.diagrams.report.case import delayed_subsystems
 from loopwright.diagrams.report.points import point_of
 from loopwright.diagrams.report.wires import wires_on_loops

@@ -7,9 +7,10 @@ import pytest
 from scipy.linalg import expm
 
 from loopwright.blocks import Constant, Gain, OptionError, StateSpace
-from loopwright.diagrams import Diagram, Requirements, Verdict, analyse, subsystem
+from loopwright.diagrams import Diagram, Requirements, analyse, subsystem
 from loopwright.diagrams.measure import step_response
 from loopwright.diagrams.requirements import Reason
+from loopwright.types import Verdict
 
 A = np.array([[-250.0, -50.0], [100.0, -0.1]])
 B = np.array([500.0, 0.0])

@@ -11,17 +11,8 @@ import html5lib
 import numpy as np
 import pytest
 
-from loopwright.blocks import (
-    Constant,
-    Gain,
-    Integrator,
-    Quantizer,
-    Saturation,
-    Sum,
-    TransferFunction,
-    UnknownNameError,
-)
-from loopwright.diagrams import Diagram, Number, Requirements, Verdict, analyse, experiments, subsystem
+from loopwright.blocks import Constant, Gain, Integrator, Quantizer, Saturation, Sum, TransferFunction, UnknownNameError
+from loopwright.diagrams import Diagram, Requirements, analyse, experiments, subsystem
 from loopwright.diagrams.cli.command_line import main
 from loopwright.diagrams.cli.report import verdict_text
 from loopwright.diagrams.report.case import Case
@@ -31,6 +22,8 @@ from loopwright.diagrams.report.pages.html import to_html
 from loopwright.diagrams.report.pages.json import to_json
 from loopwright.diagrams.report.review import review
 from loopwright.diagrams.requirements import Limit, Reason, RequirementResult, Review
+from loopwright.frequency import Number
+from loopwright.types import Verdict
 from support import reviewed
 
 PARTS = ("poles", "inner")

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import OptionError
-from loopwright.diagrams import Requirements, Verdict, analyse
+from loopwright.diagrams import Requirements, analyse
 from loopwright.diagrams.report.pages.definitions import definition
 from loopwright.diagrams.requirements import Reason
 from loopwright.diagrams.studies import CaseState, ConfirmationKind, RunConfirmation
+from loopwright.types import Verdict
 from support.tuned_loops import make_pi_loop, pi_phase_margin
 
 NOTHING = Requirements(stable=False, phase_margin_deg=1.0)

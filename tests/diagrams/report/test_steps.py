@@ -5,9 +5,10 @@ import pytest
 from scipy.optimize import brentq
 
 from loopwright.blocks import Constant, Integrator, Sum, TransferFunction
-from loopwright.diagrams import Diagram, Requirements, Verdict, analyse
+from loopwright.diagrams import Diagram, Requirements, analyse
 from loopwright.diagrams.measure import StepResponse
 from loopwright.diagrams.report.sections.step_responses import _deviation, _how
+from loopwright.types import Verdict
 
 
 def response(outputs, y, linear, before=None, wire_before=0.0):

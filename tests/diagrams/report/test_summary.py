@@ -13,12 +13,14 @@ import pytest
 from matplotlib.figure import Figure
 
 from loopwright.blocks import Constant, Gain, Integrator, TransferFunction
-from loopwright.diagrams import Diagram, Number, Plot, Report, Requirements, Section, Table, Verdict, analyse
+from loopwright.diagrams import Diagram, Plot, Requirements, Section, Table, analyse
 from loopwright.diagrams.report.pages.html import to_html
 from loopwright.diagrams.report.pages.json import to_json
 from loopwright.diagrams.report.pages.report import write_report
 from loopwright.diagrams.report.same_loops import find_same
 from loopwright.diagrams.report.sections.summary import MOST_REQUIREMENTS
+from loopwright.frequency import Number
+from loopwright.types import Report, Verdict
 
 PARTS = ("poles", "inner", "steps")
 GAIN, LAG = 3.0, 0.1

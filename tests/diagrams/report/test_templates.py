@@ -8,9 +8,11 @@ import pytest
 from matplotlib.figure import Figure
 
 import loopwright.diagrams
-from loopwright.diagrams import Number, Plot, Report, Section, Table
+from loopwright.diagrams import Plot, Section, Table
 from loopwright.diagrams.report.pages.html import to_html
 from loopwright.diagrams.report.pages.templating import Texts, environment
+from loopwright.frequency import Number
+from loopwright.types import Report
 
 ROOM = Path(loopwright.diagrams.__file__).parent
 EVIL = "<script>alert('x')</script> & \"y\""

@@ -7,11 +7,11 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq, minimize_scalar
 
-from loopwright.blocks import PID, Constant, Encoder, FmuError, Integrator, UnknownNameError
+from loopwright.blocks import PID, Constant, Encoder, Integrator, UnknownNameError
 from loopwright.diagrams import Diagram, analyse, subsystem
 from loopwright.diagrams.paper.fig3_report import FIG3
 from loopwright.diagrams.report.pages.definitions import definition
-from loopwright.fmus import Fmu, dc_motor
+from loopwright.fmus import Fmu, FmuError, dc_motor
 
 T, KP, KI = 1e-3, 0.05, 2.0
 M = dc_motor.nominal

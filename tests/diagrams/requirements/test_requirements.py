@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from loopwright.blocks import OptionError
-from loopwright.diagrams import Kink, Number, Requirements, Verdict
+from loopwright.diagrams import Requirements
 from loopwright.diagrams.requirements import (
     Limit,
     Reason,
@@ -17,6 +17,8 @@ from loopwright.diagrams.requirements import (
     judge,
     read_requirements,
 )
+from loopwright.frequency import Number
+from loopwright.types import Kink, Verdict
 
 OPEN = math.inf
 KINK = Kink("valve", "y", "u", 0.0, 1.0)

@@ -12,8 +12,9 @@ import xarray
 from scipy.io import loadmat
 
 from loopwright.blocks import OptionError, UnknownNameError
-from loopwright.diagrams import Layout, Run, Wire
+from loopwright.diagrams import Run
 from loopwright.diagrams.results import exports as _exports
+from loopwright.types import Layout, Wire
 
 SHAPES = {"plant.position": (2,), "plant.mass": (2, 3), "box.pid.v": (), "box.e": ()}
 LAYOUT = Layout.of(SHAPES)

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import OptionError, SimulationError, UnknownNameError
-from loopwright.diagrams import Layout, Occurrence, Run, Stopped, Wire
+from loopwright.diagrams import Run
 from loopwright.diagrams.results import memory as _memory
 from loopwright.diagrams.results import recorder as _recorder
 from loopwright.diagrams.results.memory import check_memory
 from loopwright.diagrams.results.recorder import Recorder, select
 from loopwright.diagrams.results.stored import header
+from loopwright.types import Layout, Occurrence, Stopped, Wire
 
 LAYOUT = Layout.of({"a.y": (), "box.b.v": (2,), "box.c.z": ()})  # and two states
 WIRES = {"e": Wire("box.b", "v", 1), "box.w": Wire("a", "y")}
@@ -164,7 +165,7 @@ def test_memory_that_fills_up_ends_the_run_with_what_was_kept(monkeypatch):
 KILLED = """
 import os, signal, sys
 import numpy as np
-from loopwright.diagrams import Layout, Occurrence
+from loopwright.types import Layout, Occurrence
 from loopwright.diagrams.results.recorder import Recorder
 from loopwright.diagrams.results.stored import header
 layout = Layout.of({"a.y": (), "b.v": (2,)})
@@ -225,7 +226,7 @@ FULL = """
 import resource, sys
 import numpy as np
 from loopwright.blocks import SimulationError
-from loopwright.diagrams import Layout
+from loopwright.types import Layout
 from loopwright.diagrams.results.recorder import Recorder
 from loopwright.diagrams.results.stored import header
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_003, 100_003))  # in the middle of a row

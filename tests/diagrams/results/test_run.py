@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Constant, Gain, OptionError, Reference, Sine, UnitDelay, UnknownNameError
-from loopwright.diagrams import Diagram, Occurrence, Run, Stopped, subsystem
+from loopwright.diagrams import Diagram, Run, subsystem
 from loopwright.diagrams.results import stored as _stored
 from loopwright.diagrams.results.recorder import select
+from loopwright.types import Occurrence, Stopped
 
 
 @subsystem(sample_time=0.5, name="a")

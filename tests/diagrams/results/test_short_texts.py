@@ -4,18 +4,8 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Gain, Integrator, OptionError, StateSpace, Step
-from loopwright.diagrams import (
-    Diagram,
-    Interrupted,
-    Requirements,
-    check_block,
-    disk_margin,
-    gang_of_four,
-    margins,
-    periodic_margins,
-    sensitivity,
-    subsystem,
-)
+from loopwright.diagrams import Diagram, Interrupted, Requirements, check_block, subsystem
+from loopwright.frequency import disk_margin, gang_of_four, margins, periodic_margins, sensitivity
 
 LONGEST = 300
 

@@ -9,15 +9,12 @@ from loopwright.blocks import (
     Block,
     Constant,
     Ellipse,
-    FmuFileError,
-    FmuRuntimeError,
     Function,
     Gain,
     GuardError,
     Input,
     Integrator,
     LoopwrightError,
-    NonFiniteError,
     OptionError,
     Output,
     ParameterError,
@@ -30,8 +27,8 @@ from loopwright.blocks import (
     UnitDelay,
     UnknownNameError,
 )
-from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.fmus import Fmu, gantry
+from loopwright.diagrams import Diagram, NonFiniteError, experiments, subsystem
+from loopwright.fmus import Fmu, FmuFileError, FmuRuntimeError, gantry
 
 
 class Root(Block):

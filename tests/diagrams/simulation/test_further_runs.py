@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Clock, Constant, DiscreteIntegrator, Function, Gain, NonFiniteError, Step, Sum, UnitDelay
-from loopwright.diagrams import Diagram, experiments, subsystem
+from loopwright.blocks import Clock, Constant, DiscreteIntegrator, Function, Gain, Step, Sum, UnitDelay
+from loopwright.diagrams import Diagram, NonFiniteError, experiments, subsystem
 
 
 @pytest.mark.parametrize("enabled", [0.0, 1.0])

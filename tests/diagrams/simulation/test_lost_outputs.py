@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Constant, Gain, Input, NonFiniteError, Output, State, StopCondition, UnitDelay
-from loopwright.diagrams import Diagram, subsystem
+from loopwright.blocks import Block, Constant, Gain, Input, Output, State, StopCondition, UnitDelay
+from loopwright.diagrams import Diagram, NonFiniteError, subsystem
 from loopwright.diagrams.results import Run
 from loopwright.fmus import Fmu, build
 from support.lost_output import LIMIT, lost_output

@@ -22,7 +22,6 @@ from loopwright.blocks import (
     Hold,
     Input,
     Integrator,
-    NonFiniteError,
     OptionError,
     Output,
     PathProjection,
@@ -39,7 +38,7 @@ from loopwright.blocks import (
     Switch,
     UnitDelay,
 )
-from loopwright.diagrams import Diagram, Interrupted, subsystem
+from loopwright.diagrams import Diagram, Interrupted, NonFiniteError, subsystem
 from loopwright.diagrams.simulation.workspace import Workspace
 from support import TESTS
 from support.hybrid_blocks import TIGHT, Ball, Crossings, Falls, Lag, Takes, Twice, counting, decay

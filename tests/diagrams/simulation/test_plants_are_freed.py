@@ -6,19 +6,9 @@ import fmpy.fmi3
 import numpy as np
 import pytest
 
-from loopwright.blocks import (
-    Block,
-    Constant,
-    FmuRuntimeError,
-    Gain,
-    Input,
-    NonFiniteError,
-    Output,
-    PathDomainError,
-    Step,
-)
-from loopwright.diagrams import Diagram, experiments
-from loopwright.fmus import Fmu, gantry
+from loopwright.blocks import Block, Constant, Gain, Input, Output, PathDomainError, Step
+from loopwright.diagrams import Diagram, NonFiniteError, experiments
+from loopwright.fmus import Fmu, FmuRuntimeError, gantry
 from support.counted import stepped_by_python
 
 pytestmark = pytest.mark.one_tier  # it counts calls

@@ -12,20 +12,17 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from loopwright.blocks import (
-    AlgebraicLoopError,
     Block,
     Clock,
     Compare,
     Constant,
     DoubleDriveError,
     Event,
-    FmuError,
     Function,
     Gain,
     Hold,
     Input,
     Integrator,
-    NonFiniteError,
     OptionError,
     Output,
     ParameterError,
@@ -45,8 +42,8 @@ from loopwright.blocks import (
     WiringError,
     parameter,
 )
-from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus import Fmu, dc_motor, mass_spring_damper
+from loopwright.diagrams import AlgebraicLoopError, Diagram, NonFiniteError, subsystem
+from loopwright.fmus import Fmu, FmuError, dc_motor, mass_spring_damper
 from support.hybrid_blocks import TIGHT, Crossings, Falls, Lag, Takes, counting, decay
 
 # --- time --------------------------------------------------------------------------------------------------------------

@@ -14,8 +14,9 @@ from loopwright.blocks import (
     Step,
     StopCondition,
 )
-from loopwright.diagrams import Diagram, Run, Stopped, subsystem
+from loopwright.diagrams import Diagram, Run, subsystem
 from loopwright.fmus import Fmu, bouncing_ball
+from loopwright.types import Stopped
 from support.hybrid_blocks import Ball, Falls, Lag, counting
 
 

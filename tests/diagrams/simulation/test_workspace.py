@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Block as Base
-from loopwright.blocks import Gain, GuardError, Input, Integrator, NonFiniteError, Output, Ramp, UnitDelay
-from loopwright.diagrams import Diagram, subsystem
+from loopwright.blocks import Gain, GuardError, Input, Integrator, Output, Ramp, UnitDelay
+from loopwright.diagrams import Diagram, NonFiniteError, subsystem
 from loopwright.diagrams.simulation.workspace import Workspace
 
 T = 0.125

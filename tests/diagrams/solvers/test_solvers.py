@@ -16,14 +16,13 @@ from loopwright.blocks import (
     Event,
     Input,
     Integrator,
-    NonFiniteError,
     OptionError,
     PythonFunction,
     SimulationError,
     State,
     Step,
 )
-from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams import Diagram, NonFiniteError, subsystem
 from loopwright.diagrams.solvers import cvode as _solvers_sundials
 from loopwright.diagrams.solvers.base import SOLVERS, Problem
 from loopwright.diagrams.solvers.choose import make_solver

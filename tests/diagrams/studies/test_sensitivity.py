@@ -7,9 +7,10 @@ import pytest
 from matplotlib.colors import to_hex
 
 from loopwright.blocks import UnknownNameError
-from loopwright.diagrams import experiments, margins
+from loopwright.diagrams import experiments
 from loopwright.diagrams.plotting import BLUE, VERMILION
 from loopwright.diagrams.studies import confirm_parameter, confirm_sensitivity, sensitivities_of
+from loopwright.frequency import margins
 from support import reviewed
 from support.tuned_loops import make_pi_loop, pi_phase_margin
 

@@ -21,9 +21,10 @@ from loopwright.blocks import (
     UnitDelay,
     parameter,
 )
-from loopwright.diagrams import Diagram, final, subsystem
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.sweeps import bound_run
 from loopwright.diagrams.sweeps.outcome import describe_failure
+from loopwright.sweeps import final
 
 QUIET = {"progress": False}
 

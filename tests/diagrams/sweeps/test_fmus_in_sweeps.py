@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, FmuRuntimeError, Gain, Input, Output, State, parameter
+from loopwright.blocks import Block, Gain, Input, Output, State, parameter
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus import Fmu, build
+from loopwright.fmus import Fmu, FmuRuntimeError, build
 from support.waiting import FAR
 
 T = 0.01

@@ -244,7 +244,8 @@ def test_other_files_are_left_alone_and_broken_ones_are_told(tmp_path):
 @pytest.mark.slow
 def test_the_revision_of_an_experiment_is_equal_in_every_process():
     code = """
-from loopwright.diagrams import experiments, final
+from loopwright.diagrams import experiments
+from loopwright.sweeps import final
 from loopwright.diagrams.sweeps.plan import Plan
 from loopwright.diagrams.sweeps.revision import digest_of, parts_of
 diagram = experiments.force_tracking().diagram

@@ -176,7 +176,8 @@ def test_ctrl_c_ends_a_sweep_at_once_and_keeps_what_was_run(tmp_path, compiled):
         f"""
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job begins with it ignored
-from loopwright.diagrams import InterruptedSweep, experiments, final
+from loopwright.diagrams import experiments
+from loopwright.sweeps import InterruptedSweep, final
 diagram = experiments.hand_guiding().diagram
 try:
     diagram.sweep({{"plant.coulomb_scale": [0.5 + 1e-3 * i for i in range(3000)]}}, 100.0, reduce={{"end": final("xi")}},

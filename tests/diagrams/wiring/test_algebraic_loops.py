@@ -7,13 +7,11 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from loopwright.blocks import (
-    AlgebraicLoopError,
     Clock,
     Compare,
     Constant,
     Function,
     Gain,
-    NonFiniteError,
     Product,
     PythonFunction,
     Relay,
@@ -23,7 +21,7 @@ from loopwright.blocks import (
     Sum,
     UnitDelay,
 )
-from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams import AlgebraicLoopError, Diagram, NonFiniteError, subsystem
 from support.hybrid_blocks import TIGHT, Lag, decay
 
 

@@ -7,7 +7,6 @@ from loopwright.blocks import (
     Block,
     Constant,
     Demux,
-    DuplicateNameError,
     Gain,
     Input,
     Integrator,
@@ -21,7 +20,7 @@ from loopwright.blocks import (
     UnknownNameError,
     WiringError,
 )
-from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams import Diagram, DuplicateNameError, subsystem
 
 
 @subsystem

@@ -4,18 +4,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import (
-    AlgebraicLoopError,
-    Constant,
-    Function,
-    Gain,
-    NonFiniteError,
-    PythonFunction,
-    Sine,
-    StateSpace,
-    UnitDelay,
-)
-from loopwright.diagrams import Diagram, subsystem
+from loopwright.blocks import Constant, Function, Gain, PythonFunction, Sine, StateSpace, UnitDelay
+from loopwright.diagrams import AlgebraicLoopError, Diagram, NonFiniteError, subsystem
 
 PAIR = Function(lambda a, b: np.stack([a, b]), name="pair")
 

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import (
-    AlgebraicLoopError,
     Block,
     Constant,
     DoubleDriveError,
-    DuplicateNameError,
     Gain,
     Input,
     Output,
@@ -32,7 +30,7 @@ from loopwright.blocks import (
     WiringError,
     parameter,
 )
-from loopwright.diagrams import Diagram, experiments, subsystem
+from loopwright.diagrams import AlgebraicLoopError, Diagram, DuplicateNameError, experiments, subsystem
 from loopwright.fmus import gantry
 
 

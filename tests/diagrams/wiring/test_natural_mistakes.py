@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Block, Gain, Input, LoopwrightError, State, Step
-from loopwright.diagrams import Diagram, margins, subsystem
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import build
+from loopwright.frequency import margins
 from support.public_calls import drive
 
 STEP = Step(times=0.0, values=1.0, name="r")

@@ -5,7 +5,6 @@ import pytest
 from scipy.linalg import expm
 
 from loopwright.blocks import (
-    AlgebraicLoopError,
     Block,
     Circle,
     Clock,
@@ -32,7 +31,7 @@ from loopwright.blocks import (
     UnknownNameError,
     WiringError,
 )
-from loopwright.diagrams import Diagram, experiments, subsystem
+from loopwright.diagrams import AlgebraicLoopError, Diagram, experiments, subsystem
 from support.hybrid_blocks import TIGHT, Ball, Lag, counting
 
 A = np.array([[0.0, 1.0], [-9.0, -0.6]])

@@ -9,17 +9,10 @@ import pytest
 from fmpy.model_description import BaseUnit
 from fmpy.model_description import Unit as UnitDefinition
 
-from loopwright.blocks import (
-    Constant,
-    FmuFileError,
-    LoopwrightError,
-    ParameterError,
-    UnknownNameError,
-    parse_unit,
-)
+from loopwright.blocks import Constant, LoopwrightError, ParameterError, UnknownNameError, parse_unit
 from loopwright.diagrams import Diagram
 from loopwright.diagrams.cli import main
-from loopwright.fmus import Fmu
+from loopwright.fmus import Fmu, FmuFileError
 from loopwright.fmus.archive.unit_definitions import FmuUnits
 from loopwright.fmus.models import mass_spring_damper
 from loopwright.fmus.platform import native_platform

@@ -5,11 +5,11 @@ import subprocess
 
 import pytest
 
-from loopwright.blocks import FmuFileError
 from loopwright.diagrams import Diagram
-from loopwright.fmus import ArchiveLimits, Fmu, FmuFault, mass_spring_damper, read_description
+from loopwright.fmus import ArchiveLimits, Fmu, FmuFileError, mass_spring_damper, read_description
 from loopwright.fmus.archive import FmuArchive, unpack
 from loopwright.fmus.child_processes.keeper import keep_folder, release_folder
+from loopwright.types import FmuFault
 from support.hostile import ARCHIVES, CASES, XML, good_files, packed
 
 BOMB = "archive: bomb"  # 120 MB

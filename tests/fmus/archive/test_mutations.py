@@ -7,9 +7,10 @@ import zipfile
 
 import pytest
 
-from loopwright.blocks import FmuFileError, LoopwrightError
-from loopwright.fmus import FmuFault, doctor, mass_spring_damper, read_description
+from loopwright.blocks import LoopwrightError
+from loopwright.fmus import FmuFileError, doctor, mass_spring_damper, read_description
 from loopwright.fmus.archive import FmuArchive, unpack
+from loopwright.types import FmuFault
 from support.hostile import XML, good_files, packed
 
 

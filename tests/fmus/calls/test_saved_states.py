@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 import loopwright.fmus
-from loopwright.blocks import FmuError, FmuFileError, FmuRuntimeError
-from loopwright.fmus import Fmu, gantry, read_description
+from loopwright.fmus import Fmu, FmuError, FmuFileError, FmuRuntimeError, gantry, read_description
 from loopwright.fmus.calls.instance import FmuInstance
 from support import TESTS
 

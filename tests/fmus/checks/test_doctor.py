@@ -9,20 +9,12 @@ import zipfile
 import numpy as np
 import pytest
 
-from loopwright.blocks import FmuFileError, ParameterError
+from loopwright.blocks import ParameterError
 from loopwright.diagrams import Diagram
 from loopwright.diagrams.cli import main
-from loopwright.fmus import (
-    ArchiveLimits,
-    Fmu,
-    FmuFault,
-    FmuSeverity,
-    FmuVerdict,
-    doctor,
-    mass_spring_damper,
-    read_description,
-)
+from loopwright.fmus import ArchiveLimits, Fmu, FmuFileError, doctor, mass_spring_damper, read_description
 from loopwright.fmus.platform import native_platform
+from loopwright.types import FmuFault, FmuSeverity, FmuVerdict
 from support.hostile import CASES, XML, binaries, described, good_files, library, packed, without_library
 from support.zoo import zoo_fmu
 

@@ -5,7 +5,7 @@ import tempfile
 
 import pytest
 
-from loopwright.blocks import FmuError
+from loopwright.fmus import FmuError
 from loopwright.fmus.child_processes import temporary_folder
 from support.failing_disk import fail_below
 

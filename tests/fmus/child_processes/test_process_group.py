@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from loopwright.blocks import CompilerError
+from loopwright.fmus import CompilerError
 from loopwright.fmus.child_processes import ProcessGroup, run_in_group
 from loopwright.fmus.export.compiler import compile_shared
 from support.marked import GONE, ON_LINUX, Host

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from loopwright.blocks import CompilerError, FmuError
-from loopwright.fmus import build_notes, gantry
+from loopwright.fmus import CompilerError, FmuError, build_notes, gantry
 from loopwright.fmus.export import compiler as _compiler
 from loopwright.fmus.export.compiler import Compiler, compile_shared
 from support.waiting import FAR, is_there, wait_for

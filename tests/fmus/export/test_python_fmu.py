@@ -15,9 +15,9 @@ import pytest
 from fmpy.validation import validate_fmu
 from lxml import etree
 
-from loopwright.blocks import Block, DefinitionError, FmuError, Input, Output, State, parameter
+from loopwright.blocks import Block, DefinitionError, Input, Output, State, parameter
 from loopwright.blocks.core import Layout
-from loopwright.fmus import Fmu, bouncing_ball, build_python
+from loopwright.fmus import Fmu, FmuError, bouncing_ball, build_python
 from loopwright.fmus.checks.summary import summarize
 from loopwright.fmus.checks.validation import validate
 

@@ -8,9 +8,9 @@ import zipfile
 import numpy as np
 import pytest
 
-from loopwright.blocks import FmuError, OptionError
+from loopwright.blocks import OptionError
 from loopwright.diagrams import experiments
-from loopwright.fmus import Fmu, gantry, tune
+from loopwright.fmus import Fmu, FmuError, gantry, tune
 
 
 @pytest.mark.parametrize("fmi", [3, 2])

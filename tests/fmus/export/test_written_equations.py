@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from loopwright.blocks import FmuError
+from loopwright.fmus import FmuError
 from loopwright.fmus.export import read_equations
 from loopwright.fmus.export.c_code import generate, runtime
 from loopwright.fmus.export.written_equations import read_text

@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopwright.blocks import PID, FmuError, FmuRuntimeError
-from loopwright.diagrams import Diagram, margins, subsystem
-from loopwright.fmus import Fmu, Isolation
+from loopwright.blocks import PID
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.fmus import Fmu, FmuError, FmuRuntimeError, Isolation
 from loopwright.fmus.calls import LoadedFmu
 from loopwright.fmus.isolation import count_processes, end_idle, open_fmu
+from loopwright.frequency import margins
 from support.misstated import misstated_fmu
 from support.waiting import FAR, is_there, wait_for
 from support.zoo import zoo_fmu

@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopwright.blocks import FmuEnd, FmuProcessError, FmuRuntimeError, ParameterError
+from loopwright.blocks import ParameterError
 from loopwright.blocks.core import Wanted
 from loopwright.diagrams import Diagram
-from loopwright.fmus import Fmu, Isolation
+from loopwright.fmus import Fmu, FmuProcessError, FmuRuntimeError, Isolation
 from loopwright.fmus.isolation import count_processes, end_idle, find_limits
+from loopwright.types import FmuEnd
 from support.exported import mass_spring_damper
 from support.waiting import Interruption, wait_for
 from support.zoo import zoo_fmu

@@ -13,8 +13,8 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import loopwright.fmus
-from loopwright.blocks import FmuRuntimeError, ParameterError
-from loopwright.fmus import Fmu, gantry_elastic, gantry_stiction, scara
+from loopwright.blocks import ParameterError
+from loopwright.fmus import Fmu, FmuRuntimeError, gantry_elastic, gantry_stiction, scara
 from support.plants import (
     C_V,
     F_C,

@@ -6,9 +6,9 @@ import shutil
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, FmuFileError, ParameterError
+from loopwright.blocks import Constant, ParameterError
 from loopwright.diagrams import Diagram
-from loopwright.fmus import Fmu, gantry
+from loopwright.fmus import Fmu, FmuFileError, gantry
 
 
 @pytest.fixture(scope="module")

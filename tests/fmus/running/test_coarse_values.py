@@ -5,9 +5,10 @@ import pytest
 from scipy.linalg import expm
 
 from loopwright.blocks import Constant
-from loopwright.diagrams import CoarseValues, Diagram
+from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu
 from loopwright.fmus.running.difference_quotients import find_slopes
+from loopwright.types import CoarseValues
 from support.closed_form import closed_form_fmu
 
 WAYS = ("model_exchange", "co_simulation")

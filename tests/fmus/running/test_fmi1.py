@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Constant, FmuRuntimeError, Input, Output, ParameterError, Sine, UnknownNameError
+from loopwright.blocks import Block, Constant, Input, Output, ParameterError, Sine, UnknownNameError
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus import Fmu, FmuFault, Isolation, StepOptions, doctor
+from loopwright.fmus import Fmu, FmuRuntimeError, Isolation, StepOptions, doctor
+from loopwright.types import FmuFault
 from support.small_fmus import small_fmu, values
 
 # x' = gain u with the inputs held, or along their slope; it logs by a format, and discards steps above `longest`.

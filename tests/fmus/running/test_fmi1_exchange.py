@@ -4,10 +4,11 @@ import fmpy
 import numpy as np
 import pytest
 
-from loopwright.blocks import AlgebraicLoopError, Constant, FmuFileError, Gain
-from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus import Fmu, FmuVerdict, doctor
+from loopwright.blocks import Constant, Gain
+from loopwright.diagrams import AlgebraicLoopError, Diagram, subsystem
+from loopwright.fmus import Fmu, FmuFileError, doctor
 from loopwright.fmus.checks.validation import validate
+from loopwright.types import FmuVerdict
 from support.small_fmus import small_fmu, values
 
 G, E = 9.81, 0.7

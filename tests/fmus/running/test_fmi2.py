@@ -9,9 +9,19 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import FmuError, FmuFileError, FmuRuntimeError, UnknownNameError
+from loopwright.blocks import UnknownNameError
 from loopwright.diagrams import Diagram, experiments
-from loopwright.fmus import Fmu, bouncing_ball, gantry, gantry_contact, mass_spring_damper, read_description
+from loopwright.fmus import (
+    Fmu,
+    FmuError,
+    FmuFileError,
+    FmuRuntimeError,
+    bouncing_ball,
+    gantry,
+    gantry_contact,
+    mass_spring_damper,
+    read_description,
+)
 from loopwright.fmus.calls.printf import Logger, format_message
 from support.plants import run
 

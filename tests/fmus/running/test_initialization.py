@@ -11,17 +11,15 @@ from loopwright.blocks import (
     Block,
     Constant,
     DefinitionError,
-    FmuFileError,
     Input,
-    NonFiniteError,
     Output,
     ParameterError,
     SimulationError,
     State,
     parameter,
 )
-from loopwright.diagrams import Diagram
-from loopwright.fmus import Fmu, ModelSpec, Variable, build, build_fmu, gantry
+from loopwright.diagrams import Diagram, NonFiniteError
+from loopwright.fmus import Fmu, FmuFileError, ModelSpec, Variable, build, build_fmu, gantry
 
 
 class Through(Block):

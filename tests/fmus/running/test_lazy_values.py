@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import Constant, FmuRuntimeError
+from loopwright.blocks import Constant
 from loopwright.blocks.core import Wanted
 from loopwright.diagrams import Diagram
-from loopwright.fmus import Fmu
+from loopwright.fmus import Fmu, FmuRuntimeError
 from support.lazy_fmus import lazy_fmu
 
 KINDS = ["equations", "comparing", "derivatives"]

@@ -10,10 +10,11 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from loopwright.blocks import FmuError, FmuRuntimeError, ParameterError, UnknownNameError
+from loopwright.blocks import ParameterError, UnknownNameError
 from loopwright.fmus import (
     Fmu,
-    FmuLinearization,
+    FmuError,
+    FmuRuntimeError,
     ModelSpec,
     Variable,
     bouncing_ball,
@@ -25,6 +26,7 @@ from loopwright.fmus import (
     mass_spring_damper,
 )
 from loopwright.fmus.calls.loaded_library import LoadedFmu
+from loopwright.types import FmuLinearization
 from support.exported import pendulums, thermostat
 
 WAYS = [("model_exchange", True), ("co_simulation", True), ("model_exchange", False), ("co_simulation", False)]

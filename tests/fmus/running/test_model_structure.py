@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import AlgebraicLoopError, Constant, FmuRuntimeError, ParameterError
-from loopwright.diagrams import Diagram
-from loopwright.fmus import Fmu
+from loopwright.blocks import Constant, ParameterError
+from loopwright.diagrams import AlgebraicLoopError, Diagram
+from loopwright.fmus import Fmu, FmuRuntimeError
 from support.closed_form import closed_form_fmu
 from support.misstated import misstated_fmu
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import FmuError
+from loopwright.fmus import FmuError
 from loopwright.fmus.running.slope_check import check_slopes
 
 

@@ -5,20 +5,10 @@ import re
 import numpy as np
 import pytest
 
-from loopwright.blocks import (
-    Block,
-    Constant,
-    FmuRuntimeError,
-    Gain,
-    OptionError,
-    Output,
-    ParameterError,
-    Ramp,
-    Sine,
-)
+from loopwright.blocks import Block, Constant, Gain, OptionError, Output, ParameterError, Ramp, Sine
 from loopwright.diagrams import Diagram
 from loopwright.diagrams.compiled.remote import PythonSteps
-from loopwright.fmus import Fmu, StepOptions
+from loopwright.fmus import Fmu, FmuRuntimeError, StepOptions
 from loopwright.fmus.isolation.process import ChildProcess
 from support.careful_fmus import (
     BETWEEN,

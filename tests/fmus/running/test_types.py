@@ -6,9 +6,10 @@ import fmpy
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Constant, FmuRuntimeError, Output, ParameterError, UnknownNameError
-from loopwright.diagrams import Diagram, StepsOnly
-from loopwright.fmus import Fmu
+from loopwright.blocks import Block, Constant, Output, ParameterError, UnknownNameError
+from loopwright.diagrams import Diagram
+from loopwright.fmus import Fmu, FmuRuntimeError
+from loopwright.types import StepsOnly
 from support.typed_fmus import description2, description3, typed_fmu
 
 EXTREMES = {

@@ -1,4 +1,4 @@
-"""``python -m loopwright.diagrams``, and the command ``loopwright``: the command line."""
+"""``python -m loopwright``, and the command ``loopwright``: the command line."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 def main() -> int:
     """Run the command line and return the exit status; an interrupt while it is loaded ends it without a traceback."""
     try:
-        from .cli import main as command_line
+        from .diagrams.cli import main as command_line
 
         return command_line()
     except KeyboardInterrupt:

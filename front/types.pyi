@@ -1,0 +1,114 @@
+from .blocks.core import Array, Call, FmuEnd, Signal, Unit
+from .blocks.paths import Frame
+from .diagrams.contact import (
+    Contact,
+    ContactAdmittance,
+    ContactConfirmation,
+    ContactLimit,
+    ContactMap,
+    ContactTrial,
+    Passivity,
+    PassivityReason,
+    PortPassivity,
+    TrialMethod,
+)
+from .diagrams.contract import BlockReport
+from .diagrams.coupling import CouplingReport
+from .diagrams.drawing import Drawing
+from .diagrams.flat import FlatDiagram, Layout
+from .diagrams.linearization import (
+    ApproximateDelay,
+    CoarseValues,
+    FreeMotion,
+    FreeMotions,
+    InexactDerivatives,
+    Kink,
+    LinearDelays,
+    Linearization,
+    MeanSlope,
+    RefutedDerivatives,
+    StepsOnly,
+    ZeroSlope,
+)
+from .diagrams.measure import FrequencyResponse, StepResponse
+from .diagrams.paper import StabilityLimit, StabilityMap
+from .diagrams.report import Report
+from .diagrams.requirements import Review, Verdict
+from .diagrams.results import Occurrence, OperatingPoint, RunState, Snapshot, Stopped, TextSignal
+from .diagrams.simulation import RunOptions, Simulation, SimulationView
+from .diagrams.studies import RunConfirmation, Sensitivities, Sensitivity, WorstCase
+from .diagrams.wiring import Subsystem, SubsystemSettings, Wire
+from .fmus.archive import FmuDescription, FmuFault, FmuFinding, FmuSeverity, FmuVariable
+from .fmus.calls import FmuInstance, FmuState
+from .fmus.checks import FmuDiagnosis, FmuTrial, FmuVerdict
+from .fmus.running import FmuLinearization
+
+__all__ = [
+    "ApproximateDelay",
+    "Array",
+    "BlockReport",
+    "Call",
+    "CoarseValues",
+    "Contact",
+    "ContactAdmittance",
+    "ContactConfirmation",
+    "ContactLimit",
+    "ContactMap",
+    "ContactTrial",
+    "CouplingReport",
+    "Drawing",
+    "FlatDiagram",
+    "FmuDescription",
+    "FmuDiagnosis",
+    "FmuEnd",
+    "FmuFault",
+    "FmuFinding",
+    "FmuInstance",
+    "FmuLinearization",
+    "FmuSeverity",
+    "FmuState",
+    "FmuTrial",
+    "FmuVariable",
+    "FmuVerdict",
+    "Frame",
+    "FreeMotion",
+    "FreeMotions",
+    "FrequencyResponse",
+    "InexactDerivatives",
+    "Kink",
+    "Layout",
+    "LinearDelays",
+    "Linearization",
+    "MeanSlope",
+    "Occurrence",
+    "OperatingPoint",
+    "Passivity",
+    "PassivityReason",
+    "PortPassivity",
+    "RefutedDerivatives",
+    "Report",
+    "Review",
+    "RunConfirmation",
+    "RunOptions",
+    "RunState",
+    "Sensitivities",
+    "Sensitivity",
+    "Signal",
+    "Simulation",
+    "SimulationView",
+    "Snapshot",
+    "StabilityLimit",
+    "StabilityMap",
+    "StepResponse",
+    "StepsOnly",
+    "Stopped",
+    "Subsystem",
+    "SubsystemSettings",
+    "TextSignal",
+    "TrialMethod",
+    "Unit",
+    "Verdict",
+    "Wire",
+    "WorstCase",
+    "ZeroSlope",
+]
