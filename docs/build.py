@@ -51,6 +51,14 @@ def stage(folder: Path) -> None:
         shutil.copytree(pictures, folder / pictures.relative_to(HERE if HERE in pictures.parents else ROOT))
 
 
+def write_reference(folder: Path) -> None:
+    """Write the pages of the reference that are made of the package."""
+    sys.path.insert(0, str(HERE / "site"))
+    import names
+
+    names.write(folder, {})
+
+
 def build(folder: Path) -> int:
     """Build the site in a folder, and return Sphinx's exit status: 0 where there was no warning."""
     from sphinx.cmd.build import main as sphinx
@@ -58,6 +66,7 @@ def build(folder: Path) -> int:
     with tempfile.TemporaryDirectory() as temporary:
         sources, trees = Path(temporary) / "pages", Path(temporary) / "trees"
         stage(sources)
+        write_reference(sources / "reference")
         options = ["-W", "--keep-going", "-q", "-j", "auto", "-d", str(trees), "-c", str(HERE / "site")]
         return sphinx([*options, str(sources), str(folder)])
 

@@ -16,6 +16,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
+    "docstrings",
     "links",
     "mathml",
 ]
@@ -28,7 +29,7 @@ nb_merge_streams = True
 suppress_warnings = ["misc.highlighting_failure"]  # examples with "…" are no JSON
 
 # Reference
-default_role = "py:obj"
+default_role = "literal"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_member_order = "bysource"
@@ -39,6 +40,7 @@ add_module_names = False
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 napoleon_use_ivar = True
+napoleon_custom_sections = [(name, "params_style") for name in ("Inputs", "Outputs", "States", "Events", "Guards")]
 
 # Theme: all of it is local; nothing is asked of a network.
 html_theme = "furo"

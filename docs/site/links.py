@@ -19,6 +19,10 @@ _INSTANCES = {"diagram": "Diagram", "run": "Run", "fmu": "Fmu"}
 """Names that pages give to instances, and their classes."""
 
 
+_ALSO_WORDS = {"final", "hold", "maximum", "mean", "minimum"}
+"""Functions whose names are those of parameters, too: linked where they are called."""
+
+
 def _index(env: BuildEnvironment) -> dict[str, tuple[str, str]]:
     """Map the short names of what the reference describes to document and anchor: `PID`, `Diagram.simulate`."""
     found: dict[str, tuple[str, str]] = {}
@@ -62,7 +66,8 @@ class LinkedNames(SphinxPostTransform):
         for literal in [*self.document.findall(nodes.literal)]:
             if isinstance(literal.parent, nodes.reference | nodes.title):
                 continue
-            target = _look_up(self.env, literal.astext())
+            text = literal.astext()
+            target = None if text in _ALSO_WORDS else _look_up(self.env, text)
             if target and target[0] != here:
                 literal.replace_self(make_refnode(builder, here, *target, literal.deepcopy()))
 
