@@ -55,8 +55,9 @@ def write_reference(folder: Path) -> None:
     """Write the pages of the reference that are made of the package."""
     sys.path.insert(0, str(HERE / "site"))
     import names
+    import responses
 
-    names.write(folder, {})
+    names.write(folder, responses.draw_all(folder / "responses"))
 
 
 def build(folder: Path) -> int:

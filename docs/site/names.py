@@ -30,9 +30,11 @@ KINDS = {
     "models": ("Modules", "Plants of the library, and the experiments of the paper."),
     "errors": (
         "Errors",
-        "Errors by name. The message of each has the block, the port, the time, what was found, what was expected, and "
-        "one next step. All are subclasses of ``LoopwrightError``. The text of a run's error ends with the samples "
-        "until then, which are in ``error.run``.",
+        (
+            "Errors by name. The message of each has the block, the port, the time, what was found, what was expected, "
+            "and one next step. All are subclasses of ``LoopwrightError``. An error of a run ends it; the samples "
+            "until then are in ``error.run``."
+        ),
     ),
 }
 """Folder of each kind of name, its title, and a sentence on it."""
@@ -136,7 +138,7 @@ def _list(kind: str, names: list[PublicName]) -> str:
 
 
 def write(folder: Path, pictures: dict[str, str]) -> None:
-    """Write the pages of all public names into the folder of the reference; `pictures` are shown ahead of their text."""
+    """Write the pages of all public names into the folder of the reference; each with its picture where it has one."""
     names = public_names()
     for kind in KINDS:
         (folder / kind).mkdir(parents=True, exist_ok=True)
