@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
-_BAR = re.compile(r"(``.*?``)|\\|(?=[^\s|][^|]*\\|)")
+_BAR = re.compile(r"(``.*?``)|\|(?=[^\s|][^|]*\|)")
 
 
 def escaped(line: str) -> str:
     """Return a line in which |x| is no substitution of reStructuredText."""
-    return _BAR.sub(lambda match: match[1] or r"\\|", line)
+    return _BAR.sub(lambda match: match[1] or "\\|", line)
 
 
 def _prepare(app: Sphinx, what: str, name: str, made: Any, options: Any, lines: list[str]) -> None:

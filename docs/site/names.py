@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import inspect
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -24,7 +25,7 @@ PLACES = (
 """Modules with public names; a name that several have is described at the first."""
 
 KINDS = {
-    "blocks": ("Blocks", "Blocks of the library, and the base of your own."),
+    "blocks": ("Library of blocks", ""),
     "classes": ("Classes", "Diagrams, runs, models and results: what functions take and return."),
     "functions": ("Functions", "Functions on diagrams, loops, runs and FMUs."),
     "models": ("Modules", "Plants of the library, and the experiments of the paper."),
@@ -37,7 +38,10 @@ KINDS = {
         ),
     ),
 }
-"""Folder of each kind of name, its title, and a sentence on it."""
+"""Folder of each kind of name, its title, and a sentence on it; blocks are listed by a page of their own."""
+
+_BLOCK = re.compile(r"(?m)^\| `(\w+)` \| (\w+) \| (.*) \|$")
+"""A row of the library's page: name, subsystems, description."""
 
 _NO_METHODS_FOR_USERS = (
     "output, derivative, update, indicators, jump, guards, initial, constants, after_start, next_instant, "
@@ -79,7 +83,8 @@ class PublicName:
             return "functions" if callable(self.made) else "classes"
         if issubclass(self.made, BaseException):
             return "errors"
-        return "blocks" if issubclass(self.made, Block) else "classes"
+        bases = self.name in ("Block", "Fmu", "PathTracking", "PlanarModel")
+        return "blocks" if issubclass(self.made, Block) and not bases else "classes"
 
     @property
     def summary(self) -> str:
@@ -99,7 +104,8 @@ def public_names() -> list[PublicName]:
     for module in modules:
         for name in getattr(module, "__all__", ()):
             made = getattr(module, name)
-            if made not in modules and not isinstance(made, str) and inspect.getdoc(made):
+            other_name = inspect.isclass(made) and made.__name__ in module.__all__ and made.__name__ != name
+            if made not in modules and not isinstance(made, str) and inspect.getdoc(made) and not other_name:
                 found.setdefault(id(made), PublicName(module.__name__, name, made))
     return sorted(found.values(), key=lambda public: public.name.lower())
 
@@ -111,7 +117,8 @@ def _title(text: str) -> str:
 def _page(public: PublicName, picture: str) -> str:
     """Return the page of a name."""
     kind, full = KINDS[public.kind][0], f"{public.place}.{public.name}"
-    where = f":doc:`{kind} </reference/{public.kind}/index>` · import it from ``{public.place}``\n\n"
+    index = "blocks" if public.kind == "blocks" else f"{public.kind}/index"
+    where = f":doc:`{kind} </reference/{index}>` · import it from ``{public.place}``\n\n"
     match public.kind:
         case "functions":
             described = f".. autofunction:: {full}\n"
@@ -119,7 +126,7 @@ def _page(public: PublicName, picture: str) -> str:
             described = f".. automodule:: {full}\n   :members:\n"
         case "errors":
             described = f".. autoexception:: {full}\n   :members:\n   :show-inheritance:\n"
-        case "blocks" if public.name != "Block":
+        case "blocks":
             described = f".. autoclass:: {full}\n   :members:\n   :exclude-members: {_NO_METHODS_FOR_USERS}\n"
         case _:
             described = f".. autoclass:: {full}\n   :members:\n"
@@ -137,12 +144,29 @@ def _list(kind: str, names: list[PublicName]) -> str:
     return _title(title) + f"{sentence}\n\n" + _TABLE + "".join(rows)
 
 
+def _with_pictures(text: str, pictures: dict[str, str]) -> str:
+    """Add a column with the responses to the tables of the library's page."""
+    text = text.replace(
+        "| block | works in | description |\n|---|---|---|\n",
+        "| block | works in | description | response |\n|---|---|---|---|\n",
+    )
+
+    def widen(row: re.Match[str]) -> str:
+        picture = f"![Response of {row[1]}](responses/{row[1]}.svg)" if row[1] in pictures else ""
+        return f"{row[0]} {picture} |"
+
+    return _BLOCK.sub(widen, text)
+
+
 def write(folder: Path, pictures: dict[str, str]) -> None:
     """Write the pages of all public names into the folder of the reference; each with its picture where it has one."""
     names = public_names()
     for kind in KINDS:
         (folder / kind).mkdir(parents=True, exist_ok=True)
-        (folder / kind / "index.rst").write_text(_list(kind, names), encoding="utf-8")
+        if kind != "blocks":
+            (folder / kind / "index.rst").write_text(_list(kind, names), encoding="utf-8")
+    library = folder / "blocks.md"
+    library.write_text(_with_pictures(library.read_text(encoding="utf-8"), pictures), encoding="utf-8")
     for public in names:
         text = _page(public, pictures.get(public.name, ""))
         (folder / f"{public.page}.rst").write_text(text, encoding="utf-8")

@@ -30,6 +30,13 @@ _STYLE = {
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
+_SHOWN = """.. image:: /reference/responses/{name}_symbol.svg
+   :alt: {name} in a diagram
+
+.. image:: /reference/responses/{name}.svg
+   :alt: Response of {name} in this diagram: inputs dashed, outputs solid
+
+"""
 _MATRICES: dict[str, Any] = {"A": ((0.0, 1.0), (-20.0, -2.0)), "B": ((0.0,), (20.0,)), "C": ((1.0, 0.0),)}
 _ELLIPSE = b.Ellipse(semi_axes=(0.3, 0.15))
 
@@ -317,5 +324,6 @@ def draw_all(folder: Path) -> dict[str, str]:
             figure = Figure(figsize=(5.2, 2.0), layout="constrained")
             _draw(figure.add_subplot(), example)
             figure.savefig(folder / f"{name}.svg", transparent=True, metadata={"Date": None})
-        found[name] = f".. image:: /reference/responses/{name}.svg\n   :alt: Response of {name}\n\n"
+        _wired(example).draw().save(folder / f"{name}_symbol.svg")
+        found[name] = _SHOWN.format(name=name)
     return found
