@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .delay_matrices import DelayMatrices, find_pade_limit, replace_delays
+from .delay_matrices import NEUTRAL, DelayMatrices, find_pade_limit, replace_delays
 from .delayed_hold import delayed_hold, delayed_hold_margin
 from .delayed_realization import DelayedRealization, realize
 from .disk_margins import DiskMargin, disk_margin, loop_at, mimo_disk_margin
@@ -55,6 +55,7 @@ def delayed_system_class() -> type[DelayedSystem]:
 __all__ = [
     "MARGIN_UNITS",
     "MARK",
+    "NEUTRAL",
     "Comparison",
     "Confirmation",
     "DelayMatrices",

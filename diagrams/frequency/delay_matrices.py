@@ -24,9 +24,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, ParameterError
+from ...blocks.core import ConfirmationError
 from ...blocks.library import PadeDelay
-from .structured_value import mu_bound
+from .structured_value import mu_bound, mu_scaling
 
 MARGINAL = 1e-11
 """Distance of a root from the axis, relative to the bound of all roots, within which it is on the axis."""
@@ -40,6 +40,10 @@ MOST_POINTS = 200_000
 """Points after which the argument is given up."""
 NEAR = 0.1
 """Damping ratio of Padé's poles below which roots are searched to tell on which side of the axis they are."""
+NEUTRAL = 1.0 - 1e-12
+"""Gain of the ways around the delays without a state from which on infinitely many roots are not stable."""
+LEFT = 0.1
+"""Distance of such a gain from 1 that takes its place in the size within which roots are then searched."""
 RIGHT = 0.01
 """Error of Padé's approximation, in parts of its input, up to which it is called right."""
 NEWTON = 60
@@ -106,8 +110,35 @@ class DelayMatrices:
         return max((mu_bound(part.H.astype(complex)) for part in self.delayed if part.H.any()), default=0.0)
 
     @cached_property
+    def chains(self) -> float:
+        """Largest Re s, in 1/s, of the chains of roots that the ways without a state have up to infinite frequency.
+
+        With one delay it is ln|h|/τ, which the chain's roots approach; with several delays their largest for every
+        choice of the delays' ratios. It is −∞ without such ways.
+        """
+        return max((part._find_chain() for part in self.delayed if part.H.any()), default=-math.inf)
+
+    def _find_chain(self) -> float:
+        from scipy.optimize import brentq
+
+        def above(c: float) -> float:
+            return math.log(max(mu_bound(self.H * np.exp(-c * self.tau).astype(complex)), 1e-300))
+
+        mu = mu_bound(self.H.astype(complex))
+        if mu <= 0.0 or not np.max(np.abs(np.linalg.eigvals(np.abs(self.H)))):
+            return -math.inf
+        ends = sorted((math.log(mu) / float(np.max(self.tau)), math.log(mu) / float(np.min(self.tau))))
+        if above(ends[0]) <= 0.0 or above(ends[1]) >= 0.0:  # one delay: both are the same
+            return ends[0] if abs(above(ends[0])) <= abs(above(ends[1])) else ends[1]
+        return float(brentq(above, *ends, xtol=1e-13 * max(map(abs, ends)), rtol=1e-13))
+
+    @cached_property
     def bound(self) -> float:
-        """Bound of |s| of all roots beyond the limit: the spectral radius of |A| + |G| (I − |H|)⁻¹ |C|."""
+        """Bound of |s| of all roots beyond the limit: the spectral radius of |A| + |G| (I − |H|)⁻¹ |C|.
+
+        Where ways without a state have a gain of 1 or more there is none; then it is the size within which roots are
+        searched.
+        """
         if not len(self.A):
             return 0.0
         A, G, C, H = (np.abs(M) for M in (self.A, self.G, self.C, self.H))
@@ -115,17 +146,14 @@ class DelayMatrices:
             return float(np.max(np.abs(np.linalg.eigvals(A))))
         if np.max(np.abs(np.linalg.eigvals(H)), initial=0.0) < 1.0:
             return float(np.max(np.abs(np.linalg.eigvals(A + G @ np.linalg.solve(np.eye(len(H)) - H, C)))))
-        sigma = float(np.linalg.norm(self.H, 2))
-        if sigma < 1.0:
-            return float(np.linalg.norm(A, 2) + np.linalg.norm(G, 2) * np.linalg.norm(C, 2) / (1.0 - sigma))
-        raise ParameterError(
-            f"found delays with ways around them without a state whose gains sum up to {sigma:.6g}; expected less than "
-            "1. Put a lag into one of these ways.",
-            block="delays",
-        )
+        mu, d = mu_scaling(self.H.astype(complex))
+        left = 1.0 - mu if mu < NEUTRAL else LEFT
+        return float(np.linalg.norm(A, 2) + np.linalg.norm(G / d, 2) * np.linalg.norm(d[:, None] * C, 2) / left)
 
     def poles(self) -> tuple[complex, ...]:
         """Return the poles without those far to the left, the rightmost first; all that are not stable are among them.
+
+        Where ways without a state have a gain of 1 or more, infinitely many are not stable, and some are returned.
 
         Raises
         ------
@@ -133,6 +161,8 @@ class DelayMatrices:
             If fewer were found than the argument says, or more.
         """
         for part in self.delayed:
+            if part.gain_at_infinity >= NEUTRAL:
+                continue
             if (count := part.count_in_part()) > np.sum(part.roots.real >= -MARGINAL * part.bound):
                 raise ConfirmationError(
                     f"found {len(part.roots)} roots of a characteristic function, of which fewer than {count:g} are "
@@ -234,7 +264,7 @@ class DelayMatrices:
         ConfirmationError
             If the argument can't be followed, or a root is found where it says that there is none.
         """
-        if self.gain_at_infinity >= 1.0 - 1e-12:
+        if self.gain_at_infinity >= NEUTRAL:
             return math.inf
         plain = self.plain_poles
         rounding = 1e-13 * float(np.abs(plain).max(initial=0.0))

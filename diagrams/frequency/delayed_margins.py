@@ -50,8 +50,8 @@ class ByArgument:
         for part in FLOORS:
             self.floor = part * size
             scan = LoopScan(self.r, features, floor=self.floor)
-            if any(self.floor <= abs(c.L) < 1.0 for c in scan.find_phase_crossovers()):
-                break
+            if np.isfinite(self.r.settled) or any(self.floor <= abs(c.L) < 1.0 for c in scan.phase_crossovers):
+                break  # one that turns up to infinite frequency is scanned as far as it changes
         return scan
 
     def count_encirclements(self) -> int:

@@ -23,6 +23,14 @@ ZEROS_ORDER = 6
 """Order of Padé's approximation whose zeros say where a response bends."""
 MOST_TURNS = 5000
 """Frequencies in even steps at which a response is drawn besides."""
+SETTLED = 1e-3
+"""Difference of L from its limit, relative to that and to 1 + L, that is left where it has settled."""
+MOST_CYCLES = 60
+"""Turns of all delays up to which a response that turns up to infinite frequency is scanned."""
+SAMPLES = 400
+"""Frequencies at which the distance of a response from its limit is measured."""
+SECOND = 4.0
+"""Factor of the second-order term of that distance."""
 MOST_SIGNS = 10
 """Delays up to which the response at infinite frequency is looked at for all signs."""
 
@@ -121,6 +129,54 @@ class DelayedRealization:
     def D(self) -> np.ndarray:  # noqa: N802 - as of a realization
         """L at infinite frequency, shape (1, 1): of all values that it has there, the one nearest to −1 or beyond."""
         return np.array([[float(np.min(self.at_infinity))]])
+
+    @property
+    def _turns(self) -> bool:
+        """Whether L turns up to infinite frequency: a way without a state goes through a delay."""
+        return len(self.at_infinity) > 1
+
+    @cached_property
+    def _beyond(self) -> tuple[float, float]:
+        """Frequency from which L is what it is at infinite frequency, and the size of what is left of it there.
+
+        Without states L would be L(E), E = diag(e^(−sτ)). The difference falls as 1/ω; its factor is measured.
+        """
+        if not self._turns:
+            return np.inf, 0.0
+        parts = [*self.open.delayed, *self.close().delayed]
+        sizes = [*np.abs(self.open.plain_poles), *(p.bound for p in parts if p.gain_at_infinity < 1.0)]
+        at = 30.0 * (float(max(sizes, default=0.0)) or 1.0 / float(np.sum(self.tau)))
+        omega = at * (1.0 + np.linspace(0.0, 1.0, SAMPLES) ** 2)
+        r, m = self.rest, len(self.tau)
+        E = np.exp(-1j * omega[:, None] * self.tau)
+        into = np.linalg.solve(np.eye(m) - r.D[1:, 1:] * E[:, None, :], np.broadcast_to(r.D[1:, :1], (SAMPLES, m, 1)))
+        ends = r.D[0, 0] + np.sum(r.D[0, 1:] * E * into[:, :, 0], axis=1)
+        factor = float(np.max(np.abs(self.matrix(1j * omega)[:, 0, 0] - ends) * omega))
+        size = min(float(np.max(np.abs(self.at_infinity))), float(np.min(np.abs(1.0 + self.at_infinity))))
+        settled = max(at, factor / (SETTLED * max(size, 1e-300)))
+        settled = min(settled, max(at, 2.0 * np.pi * MOST_CYCLES / float(np.sum(self.tau))))
+        return settled, factor / settled
+
+    @property
+    def late(self) -> float:
+        """Delay in s by which L turns at most, besides the turns that its poles and zeros make."""
+        return float(np.sum(self.tau))
+
+    @property
+    def settled(self) -> float:
+        """Frequency in rad/s from which L is what it is at infinite frequency, but turns without end; else infinite."""
+        return self._beyond[0]
+
+    @property
+    def end_error(self) -> float:
+        """Relative error of L at infinite frequency where it turns, as a limit of values beyond `settled`.
+
+        A real L(E) is one of real E, whose change with 1/ω is imaginary: the size changes with its square.
+        """
+        if not self._turns:
+            return 1e-15
+        left = self._beyond[1] / max(float(np.max(np.abs(self.at_infinity))), 1e-300)
+        return max(1e-15, SECOND * left**2)
 
     @property
     def scale(self) -> float:

@@ -28,6 +28,8 @@ GAINS = (1.5, 2.0, 5.0, 10.0, 100.0, 1e3)
 """Factors, and reciprocals of factors, that are tried where no limit of the gain was found."""
 MOST_SAMPLES = 100
 """Samples of delay up to which closed-loop eigenvalues count the unstable poles; beyond, encirclements do."""
+SHOWN = 24
+"""Phase crossovers that are given of a loop which has them up to infinite frequency."""
 
 
 @explain_calls
@@ -85,8 +87,12 @@ class Margins(StabilityMargins):
         Poles that are not controllable or not observable in the loop; none of the numbers above contains them.
     hidden_unstable : tuple of complex
         Hidden poles beyond the limit of stability. No gain in this loop stabilizes them: another loop must.
-    encirclements : int
-        Clockwise encirclements of −1 by L.
+    gain_crossovers, phase_crossovers : tuple
+        Crossings of the unit circle and of the negative real axis by rising frequency. Where a way without a state goes
+        through a delay the curve crosses the axis up to infinite frequency: the first 23 and the one at the end are
+        given, and all are looked at.
+    encirclements : float
+        Clockwise encirclements of −1 by L; infinite where L turns around it up to infinite frequency.
     dt : float
         Sample time of the loop in s, 0 of a continuous one.
     findings : tuple of Finding
@@ -112,7 +118,7 @@ class Margins(StabilityMargins):
     closed_loop_poles: tuple[complex, ...]
     hidden_poles: tuple[complex, ...]
     hidden_unstable: tuple[complex, ...]
-    encirclements: int
+    encirclements: float
     dt: float = 0.0
     findings: tuple[Finding, ...] = ()
 
@@ -241,7 +247,7 @@ class _LoopMarginFinder(MarginFinder[Margins]):
         self.eigenvalues = self.by.stability
         self.skew, self.scan = skew, self.by.scan
         self.gain = self.scan.find_gain_crossovers()
-        self.phase = [c for c in self.scan.find_phase_crossovers() if abs(c.L) >= self.by.floor]
+        self.phase = [c for c in self.scan.phase_crossovers if abs(c.L) >= self.by.floor]
 
     def find_numbers(self) -> dict[str, Number]:
         return {
@@ -258,14 +264,21 @@ class _LoopMarginFinder(MarginFinder[Margins]):
         except ConfirmationError:  # of an unstable loop a pole may lie on the limit: the curve passes through −1
             if not self.unstable:
                 raise
-            encirclements = int(self.unstable - self.scan.features.unstable_poles())
+            encirclements = self.unstable - self.scan.features.unstable_poles()
+            encirclements = encirclements if np.isinf(encirclements) else int(encirclements)
         return {
             "gain_crossovers": tuple(self._make_gain_crossover(c) for c in self.gain),
-            "phase_crossovers": tuple(self._make_phase_crossover(c) for c in self.phase),
+            "phase_crossovers": tuple(self._make_phase_crossover(c) for c in self._shown(self.phase)),
             "hidden_poles": tuple(complex(p) for p in (r.hidden + 1 if r.dt else r.hidden)),
             "hidden_unstable": find_hidden_unstable(r),
             "encirclements": encirclements,
         }
+
+    def _shown(self, crossings: Sequence[Crossing]) -> Sequence[Crossing]:
+        """Return the first of the crossings that a loop has up to infinite frequency, and the last; else all."""
+        if np.isinf(self.r.settled) or len(crossings) <= SHOWN:
+            return crossings
+        return [*crossings[: SHOWN - 1], crossings[-1]]
 
     def _frequency(self, c: Crossing, how: str) -> Number:
         ends = c.omega in (0.0, np.inf) or c.omega == self.r.nyquist
@@ -398,7 +411,8 @@ class _LoopMarginFinder(MarginFinder[Margins]):
     def _error(self, peak: Peak, t: Peak) -> float:
         """Return the relative error of a peak: that of L, times the largest |T|."""
         inside = 0 < peak.omega < np.inf and not any(a.omega == peak.omega for a in self.scan.features.axis_poles)
-        return max(1e-12, (self.r.error(peak.omega) if inside else 1e-13) * 3 * (1 + t.value))
+        end = max(1e-13, self.r.end_error) if np.isinf(peak.omega) else 1e-13
+        return max(1e-12, (self.r.error(peak.omega) if inside else end) * 3 * (1 + t.value))
 
     def _tolerate(self, peak: Peak, how: str) -> tuple[float, str]:
         ends = peak.omega in (0.0, np.inf) or peak.omega == self.r.nyquist

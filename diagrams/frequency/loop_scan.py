@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
@@ -38,6 +39,18 @@ class Response(Protocol):
     @property
     def D(self) -> np.ndarray:  # noqa: N802 - as of a realization
         """L at infinite frequency, shape (1, 1)."""
+
+    @property
+    def late(self) -> float:
+        """Delay in s by which L turns at most, besides the turns that its poles and zeros make."""
+
+    @property
+    def settled(self) -> float:
+        """Frequency in rad/s from which L is what it is at infinite frequency, but turns without end; else infinite."""
+
+    @property
+    def end_error(self) -> float:
+        """Relative error of L at infinite frequency, as a limit of values beyond `settled`."""
 
     def matrix(self, s: np.ndarray) -> np.ndarray:
         """Return L at points, shape (points, 1, 1)."""
@@ -98,18 +111,23 @@ class LoopScan:
         ends = [Crossing(omega, L, 0.0, 1e-13) for omega, L in self.ends() if abs(abs(L) - 1) < 1e-13]
         return sorted(inside + ends, key=lambda c: c.omega)
 
+    @cached_property
+    def phase_crossovers(self) -> list[Crossing]:
+        """Those of `find_phase_crossovers`, searched once."""
+        return self.find_phase_crossovers()
+
     def find_phase_crossovers(self) -> list[Crossing]:
         """Return the points with L real and negative by rising frequency; also at 0, at π/T and at infinity (D < 0)."""
 
         def sine(L: np.ndarray, dL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             return L.imag / np.abs(L), np.real(L) / np.abs(L) * np.imag(dL / L)
 
-        inside = [self._make_crossing(omega, sine) for omega in self._find_roots(sine)]
+        inside = [self._make_crossing(omega, sine) for omega in self._find_roots(sine, lambda L: L.real < 0)]
         found = [c for c in inside if c.L.real < 0 and c.slope != 0.0]
         zeros = {a.omega for a in self.features.axis_zeros}
         for omega, value in self.ends():
             if np.isfinite(value) and value.real < 0 and omega not in zeros and not self._is_rounding(omega, value):
-                error = self.r.error(omega) if np.isfinite(omega) else 1e-15
+                error = self.r.error(omega) if np.isfinite(omega) else self.r.end_error
                 found.append(Crossing(omega, complex(value.real), 0.0, error))
         return sorted(found, key=lambda c: c.omega)
 
@@ -156,8 +174,8 @@ class LoopScan:
         def gain(L: np.ndarray, dL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             return np.log(np.abs(L / (1 + L)) / level), np.real(dL / (L * (1 + L)))
 
-        roots = [omega for omega in self._find_roots(gain) if gain(*self._response(omega))[1][0] < 0]
-        return min(roots, default=np.inf)
+        falls = (omega for omega in self._find_roots(gain) if gain(*self._response(omega))[1][0] < 0)
+        return next(falls, np.inf)
 
     def _response(self, omega: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
         """Return L and dL/d(log ω)."""
@@ -171,19 +189,25 @@ class LoopScan:
         L, dL = self._response(omega)
         return Crossing(omega, complex(L[0]), float(function(L, dL)[1][0]), self.r.error(omega))
 
-    def _find_roots(self, function: Function) -> list[float]:
-        """Return the roots of a function; its slope shows two of them between two samples."""
-        found: list[float] = []
+    def _find_roots(
+        self, function: Function, where: Callable[[np.ndarray], np.ndarray] | None = None
+    ) -> Iterator[float]:
+        """Yield the roots of a function by rising frequency; its slope shows two of them between two samples.
+
+        ``where`` says of values of L whether a root beside them is looked for.
+        """
+        last = -np.inf
         for omega, (L, dL) in zip(self.segments, self.samples, strict=True):
             with np.errstate(all="ignore"):
                 h, slope = function(L, dL)
+            wanted = np.ones(len(L), dtype=bool) if where is None else where(L)
             searched = 0
             for k in range(len(omega) - 1):
                 if k < searched:
                     continue
                 span = (float(omega[k]), float(omega[k + 1]))
                 left, right = h[k], h[k + 1]
-                if not (np.isfinite(left) and np.isfinite(right)):
+                if not (np.isfinite(left) and np.isfinite(right) and (wanted[k] or wanted[k + 1])):
                     continue
                 turns = left * slope[k] < 0 and right * slope[k + 1] > 0
                 if left * right > 0 and not turns:
@@ -193,19 +217,18 @@ class LoopScan:
                     searched = len(omega) if behind is None else behind
                     if before is not None and behind is not None and h[before] * h[behind] < 0:
                         span = float(omega[before]), float(omega[behind])  # both samples are too close to the root
-                        if not any(span[0] < w < span[1] for w in found):  # rounding may have shown it before the first
-                            found.append(self._polish(lambda w: self._evaluate(function, w, 0), span))
+                        if not last > span[0]:  # rounding may have shown it before the first
+                            yield (last := self._polish(lambda w: self._evaluate(function, w, 0), span))
                     continue
                 if left == 0.0:
-                    found.append(span[0])
+                    yield (last := span[0])
                 elif left * right < 0:
-                    found.append(self._polish(lambda w: self._evaluate(function, w, 0), span))
+                    yield (last := self._polish(lambda w: self._evaluate(function, w, 0), span))
                 elif turns:
                     turn = self._polish(lambda w: self._evaluate(function, w, 1), span)
                     if self._evaluate(function, turn, 0) * left < 0:
-                        found.append(self._polish(lambda w: self._evaluate(function, w, 0), (span[0], turn)))
-                        found.append(self._polish(lambda w: self._evaluate(function, w, 0), (turn, span[1])))
-        return found
+                        yield self._polish(lambda w: self._evaluate(function, w, 0), (span[0], turn))
+                        yield (last := self._polish(lambda w: self._evaluate(function, w, 0), (turn, span[1])))
 
     def _find_rounding(self, omega: np.ndarray, L: np.ndarray) -> np.ndarray:
         """Return bounds of the relative rounding error of L at frequencies, at least that of a constant.
@@ -242,8 +265,7 @@ def make_grid(r: Response, features: Features, *, delay: float = 0.0, floor: flo
     floor = max(floor, TURNS_MATTER) if delay else floor
     sizes = features.sizes()
     low, high = (sizes[0] / 1e4, sizes[-1] * 1e4) if len(sizes) else (1e-3, 1e3)
-    if r.dt:
-        high = r.nyquist
+    high = r.nyquist if r.dt else min(high, r.settled)
     low = min(low, high / 10)
     on_axis = (*features.axis_poles, *features.axis_zeros)
     low = max([low, *(30 * a.scatter for a in on_axis if a.omega == 0.0)])
@@ -279,11 +301,15 @@ def _bisect(r: Response, omega: np.ndarray, delay: float, floor: float) -> np.nd
     def respond(at: np.ndarray) -> np.ndarray:
         return np.asarray(r.matrix(1j * at)[:, 0, 0] * np.exp(-1j * at * delay))
 
-    L = respond(omega)
+    L, late = respond(omega), delay + r.late
     for _ in range(14):
         with np.errstate(divide="ignore", invalid="ignore"):
             step = np.log(L[1:] / L[:-1])
-        coarse = ~((np.abs(step.real) < 0.3) & (np.abs(step.imag) < 0.15)) & (np.diff(omega) > 1e-12 * omega[1:])
+        apart = np.diff(omega)
+        smooth = (
+            (np.abs(step.real) < 0.3) & (np.abs(step.imag) < 0.15) & (apart * late < 1.0)
+        )  # a whole turn shows none
+        coarse = ~smooth & (apart > 1e-12 * omega[1:])
         if floor:
             coarse &= np.maximum(np.abs(L[1:]), np.abs(L[:-1])) > floor
         if not coarse.any() or len(omega) > 40_000:

@@ -126,9 +126,8 @@ class MarginFinder(ABC, Generic[Found]):
         poles = r.eigenvalues()
         if self.unstable:
             near = r.growth(poles).max()
-            reason = (
-                f"the closed loop is not stable: {self.unstable:g} of its poles are not (largest growth {near:.3g})"
-            )
+            count = f"{self.unstable:g}" if np.isfinite(self.unstable) else "infinitely many"
+            reason = f"the closed loop is not stable: {count} of its poles are not (largest growth {near:.3g})"
             names = [f.name for f in fields(self.result) if f.type == "Number"]
             found = {name: Number(np.nan, MARGIN_UNITS.get(name, "1"), np.nan, reason) for name in names}
         else:

@@ -107,6 +107,21 @@ class Realization:
         """Highest frequency of the response in rad/s: π/T, or infinity."""
         return np.pi / self.dt if self.dt else np.inf
 
+    @property
+    def late(self) -> float:
+        """0: poles and zeros make all turns of the response."""
+        return 0.0
+
+    @property
+    def settled(self) -> float:
+        """Infinity: without delays the response comes to a single value at infinite frequency."""
+        return np.inf
+
+    @property
+    def end_error(self) -> float:
+        """Relative error of L at infinite frequency, D."""
+        return 1e-15
+
     def point(self, s: np.ndarray) -> np.ndarray:
         """Return p at points s."""
         return np.asarray(np.expm1(s * self.dt) if self.dt else s, dtype=complex)

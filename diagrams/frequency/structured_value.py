@@ -12,17 +12,21 @@ def mu_bound(M: np.ndarray, *, polish: bool = True) -> float:
     is given. For more channels the bound is convex in log D and minimized. Without ``polish`` the minimum is rough;
     it still is a bound.
     """
-    n = len(M)
-    if n == 1:
-        return float(abs(M[0, 0]))
-    if n == 2:
+    if len(M) == 2:
         square = abs(M[0, 0]) ** 2 + abs(M[1, 1]) ** 2 + 2 * abs(M[0, 1] * M[1, 0])
         det = abs(np.linalg.det(M))
         return float(np.sqrt((square + np.sqrt(max(square**2 - 4 * det**2, 0.0))) / 2))
+    return mu_scaling(M, polish=polish)[0]
+
+
+def mu_scaling(M: np.ndarray, *, polish: bool = True) -> tuple[float, np.ndarray]:
+    """Return σ̄(D M D⁻¹) with the diagonal of the D that makes it smallest, about the bound of `mu_bound`."""
+    if len(M) == 1:
+        return float(abs(M[0, 0])), np.ones(1)
     return _minimize_scaling(M, polish=polish)
 
 
-def _minimize_scaling(M: np.ndarray, *, polish: bool = True) -> float:
+def _minimize_scaling(M: np.ndarray, *, polish: bool = True) -> tuple[float, np.ndarray]:
     """Minimize σ̄(D M D⁻¹) over log D by its gradient σ̄ (|u|² − |v|²), and without a gradient where σ̄ has a kink."""
     from scipy.optimize import minimize
 
@@ -32,7 +36,7 @@ def _minimize_scaling(M: np.ndarray, *, polish: bool = True) -> float:
         return float(sigma[0]), sigma[0] * (np.abs(U[:, 0]) ** 2 - np.abs(V[0]) ** 2)[:-1]
 
     if not M.any():
-        return 0.0
+        return 0.0, np.ones(len(M))
     size = np.abs(M) + 1e-12 * np.abs(M).max()
     d = np.ones(len(M))
     for _ in range(20):  # Osborne's balancing: rows and columns get one size
@@ -41,12 +45,14 @@ def _minimize_scaling(M: np.ndarray, *, polish: bool = True) -> float:
     x = np.log(d[:-1] / d[-1])
     found = minimize(bound_and_gradient, x, jac=True, method="BFGS")
     x_found, gradient = np.asarray(found.x), np.asarray(found.jac)
+    tried = [x_found, x]
     best = min(float(found.fun), bound_and_gradient(x)[0])
     if polish and float(np.max(np.abs(gradient))) > 1e-7 * best:
         options = {"xatol": 1e-9, "fatol": 1e-12 * best, "maxiter": 2000}
         again = minimize(lambda x: bound_and_gradient(x)[0], x_found, method="Nelder-Mead", options=options)
-        best = min(best, float(again.fun))
-    return best
+        tried.append(np.asarray(again.x))
+    bound, x = min(((bound_and_gradient(x)[0], x) for x in tried), key=lambda pair: pair[0])
+    return bound, np.exp(np.append(np.clip(x, -20, 20), 0.0))
 
 
 def mu_lower_bound(M: np.ndarray) -> tuple[float, np.ndarray]:

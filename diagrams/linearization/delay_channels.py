@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from ...blocks.core import read_time
 from ..flat import FlatDiagram
-from ..wiring import join
+from ..wiring import find_cyclic_parts, join
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,23 @@ def delay_channels(flat: FlatDiagram) -> DelayChannels:
     return DelayChannels(
         tuple(paths), tuple(labels), np.array(inputs, dtype=int), np.array(outputs, dtype=int), tuple(times)
     )
+
+
+def blocks_around(flat: FlatDiagram, delays: Iterable[str]) -> tuple[str, ...]:
+    """Return the blocks on ways without a state that lead from some transport delays back to them, sorted by path.
+
+    ``delays`` are paths of blocks, and the delays are among what is returned.
+    """
+    traced, every = flat.checked.traced, set(delay_channels(flat).paths)
+    edges: list[tuple[str, str]] = []
+    for (block, port), wire in flat.table.wires.items():
+        outputs = (
+            [name for name in traced[block].outputs if port in traced[block].depends[name]] if block in traced else []
+        )
+        edges += [(join(wire.block, wire.port), join(block, out)) for out in (["y"] if block in every else outputs)]
+    parts = find_cyclic_parts(sorted({key for edge in edges for key in edge}), edges)
+    blocks = [{key.rpartition(".")[0] for key in part} for part in parts]
+    return tuple(sorted(set().union(*(part for part in blocks if part & set(delays)))))
 
 
 def reaches(M: np.ndarray) -> np.ndarray:

@@ -33,9 +33,10 @@ from ...blocks.core import (
 )
 from ...fmus.running import Derivation, DerivativeMethod
 from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
-from ..frequency import DelayMatrices, delayed_loop_class, delayed_system_class, loop_class
+from ..frequency import NEUTRAL, DelayMatrices, delayed_loop_class, delayed_system_class, loop_class, mu_bound
 from ..results import OperatingPoint
 from ..wiring import exact_time
+from .delay_channels import blocks_around
 from .derivatives import LocalDerivatives, Tap, find_moving, find_signal
 from .exchanged import derivations_at, evaluators_at, findings_on
 from .findings import EntryTaken
@@ -230,6 +231,23 @@ class Linearization:
         if delays is None:
             return DelayMatrices(A, np.zeros((len(A), 0)), np.zeros((0, len(A))), np.zeros((0, 0)), np.zeros(0))
         return DelayMatrices(A, delays.G[keep], delays.Z[:, keep], delays.H, delays.times)
+
+    @property
+    def neutral_blocks(self) -> tuple[str, ...]:
+        """Blocks on the ways around dead times that have no state and a gain of 1 or more, sorted by path; see `poles`.
+
+        Through them signals of all frequencies come back as large as they were: a lag in one of these ways ends that.
+        It is empty where the gain is below 1, and of a sampled model.
+        """
+        if self.delays is None:
+            return ()
+        found: set[str] = set()
+        H = self.delays.H
+        for part in self.characteristic.parts:
+            places = part.delays
+            if len(places) and mu_bound(H[np.ix_(places, places)].astype(complex)) >= NEUTRAL:
+                found |= {self.delays.names[i].rpartition(".")[0] for i in places}
+        return blocks_around(self.wired.flatten_like(self.point), found) if found else ()
 
     def characteristic_without(self, free: FreeMotions) -> DelayMatrices:
         """Return the characteristic function without the roots of some free motions, of a continuous model."""

@@ -30,7 +30,7 @@ from .sections.injection import REFUTED
 from .sections.measured_loops import MEASURED, MeasuredLoop
 from .sections.step_responses import APART, key_of_step, unit_at
 from .sections.worst_case import MissingWorstCase, ReportedWorstCase
-from .stability import Stability, free_motions
+from .stability import Stability, free_motions, why_unstable
 from .variant import Cut, Variant
 
 STABLE = Limit(-math.inf, 0.0)
@@ -239,7 +239,7 @@ class _State:
         except LoopwrightError as error:
             return cls(Verdict.UNDECIDED, Reason.NOT_ANALYSED, error.message)
         if stability is Stability.UNSTABLE:
-            return cls(Verdict.FAILED, Reason.UNSTABLE)
+            return cls(Verdict.FAILED, Reason.UNSTABLE, why_unstable(v))
         return cls(Verdict.UNDECIDED, Reason.MOVING, v.moves_most) if _moves(v) else cls()
 
 
@@ -258,7 +258,7 @@ def _stable(v: Variant, state: _State, numbers: Mapping[str, Number]) -> Require
     distance = math.nan if number is None else STABLE.distance(number.value)
     result = replace(result, distance=distance, path=path if number is not None else "", number=number)
     if stability is Stability.UNSTABLE:
-        return replace(result, verdict=Verdict.FAILED, reason=Reason.UNSTABLE)
+        return replace(result, verdict=Verdict.FAILED, reason=Reason.UNSTABLE, detail=state.detail)
     if stability is Stability.ON_THE_LIMIT:
         return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.ON_THE_LIMIT)
     if number is not None and is_doubtful(number):

@@ -10,7 +10,10 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError
 from ..linearization import FreeMotion
+from .pages import Texts
 from .variant import Variant, in_s
+
+TEXTS = Texts(__package__, "stability")
 
 ON_THE_LIMIT = 1e-9
 """A pole no farther than that from the imaginary axis, relative to the fastest pole, is called neither way."""
@@ -33,6 +36,15 @@ class Stability(StrEnum):
             return cls.UNSTABLE
         slowest, margin = float(np.max(poles_in_s(v).real, initial=-np.inf)), stability_margin(v)
         return cls.STABLE if slowest < -margin else cls.UNSTABLE if slowest > margin else cls.ON_THE_LIMIT
+
+
+def why_unstable(v: Variant) -> str:
+    """Return why a variant is unstable where its poles alone don't say it; empty where they do."""
+    blocks = v.model.neutral_blocks
+    if not blocks:
+        return ""
+    gain = v.model.characteristic.gain_at_infinity
+    return TEXTS.line("neutral", gain=gain, blocks=blocks)
 
 
 def free_motions(variants: Iterable[Variant]) -> tuple[FreeMotion, ...]:

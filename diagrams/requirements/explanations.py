@@ -17,6 +17,8 @@ MEASURED, WORST_CASE, CONTACT = "measured", "worst_case", "contact"
 def explain(result: RequirementResult) -> str:
     """Return the reason of a verdict, and the step that would decide an open one; empty where numbers were compared.
 
+    A failed one may have more about its reason.
+
     Examples
     --------
     >>> from loopwright.diagrams.requirements import Limit
@@ -27,7 +29,8 @@ def explain(result: RequirementResult) -> str:
     if result.reason is Reason.COMPARED:
         return ""
     if result.verdict is not Verdict.UNDECIDED:
-        return str(result.reason)
+        is_contact = result.variant == CONTACT  # whose detail is its environment
+        return f"{result.reason}: {result.detail}" if result.detail and not is_contact else str(result.reason)
     why, step = _find_reason(result)
     why = why.rstrip(".")
     return f"{why}{' Or ' if why.endswith('?') else '; '}{step}" if step else why

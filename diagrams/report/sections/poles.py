@@ -9,7 +9,7 @@ import numpy as np
 from ...frequency import Number, order_key, with_findings
 from ..case import Case
 from ..pages import Section, TableForm, Texts
-from ..stability import ON_THE_LIMIT, Stability, free_motions, poles_in_s, scatter, stability_margin
+from ..stability import ON_THE_LIMIT, Stability, free_motions, poles_in_s, scatter, stability_margin, why_unstable
 from ..variant import Variant, in_s
 from .subject import SUBJECT_TITLE
 
@@ -45,7 +45,8 @@ def closed_loops(case: Case) -> Section | None:
                 how = "the argument of the characteristic function, which counts no root beyond the axis"
                 if Stability.of(v) is not Stability.STABLE:
                     how = "the argument of the characteristic function, which counts the roots beyond the axis"
-            largest = Number(float(np.max(s.real, initial=-np.inf)), "1/s", scatter(v), how)
+            chains = -np.inf if v.model.delays is None else v.model.characteristic_without(v.free).chains
+            largest = Number(max(float(np.max(s.real, initial=-np.inf)), chains), "1/s", scatter(v), how)
             facts = {"count": len(every), "stable": Stability.of(v), "fastest": float(np.min(every.real))}
             facts["slowest"] = with_findings(largest, v.model.findings_on_loops)
             rows.append({"variant": v.title, "key": v.key, **facts})
@@ -105,9 +106,9 @@ def unstable_first(case: Case) -> Section | None:
     for v in case.usable():
         if Stability.of(v) is Stability.UNSTABLE:
             poles = poles_in_s(v)
-            text.append(
-                TEXTS.line("unstable", variant=v.title, poles=show_poles(poles[poles.real > stability_margin(v)], v))
-            )
+            beyond = poles[poles.real > stability_margin(v)]
+            said = show_poles(beyond, v) if beyond.size else ""
+            text.append(TEXTS.line("unstable", variant=v.title, poles=said, why=why_unstable(v)))
     return Section("subject", SUBJECT_TITLE, tuple(text)) if text else None
 
 

@@ -157,7 +157,7 @@ def _row(case: Case, result: RequirementResult) -> tuple[Any, ...]:
     variant = case.variants.get(result.variant)
     touches, why = result.variant == CONTACT, explain(result)
     said = Judged(str(result.verdict), result.verdict, why)
-    if result.verdict is not Verdict.UNDECIDED:  # a word, which stands in the row
+    if result.verdict is not Verdict.UNDECIDED and (touches or not result.detail):  # a word, which stands in the row
         said = Judged(str(said), result.verdict)
     distance: Any = "–"
     if result.number is not None and not math.isnan(result.distance):

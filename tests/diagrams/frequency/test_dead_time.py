@@ -356,3 +356,94 @@ def test_a_model_with_pades_approximation_says_its_order_and_how_far_it_is_right
     assert margins(loop).phase_margin_deg.findings == (finding,)
     assert model.A.shape == (4, 4)
     assert model.delays is None
+
+
+def slow(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
+def neutral(k, a, b, tau):
+    """k e^(−sτ)(s + a)/(s + b): up to infinite frequency |L| comes to k, and the curve turns around 0."""
+    plant, late = rational([1.0, a], [1.0, b], "plant"), delay(tau)
+    u = Gain(gain=k, name="k")(error(late.y)).named("u")
+    return Diagram("d", late(plant(u)))
+
+
+@pytest.mark.parametrize(
+    ("k", "a", "b", "tau"), [(0.4, 2.0, 1.0, 0.5), slow(0.9, 2.0, 1.0, 0.5), slow(0.3, 3.0, 1.0, 2.0)]
+)
+def test_a_neutral_loop_that_falls_to_its_gain_at_infinity_is_decided_at_its_first_crossings(k, a, b, tau):
+    """|L| falls with ω, so the first crossing of the negative axis limits the gain."""
+    L = lambda s: k * np.exp(-s * tau) * (s + a) / (s + b)  # noqa: E731
+    phase = lambda w: -w * tau + np.arctan(w / a) - np.arctan(w / b) + np.pi  # noqa: E731
+    at = brentq(phase, 1e-3, np.pi / tau, xtol=1e-15)
+    omega = np.linspace(1e-4, 3 * np.pi / tau, 20001)
+    first = omega[np.argmin(np.abs(1 + L(1j * omega)))]
+    ms = -minimize_scalar(
+        lambda w: -1 / abs(1 + L(1j * w)),
+        bounds=(first - 0.01, first + 0.01),
+        method="bounded",
+        options={"xatol": 1e-12},
+    ).fun
+    found = margins(neutral(k, a, b, tau).linearize().loop("u"))
+    assert found.stable
+    assert abs(found.gain_margin_high.value * abs(L(1j * at)) - 1) < 1e-9
+    assert abs(found.ms.value / ms - 1) < 1e-9
+    assert np.isinf(found.phase_margin_deg.value) == (k * a / b < 1)
+    places = [float(c.frequency.value) for c in found.phase_crossovers[:-1]]
+    for n, omega in enumerate(places):  # each turn has one, and none is left out
+        crossing = brentq(lambda w, n=n: phase(w) + 2 * np.pi * n, 1e-3, (2 * n + 3) * np.pi / tau, xtol=1e-14)
+        assert abs(omega / crossing - 1) < 1e-9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("k", [0.5, 0.9])
+def test_a_neutral_loop_that_rises_to_its_gain_at_infinity_has_the_margins_of_that_gain(k):
+    """With a < b |L| is below k at every frequency, and comes as near to −k as one likes."""
+    found = margins(neutral(k, 1.0, 2.0, 0.5).linearize().loop("u"))
+    for number, value in (
+        (found.gain_margin_high, 1 / k),
+        (found.ms, 1 / (1 - k)),
+        (found.disk_margin, 2 * (1 - k) / (1 + k)),
+    ):
+        assert abs(number.value - value) <= max(number.tolerance, 1e-12 * value)
+        assert number.tolerance < 1e-3 * value
+
+
+def test_a_neutral_loop_with_a_gain_of_one_or_more_has_a_chain_of_unstable_poles_and_names_its_blocks():
+    k, a, b, tau = 1.2, 2.0, 1.0, 0.5
+    model = neutral(k, a, b, tau).linearize()
+    assert model.characteristic.count_unstable() == np.inf
+    assert abs(model.characteristic.chains - np.log(k) / tau) < 1e-12
+    assert model.neutral_blocks == ("e", "k", "late", "plant")
+    beyond = [p for p in model.poles if p.real > 0]
+    assert len(beyond) >= 4
+    for pole in beyond:
+        s = mpmath.mpc(pole)
+        f = lambda s: (s + b) + k * mpmath.exp(-s * tau) * (s + a)  # noqa: E731
+        assert abs(f(s) / mpmath.diff(f, s)) < 1e-9 * abs(pole)
+    found = margins(model.loop("u"))
+    assert not found.stable
+    assert "infinitely many of its poles" in found.ms.confirmed_by
+    assert found.encirclements == np.inf
+    assert neutral(0.9, a, b, tau).linearize().neutral_blocks == ()
+
+
+def test_chains_of_a_neutral_system_with_two_delays_are_the_largest_for_all_their_ratios():
+    """1 − g₁ e^(−sτ₁) − g₂ e^(−sτ₂) = 0 has its largest Re s where both are positive."""
+    g, tau = (0.5, 0.6), (1.0, 0.3)
+    H = np.array([[g[0], g[1]], [g[0], g[1]]])
+    system = DelayMatrices(np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((2, 0)), H, np.array(tau))
+    c = brentq(lambda c: g[0] * np.exp(-c * tau[0]) + g[1] * np.exp(-c * tau[1]) - 1, -5, 5, xtol=1e-14)
+    assert abs(system.chains - c) < 1e-9
+
+
+def test_roots_are_counted_where_ways_without_a_state_cancel_each_other_for_every_delay():
+    """H is 0.85 times a rotation: |H| sums up to 1.2, but |(I − H E)⁻¹| ≤ 6.6. By the small gain it is stable up to 1."""
+    H, G, C = np.array([[0.6, 0.6], [-0.6, 0.6]]), np.array([[0.1, 0.02]]), np.array([[1.0], [0.2]])
+    system = DelayMatrices(np.array([[-1.0]]), G, C, H, np.array([0.4, 0.7]))
+    assert abs(system.gain_at_infinity - np.sqrt(0.72)) < 1e-9
+    assert np.linalg.norm(G) * np.linalg.norm(C) / (1 - np.sqrt(0.72)) < 0.7
+    assert system.count_unstable() == 0
+    f = 1 + G @ np.linalg.solve(np.eye(2) - H, C)  # with −A less than what comes back at s = 0 a root is unstable
+    assert DelayMatrices(np.array([[1.0 - f[0, 0] + 0.01]]), G, C, H, system.tau).count_unstable() == 1

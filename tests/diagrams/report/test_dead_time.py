@@ -1,10 +1,13 @@
 """Reports of process loops with dead time: everyday loops have an everyday verdict."""
 
+import time
+
 import numpy as np
 import pytest
 
-from loopwright.blocks import PID, Step, TransferFunction, TransportDelay
-from loopwright.diagrams import Diagram, Requirements, subsystem
+from loopwright.blocks import PID, Gain, Step, TransferFunction, TransportDelay
+from loopwright.diagrams import Diagram, Requirements, Verdict, subsystem
+from loopwright.diagrams.requirements import Reason, explain
 
 
 def process(sample_time, dead_time=1.05, gain=2.0):
@@ -60,3 +63,34 @@ def test_an_everyday_loop_with_dead_time_passes(sample_time):
 def test_what_breaks_a_loop_with_dead_time_fails_and_what_does_not_passes(sample_time, change, verdict):
     report = process(sample_time, **change).report(requirements=Requirements(**ASKED), loops=["valve"])
     assert report.review.verdict == verdict
+
+
+def neutral(k):
+    """k e^(−0.5 s)(s + 2)/(s + 1), without a lag: up to infinite frequency its gain is k."""
+    plant, late = (
+        TransferFunction(numerator=[1.0, 2.0], denominator=[1.0, 1.0], name="plant"),
+        TransportDelay(delay=0.5, name="pipe"),
+    )
+    wish = Step(times=1.0, values=1.0, name="wish").y
+    u = Gain(gain=k, name="controller")(wish - late.y).named("u")
+    return Diagram("neutral", late(plant(u)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("k", "verdict"), [(0.4, Verdict.PASSED), (1.2, Verdict.FAILED), (-1.0, Verdict.FAILED)])
+def test_a_neutral_loop_gets_a_verdict_in_seconds_that_names_the_way_without_a_state(k, verdict):
+    begins = time.process_time()
+    asked = Requirements(loops={"u": {"gain_margin_high": 2.0, "ms": 2.0}})
+    report = neutral(k).report(requirements=asked)
+    assert time.process_time() - begins < 60.0  # it took 150 to 220 s
+    assert report.review.verdict is verdict
+    numbers = report.numbers()
+    if verdict is Verdict.FAILED:
+        for result in report.review.results:
+            assert result.reason is Reason.UNSTABLE
+            assert "gain of" in explain(result)
+            assert "through controller, pipe, plant, " in explain(result)
+        assert numbers["poles.continuous.slowest"].value >= np.log(abs(k)) / 0.5 - 1e-9
+    else:
+        assert abs(numbers["inner.u.continuous.gain_margin_high"].value - 2.4035) < 1e-3  # test_dead_time of frequency
+        assert numbers["poles.continuous.slowest"].value < 0.0
