@@ -248,7 +248,8 @@ def find_inputs(diagram: WiredDiagram, flat: FlatDiagram, wire: str, to: Iterabl
         If an input has another source.
     """
     signal, table = find_signal(flat, wire), diagram.structure
-    inputs = [_find_input(diagram, name) for name in to]
+    fed = [port for port, source in table.wires.items() if (source.block, source.port) == signal.port]
+    inputs = [_find_input(diagram, name, fed) for name in to]
     for block, port in inputs:
         source = table.wires[block, port]
         found = find_signal(flat, f"{source.block}.{source.port}")
@@ -264,9 +265,12 @@ def find_inputs(diagram: WiredDiagram, flat: FlatDiagram, wire: str, to: Iterabl
     return inputs
 
 
-def _find_input(diagram: WiredDiagram, name: str) -> Port:
+def _find_input(diagram: WiredDiagram, name: str, fed: Sequence[Port]) -> Port:
+    """Return the input of a name, or the only one of the block of that name that a wire feeds."""
     known = {join(*port): port for port in diagram.structure.wires}
     found = [name] if name in known else [n for n in known if n.endswith("." + name)]
+    if not found:
+        found = [join(*port) for port in fed if port[0] == name or port[0].endswith("." + name)]
     if len(found) != 1:
         several = f"several inputs end with {name!r}: {', '.join(found)}" if found else f"there is no input {name!r}"
         raise UnknownNameError(f"{several}. {near(name, known)}", block=diagram.name, port="to")

@@ -6,11 +6,12 @@ from .recorder import Recorder, select
 from .recording import Recording
 from .run import Run, Snapshot
 from .saved_state import RunState, check_fits, layout_of, not_open_error
-from .signal_names import Places, entries, resolve
+from .signal_names import BlockOutputs, Places, entries, outputs_of, resolve
 from .stored import Occurrence, Stopped
 from .texts import TextSignal
 
 __all__ = [
+    "BlockOutputs",
     "FreeDirection",
     "Occurrence",
     "OperatingPoint",
@@ -28,6 +29,7 @@ __all__ = [
     "layout_of",
     "machine_memory",
     "not_open_error",
+    "outputs_of",
     "resolve",
     "select",
     "units_of",

@@ -22,7 +22,7 @@ from ...blocks.core import (
 )
 from ..wiring import Wire
 from .memory import machine_memory
-from .signal_names import entries, resolve
+from .signal_names import entries, find_blocks, resolve
 from .stored import END, OTHER_PATH, Occurrence, PathLike, create, event_line, prepare, read, split, write_json
 
 _FIRST, _LARGEST = 1024, 2**26  # rows of the first chunk in memory, bytes of the largest
@@ -395,7 +395,9 @@ def select(
         record = (record,)
     kept: set[int] = set()
     for name in record:
-        inside = [where for port, where in layout.slices.items() if port.startswith(f"{name}.")]
+        whole = find_blocks(name, blocks or {}) if isinstance(name, str) else []
+        within = f"{whole[0]}." if len(whole) == 1 else f"{name}."
+        inside = [where for port, where in layout.slices.items() if port.startswith(within)]
         try:
             full = resolve(name, wires, layout.slices, None if inside else blocks)
             kept.update(entries(full, layout, wires).ravel().tolist())

@@ -14,6 +14,7 @@ from ..flat import FlatDiagram
 from ..wiring import join
 from .memory import check_memory
 from .recorder import EVERY, Recorder, select
+from .signal_names import outputs_of
 from .stored import PathLike, header
 
 
@@ -99,6 +100,7 @@ class Recording:
                 columns=self.columns,
                 has_states=self.states,
                 residual=residual,
+                outputs=outputs_of(flat.table.blocks),
             )
         recorder = Recorder(
             self.width,

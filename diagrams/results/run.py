@@ -25,7 +25,7 @@ from ...blocks.core import (
     with_unit,
 )
 from ..wiring import Wire, index_of, split_entry
-from .signal_names import Place, Places, entries, place_of, resolve
+from .signal_names import BlockOutputs, Place, Places, entries, outputs_of, place_of, resolve
 from .stored import Occurrence, PathLike, Stopped, header, prepare, read, write
 from .texts import TextSignal
 
@@ -69,7 +69,8 @@ class Snapshot:
 
     def __getitem__(self, name: str) -> Any:
         diagram = None if self.run is None else self.run.diagram
-        full = resolve(name, self.names, self.values, getattr(diagram, "blocks", None))
+        outputs = None if self.run is None else self.run.outputs
+        full = resolve(name, self.names, self.values, getattr(diagram, "blocks", None), outputs)
         full, entry = split_entry(full, self.values)
         value = self.values[full]
         return value[index_of(entry, value.shape, full)] if entry else value
@@ -139,6 +140,8 @@ class Run:
     """The complete state at the end, for ``simulate(…, start=)``; None where an FMU can't save its state."""
     recipe: Mapping[str, Any] = field(default_factory=dict, repr=False)
     """Options of the run (step, solver, tolerances, start), with which an instant of it can be found again."""
+    outputs: BlockOutputs | None = field(default=None, repr=False)
+    """Outputs by their blocks' paths, secondary ones aside, where there is no diagram that has them."""
     _places: Places = field(init=False, default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -203,6 +206,7 @@ class Run:
             columns=stored.columns,
             has_states=vector["has_states"],
             diagram_name=stored.head["diagram"],
+            outputs=stored.head.get("outputs", {}),
         )
 
     def save(self, path: PathLike, *, overwrite: bool = False) -> None:
@@ -234,6 +238,7 @@ class Run:
             columns=columns,
             has_states=self.has_states,
             residual=self.residual is not None,
+            outputs=outputs_of(self.diagram.blocks) if self.outputs is None and self.diagram else self.outputs,
         )
         parts = [self.t[:, None], self.data, *([] if self.residual is None else [self.residual[:, None]])]
         end = {"elapsed": self.elapsed, "tier": self.tier, "messages": self.messages, "stopped": self.stopped}
@@ -308,7 +313,8 @@ class Run:
         return self._places[name]
 
     def _resolve(self, name: str) -> str:
-        return resolve(name, self.wires, self.layout.slices, getattr(self.diagram, "blocks", None))
+        blocks = getattr(self.diagram, "blocks", None)
+        return resolve(name, self.wires, self.layout.slices, blocks, self.outputs)
 
     def find_in(self, places: Places) -> None:
         """Find signals where other runs of the same recording have found them."""

@@ -6,7 +6,7 @@ matrix a single number counts row by row, as the columns of exported tables do.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,8 @@ Place = tuple[tuple[int, ...], slice | np.ndarray]
 """Shape of a signal, and its columns in a run's data."""
 Places = dict[str, Place]
 """Places by the names that were asked for."""
+BlockOutputs = Mapping[str, Sequence[str]]
+"""Names of outputs, secondary ones aside, by the path of their block."""
 
 
 def place_of(columns: np.ndarray) -> Place:
@@ -29,7 +31,11 @@ def place_of(columns: np.ndarray) -> Place:
 
 
 def resolve(
-    name: str, wires: Mapping[str, Wire], ports: Collection[str], blocks: Mapping[str, Any] | None = None
+    name: str,
+    wires: Mapping[str, Wire],
+    ports: Collection[str],
+    blocks: Mapping[str, Any] | None = None,
+    outputs: BlockOutputs | None = None,
 ) -> str:
     """Return the full name that ``name`` stands for: a wire's or port's path, or a unique end of one; wires go first.
 
@@ -44,6 +50,8 @@ def resolve(
         Named wires, and the dotted paths of ports.
     blocks : mapping, optional
         Blocks by path, whose names stand for their outputs; an error names their variables that are no ports.
+    outputs : mapping, optional
+        Outputs by their blocks' paths, where the blocks are not there: those of `outputs_of`.
 
     Raises
     ------
@@ -69,11 +77,11 @@ def resolve(
             )
             error.candidates = tuple(found)
             raise error
-    if (output := _only_output(name, blocks or {})) in ports:
+    if output := _only_output(name, ports, outputs_of(blocks or {}) if outputs is None else outputs):
         return output
     whole, entry = split_entry(name, {*wires, *ports})
     if entry:
-        return resolve(whole, wires, ports, blocks) + name[len(whole) :]
+        return resolve(whole, wires, ports, blocks, outputs) + name[len(whole) :]
     if hidden := _hidden_variable(name, blocks or {}):
         path, variable = hidden
         raise UnknownNameError(
@@ -93,11 +101,32 @@ def _output_itself(name: str, found: Collection[str]) -> str:
     return shortest if all(other.startswith(head) for other in found) else ""
 
 
-def _only_output(name: str, blocks: Mapping[str, Any]) -> str:
-    """Return the path of the only output, secondary ones aside, of the block that a name stands for, else ""."""
-    found = [name] if name in blocks else [path for path in blocks if path.endswith("." + name)]
-    outputs = primary_outputs(blocks[found[0]].outputs) if len(found) == 1 else []
-    return f"{found[0]}.{outputs[0]}" if len(outputs) == 1 else ""
+def outputs_of(blocks: Mapping[str, Any]) -> BlockOutputs:
+    """Return the outputs of blocks, secondary ones aside, by the blocks' paths."""
+    return {path: primary_outputs(block.outputs) for path, block in blocks.items()}
+
+
+def find_blocks(name: str, paths: Collection[str]) -> list[str]:
+    """Return the paths of the blocks that a name stands for: the path itself, or all of which it is an end."""
+    return [name] if name in paths else [path for path in paths if path.endswith("." + name)]
+
+
+def _only_output(name: str, ports: Collection[str], outputs: BlockOutputs) -> str:
+    """Return the path of the only output of the blocks that a name stands for, "" where there is none.
+
+    Raises
+    ------
+    UnknownNameError
+        If there are several.
+    """
+    paths = find_blocks(name, outputs)
+    found = [full for path in paths for full in (f"{path}.{output}" for output in outputs[path]) if full in ports]
+    if len(found) < 2:
+        return found[0] if found else ""
+    kind = f"is a block with {len(found)} outputs" if len(paths) == 1 else f"stands for {len(paths)} blocks"
+    error = UnknownNameError(f"{name!r} {kind}; expected a signal. Name one of {', '.join(found)}.")
+    error.candidates = tuple(found)
+    raise error
 
 
 def _hidden_variable(name: str, blocks: Mapping[str, Any]) -> tuple[str, str] | None:

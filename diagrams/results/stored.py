@@ -24,7 +24,7 @@ from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from io import FileIO
 from pathlib import Path
-from typing import Any, TextIO, TypedDict, overload
+from typing import Any, NotRequired, TextIO, TypedDict, overload
 
 import numpy as np
 
@@ -117,6 +117,7 @@ class Header(TypedDict):
     signals: list[SignalEntry]
     wires: dict[str, WireEntry]
     vector: VectorEntry
+    outputs: NotRequired[Mapping[str, Sequence[str]]]
 
 
 class StoppedEntry(TypedDict):
@@ -145,6 +146,7 @@ def header(
     columns: Iterable[int] | None = None,
     has_states: bool = True,
     residual: bool = False,
+    outputs: Mapping[str, Sequence[str]] | None = None,
 ) -> Header:
     """Return the header of a stored run.
 
@@ -164,6 +166,8 @@ def header(
         Whether the states are among them.
     residual : bool
         Whether each row ends with the residual of the algebraic loops.
+    outputs : mapping, optional
+        Outputs by their blocks' paths, secondary ones aside, by which a block's name is found to be a signal.
     """
     entries = [""] * width
     for name, where in layout.slices.items():
@@ -192,6 +196,7 @@ def header(
             "has_states": has_states,
             "residual": residual,
         },
+        "outputs": {path: list(names) for path, names in (outputs or {}).items()},
     }
 
 

@@ -14,7 +14,7 @@ from ...blocks.core import SimulationError
 from ...fmus.calls import FmuInstance
 from ..coupling import note_loops, note_steps
 from ..flat import EVERY, FlatDiagram, WiredDiagram, renumber
-from ..results import Occurrence, Places, Recorder, Recording, Run, Stopped
+from ..results import Occurrence, Places, Recorder, Recording, Run, Stopped, outputs_of
 from ..simulation import Engine, RunOptions, StartValues, default_step, note_held_inputs, refuse_rest, ticks_in
 from .variation import Numbers
 
@@ -65,6 +65,7 @@ class BoundRun:
         self._has_begun = False
         self._messages_before: dict[str, int] = {}
         self._places: Places = {}
+        self._outputs = outputs_of(diagram.blocks)
         self._start = StartValues(self.engine.workspace) if StartValues.fits(self.flat) else None
         self._stack = ExitStack()
 
@@ -227,6 +228,7 @@ class BoundRun:
             columns=self.recorder.columns,
             has_states=self._recording.states,
             diagram_name=self._name,
+            outputs=self._outputs,
         )
         run.find_in(self._places)
         return run

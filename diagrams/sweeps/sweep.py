@@ -184,7 +184,7 @@ def make_plan(
 def _check_recorded(plan: Plan, flat: FlatDiagram, needed: Iterable[str]) -> None:
     """Refuse a ``record`` that lacks signals that are kept, or reduced."""
     wires, width = flat.table.names, flat.log.total + flat.width
-    columns = select(plan.run_options.record, flat.log, wires, width, states=False)
+    columns = select(plan.run_options.record, flat.log, wires, width, states=False, blocks=flat.table.blocks)
     if plan.options.get("record") is None or columns is None:
         return
     kept = set(columns.tolist())

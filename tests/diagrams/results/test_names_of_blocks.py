@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import PID, Step, TransferFunction, UnknownNameError
-from loopwright.diagrams import Diagram, Requirements, subsystem
+from loopwright.blocks import PID, Constant, Demux, Gain, Step, TransferFunction, UnknownNameError
+from loopwright.diagrams import Diagram, Requirements, Run, final, subsystem
 
 
 @pytest.fixture(scope="module")
@@ -49,3 +49,41 @@ def test_in_linear_models_and_requirements(loop):
 def test_a_block_with_several_outputs_or_of_a_name_that_stands_twice_is_no_signal(loop):
     with pytest.raises(UnknownNameError, match="no signal 'wishes' was recorded"):
         loop.simulate(0.1, progress=False)["wishes"]
+
+
+def test_in_runs_from_disk_and_sweeps(loop, tmp_path):
+    run = loop.simulate(0.2, progress=False)
+    run.save(tmp_path / "saved")
+    loop.simulate(0.2, progress=False, to=tmp_path / "streamed")
+    for name in ("saved", "streamed"):
+        stored = Run.open(tmp_path / name)
+        assert np.array_equal(stored["pid"], run["controller.pid.u"])
+        assert np.array_equal(stored["wish"], run["wish.y"])
+    asked = {"signals": ["wish"], "reduce": {"last": final("pid")}, "record": ["wish", "pid"]}
+    sweep = loop.sweep({"pid.kp": [1.0]}, 0.2, **asked, progress=False, compile=True, workers=1)
+    assert not sweep.failures
+    assert np.array_equal(sweep["wish"][0], run["wish.y"])
+    assert sweep["last"][0] == run["controller.pid.u"][-1]
+
+
+def test_a_cut_ahead_of_a_block_by_its_name(loop):
+    model = loop.linearize()
+    by_block, by_port = model.loop("y", to="pid"), model.loop("y", to="pid.y")
+    assert all(np.array_equal(getattr(by_block, M), getattr(by_port, M)) for M in "ABCD")
+
+
+def test_several_signals_of_one_name_are_an_error_that_has_them():
+    one, two = (subsystem(lambda u, k=k: Gain(gain=k, name="kp")(u), name=name) for name, k in (("a", 2.0), ("b", 3.0)))
+    split = Demux(sizes=(1, 1), name="split")
+    first, second = split(Constant(value=[1.0, 2.0], name="c"))
+    diagram = Diagram("d", one(first), two(second))
+    run = diagram.simulate(0.2, step=0.1, progress=False)
+    for name, text, known in (
+        ("kp", "'kp' stands for 2 blocks; expected a signal. Name one of a.kp.y, b.kp.y.", ("a.kp.y", "b.kp.y")),
+        ("split", "'split' is a block with 2 outputs; expected a signal. Name one of split.y1, split.y2.", None),
+    ):
+        for ask in (lambda name=name: run[name], lambda name=name: diagram.linearize(inputs=name)):
+            with pytest.raises(UnknownNameError) as error:
+                ask()
+            assert text in str(error.value)
+            assert known is None or error.value.candidates == known
