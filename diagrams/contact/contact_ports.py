@@ -62,8 +62,10 @@ class Ports:
         parts = str(force).split(".")  # an FMU's port may have a name with dots
         pairs = [(".".join(parts[:cut]), ".".join(parts[cut:])) for cut in range(len(parts) - 1, 0, -1)]
         plant, port = next((pair for pair in pairs if pair[0] in diagram.blocks), ("", ""))
-        if force in diagram.blocks and len(inputs := list(diagram.blocks[force].inputs)) == 1:  # by its block's name
-            plant, port = force, inputs[0]
+        if (
+            str(force) in diagram.blocks and len(inputs := list(diagram.blocks[str(force)].inputs)) == 1
+        ):  # by its block's name
+            plant, port = str(force), inputs[0]
         if not plant:
             candidates = [f"{path}.{name}" for path, block in diagram.blocks.items() for name in block.inputs]
             raise UnknownNameError(
