@@ -20,7 +20,7 @@ from .wiring import Collector, Structure, SubsystemSettings, Wire
 
 if TYPE_CHECKING:
     from .contact import Contact
-    from .drawing import Drawing
+    from .drawing import Drawing, Facts
     from .linearization import Linearization
     from .measure import FrequencyResponse
     from .report import Report
@@ -896,6 +896,7 @@ class Diagram:
         subsystem: str = "",
         closed: bool | Iterable[str] | None = None,
         width: float = 1000.0,
+        run: Run | None = None,
     ) -> Drawing:
         """Draw the diagram itself: blocks, subsystems with their rates, wires with their names, FMUs marked.
 
@@ -906,7 +907,7 @@ class Diagram:
         Parameters
         ----------
         path : path, optional
-            File to write: ``.svg``; ``.png`` and ``.pdf`` with the extra ``pdf``.
+            File to write: ``.svg`` or ``.html``; ``.png`` and ``.pdf`` with the extra ``pdf``.
         subsystem : str
             Path of the subsystem whose inside is drawn; the whole diagram without it.
         closed : bool or list of str, optional
@@ -914,23 +915,41 @@ class Diagram:
             of more than 40 blocks closed.
         width : float
             Width in pixels that the drawing should have; by default that of a notebook.
+        run : Run, optional
+            A run, whose signals are shown where a wire is clicked.
 
         Returns
         -------
         Drawing
-            A notebook shows it; ``.svg`` is its text.
+            A notebook shows it: subsystems open and close at a click, a block says its parameters and its equation,
+            a wire its name, unit and signal. ``.svg`` is the drawing, ``.html`` the part of a page.
 
         Raises
         ------
         OptionError
             No such subsystem, a file of another ending, a folder that isn't there, or an extra that isn't installed.
         """
-        from .drawing import Drawing, draw
+        from .drawing import draw
 
-        drawing = Drawing(draw(self.structure, self.name, subsystem=subsystem, closed=closed, width=width))
+        facts = self._facts(run)
+        drawing = draw(self.structure, self.name, facts, subsystem=subsystem, closed=closed, width=width)
         if path is not None:
             drawing.save(path)
         return drawing
 
+    def _facts(self, run: Run | None = None) -> Facts:
+        """Return what a drawing says of signals: shapes, units, and the signals of a run."""
+        from .drawing import Facts, RecordedSignal
+
+        checked = self.wired.checked
+        found = {}
+        for port in checked.shapes if run is not None else ():
+            if ".".join(port) in run:
+                found[port] = RecordedSignal(run.t, run[".".join(port)])
+        return Facts(checked.shapes, checked.units, found)
+
     def _repr_svg_(self) -> str:
-        return str(self.draw().svg)
+        return self.draw().svg
+
+    def _repr_html_(self) -> str:
+        return self.draw().html

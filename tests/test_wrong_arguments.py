@@ -287,5 +287,5 @@ def test_a_drawing_of_a_subsystem_counts_the_blocks_in_it(monkeypatch):
 
     monkeypatch.setattr(svg, "MANY", 5)  # the diagram has 7 blocks, its subsystem 4
     assert isinstance(drive(), Diagram)
-    assert svg._find_closed(drive().structure, "", None, diagram="d") == {"control"}
-    assert svg._find_closed(drive().structure, "control", None, diagram="d") == set()
+    assert svg.find_closed(drive().structure, "", None, diagram="d") == {"control"}
+    assert svg.find_closed(drive().structure, "control", None, diagram="d") == set()

@@ -1,11 +1,13 @@
 """Drawings of diagrams."""
 
-from .drawing import Drawing
+from .drawing import Drawing, draw
+from .live import Facts, RecordedSignal
 from .printer import printer
-from .svg import draw
 
 __all__ = [
     "Drawing",
+    "Facts",
+    "RecordedSignal",
     "draw",
     "printer",
 ]

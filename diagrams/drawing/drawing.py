@@ -4,15 +4,30 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Callable, Iterable
+from functools import cached_property, partial
+from html import escape, unescape
 from pathlib import Path
 
 from ...blocks.core import OptionError, accepts, check_file, explain_calls, kinds, write_text
+from ..wiring import Structure
+from .live import Facts, live_html
 from .printer import printer
+from .svg import WIDTH, Picture, find_closed
 
 SCALE = 2
 """Pixels of a PNG for each pixel of the drawing."""
 
-ENDINGS = (".svg", ".png", ".pdf")
+ENDINGS = (".svg", ".png", ".pdf", ".html")
+
+
+PAGE = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{title}</title>
+<style>html {{ background: #fff }} body {{ margin: 1rem }}
+@media (prefers-color-scheme: dark) {{ html {{ background: #14191f; color: #e4e9ee }} }}</style>
+{body}</html>
+"""
+"""A page of its own."""
 
 
 @explain_calls
@@ -25,8 +40,20 @@ class Drawing:
         The drawing as SVG.
     """
 
-    def __init__(self, svg: str):
+    def __init__(self, svg: str, live: Callable[[], str] | None = None):
         self.svg = svg
+        self._live = live
+
+    @cached_property
+    def html(self) -> str:
+        """The drawing as a part of a page, with a few lines of script and no network.
+
+        Subsystems open and close at a click; a block or a wire says what it is; names are searched for.
+        """
+        return self.svg if self._live is None else self._live()
+
+    def _repr_html_(self) -> str:
+        return self.html
 
     def _repr_svg_(self) -> str:
         return self.svg
@@ -41,6 +68,12 @@ class Drawing:
         found = re.search(r'width="([\d.]+)" height="([\d.]+)"', self.svg)
         return (float(found[1]), float(found[2])) if found else (0.0, 0.0)
 
+    @property
+    def title(self) -> str:
+        """What it shows, in words."""
+        found = re.search("<title>(.*?)</title>", self.svg)
+        return unescape(found[1]) if found else "Block diagram"
+
     @accepts(path=kinds.path)
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the drawing to a file, and return the file.
@@ -48,8 +81,8 @@ class Drawing:
         Parameters
         ----------
         path : path
-            File: ``.svg``; ``.png``, at two pixels for each of the drawing; ``.pdf``, of one page. The last two need
-            the extra ``pdf``.
+            File: ``.svg``; ``.html``, a page on which subsystems open and close; ``.png``, at two pixels for each of
+            the drawing, and ``.pdf``, of one page, with the extra ``pdf``.
 
         Raises
         ------
@@ -60,11 +93,14 @@ class Drawing:
         ending = file.suffix.lower()
         if ending not in ENDINGS:
             raise OptionError(
-                f"found {str(path)!r}; expected a file for SVG, PNG or PDF; name it {file.stem}.svg.", port="path"
+                f"found {str(path)!r}; expected a file for SVG, HTML, PNG or PDF; name it {file.stem}.svg.", port="path"
             )
         check_file(file)
         if ending == ".svg":
             write_text(file, self.svg)
+            return file
+        if ending == ".html":
+            write_text(file, PAGE.format(title=escape(self.title), body=self.html))
             return file
         width, height = self.size
         library = printer(f"a drawing as {ending[1:].upper()}", f"write {file.stem}.svg", "path")
@@ -77,3 +113,40 @@ class Drawing:
         else:
             book.write_to_pdf(str(file))
         return file
+
+
+@accepts(subsystem=kinds.text, closed=kinds.either(kinds.flag, kinds.names), width=kinds.positive)
+def draw(
+    table: Structure,
+    name: str,
+    facts: Facts,
+    *,
+    subsystem: str = "",
+    closed: bool | Iterable[str] | None = None,
+    width: float = WIDTH,
+) -> Drawing:
+    """Return the drawing of a diagram, or of the inside of one of its subsystems.
+
+    Parameters
+    ----------
+    table : Structure
+        The diagram's blocks and wires.
+    name : str
+        The diagram's name.
+    facts : Facts
+        What the drawing says of signals.
+    subsystem : str
+        Path of the subsystem whose inside is drawn; the whole diagram without it.
+    closed : bool or list of str, optional
+        Subsystems that are drawn closed, all or some; by default all of them in a diagram of more than 40 blocks.
+    width : float
+        Width in pixels above which chains of blocks are broken into rows.
+
+    Raises
+    ------
+    OptionError
+        If a path stands for no subsystem.
+    """
+    shut = find_closed(table, subsystem, closed, diagram=name) - {subsystem}
+    picture = Picture(table, shut, width).page(subsystem, subsystem or name)
+    return Drawing(picture, partial(live_html, table, name, facts, subsystem=subsystem, closed=shut, width=width))

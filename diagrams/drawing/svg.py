@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from html import escape
 
-from ...blocks.core import OptionError, Sum, accepts, kinds, near
+from ...blocks.core import OptionError, Sum, near
 from ..wiring import Structure, stepped_blocks
 from .drawing_layout import Net
 from .nets import Border, Nets, PinPlace
@@ -25,46 +25,13 @@ TINTS = ("#eaf2fb", "#e6f5ec", "#f3ecfa", "#fdebec", "#e8f4f6", "#f6f2e2")
 """Colours of sampled subsystems, one for each sample time."""
 
 
-@accepts(subsystem=kinds.text, closed=kinds.either(kinds.flag, kinds.names), width=kinds.positive)
-def draw(
-    table: Structure,
-    name: str,
-    *,
-    subsystem: str = "",
-    closed: bool | Iterable[str] | None = None,
-    width: float = WIDTH,
-) -> str:
-    """Return the drawing of a diagram, or of the inside of one of its subsystems, as SVG.
-
-    Parameters
-    ----------
-    table : Structure
-        The diagram's blocks and wires.
-    name : str
-        The diagram's name.
-    subsystem : str
-        Path of the subsystem whose inside is drawn; the whole diagram without it.
-    closed : bool or list of str, optional
-        Subsystems that are drawn closed, all or some; by default all of them in a diagram of more than 40 blocks.
-    width : float
-        Width in pixels above which chains of blocks are broken into rows.
-
-    Raises
-    ------
-    OptionError
-        If a path stands for no subsystem.
-    """
-    paths = [path for path in table.subsystems if path]
-    shut = _find_closed(table, subsystem, closed, diagram=name)
+def find_closed(table: Structure, subsystem: str, closed: bool | Iterable[str] | None, *, diagram: str) -> set[str]:
+    """Return the subsystems that are drawn closed; `draw` says what the options mean, and what is refused."""
+    known = {path for path in table.subsystems if path}
     if subsystem not in table.subsystems:
         raise OptionError(
-            f"there is no subsystem {subsystem!r}. {near(subsystem, paths)}", block=name, port="subsystem"
+            f"there is no subsystem {subsystem!r}. {near(subsystem, sorted(known))}", block=diagram, port="subsystem"
         )
-    return _Picture(table, shut - {subsystem}, width).page(subsystem, subsystem or name)
-
-
-def _find_closed(table: Structure, subsystem: str, closed: bool | Iterable[str] | None, *, diagram: str) -> set[str]:
-    known = {path for path in table.subsystems if path}
     if closed is None:
         inside = [
             p
@@ -80,7 +47,7 @@ def _find_closed(table: Structure, subsystem: str, closed: bool | Iterable[str] 
     return shut
 
 
-class _Picture:
+class Picture:
     """A drawing in the making."""
 
     def __init__(self, table: Structure, closed: set[str], limit: float):
@@ -158,9 +125,10 @@ class _Picture:
             nets.append(Net(f"{place} {pin}", (place.key(pin), pin), ends, label))
             names.append(name)
         w, h = arrange_in_rows([*borders, *nodes], nets, self.limit - depth * 2 * MARGIN)
-        out = [self._wire(net) for net in nets]
+        labels = [self._label(net, name, nodes) for net, name in zip(nets, names, strict=True)]
+        out = [self._signal(net, self._wire(net)) for net in nets]
         out += [self._item(node, drawn.get(node.key)) for node in nodes]
-        out += [self._label(net, name, nodes) for net, name in zip(nets, names, strict=True)]
+        out += [self._signal(net, label) for net, label in zip(nets, labels, strict=True) if label]
         return "".join(out), w, h, borders
 
     def _place_control_pins(self, node: Node) -> None:
@@ -296,7 +264,8 @@ class _Picture:
         )
         dash = ' stroke-dasharray="5 3"' if self.table.subsystems[path].control else ""
         return (
-            f'<g><title>{escape(path)}</title><rect class="{kind}" x="{x:g}" y="{y:g}" width="{w:g}" height="{h:g}" '
+            f'<g data-subsystem="{escape(path, quote=True)}"><title>{escape(path)}</title>'
+            f'<rect class="{kind}" x="{x:g}" y="{y:g}" width="{w:g}" height="{h:g}" '
             f'rx="5" fill="{tint}" stroke="{BORDER}"{dash}/>\n'
             f'<text x="{x + 10:g}" y="{y + 16:g}" font-weight="bold">{escape(name)}{more}</text></g>\n'
         )
@@ -307,7 +276,7 @@ class _Picture:
         title, kind = self._titles(path)
         plant = block.stepped
         middle = x + w / 2
-        out = [f"<g><title>{escape(path)}: {escape(kind)}</title>"]
+        out = [f'<g data-block="{escape(path, quote=True)}"><title>{escape(path)}: {escape(kind)}</title>']
         if isinstance(block, Sum):
             out.append(rect(x, y, w, h, "#ffffff", 12))
             out.append(text_at(middle + 4, y + h / 2 + 5, "Σ", 14, anchor="middle"))
@@ -335,6 +304,12 @@ class _Picture:
             at = node.x + node.width - 6
             out.append(text_at(at, node.y + node.outs[name] + 3, text, 8.5, anchor="end", fill=GREY) if text else "")
         return "".join(out)
+
+    def _signal(self, net: Net, shapes: str) -> str:
+        """Return shapes of a wire, marked as those of its signal."""
+        place, pin = net.source
+        name = f"{pin.maker or place}.{pin.port}"
+        return f'<g data-signal="{escape(name, quote=True)}">{shapes}</g>\n'
 
     def _wire(self, net: Net) -> str:
         out = [line(*net.runs)] if net.runs else []

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
-from ...drawing import draw
+from ...drawing import Facts, draw
 from ...flat import WiredDiagram
 from ..pages import Plot, Report, Texts
 
 TEXTS = Texts(__package__, "figures")
 
-ACROSS = 1200.0
-"""Width in pixels up to which a diagram is drawn as one."""
+ACROSS = 760.0
+"""Width in pixels above which a drawing is broken into rows: that of a sheet, with texts that can be read."""
+
+WIDEST, TALLEST = 1000.0, 700.0
+"""Size in pixels up to which a diagram is drawn as one."""
 
 
 def with_drawing(report: Report, diagram: WiredDiagram) -> Report:
@@ -30,13 +33,14 @@ def with_drawing(report: Report, diagram: WiredDiagram) -> Report:
 
 
 def _drawings(diagram: WiredDiagram) -> Iterator[Plot]:
-    whole = draw(diagram.structure, diagram.name, closed=False)
-    found = re.search(r'width="([\d.]+)"', whole)
+    facts = Facts(diagram.checked.shapes, diagram.checked.units, {})
+    drawn = partial(draw, diagram.structure, diagram.name, facts, width=ACROSS)
+    whole = drawn(closed=False)
     subsystems = [path for path in diagram.subsystems if path]
-    if not subsystems or (found is not None and float(found[1]) <= ACROSS):
+    if not subsystems or (whole.size[0] <= WIDEST and whole.size[1] <= TALLEST):
         yield Plot("diagram", TEXTS.line("diagram", closed=False), whole)
         return
-    yield Plot("diagram", TEXTS.line("diagram", closed=True), draw(diagram.structure, diagram.name, closed=True))
+    yield Plot("diagram", TEXTS.line("diagram", closed=True), drawn(closed=True))
     for subsystem in subsystems:
-        inside = draw(diagram.structure, diagram.name, subsystem=subsystem, closed=True)
+        inside = drawn(subsystem=subsystem, closed=True)
         yield Plot(f"diagram.{subsystem}", TEXTS.line("inside", subsystem=subsystem), inside, details=True)

@@ -93,7 +93,7 @@ class Judged(str):
 @explain_calls
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """A figure: a key for its file, a caption, the matplotlib figure or SVG text; ``ahead`` of the tables or not.
+    """A figure: a key for its file, a caption, the matplotlib figure or the `Drawing`; ``ahead`` of the tables or not.
 
     One of ``details`` stands in the appendix. Figures with the same ``group`` are small and stand side by side.
     """

@@ -1,4 +1,4 @@
-"""A report as one HTML page: styles and figures are in it; it needs no network and no script."""
+"""A report as one HTML page with its styles and figures, without a network; only a drawing has a script."""
 
 from __future__ import annotations
 

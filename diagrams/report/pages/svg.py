@@ -10,6 +10,7 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
+from ...drawing import Drawing
 from ...plotting import lay_out
 
 if TYPE_CHECKING:
@@ -47,13 +48,13 @@ _KEPT: WeakKeyDictionary[Any, str] = WeakKeyDictionary()
 
 def draw_section(section: Section) -> tuple[str, ...]:
     """Return the figures of a section, and of those in it, as SVG."""
-    return tuple(plot.figure if isinstance(plot.figure, str) else _drawn(plot.figure) for plot in _plots(section))
+    return tuple("" if isinstance(plot.figure, Drawing) else _drawn(plot.figure) for plot in _plots(section))
 
 
 def keep_drawings(section: Section, drawings: Sequence[str]) -> None:
     """Keep the drawings of `draw_section` until the section's figures are written."""
     for plot, drawing in zip(_plots(section), drawings, strict=True):
-        if not isinstance(plot.figure, str):
+        if not isinstance(plot.figure, Drawing):
             _KEPT[plot.figure] = drawing
 
 
@@ -69,7 +70,11 @@ def embedded(figure: Any, key: str, caption: str = "") -> EmbeddedFigure:
     ``key`` begins every id in it, so that the figures of a page don't share any; ``caption`` is its text for people who
     don't see it.
     """
-    svg = figure if isinstance(figure, str) else _KEPT.pop(figure, "") or _drawn(figure)
+    if isinstance(figure, Drawing):
+        from markupsafe import Markup
+
+        return EmbeddedFigure(Markup(figure.html))
+    svg = _KEPT.pop(figure, "") or _drawn(figure)
     svg = re.sub(r"<\?xml.*?\?>|<!DOCTYPE.*?>|<!--.*?-->|<metadata>.*?</metadata>", "", svg, flags=re.DOTALL).strip()
     head, rest = svg[: svg.index(">")], svg[svg.index(">") :]
     head = re.sub(r'\s(role|aria-label)="[^"]*"', "", head)
