@@ -942,10 +942,10 @@ class Diagram:
         from .drawing import Facts, RecordedSignal
 
         checked = self.wired.checked
-        found = {}
-        for port in checked.shapes if run is not None else ():
-            if ".".join(port) in run:
-                found[port] = RecordedSignal(run.t, run[".".join(port)])
+        found: dict[tuple[str, str], RecordedSignal] = {}
+        if run is not None:
+            names = {port: ".".join(port) for port in checked.shapes}
+            found = {port: RecordedSignal(run.t, run[name]) for port, name in names.items() if name in run}
         return Facts(checked.shapes, checked.units, found)
 
     def _repr_svg_(self) -> str:

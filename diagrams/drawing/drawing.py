@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Iterable
 from functools import cached_property, partial
-from html import escape, unescape
+from html import escape
 from pathlib import Path
 
 from ...blocks.core import OptionError, accepts, check_file, explain_calls, kinds, write_text
 from ..wiring import Structure
 from .live import Facts, live_html
 from .printer import printer
-from .svg import WIDTH, Picture, find_closed
+from .svg import WIDTH, DiagramPicture, find_closed
 
 SCALE = 2
 """Pixels of a PNG for each pixel of the drawing."""
@@ -38,10 +37,20 @@ class Drawing:
     ----------
     svg : str
         The drawing as SVG.
+    size : (float, float)
+        Its width and height in pixels.
+    title : str
+        What it shows, in words.
     """
 
-    def __init__(self, svg: str, live: Callable[[], str] | None = None):
-        self.svg = svg
+    def __init__(
+        self,
+        svg: str,
+        size: tuple[float, float] = (0.0, 0.0),
+        title: str = "Block diagram",
+        live: Callable[[], str] | None = None,
+    ):
+        self.svg, self.size, self.title = svg, size, title
         self._live = live
 
     @cached_property
@@ -61,18 +70,6 @@ class Drawing:
     def __repr__(self) -> str:
         width, height = self.size
         return f"<drawing, {width:.0f} × {height:.0f} pixels; .save('diagram.svg') writes it>"
-
-    @property
-    def size(self) -> tuple[float, float]:
-        """Width and height in pixels."""
-        found = re.search(r'width="([\d.]+)" height="([\d.]+)"', self.svg)
-        return (float(found[1]), float(found[2])) if found else (0.0, 0.0)
-
-    @property
-    def title(self) -> str:
-        """What it shows, in words."""
-        found = re.search("<title>(.*?)</title>", self.svg)
-        return unescape(found[1]) if found else "Block diagram"
 
     @accepts(path=kinds.path)
     def save(self, path: str | os.PathLike[str]) -> Path:
@@ -148,5 +145,6 @@ def draw(
         If a path stands for no subsystem.
     """
     shut = find_closed(table, subsystem, closed, diagram=name) - {subsystem}
-    picture = Picture(table, shut, width).page(subsystem, subsystem or name)
-    return Drawing(picture, partial(live_html, table, name, facts, subsystem=subsystem, closed=shut, width=width))
+    page = DiagramPicture(table, shut, width).page(subsystem, subsystem or name)
+    live = partial(live_html, table, name, facts, subsystem=subsystem, closed=shut, width=width)
+    return Drawing(page.svg, (page.width, page.height), page.about, live)

@@ -19,7 +19,7 @@ import numpy as np
 
 from ...blocks.core import PortUnit, shorten
 from ..wiring import Structure
-from .svg import Picture
+from .svg import DiagramPicture
 
 MOST_SUBSYSTEMS = 4
 """Number of subsystems up to which every combination of open ones is drawn ahead."""
@@ -80,7 +80,7 @@ def live_html(table: Structure, name: str, facts: Facts, *, subsystem: str, clos
     title = subsystem or name
 
     def view(open_ones: set[str]) -> str:
-        return Picture(table, set(inside) - open_ones, width).page(subsystem, title)
+        return DiagramPicture(table, set(inside) - open_ones, width).page(subsystem, title).svg
 
     shown = view(first)
     sets = list(_views(inside, first)) if inside else []

@@ -127,20 +127,20 @@ def _stack(nodes: Sequence[Node], nets: Sequence[Net], row_of: dict[str, int]) -
             crossing[-1][2].extend(rows[row] for row in across)
     left = (len(crossing) - 1) * TRACK + 2 * LANE if crossing else 0.0
     _place(rows, crossing, left)
-    for row in rows:
-        for node in (*row.nodes, *row.entries.values(), *row.exits.values()):
-            node.x, node.y = node.x + left, node.y + row.y
-        for net, part in row.nets:
-            net.runs += [[(x + left, y + row.y) for x, y in run] for run in part.runs]
-            net.dots += [(x + left, y + row.y) for x, y in part.dots]
+    for line in rows:
+        for node in (*line.nodes, *line.entries.values(), *line.exits.values()):
+            node.x, node.y = node.x + left, node.y + line.y
+        for net, part in line.nets:
+            net.runs += [[(x + left, y + line.y) for x, y in run] for run in part.runs]
+            net.dots += [(x + left, y + line.y) for x, y in part.dots]
     _connect(crossing, left, {id(net) for _, _, net, _ in at_border})
     width = max(
         [left + row.width for row in rows] + [x for net in nets for run in net.runs for x, _ in run],
     )
     for node in nodes:
         node.x = 0.0 if node.side < 0 else width + LANE if node.side > 0 else node.x
-    for node, row, net, side in at_border:
-        end = row.entries[net.key] if side < 0 else row.exits[net.key]
+    for node, home_row, net, side in at_border:
+        end = home_row.entries[net.key] if side < 0 else home_row.exits[net.key]
         node.y = end.y
         run = [(node.x, node.y), (end.x, end.y)]
         net.runs.append(run if side < 0 else run[::-1])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from html import escape
+from typing import NamedTuple
 
 from ...blocks.core import OptionError, Sum, near
 from ..wiring import Structure, stepped_blocks
@@ -47,7 +48,16 @@ def find_closed(table: Structure, subsystem: str, closed: bool | Iterable[str] |
     return shut
 
 
-class Picture:
+class DrawnPage(NamedTuple):
+    """A drawing: its SVG, its width and height in pixels, and what it shows, in words."""
+
+    svg: str
+    width: float
+    height: float
+    about: str
+
+
+class DiagramPicture:
     """A drawing in the making."""
 
     def __init__(self, table: Structure, closed: set[str], limit: float):
@@ -61,7 +71,7 @@ class Picture:
 
     # --- layout -----------------------------------------------------------------------------------------------------
 
-    def page(self, subsystem: str, title: str) -> str:
+    def page(self, subsystem: str, title: str) -> DrawnPage:
         """Return the whole SVG."""
         body, w, h, pins = self._lay_out(subsystem)
         left, right, top, border = MARGIN, MARGIN, MARGIN, ""
@@ -80,13 +90,14 @@ class Picture:
                 border += text_at(at, pin.y + 3, texts[name][1], 9, anchor=anchor, fill=NAME, italic=True)
         w, h = w + left + right, h + top + 2 * MARGIN
         about = f"Block diagram of {title}: {len(self.table.blocks)} blocks."
-        return (
+        svg = (
             f'<svg xmlns="http://www.w3.org/2000/svg" class="lw-drawing" width="{w:g}" height="{h:g}" '
             f'viewBox="0 0 {w:g} {h:g}" style="max-width:100%;height:auto" role="img" '
             f'font-family="Helvetica, Arial, sans-serif" font-size="10" fill="{INK}">\n'
             f"<title>{escape(about)}</title>\n{style()}"
             f'<g transform="translate({left:g} {top:g})">\n{border}{body}</g>\n</svg>\n'
         )
+        return DrawnPage(svg, w, h, about)
 
     def _lay_out(self, subsystem: str, depth: int = 0) -> tuple[str, float, float, list[Node]]:
         """Lay out the inside of a subsystem; return its drawing, its width and height, and the pins on its border."""

@@ -342,13 +342,18 @@ def _(block: Any) -> Symbol | None:
     return _characteristic(lambda u: u - np.clip(u, *limits), -reach, reach)
 
 
+def _centred(values: np.ndarray) -> np.ndarray:
+    """Scale values to -1 to 1."""
+    low, high = float(values.min()), float(values.max())
+    return np.asarray((2.0 * values - (high + low)) / ((high - low) or 1.0))
+
+
 @_symbol.register(Lookup1D)
 def _(block: Any) -> Symbol | None:
     points, values = np.asarray(block.breakpoints, dtype=float), np.asarray(block.values, dtype=float)
     if values.ndim > 1:
         return Symbol("table")
-    middle = lambda v: (2.0 * v - (v.max() + v.min())) / ((v.max() - v.min()) or 1.0)  # noqa: E731
-    x, y = middle(points), 0.9 * middle(values)
+    x, y = _centred(points), 0.9 * _centred(values)
     step = max(len(x) // 64, 1)
     return Symbol(curve=tuple(zip(x[::step].tolist(), y[::step].tolist(), strict=True)))
 
