@@ -33,7 +33,6 @@ WORDS = re.compile(r"[A-Za-z]{2,}[^\n]* |\A[A-Z]?[a-z]{4,}[a-z ,.;:]*\Z| [^\n]*[
 ALLOWED = {
     "blocks/library/python_control.py": {"Discrete"},  # the beginning of a class's name
     "diagrams/compiled/reordered.py": {"  return 0;\n", "casadi_real "},  # C code that CasADi writes
-    "diagrams/drawing/drawing.py": {r'width="([\d.]+)" height="([\d.]+)"'},  # a drawing's SVG
     "diagrams/report/pages/svg.py": {r'<svg[^>]*?\bwidth="([\d.]+)(pt|px)?" height="([\d.]+)'},  # Matplotlib's SVG
     "fmus/checks/libraries.py": {r"^\s*(\S+) => not found", "linux"},  # ldd's output; sys.platform
     "fmus/checks/validation.py": {"has no start value", "is not defined"},  # FMPy's problems are texts alone
