@@ -111,7 +111,8 @@ def arrange(nodes: Sequence[Node], nets: Sequence[Net]) -> tuple[float, float]:
 
 def _assign_layers(nodes: Sequence[Node], pairs: Sequence[tuple[str, str]]) -> None:
     """Give every node its layer, behind the nodes that drive it; wires that close loops don't count."""
-    forward = cut_loops([n.key for n in nodes], pairs, {n.key for n in nodes if n.plant})
+    controllers = {n.key: n.controller for n in nodes if n.controller is not None}
+    forward = cut_loops([n.key for n in nodes], pairs, {n.key for n in nodes if n.plant}, controllers)
     before: dict[str, list[str]] = {n.key: [] for n in nodes}
     after: dict[str, list[str]] = {n.key: [] for n in nodes}
     for a, b in forward:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import NamedTuple
 
 from ..wiring import find_cyclic_parts
@@ -39,6 +40,8 @@ class Node:
         -1 for an input pin of the subsystem whose inside is laid out, 1 for an output pin, else 0.
     plant : bool
         Whether loops are closed behind it.
+    controller : int, optional
+        Rank among the nodes ahead of which loops are closed; None for a node that isn't one.
     lane : bool
         Whether it is a wire on its way through a layer.
     loose : bool
@@ -52,6 +55,7 @@ class Node:
     outs: dict[Pin, float] = field(default_factory=dict)
     side: int = 0
     plant: bool = False
+    controller: int | None = None
     lane: bool = False
     loose: bool = False
     layer: int = 0
@@ -65,7 +69,12 @@ Link = tuple[Node, float, Node, float]
 # --- loops ----------------------------------------------------------------------------------------------------------
 
 
-def cut_loops(keys: Sequence[str], pairs: Iterable[tuple[str, str]], plants: set[str]) -> list[tuple[str, str]]:
+def cut_loops(
+    keys: Sequence[str],
+    pairs: Iterable[tuple[str, str]],
+    plants: set[str],
+    controllers: Mapping[str, int] = MappingProxyType({}),
+) -> list[tuple[str, str]]:
     """Return the wires that close no loop.
 
     Parameters
@@ -75,7 +84,10 @@ def cut_loops(keys: Sequence[str], pairs: Iterable[tuple[str, str]], plants: set
     pairs : list of pairs
         The wires.
     plants : set of str
-        Nodes behind which loops are closed; other loops are closed ahead of the node at which they are entered.
+        Nodes behind which loops are closed.
+    controllers : mapping of str to int
+        Nodes ahead of which other loops are closed, so that a plant is on the right of them, with their ranks: the
+        lowest is taken. Without any it is the node at which the loop is entered.
     """
     left = [pair for pair in dict.fromkeys(pairs) if pair[0] != pair[1]]
     place = {key: i for i, key in enumerate(keys)}
@@ -90,7 +102,8 @@ def cut_loops(keys: Sequence[str], pairs: Iterable[tuple[str, str]], plants: set
                 gone |= {(a, b) for a, b in left if a == plant and b in knot}
             else:
                 entered = {b for a, b in left if b in knot and a not in knot}
-                door = min(entered or knot, key=place.__getitem__)
+                known = [key for key in (*entered, *knot) if key in controllers]
+                door = min(known or entered or knot, key=lambda key: (controllers.get(key, 0), place[key]))
                 gone |= {(a, b) for a, b in left if b == door and a in knot}
         left = [pair for pair in left if pair not in gone]
 

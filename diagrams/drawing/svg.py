@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from html import escape
 from typing import NamedTuple
 
+from ...blocks import PID
 from ...blocks.core import OptionError, Sum, near
 from ..wiring import Structure, stepped_blocks
 from .drawing_layout import Net
@@ -120,6 +121,7 @@ class DiagramPicture:
                 drawn[path] = (body, pins)
                 nodes.append(node)
             nodes[-1].plant = self._has_plant(path)
+            nodes[-1].controller = self._controller_rank(path)
         borders = []
         if subsystem:
             entering, leaving = PinPlace(subsystem, Border.INPUTS), PinPlace(subsystem, Border.OUTPUTS)
@@ -146,6 +148,14 @@ class DiagramPicture:
         for pin in self.nets.ins.get(node.key, []):
             if pin.control:
                 node.ins[pin] = HEADER / 2
+
+    def _controller_rank(self, path: str) -> int | None:
+        """Return how surely a loop begins here: at a sampled subsystem, or where a signal is compared with another."""
+        block = self.table.blocks.get(path)
+        if block is None:
+            return 0 if self.table.rate(path) is not None and not self._has_plant(path) else None
+        compares = isinstance(block, PID) or (isinstance(block, Sum) and len(set(block.signs)) == 2)
+        return 1 if compares else None
 
     def _has_plant(self, path: str) -> bool:
         return bool(stepped_blocks(self.table, path))

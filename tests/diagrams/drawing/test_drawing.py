@@ -10,7 +10,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from loopwright.blocks import Gain, Integrator, OptionError, Sine, Sum
+from loopwright.blocks import PID, Gain, Integrator, OptionError, Sine, Sum, TransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.drawing.drawing_layout import Net, _assign_tracks, _draw, _Part, arrange
 from loopwright.diagrams.drawing.order import Node, cut_loops
@@ -164,6 +164,26 @@ def test_loops_are_cut_behind_the_plant_and_else_where_they_are_entered():
     assert set(wires) - set(cut_loops(["p", "c", "sum", "r"], wires, {"p"})) == {("p", "sum")}
     assert set(wires) - set(cut_loops(["p", "c", "sum", "r"], wires, set())) == {("p", "sum")}
     assert cut_loops(["a"], [("a", "a")], set()) == []
+
+
+@pytest.mark.parametrize("kind", ["sampled", "sum", "pid"])
+def test_a_plant_is_right_of_its_controller_however_it_is_written(kind):
+    plant = TransferFunction(numerator=1.0, denominator=[1.0, 1.0], name="plant")  # written first, with its disturbance
+    feed = Sum(signs="++", name="feed")
+    r, d = Sine(frequency=1.0, name="wish"), Sine(frequency=2.0, name="disturbance")
+    if kind == "sampled":
+
+        @subsystem(sample_time=0.1)
+        def controller(r, y):
+            return Gain(gain=2.0, name="law")(r - y)
+
+        command = controller(r, plant.y)
+    elif kind == "sum":
+        command = Gain(gain=2.0, name="controller")(Sum(signs="+-", name="error")(r, plant.y))
+    else:
+        command = PID(kp=2.0, ki=1.0, name="controller")(r, plant.y)
+    at = positions(Diagram("loop", plant(feed(d, command))).draw().svg)
+    assert at["wish"][0] < at["controller"][0] < at["feed"][0] < at["plant"][0]
 
 
 def test_long_chains_of_blocks_need_no_recursion():
