@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from .sweeps import Sweep
 
 LOOPS = ("error", "solve")
+PLUMBING = {"contact_port", "has_clock", "has_fmu", "is_continuous", "of_wired", "structure", "wired"}
+"""Public members of a diagram that only functions below it use: completion leaves them out."""
 
 
 @explain_calls
@@ -104,6 +106,9 @@ class Diagram:
 
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"a diagram is a value: {name!r} can't be set. Use replace(…), or build another one.")
+
+    def __dir__(self) -> list[str]:
+        return sorted(name for name in {*super().__dir__()} - PLUMBING if not name.startswith("_"))
 
     def __repr__(self) -> str:
         paths = [path for path in self.structure.subsystems if path]

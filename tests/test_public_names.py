@@ -1,8 +1,10 @@
 """Public names: the front door, errors where they are raised, and hints for names that are elsewhere."""
 
+import abc
 import ast
 import importlib
 import inspect
+import pydoc
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +12,11 @@ from pathlib import Path
 import pytest
 
 import loopwright
+from loopwright.blocks import PID, Gain
 from loopwright.blocks.core import errors
+from loopwright.blocks.core.shown import documented
+from loopwright.diagrams.diagram import PLUMBING
+from loopwright.fmus import mass_spring_damper
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = [
@@ -111,3 +117,89 @@ def test_the_package_runs_as_a_module():
     command = (sys.executable, "-m", "loopwright", "--version")
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["loopwright", loopwright.__version__]
+
+
+# --- completion and help ---------------------------------------------------------------------------------------------------
+
+
+def test_completion_of_a_block_shows_its_ports_and_parameters_and_little_else():
+    common = {"events", "inputs", "name", "named", "outputs", "parameters", "replace", "states"}
+    assert set(dir(Gain(gain=2.0))) == common | {"gain", "y"}
+    assert {"kp", "excess", "u"} <= set(dir(PID(kp=1.0)))
+    assert "drawn_as" not in dir(PID(kp=1.0))
+    assert PID(kp=1.0).drawn_as == "PID"  # it is there all the same
+
+
+def test_completion_shows_what_a_users_own_block_declares():
+    class Lag(loopwright.Block):
+        """First-order lag."""
+
+        time_constant: float = loopwright.parameter(unit="s")
+        u = loopwright.Input()
+        y = loopwright.State(output=True)
+
+        def derivative(self, t, x, u):
+            return (u.u - x.y) / self.time_constant
+
+        @property
+        def corner(self):
+            """Corner frequency in rad/s."""
+            return 1.0 / self.time_constant
+
+    assert {"time_constant", "y", "derivative", "corner", "replace"} <= set(dir(Lag(time_constant=2.0)))
+
+
+def test_completion_of_a_plant_and_a_diagram_shows_what_a_person_types():
+    plant = loopwright.Fmu(mass_spring_damper.build())
+    shown = set(dir(plant))
+    assert {"file", "start", "position", "description", "left_out", "linear_model", "replace"} <= shown
+    assert len(shown) < 40
+    assert not shown & {"instantiate", "check_place", "exchange", "start_of", "held_inputs"}
+    diagram = loopwright.Diagram("small", Gain(gain=2.0)(loopwright.blocks.Constant(value=1.0)))
+    assert {"simulate", "linearize", "draw", "report", "sweep", "blocks", "replace"} <= set(dir(diagram))
+    assert not set(dir(diagram)) & PLUMBING
+    assert all(hasattr(diagram, name) for name in PLUMBING)
+
+
+@pytest.mark.parametrize("cls", [Gain, PID, loopwright.Block, loopwright.Fmu])
+def test_help_shows_no_special_methods(cls):
+    text = pydoc.render_doc(cls, renderer=pydoc.plaintext)
+    assert "__add__" not in text
+    assert "replace" in text
+    assert "Methods defined here" in text
+
+
+def test_help_of_the_base_has_what_an_author_of_blocks_overrides():
+    text = pydoc.render_doc(loopwright.Block, renderer=pydoc.plaintext)
+    assert all(name in text for name in ("input_breaks", "time_scale", "guard_error", "same_units"))
+
+
+def test_what_a_docstring_lists_for_completion_exists():
+    for package in PACKAGES:
+        for name in getattr(loopwright, package).__all__:
+            value = getattr(getattr(loopwright, package), name)
+            if inspect.isclass(value) and issubclass(value, loopwright.Block):
+                listed = documented(value) - {"inputs", "outputs", "states", "events"}
+                assert not [member for member in listed if not hasattr(value, member)], name
+
+
+def test_an_abstract_class_may_be_a_second_base_of_a_block():
+    class Plant(loopwright.Block, abc.ABC):
+        """A plant."""
+
+        y = loopwright.Output()
+
+        @abc.abstractmethod
+        def output(self, t, x, u): ...
+
+    class Still(Plant):
+        """A plant that rests."""
+
+        def output(self, t, x, u):
+            return 0.0
+
+    with pytest.raises(TypeError, match="abstract"):
+        Plant()
+    assert isinstance(Still(), Plant)
+    assert not isinstance(Gain(gain=1.0), Plant)
+    assert issubclass(Still, loopwright.Block)

@@ -20,6 +20,7 @@ from .errors import (
     near,
 )
 from .ports import Event, Input, Output, Port, PortUnit, State, check_port_names
+from .shown import ShownMembers, documented
 from .signals import (
     Call,
     Signal,
@@ -40,7 +41,7 @@ _ABSENT = frozenset(
 _ABSENT |= {"inputs", "outputs", "states", "events"}
 
 
-class Block(Value, Wireable):
+class Block(Value, Wireable, metaclass=ShownMembers):
     """A signal-flow block: parameters, ports, and equations that are written once.
 
     A subclass declares ports and parameters, and writes its equations as plain functions of ``(t, x, u)`` with NumPy's
@@ -101,6 +102,20 @@ class Block(Value, Wireable):
     ----------
     name : str, optional
         Name in the diagram; without one the class name in snake case, numbered where it repeats.
+
+    Attributes
+    ----------
+    parameters : mapping of str
+        Value of each parameter by its name.
+    inputs, outputs, states, events : mapping of str
+        Declaration of each port by its name.
+
+    Methods
+    -------
+    named(*names)
+        Name the wires of the outputs of a block without inputs.
+    replace(**changes)
+        Return a variant with other parameters, or another name; it is another node.
     """
 
     _keywords: ClassVar[frozenset[str]] = frozenset({"name"})
@@ -298,6 +313,10 @@ class Block(Value, Wireable):
             return Signal(self, name)
         known = {*self.outputs, *self.parameter_specs}
         raise UnknownAttributeError(f"it has no output or parameter {name!r}. {near(name, known)}", block=self.label)
+
+    def __dir__(self) -> list[str]:
+        outputs = {name for name in self._ipython_key_completions_() if name.isidentifier()}
+        return sorted({"name", *self.parameter_specs, *documented(type(self)), *outputs})
 
     def _signal(self) -> Signal:
         if any(port.default is None for port in self.inputs.values()) or len(primary_outputs(self.outputs)) != 1:

@@ -42,6 +42,24 @@ class Fmu(ModelExchangeMembers):
 
     The file is checked when the block is made, and loaded only for a run. The SHA-256 digest of its content belongs to
     the block: blocks are equal only if the contents were equal, and a file that has changed since is an error.
+
+    Attributes
+    ----------
+    description : FmuDescription
+        Variables, capabilities and default experiment, as the file declares them.
+    left_out : mapping of str
+        Reason for each input and output that is no port.
+    used_interface : str
+        Interface of its runs: "co_simulation" or "model_exchange".
+    can_save, can_serialize : bool
+        Whether its state can be saved and restored, and be written to a file.
+    variable_step, fixed_internal_step : bool, float or None
+        Whether its communication steps may differ, and its fixed internal step in s.
+
+    Methods
+    -------
+    linear_model(...)
+        Return its linear model at a point.
     """
 
     opaque = True

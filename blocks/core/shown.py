@@ -1,0 +1,47 @@
+"""Names that completion and ``help`` show of an object: those that a person types, and no plumbing.
+
+They are read from docstrings: the entries of the sections "Attributes" and "Methods" (numpydoc) of a class and its
+bases. What a class outside of this package declares is shown, too. Everything else is there as before.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from abc import ABCMeta
+from functools import cache
+
+from .ports import Port
+
+_PACKAGE = __name__.partition(".")[0]
+_SECTION = re.compile(r"^(?:Attributes|Methods)\n-+\n((?:.+\n|\n(?!\S.*\n-+\n))*)", re.MULTILINE)
+
+
+@cache
+def documented(cls: type) -> frozenset[str]:
+    """Return the names that the docstrings of a class and its bases list, and those of classes of users."""
+    found: set[str] = set()
+    for base in cls.__mro__[:-1]:
+        for section in _SECTION.finditer(inspect.cleandoc(base.__dict__.get("__doc__") or "") + "\n"):
+            entries = re.findall(r"^(\w[^:(\n]*)", section[1], re.MULTILINE)
+            found.update(name.strip() for entry in entries for name in entry.split(","))
+        if base.__module__.partition(".")[0] not in (_PACKAGE, "typing", "builtins"):
+            own = vars(base).items()  # ports follow from the object: not each of them is read as an attribute
+            found.update(name for name, value in own if not (name.startswith("_") or isinstance(value, Port)))
+    return frozenset(found)
+
+
+class ShownMembers(ABCMeta):
+    """Class of classes whose ``help`` and ``dir`` list what they declare and what is `documented`; no special methods.
+
+    It derives from that of abstract classes, so that one may be a second base; ``isinstance`` is the plain one.
+    """
+
+    __instancecheck__ = type.__instancecheck__
+    __subclasscheck__ = type.__subclasscheck__
+
+    def __dir__(cls) -> list[str]:
+        """List public names: those that the class declares itself, and the documented ones of its bases."""
+        inherited = {name for base in cls.__mro__[1:] for name in vars(base)}
+        own = {name for name in vars(cls) if not name.startswith("_")} - inherited
+        return sorted(own | {name for name in documented(cls) if hasattr(cls, name)})
