@@ -613,6 +613,7 @@ class Diagram:
         kind: str = "sine",
         at: Any = 0.0,
         outputs: str | Iterable[str] = (),
+        to: str | Iterable[str] = (),
         windows: int = 40,
         agreement: float = 1e-6,
         confirm: bool = True,
@@ -640,6 +641,10 @@ class Diagram:
             Where: `trim`, ``run.at(t)``, or a time in s that is run to first.
         outputs : str or list of str
             Further signals to be measured: `FrequencyResponse.response`, from the test signal to them.
+        to : str or list of str
+            Inputs of blocks, ``"plant.u"``: these consumers of the wire alone get the test signal, as of
+            `Linearization.loop`. So is measured the loop at the plant's input where the wire also feeds a model of the
+            controller's own.
         windows : int
             Most windows that are waited for.
         agreement : float
@@ -675,6 +680,7 @@ class Diagram:
             kind=kind,
             at=at,
             outputs=outputs,
+            to=to,
             windows=windows,
             agreement=agreement,
             confirm=confirm,
@@ -769,6 +775,7 @@ class Diagram:
         parameters: Mapping[str, Any] | None,
         loop: str | Iterable[str] | None = None,
         *,
+        to: str | Iterable[str] | None = None,
         quantity: str | Callable[[Any], Any] | None = None,
         requirements: Requirements | None = None,
         contact: Mapping[str, Any] | None = None,
@@ -796,6 +803,10 @@ class Diagram:
         loop : str or list of str
             Wire that the loop is cut at; with requirements several wires, each its own loop. Without them several
             wires are one loop, cut at all at once, with a disk margin. Requirements need none where they name loops.
+        to : str or list of str, optional
+            Inputs of blocks, ``"plant.u"``, ahead of which the one wire is cut; an empty list for all its consumers.
+            Without it a wire that also feeds a model of the controller's own is cut at the plant's input, as in a
+            report. Requirements have it for each of their loops.
         quantity : str or callable, optional
             The number, ``"disk_margin"`` without it: one of those that `Requirements` can limit. Or a function from a
             diagram to a number, the smaller, the worse, without a loop; its search takes differences.
@@ -835,6 +846,7 @@ class Diagram:
                 self.wired,
                 parameters,
                 loop,
+                to=to,
                 quantity=quantity,
                 requirements=requirements,
                 contact=contact,

@@ -1,6 +1,7 @@
 """Linear models, operating points and trim."""
 
 from .block_slopes import linearize_block
+from .cut_wires import carry_point, cut_to, name_of_cut
 from .derivatives import Tap, find_signal, moves_between_ticks
 from .findings import (
     ApproximateDelay,
@@ -81,8 +82,10 @@ __all__ = [
     "WaysBack",
     "ZeroSlope",
     "capture",
+    "carry_point",
     "check_options",
     "copy_point",
+    "cut_to",
     "deflate",
     "differentiate_loop",
     "find_flow_poles",
@@ -99,6 +102,7 @@ __all__ = [
     "loop_of_variant",
     "model_ticks",
     "moves_between_ticks",
+    "name_of_cut",
     "name_wire_to",
     "operating_point",
     "point_from_states",

@@ -373,18 +373,26 @@ class Linearization:
         made.linearization, made.wires = self, wires
         return made
 
-    def sensitivity(self, *wires: str) -> StateSpace:
+    def sensitivity(self, *wires: str, to: str | Iterable[str] = ()) -> StateSpace:
         """Return S at a wire, from the injected signal to that of the consumers, with all loops closed.
+
+        With inputs of blocks in ``to``, these consumers alone get the injected signal, as of `loop`.
 
         Over a period of several ticks, the injected signal is held from the tick at which the wire is renewed, for a
         whole period. S of a wire that is renewed several times in the period is not 1/(1 + L): there is no L at one
         rate.
         """
+        if to:
+            diagram, point, port = split_consumers(self.wired, self.point, wires, _as_list(to))
+            return replace(self, wired=diagram, point=point).sensitivity(port)
         closed = self._make_at(wires)
         return closed._state_space(closed.C, closed.D + np.eye(len(closed.D)), f"S({', '.join(wires)})")
 
-    def complementary(self, *wires: str) -> StateSpace:
-        """Return T = 1 − S at a wire."""
+    def complementary(self, *wires: str, to: str | Iterable[str] = ()) -> StateSpace:
+        """Return T = 1 − S at a wire; with ``to`` ahead of these consumers, as `sensitivity`."""
+        if to:
+            diagram, point, port = split_consumers(self.wired, self.point, wires, _as_list(to))
+            return replace(self, wired=diagram, point=point).complementary(port)
         closed = self._make_at(wires)
         return closed._state_space(-closed.C, -closed.D, f"T({', '.join(wires)})", sign=-1.0)
 

@@ -44,7 +44,15 @@ from numpy.typing import ArrayLike
 
 from ...blocks.core import OptionError, accepts, brief, explain_calls, kinds
 from ..flat import FlatDiagram, WiredDiagram
-from ..linearization import RUN_OPTIONS, PointLike, find_signal, operating_point, ticks_to_renewal
+from ..linearization import (
+    RUN_OPTIONS,
+    PointLike,
+    carry_point,
+    cut_to,
+    find_signal,
+    operating_point,
+    ticks_to_renewal,
+)
 from ..results import OperatingPoint, PointOrigin, Snapshot
 from ..solvers import FIXED
 from ..wiring import exact_time
@@ -101,6 +109,8 @@ class FrequencyResponse:
     moved : float
         Drift of the operating point: the largest change of a block's state or an FMU's output, from before the test
         signal to a window after its end, relative to 1 + its size.
+    to : tuple of str
+        Inputs of blocks that alone got the test signal; empty where all consumers of the wire did.
     """
 
     wired: WiredDiagram = field(repr=False)
@@ -121,6 +131,7 @@ class FrequencyResponse:
     """Whether v is constant between two samples, or nothing is sampled; if not, −v/u is no loop."""
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
+    to: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         w = self.omega
@@ -220,7 +231,7 @@ class FrequencyResponse:
         made = {"L": linearization.loop, "S": linearization.sensitivity, "T": linearization.complementary}
         if of == "L":
             self._check_held()
-        model = made[of](self.wire)
+        model = made[of](self.wire, to=self.to)
         dt = float(model.dt)
         if not math.isclose(dt, self.dt, rel_tol=1e-12):
             raise OptionError(
@@ -249,6 +260,7 @@ class FrequencyResponse:
         "a positive number, the largest value of the test signal in the wire's unit", "Give one."
     ),
     kind=kinds.one_of(*KINDS),
+    to=kinds.names,
     windows=kinds.integer(2).worded("a whole number of windows, at least 2", "Give one."),
 )
 def frequency_response(
@@ -260,12 +272,17 @@ def frequency_response(
     kind: str = "sine",
     at: PointLike = 0.0,
     outputs: str | Iterable[str] = (),
+    to: str | Iterable[str] = (),
     windows: int = 40,
     agreement: float = 1e-6,
     confirm: bool = True,
     **options: Any,
 ) -> FrequencyResponse:
     """Measure a frequency response; see `Diagram.frequency_response`."""
+    consumers, whole, cut = ((to,) if isinstance(to, str) else tuple(to)), diagram, wire
+    if consumers:
+        diagram, cut = cut_to(diagram, wire, consumers)
+        at = carry_point(whole, at, diagram)
     omega, amplitude = np.unique(np.atleast_1d(np.asarray(frequencies, dtype=float))), float(amplitude)
     discrete = diagram.has_clock or diagram.has_fmu
     if discrete:
@@ -284,7 +301,7 @@ def frequency_response(
             block=diagram.name,
             port="frequencies",
         )
-    signal = find_signal(flat, wire)
+    signal = find_signal(flat, cut)
     measured = [find_signal(flat, name) for name in ([outputs] if isinstance(outputs, str) else outputs)]
     if flat.hybrid:
         chosen = {**EXACT, **chosen}
@@ -320,8 +337,11 @@ def frequency_response(
         )
     found.refute_moved()
     labels = tuple(e for o in measured for e in o.labels)
+    shown = variant  # the diagram as it was given, without the cut
+    if consumers:
+        shown = whole.replace(point.parameters) if point is not None and point.parameters else whole
     return FrequencyResponse(
-        variant,
+        shown,
         wire,
         kind,
         float(amplitude),
@@ -338,6 +358,7 @@ def frequency_response(
         not discrete or (found.held and not _changes_between_ticks(flat, signal.port)),
         signal.labels,
         labels,
+        consumers,
     )
 
 

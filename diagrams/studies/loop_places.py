@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
-from ...blocks.core import LoopwrightError
+from ...blocks.core import LoopwrightError, OptionError
 from ..flat import FlatDiagram, WiredDiagram
-from ..linearization import find_inputs, find_signal, find_ways_back, name_wire_to
+from ..linearization import find_inputs, find_signal, find_ways_back, name_of_cut, name_wire_to
 from ..requirements import Requirements
-from ..wiring import join
 
 STEP = 1e-3
 """Communication step in s with which signals of a diagram without a clock are looked up."""
@@ -36,7 +36,7 @@ class LoopPlace:
     @property
     def name(self) -> str:
         """Name of the wire that is cut, in diagrams of `cut_places`: "u → plant.u" ahead of some consumers."""
-        return f"{self.wire} → {', '.join(join(*to) for to in self.to)}" if self.to else self.wire
+        return name_of_cut(self.wire, self.to)
 
 
 def find_places(diagram: WiredDiagram, wires: Mapping[str, str], asked: Requirements | None) -> dict[str, LoopPlace]:
@@ -82,22 +82,52 @@ def _place_at_plant(diagram: WiredDiagram, wire: str, flat: FlatDiagram) -> Loop
 
 
 def place_loops(
-    diagram: WiredDiagram, loops: str | Iterable[str] | None, requirements: Requirements
-) -> tuple[WiredDiagram, list[str], Requirements]:
-    """Return a diagram with loops at wires, and requirements on them, in which places that are required have names.
+    diagram: WiredDiagram,
+    loops: str | Iterable[str] | None,
+    requirements: Requirements | None,
+    to: str | Iterable[str] | None = None,
+) -> tuple[WiredDiagram, list[str], Requirements | None]:
+    """Return a diagram with loops at wires, and requirements on them, in which the places of these loops have names.
+
+    Places are those that requirements name, or ``to`` of a single wire: inputs of blocks, none for all consumers. Else
+    a wire that also feeds a model of the controller's own is cut ahead of the plant, unless it is cut together with
+    other wires.
 
     Raises
     ------
+    OptionError
+        If ``to`` is given beside several wires, or beside requirements, which have one of their own.
     UnknownNameError, WiringError
-        If the inputs of a requirement are none of the wire.
+        If the inputs are none of the wire.
     """
     wires = [loops] if isinstance(loops, str) else list(loops or ())
-    every = dict.fromkeys([*wires, *requirements.loops])
-    asked = {wire: wire for wire in every if requirements.inputs_of((wire,))}
-    places = find_places(diagram, asked, requirements)
+    if to is not None and (requirements is not None or len(wires) != 1):
+        found = "requirements" if requirements is not None else f"{len(wires)} wires"
+        raise OptionError(
+            f"found it with {found}; expected it for one wire. Give one, loop='u', or write it into the requirements: "
+            "loops={'u': {'to': 'plant.u'}}.",
+            block=diagram.name,
+            port="to",
+        )
+    if requirements is None and len(wires) != 1:
+        return diagram, wires, None
+    if to is not None:
+        inputs = (to,) if isinstance(to, str) else tuple(to)
+        flat = diagram.flatten(None if diagram.has_clock else STEP)
+        places = {wires[0]: LoopPlace(wires[0], tuple(find_inputs(diagram, flat, wires[0], inputs)))}
+    else:
+        every = dict.fromkeys([*wires, *(requirements.loops if requirements is not None else ())])
+        asked = [w for w in every if requirements is not None and requirements.inputs_of((w,)) is not None]
+        places = find_places(diagram, {wire: wire for wire in asked}, requirements)
+        flat = diagram.flatten(None if diagram.has_clock else STEP)
+        for wire in every:
+            if wire not in places:
+                with suppress(LoopwrightError):  # an unknown wire is refused where its loop is made
+                    places[wire] = _place_at_plant(diagram, wire, flat)
     names = {wire: place.name for wire, place in places.items()}
     diagram = cut_places(diagram, tuple(places.values()))
-    return diagram, [names.get(wire, wire) for wire in wires], requirements.with_loops(names)
+    renamed = None if requirements is None else requirements.with_loops(names)
+    return diagram, [names.get(wire, wire) for wire in wires], renamed
 
 
 def cut_places(diagram: WiredDiagram, places: Sequence[LoopPlace]) -> WiredDiagram:

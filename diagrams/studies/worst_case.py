@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from ...blocks.core import OptionError, accepts, brief, enumerate_some, explain_calls, kinds
 from ..flat import WiredDiagram
 from ..frequency import order_key
+from ..linearization import carry_point
 from ..requirements import Requirements
 from ..sweeps import Box, Samples, read_samples
 from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe, make_goal
@@ -184,6 +185,7 @@ _FROM_0 = kinds.integer(0).worded(step="Give one.", found=kinds.by_name)
 @accepts(
     "worst_case",
     loop=kinds.names,
+    to=kinds.names,
     quantity=kinds.either(kinds.text, kinds.function),
     starts=_FROM_0,
     steps=_FROM_0,
@@ -195,6 +197,7 @@ def find_worst_case(
     parameters: Mapping[str, Any] | None,
     loop: str | Iterable[str] | None = None,
     *,
+    to: str | Iterable[str] | None = None,
     quantity: str | Callable[[Any], Any] | None = None,
     requirements: Requirements | None = None,
     contact: Mapping[str, Any] | None = None,
@@ -219,8 +222,10 @@ def find_worst_case(
         goal = Goal({(measure.place,): {measure.name: None}})
     else:
         assert not callable(quantity)
-        if requirements is not None:
-            diagram, loop, requirements = place_loops(diagram, loop, requirements)
+        whole = diagram
+        diagram, loop, requirements = place_loops(diagram, loop, requirements, to)
+        at = carry_point(whole, at, diagram)
+        points = None if points is None else [carry_point(whole, point, diagram) for point in points]
         goal = make_goal(loop, quantity, requirements, diagram.name)
     if isinstance(samples, str) and samples == "latin" and count is None:
         count = 100
