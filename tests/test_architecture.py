@@ -196,17 +196,18 @@ PUBLIC = {
         margins parameter place read_description subsystem sweeps types
     """,
     "loopwright.blocks": """
-        AdmittanceFilter And Backlash BandLimitedNoise Block Chirp Circle Clock Compare Constant Counter CubicSpline
-        DeadZone DefinitionError Delay Demux DiscreteIntegrator DiscreteStateSpace DiscreteTransferFunction
-        DiscreteZeroPoleGain DoubleDriveError EdgeDetector Ellipse Encoder ErrorDynamics Event FIR FeedbackLinearization
-        FilteredDerivative ForceProjection ForceSensor Function Gain GuardError HandForce HandProfile Hold IIR Input
-        Integrator Latch LimitedIntegrator Line Lookup1D Lookup2D LoopwrightError Maximum Minimum MovingAverage Mux Not
-        OptionError Or Output PID PadeDelay ParameterError Path PathDomainError PathProjection PathSpring PathTracking
-        PiecewiseLinear PlanarModel Power Product Pulse PulseTrain PythonFunction Quantizer Ramp RateLimiter Recorded
-        Reference Relay Requirement ResettableIntegrator SampleTimeError Saturation ShapeError SimulationError Sine
-        SmoothStep SpringDamper Stack State StateMachine StateSpace Step StopCondition Sum Switch TraceError
-        TransferFunction TransportDelay TransverseTransform UnitConversion UnitDelay UnitError UnknownNameError
-        UnwiredInputError Value Wall WiringError ZeroPoleGain hold parameter parse_unit
+        AdmittanceFilter And Backlash BandLimitedNoise Block Butterworth Chirp Circle Clock Compare Constant Counter
+        CubicSpline DeadZone DefinitionError Delay Demux DiscreteIntegrator DiscreteObserver DiscreteStateSpace
+        DiscreteTransferFunction DiscreteZeroPoleGain DoubleDriveError EdgeDetector Ellipse Encoder ErrorDynamics Event
+        FIR FeedbackLinearization FilteredDerivative ForceProjection ForceSensor Function Gain GuardError HandForce
+        HandProfile Hold IIR Input Integrator Latch LeadLag LimitedIntegrator Line Lookup1D Lookup2D LoopwrightError
+        Maximum Minimum MovingAverage Mux Not Notch Observer OptionError Or Output PID PT1 PT2 PadeDelay ParameterError
+        Path PathDomainError PathProjection PathSpring PathTracking PiecewiseLinear PlanarModel Power Product Pulse
+        PulseTrain PythonFunction Quantizer Ramp RateLimiter Recorded Reference Relay Requirement ResettableIntegrator
+        SampleTimeError Saturation Sawtooth ShapeError SimulationError Sine SmoothStep SpringDamper Stack State
+        StateFeedback StateMachine StateSpace Step StopCondition Sum Switch TraceError TransferFunction TransportDelay
+        TransverseTransform Triangle UnitConversion UnitDelay UnitError UnknownNameError UnwiredInputError Value
+        VariableDelay Wall WiringError ZeroPoleGain hold parameter parse_unit
     """,
     "loopwright.fmus": """
         ArchiveLimits CompilerError DefinitionError DiskError Fmu FmuError FmuFileError FmuProcessError FmuRuntimeError

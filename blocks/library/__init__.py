@@ -2,10 +2,21 @@
 
 from .algebra import DeadZone, Maximum, Minimum, Power, Saturation
 from .contact import HandProfile, SpringDamper, Wall
-from .delays import Delay, PadeDelay, TransportDelay
+from .delays import Delay, PadeDelay, TransportDelay, VariableDelay
+from .estimators import DiscreteObserver, Observer, StateFeedback
 from .filters import FIR, IIR, DiscreteIntegrator, MovingAverage
 from .functions import Function, PythonFunction
-from .generators import BandLimitedNoise, Chirp, Clock, PiecewiseLinear, PulseTrain, Ramp, Recorded
+from .generators import (
+    BandLimitedNoise,
+    Chirp,
+    Clock,
+    PiecewiseLinear,
+    PulseTrain,
+    Ramp,
+    Recorded,
+    Sawtooth,
+    Triangle,
+)
 from .integrators import FilteredDerivative, Integrator, LimitedIntegrator, ResettableIntegrator
 from .linear import DiscreteStateSpace, DiscreteTransferFunction, StateSpace, TransferFunction
 from .logic import And, Compare, Counter, EdgeDetector, Latch, Not, Or, Switch
@@ -17,6 +28,7 @@ from .python_control import FixedSampleTime
 from .requirements import Requirement, StopCondition
 from .sampled import Encoder, ForceSensor, Hold, UnitDelay
 from .sources import Pulse, Reference, Sine, SmoothStep, Step
+from .standard_elements import PT1, PT2, Butterworth, LeadLag, Notch
 from .state_machine import StateMachine
 from .unit_conversion import UnitConversion
 from .zero_pole import DiscreteZeroPoleGain, ZeroPoleGain
@@ -25,9 +37,12 @@ __all__ = [
     "FIR",
     "IIR",
     "PID",
+    "PT1",
+    "PT2",
     "And",
     "Backlash",
     "BandLimitedNoise",
+    "Butterworth",
     "Chirp",
     "Clock",
     "Compare",
@@ -35,6 +50,7 @@ __all__ = [
     "DeadZone",
     "Delay",
     "DiscreteIntegrator",
+    "DiscreteObserver",
     "DiscreteStateSpace",
     "DiscreteTransferFunction",
     "DiscreteZeroPoleGain",
@@ -48,6 +64,7 @@ __all__ = [
     "Hold",
     "Integrator",
     "Latch",
+    "LeadLag",
     "LimitedIntegrator",
     "Lookup1D",
     "Lookup2D",
@@ -55,6 +72,8 @@ __all__ = [
     "Minimum",
     "MovingAverage",
     "Not",
+    "Notch",
+    "Observer",
     "Or",
     "PadeDelay",
     "PiecewiseLinear",
@@ -71,9 +90,11 @@ __all__ = [
     "Requirement",
     "ResettableIntegrator",
     "Saturation",
+    "Sawtooth",
     "Sine",
     "SmoothStep",
     "SpringDamper",
+    "StateFeedback",
     "StateMachine",
     "StateSpace",
     "Step",
@@ -81,8 +102,10 @@ __all__ = [
     "Switch",
     "TransferFunction",
     "TransportDelay",
+    "Triangle",
     "UnitConversion",
     "UnitDelay",
+    "VariableDelay",
     "Wall",
     "ZeroPoleGain",
     "jet",

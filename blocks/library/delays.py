@@ -80,6 +80,56 @@ class Delay(Block):
         return push(x.line, u.u)
 
 
+class VariableDelay(Block):
+    """Delay of a sampled subsystem that varies: y[k] = u(t_k − τ[k]), with straight lines between the samples of u.
+
+    The delay is an input, from 0 to ``samples`` times the sample time; beyond it the run stops. Before the start u is
+    ``initial_value``; without it, the input just before t = 0. With τ = n T it is `Delay`.
+
+    Raises
+    ------
+    SampleTimeError
+        In a continuous subsystem, when the diagram is built; a `TransportDelay` there has one delay.
+    ShapeError
+        For an ``initial_value`` of another shape than the input's, and for a matrix as input, when the diagram is
+        built.
+    """
+
+    samples: int = parameter(minimum=1, description="longest delay, in samples")
+    initial_value: Array | None = parameter(default=None, description="u before the start; None: u just before t = 0")
+    u = Input(shape=None, description="signal to delay, a scalar or a vector")
+    delay = Input(unit="s", description="delay τ")
+    y = Output(like="u", description="the input τ ago")
+    line = History("samples", "initial_value", description="the last inputs, the oldest first, one row for each")
+
+    @property
+    def starts_from_inputs(self) -> bool:
+        """Whether `initial` computes the state."""
+        return self.initial_value is None
+
+    def initial(self, u: Any) -> Array:
+        """Return the state at the start, all rows the input just before t = 0."""
+        return np.stack([u.u] * self.samples)
+
+    def guards(self, t: Array, x: Any, u: Any, T: Array) -> dict[str, Array]:
+        """Return the distances of the delay from its limits, in samples, beyond rounding."""
+        return {"delay of 0 or more": u.delay / T + 1e-9, "longest delay": self.samples - u.delay / T + 1e-9}
+
+    def output(self, t: Array, x: Any, u: Any, T: Array) -> Array:
+        """Return the input of that time."""
+        back = u.delay / T
+        y = 0.0
+        for n in range(self.samples + 1):  # the share of the sample n ticks ago: a hat of width 2 around n
+            distance = np.abs(back - n)
+            share = np.where(distance < 1.0, 1.0 - distance, 0.0)
+            y = y + share * (u.u if n == 0 else x.line[-n])
+        return y
+
+    def update(self, t: Array, x: Any, u: Any, T: Array) -> Array:
+        """Return the history with this input."""
+        return push(x.line, u.u)
+
+
 class TransportDelay(Block):
     """Transport delay: y(t) = u(t − τ), of any shape, and ``initial_value`` while t < τ.
 

@@ -8,9 +8,13 @@ An instant that is a few rounding errors before such an edge (1e-15 t) counts as
 
 from __future__ import annotations
 
+import csv
 import math
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from functools import cached_property, lru_cache
+from os import PathLike
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -18,15 +22,20 @@ import numpy as np
 from ..core import (
     Array,
     Kind,
+    OptionError,
     Output,
     ParameterError,
     Source,
+    UnknownNameError,
+    explain_disk_errors,
     kinds,
     move_earlier,
+    near,
     next_edge,
     parameter,
     period_of,
     read_time,
+    shorten,
 )
 from .piecewise_functions import piecewise
 
@@ -159,6 +168,73 @@ class PulseTrain(Source):
         return self.base + self.amplitude * high
 
 
+class Sawtooth(Source):
+    """Sawtooth: y rises from bias − A to bias + A within each period P, from t₀ on, and falls back at once.
+
+    y = bias + A (2 p − 1) with the part p = (t − t₀) / P − k of period k = 0, 1, …; before t₀ it is bias − A. A
+    negative amplitude makes it fall. Edges never drift, as those of `PulseTrain`. `scipy.signal.sawtooth` has the same
+    shape.
+    """
+
+    amplitude: float = parameter(default=1.0, description="amplitude A")
+    period: float = parameter(unit="s", above=0.0, description="time from edge to edge, P")
+    delay: float = parameter(
+        default=0.0, unit="s", minimum=0.0, description="time at which the first period begins, t₀"
+    )
+    bias: float = parameter(default=0.0, description="mean value")
+    y = Output()
+
+    def next_instant(self, t: float) -> float:
+        """Return the next edge."""
+        return next_edge(t, self.period, self.delay)
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the sawtooth."""
+        number, part, _ = period_of(t, self.period, self.delay)
+        return self.bias + self.amplitude * (2.0 * np.where(number < 0.0, 0.0, part) - 1.0)
+
+
+class Triangle(Source):
+    """Triangle wave: y rises from bias − A to bias + A in the part ``rise`` of each period P, then falls back.
+
+    Before t₀ it is bias − A. Corners never drift, as the edges of `PulseTrain`. ``scipy.signal.sawtooth(…,
+    width=rise)`` has the same shape.
+
+    Raises
+    ------
+    ParameterError
+        For a rise of 1 or more; `Sawtooth` falls at once.
+    """
+
+    amplitude: float = parameter(default=1.0, description="amplitude A")
+    period: float = parameter(unit="s", above=0.0, description="time from corner to corner, P")
+    rise: float = parameter(
+        default=0.5,
+        above=0.0,
+        description="duration of the rise as a part of the period, below 1",
+        kind=kinds.number.where(lambda rise: rise < 1.0).worded(
+            "a part of the period below 1", "Use Sawtooth to fall at once."
+        ),
+    )
+    delay: float = parameter(
+        default=0.0, unit="s", minimum=0.0, description="time at which the first period begins, t₀"
+    )
+    bias: float = parameter(default=0.0, description="mean value")
+    y = Output()
+
+    def next_instant(self, t: float) -> float:
+        """Return the next corner."""
+        period, delay, rise = (read_time(v) or Fraction(repr(v)) for v in (self.period, self.delay, self.rise))
+        return next_edge(t, self.period, self.delay, float(delay + rise * period))
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the triangle."""
+        number, part, _ = period_of(t, self.period, self.delay)
+        up = part / self.rise
+        shape = np.where(number < 0.0, 0.0, np.where(part < self.rise, up, (1.0 - part) / (1.0 - self.rise)))
+        return self.bias + self.amplitude * (2.0 * shape - 1.0)
+
+
 class _Table(Source):
     """Base of the sources that read a table over time."""
 
@@ -245,6 +321,109 @@ class Recorded(_Table):
     interpolation: str = parameter(
         default="linear", description="'linear' or 'previous'", kind=kinds.choice("linear", "previous")
     )
+
+    @classmethod
+    def from_csv(
+        cls, path: str | PathLike[str], columns: str | Sequence[str] = "", *, time: str = "", **parameters: Any
+    ) -> Self:
+        """Return the source that plays columns of a file of comma-separated values with a line of names.
+
+        Semicolons and tabs separate columns, too. `Run.to_csv` writes such a file.
+
+        Parameters
+        ----------
+        path : path
+            The file.
+        columns : str or sequence of str
+            Column, or columns of a vector; without it, all but the time.
+        time : str
+            Column of the times in s; without it, the first one.
+        **parameters
+            Further ones of the block: ``interpolation``, ``unit``, ``name``.
+
+        Raises
+        ------
+        OptionError
+            For a file that can't be read.
+        UnknownNameError
+            For a column that isn't there; the message has near names.
+        ParameterError
+            For values that are no numbers, and times that don't rise.
+        """
+        file = Path(path).expanduser()
+        with explain_disk_errors(f"{str(path)!r} can't be read", file, "Name another file.", OptionError, port="path"):
+            text = file.read_text(encoding="utf-8-sig")
+        head = text.partition("\n")[0]
+        separator = max(",;\t", key=head.count)
+        names, *rows = (
+            [cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=separator) if row
+        )
+        table: dict[str, list[float]] = {name: [] for name in names}
+        for number, row in enumerate(rows, 2):
+            try:
+                for name, cell in zip(names, row, strict=True):
+                    table[name].append(float(cell))
+            except ValueError:
+                raise ParameterError(
+                    f"found the row {number} of {str(path)!r}, {shorten(row)}; expected {len(names)} numbers, one for "
+                    "each name in its first line. Leave other rows out.",
+                    block=parameters.get("name") or cls.__name__,
+                    port="values",
+                ) from None
+        return cls._from_columns(table, columns, time or names[0], parameters)
+
+    @classmethod
+    def from_pandas(cls, frame: Any, columns: str | Sequence[str] = "", *, time: str = "", **parameters: Any) -> Self:
+        """Return the source that plays columns of a pandas DataFrame, or a Series.
+
+        Parameters
+        ----------
+        frame : pandas.DataFrame or pandas.Series
+            The data, with the times in s as its index.
+        columns : str or sequence of str
+            Column, or columns of a vector; without it, all but the time.
+        time : str
+            Column of the times in s; without it, the index.
+        **parameters
+            Further ones of the block: ``interpolation``, ``unit``, ``name``.
+
+        Raises
+        ------
+        UnknownNameError
+            For a column that isn't there; the message has near names.
+        ParameterError
+            For values that are no numbers, and times that don't rise.
+        """
+        data = frame.to_frame() if hasattr(frame, "to_frame") else frame
+        table = {str(name): data[name].to_numpy() for name in data.columns}
+        if not time:
+            time, table = "index", {**table, "index": data.index.to_numpy()}
+        return cls._from_columns(table, columns, time, parameters)
+
+    @classmethod
+    def _from_columns(
+        cls, table: Mapping[str, Any], columns: str | Sequence[str], time: str, parameters: dict[str, Any]
+    ) -> Self:
+        chosen = [columns] if isinstance(columns, str) and columns else list(columns) or [n for n in table if n != time]
+        for name in (time, *chosen):
+            if name not in table:
+                raise UnknownNameError(
+                    f"the data has no column {name!r}. {near(name, table)}",
+                    block=parameters.get("name") or cls.__name__,
+                )
+        try:
+            times, *values = (np.asarray(table[name], dtype=float) for name in (time, *chosen))
+        except (TypeError, ValueError):
+            raise ParameterError(
+                f"found columns {time}, {', '.join(chosen)} with other values than numbers; expected numbers, times "
+                "in s. Convert them.",
+                block=parameters.get("name") or cls.__name__,
+                port="values",
+            ) from None
+        if parameters.get("interpolation") == "previous":  # at an event a run has two rows: the last one holds
+            last = np.append(np.diff(times) != 0.0, True)
+            times, values = times[last], [column[last] for column in values]
+        return cls(times=times, values=values[0] if len(chosen) == 1 else np.stack(values, axis=1), **parameters)
 
     def piece_starts(self) -> np.ndarray:
         """Return the times, moved earlier by their rounding if values jump there."""

@@ -95,7 +95,65 @@ _ROOTS = Kind(
 )
 
 
-class _ZeroPoleGain(Block):
+class Cascade(Block):
+    """Base of the transfer functions of zeros and poles: a cascade of real sections of at most second order."""
+
+    u = Input(description="input")
+    y = Output(description="output")
+    x = State(
+        start=lambda block: np.zeros(len(block.roots()[1])), description="states of the sections, one after another"
+    )
+
+    def roots(self) -> tuple[Numbers, Numbers, Array]:
+        """Return zeros, poles and gain."""
+        raise NotImplementedError
+
+    def factors(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return numerator and denominator of each section, monic and of equal length."""
+        made = []
+        for zeros, poles in sections(*self.roots()[:2]):
+            b, a = _polynomial(zeros), _polynomial(poles)
+            made.append((np.concatenate([np.zeros(len(a) - len(b)), b]), a))
+        return made
+
+    def cascade(self, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return the output, and the rates or next states of all sections."""
+        signal, parts, gain, factors = u.u, [], 1.0, self.factors()
+        for (b, a), place in zip(factors, lay_out(len(a) - 1 for _, a in factors), strict=True):
+            signal, part, factor = self.advance_section(b, a, x.x[place], signal)
+            parts.append(part)
+            gain *= factor
+        return self.roots()[2] * gain * signal, np.concatenate(parts)
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the output."""
+        return self.cascade(x, u)[0]
+
+    def advance_section(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
+        """Return output and rate or next state of one section, and the factor by which its output is too small."""
+        raise NotImplementedError
+
+
+class ContinuousCascade(Cascade):
+    """Base of such transfer functions in continuous time."""
+
+    def advance_section(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
+        """Return output and ẋ of a section in controllable canonical form in s / ω."""
+        n = len(a) - 1
+        w = abs(a[2]) ** 0.5 if n == 2 and a[2] else abs(a[1]) or 1.0
+        powers = w ** -np.arange(n + 1.0)
+        a, b = a * powers, b * powers
+        factor = float(np.abs(b).max())
+        b = b / factor
+        rate = w * np.concatenate([x[1:], np.stack([u - a[1:][::-1] @ x])])
+        return b[0] * u + (b[1:] - b[0] * a[1:])[::-1] @ x, rate, factor
+
+    def derivative(self, t: Array, x: Any, u: Any) -> Array:
+        """Return ẋ."""
+        return self.cascade(x, u)[1]
+
+
+class _ZeroPoleGain(Cascade):
     """Common part of zero-pole-gain blocks in continuous and in discrete time."""
 
     zeros: Numbers = parameter(
@@ -107,9 +165,6 @@ class _ZeroPoleGain(Block):
     gain: float = parameter(default=1.0, description="factor k")
     input_names: Names = parameter(default=None, description="name of the input, for python-control")
     output_names: Names = parameter(default=None, description="name of the output, for python-control")
-    u = Input(description="input")
-    y = Output(description="output")
-    x = State(start=lambda block: np.zeros(len(block.poles)), description="states of the sections, one after another")
 
     def check(self) -> None:
         """Refuse zeros and poles that don't make a real, proper transfer function."""
@@ -122,30 +177,9 @@ class _ZeroPoleGain(Block):
             )
         check_names(self, input_names=1, output_names=1)
 
-    def factors(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return numerator and denominator of each section, monic and of equal length."""
-        made = []
-        for zeros, poles in sections(self.zeros, self.poles):
-            b, a = _polynomial(zeros), _polynomial(poles)
-            made.append((np.concatenate([np.zeros(len(a) - len(b)), b]), a))
-        return made
-
-    def cascade(self, x: Any, u: Any) -> tuple[Array, Array]:
-        """Return the output, and the rates or next states of all sections."""
-        signal, parts, gain, factors = u.u, [], 1.0, self.factors()
-        for (b, a), place in zip(factors, lay_out(len(a) - 1 for _, a in factors), strict=True):
-            signal, part, factor = self.advance_section(b, a, x.x[place], signal)
-            parts.append(part)
-            gain *= factor
-        return self.gain * gain * signal, np.concatenate(parts)
-
-    def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the output."""
-        return self.cascade(x, u)[0]
-
-    def advance_section(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
-        """Return output and rate or next state of one section, and the factor by which its output is too small."""
-        raise NotImplementedError
+    def roots(self) -> tuple[Numbers, Numbers, Array]:
+        """Return zeros, poles and gain."""
+        return self.zeros, self.poles, self.gain
 
     @classmethod
     def from_control(cls, system: Any, *, name: str | None = None) -> Self:
@@ -179,7 +213,7 @@ class _ZeroPoleGain(Block):
         return control.zpk(list(self.zeros), list(self.poles), self.gain, sample_time_of(self), **labels(self))
 
 
-class ZeroPoleGain(_ZeroPoleGain):
+class ZeroPoleGain(_ZeroPoleGain, ContinuousCascade):
     """Zeros, poles and gain: Y(s) = k (s − z₁) … (s − z_m) / ((s − p₁) … (s − p_n)) U(s), m ≤ n; it starts at rest.
 
     The realization is a cascade of real sections of second order, each in its own scaled frequency. Zeros are in the
@@ -197,21 +231,6 @@ class ZeroPoleGain(_ZeroPoleGain):
     >>> ZeroPoleGain(poles=[-1 + 5j, -1 - 5j], gain=26.0)
     ZeroPoleGain(poles=((-1+5j), (-1-5j)), gain=26)
     """
-
-    def advance_section(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
-        """Return output and ẋ of a section in controllable canonical form in s / ω."""
-        n = len(a) - 1
-        w = abs(a[2]) ** 0.5 if n == 2 and a[2] else abs(a[1]) or 1.0
-        powers = w ** -np.arange(n + 1.0)
-        a, b = a * powers, b * powers
-        factor = float(np.abs(b).max())
-        b = b / factor
-        rate = w * np.concatenate([x[1:], np.stack([u - a[1:][::-1] @ x])])
-        return b[0] * u + (b[1:] - b[0] * a[1:])[::-1] @ x, rate, factor
-
-    def derivative(self, t: Array, x: Any, u: Any) -> Array:
-        """Return ẋ."""
-        return self.cascade(x, u)[1]
 
 
 class DiscreteZeroPoleGain(FixedSampleTime, _ZeroPoleGain):
