@@ -355,9 +355,10 @@ class Recorded(_Table):
             text = file.read_text(encoding="utf-8-sig")
         head = text.partition("\n")[0]
         separator = max(",;\t", key=head.count)
-        names, *rows = (
-            [cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=separator) if row
-        )
+        lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=separator) if row]
+        if not lines:
+            raise OptionError(f"{str(path)!r} is empty; expected a line of names, then numbers.", port="path")
+        names, *rows = lines
         table: dict[str, list[float]] = {name: [] for name in names}
         for number, row in enumerate(rows, 2):
             try:
