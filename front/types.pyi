@@ -37,7 +37,7 @@ from .diagrams.requirements import Review, Verdict
 from .diagrams.results import Occurrence, OperatingPoint, RunState, Snapshot, Stopped, TextSignal
 from .diagrams.simulation import RunOptions, Simulation, SimulationView
 from .diagrams.studies import RunConfirmation, Sensitivities, Sensitivity, WorstCase
-from .diagrams.wiring import Subsystem, SubsystemSettings, Wire
+from .diagrams.wiring import Bus, Subsystem, SubsystemSettings, Wire
 from .fmus.archive import FmuDescription, FmuFault, FmuFinding, FmuSeverity, FmuVariable
 from .fmus.calls import FmuInstance, FmuState
 from .fmus.checks import FmuDiagnosis, FmuTrial, FmuVerdict
@@ -47,6 +47,7 @@ __all__ = [
     "ApproximateDelay",
     "Array",
     "BlockReport",
+    "Bus",
     "Call",
     "CoarseValues",
     "Contact",

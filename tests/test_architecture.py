@@ -235,7 +235,7 @@ PUBLIC = {
         maximum mean minimum settling_time
     """,
     "loopwright.types": """
-        ApproximateDelay Array BlockReport Call CoarseValues Contact ContactAdmittance ContactConfirmation ContactLimit
+        ApproximateDelay Array BlockReport Bus Call CoarseValues Contact ContactAdmittance ContactConfirmation ContactLimit
         ContactMap ContactTrial CouplingReport Drawing FlatDiagram FmuDescription FmuDiagnosis FmuEnd FmuFault
         FmuFinding FmuInstance FmuLinearization FmuSeverity FmuState FmuTrial FmuVariable FmuVerdict Frame FreeMotion
         FreeMotions FrequencyResponse InexactDerivatives Kink Layout LinearDelays Linearization MeanSlope Occurrence

@@ -1,6 +1,7 @@
 """Structure of a diagram: blocks, wires, subsystems, checks and the order of evaluation."""
 
 from .absent_states import explain_absent_state
+from .buses import Bus
 from .check import Checked, check
 from .collector import Collector
 from .cycles import find_cyclic_parts
@@ -15,6 +16,7 @@ from .variants import apply_changes, change_parameter, change_parameters
 from .wire_units import add_unit_conversions
 
 __all__ = [
+    "Bus",
     "Checked",
     "Collector",
     "Order",

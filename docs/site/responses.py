@@ -11,7 +11,8 @@ import matplotlib
 import numpy as np
 
 from loopwright import blocks as b
-from loopwright.blocks import Block, Call, Signal
+from loopwright.blocks import Block
+from loopwright.types import Call, Signal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -124,6 +125,8 @@ def examples() -> dict[str, Example]:
         Example(b.Ramp(slope=2.0, start_time=0.3)),
         Example(b.Pulse(start_time=0.1, end_time=0.8, amplitude=1.0)),
         Example(b.PulseTrain(period=0.3, duty=0.3, delay=0.1)),
+        Example(b.Sawtooth(period=0.3, delay=0.1)),
+        Example(b.Triangle(period=0.3, rise=0.3, delay=0.1)),
         Example(b.SmoothStep(levels=(0.0, 1.0, 0.4), start_times=(0.5, 2.5), durations=(1.5, 1.0)), duration=4.0),
         Example(b.Sine(frequency=2.0, bias=0.5)),
         Example(b.Chirp(start_frequency=1.0, end_frequency=12.0, duration=0.9)),
@@ -182,6 +185,18 @@ def examples() -> dict[str, Example]:
         Example(b.TransferFunction(numerator=(20.0,), denominator=(1.0, 4.0, 20.0)), kick, 2.0),
         Example(b.ZeroPoleGain(zeros=(5.0,), poles=(-4.0 + 4.0j, -4.0 - 4.0j), gain=-6.4), kick, 2.0),
         Example(b.StateSpace(**_MATRICES, name="state_space"), {"u": b.Stack(count=1)(step())}, 4.0),
+        Example(b.PT1(gain=1.5, time_constant=0.2), kick),
+        Example(b.PT2(time_constant=0.1, damping_ratio=0.3), kick, 2.0),
+        Example(b.LeadLag(lead_time=0.3, lag_time=0.1), kick),
+        Example(b.Notch(frequency=4.0, bandwidth=2.0), {"u": _sine(frequency=4.0)}, 2.0),
+        Example(b.Butterworth(order=4, cutoff=3.0), {"u": pulses}, 2.0),
+        Example(b.StateFeedback((1.0, 2.0)), {"state": b.Stack()(wave(), step())}, outputs=("y",)),
+        Example(
+            b.Observer(b.StateSpace(A=((0.0, 1.0), (-20.0, -2.0)), B=(0.0, 20.0), C=(1.0, 0.0)), gain=(18.0, 46.0)),
+            {"u": b.Constant(value=0.0, name="u"), "y": wave},
+            outputs=("x_hat",),
+            hidden=("u",),
+        ),
         Example(
             b.PID(kp=1.0, ki=4.0, kd=0.05, filter_time=0.02, lower=-2.0, upper=2.0),
             {"r": step, "y": b.Constant(value=0.0, name="y")},
@@ -193,6 +208,12 @@ def examples() -> dict[str, Example]:
         # sampled
         Example(b.UnitDelay(), {"u": wave}, sample_time=0.1),
         Example(b.Delay(steps=3), {"u": wave}, sample_time=0.05),
+        Example(
+            b.VariableDelay(samples=10),
+            {"u": wave, "delay": b.Ramp(slope=0.4, name="ramp")},
+            sample_time=0.05,
+            hidden=("delay",),
+        ),
         Example(b.Hold(), {"u": wave}, sample_time=0.1),
         Example(b.DiscreteIntegrator(), {"u": wave}, sample_time=0.05, outputs=("y",)),
         Example(b.DiscreteTransferFunction(numerator=(0.3,), denominator=(1.0, -0.7)), kick, sample_time=0.05),
@@ -201,6 +222,15 @@ def examples() -> dict[str, Example]:
             b.DiscreteStateSpace(A=((0.7,),), B=((0.3,),), C=((1.0,),)),
             {"u": b.Stack(count=1)(step())},
             sample_time=0.05,
+        ),
+        Example(
+            b.DiscreteObserver(
+                b.DiscreteStateSpace(A=((1.0, 0.05), (0.0, 1.0)), B=(0.0, 0.05), C=(1.0, 0.0)), (0.8, 3.0)
+            ),
+            {"u": b.Constant(value=0.0, name="u"), "y": wave},
+            sample_time=0.05,
+            outputs=("x_hat",),
+            hidden=("u",),
         ),
         Example(b.FIR(coefficients=(0.4, 0.3, 0.2, 0.1)), {"u": pulses}, sample_time=0.02),
         Example(b.IIR(b=(0.2, 0.1), a=(1.0, -0.7)), {"u": pulses}, sample_time=0.02),
