@@ -49,7 +49,7 @@ from .requirements import Requirements
 from .results import Run
 from .simulation import Interrupted
 from .studies import confirm_sensitivity
-from .wiring import subsystem
+from .wiring import first_order_hold, subsystem
 
 __all__ = [
     "AdmittanceLoop",
@@ -91,6 +91,7 @@ __all__ = [
     "crossing_frequency",
     "experiments",
     "fig3",
+    "first_order_hold",
     "growth_rate",
     "passivity",
     "poles",

@@ -220,7 +220,7 @@ PUBLIC = {
         DefinitionError Diagram DiskError DoubleDriveError DuplicateNameError Fig3Diagram FmuError FmuRuntimeError
         Interrupted NonFiniteError OptionError ParameterError PeriodicLoopError Plot Requirements Rig Run
         SampleTimeError Section ShapeError SimulationError Table UnitError UnknownNameError UnwiredInputError
-        WiringError analyse check_block confirm_sensitivity crossing_frequency experiments fig3 growth_rate passivity
+        WiringError analyse check_block confirm_sensitivity crossing_frequency experiments fig3 first_order_hold growth_rate passivity
         poles rendered_admittance rendered_response rendered_system rule_of_thumb stability_limit stability_map
         stiffness_limits subsystem target_admittance
     """,

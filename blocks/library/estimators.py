@@ -268,7 +268,7 @@ class DiscreteObserver(FixedSampleTime, _Observer):
     predicted = State(start=_start, description="state that is expected at the next tick")
 
     @property
-    def dt(self) -> float | None:  # type: ignore[override]
+    def dt(self) -> float | None:
         """Sample time of the model in s; None: any."""
         model: Any = self.model
         dt: float | None = model.dt

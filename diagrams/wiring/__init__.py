@@ -8,6 +8,7 @@ from .cycles import find_cyclic_parts
 from .delay_blocks import add_delay_blocks
 from .entry_names import index_of, split_entry
 from .entry_order import OrderStep
+from .first_order_hold import first_order_hold
 from .order import Order, find_orders
 from .parameter_names import find_name, find_path, find_place, split_path
 from .structure import Structure, SubsystemSettings, Wire, join, stepped_blocks
@@ -38,6 +39,7 @@ __all__ = [
     "find_orders",
     "find_path",
     "find_place",
+    "first_order_hold",
     "index_of",
     "join",
     "split_entry",
