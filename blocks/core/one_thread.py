@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import wraps
+from functools import cache, wraps
 from threading import Lock
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -25,13 +25,19 @@ def one_thread() -> Iterator[None]:
         yield
         return
     try:
-        import scipy.linalg  # noqa: F401 - brings its own BLAS, which must be loaded to be limited
-        from threadpoolctl import threadpool_limits
-
-        with threadpool_limits(1, user_api="blas"):
+        with _find_blas().limit(limits=1):
             yield
     finally:
         _lock.release()
+
+
+@cache
+def _find_blas() -> Any:
+    """Return the BLAS libraries of NumPy and SciPy; to look for them takes milliseconds, so it is done once."""
+    import scipy.linalg  # noqa: F401 - brings its own BLAS, which must be loaded to be limited
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController().select(user_api="blas")
 
 
 def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
