@@ -97,6 +97,7 @@ def test_a_cache_that_can_not_be_used(use, code, file, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("code", FOUND, ids=errno.errorcode.get)
 @pytest.mark.parametrize("use", OUT)
+@pytest.mark.drawn
 def test_a_file_that_a_user_asks_for_and_that_can_not_be_written(use, code, file, tmp_path, monkeypatch):
     theirs = tmp_path / "theirs"
     theirs.mkdir()
@@ -112,6 +113,7 @@ def test_a_file_that_a_user_asks_for_and_that_can_not_be_written(use, code, file
     "command",
     [["run", "A", "--out", "{}"], ["report", "A", "--out", "{}/a.html"], ["build", "dc_motor", "--out", "{}/a.fmu"]],
 )
+@pytest.mark.drawn
 def test_commands_end_without_a_traceback(command, code, tmp_path, monkeypatch, capsys):
     theirs = tmp_path / "theirs"
     theirs.mkdir()
@@ -256,9 +258,10 @@ def test_a_disk_that_is_full_after_some_files_of_an_fmu(file, monkeypatch):
 @pytest.mark.parametrize(
     "name",
     [
-        "with spaces",
-        'it\'s "quoted"',
-        "100%",
+        'it\'s 100% "quoted", with spaces',
+        pytest.param("with spaces", marks=pytest.mark.slow),
+        pytest.param('it\'s "quoted"', marks=pytest.mark.slow),
+        pytest.param("100%", marks=pytest.mark.slow),
         pytest.param("ü λ 日本", marks=pytest.mark.slow),
         pytest.param("a:b", marks=pytest.mark.slow),
         pytest.param("%d $HOME #1 ;,&|<>*?[x]{y}~!@=+^`\\", marks=pytest.mark.slow),

@@ -9,9 +9,8 @@ from scipy.optimize import brentq
 
 from loopwright.blocks import PID, Gain, Step, TransferFunction, TransportDelay
 from loopwright.diagrams import BetweenTicksError, Diagram, Requirements, subsystem
-from loopwright.diagrams.report.case import Case
-from loopwright.diagrams.report.review import review
 from loopwright.diagrams.requirements import Reason, Verdict
+from support.reviewed import judge_again
 
 T, LAG, GAIN, DEAD_TIME, KP, KI = 1.0, 60.0, 1.5, 7.3, 2.0, 0.03
 
@@ -45,10 +44,7 @@ def analysed():
 
 
 def judged(**limits):
-    """Judge the numbers of one report by limits, as a report does."""
-    case, asked = Case(process().wired), Requirements(**limits)
-    case.requirements = asked
-    found = review(case, asked, analysed().numbers(), absent=analysed().absent())
+    found = judge_again(process(), analysed(), **limits)
     return found, {(r.loop, r.quantity): r for r in found.results}
 
 

@@ -164,7 +164,8 @@ def test_parameters_that_an_fmu_in_model_exchange_sets_are_among_the_sensitiviti
 def test_a_trim_frees_a_parameter_of_an_fmu(interface):
     """At rest the motor's torque is friction: k (V − k w)/R = b w."""
     k, R, V, w = dc_motor.nominal.motor_constant, dc_motor.nominal.resistance, 5.0, 70.0
-    motor = Fmu(dc_motor.build(), name="motor", interface=interface, start={"friction": 1e-6})
+    friction = k * (V - k * w) / (R * w)
+    motor = Fmu(dc_motor.build(), name="motor", interface=interface, start={"friction": 0.5 * friction})
     made = Diagram("drive", motor(voltage=V, load_torque=0.0))
     found = made.trim(["motor.friction"], {"motor.speed": w}, rates={"motor.angle": w})
-    assert found.parameters["motor.start.friction"] == pytest.approx(k * (V - k * w) / (R * w), rel=1e-9)
+    assert found.parameters["motor.start.friction"] == pytest.approx(friction, rel=1e-9)
