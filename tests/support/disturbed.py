@@ -196,7 +196,7 @@ class Disturbance:
         changed = np.array(array, order="C")
         rows, columns = (0, *array.shape)[-2:]
         used = self._disturb(
-            changed.ctypes.data,
+            changed.__array_interface__["data"][0],
             array.size // (columns * max(rows, 1)),
             rows,
             columns,
