@@ -8,7 +8,7 @@ from .delay_matrices import NEUTRAL, DelayMatrices, find_pade_limit, replace_del
 from .delayed_hold import delayed_hold, delayed_hold_margin
 from .delayed_realization import DelayedRealization, realize
 from .disk_margins import DiskMargin, disk_margin, loop_at, mimo_disk_margin
-from .loop_margins import GainCrossover, Margins, PhaseCrossover, find_disk_frequency, margins
+from .loop_margins import GainCrossover, Margins, PhaseCrossover, find_disk_frequency, margins, scan_margins
 from .margin_analysis import MARGIN_UNITS
 from .margin_slopes import MarginSlope, margin_slopes
 from .measured_margins import MeasuredMargins, measured_margins, read_frequency_data
@@ -109,6 +109,7 @@ __all__ = [
     "replace_delays",
     "sampled_gains",
     "sampled_poles",
+    "scan_margins",
     "sensitivity",
     "with_findings",
 ]

@@ -107,7 +107,18 @@ class DelayMatrices:
     @cached_property
     def gain_at_infinity(self) -> float:
         """Gain of the ways around the delays without a state: the neutral part is stable below 1."""
-        return max((mu_bound(part.H.astype(complex)) for part in self.delayed if part.H.any()), default=0.0)
+        return max((mu_bound(self.H[np.ix_(w, w)].astype(complex)) for w in self.cycles), default=0.0)
+
+    @cached_property
+    def cycles(self) -> list[np.ndarray]:
+        """Delays that act on one another, or on themselves, by ways without a state: the places of each set."""
+        from scipy.sparse.csgraph import connected_components
+
+        if not self.H.any():
+            return []
+        count, labels = connected_components(self.H != 0.0, directed=True, connection="strong")
+        sets = [np.flatnonzero(labels == k) for k in range(count)]
+        return [w for w in sets if self.H[np.ix_(w, w)].any()]
 
     @cached_property
     def chains(self) -> float:
@@ -116,21 +127,7 @@ class DelayMatrices:
         With one delay it is ln|h|/τ, which the chain's roots approach; with several delays their largest for every
         choice of the delays' ratios. It is −∞ without such ways.
         """
-        return max((part._find_chain() for part in self.delayed if part.H.any()), default=-math.inf)
-
-    def _find_chain(self) -> float:
-        from scipy.optimize import brentq
-
-        def above(c: float) -> float:
-            return math.log(max(mu_bound(self.H * np.exp(-c * self.tau).astype(complex)), 1e-300))
-
-        mu = mu_bound(self.H.astype(complex))
-        if mu <= 0.0 or not np.max(np.abs(np.linalg.eigvals(np.abs(self.H)))):
-            return -math.inf
-        ends = sorted((math.log(mu) / float(np.max(self.tau)), math.log(mu) / float(np.min(self.tau))))
-        if above(ends[0]) <= 0.0 or above(ends[1]) >= 0.0:  # one delay: both are the same
-            return ends[0] if abs(above(ends[0])) <= abs(above(ends[1])) else ends[1]
-        return float(brentq(above, *ends, xtol=1e-13 * max(map(abs, ends)), rtol=1e-13))
+        return max((_find_chain(self.H[np.ix_(w, w)], self.tau[w]) for w in self.cycles), default=-math.inf)
 
     @cached_property
     def bound(self) -> float:
@@ -348,6 +345,22 @@ class DelayMatrices:
             turns.append(sign)
             rates.append(np.trace(np.linalg.solve(value, slope), axis1=1, axis2=2).real)
         return np.concatenate(turns), np.concatenate(rates)
+
+
+def _find_chain(H: np.ndarray, tau: np.ndarray) -> float:
+    """Return the Re s at which the ways without a state have the gain 1 with signals that grow as e^(s t)."""
+    from scipy.optimize import brentq
+
+    def above(c: float) -> float:
+        return math.log(max(mu_bound(H * np.exp(-c * tau).astype(complex)), 1e-300))
+
+    if len(tau) == 1:
+        return math.log(abs(complex(H[0, 0]))) / float(tau[0])
+    mu = math.log(max(mu_bound(H.astype(complex)), 1e-300))
+    ends = sorted((mu / float(np.max(tau)), mu / float(np.min(tau))))
+    if above(ends[0]) <= 0.0 or above(ends[1]) >= 0.0:  # equal delays: both are the same, up to rounding
+        return ends[0]
+    return float(brentq(above, *ends, xtol=1e-13 * max(map(abs, ends)), rtol=1e-13))
 
 
 def replace_delays(

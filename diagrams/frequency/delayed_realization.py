@@ -133,7 +133,8 @@ class DelayedRealization:
     @property
     def _turns(self) -> bool:
         """Whether L turns up to infinite frequency: a way without a state goes through a delay."""
-        return len(self.at_infinity) > 1
+        ends = self.at_infinity
+        return bool(np.max(np.abs(ends - ends[0])) > ROUNDOFF * len(self.tau) * np.max(np.abs(ends)))
 
     @cached_property
     def _beyond(self) -> tuple[float, float]:

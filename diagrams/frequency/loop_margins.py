@@ -243,7 +243,7 @@ class _LoopMarginFinder(MarginFinder[Margins]):
 
     def __init__(self, r: Realization | DelayedRealization, skew: float):
         super().__init__(r)
-        self.by = ByArgument(r) if isinstance(r, DelayedRealization) else ByEigenvalues(r)
+        self.by: Any = ByArgument(r) if isinstance(r, DelayedRealization) else ByEigenvalues(r)
         self.eigenvalues = self.by.stability
         self.skew, self.scan = skew, self.by.scan
         self.gain = self.scan.find_gain_crossovers()
@@ -428,6 +428,54 @@ class _LoopMarginFinder(MarginFinder[Margins]):
         if np.isinf(omega):
             return Number(omega, "rad/s", 0.0, "the response: |T| never falls below 1/√2 of its low-frequency value")
         return Number(omega, "rad/s", 1e-10 * omega, self.by.confirm_bandwidth(omega, level))
+
+
+class _Unconfirmed:
+    """A scan whose numbers nothing confirms."""
+
+    def __init__(self, by: ByEigenvalues | ByArgument):
+        self.scan, self.floor, self.stability = by.scan, by.floor, by.stability
+
+    def confirm_crossing(self, c: Crossing, factor: complex, name: str) -> str:
+        """Return no confirmation."""
+        return ""
+
+    def confirm_peak(self, a: float, b: float, peak: Peak, name: str) -> str:
+        """Return no confirmation."""
+        return ""
+
+    def confirm_bandwidth(self, omega: float, level: float) -> str:
+        """Return no confirmation."""
+        return ""
+
+
+class _ScanFinder(_LoopMarginFinder):
+    """A scanned loop of which the numbers are given as they are found."""
+
+    def __init__(self, r: Realization | DelayedRealization, skew: float):
+        super().__init__(r, skew)
+        self.by: Any = _Unconfirmed(self.by)
+
+    def find_numbers(self) -> dict[str, Number]:
+        return {**self._find_gain_margins(), "phase_margin_deg": self._find_phase_margin(), **self._find_peaks()}
+
+    def make_gain_margin(
+        self, name: str, factor: float, tolerance: float, *, others: Sequence[float] = (), tried: Sequence[float]
+    ) -> Number:
+        return Number(factor, "1", tolerance, "")
+
+    def make_phase_margin(self, degrees: float, tolerance: float, *, others: Sequence[float] = ()) -> Number:
+        return Number(degrees, "deg", tolerance, "")
+
+
+def scan_margins(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> dict[str, Number]:
+    """Return the margins of a loop with one channel but for those of delay, which nothing confirms.
+
+    They are for comparisons: a number of many that are compared with one that is confirmed. Those of an unstable loop
+    are none. Arguments and errors are those of `margins`.
+    """
+    finder = _ScanFinder(realize(loop, delay=delay), skew)
+    return {} if finder.unstable else finder.find_numbers()
 
 
 def find_disk_frequency(r: Realization | DelayedRealization, skew: float = 0.0) -> float:

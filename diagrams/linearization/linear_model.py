@@ -241,11 +241,9 @@ class Linearization:
         """
         if self.delays is None:
             return ()
-        found: set[str] = set()
-        H = self.delays.H
-        for part in self.characteristic.parts:
-            places = part.delays
-            if len(places) and mu_bound(H[np.ix_(places, places)].astype(complex)) >= NEUTRAL:
+        H, found = self.delays.H, set[str]()
+        for places in self.characteristic.cycles:
+            if mu_bound(H[np.ix_(places, places)].astype(complex)) >= NEUTRAL:
                 found |= {self.delays.names[i].rpartition(".")[0] for i in places}
         return blocks_around(self.wired.flatten_like(self.point), found) if found else ()
 

@@ -29,8 +29,9 @@ def find_same(loops: Mapping[str, Mapping[str, Number]]) -> dict[str, str]:
 
 
 def _contains(whole: Mapping[str, Number], part: Mapping[str, Number]) -> bool:
-    return all(path in whole and _is_same(whole[path].value, number.value) for path, number in part.items())
+    return all(path in whole and is_same(whole[path].value, number.value) for path, number in part.items())
 
 
-def _is_same(a: float, b: float) -> bool:
+def is_same(a: float, b: float) -> bool:
+    """Whether two numbers are those of one loop."""
     return (math.isnan(a) and math.isnan(b)) or math.isclose(a, b, rel_tol=SAME)

@@ -21,10 +21,10 @@ from ...blocks.core import (
     kinds,
 )
 from ..flat import WiredDiagram
-from ..frequency import Confirmation, Margins, Number, disk_margin, margins, mimo_disk_margin, mu_bound, realize
+from ..frequency import Confirmation, Margins, disk_margin, margins, mimo_disk_margin, mu_bound, realize
 from ..linearization import Linearization, find_signal, hold_sources, linearize, loop_of_variant, trim
 from ..measure import StepResponse, find_least_sine, frequency_response, step_response
-from .numbers import numbers_of
+from .numbers import compared_numbers
 from .parameters import changed_entry
 
 if TYPE_CHECKING:
@@ -343,17 +343,17 @@ def confirm_parameter(
         return rows
     h = STEP * (abs(rows[0].value) or 1.0)
 
-    def numbers(change: float) -> dict[str, Number]:
+    def numbers(change: float) -> dict[str, float]:
         diagram = model.wired.replace(changed_entry(model.wired, parameter, rows[0].value + change))
         L, rests = loop_of_variant(model, found.wires, diagram, model.point)
         if model.is_equilibrium and not rests and not rows[0].rest_lost:
             point = trim(diagram, None, None, rates=None, fixed=(), at=model.point, tolerance=1e-9)
             L, rests = loop_of_variant(model, found.wires, diagram, point)
-        return numbers_of(L, delay, skew)
+        return compared_numbers(L, [row.quantity for row in rows], delay, skew)
 
     def differences(h: float) -> dict[str, float]:
         high, low = numbers(h), numbers(-h)
-        return {row.quantity: (high[row.quantity].value - low[row.quantity].value) / (2.0 * h) for row in rows}
+        return {row.quantity: (high[row.quantity] - low[row.quantity]) / (2.0 * h) for row in rows}
 
     wide, narrow = differences(h), dict[str, float]()
     made = []

@@ -11,7 +11,7 @@ from ...studies import Sensitivities, Sensitivity, confirm_parameter, sensitivit
 from .. import figures
 from ..case import Case
 from ..pages import Section, Table, Texts
-from ..same_loops import find_same
+from ..same_loops import find_same, is_same
 from .loops import ROWS
 
 TEXTS = Texts(__package__, "sensitivity")
@@ -29,6 +29,7 @@ def sensitivity(case: Case) -> Section | None:
     if variant is None or variant.problem:
         return None
     text, parts = [*TEXTS.paragraphs("about", title=variant.title)], []
+    confirmed: list[Sensitivity] = []
     for key, wire in case.sensitivity_wires().items():
         case.tell(f"sensitivity at {wire}")
         try:
@@ -42,7 +43,7 @@ def sensitivity(case: Case) -> Section | None:
         if not found.stable:
             text.append(TEXTS.line("unstable", wire=wire))
         elif found.rows:
-            parts.append(_part(case, key, wire, found))
+            parts.append(_part(case, key, wire, found, confirmed))
     wires, shown = case.sensitivity_wires(), find_same({part.key: part.numbers for part in parts})
     for i, part in enumerate(parts):
         if part.key in shown:
@@ -51,7 +52,8 @@ def sensitivity(case: Case) -> Section | None:
     return Section("sensitivity", "Sensitivity to parameters", tuple(text), sections=tuple(parts)) if parts else None
 
 
-def _part(case: Case, key: str, wire: str, found: Sensitivities) -> Section:
+def _part(case: Case, key: str, wire: str, found: Sensitivities, confirmed: list[Sensitivity]) -> Section:
+    """Return the part of one loop; ``confirmed`` are the sensitivities of earlier loops, which one may have again."""
     shown = [name for name in QUANTITIES if name in found.quantities]
     first = next((name for name in shown if any(map(_acts, found.of(name)))), shown[0])
     largest = [row for row in found.of(first) if _acts(row)]
@@ -64,9 +66,12 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities) -> Section:
     lost: list[str] = []
     text: list[str] = []
     for name in names:
-        case.tell(f"confirming the sensitivity at {wire} to {name}")
         try:
-            made = confirm_parameter(found, name, shown)
+            made = _take_confirmed([found[name, quantity] for quantity in shown], confirmed)
+            if not made:
+                case.tell(f"confirming the sensitivity at {wire} to {name}, by differences of {', '.join(shown)}")
+                made = confirm_parameter(found, name, shown)
+                confirmed += made
         except LoopwrightError as error:
             text.append(TEXTS.line("left_out", wire=wire, message=error.message))
             rough = [found[name, quantity] for quantity in shown]
@@ -95,6 +100,26 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities) -> Section:
     )
     plot = figures.sensitivity_bars(f"sensitivity_{key}", wire, ROWS[first], bars)
     return Section(key, f"Sensitivity of {wire}", tuple(text), (table,), (plot,), numbers)
+
+
+def _take_confirmed(rows: list[Sensitivity], confirmed: list[Sensitivity]) -> list[Sensitivity]:
+    """Return sensitivities with the confirmation of the same ones of an earlier loop; none if one isn't there.
+
+    A loop that is cut at another of its wires has the same numbers with the same slopes.
+    """
+    made = []
+    for row in rows:
+        same = (
+            one
+            for one in confirmed
+            if (one.parameter, one.quantity) == (row.parameter, row.quantity)
+            and is_same(one.number.value, row.number.value)
+            and is_same(one.slope.value, row.slope.value)
+        )
+        if (one := next(same, None)) is None:
+            return []
+        made.append(replace(row, slope=replace(row.slope, confirmed_by=one.slope.confirmed_by)))
+    return made
 
 
 def _acts(row: Sensitivity) -> bool:

@@ -447,3 +447,17 @@ def test_roots_are_counted_where_ways_without_a_state_cancel_each_other_for_ever
     assert system.count_unstable() == 0
     f = 1 + G @ np.linalg.solve(np.eye(2) - H, C)  # with −A less than what comes back at s = 0 a root is unstable
     assert DelayMatrices(np.array([[1.0 - f[0, 0] + 0.01]]), G, C, H, system.tau).count_unstable() == 1
+
+
+def test_a_smith_predictor_with_feedthrough_to_two_delays_is_not_neutral_and_keeps_its_gain_margin():
+    """C e^(−17 s) P/(1 + C P (1 − e^(−15 s))): the controller feeds two delays at once, but no way back is without a state."""
+    plant, late = rational([1.0], [20.0, 1.0], "plant"), delay(17.0)
+    model, model_late = rational([1.0], [20.0, 1.0], "model"), delay(15.0, "model_late")
+    u = rational([2.0, 0.1], [1.0, 0.0], "pi")(error(plant.y - model_late.y + model.y)).named("u")
+    diagram = Diagram("d", plant(late(u)), model_late(model(u)))
+    C, P = lambda s: 2 + 0.1 / s, lambda s: 1 / (20 * s + 1)
+    L = lambda s: C(s) * P(s) * np.exp(-17 * s) / (1 + C(s) * P(s) * (1 - np.exp(-15 * s)))  # noqa: E731
+    at = brentq(lambda w: L(1j * w).imag, 0.1, 0.15, xtol=1e-15)
+    found = margins(diagram.linearize().loop("u", to=["late.u"]))
+    assert L(1j * at).real < 0
+    assert abs(found.gain_margin_high.value * abs(L(1j * at)) - 1) < 1e-9
