@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import PID, Gain, Step, TransferFunction, TransportDelay
-from loopwright.diagrams import Diagram, Requirements, Verdict, subsystem
-from loopwright.diagrams.requirements import Reason, explain
+from loopwright.diagrams import Diagram, Requirements, subsystem
+from loopwright.diagrams.requirements import Reason, Verdict, explain
 
 
 def process(sample_time, dead_time=1.05, gain=2.0):
