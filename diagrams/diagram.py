@@ -11,12 +11,22 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any, ClassVar, Self, Unpack
 
-from ..blocks.core import Block, WiringError, accepts, check_name, explain_calls, kinds, without_collection
+from ..blocks.core import (
+    Block,
+    Sheet,
+    ShownAsTable,
+    WiringError,
+    accepts,
+    check_name,
+    explain_calls,
+    kinds,
+    without_collection,
+)
 from .coupling import Coupling, CouplingReport, report_coupling, to_coupling
 from .flat import FlatDiagram, WiredDiagram
 from .results import OperatingPoint, Run
 from .simulation import KeptKeywords, RunKeywords, RunOptions, Simulation, simulate
-from .wiring import Collector, Structure, SubsystemSettings, Wire
+from .wiring import Collector, Structure, SubsystemSettings, Wire, sheet_of_structure
 
 if TYPE_CHECKING:
     from .contact import Contact
@@ -34,7 +44,7 @@ PLUMBING = {"contact_port", "has_clock", "has_fmu", "is_continuous", "of_wired",
 
 
 @explain_calls
-class Diagram:
+class Diagram(ShownAsTable):
     """A diagram: what its last calls need, found by walking the wires backwards.
 
     Building it checks everything: unwired inputs, double drives, shapes, units, names, algebraic loops.
@@ -113,6 +123,12 @@ class Diagram:
     def __repr__(self) -> str:
         paths = [path for path in self.structure.subsystems if path]
         return f"<diagram {self.name}: {len(self.blocks)} blocks{', in ' + ', '.join(paths) if paths else ''}>"
+
+    def _sheet(self) -> Sheet:
+        return sheet_of_structure(self.name, self.structure)
+
+    def _repr_html_(self) -> None:
+        """Return None: a notebook shows the drawing, ``print`` the table."""
 
     @property
     def name(self) -> str:

@@ -58,6 +58,7 @@ from .parameters import ParameterSpec
 from .ports import Event, Input, Output, Port, PortUnit, Shape, State, number_inputs
 from .signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, check_name, primary_outputs, recorder
 from .source import Constant, Source
+from .tables import MOST_ROWS, Grid, Sheet, ShownAsTable, cell_text, decibels
 from .units import (
     BASE_UNITS,
     DefinedUnit,
@@ -77,6 +78,7 @@ from .values import Array, Value, identity, parameter
 __all__ = [
     "BASE_UNITS",
     "FINEST",
+    "MOST_ROWS",
     "OTHER_TEMPORARY",
     "SOLVED",
     "AlgebraicLoopError",
@@ -103,6 +105,7 @@ __all__ = [
     "FmuRuntimeError",
     "FrozenMapping",
     "Gain",
+    "Grid",
     "GuardError",
     "Input",
     "Kind",
@@ -122,6 +125,8 @@ __all__ = [
     "SampleTimeError",
     "Shape",
     "ShapeError",
+    "Sheet",
+    "ShownAsTable",
     "Signal",
     "SimulationError",
     "Source",
@@ -144,6 +149,7 @@ __all__ = [
     "arithmetic",
     "as_signal",
     "brief",
+    "cell_text",
     "check_argument",
     "check_file",
     "check_name",
@@ -151,6 +157,7 @@ __all__ = [
     "close_names",
     "convert_unit",
     "count_of",
+    "decibels",
     "describe_disk_error",
     "describe_mismatch",
     "elements",

@@ -30,6 +30,7 @@ from .signals import (
     check_name,
     primary_outputs,
 )
+from .tables import Grid, Sheet, ShownAsTable
 from .values import Array, Value
 
 SOLVED = "trapezoidal step"
@@ -41,7 +42,7 @@ _ABSENT = frozenset(
 _ABSENT |= {"inputs", "outputs", "states", "events"}
 
 
-class Block(Value, Wireable, metaclass=ShownMembers):
+class Block(ShownAsTable, Value, Wireable, metaclass=ShownMembers):
     """A signal-flow block: parameters, ports, and equations that are written once.
 
     A subclass declares ports and parameters, and writes its equations as plain functions of ``(t, x, u)`` with NumPy's
@@ -356,6 +357,20 @@ class Block(Value, Wireable, metaclass=ShownMembers):
         text = super().__repr__()
         return text if self.name is None else f"{text[:-1]}{', ' if text[-2] != '(' else ''}name={self.name!r})"
 
+    def _sheet(self) -> Sheet:
+        own = [(n, getattr(self, n), s.unit, s.description) for n, s in type(self).parameter_specs.items()]
+        line = (type(self).__doc__ or "").strip().partition("\n")[0]
+        columns = "", "unit", "shape", "description"
+        kinds = (("Inputs", self.inputs), ("Outputs", self.outputs), ("States", self.states))
+        return Sheet(
+            type(self).__name__ + (f" {self.name!r}" if self.name else ""),
+            (("", line),),
+            (
+                Grid("Parameters", ("", "value", "unit", "description"), tuple(own)),
+                *(Grid(kind, columns, tuple(_port_row(n, p) for n, p in ports.items())) for kind, ports in kinds),
+            ),
+        )
+
     def equation_function(self, equation: str) -> Callable[..., Any]:
         """Return the function that a user wrote for an equation, for messages."""
         return getattr(type(self), equation)  # type: ignore[no-any-return]
@@ -371,6 +386,13 @@ class Block(Value, Wireable, metaclass=ShownMembers):
             f"guard {name!r} is {value:.6g}; expected a positive value. Check its inputs: "
             f"{', '.join(f'{k} = {np.asarray(v).tolist()}' for k, v in u._asdict().items())}."
         )
+
+
+def _port_row(name: str, port: Port) -> tuple[Any, ...]:
+    """Return the row of a port in a table: any shape and a scalar's are left out."""
+    units = port.unit if isinstance(port.unit, tuple) else (port.unit or "",)
+    unit = units[0] if len(set(units)) == 1 else ", ".join(units)
+    return name, unit, " × ".join(map(str, port.shape or ())), port.description
 
 
 def _is_kind(port: Port, attribute: str) -> bool:

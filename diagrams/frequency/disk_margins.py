@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, brief, explain_calls, kinds
+from ...blocks.core import (
+    ConfirmationError,
+    Finding,
+    ParameterError,
+    Sheet,
+    ShownAsTable,
+    accepts,
+    brief,
+    decibels,
+    explain_calls,
+    kinds,
+)
 from .delayed_margins import ByArgument
 from .delayed_realization import DelayedRealization, realize
 from .loop_scan import LoopScan
@@ -29,7 +40,7 @@ if TYPE_CHECKING:
 
 @explain_calls
 @dataclass(frozen=True)
-class DiskMargin:
+class DiskMargin(ShownAsTable):
     """Size α of the disk of factors that leave a loop stable.
 
     The factors are f = (1 + (1 − σ)/2 δ) / (1 − (1 + σ)/2 δ) with |δ| < α, another one in each channel.
@@ -68,6 +79,17 @@ class DiskMargin:
         gains = f"gains of {self.gain_low:.4g} to {self.gain_high:.4g}"
         facts = f"α = {self.alpha} at {self.frequency}", gains, f"phases to ±{self.phase_deg:.4g}°"
         return brief("disk margin", *facts, then=".alpha, .frequency, .destabilizing")
+
+    def _sheet(self) -> Sheet:
+        gains = f"{self.gain_low:.4g} to {self.gain_high:.4g}"
+        in_db = " to ".join(text for text in (decibels(self.gain_low), decibels(self.gain_high)) if text)
+        facts = (
+            ("alpha", str(self.alpha)),
+            ("frequency", str(self.frequency)),
+            ("gains", f"{gains} ({in_db})" if in_db else gains),
+            ("phases", f"to ±{self.phase_deg:.4g}°"),
+        )
+        return Sheet("disk margin", facts)
 
 
 @accepts(delay=kinds.finite, skew=kinds.number)

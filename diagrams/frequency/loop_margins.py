@@ -122,12 +122,12 @@ class Margins(StabilityMargins):
     dt: float = 0.0
     findings: tuple[Finding, ...] = ()
 
-    def _further_lines(self) -> list[str]:
-        lines: list[str] = []
+    def _further_facts(self) -> list[tuple[str, str]]:
+        facts = []
         if not self.stable:
-            lines += [f"gain_crossover        {c.frequency}" for c in self.gain_crossovers]
-            lines += [f"phase_crossover       {c.frequency}, factor {c.gain_margin}" for c in self.phase_crossovers]
-        return [*lines, *tell_hidden_unstable(self.hidden_unstable)]
+            facts += [("gain_crossover", str(c.frequency)) for c in self.gain_crossovers]
+            facts += [("phase_crossover", f"{c.frequency}, factor {c.gain_margin}") for c in self.phase_crossovers]
+        return [*facts, *tell_hidden_unstable(self.hidden_unstable)]
 
 
 @accepts(delay=kinds.finite, skew=kinds.number)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import fields
@@ -9,9 +10,9 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
-from ...blocks.core import Finding, brief, explain_calls
+from ...blocks.core import Finding, Grid, Sheet, ShownAsTable, brief, decibels, explain_calls
 from .delayed_realization import DelayedRealization
-from .number import MARK, Interval, Number
+from .number import MARK, NOT_IN_DATA, Interval, Number
 from .realization import Realization
 from .scan_refine_confirm import number_of_limit
 
@@ -28,12 +29,14 @@ MARGIN_UNITS = {
     "disk_frequency": "rad/s",
 }
 """Units of the numbers that are no pure ones."""
+FACTORS = ("gain_margin_low", "gain_margin_high")
+"""Numbers that are factors on the gain, which are shown in dB, too."""
 ROTATIONS = (30.0, 60.0, 90.0, 120.0, 150.0, 180.0)
 """Rotations in degrees that are tried where no limit was found."""
 
 
 @explain_calls
-class MarginTable:
+class MarginTable(ShownAsTable):
     """Margins by name. The results for a linear, a periodic and a measured loop are such tables."""
 
     def numbers(self) -> dict[str, Any]:
@@ -41,8 +44,20 @@ class MarginTable:
         found = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
         return {name: value for name, value in found.items() if isinstance(value, Number | Interval)}
 
-    def _rows(self) -> list[str]:
-        return [f"{name:22s}{number}" for name, number in self.numbers().items()]
+    def _grid(self) -> Grid:
+        """Return its numbers as a table; factors of the gain in dB, too."""
+        rows: list[tuple[Any, ...]] = []
+        for name, number in self.numbers().items():
+            unit = decibels(float(number)) if name in FACTORS else number.unit
+            mark = f" {MARK}" if getattr(number, "findings", ()) else ""
+            value, interval = float(number), ""
+            if isinstance(number, Interval):
+                interval = f"{number.low:.4g} to {number.high:.4g}"
+            if isinstance(number, Interval) and math.isnan(value):
+                rows.append((name, None, "", NOT_IN_DATA))
+            else:
+                rows.append((name, value, ("" if unit == "1" else unit) + mark, interval))
+        return Grid("", ("number", "value", "unit", "interval"), tuple(rows))
 
 
 @explain_calls
@@ -63,22 +78,21 @@ class StabilityMargins(MarginTable):
             facts = (f"the closed loop is unstable, poles {poles}",)
         return brief(self._title(), *facts, then="print(…) shows all")
 
-    def __str__(self) -> str:
-        lines = self._rows()
-        if not self.stable:
-            plane, limit = ("z", "|z| < 1") if self.dt else ("s", "Re s < 0")
-            poles = ", ".join(f"{p:.6g}" for p in self.unstable_poles)
-            lines = [
-                "unstable: the closed loop has no margins",
-                f"unstable_poles        {plane} = {poles} (stable: {limit})",
-            ]
-        said = (f"{MARK if finding.limits_numbers else '–'} {finding}" for finding in self.findings)
-        return "\n".join([*lines, *self._further_lines(), *said])
+    def _sheet(self) -> Sheet:
+        said = tuple(f"{MARK if finding.limits_numbers else '–'} {finding}" for finding in self.findings)
+        if self.stable:
+            return Sheet(self._title(), tuple(self._further_facts()), (self._grid(),), said)
+        plane, limit = ("z", "|z| < 1") if self.dt else ("s", "Re s < 0")
+        poles = ", ".join(f"{p:.6g}" for p in self.unstable_poles)
+        unstable = "unstable_poles", f"{plane} = {poles} (stable: {limit})"
+        head = f"{self._title()}: none, as the closed loop is unstable"
+        return Sheet(head, (unstable, *self._further_facts()), (), said)
 
     def _title(self) -> str:
         return "margins"
 
-    def _further_lines(self) -> list[str]:
+    def _further_facts(self) -> list[tuple[str, str]]:
+        """Return facts of the loop besides its numbers."""
         return []
 
     def as_dict(self) -> dict[str, dict[str, Any]]:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError, accepts, brief, describe_disk_error, explain_calls, kinds
+from ...blocks.core import OptionError, Sheet, accepts, brief, describe_disk_error, explain_calls, kinds
 from .margin_analysis import MarginTable
 from .number import Interval
 
@@ -76,8 +76,8 @@ class MeasuredMargins(MarginTable):
         )
         return brief("measured margins", *facts, then="print(…) shows all")
 
-    def __str__(self) -> str:
-        return "\n".join([*self._rows(), *self.notes])
+    def _sheet(self) -> Sheet:
+        return Sheet("measured margins", (), (self._grid(),), self.notes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 MARK = "†"
 """Mark of a number with findings."""
+NOT_IN_DATA = "not in the data"
 
 
 class Confirmation(str):
@@ -114,7 +115,7 @@ class Interval:
 
     def __str__(self) -> str:
         if math.isnan(self.value):
-            return "not in the data"
+            return NOT_IN_DATA
         return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]" + ("" if self.unit == "1" else f" {self.unit}")
 
 

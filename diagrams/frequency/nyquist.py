@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, explain_calls, kinds
+from ...blocks.core import (
+    ConfirmationError,
+    Finding,
+    ParameterError,
+    Sheet,
+    ShownAsTable,
+    accepts,
+    explain_calls,
+    kinds,
+)
 from .delayed_realization import DelayedRealization, realize
 from .loop_scan import TURNS_MATTER, make_grid
 from .number import carries_findings
@@ -22,7 +31,7 @@ if TYPE_CHECKING:
 
 @explain_calls
 @dataclass(frozen=True, repr=False)
-class NyquistCount:
+class NyquistCount(ShownAsTable):
     """Numbers of the Nyquist criterion Z = N + P.
 
     P and Z are those of the realization that was given. A mode that input or output doesn't see is no part of L, and no
@@ -53,8 +62,13 @@ class NyquistCount:
         names = ("encirclements", "open_loop", "closed_loop", *(("hidden_unstable",) if self.hidden_unstable else ()))
         return f"{type(self).__name__}({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"
 
-    def __str__(self) -> str:
-        return "\n".join([repr(self), *tell_hidden_unstable(self.hidden_unstable)])
+    def _sheet(self) -> Sheet:
+        facts = (
+            ("N", f"{self.encirclements} clockwise encirclements of −1"),
+            ("P", f"{self.open_loop} unstable poles of the open loop"),
+            ("Z = N + P", f"{self.closed_loop} unstable poles of the closed loop"),
+        )
+        return Sheet("Nyquist criterion", (*facts, *tell_hidden_unstable(self.hidden_unstable)))
 
 
 @accepts(delay=kinds.finite)

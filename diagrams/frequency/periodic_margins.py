@@ -89,8 +89,8 @@ class PeriodicMargins(StabilityMargins):
     def _title(self) -> str:
         return f"margins of a periodic loop, period {self.dt:g} s"
 
-    def _further_lines(self) -> list[str]:
-        return [f"period                {self.dt:g} s, in which the wire is renewed {self.renewals} times"]
+    def _further_facts(self) -> list[tuple[str, str]]:
+        return [("period", f"{self.dt:g} s, in which the wire is renewed {self.renewals} times")]
 
 
 @explain_calls

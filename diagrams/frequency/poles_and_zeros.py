@@ -206,9 +206,9 @@ def find_hidden_unstable(r: HiddenPoles) -> tuple[complex, ...]:
     return tuple(complex(p) for p in beyond)
 
 
-def tell_hidden_unstable(poles: tuple[complex, ...]) -> list[str]:
-    """Return the line of a text that names hidden unstable poles, as `find_hidden_unstable` returns them."""
+def tell_hidden_unstable(poles: tuple[complex, ...]) -> list[tuple[str, str]]:
+    """Return the fact of a table that names hidden unstable poles, as `find_hidden_unstable` returns them."""
     if not poles:
         return []
     named = ", ".join(f"{p:.6g}" if p.imag else f"{p.real:.6g}" for p in poles)
-    return [f"hidden_unstable       {named}: not in this loop, and not moved by feedback around it"]
+    return [("hidden_unstable", f"{named}: not in this loop, and not moved by feedback around it")]

@@ -20,14 +20,18 @@ import numpy as np
 from ...blocks.core import (
     BetweenTicksError,
     Finding,
+    Grid,
     LoopwrightError,
     NonFiniteError,
     OptionError,
+    Sheet,
+    ShownAsTable,
     WiringError,
     accepts,
     brief,
     check_argument,
     count_of,
+    enumerate_some,
     explain_calls,
     kinds,
 )
@@ -48,6 +52,7 @@ from .mean_stairs import replace_stairs
 from .operating_points import PointLike, check_options, operating_point, refine_ticks
 from .over_a_period import begin_loop, confirm_loop, model_loop, model_period
 from .plant_models import EQUILIBRIUM
+from .pole_table import pole_rows
 from .signal_paths import SignalPaths
 from .tick_chain import period_of
 
@@ -57,9 +62,13 @@ if TYPE_CHECKING:
     from ..frequency import LoopTransfer
 
 
+MOST_SHOWN, MOST_NAMES = 60, 8
+"""States up to which a model's table has the poles (a few milliseconds), and names that it shows in a row."""
+
+
 @explain_calls
 @dataclass(frozen=True, eq=False)
-class Linearization:
+class Linearization(ShownAsTable):
     """A linear model of a diagram at an operating point.
 
     Attributes
@@ -133,6 +142,31 @@ class Linearization:
         facts = [f"T = {self.dt:g} s" if self.dt else "continuous", count_of(len(self.states), "state")]
         facts += [count_of(len(self.delays.times), "delay")] if self.delays else []
         return brief(f"linear model of {self.wired.name!r}", *facts, then="model.loop('wire'), .A, .findings")
+
+    def _sheet(self) -> Sheet:
+        point, T = self.point, self.dt
+        grids, notes = [], []
+        if self.delays:
+            notes.append(f"It has {count_of(len(self.delays.times), 'delay')}, so infinitely many poles: model.poles.")
+        elif len(self.states) > MOST_SHOWN:
+            notes.append(f"It has {len(self.states)} states: model.poles.")
+        else:
+            columns = "pole", "frequency in rad/s", "damping", *(("size",) if T else ())
+            grids.append(Grid(f"Poles in the {'z' if T else 's'} plane", columns, tuple(pole_rows(self.poles, T))))
+        moves = "" if math.isnan(point.residual) else f", residual {point.residual:.3g}"
+        return Sheet(
+            f"linear model of {self.wired.name!r}",
+            (
+                ("time", f"sampled, T = {T:.9g} s" if T else "continuous"),
+                ("inputs", enumerate_some(self.inputs, MOST_NAMES)),
+                ("outputs", enumerate_some(self.outputs, MOST_NAMES)),
+                ("states", f"{len(self.states)}: {enumerate_some(self.states, MOST_NAMES)}" if self.states else "none"),
+                ("operating point", f"t = {point.t:.9g} s{moves}{f' by {point.largest}' if point.largest else ''}"),
+                ("cut at", enumerate_some(self.openings, MOST_NAMES)),
+            ),
+            tuple(grids),
+            (*notes, *map(str, self.findings)),
+        )
 
     @property
     def diagram(self) -> Any:

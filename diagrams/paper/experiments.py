@@ -28,7 +28,7 @@ from ...blocks import (
     SmoothStep,
     Step,
 )
-from ...blocks.core import brief, explain_calls
+from ...blocks.core import Grid, Sheet, ShownAsTable, brief, explain_calls
 from ...fmus import Fmu
 from ...fmus.models import gantry
 from ..diagram import Diagram
@@ -55,7 +55,7 @@ __all__ = [
 
 @explain_calls
 @dataclass(frozen=True)
-class Experiment:
+class Experiment(ShownAsTable):
     """An experiment, ready to run; it can be pickled.
 
     Attributes
@@ -82,6 +82,14 @@ class Experiment:
     def __repr__(self) -> str:
         return brief(
             f"{self.title!r}", f"{self.duration:g} s", repr(self.diagram), then=".simulate(), .diagram, .options"
+        )
+
+    def _sheet(self) -> Sheet:
+        rows = ((name, value, str(value) == str(DEFAULTS.get(name))) for name, value in self.options.items())
+        return Sheet(
+            self.title,
+            (("duration", f"{self.duration:g} s"), ("diagram", repr(self.diagram)), ("path", repr(self.path))),
+            (Grid("Options", ("option", "value", "default"), tuple(rows)),),
         )
 
     def __post_init__(self) -> None:

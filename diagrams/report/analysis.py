@@ -30,7 +30,7 @@ from .sections.poles import closed_loops, memory
 from .sections.sensitivity import sensitivity
 from .sections.step_responses import steps
 from .sections.subject import operating_points, remarks, subject, versions
-from .sections.summary import all_requirements, summarize
+from .sections.summary import all_requirements, summarize, with_words
 from .sections.worst_case import find_reported, read_task, worst_case_of
 
 _HEADING = ("title", "author", "project", "date", "revision")  # lines of ``about``
@@ -214,10 +214,12 @@ def analyse(
         sections = (*sections, contact_sections(touched))
     whole = Report("", sections)
     made, absent = whole.numbers(), whole.absent()
-    reviewed = None if asked is None else review(case, asked, made, loops_measured, searched, touched, absent)
+    reviewed = None
+    if asked is not None:
+        reviewed = with_words(case, review(case, asked, made, loops_measured, searched, touched, absent))
     if only is None or asked is not None or summary:
         more = [] if touched is None or not touched.contacts else [contacts_on_first_page(touched)]
-        first = summarize(case, reviewed, made, searched, more, sections), all_requirements(case, reviewed)
+        first = summarize(case, reviewed, made, searched, more, sections), all_requirements(reviewed)
         sections = (*(section for section in first if section is not None), *sections)
     name = wired.name if experiment is None else f"Experiment {experiment.letter}: {wired.name}"
     lines = {str(key): str(text) for key, text in (about or {}).items()}

@@ -4,10 +4,15 @@ from .contact_limits import ContactLimits, read_contact_limits
 from .explanations import UNREAD, explain
 from .number_limits import SENSES, STEP_UNITS, Limit, Reason, Sense, Verdict, is_doubtful, judge, judge_interval
 from .requirements import LoopLimits, Requirements, StepLimits
-from .results import RequirementResult, Review
+from .results import RequirementResult
+from .review import COLUMNS, DIGITS, MOST_REQUIREMENTS, NOTHING, Review, by_loop, rank, reason_in_table, row_of
 from .toml_file import REQUIRED, STUDIES, TomlFile, read_requirements
 
 __all__ = [
+    "COLUMNS",
+    "DIGITS",
+    "MOST_REQUIREMENTS",
+    "NOTHING",
     "REQUIRED",
     "SENSES",
     "STEP_UNITS",
@@ -24,10 +29,14 @@ __all__ = [
     "StepLimits",
     "TomlFile",
     "Verdict",
+    "by_loop",
     "explain",
     "is_doubtful",
     "judge",
     "judge_interval",
+    "rank",
     "read_contact_limits",
     "read_requirements",
+    "reason_in_table",
+    "row_of",
 ]

@@ -1,12 +1,12 @@
-"""Verdicts on the requirements of a design."""
+"""A requirement with its verdict."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-from ...blocks.core import brief, explain_calls, print_unit
+from ...blocks.core import print_unit
 from ..frequency import Number
 from .number_limits import Limit, Reason, Verdict, unit_of
 
@@ -41,6 +41,8 @@ class RequirementResult:
         Wires of a step from one to another, such as "wish → y"; empty of all other numbers.
     unit : str
         Unit of the limit: the number's, or where there is none that of the quantity; empty if neither says it.
+    words, where, title : str
+        The quantity, the place and the variant in words, as a report names them; empty where no report does.
     """
 
     quantity: str
@@ -55,6 +57,9 @@ class RequirementResult:
     detail: str = ""
     place: str = ""
     unit: str = ""
+    words: str = field(default="", repr=False, compare=False)
+    where: str = field(default="", repr=False, compare=False)
+    title: str = field(default="", repr=False, compare=False)
 
     def __post_init__(self) -> None:
         unit = self.unit or unit_of(self.quantity) if self.number is None else self.number.unit
@@ -92,47 +97,4 @@ class RequirementResult:
             "value": math.nan if self.number is None else self.number.value,
             "detail": self.detail,
             "place": self.place,
-        }
-
-
-@explain_calls
-@dataclass(frozen=True)
-class Review:
-    """All requirements of a design with their verdicts.
-
-    Attributes
-    ----------
-    results : tuple of RequirementResult
-        In the order of the report.
-    free : tuple of FreeMotion
-        Motions that nothing notices, and that don't count as instabilities: ``motor.angle drifts: nothing feeds it
-        back``. A forgotten wire looks the same.
-    """
-
-    results: tuple[RequirementResult, ...]
-    free: tuple[Any, ...] = ()
-
-    def __repr__(self) -> str:
-        told = [f"{len(self.of(verdict))} {verdict.value}" for verdict in Verdict if self.of(verdict)]
-        return brief(f"review of {len(self.results)} requirements", *told, then=".results, .of(Verdict.FAILED)")
-
-    @property
-    def verdict(self) -> Verdict:
-        """Failed if one requirement fails; else not decided if one isn't, or there is none; else passed."""
-        found = {result.verdict for result in self.results}
-        if Verdict.FAILED in found:
-            return Verdict.FAILED
-        return Verdict.PASSED if found == {Verdict.PASSED} else Verdict.UNDECIDED
-
-    def of(self, verdict: Verdict) -> tuple[RequirementResult, ...]:
-        """Return the results with a verdict."""
-        return tuple(result for result in self.results if result.verdict is verdict)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the verdict, the counts and all results, as in the JSON."""
-        return {
-            "verdict": self.verdict.value,
-            **{verdict.name.lower(): len(self.of(verdict)) for verdict in Verdict},
-            "free": [str(motion) for motion in self.free],
-            "results": [result.as_dict() for result in self.results],
         }

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from fractions import Fraction
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
-from ...blocks.core import Finding, OptionError, brief, count_of, enumerate_some, explain_calls, same_unit, shorten
+from ...blocks.core import (
+    Finding,
+    Grid,
+    OptionError,
+    Sheet,
+    ShownAsTable,
+    brief,
+    count_of,
+    enumerate_some,
+    explain_calls,
+    same_unit,
+    shorten,
+)
 from ..flat import FlatDiagram
 from ..wiring import explain_absent_state
 from .saved_state import StateLayout, layout_of
@@ -64,7 +77,7 @@ def units_of(blocks: Mapping[str, Any], paths: Iterable[str]) -> dict[str, str]:
 
 @explain_calls
 @dataclass(frozen=True, eq=False)
-class OperatingPoint:
+class OperatingPoint(ShownAsTable):
     """An instant of a diagram: everything that its linear model depends on.
 
     `Diagram.operating_point` makes one by a run, `Diagram.trim` by solving for it. ``diagram.linearize(run.at(t))``
@@ -191,4 +204,34 @@ class OperatingPoint:
         )
         return brief(f"operating point at t = {self.t:.9g} s", *facts, then="diagram.linearize(point)")
 
+    def _sheet(self) -> Sheet:
+        moves = f"{self.residual:.3g}" + (f" by {self.largest}" if self.largest else "")
+        return Sheet(
+            f"operating point at t = {self.t:.9g} s",
+            (("origin", self.how.value), ("residual", moves), ("not judged", enumerate_some(self.unjudged))),
+            (
+                Grid("Parameters", ("name", "value"), tuple(self.parameters.items())),
+                Grid("States", ("state", "value", "unit"), tuple(self._state_rows())),
+            ),
+            tuple(map(str, self.free)),
+        )
+
+    def _state_rows(self) -> Iterator[tuple[str, Any, str]]:
+        """Yield the name, value and unit of each state, those of FMUs too."""
+        start = 0
+        for name, shape in self.layout[0] if self.layout else ():
+            size = math.prod(cast("tuple[int, ...]", shape))
+            entries = self.x[start : start + size]
+            yield from _entries(name, entries, "")
+            start += size
+        for path, about in {**self.plants, **self.exchanged}.items():
+            if path not in self.exchanged:  # whose continuous states are in x, too
+                for name, value in about["state"].items():
+                    yield from _entries(f"{path}.{name}", np.ravel(value), self.units.get(f"{path}.{name}", ""))
+
     """Remainder of each equation of a trim by name, largest first, relative to 1 + the size of its quantity."""
+
+
+def _entries(name: str, values: np.ndarray, unit: str) -> Iterator[tuple[str, Any, str]]:
+    for k, value in enumerate(values):
+        yield f"{name}[{k + 1}]" if len(values) > 1 else name, float(value), unit

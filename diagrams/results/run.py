@@ -14,6 +14,8 @@ from ...blocks.core import (
     Layout,
     OptionError,
     PortUnit,
+    Sheet,
+    ShownAsTable,
     UnknownNameError,
     brief,
     check_argument,
@@ -42,8 +44,8 @@ if TYPE_CHECKING:
 _TIMES = kinds.row.where(lambda value: len(value) == 2 and value[0] < value[1]).worded(
     "two times in s, the first one below the other", "Give them: xlim=(0, 5)."
 )
-_MESSAGES = 3
-"""Messages that the short text of a run shows; the others are counted."""
+_MESSAGES, _SHOWN_MESSAGES = 3, 10
+"""Messages that the short text and the table of a run show; the others are counted."""
 
 
 @explain_calls
@@ -78,7 +80,7 @@ class Snapshot:
 
 @explain_calls
 @dataclass(frozen=True, eq=False)
-class Run:
+class Run(ShownAsTable):
     """A run: the outputs of the blocks, and the states, at the instants that were recorded.
 
     ``run.t`` holds the times in s. ``run["xi"]`` is an array with one row per sample, by a wire's name, by a port's
@@ -165,6 +167,29 @@ class Run:
         head = brief(f"run of {self.diagram_name!r}", *facts, then=f"run[{first!r}], run.plot({first!r}), run.at(t)")
         more = len(self.messages) - _MESSAGES
         return "\n".join([head, *self.messages[:_MESSAGES], *([f"and {more} more: run.messages"] if more > 0 else [])])
+
+    def _sheet(self) -> Sheet:
+        from .run_table import ShownSignal, signal_grid
+
+        t, names, messages = self.t, self.names, self.messages
+        named = [name for name in self.wires if name in names]
+        shown = named or [name for name in names if name not in self.wires]
+        signals = [ShownSignal(name, self._place(name)[0], self._units(name)) for name in shown]
+        grid, why = signal_grid(t, self.data, signals, self.__getitem__)
+        others = len(names) - len(shown)
+        more = f"and {count_of(others, 'more signal')}: run.names, run['block.port']." if others else ""
+        further = len(messages) - _SHOWN_MESSAGES
+        last = f"and {further} more: run.messages" if further > 0 else ""
+        return Sheet(
+            f"run of {self.diagram_name!r}",
+            (
+                ("time", f"{t[0]:.9g} s to {t[-1]:.9g} s, {count_of(len(t), 'sample')}" if len(t) else "no sample"),
+                ("stopped", "" if self.stopped is None else f"at {self.stopped.t:.9g} s by {self.stopped.block}"),
+                ("events", count_of(len(self.events), "event") if self.events else ""),
+            ),
+            (grid,),
+            tuple(note for note in (why, more, *messages[:_SHOWN_MESSAGES], last) if note),
+        )
 
     @classmethod
     def open(cls, path: PathLike) -> Run:
@@ -522,7 +547,7 @@ class Run:
             raise OptionError(f"found no signal to draw, and no wire has a name; expected names, such as {some}.")
         return [[name] for name in wires]
 
-    # --- for other tools: all named wires (where none has a name, all ports) if no signal is given -------------------
+    # --- for other tools: all recorded signals if none is given -------------------------------------------------------
 
     def to_csv(self, path: PathLike | IO[str], *names: str) -> None:
         """Write ``t`` (s) and signals as comma-separated values, 17 significant digits.
@@ -534,7 +559,7 @@ class Run:
         path : path or file
             File to write.
         *names : str
-            Signals; all named wires if none is given, and all ports where no wire has a name.
+            Signals; all that were recorded if none is given, under the name of their wire or the path of their port.
 
         Raises
         ------
@@ -546,8 +571,9 @@ class Run:
         to_csv(path, self.t, dict(self._columns(names)))
 
     def to_pandas(self, *names: str) -> DataFrame:
-        """Return signals as a pandas DataFrame with the times (s) as index ``t``; columns are named as in `to_csv`.
+        """Return signals as a pandas DataFrame with the times (s) as index ``t``; all that were recorded without names.
 
+        Columns are named as in `to_csv`.
         Units are in its ``attrs["units"]``, by column. At an event an index repeats: before and after.
 
         Raises
@@ -562,7 +588,7 @@ class Run:
         return to_pandas(self.t, dict(self._columns(names)), self._units_of_columns(names))
 
     def to_xarray(self, *names: str) -> Dataset:
-        """Return signals as an xarray Dataset over ``t`` (s).
+        """Return signals as an xarray Dataset over ``t`` (s); all that were recorded without names.
 
         A vector ``f`` has the dimensions ``t`` and ``f_dim``, a matrix ``t``, ``f_dim1`` and ``f_dim2``; entries are
         counted from 1, as in `to_csv`. ``attrs["units"]`` of a variable is its unit, those of a vector separated by
@@ -581,7 +607,7 @@ class Run:
         return to_xarray(self.t, signals, {name: self._units(name) for name in signals}, self.diagram_name)
 
     def to_parquet(self, path: PathLike, *names: str) -> None:
-        """Write ``t`` (s) and signals as a Parquet file; columns are named as in `to_csv`.
+        """Write ``t`` (s) and signals, all without names, as a Parquet file; columns are named as in `to_csv`.
 
         A field's metadata holds its unit. Rows are written in groups, so a run on disk need not fit into memory.
 
@@ -602,6 +628,7 @@ class Run:
     def to_mat(self, path: PathLike, *names: str) -> None:
         """Write ``t`` (s) and signals as a MATLAB file (version 5), a column vector or an N-by-n matrix each.
 
+        Without names, these are all signals that were recorded.
         A variable is named after its signal, as MATLAB allows. Every character other than an ASCII letter, a digit or
         ``_`` becomes ``_``. A name that doesn't begin with a letter gets ``s_`` in front, as do MATLAB's keywords,
         ``t`` and ``info``. Of a name longer than 63 characters the end is kept. A name that is taken already gets
@@ -622,13 +649,22 @@ class Run:
         to_mat(path, self.t, signals, units, self.diagram_name)
 
     def _names_to_export(self, names: Iterable[str]) -> list[str]:
-        """Return signals, each once: those given, else all named wires, else all ports."""
+        """Return signals, each once: those given, else all that were recorded.
+
+        A port is left out where the names of wires cover all its entries: each value is there once at least.
+        """
         names = list(names)
         for name in names:
             check_argument(name, kinds.text, "names", self.diagram_name)
-        every = self.names
-        wires = [n for n in every if n in self.wires]
-        return list(dict.fromkeys(names or wires or every))
+        if names:
+            return list(dict.fromkeys(names))
+        every = {name: entries(name, self.layout, self.wires) for name in self.names}
+        named = [name for name in every if name in self.wires]
+        covered = {int(k) for name in named for k in np.ravel(every[name])}
+        return [
+            *named,
+            *(n for n, own in every.items() if n not in self.wires and not covered.issuperset(np.ravel(own))),
+        ]
 
     def _columns(self, names: Iterable[str], samples: slice = slice(None)) -> Iterator[tuple[str, np.ndarray]]:
         """Yield the name and the values of each column; entries of a vector are counted from 1."""

@@ -10,7 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, UnknownNameError, accepts, brief, enumerate_some, explain_calls, kinds, near
+from ...blocks.core import (
+    Grid,
+    LoopwrightError,
+    Sheet,
+    ShownAsTable,
+    UnknownNameError,
+    accepts,
+    brief,
+    enumerate_some,
+    explain_calls,
+    kinds,
+    near,
+)
 from ..flat import WiredDiagram
 from ..frequency import MarginSlope, Number, margin_slopes, margins, order_key
 from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize, rational_loop
@@ -98,7 +110,7 @@ class Sensitivity:
 
 @explain_calls
 @dataclass(frozen=True)
-class Sensitivities(Sequence[Sensitivity]):
+class Sensitivities(ShownAsTable, Sequence[Sensitivity]):
     """Sensitivities of a loop's numbers to parameters, in the order of the parameters.
 
     ``found["pid.kp", "phase_margin_deg"]`` is one of them, ``found.of("ms")`` those of one number, the largest first.
@@ -181,26 +193,22 @@ class Sensitivities(Sequence[Sensitivity]):
         """Return all rows as mappings; ``pandas.DataFrame(found.table())`` shows them."""
         return [row.as_dict() for row in self.rows]
 
-    def __str__(self) -> str:
-        lines = [f"loop at {', '.join(self.wires)}: change per 1 % of each parameter (derivative)"]
-        if not self.stable:
-            lines.append("the closed loop is unstable: it has no margins")
+    def _sheet(self) -> Sheet:
+        grids = []
         for quantity in self.quantities:
-            mine = self.of(quantity)
-            if mine:
-                lines.append(f"{quantity} = {mine[0].number}")
-            for row in mine:
-                marks = "".join((" (kink)" if row.kink else "", " (states held)" if row.rest_lost else ""))
-                error = row.slope.tolerance
-                known = ", of unknown error" if math.isnan(error) else f" ± {error:.1g}"
-                lines.append(
-                    f"  {row.parameter:44s} {row.per_percent.value:+12.4g}   ({row.slope.value:+.6g}{known}, at "
-                    f"{row.value:g} {row.unit}){marks}"
-                )
-        if self.without_effect:
-            lines.append(f"without effect: {', '.join(self.without_effect)}")
-        lines += [f"left out: {name}: {reason}" for name, reason in self.left_out.items()]
-        return "\n".join(lines)
+            if mine := self.of(quantity):
+                title = f"{quantity} = {mine[0].number}"
+                columns = "parameter", "value", "unit", "change per 1 %", "derivative", "±", ""
+                grids.append(Grid(title, columns, tuple(_row(row) for row in mine)))
+        return Sheet(
+            f"sensitivities of the loop at {', '.join(self.wires)}",
+            (
+                ("closed loop", "stable" if self.stable else "unstable: it has no margins"),
+                ("without effect", ", ".join(self.without_effect)),
+            ),
+            tuple(grids),
+            tuple(f"left out: {name}: {reason}" for name, reason in self.left_out.items()),
+        )
 
     def plot(self, quantity: str = "disk_margin", count: int = 8) -> Figure:
         """Return a bar for each of the largest changes per 1 % of a parameter."""
@@ -217,6 +225,15 @@ class Sensitivities(Sequence[Sensitivity]):
             axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
             axes.grid(visible=False, axis="y")
         return figure
+
+
+def _row(row: Sensitivity) -> tuple[Any, ...]:
+    """Return the row of a table: the error as a text where it is not known."""
+    marks = ", ".join(("kink",) * row.kink + ("states held",) * row.rest_lost)
+    error = row.slope.tolerance
+    known = "error unknown" if math.isnan(error) else f"{error:.1g}"
+    change = float(f"{row.per_percent.value:.4g}")
+    return row.parameter, row.value, row.unit, change, row.slope.value, known, marks
 
 
 @accepts("sensitivity", loop=kinds.names, parameters=kinds.names, delay=kinds.whole, skew=kinds.number)

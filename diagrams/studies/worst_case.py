@@ -11,7 +11,17 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from ...blocks.core import OptionError, accepts, brief, enumerate_some, explain_calls, kinds
+from ...blocks.core import (
+    Grid,
+    OptionError,
+    Sheet,
+    ShownAsTable,
+    accepts,
+    brief,
+    enumerate_some,
+    explain_calls,
+    kinds,
+)
 from ..flat import WiredDiagram
 from ..frequency import order_key
 from ..linearization import carry_point
@@ -31,7 +41,7 @@ if TYPE_CHECKING:
 
 @explain_calls
 @dataclass(frozen=True)
-class WorstCase:
+class WorstCase(ShownAsTable):
     """Worst case of a loop's numbers over ranges of parameters.
 
     ``diagram.simulate(…)`` of ``found.diagram`` runs it; ``found.parameters`` are its parameters for `replace`.
@@ -149,20 +159,35 @@ class WorstCase:
             self._worst_wired, self.worst, self.points[self.worst.point], amplitude, self.options["delay"], options
         )
 
-    def __str__(self) -> str:
-        w, n = self.worst, min(self.nominal, key=lambda case: case.goodness)
+    def _sheet(self) -> Sheet:
+        worst, nominal = self.worst, min(self.nominal, key=lambda case: case.goodness)
         counts = {state: sum(case.state is state for case in self.cases) for state in CaseState}
-        told = ", ".join(f"{count} {state.value}" for state, count in counts.items() if count)
-        lines = [f"worst of {len(self.cases)} cases ({told}), found by {w.origin.value}:"]
-        lines.append(f"  {describe(w)}; as it is: {describe(n)}")
-        lines += [f"  {name} = {_short(value)}" for name, value in w.parameters.items()]
-        if w.point or len(self.points) > 1:
-            lines.append(f"  at operating point {w.point} of {len(self.points)}")
-        if self.goal.left_out:
-            lines.append(f"  not looked at: {', '.join(self.goal.left_out)}")
-        if counts[CaseState.FAILED]:
-            lines.append(f"  {counts[CaseState.FAILED]} cases failed, the first: {self.failures[0].reason}")
-        return "\n".join(lines)
+        several = len(self.points) > 1
+        return Sheet(
+            f"worst of {len(self.cases)} cases",
+            (
+                ("worst", describe(worst)),
+                ("as it is", describe(nominal)),
+                ("found by", worst.origin.value),
+                ("cases", ", ".join(f"{count} {state.value}" for state, count in counts.items() if count)),
+                ("operating point", f"{worst.point} of {len(self.points)}" if several else ""),
+                ("not looked at", ", ".join(self.goal.left_out)),
+            ),
+            (
+                Grid(
+                    "Parameters of the worst case",
+                    ("parameter", "value", "from", "to"),
+                    tuple((name, value, *self._range(name)) for name, value in worst.parameters.items()),
+                ),
+            ),
+            (f"{counts[CaseState.FAILED]} cases failed, the first: {self.failures[0].reason}",)
+            if counts[CaseState.FAILED]
+            else (),
+        )
+
+    def _range(self, name: str) -> tuple[Any, Any]:
+        box = self.boxes.get(name)
+        return (None, None) if box is None else (box.low, box.high)
 
     def plot(self, parameters: Sequence[str] | None = None) -> Figure:
         """Return a scatter of the number over each parameter: samples, search, the worst case and the limit.

@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, UnknownNameError, accepts, explain_calls, kinds, near
+from ...blocks.core import (
+    MOST_ROWS,
+    Grid,
+    OptionError,
+    Sheet,
+    ShownAsTable,
+    UnknownNameError,
+    accepts,
+    count_of,
+    enumerate_some,
+    explain_calls,
+    kinds,
+    near,
+)
 from .outcome import Failure, SampleOutcome
 from .samples import Samples
 
@@ -20,7 +33,7 @@ if TYPE_CHECKING:
 
 @explain_calls
 @dataclass(frozen=True, eq=False)
-class Sweep:
+class Sweep(ShownAsTable):
     """The results of a sweep.
 
     ``sweep["name"]`` is an array with one row for each sample, in their order: a reduction, or the samples of a signal
@@ -55,6 +68,32 @@ class Sweep:
         failed = len(self.failures)
         more = (f", {failed} failed" if failed else "") + (f", {missing} not run" if missing else "")
         return f"<sweep of {self.diagram_name}: {len(self.samples)} samples of {', '.join(self.samples.names)}{more}>"
+
+    def _sheet(self) -> Sheet:
+        missing = sum(outcome is None for outcome in self.outcomes)
+        failures, rows = self.failures, self.samples.rows
+        return Sheet(
+            f"sweep of {self.diagram_name}",
+            (
+                ("samples", len(rows)),
+                ("failed", count_of(len(failures), "run") if failures else ""),
+                ("not run", count_of(missing, "sample") if missing else ""),
+                ("signals kept", enumerate_some(self._signals, 8)),
+            ),
+            (
+                Grid("", ("", *self.samples.names, *self._reductions), tuple(self._rows()), total=len(rows)),
+                Grid("Failures", ("sample", "error", "message"), tuple((f.index, f.kind, f.message) for f in failures)),
+            ),
+            self.messages,
+        )
+
+    def _rows(self) -> Iterator[tuple[Any, ...]]:
+        """Yield the first rows of its table: a sample's number and parameters, and its reductions."""
+        for k, row in enumerate(self.samples.rows[:MOST_ROWS]):
+            outcome = self.outcomes[k]
+            numbers = {} if outcome is None else outcome.numbers
+            found = (numbers.get(name) for name in self._reductions)
+            yield k, *row, *(float(v) if v is not None and np.ndim(v) == 0 else v for v in found)
 
     @cached_property
     def failures(self) -> tuple[Failure, ...]:

@@ -12,6 +12,7 @@ from .first_order_hold import first_order_hold
 from .order import Order, find_orders
 from .parameter_names import find_name, find_path, find_place, split_path
 from .structure import Structure, SubsystemSettings, Wire, join, stepped_blocks
+from .structure_table import sheet_of_structure
 from .subsystems import Subsystem, exact_time, subsystem
 from .variants import apply_changes, change_parameter, change_parameters
 from .wire_units import add_unit_conversions
@@ -42,6 +43,7 @@ __all__ = [
     "first_order_hold",
     "index_of",
     "join",
+    "sheet_of_structure",
     "split_entry",
     "split_path",
     "stepped_blocks",

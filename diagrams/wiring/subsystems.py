@@ -10,7 +10,10 @@ from typing import Any, SupportsFloat, TypedDict, Unpack, overload
 from ...blocks.core import (
     Call,
     DoubleDriveError,
+    Grid,
     SampleTimeError,
+    Sheet,
+    ShownAsTable,
     Signal,
     UnknownAttributeError,
     UnknownNameError,
@@ -114,7 +117,7 @@ class SubsystemKeywords(TypedDict, total=False):
 
 
 @explain_calls
-class Subsystem:
+class Subsystem(ShownAsTable):
     """A function of signals that is used in a diagram like a block; made by `subsystem`, called like a block."""
 
     def __init__(
@@ -219,12 +222,29 @@ class Subsystem:
             wires |= {port: signals[path] for path, port in buses[key].items()}
         return SubsystemCall(self, wires, buses)
 
+    def _sheet(self) -> Sheet:
+        line = (self.function.__doc__ or "").strip().partition("\n")[0]
+        return Sheet(f"subsystem {self.name!r}", (("", line), *self._facts()))
+
+    def _facts(self) -> tuple[tuple[str, Any], ...]:
+        """Return its inputs and settings by name, as far as they are its own."""
+        given = [p.name if p.default is p.empty else f"{p.name} (optional)" for p in self.parameters]
+        rate = "" if self.sample_time is None else f"{float(self.sample_time):g} s"
+        return (
+            ("inputs", ", ".join([*given, *([self.control_input] if self.control_input else [])])),
+            ("sample time", rate),
+            ("offset", f"{float(self.offset):g} s" if self.offset else ""),
+            ("delay", f"{self.delay} samples" if self.delay else ""),
+            ("method", self.method),
+            (self.control, self.when),
+        )
+
     def __repr__(self) -> str:
         rate = "" if self.sample_time is None else f", sample_time={float(self.sample_time):g}"
         return f"<subsystem {self.name}({', '.join(p.name for p in self.parameters)}){rate}>"
 
 
-class SubsystemCall(Wireable):
+class SubsystemCall(ShownAsTable, Wireable):
     """A subsystem with its inputs, and the calls that its function made."""
 
     def __init__(
@@ -273,6 +293,15 @@ class SubsystemCall(Wireable):
 
     def __repr__(self) -> str:
         return f"<call of {self.label}>"
+
+    def _sheet(self) -> Sheet:
+        wired = tuple((name, repr(signal)) for name, signal in self.wires.items())
+        made = tuple((name, repr(signal)) for name, signal in self.results.items())
+        return Sheet(
+            f"call of the subsystem {self.label!r}",
+            self.subsystem._facts()[1:],
+            (Grid("Inputs", ("input", "wired to"), wired), Grid("Outputs", ("output", "from"), made)),
+        )
 
     def _signal(self) -> Signal:
         if not self.results:

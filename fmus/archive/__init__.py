@@ -2,7 +2,7 @@
 
 from .archive_limits import ArchiveLimits
 from .binaries import check_binary, find_binary, missing_functions
-from .description import FmuDescription, find_description, read_description
+from .description import FmuDescription, find_description, kept_description, read_description
 from .faults import FmuFault, FmuFinding, FmuSeverity
 from .gathering import read_index
 from .joining import join_scalars
@@ -33,6 +33,7 @@ __all__ = [
     "find_description",
     "inexact",
     "join_scalars",
+    "kept_description",
     "missing_functions",
     "parse_xml",
     "read_description",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import stat
+import weakref
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -13,7 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuFileError, Layout, accepts, brief, describe_disk_error, explain_calls, kinds
+from ...blocks.core import (
+    FmuFileError,
+    Layout,
+    Sheet,
+    ShownAsTable,
+    accepts,
+    brief,
+    describe_disk_error,
+    enumerate_some,
+    explain_calls,
+    kinds,
+)
 from ..host_state import FOLDER
 from .aliases import find_aliases
 from .archive_limits import ArchiveLimits
@@ -28,6 +40,7 @@ from .rules import KNOWN_VERSIONS, check_dimensions, unknown_version
 from .sizes import resize
 from .states import find_states, read_derivatives
 from .unit_definitions import FmuUnits
+from .variable_table import variable_grid
 from .variables import WIRE_TYPES, FmuVariable, OtherVariable, fmi3_type, read_other, read_variable
 from .xml_text import parse_xml
 from .zip_file import DESCRIPTION, OTHER_PLACE, FmuArchive
@@ -38,7 +51,7 @@ _DROPPED = ("UInt", "Clock")
 
 @explain_calls
 @dataclass(frozen=True, eq=False)
-class FmuDescription:
+class FmuDescription(ShownAsTable):
     """Content of ``modelDescription.xml``, as far as a diagram needs it."""
 
     fmi: str
@@ -123,6 +136,56 @@ class FmuDescription:
         kinds = "co-simulation" * self.co_simulation, "model exchange" * bool(self.model_exchange)
         facts = f"FMI {self.fmi}", " and ".join(filter(None, kinds)), f"{len(self.variables)} variables"
         return brief(f"description of {self.file.name!r}", *facts, then=".variables, .states, loopwright.doctor(file)")
+
+    def _sheet(self) -> Sheet:
+        return self.as_sheet()
+
+    def as_sheet(
+        self,
+        head: str = "",
+        inputs: Mapping[str, FmuVariable] | None = None,
+        outputs: Mapping[str, FmuVariable] | None = None,
+        started: Mapping[str, Any] | None = None,
+        facts: tuple[tuple[str, Any], ...] = (),
+    ) -> Sheet:
+        """Return the FMU as it is shown; a block's ports and start values take the place of the file's own."""
+        kinds = (("co-simulation", self.co_simulation), ("model exchange", self.model_exchange is not None))
+        states = {name: self.find(name) for name in self.states}
+        started = started or {}
+        step = self.fixed_internal_step
+        return Sheet(
+            head or f"FMU {self.file.name!r}",
+            (
+                ("model", " ".join(filter(None, (self.model_name, self.model_version)))),
+                ("FMI", f"{self.fmi}, {' and '.join(name for name, has in kinds if has)}"),
+                ("made by", self.generation_tool),
+                *facts,
+                ("can", ", ".join(self.capabilities) or "none of saving its state, derivatives, events"),
+                ("steps", "" if step is None else f"multiples of {step:g} s"),
+                ("no ports for", enumerate_some(map(str, self.other.values()), 8)),
+            ),
+            (
+                variable_grid("Inputs", self.of("input") if inputs is None else inputs, started),
+                variable_grid("Outputs", self.of("output") if outputs is None else outputs, {}),
+                variable_grid("Parameters", {**self.structural, **self.of("parameter")}, started),
+                variable_grid("Continuous states", states, started),
+            ),
+            tuple(map(str, self.findings)),
+        )
+
+    @property
+    def capabilities(self) -> list[str]:
+        """What it can do in a run, in words."""
+        flags = {
+            "save its state": self.can_save,
+            "serialize it": self.can_serialize,
+            "give directional derivatives": self.has_derivatives or self.model_exchange_has_derivatives,
+            "take steps of different lengths": self.variable_step,
+            "handle events in co-simulation": self.has_event_mode,
+            "take inputs within a step": self.interpolates_inputs,
+            "be loaded once per process only": self.only_once,
+        }
+        return [text for text, has in flags.items() if has]
 
     def layout(self, names: Iterable[str]) -> Layout:
         """Return the layout of some variables in a flat vector, one after the other."""
@@ -268,7 +331,7 @@ def find_description(
         found = f"{shown!r} is a folder" if os.path.isdir(path) else f"there is no file {shown!r}"
         raise FmuFileError(f"{found}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
     identity = (status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size)
-    return _read(path, identity, limits or _USUAL, tuple(sorted(sizes.items())) if sizes else ())
+    return _read(path, identity, limits or _USUAL, _key_of(sizes))
 
 
 def _unreadable(path: str, error: OSError) -> FmuFileError:
@@ -276,6 +339,17 @@ def _unreadable(path: str, error: OSError) -> FmuFileError:
     return FmuFileError(f"{path!r} can't be read: {found}", fault=FmuFault.NO_FILE)
 
 
+def kept_description(digest: str, sizes: Mapping[str, int] | None) -> FmuDescription | None:
+    """Return a description that is in memory, by the file's SHA-256, without a look at the file; None if none is."""
+    return _KEPT.get((digest, _key_of(sizes)))
+
+
+def _key_of(sizes: Mapping[str, int] | None) -> tuple[tuple[str, int], ...]:
+    return tuple(sorted(sizes.items())) if sizes else ()
+
+
+_KEPT: weakref.WeakValueDictionary[tuple[str, tuple[tuple[str, int], ...]], FmuDescription]
+_KEPT = weakref.WeakValueDictionary()
 _USUAL = ArchiveLimits()
 
 
@@ -314,7 +388,7 @@ def _read(
             subject=DESCRIPTION,
         ) from error
     findings = (*archive.findings, *judge_name(binary, identifier), *judge_negated(found["other"].values()))
-    return FmuDescription(
+    made = FmuDescription(
         version,
         path,
         archive.digest,
@@ -329,6 +403,8 @@ def _read(
         model_version=root.get("version", ""),
         **found,
     )
+    _KEPT[made.digest, sizes] = made
+    return made
 
 
 def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dict[str, Any]:

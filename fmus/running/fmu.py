@@ -13,15 +13,28 @@ from ...blocks.core import (
     FmuError,
     FmuFileError,
     FrozenMapping,
+    Sheet,
     kinds,
     parameter,
 )
-from ..archive import ArchiveLimits, FmuDescription, find_description, join_scalars
+from ..archive import (
+    ArchiveLimits,
+    FmuDescription,
+    find_description,
+    join_scalars,
+    kept_description,
+)
 from ..calls import FmuInstance, StepOptions, check_offered
 from ..isolation import Isolation, open_fmu
 from .fmu_point import FmuLinearization
 from .linearization import STEP, linear_model, step_difference
-from .model_exchange_members import DEPENDENCIES, INTERFACES, ModelExchangeMembers, choose_interface
+from .model_exchange_members import (
+    DEPENDENCIES,
+    INTERFACES,
+    ModelExchangeMembers,
+    choose_interface,
+    interface_text,
+)
 from .replacement import check_replacement
 from .start_values import check_start, check_value, read_sized
 
@@ -168,13 +181,29 @@ class Fmu(ModelExchangeMembers):
 
     def __repr__(self) -> str:
         text = super().__repr__()
-        try:
-            shown = [str(v) for v in self.description.other.values()]
-            text += f", {self.interface_text}" if self.interface_text else ""
-        except FmuError:
+        about = self._kept_description()
+        if about is None:
             return text
+        shown = [str(v) for v in about.other.values()]
+        used = interface_text(about, choose_interface(about, self.interface, self.label))
+        text += f", {used}" if used else ""
         more = f" and {len(shown) - 5} more" if len(shown) > 5 else ""
         return f"{text} without ports for {', '.join(shown[:5])}{more}" if shown else text
+
+    def _sheet(self) -> Sheet:
+        about = self._kept_description()
+        head = f"FMU {Path(self.file).name!r}" + (f", block {self.name!r}" if self.name else "")
+        if about is None:
+            return Sheet(head, (("start", dict(self.start)),), (), ("Its description is not in memory: .description.",))
+        ports = self._choose_ports(about)
+        by_steps = choose_interface(about, self.interface, self.label) == INTERFACES[0]
+        facts = (("runs by", "co-simulation" if by_steps else "model exchange"),)
+        return about.as_sheet(head, ports.inputs, ports.outputs, self.start, facts)
+
+    def _kept_description(self) -> FmuDescription | None:
+        """Return the description where it is in memory, without a look at the file."""
+        found = kept_description(str(self._content), self.__dict__["_sizes"])
+        return None if found is None else join_scalars(found, self.rename, self.label)
 
     @property
     def description(self) -> FmuDescription:

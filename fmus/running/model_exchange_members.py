@@ -25,6 +25,13 @@ UNNAMED = "continuous_states"
 """Name of the state of an FMU whose continuous states are no variables."""
 
 
+def interface_text(about: FmuDescription, used: str) -> str:
+    """Return the text on the interface that a run uses; empty for co-simulation where there is nothing else."""
+    if used != INTERFACES[0]:
+        return "by model exchange" if about.co_simulation else "by model exchange, its only interface"
+    return "by co-simulation" if about.exchange is not None else ""
+
+
 def choose_interface(description: FmuDescription, asked: str | None, label: str) -> str:
     """Return the interface by which an FMU runs: that asked for, else co-simulation where it offers it.
 
@@ -101,10 +108,7 @@ class ModelExchangeMembers(PortMembers):
     @property
     def interface_text(self) -> str:
         """Text on the interface that a run uses; empty for co-simulation where there is nothing else."""
-        about, by_steps = self.description, self.stepped
-        if not by_steps:
-            return "by model exchange" if about.co_simulation else "by model exchange, its only interface"
-        return "by co-simulation" if about.exchange is not None else ""
+        return interface_text(self.description, self.used_interface)
 
     @property
     def states(self) -> Mapping[str, State]:  # type: ignore[override]

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ....blocks.core import brief, explain_calls
+from ....blocks.core import Grid, Sheet, ShownAsTable, brief, explain_calls
 from ...frequency import Number
 from ...requirements import Review, Verdict
 
@@ -16,7 +16,7 @@ SUMMARY = "summary"
 
 @explain_calls
 @dataclass(frozen=True)
-class Table:
+class Table(ShownAsTable, Grid):
     """A table: a title, column headings, and rows of texts or numbers.
 
     One of ``details`` stands in the appendix. Numbers have ``digits`` significant digits at most, fewer where their
@@ -25,10 +25,6 @@ class Table:
     repeats numbers of other tables: of their confirmations it has only those that say less than "confirmed".
     """
 
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Any, ...], ...]
-    note: str = ""
     details: bool = False
     digits: int = 6
     terms: Mapping[str, str] = field(default_factory=dict)
@@ -38,6 +34,9 @@ class Table:
     def __repr__(self) -> str:
         facts = f"{len(self.rows)} rows", ", ".join(map(str, self.columns))
         return brief(f"table {self.title!r}", *facts, then=".rows")
+
+    def _sheet(self) -> Sheet:
+        return Sheet("", (), (self,))
 
 
 @dataclass(frozen=True)

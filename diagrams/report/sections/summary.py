@@ -4,12 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from ....blocks.core import LoopwrightError, print_unit
 from ...frequency import Number, find_disk_frequency, order_key, realize
 from ...linearization import Linearization, find_signal
-from ...requirements import RequirementResult, Review, Verdict, explain
+from ...requirements import (
+    COLUMNS,
+    DIGITS,
+    MOST_REQUIREMENTS,
+    NOTHING,
+    RequirementResult,
+    Review,
+    Verdict,
+    by_loop,
+    explain,
+    rank,
+    reason_in_table,
+    row_of,
+)
 from ...studies import CaseState
 from ..case import Case
 from ..figures import HEIGHTS, fit_overview
@@ -28,8 +42,6 @@ from .worst_case import MissingWorstCase, ReportedWorstCase
 
 TEXTS = Texts(__package__, "summary")
 TITLE = "Summary"
-MOST_REQUIREMENTS = 20
-"""Requirements that the summary shows at most."""
 LOOP_NUMBERS = (
     "phase_margin_deg",
     "gain_margin_low",
@@ -40,11 +52,8 @@ LOOP_NUMBERS = (
     "bandwidth",
 )
 """Numbers of the loops that stand on the first page."""
-DIGITS = 4
-"""Significant digits on the first page; the appendix has more."""
 ALIKE = 0.05
 """Relative difference up to which a margin is hardly changed."""
-ORDER = (Verdict.FAILED, Verdict.UNDECIDED, Verdict.PASSED)
 
 
 def summarize(
@@ -65,7 +74,7 @@ def summarize(
         counts = {verdict.name.lower(): len(reviewed.of(verdict)) for verdict in Verdict}
         said = TEXTS.line("verdict", verdict=reviewed.verdict.name, total=len(reviewed.results), **counts)
         text.append(Judged(said, reviewed.verdict))
-        tables.append(_requirements(case, reviewed, MOST_REQUIREMENTS))
+        tables.append(_requirements(reviewed, MOST_REQUIREMENTS))
     motions = free_motions(case.judged()) if reviewed is None else reviewed.free
     text += [TEXTS.line("drifts", motions=[str(motion) for motion in motions])] if motions else []
     text += _weakest(case, numbers)
@@ -80,35 +89,22 @@ def summarize(
     return Section(SUMMARY, TITLE, tuple(text), tuple(tables), plots)
 
 
-def all_requirements(case: Case, reviewed: Review | None) -> Section | None:
+def all_requirements(reviewed: Review | None) -> Section | None:
     """Return the chapter with all requirements, None where the summary has them all."""
     if reviewed is None or len(reviewed.results) <= MOST_REQUIREMENTS:
         return None
-    return Section("requirements", "Requirements", (), (_requirements(case, reviewed, len(reviewed.results)),))
+    return Section("requirements", "Requirements", (), (_requirements(reviewed, len(reviewed.results)),))
 
 
-def _requirements(case: Case, reviewed: Review, most: int) -> Table:
+def _requirements(reviewed: Review, most: int) -> Table:
     """Return the table of so many requirements: those that fail first, then those that are not decided."""
-    ranked = sorted(reviewed.results, key=lambda r: (ORDER.index(r.verdict), _relative(r)))
-    rows = tuple(_row(case, result) for result in by_loop(ranked[:most]))
-    columns = ("verdict", "requirement", "at", "variant", "required", "found", "distance")
+    ranked = rank(reviewed.results)
+    rows = tuple(_row(result) for result in by_loop(ranked[:most]))
     note = TEXTS.line("distance")
     if len(ranked) > most:
         note = TEXTS.line("more_requirements", shown=most, total=len(ranked)) + f" {note}"
     terms = {"distance": "distance_to_limit"}
-    return Table("Requirements", columns, rows, note, digits=DIGITS, terms=terms, brief=True)
-
-
-def by_loop(ranked: Sequence[RequirementResult]) -> list[RequirementResult]:
-    """Return results with those of a loop together behind the failed ones, in the order of the loops' first ones."""
-    places = [(result.loop, result.place) for result in ranked]
-
-    def key(i: int) -> tuple[int, int]:
-        verdict = ranked[i].verdict
-        first = next(j for j in range(i + 1) if ranked[j].verdict is verdict and places[j] == places[i])
-        return ORDER.index(verdict), i if verdict is Verdict.FAILED else first
-
-    return [ranked[i] for i in sorted(range(len(ranked)), key=key)]
+    return Table("Requirements", COLUMNS, rows, note, digits=DIGITS, terms=terms, brief=True)
 
 
 def _overview(
@@ -149,33 +145,27 @@ def _small_figures(sections: Sequence[Section]) -> Iterator[Plot]:
         yield from _small_figures(section.sections)
 
 
-def _relative(result: RequirementResult) -> float:
-    return math.inf if math.isnan(result.relative) else result.relative
+def with_words(case: Case, reviewed: Review) -> Review:
+    """Return a review whose results have their quantities, places and variants in words."""
+    return replace(reviewed, results=tuple(_with_words(case, result) for result in reviewed.results))
 
 
-def _row(case: Case, result: RequirementResult) -> tuple[Any, ...]:
+def _with_words(case: Case, result: RequirementResult) -> RequirementResult:
     variant = case.variants.get(result.variant)
-    touches, why = result.variant == CONTACT, explain(result)
-    said = Judged(str(result.verdict), result.verdict, why)
-    if result.verdict is not Verdict.UNDECIDED and (touches or not result.detail):  # a word, which stands in the row
-        said = Judged(str(said), result.verdict)
-    distance: Any = "–"
-    if result.number is not None and not math.isnan(result.distance):
-        number = result.number
-        distance = Number(result.distance, number.unit, number.tolerance, number.confirmed_by, findings=number.findings)
     place = case.loop_wires().get(result.loop, result.loop) or result.place
-    place = f"{place}, with {result.detail}" if touches and place and result.detail else place
+    place = f"{place}, with {result.detail}" if result.variant == CONTACT and place and result.detail else place
     others = {MEASURED: "measured", WORST_CASE: "worst case", CONTACT: "as it is"}
-    title = variant.title if variant else others.get(result.variant, "–")
-    return (
-        said,
-        words_of(result.quantity),
-        place or "whole diagram",
-        title,
-        result.required,
-        result.number if result.number is not None else "–",
-        distance,
-    )
+    title = variant.title if variant else others.get(result.variant, NOTHING)
+    return replace(result, words=words_of(result.quantity), where=place, title=title)
+
+
+def _row(result: RequirementResult) -> tuple[Any, ...]:
+    verdict, *others = row_of(result)
+    why = reason_in_table(result)
+    said = Judged(str(verdict), verdict, why)
+    if not why and (word := explain(result)):  # which stands in the row
+        said = Judged(f"{verdict}: {word}", verdict)
+    return (said, *others)
 
 
 def words_of(quantity: str) -> str:

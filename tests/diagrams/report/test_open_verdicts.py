@@ -8,8 +8,7 @@ from loopwright.blocks import Constant, Gain, Integrator, Saturation, StateSpace
 from loopwright.diagrams import Diagram, Requirements
 from loopwright.diagrams.cli.report import verdict_text
 from loopwright.diagrams.report.pages.tables import Numbered
-from loopwright.diagrams.report.sections.summary import by_loop
-from loopwright.diagrams.requirements import Limit, Reason, RequirementResult, Verdict
+from loopwright.diagrams.requirements import Limit, Reason, RequirementResult, Verdict, by_loop
 
 
 def spring(start=0.0):

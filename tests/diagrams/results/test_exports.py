@@ -49,7 +49,8 @@ def same(a, b):
     return a.shape == b.shape and bool(np.all((a.view("u8") == b.view("u8")) | (np.isnan(a) & np.isnan(b))))
 
 
-COLUMNS = ["both[1]", "both[2]", "v", "x", "η/ξ error"]
+COLUMNS = ["both[1]", "both[2]", "v", "x", "η/ξ error", *(f"plant.mass[{k}]" for k in range(1, 7))]
+"""All that was recorded: the named wires, and the port that no wire's name covers."""
 
 
 def check_columns(run, table):
@@ -59,6 +60,7 @@ def check_columns(run, table):
     assert same(table["both[1]"], run["plant.position"][:, 0])
     assert same(table["both[2]"], run["plant.position"][:, 1])
     assert same(table["η/ξ error"], run["box.e"])
+    assert same(table["plant.mass[4]"], run["plant.mass"][:, 1, 0])
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet", "mat"])
@@ -87,7 +89,14 @@ def test_pandas_has_the_times_as_index(run):
     assert same(frame.index, run.t)
     assert list(frame) == COLUMNS
     check_columns(run, frame)
-    assert frame.attrs["units"] == {"t": "s", "both[1]": "m", "both[2]": "rad", "v": "m/s2", "x": "m", "η/ξ error": ""}
+    assert frame.attrs["units"] == {
+        "t": "s",
+        "both[1]": "m",
+        "both[2]": "rad",
+        "v": "m/s2",
+        "x": "m",
+        "η/ξ error": "",
+    } | {f"plant.mass[{k}]": "kg" for k in range(1, 7)}
 
 
 def test_a_matrix_goes_out_row_by_row(run, tmp_path):
@@ -138,12 +147,14 @@ def test_parquet_is_read_by_pandas_and_says_the_units(run, tmp_path):
     check_columns(run, table)
     schema = pyarrow.parquet.read_schema(tmp_path / "run.parquet")
     units = {f.name: (f.metadata or {}).get(b"unit") for f in schema}
-    assert units == {"t": b"s", "both[1]": b"m", "both[2]": b"rad", "v": b"m/s2", "x": b"m", "η/ξ error": None}
+    assert units == {"t": b"s", "both[1]": b"m", "both[2]": b"rad", "v": b"m/s2", "x": b"m", "η/ξ error": None} | {
+        f"plant.mass[{k}]": b"kg" for k in range(1, 7)
+    }
     assert schema.metadata[b"diagram"] == b"crane"
 
 
 def test_parquet_is_written_in_groups_of_rows(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(_exports, "_GROUP", 8 * 6 * 63)
+    monkeypatch.setattr(_exports, "_GROUP", 8 * 12 * 63)
     run.to_parquet(tmp_path / "run.parquet")
     assert pyarrow.parquet.ParquetFile(tmp_path / "run.parquet").num_row_groups == 4
     check_columns(run, pandas.read_parquet(tmp_path / "run.parquet"))
@@ -208,7 +219,7 @@ def test_only_what_was_recorded_goes_out():
 @pytest.mark.parametrize("n", [0, 1])
 def test_a_run_of_no_sample_and_of_one_goes_out(n, tmp_path):
     run = make(n)
-    assert run.to_pandas().shape == (n, 5)
+    assert run.to_pandas().shape == (n, 11)
     assert run.to_xarray("mass")["mass"].shape == (n, 2, 3)
     run.to_csv(tmp_path / "run.csv")
     run.to_mat(tmp_path / "run.mat")
