@@ -86,7 +86,8 @@ def test_hidden_stable_modes_change_nothing(dt, poles, way):
     seen = control.ss(SEEN[dt])
     count = check(hide(seen, poles, way, rotated=True))
     assert count == nyquist_count(seen)
-    assert repr(count) == str(count) == repr(nyquist_count(seen))
+    assert repr(count) == repr(nyquist_count(seen))
+    assert "hidden_unstable" not in str(count)
     assert count.hidden_unstable == ()
 
 
@@ -114,10 +115,10 @@ def test_hidden_unstable_modes_are_told_by_their_poles():
     loop = hide(control.ss(SEEN[0]), [3.0], "not seen")
     count = nyquist_count(loop)
     assert repr(count).endswith(f"closed_loop=1, hidden_unstable={count.hidden_unstable!r})")
-    assert str(count) == f"{count!r}\nhidden_unstable       {told}"
+    assert str(count).splitlines()[-1] == f"  hidden_unstable  {told}"
     assert told in str(margins(loop))
     sampled = nyquist_count(hide(control.ss(SEEN[0.1]), [-1.1], "not seen"))
-    assert "hidden_unstable       -1.1: not in this loop" in str(sampled)
+    assert "hidden_unstable  -1.1: not in this loop" in str(sampled)
 
 
 @pytest.mark.parametrize("dt", [0, 0.1])
