@@ -127,9 +127,6 @@ class Diagram(ShownAsTable):
     def _sheet(self) -> Sheet:
         return sheet_of_structure(self.name, self.structure)
 
-    def _repr_html_(self) -> None:
-        """Return None: a notebook shows the drawing, ``print`` the table."""
-
     @property
     def name(self) -> str:
         """Its name."""

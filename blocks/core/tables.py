@@ -97,8 +97,9 @@ class ShownAsTable:
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        if "__repr__" in vars(cls):
-            setattr(cls, "__repr__", _safe(vars(cls)["__repr__"]))  # noqa: B010  mypy refuses to assign a method
+        for name in ("__repr__", "_repr_html_", "_repr_svg_"):
+            if name in vars(cls):
+                setattr(cls, name, _safe(vars(cls)[name]))
 
     def _sheet(self) -> Sheet:
         """Return the object as it is shown."""
@@ -118,15 +119,16 @@ class ShownAsTable:
             return None
 
 
-def _safe(short: Callable[[Any], str]) -> Callable[[Any], str]:
-    """Return a ``__repr__`` that doesn't raise."""
+def _safe(show: Callable[[Any], str]) -> Callable[[Any], str | None]:
+    """Return a method that shows an object and doesn't raise; None has a notebook take the short text."""
 
-    @wraps(short)
-    def shown(self: Any) -> str:
+    @wraps(show)
+    def shown(self: Any) -> str | None:
         try:
-            return short(self)
+            return show(self)
         except Exception as error:  # whatever the object lacks
-            return f"<{type(self).__name__} that can't be shown: {type(error).__name__}>"
+            short = f"<{type(self).__name__} that can't be shown: {type(error).__name__}>"
+            return short if show.__name__ == "__repr__" else None
 
     return shown
 
