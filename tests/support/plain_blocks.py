@@ -10,6 +10,7 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+from scipy.linalg import expm
 
 from loopwright import blocks as lw
 from loopwright.blocks import Block, Event, Input, State, parameter
@@ -117,6 +118,33 @@ def pulse_train(d):
     return train(d, d.uniform(-1, 1), d.uniform(-1, 1))
 
 
+@kind()
+def sawtooth(d):
+    period, delay, size = d.choose(7, 10, 23, 30) * HUNDREDTH, d.choose(0, 1, 5) * HUNDREDTH, d.uniform(-1, 1)
+    made = lw.Sawtooth(period=float(period), delay=float(delay), amplitude=size, bias=0.2, name=d.name)
+    edges = [delay + k * period for k in range(int((d.end - delay) / period) + 2)]
+
+    def out(t, x, k, u):
+        return 0.2 - size if k == 0 else 0.2 + size * (2 * (t - float(edges[k - 1])) / float(period) - 1)
+
+    return made, Part(d.name, out, breaks=tuple(edges))
+
+
+@kind()
+def triangle(d):
+    period, rise, size = d.choose(7, 10, 23, 30) * HUNDREDTH, d.choose(1, 2, 3) * Fraction(1, 4), d.uniform(-1, 1)
+    made = lw.Triangle(period=float(period), rise=float(rise), amplitude=size, name=d.name)
+    corners = [k * period + more for k in range(int(d.end / period) + 2) for more in (0, rise * period)]
+
+    def out(t, x, k, u):
+        if k == 0:
+            return -size
+        since = (t - float(corners[k - 1])) / float(period)
+        return size * (2 * since / float(rise) - 1 if k % 2 else 1 - 2 * since / float(1 - rise))
+
+    return made, Part(d.name, out, breaks=tuple(corners))
+
+
 @kind(makes="logic")
 def logic_train(d):
     return train(d, 0.0, 1.0)
@@ -147,6 +175,31 @@ def difference(d):
 @kind("real real")
 def product(d):
     return lw.Product(name=d.name), Part(d.name, lambda t, x, z, u: u[0] * u[1])
+
+
+class Stacked:
+    """A stack, and a block of the vector that it makes, as one block with the second one's name."""
+
+    def __init__(self, stack, inner):
+        self.stack, self.inner, self.y = stack, inner, inner.y
+
+    def __call__(self, *signals):
+        return self.inner(self.stack(*signals))
+
+
+@kind("real real real")
+def stack(d):
+    row = [d.uniform(-0.5, 0.5) for _ in range(3)]
+    inner = lw.Function(lambda v: np.dot(np.array(row), v), arguments=("v",), name=d.name)
+    made = Stacked(lw.Stack(count=3, name=f"{d.name}_vector"), inner)
+    return made, Part(d.name, lambda t, x, z, u: row[0] * u[0] + row[1] * u[1] + row[2] * u[2])
+
+
+@kind("real")
+def magnitude(d):
+    return lw.Function(np.absolute, name=d.name), Part(
+        d.name, lambda t, x, z, u: abs(u[0]), kinks=lambda t, x, z, u: (u[0],)
+    )
 
 
 @kind("real")
@@ -211,6 +264,50 @@ def lag(d):
         z=(0.0,),
         update=lambda t, x, z, u: (decay * z[0] + (1 - decay) * k * u[0],),
         direct=False,
+    )
+
+
+@kind("real")
+def pt2(d):
+    k, tau, damping, start = d.uniform(-1, 1), d.uniform(0.1, 0.5), d.uniform(0.1, 1.5), d.uniform(-1, 1)
+    made = lw.PT2(gain=k, time_constant=tau, damping_ratio=damping, initial_value=start, name=d.name)
+    A, b = np.array([[0.0, 1.0], [-1 / tau**2, -2 * damping / tau]]), np.array([0.0, k / tau**2])
+    if d.T is None:
+        return made, Part(
+            d.name,
+            lambda t, x, z, u: x[0],
+            x=(start, 0.0),
+            rate=lambda t, x, z, u: tuple(A @ np.array(x) + b * u[0]),
+            direct=False,
+        )
+    over = expm(A * d.T)
+    held = np.linalg.solve(A, (over - np.eye(2)) @ b)
+    return made, Part(
+        d.name,
+        lambda t, x, z, u: z[0],
+        z=(start, 0.0),
+        update=lambda t, x, z, u: tuple(over @ np.array(z) + held * u[0]),
+        direct=False,
+    )
+
+
+@kind("real")
+def lead_lag(d):
+    k, ahead, tau = d.uniform(-1, 1), d.uniform(0, 0.5), d.uniform(0.1, 0.5)
+    made = lw.LeadLag(gain=k, lead_time=ahead, lag_time=tau, name=d.name)
+    if d.T is None:
+        return made, Part(
+            d.name,
+            lambda t, x, z, u: k * (x[0] + ahead / tau * (u[0] - x[0])),
+            x=(0.0,),
+            rate=lambda t, x, z, u: (u[0] - x[0]) / tau,
+        )
+    decay = np.exp(-d.T / tau)
+    return made, Part(
+        d.name,
+        lambda t, x, z, u: k * (z[0] + ahead / tau * (u[0] - z[0])),
+        z=(0.0,),
+        update=lambda t, x, z, u: (decay * z[0] + (1 - decay) * u[0],),
     )
 
 
