@@ -47,6 +47,7 @@ RESULTS = {
     "ApproximateDelay",
     "Array",
     "BlockReport",
+    "Bus",
     "Call",
     "Channel",
     "CoarseValues",

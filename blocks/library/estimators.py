@@ -6,7 +6,7 @@ Digital Control of Dynamic Systems, 3rd edition, 8.2 (prediction and current est
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import Any, ClassVar, Self
 
@@ -21,6 +21,7 @@ from ..core import (
     ParameterError,
     ShapeError,
     State,
+    accepts,
     kinds,
     parameter,
     shape_of,
@@ -31,9 +32,41 @@ from .python_control import FixedSampleTime
 _GAIN = Kind("a number, a list of numbers or a matrix", lambda value: np.ndim(value) <= 2 and np.size(value) > 0)
 
 
+_MODEL = Kind(
+    "a state space: control.StateSpace, StateSpace or DiscreteStateSpace",
+    lambda value: (
+        isinstance(value, StateSpace | DiscreteStateSpace) or all(hasattr(value, n) for n in ("A", "nstates"))
+    ),
+    "Convert a transfer function by control.ss(system).",
+)
+
+
 def as_control(model: Any) -> Any:
     """Return a model as python-control has it."""
     return model.to_control() if isinstance(model, StateSpace | DiscreteStateSpace) else model
+
+
+def _design(cls: type[Block], name: str, compute: Callable[[], Any]) -> np.ndarray:
+    """Return the gain that a function of python-control finds.
+
+    Raises
+    ------
+    ParameterError
+        If it finds none, with its reason.
+    """
+    try:
+        gain = np.asarray(compute(), dtype=float)
+        if np.all(np.isfinite(gain)):
+            return gain
+        reason = "the gain is not finite"
+    except (ValueError, TypeError, ArithmeticError, np.linalg.LinAlgError) as error:
+        reason = str(error).rstrip(".")
+    raise ParameterError(
+        f"{name} finds no gain: {reason}. Check the sizes of the arguments, and that the model can be controlled, or "
+        "observed, where it is unstable.",
+        block=cls.__name__,
+        port="gain",
+    ) from None
 
 
 class StateFeedback(Block):
@@ -57,6 +90,7 @@ class StateFeedback(Block):
     y = Output(shape=None, description="input of the plant")
 
     @classmethod
+    @accepts("{cls.__name__}", ParameterError, system=_MODEL, Q=kinds.matrix, R=kinds.matrix)
     def from_lqr(cls, system: Any, Q: Any, R: Any, *, name: str | None = None) -> Self:
         """Return the linear-quadratic regulator, by `control.lqr`, or `control.dlqr` of a discrete system.
 
@@ -70,14 +104,20 @@ class StateFeedback(Block):
             Weights of the state, n × n, and of the input, m × m or a number.
         name : str, optional
             Name of the block.
+
+        Raises
+        ------
+        ParameterError
+            For arguments of another kind, and where python-control finds no gain; the message has its reason.
         """
         import control
 
         plant = as_control(system)
         solve = control.dlqr if plant.isdtime(strict=True) else control.lqr
-        return cls(np.asarray(solve(plant, np.atleast_2d(Q), np.atleast_2d(R))[0]), name=name)
+        return cls(_design(cls, solve.__name__, lambda: solve(plant, np.atleast_2d(Q), np.atleast_2d(R))[0]), name=name)
 
     @classmethod
+    @accepts("{cls.__name__}", ParameterError, system=_MODEL, poles=kinds.roots)
     def from_poles(cls, system: Any, poles: Any, *, name: str | None = None) -> Self:
         """Return the gain that places the poles of A − B K, by `control.place`.
 
@@ -89,11 +129,16 @@ class StateFeedback(Block):
             Poles of the closed loop, of z for a discrete system. At most as many are equal as there are inputs.
         name : str, optional
             Name of the block.
+
+        Raises
+        ------
+        ParameterError
+            For arguments of another kind, and where python-control finds no gain; the message has its reason.
         """
         import control
 
         plant = as_control(system)
-        return cls(np.asarray(control.place(plant.A, plant.B, poles)), name=name)
+        return cls(_design(cls, "place", lambda: control.place(plant.A, plant.B, poles)), name=name)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the input of the plant."""
@@ -125,7 +170,7 @@ class _Observer(Block):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         cls, given = type(self), [*args]
         found = given[0] if given else kwargs.get("model")
-        if found is not None and not isinstance(found, cls._linear):
+        if (given or "model" in kwargs) and not isinstance(found, cls._linear):
             made = cls._linear.from_control(found)
             given, kwargs = ([made, *given[1:]], kwargs) if given else (given, {**kwargs, "model": made})
         super().__init__(*given, **kwargs)
@@ -194,6 +239,7 @@ class Observer(_Observer):
     innovation = Output(shape=None, secondary=True, description="measured less expected output, y − C x̂ − D u")
 
     @classmethod
+    @accepts("{cls.__name__}", ParameterError, system=_MODEL, QN=kinds.matrix, RN=kinds.matrix, G=kinds.matrix)
     def from_lqe(cls, system: Any, QN: Any, RN: Any, *, G: Any = None, **parameters: Any) -> Self:
         """Return the stationary Kalman-Bucy filter, with the gain of `control.lqe`.
 
@@ -209,14 +255,21 @@ class Observer(_Observer):
             Matrix by which w enters, n × q; without it, there is one w for each state.
         **parameters
             Further ones of the block, such as ``initial_state`` and ``name``.
+
+        Raises
+        ------
+        ParameterError
+            For arguments of another kind, and where python-control finds no gain; the message has its reason.
         """
         import control
 
         plant = as_control(system)
-        gain = control.lqe(plant.A, _noise(plant, G), plant.C, np.atleast_2d(QN), np.atleast_2d(RN))[0]
-        return cls(system, np.asarray(gain), **parameters)
+        noise = np.atleast_2d(QN), np.atleast_2d(RN)
+        gain = _design(cls, "lqe", lambda: control.lqe(plant.A, _noise(plant, G), plant.C, *noise)[0])
+        return cls(system, gain, **parameters)
 
     @classmethod
+    @accepts("{cls.__name__}", ParameterError, system=_MODEL, poles=kinds.roots)
     def from_poles(cls, system: Any, poles: Any, **parameters: Any) -> Self:
         """Return the observer whose error has these poles, those of A − L C, by `control.place`.
 
@@ -228,11 +281,17 @@ class Observer(_Observer):
             Poles of s. At most as many are equal as there are outputs.
         **parameters
             Further ones of the block, such as ``initial_state`` and ``name``.
+
+        Raises
+        ------
+        ParameterError
+            For arguments of another kind, and where python-control finds no gain; the message has its reason.
         """
         import control
 
         plant = as_control(system)
-        return cls(system, np.asarray(control.place(plant.A.T, plant.C.T, poles)).T, **parameters)
+        gain = _design(cls, "place", lambda: control.place(plant.A.T, plant.C.T, poles)).T
+        return cls(system, gain, **parameters)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the innovation."""
@@ -275,6 +334,7 @@ class DiscreteObserver(FixedSampleTime, _Observer):
         return dt
 
     @classmethod
+    @accepts("{cls.__name__}", ParameterError, system=_MODEL, QN=kinds.matrix, RN=kinds.matrix, G=kinds.matrix)
     def from_lqe(
         cls,
         system: Any,
@@ -302,15 +362,21 @@ class DiscreteObserver(FixedSampleTime, _Observer):
             Form of the observer.
         **parameters
             Further ones of the block, such as ``initial_state`` and ``name``.
+
+        Raises
+        ------
+        ParameterError
+            For arguments of another kind, and where python-control finds no gain; the message has its reason.
         """
         import control
 
         plant, R = as_control(system), np.atleast_2d(np.asarray(RN, dtype=float))
-        P = np.asarray(control.dlqe(plant.A, _noise(plant, G), plant.C, np.atleast_2d(QN), R)[1])
+        P = _design(cls, "dlqe", lambda: control.dlqe(plant.A, _noise(plant, G), plant.C, np.atleast_2d(QN), R)[1])
         gain = np.linalg.solve(plant.C @ P @ plant.C.T + R, plant.C @ P).T
         return cls(system, gain if form == "current" else plant.A @ gain, form=form, **parameters)
 
     @classmethod
+    @accepts("{cls.__name__}", ParameterError, system=_MODEL, poles=kinds.roots)
     def from_poles(cls, system: Any, poles: Any, *, form: str = "predictor", **parameters: Any) -> Self:
         """Return the observer whose error has these poles, by `control.place`.
 
@@ -326,12 +392,18 @@ class DiscreteObserver(FixedSampleTime, _Observer):
             Form of the observer.
         **parameters
             Further ones of the block, such as ``initial_state`` and ``name``.
+
+        Raises
+        ------
+        ParameterError
+            For arguments of another kind, and where python-control finds no gain; the message has its reason.
         """
         import control
 
         plant = as_control(system)
         C = plant.C @ plant.A if form == "current" else plant.C
-        return cls(system, np.asarray(control.place(plant.A.T, C.T, poles)).T, form=form, **parameters)
+        gain = _design(cls, "place", lambda: control.place(plant.A.T, C.T, poles)).T
+        return cls(system, gain, form=form, **parameters)
 
     def output(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
         """Return the estimate and the innovation."""

@@ -27,6 +27,7 @@ from ..core import (
     ParameterError,
     Source,
     UnknownNameError,
+    accepts,
     explain_disk_errors,
     kinds,
     move_earlier,
@@ -305,6 +306,9 @@ class PiecewiseLinear(_Table):
         return self.times[np.any(changes > 1e-12 * np.max(np.abs(slopes), initial=0.0), axis=1)]
 
 
+_FRAME = Kind("a pandas DataFrame or Series", lambda value: all(hasattr(value, name) for name in ("index", "to_numpy")))
+
+
 class Recorded(_Table):
     """Recorded data: y is interpolated between the samples; beyond them the first and the last value are held.
 
@@ -323,6 +327,7 @@ class Recorded(_Table):
     )
 
     @classmethod
+    @accepts("{cls.__name__}", path=kinds.path, columns=kinds.names, time=kinds.text)
     def from_csv(
         cls, path: str | PathLike[str], columns: str | Sequence[str] = "", *, time: str = "", **parameters: Any
     ) -> Self:
@@ -374,6 +379,7 @@ class Recorded(_Table):
         return cls._from_columns(table, columns, time or names[0], parameters)
 
     @classmethod
+    @accepts("{cls.__name__}", frame=_FRAME, columns=kinds.names, time=kinds.text)
     def from_pandas(cls, frame: Any, columns: str | Sequence[str] = "", *, time: str = "", **parameters: Any) -> Self:
         """Return the source that plays columns of a pandas DataFrame, or a Series.
 

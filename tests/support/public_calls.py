@@ -291,6 +291,10 @@ def calls():
             diagrams.subsystem,
             {"sample_time": 0.1, "method": "exact", "name": "s", "offset": 0.0, "delay": 0},
         ),
+        "first_order_hold": lambda: (
+            diagrams.first_order_hold,
+            {"u": Gain(gain=1.0)(1.0), "sample_time": 0.1, "offset": 0.0, "name": "s"},
+        ),
         "check_block": lambda: (
             diagrams.check_block,
             {

@@ -94,6 +94,7 @@ def test_other_separators_and_rows_at_one_time(tmp_path):
         ("t,speed\n0,1,5\n", {"name": "a"}, ParameterError, r"a\.values: found the row 2 of"),
         (None, {}, OptionError, r"can't be read"),
         ("", {}, OptionError, r"is empty"),
+        ("t,a\n0,1\n", {"columns": 3}, OptionError, r"Recorded\.columns: found 3; expected a name, or a list of names"),
     ],
 )
 def test_files_that_do_not_fit_are_named(tmp_path, text, options, error, said):
@@ -106,6 +107,8 @@ def test_files_that_do_not_fit_are_named(tmp_path, text, options, error, said):
 def test_a_frame_with_words_is_refused():
     with pytest.raises(ParameterError, match=r"found columns index, speed with other values than numbers"):
         Recorded.from_pandas(pd.DataFrame({"speed": ["a", "b"]}))
+    with pytest.raises(OptionError, match=r"Recorded\.frame: found 'data\.csv'; expected a pandas DataFrame or Series"):
+        Recorded.from_pandas("data.csv")
 
 
 # --- delays that vary ----------------------------------------------------------------------------------------------------
