@@ -8,6 +8,7 @@ from .delay_matrices import NEUTRAL, DelayMatrices, find_pade_limit, replace_del
 from .delayed_hold import delayed_hold, delayed_hold_margin
 from .delayed_realization import DelayedRealization, realize
 from .disk_margins import DiskMargin, disk_margin, loop_at, mimo_disk_margin
+from .loop_drawing import DrawnLoop, draw_bode_axes, draw_nyquist_axes, in_decibels, phase_of
 from .loop_margins import GainCrossover, Margins, PhaseCrossover, find_disk_frequency, margins, scan_margins
 from .margin_analysis import MARGIN_UNITS
 from .margin_slopes import MarginSlope, margin_slopes
@@ -61,6 +62,7 @@ __all__ = [
     "DelayMatrices",
     "DelayedRealization",
     "DiskMargin",
+    "DrawnLoop",
     "FourMatrices",
     "GainCrossover",
     "GangOfFour",
@@ -83,12 +85,15 @@ __all__ = [
     "delayed_loop_class",
     "delayed_system_class",
     "disk_margin",
+    "draw_bode_axes",
+    "draw_nyquist_axes",
     "find_disk_frequency",
     "find_hidden_unstable",
     "find_pade_limit",
     "first_largest",
     "gang_of_four",
     "hold_inputs",
+    "in_decibels",
     "loop_at",
     "loop_class",
     "margin_slopes",
@@ -100,6 +105,7 @@ __all__ = [
     "nyquist_count",
     "order_key",
     "periodic_margins",
+    "phase_of",
     "place",
     "read_frequency_data",
     "read_matrices",

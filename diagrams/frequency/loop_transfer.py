@@ -9,10 +9,22 @@ import numpy as np
 from control import StateSpace, feedback
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError, accepts, brief, count_of, explain_calls, kinds, shorten, with_unit
-from ..plotting import COLORS, DARK, GREY, LINES, STONE, legend_above, shown_figure
+from ...blocks.core import (
+    LoopwrightError,
+    OptionError,
+    accepts,
+    brief,
+    count_of,
+    explain_calls,
+    kinds,
+    shorten,
+    with_unit,
+)
+from ..plotting import COLORS, GREY, LINES, AxisUnits, legend_above, shown_figure
 from .delayed_realization import DelayedRealization, realize
 from .delayed_system import DelayedSystem
+from .loop_drawing import DrawnLoop, describe_margins, draw_bode_axes, draw_nichols_axes, draw_nyquist_axes
+from .loop_margins import Margins, margins
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,7 +59,7 @@ class LoopPlots:
     def _repr_html_(self) -> None:
         """Return None: a notebook shows the short text; python-control's matrices grow with the states."""
 
-    @accepts(omega=kinds.frequencies, labels=kinds.names, db=kinds.flag, hz=kinds.flag)
+    @accepts(omega=kinds.frequencies, labels=kinds.names, db=kinds.flag, hz=kinds.flag, margins=kinds.flag)
     def bode(
         self,
         *others: Any,
@@ -55,6 +67,7 @@ class LoopPlots:
         labels: Sequence[str] | None = None,
         db: bool = True,
         hz: bool = False,
+        margins: bool = True,
     ) -> Figure:
         """Return the gain and the phase over frequency.
 
@@ -71,6 +84,9 @@ class LoopPlots:
             Whether the gain is in decibels.
         hz : bool
             Whether the frequency axis is in Hz.
+        margins : bool
+            Whether the margins of each loop are marked: the phase margin at each |L| = 1 (○), the gain margin at each
+            crossing of −180° (□). The phase is drawn on the branch on which the phase margin can be read from −180°.
 
         Raises
         ------
@@ -78,23 +94,37 @@ class LoopPlots:
             If a loop has several inputs or outputs, or the labels or frequencies don't fit.
         """
         loops = (self, *others)
-        return _plot_bode(loops, _name_loops(loops, labels), omega, db=db, hz=hz)
+        drawn = drawn_loops(loops, _name_loops(loops, labels), omega, marked=margins)
+        return _plot_bode(loops, drawn, omega, AxisUnits(decibels=db, hertz=hz))
 
-    @accepts(omega=kinds.frequencies, labels=kinds.names)
-    def nyquist(self, *others: Any, omega: ArrayLike | None = None, labels: Sequence[str] | None = None) -> Figure:
+    @accepts(omega=kinds.frequencies, labels=kinds.names, margins=kinds.flag)
+    def nyquist(
+        self,
+        *others: Any,
+        omega: ArrayLike | None = None,
+        labels: Sequence[str] | None = None,
+        margins: bool = True,
+    ) -> Figure:
         """Return the locus of L around −1, with all its crossings of the real axis up to 8 from the origin in view.
 
-        The arrow points to rising frequencies, the thin line is that of negative ones, and the circle is |L| = 1. See
-        `bode` for the parameters.
+        Arrows point to rising frequencies, the thin line is that of negative ones, and the circle is |L| = 1. The marks
+        are the points with |L| = 1 (○), the crossings of the negative real axis (□), and the largest circle around −1
+        that L keeps out of (dotted). See `bode` for the parameters.
         """
         loops = (self, *others)
-        return _plot_nyquist(loops, _name_loops(loops, labels), omega)
+        return _plot_nyquist(loops, drawn_loops(loops, _name_loops(loops, labels), omega, marked=margins), omega)
 
-    @accepts(omega=kinds.frequencies, labels=kinds.names)
-    def nichols(self, *others: Any, omega: ArrayLike | None = None, labels: Sequence[str] | None = None) -> Figure:
+    @accepts(omega=kinds.frequencies, labels=kinds.names, margins=kinds.flag)
+    def nichols(
+        self,
+        *others: Any,
+        omega: ArrayLike | None = None,
+        labels: Sequence[str] | None = None,
+        margins: bool = True,
+    ) -> Figure:
         """Return gain over phase, with contours of |T| in dB. See `bode` for the parameters."""
         loops = (self, *others)
-        return _plot_nichols(loops, _name_loops(loops, labels), omega)
+        return _plot_nichols(loops, drawn_loops(loops, _name_loops(loops, labels), omega, marked=margins), omega)
 
     @accepts(t=kinds.numbers, labels=kinds.names)
     def step(self, *others: Any, t: float | None = None, labels: Sequence[str] | None = None) -> Figure:
@@ -386,100 +416,81 @@ def _style_of(i: int, loop: Any) -> dict[str, Any]:
     return {"color": color, "linestyle": LINES[(i // len(COLORS) + i) % len(LINES)]}
 
 
-def _phase(values: np.ndarray) -> np.ndarray:
-    """Return the phase in degrees without jumps; at the lowest frequency it lies in (−270°, 90°]."""
-    phase = np.degrees(np.unwrap(np.angle(values)))
-    return np.asarray(phase - 360.0 * np.ceil((phase[0] - 90.0) / 360.0))
-
-
 def _legend(figure: Figure, axes: Axes) -> None:
     legend_above(figure, axes)
     figure.align_ylabels()
 
 
-def _plot_bode(loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | None, *, db: bool, hz: bool) -> Figure:
+def drawn_loops(
+    loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | None, *, marked: bool
+) -> list[DrawnLoop]:
+    """Return loops as they are drawn."""
+    return [
+        DrawnLoop(
+            name,
+            w,
+            _response(loop, w),
+            _style_of(i, loop),
+            _margins(loop) if marked else None,
+            0.0 if _is_measured(loop) else float(loop.dt or 0.0),
+            _is_measured(loop),
+        )
+        for i, (loop, name, w) in enumerate(zip(loops, names, _span(loops, omega), strict=True))
+    ]
+
+
+def _margins(loop: Any) -> Margins | None:
+    """Return the margins of a loop; None of data, and where they can't be confirmed."""
+    if _is_measured(loop):
+        return None
+    try:
+        return margins(loop)
+    except LoopwrightError:  # a figure is drawn all the same: margins(loop) says why
+        return None
+
+
+def _write_title(axes: Axes, drawn: Sequence[DrawnLoop], loops: Sequence[Any], omega: ArrayLike | None) -> None:
+    """Write the margins of a single loop above the axes, and where sampled loops end."""
+    if len(drawn) == 1 and (text := describe_margins(drawn[0].margins)):
+        axes.set_title(text, loc="right", fontsize="small")
+    _write_ends(axes, loops, [one.title for one in drawn], omega)
+
+
+def _plot_bode(loops: Sequence[Any], drawn: Sequence[DrawnLoop], omega: ArrayLike | None, units: AxisUnits) -> Figure:
     """Return the gain and the phase over frequency; see `LoopTransfer.bode`."""
-    unit = 2.0 * np.pi if hz else 1.0
     with shown_figure(4.4) as figure:
         gain, phase = figure.subplots(2, 1, sharex=True)
-        for i, (loop, w) in enumerate(zip(loops, _span(loops, omega), strict=True)):
-            values = _response(loop, w)
-            size = np.abs(values)
-            gain.plot(w / unit, 20.0 * np.log10(size) if db else size, label=names[i], **_style_of(i, loop))
-            phase.plot(w / unit, _phase(values), **_style_of(i, loop))
-        gain.set_xscale("log")
-        if not db:
-            gain.set_yscale("log")
-        gain.axhline(0.0 if db else 1.0, color=GREY, linewidth=0.8, zorder=0)
-        phase.axhline(-180.0, color=GREY, linewidth=0.8, zorder=0)
-        low, high = phase.get_ylim()
-        step = 45.0 if high - low < 400.0 else 90.0 if high - low < 900.0 else 360.0
-        phase.set_yticks(np.arange(np.ceil(low / step) * step, high + 1e-9, step))
-        gain.set_ylabel(with_unit("|L|", "dB" if db else "1"))
-        phase.set_ylabel(with_unit("phase of L", "deg"))
-        phase.set_xlabel(with_unit("frequency", "Hz") if hz else with_unit("ω", "rad/s"))
-        _write_ends(gain, loops, names, omega)
+        draw_bode_axes(gain, phase, drawn, units)
+        _write_title(gain, drawn, loops, omega)
         _legend(figure, gain)
     return figure
 
 
-def _plot_nyquist(loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | None) -> Figure:
+def _plot_nyquist(loops: Sequence[Any], drawn: Sequence[DrawnLoop], omega: ArrayLike | None) -> Figure:
     """Return the loci of the loops around −1; see `LoopTransfer.nyquist`."""
     reach = 1.6
+    for one in drawn:
+        crossed = np.flatnonzero((one.values.imag[1:] > 0) != (one.values.imag[:-1] > 0))
+        left = -one.values.real[crossed]
+        reach = max(reach, 1.2 * float(np.max(left[left < FAR], initial=0.0)))
     with shown_figure(5.0) as figure:
         axes = figure.subplots()
-        axes.plot(np.cos(turn := np.linspace(0, 2 * np.pi, 200)), np.sin(turn), color=GREY, linewidth=0.8, zorder=0)
-        for i, (loop, w) in enumerate(zip(loops, _span(loops, omega), strict=True)):
-            values = _response(loop, w)
-            look = _style_of(i, loop)
-            axes.plot(values.real, values.imag, label=names[i], **look)
-            crossed = np.flatnonzero((values.imag[1:] > 0) != (values.imag[:-1] > 0))
-            left = -values.real[crossed]
-            reach = max(reach, 1.2 * float(np.max(left[left < FAR], initial=0.0)))
-            if _is_measured(loop):
-                continue
-            axes.plot(values.real, -values.imag, color=look["color"], linewidth=0.6, alpha=0.6)
-            near = np.flatnonzero(np.abs(values) < 0.8 * max(reach, 1.6))
-            if near.size and near[0] + 1 < len(values):
-                k = min(int(near[0]) + 1, len(values) - 2)
-                axes.annotate(
-                    "",
-                    xy=(values[k + 1].real, values[k + 1].imag),
-                    xytext=(values[k].real, values[k].imag),
-                    arrowprops={"arrowstyle": "-|>", "color": look["color"], "mutation_scale": 12},
-                )
-        axes.plot([-1.0], [0.0], marker="+", color=DARK, markersize=9, linestyle="none")
+        draw_nyquist_axes(axes, drawn)
         axes.annotate("−1", (-1.0, 0.0), (-6, 5), textcoords="offset points", ha="right", fontsize=7)
         axes.axhline(0.0, color=GREY, linewidth=0.6, zorder=0)
         axes.axvline(0.0, color=GREY, linewidth=0.6, zorder=0)
-        axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="Re L", ylabel="Im L")
-        _write_ends(axes, loops, names, omega)
+        axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
+        _write_title(axes, drawn, loops, omega)
         _legend(figure, axes)
     return figure
 
 
-def _plot_nichols(loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | None) -> Figure:
+def _plot_nichols(loops: Sequence[Any], drawn: Sequence[DrawnLoop], omega: ArrayLike | None) -> Figure:
     """Return gain over phase, with contours of |T|; see `LoopTransfer.nichols`."""
     with shown_figure(4.6) as figure:
         axes = figure.subplots()
-        for i, (loop, w) in enumerate(zip(loops, _span(loops, omega), strict=True)):
-            values = _response(loop, w)
-            axes.plot(_phase(values), 20.0 * np.log10(np.abs(values)), label=names[i], **_style_of(i, loop))
-        left, right = axes.get_xlim()
-        left, right = min(left, -225.0), max(right, -90.0)
-        low, high = max(axes.get_ylim()[0], -40.0), min(axes.get_ylim()[1], 40.0)
-        low, high = min(low, -20.0), max(high, 20.0)
-        phase, gain = np.meshgrid(np.linspace(left, right, 400), np.linspace(low, high, 300))
-        value = 10.0 ** (gain / 20.0) * np.exp(1j * np.radians(phase))
-        with np.errstate(divide="ignore"):
-            closed = 20.0 * np.log10(np.abs(value / (1.0 + value)))
-        lines = axes.contour(phase, gain, closed, levels=[-12, -6, -3, 0, 3, 6, 12], colors=STONE, linewidths=0.5)
-        axes.clabel(lines, fmt=lambda value: f"{value:g} dB".replace("-", "−"), fontsize=6)
-        axes.plot([-180.0], [0.0], marker="+", color=DARK, markersize=9, linestyle="none")
-        axes.set(
-            xlim=(left, right), ylim=(low, high), xlabel=with_unit("phase of L", "deg"), ylabel=with_unit("|L|", "dB")
-        )
-        _write_ends(axes, loops, names, omega)
+        draw_nichols_axes(axes, drawn)
+        _write_title(axes, drawn, loops, omega)
         _legend(figure, axes)
     return figure
 

@@ -1,6 +1,6 @@
 """Figures: their style, axes, layout, and whether pyplot has them."""
 
-from .axes import AxisUnits, set_frequencies, set_magnitudes, set_powers
+from .axes import AxisUnits, set_degrees, set_frequencies, set_magnitudes, set_powers
 from .figures import new_figure, save, shown_figure
 from .layout import lay_out
 from .style import (
@@ -40,6 +40,7 @@ __all__ = [
     "marker_of",
     "new_figure",
     "save",
+    "set_degrees",
     "set_frequencies",
     "set_magnitudes",
     "set_powers",

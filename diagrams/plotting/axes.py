@@ -1,4 +1,4 @@
-"""Axes of a report's figures: their units, and ticks that don't overlap."""
+"""Axes of figures: their units, and ticks that don't overlap."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
 
+FINEST = 5
+"""Smallest step in degrees between the ticks of a phase."""
 DECADES = 2.0
 """Decades from which on the ticks of a logarithmic axis are powers of ten."""
 
@@ -86,6 +88,18 @@ def _label(value: float, position: int | None = None) -> str:
     power = math.floor(math.log10(value) + 1e-9)
     factor = value / 10.0**power
     return ("" if abs(factor - 1) < 1e-6 else f"{factor:.6g}·") + "10" + str(power).translate(_RAISED)
+
+
+def set_degrees(ax: Axes, *, few: bool) -> None:
+    """Set ticks of a phase at multiples of 45° or 90°; at few of them in a small figure."""
+    from matplotlib.ticker import MultipleLocator
+
+    low, high = ax.get_ylim()
+    steps = {200: 90, 600: 180} if few else {300: 45, 600: 90, 1400: 180}
+    step = next((step for span, step in steps.items() if high - low < span), 360)
+    while step > FINEST and np.floor(high / step) - np.ceil(low / step) < 1:  # a scale has two labels
+        step = next(finer for finer in (90, 45, 15, FINEST) if finer < step)
+    ax.yaxis.set_major_locator(MultipleLocator(step, 180 if step == 360 else 0))  # −180° has a tick
 
 
 def set_frequencies(ax: Axes, most: int = 5) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ....blocks.core import with_unit
+from ...frequency import DrawnLoop, phase_of
 from ...plotting import BLUE, VERMILION, AxisUnits, legend_above, new_figure, set_frequencies, set_magnitudes, style
 from ..pages import Plot, Texts
 
@@ -62,7 +63,7 @@ def _draw_measured(
     size = np.abs(curve.points)
     if len(curve.w):
         left.semilogx(x, axes.magnitude(np.abs(curve.model)), label=curve.title, **look)
-        phase = np.degrees(np.unwrap(np.angle(curve.model)))
+        phase = phase_of(DrawnLoop(curve.title, curve.w, curve.model, look))
         right.semilogx(x, phase, **look)
     given = np.degrees(np.unwrap(np.angle(curve.points)))
     near = np.interp(curve.omega, curve.w, phase) if len(curve.w) else given

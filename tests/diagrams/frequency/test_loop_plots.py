@@ -4,8 +4,10 @@ import control
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, Gain, Integrator, OptionError, TransferFunction
+from loopwright.blocks import Constant, Gain, Integrator, OptionError, TransferFunction, TransportDelay
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams.frequency.loop_drawing import phase_of
+from loopwright.diagrams.frequency.loop_transfer import drawn_loops
 
 KP, KI, TAU = 5.0, 4.0, 0.05
 
@@ -37,8 +39,23 @@ def exact(w):
     return (KP * s + KI) / s, 1 / (s * (TAU * s + 1))
 
 
+def data(line):
+    return tuple(np.asarray(part, dtype=float) for part in line.get_data())
+
+
 def curve(axes, i=0):
-    return tuple(np.asarray(part, dtype=float) for part in axes.lines[i].get_data())
+    """Return the curve of a loop, which has a name; marks have none."""
+    return data([line for line in axes.lines if not line.get_label().startswith("_")][i])
+
+
+def marks(axes, marker):
+    """Return the points of the marks of a kind."""
+    return [tuple(np.ravel(data(line))) for line in axes.lines if line.get_marker() == marker]
+
+
+def thick(axes):
+    """Return the margins that are drawn as thick lines: their ends."""
+    return [data(line) for line in axes.lines if line.get_linewidth() == 2.0]
 
 
 def test_a_loop_is_a_state_space_of_python_control(loop):
@@ -77,7 +94,7 @@ def test_nyquist_is_the_closed_form_with_its_mirror_and_crossings_in_view(loop):
     figure = loop.nyquist(omega=np.geomspace(0.5, 50.0, 40))
     C, P = exact(np.geomspace(0.5, 50.0, 40))
     axes = figure.axes[0]
-    drawn = {tuple(np.round(curve(axes, i)[1][:3], 9)) for i in range(len(axes.lines))}
+    drawn = {tuple(np.round(data(line)[1][:3], 9)) for line in axes.lines}
     assert tuple(np.round((C * P).imag[:3], 9)) in drawn
     assert tuple(np.round(-(C * P).imag[:3], 9)) in drawn
     far = control.tf([20.0], [1.0, 3.0, 3.0, 1.0])  # crosses at −20/8
@@ -90,6 +107,77 @@ def test_nichols_is_gain_over_phase(loop):
     C, P = exact(w)
     assert np.allclose(gain, 20 * np.log10(np.abs(C * P)), atol=1e-9)
     assert np.allclose(phase, np.degrees(np.unwrap(np.angle(C * P))), atol=1e-9)
+
+
+DELAY, T = 0.3, 0.1
+s_, atan = control.tf("s"), lambda x: np.degrees(np.arctan(x))
+BRANCHES = {
+    "stable": (2 / (s_ * (s_ + 1)), lambda w: -90 - atan(w)),
+    "unstable": (3 / (s_ - 1), lambda w: -180 + atan(w)),
+    "unstable with an integrator and a lead": (
+        8 * (s_ + 1) / ((0.02 * s_ + 1) * s_ * (s_ - 1)),
+        lambda w: -270 + 2 * atan(w) - atan(0.02 * w),
+    ),
+    "two integrators": ((s_ + 1) / s_**2, lambda w: -180 + atan(w)),
+    "three integrators": (10 * (s_ + 1) ** 2 / s_**3, lambda w: -270 + 2 * atan(w)),
+    "two unstable poles": (10 * s_ / (s_ - 1) ** 2, lambda w: -270 + 2 * atan(w)),
+    "two unstable poles and an integrator": (10 * (s_ + 1) ** 2 / (s_ * (s_ - 1) ** 2), lambda w: -450 + 4 * atan(w)),
+    "three unstable poles": (30 * (s_ + 1) ** 2 / (s_ - 1) ** 3, lambda w: -540 + 5 * atan(w)),
+    "negative gain of an unstable plant": (-3 / (1 - s_), lambda w: -180 + atan(w)),
+    "sampled": (control.tf([0.5], [1, -1], T), lambda w: -90 - np.degrees(w * T / 2)),
+    "sampled, unstable": (
+        control.tf([0.4], [1, -1.2], T),
+        lambda w: -180 + np.degrees(np.arctan2(np.sin(w * T), 1.2 - np.cos(w * T))),
+    ),
+    "never 1": (control.tf([0.5], [1, 1]), lambda w: -atan(w)),
+}
+
+
+@pytest.mark.parametrize("name", BRANCHES)
+def test_the_phase_is_on_the_branch_on_which_the_phase_margin_is_read(name):
+    system, phase = BRANCHES[name]
+    (loop,) = drawn_loops([system], [name], None, marked=True)
+    assert np.allclose(phase_of(loop), phase(loop.omega), atol=1e-6)
+    for omega, margin in loop.gain_crossovers():
+        assert margin == pytest.approx(phase(omega) + 180.0, abs=1e-6)
+
+
+def test_the_phase_of_a_loop_with_dead_time():
+    level = Integrator(name="level")
+    pipe = TransportDelay(delay=DELAY, name="pipe")
+    slow = Diagram("d", level(pipe(Gain(gain=2.0, name="k")(-level.y)).named("u"))).linearize().loop("u")
+    w, phase = curve(slow.bode().axes[1])
+    assert np.allclose(phase, -90 - np.degrees(w * DELAY), atol=1e-6)
+
+
+def test_margins_are_marked_in_all_three_diagrams():
+    # L = K/(s (s + 1)²): −180° at 1 rad/s with K/2; |L| = 1 where ω (1 + ω²) = K; with K = 2·0.45 at ω₁
+    K = 0.9
+    real = np.roots([1.0, 0.0, 1.0, -K])
+    omega = float(real[np.abs(real.imag) < 1e-9][0].real)
+    phase = -90 - 2 * atan(omega)
+    loop = Diagram("d", (plant := TransferFunction(numerator=[K], denominator=[1, 2, 1, 0], name="p"))(-plant.y))
+    loop = loop.linearize().loop("p")
+    gain_axes, phase_axes = loop.bode().axes
+    assert marks(gain_axes, "o") == [pytest.approx((omega, 0.0))]
+    assert marks(phase_axes, "s") == [pytest.approx((1.0, -180.0))]
+    ((x, y),) = thick(phase_axes)
+    assert x == pytest.approx([omega, omega])
+    assert y == pytest.approx([-180.0, phase], abs=1e-6)
+    ((x, y),) = thick(gain_axes)
+    assert y == pytest.approx([0.0, 20 * np.log10(K / 2)])
+    factor = 2 / K
+    text = f"gain margin {factor:.4g} ({20 * np.log10(factor):.2f} dB), phase margin {phase + 180:.4g}°"
+    assert gain_axes.get_title(loc="right") == text
+    nichols = loop.nichols().axes[0]
+    assert marks(nichols, "o") == [pytest.approx((phase, 0.0), abs=1e-6)]
+    assert marks(nichols, "s") == [pytest.approx((-180.0, 20 * np.log10(K / 2)))]
+    nyquist = loop.nyquist().axes[0]
+    assert marks(nyquist, "o") == [pytest.approx((np.cos(np.radians(phase)), np.sin(np.radians(phase))))]
+    assert marks(nyquist, "s") == [pytest.approx((-K / 2, 0.0))]
+    plain = loop.bode(margins=False).axes[0]
+    assert not marks(plain, "o")
+    assert not plain.get_title(loc="right")
 
 
 def test_a_step_is_that_of_the_closed_loop(loop, sampled):
@@ -128,7 +216,7 @@ def test_several_loops_and_measured_data_stand_in_one_figure(loop):
     w, size = curve(axes, 2)
     assert list(w) == [1.0, 10.0]
     assert np.allclose(10 ** (size / 20), np.abs(C * P))
-    assert axes.lines[2].get_marker() == "o"
+    assert [line.get_marker() for line in axes.lines if line.get_label() == "measured"] == ["o"]
     own = loop.bode(plain, labels=["a", "b"]).legends[0].get_texts()
     assert [text.get_text() for text in own] == ["a", "b"]
 

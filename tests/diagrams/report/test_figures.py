@@ -9,10 +9,10 @@ import pytest
 
 from loopwright.blocks import Constant, Gain, Integrator, StateSpace, TransferFunction
 from loopwright.diagrams import Diagram, Section, Table, analyse
-from loopwright.diagrams.plotting import BLUE
+from loopwright.diagrams.plotting import BLUE, set_degrees
 from loopwright.diagrams.report.case import Case
 from loopwright.diagrams.report.figures import AxisUnits, MeasuredCurve, contact_admittance, contact_map, measured
-from loopwright.diagrams.report.figures.loop_figures import DrawnLoops, bode, nyquist, set_degrees
+from loopwright.diagrams.report.figures.loop_figures import DrawnLoops, bode, nyquist
 from loopwright.diagrams.report.figures.step_figures import draw_answer
 from loopwright.diagrams.report.pages import Judged
 from loopwright.diagrams.report.pages.definitions import definition
