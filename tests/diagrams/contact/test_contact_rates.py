@@ -93,7 +93,7 @@ def growth(k, b=0.0, m=0.0, **rates):
     return math.log(np.max(np.abs(np.linalg.eigvals(monodromy(k, b, m, **rates))))) / rates.get("slow", SLOW)
 
 
-@pytest.mark.drawn
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize(
     ("vary", "held"),
     [("stiffness", {}), ("stiffness", {"damping": 10.0}), ("stiffness", {"mass": 0.5}), ("mass", {"stiffness": 50.0})],

@@ -143,7 +143,7 @@ def check(family, seeds, compiled):
 @pytest.mark.drawn(3)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_random_diagrams_are_what_the_reference_loop_says(family):
-    check(family, range(1000, 1005), "auto")
+    check(family, range(1000, 1003), "auto")
 
 
 @pytest.mark.parametrize("family", FAMILIES)

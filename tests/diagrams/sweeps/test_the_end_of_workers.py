@@ -59,7 +59,7 @@ def test_fmus_of_workers_end_with_the_host(tmp_path, number):
     with Host(SWEEP.format(**names), TMPDIR=names["temporary"]) as host:
 
         def busy():
-            return [pid for pid, line in host.others().items() if "loopwright_child" in line and seconds_of(pid) > 1.0]
+            return [pid for pid, line in host.others().items() if "loopwright_child" in line and seconds_of(pid) > 0.4]
 
         assert wait_for(lambda: len(busy()), 2, 60.0) == 2
         assert host.kill(number) == {}
