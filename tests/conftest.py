@@ -26,6 +26,15 @@ def pytest_addoption(parser):
     text = "disturb linear algebra in all tests (0: in none); else in the tests of numbers, with seed 1"
     parser.addoption("--disturbed", type=int, metavar="SEED", help=text)
     parser.addoption("--grouped", action="store_true", help="compile every diagram block by block")
+    text = "list the test functions that take more processor time, with all their cases, and the sum of each folder"
+    parser.addoption("--budget", type=float, metavar="SECONDS", help=text)
+
+
+def pytest_configure(config):
+    if (budget := config.getoption("--budget")) is not None:
+        from support.cpu_budget import Budget
+
+        config.pluginmanager.register(Budget(budget))
 
 
 def pytest_terminal_summary(terminalreporter, config):

@@ -1,9 +1,11 @@
 """The part of a product of cases that the quick set takes, and what it keeps for later sessions."""
 
 from itertools import product
+from types import SimpleNamespace
 
 import pytest
 
+from support.cpu_budget import Budget
 from support.drawn import draw
 from support.kept import kept_folder, kept_tree
 
@@ -26,6 +28,22 @@ def test_so_many_as_asked_for_are_drawn_evenly(count, expected):
 @pytest.mark.parametrize("first", "ab")
 def test_what_is_not_drawn_is_slow(first, second, request):
     assert (request.node.get_closest_marker("slow") is None) == (first + second == "ax")
+
+
+def test_the_cases_of_a_function_have_one_budget():
+    lines, budget = [], Budget(0.5)
+    for name, taken in (("a[1]", 0.3), ("a[2]", 0.3), ("b", 0.4)):
+        report = SimpleNamespace(
+            when="teardown", nodeid=f"tests/x/y/test_z.py::test_{name}", user_properties=[("cpu", taken)]
+        )
+        budget.pytest_runtest_logreport(report)
+    budget.pytest_terminal_summary(SimpleNamespace(write_line=lines.append, section=lines.append))
+    assert lines == [
+        "processor time, 1 s",
+        "     1.0 s  tests/x/y",
+        "1 functions beyond 0.5 s",
+        "    0.60 s  tests/x/y/test_z.py::test_a, 2 cases",
+    ]
 
 
 def test_a_folder_that_is_kept_is_the_same_for_all_and_none_where_nothing_can_be_written(tmp_path):
