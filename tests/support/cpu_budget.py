@@ -5,6 +5,7 @@ test and of the child processes that have ended in it, with its fixtures; with s
 """
 
 import os
+import time
 from collections import defaultdict
 
 import pytest
