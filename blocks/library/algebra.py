@@ -57,6 +57,9 @@ class Maximum(NumberedInputs):
         return self.fold(u, lambda a, b: np.where(a > b, a, np.where(b >= a, b, a + b)))
 
 
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
 class Power(Block):
     """Power with a constant exponent, element by element: y = uⁿ; ``u**2`` makes one.
 
@@ -67,6 +70,12 @@ class Power(Block):
     exponent: float = parameter(structural=True, description="exponent n")
     u = Input(shape=None, description="base, of any shape")
     y = Output(shape=None, description="the power")
+
+    @property
+    def drawn_inside(self) -> str:
+        """What a drawing shows."""
+        number = f"{self.exponent:g}"
+        return f"u^{number}" if set(number) - set("-0123456789") else f"u{number.translate(_RAISED)}"
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the power."""

@@ -103,6 +103,11 @@ class VariableDelay(Block):
     line = History("samples", "initial_value", description="the last inputs, the oldest first, one row for each")
 
     @property
+    def drawn_inside(self) -> str:
+        """What a drawing shows."""
+        return "u(t − τ)"
+
+    @property
     def starts_from_inputs(self) -> bool:
         """Whether `initial` computes the state."""
         return self.initial_value is None

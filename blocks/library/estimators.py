@@ -89,6 +89,11 @@ class StateFeedback(Block):
     feedforward = Input(shape=None, default=0.0, description="input u_ff that is added, such as that of the target")
     y = Output(shape=None, description="input of the plant")
 
+    @property
+    def drawn_inside(self) -> str:
+        """What a drawing shows."""
+        return "−K x"
+
     @classmethod
     @accepts("{cls.__name__}", ParameterError, system=_MODEL, Q=kinds.matrix, R=kinds.matrix)
     def from_lqr(cls, system: Any, Q: Any, R: Any, *, name: str | None = None) -> Self:
@@ -166,6 +171,11 @@ class _Observer(Block):
     )
     u = Input(shape=None, description="input of the plant, as the model's")
     y = Input(shape=None, description="measured output of the plant, as the model's")
+
+    @property
+    def drawn_inside(self) -> str:
+        """What a drawing shows."""
+        return "x̂"
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         cls, given = type(self), [*args]

@@ -24,6 +24,8 @@ from ..core import (
     shorten,
 )
 
+_SIGNS: dict[object, str] = {np.divide: "÷", np.absolute: "|u|", np.sqrt: "√u", np.power: "u₁^u₂"}
+
 
 class Function(Block):
     """NumPy-style function of the inputs, traced like the equations of every block: y = f(u₁, …).
@@ -86,6 +88,11 @@ class Function(Block):
     def outputs(self) -> Mapping[str, Output]:  # type: ignore[override]
         """One output for each result."""
         return {n: Output(shape, name=n) for n, shape in self._shapes("results", self.results).items()}
+
+    @property
+    def drawn_inside(self) -> str:
+        """What a drawing shows."""
+        return _SIGNS.get(self.function, "")
 
     def output(self, t: Array, x: Any, u: Any) -> Any:
         """Return the function's result."""

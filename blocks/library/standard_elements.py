@@ -26,6 +26,11 @@ class PT1(Block):
     u = Input(shape=None, description="input, of any shape")
     y = State(start="initial_value", like="u", output=True, description="the lagged signal")
 
+    @property
+    def drawn_inside(self) -> str:
+        """What a drawing shows."""
+        return f"{self.gain:.4g} / {self.time_constant:.4g} s + 1"
+
     def derivative(self, t: Array, x: Any, u: Any) -> Array:
         """Return ẏ."""
         return (self.gain * u.u - x.y) / self.time_constant
@@ -46,6 +51,12 @@ class PT2(Block):
     y = State(start="initial_value", like="u", output=True, description="the lagged signal")
     rate = State(like="u", description="T ẏ")
 
+    @property
+    def drawn_inside(self) -> str:
+        """What a drawing shows."""
+        T, D = self.time_constant, self.damping_ratio
+        return f"{self.gain:.4g} / {T * T:.3g} s² + {2.0 * D * T:.3g} s + 1"
+
     def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
         """Return ẏ, and the rate of T ẏ."""
         T = self.time_constant
@@ -65,6 +76,13 @@ class LeadLag(Block):
     u = Input(shape=None, description="input, of any shape")
     y = Output(shape=None, description="output")
     slow = State(like="u", description="the input behind the lag")
+
+    @property
+    def drawn_inside(self) -> str:
+        """What a drawing shows."""
+        return (
+            f"{self.lead_time:.4g} s + 1 / {self.lag_time:.4g} s + 1" if self.gain == 1 else "K (T₁ s + 1) / T₂ s + 1"
+        )
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the output."""
@@ -89,6 +107,11 @@ class Notch(Block):
     u = Input(description="input")
     y = Output(like="u", description="the filtered signal")
     x = State(shape=(2,), description="band-pass and low-pass state, in the frequency s / ω₀")
+
+    @property
+    def drawn_inside(self) -> str:
+        """What a drawing shows."""
+        return f"notch {self.frequency:.4g} Hz"
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the input less the band."""
@@ -127,6 +150,11 @@ class Butterworth(ContinuousCascade):
         kind=kinds.choice(*_BANDS),
     )
     gain: float = parameter(default=1.0, description="gain in the band")
+
+    @property
+    def drawn_inside(self) -> str:
+        """What a drawing shows."""
+        return f"{self.band} {'–'.join(f'{f:.4g}' for f in np.atleast_1d(self.cutoff))} Hz"
 
     def check(self) -> None:
         """Refuse cut-off frequencies that don't make the band."""
