@@ -26,7 +26,7 @@ from .event_rules import check_events, check_smooth, find_instants
 from .exercise import Bench, Exercise, kind_text, points
 from .runs import check_run
 from .traces import check_derivatives, check_feedthrough, check_guards, check_shapes, check_trace, find_swallowed
-from .value_rules import check_ports, check_purity, check_values
+from .value_rules import check_after_start, check_ports, check_purity, check_values
 
 
 @explain_calls
@@ -105,6 +105,7 @@ def check_block(
     - Feedthrough: no output changes with an input that the trace doesn't show.
     - Smoothness in a continuous subsystem: outputs and rates jump only at `next_instant` and where an event's indicator
       changes its sign. Indicators are finite, and jumps at one instant come to an end.
+    - ``after_start`` gives finite states, from its own states the same again, and with them the outputs of the start.
     - Runs in a sampled and in a continuous subsystem, where the block allows it: a run that continues from a saved
       state, pickled, equals the straight run bit for bit.
 
@@ -203,7 +204,8 @@ class _Findings:
             self.check_run_in(sampled)
             return None
         rng = np.random.default_rng([exercise.seed, 20140])
-        equations = check_purity(exercise, sampled, list(points(exercise, rng, 6)))
+        places = list(points(exercise, rng, 6))
+        equations = check_purity(exercise, sampled, places)
         try:
             traced = trace(block, exercise.shapes, sampled=sampled, cache={})
         except (SampleTimeError, ShapeError) as error:
@@ -214,6 +216,8 @@ class _Findings:
             return error
         bench = Bench(exercise, sampled, traced)
         checks[f"{kind}: purity"] = f"{equations} equations"
+        if hasattr(block, "after_start"):
+            checks[f"{kind}: after_start"] = check_after_start(exercise, sampled, places, traced.states)
         check_shapes(bench)
         checks[f"{kind}: trace"] = f"as NumPy to {check_trace(bench):.1e}, at {len(bench.points)} points"
         checks[f"{kind}: derivatives"] = f"as differences to {check_derivatives(bench):.1e}"

@@ -5,12 +5,14 @@ from __future__ import annotations
 import inspect
 import math
 import pickle
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import Block, DefinitionError, LoopwrightError, UnitError, parse_unit
-from ...blocks.tracing import bundle, size, with_values
+from ...blocks.core import Block, DefinitionError, LoopwrightError, Shape, UnitError, parse_unit
+from ...blocks.tracing import bundle, size, state_after_start, with_values
 from .exercise import Exercise, Point, Values, numbers_of
 
 
@@ -191,10 +193,8 @@ def _evaluate_all(block: Block, point: Point, T: float | None) -> dict[str, byte
         arguments = [given[1]] if equation == "initial" else [t, *given]
         if equation == "jump":
             arguments.append(bundle("fired", fired))
-        timed = T is not None and "T" in inspect.signature(getattr(block, equation)).parameters
         try:
-            with np.errstate(all="ignore"):
-                found = getattr(block, equation)(*arguments, **({"T": np.float64(T)} if timed else {}))
+            found = _call(block, equation, arguments, T)
         except LoopwrightError:
             continue
         except Exception:  # a user's equation may raise anything
@@ -202,6 +202,87 @@ def _evaluate_all(block: Block, point: Point, T: float | None) -> dict[str, byte
         _expect_unchanged(block, equation, point, x, u)
         result[equation] = _to_bytes(found)
     return result
+
+
+def check_after_start(exercise: Exercise, sampled: bool, places: list[Point], shapes: Mapping[str, Shape]) -> str:
+    """Check the states that ``after_start`` gives, and return a summary; ``shapes`` are those of the states.
+
+    They are finite, have the states' shapes, are the same again for the same arguments, and come from arguments that
+    stay unchanged. From states after the branch it leads to themselves: a point that is taken twice is the same point.
+    With the states after that of the start, the outputs are those of the start; the first place is there.
+    """
+    block = exercise.block
+    T = exercise.sample_time if sampled else None
+    shadow = with_values(block, numbers_of(block, math.nan if T is None else T, "exact"))
+
+    def evaluate(x: Values, u: Values) -> np.ndarray:
+        try:
+            return state_after_start(shadow, shapes, bundle("x", x), bundle("u", u), T)
+        except LoopwrightError as error:
+            raise rule_error("after_start", f"{error.message}", block) from error.__cause__
+        except Exception as error:  # a user's function may raise anything
+            raise rule_error(
+                "after_start",
+                f"its after_start(x, u, T) failed with T = {T}: {type(error).__name__}: {error}; expected the states "
+                f"{', '.join(shapes) or '()'}. Return one value for each; T is None in a continuous subsystem.",
+                block,
+            ) from error
+
+    for point in places:
+        _, x, u, _ = point.arguments()
+        found = evaluate(x, u)
+        _expect_unchanged(block, "after_start", point, x, u)
+        if not np.array_equal(found, evaluate(x, u), equal_nan=True):
+            raise rule_error(
+                "purity",
+                f"its after_start gives other values when it is called again with the same arguments ({point}); "
+                "expected the same ones. Let it depend on nothing but (x, u, T) and parameters.",
+                block,
+            )
+        if not np.all(np.isfinite(found)):
+            raise rule_error(
+                "after_start",
+                f"it gave {found.tolist()} at {point}; expected finite states. Look at T, which is "
+                f"{'None in a continuous subsystem' if T is None else f'{T:g} s here'}.",
+                block,
+            )
+        ends = np.cumsum([0, *(size(shape) for shape in shapes.values())])
+        split = {n: found[a:b].reshape(s) for (n, s), a, b in zip(shapes.items(), ends, ends[1:], strict=False)}
+        again = evaluate(split, u)
+        if np.max(np.abs(again - found) / (1.0 + np.abs(found)), initial=0.0) > 1e-9:
+            raise rule_error(
+                "after_start",
+                f"from its own states {found.tolist()} it gave {again.tolist()} at {point}; expected the same, as they "
+                "are past the start already. Give back x where the branch is over.",
+                block,
+            )
+        if point is places[0] and shapes:
+            one, other = (_outputs(shadow, states, u, T) for states in (x, split))
+            if one is not None and other is not None and not np.allclose(one, other, rtol=1e-6, atol=1e-6):
+                raise rule_error(
+                    "after_start",
+                    f"with the states {found.tolist()} its outputs are {other.tolist()}; expected those of the start, "
+                    f"{one.tolist()}, at {point}. Give states that the branch leaves behind, such as an earlier value.",
+                    block,
+                )
+    return f"{len(shapes)} states, at {len(places)} points"
+
+
+def _outputs(block: Block, x: Values, u: Values, T: float | None) -> np.ndarray | None:
+    """Return the outputs at t = 0, one after the other; None where they fail, which tracing says."""
+    try:
+        found = _call(block, "output", [np.float64(0.0), bundle("x", x), bundle("u", u)], T)
+    except Exception:  # a user's equation may raise anything
+        return None
+    columns = found if isinstance(found, tuple | list) else (found,)
+    return np.concatenate([np.ravel(np.asarray(column, dtype=float)) for column in columns])
+
+
+def _call(block: Block, equation: str, arguments: list[Any], T: float | None) -> Any:
+    """Return the result of an equation, which may take the sample time."""
+    timed = T is not None and "T" in inspect.signature(getattr(block, equation)).parameters
+    with np.errstate(all="ignore"):
+        return getattr(block, equation)(*arguments, **({"T": np.float64(T)} if timed else {}))
 
 
 def _expect_unchanged(block: Block, equation: str, point: Point, x: Values, u: Values) -> None:

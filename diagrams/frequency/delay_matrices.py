@@ -46,6 +46,10 @@ LEFT = 0.1
 """Distance of such a gain from 1 that takes its place in the size within which roots are then searched."""
 RIGHT = 0.01
 """Error of Padé's approximation, in parts of its input, up to which it is called right."""
+MOST_ROOTS = 1000
+"""Roots beyond the limit up to which all are looked for."""
+CHAIN = 4.0
+"""Starts of searches for each of them, a quarter of their distance apart in a chain."""
 NEWTON = 60
 """Steps of Newton's method."""
 SIDES = np.array([-30, -10, -3, -1, -0.3, 0.0, 0.3, 1, 3, 10, 30])
@@ -157,16 +161,41 @@ class DelayMatrices:
         ConfirmationError
             If fewer were found than the argument says, or more.
         """
+        found = self.plain_poles.tolist()
         for part in self.delayed:
             if part.gain_at_infinity >= NEUTRAL:
+                found += part.roots.tolist()
                 continue
-            if (count := part.count_in_part()) > np.sum(part.roots.real >= -MARGINAL * part.bound):
+            roots, count = part.roots, part.count_in_part()
+            if count > part.count_beyond(roots):
+                roots = part.find_chain(count)
+            if count > part.count_beyond(roots):
                 raise ConfirmationError(
-                    f"found {len(part.roots)} roots of a characteristic function, of which fewer than {count:g} are "
+                    f"found {len(roots)} roots of a characteristic function, of which fewer than {count:g} are "
                     "not stable; expected that many. The system is far from stable: count_unstable() counts them.",
                     block="delays",
                 )
-        return sort_rightmost([*self.plain_poles, *(p for part in self.delayed for p in part.roots)])
+            found += roots.tolist()
+        return sort_rightmost(found)
+
+    def count_beyond(self, roots: np.ndarray) -> int:
+        """Return how many of some roots are not stable."""
+        return int(np.sum(roots.real >= -MARGINAL * self.bound))
+
+    def find_chain(self, count: float) -> np.ndarray:
+        """Return the roots from more starts, of which ``count`` are not stable, the rightmost first.
+
+        Behind a delay τ that is long, with a gain g(ω) around it, there is a chain of them about 2π/τ apart, near
+        s = ln(g)/τ + i ω. Of more than `MOST_ROOTS` those that are known are returned.
+        """
+        if count > MOST_ROOTS:
+            return self.roots
+        tau = float(np.max(self.tau))
+        omega = np.pi / (2.0 * tau) * np.arange(1, round(CHAIN * count) + 1)
+        rest = np.linalg.inv(1j * omega[:, None, None] * np.eye(len(self.A)) - self.A)
+        gain = np.max(np.abs(np.linalg.eigvals(self.H + self.C @ rest @ self.G)), axis=1)
+        chain = np.log(np.maximum(gain, 1e-300)) / tau + 1j * omega
+        return self._search(np.concatenate([self.starts, chain, chain.conj()]))
 
     def evaluate(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return s I − A − G E (I − H E)⁻¹ C at points, and its derivative by s."""
@@ -239,11 +268,13 @@ class DelayMatrices:
                 s[todo] = np.where(np.isfinite(step), s[todo] - step, s[todo])
                 alive[todo] &= np.abs(s[todo] - starts[todo]) < 2.0 * (1.0 + np.abs(starts[todo])) + self.bound
                 done[todo] = np.abs(step) <= 1e-13 * (np.abs(s[todo]) + 1e-3 * self.bound)
-        found: list[complex] = []
-        for root in s[alive & done]:
-            if all(abs(root - other) > 1e-8 * (abs(root) + 1e-3 * self.bound) for other in found):
-                found.append(complex(root))
-        return np.array(sort_rightmost(found), dtype=complex)
+        all_found = s[alive & done]
+        found = np.full(len(all_found), np.inf, dtype=complex)
+        count = 0
+        for root in all_found:
+            if np.all(np.abs(root - found[:count]) > 1e-8 * (abs(root) + 1e-3 * self.bound)):
+                found[count], count = root, count + 1
+        return np.array(sort_rightmost(found[:count].tolist()), dtype=complex)
 
     def _step(self, at: complex) -> complex:
         try:

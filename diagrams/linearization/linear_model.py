@@ -478,6 +478,13 @@ def linearize(
     check_argument(order, kinds.integer(1), "order", "linearize")
     check_options(diagram, options, "linearize")
     at = operating_point(diagram, point, options)
+    if delays == "pade" and _is_discrete(diagram, options.get("step")):
+        raise OptionError(
+            "found 'pade' for a sampled model, which is rational as it is: the past of its delays is a part of the "
+            "states. Expected 'exact'. Leave delays out, or take diagram.continuous().",
+            block=diagram.name,
+            port="delays",
+        )
     _refuse_lost(diagram, at)
     diagram = diagram.replace(at.parameters) if at.parameters else diagram  # parameters that a trim has found
     given = [_as_list(names) for names in (inputs, outputs, openings)]
@@ -547,6 +554,11 @@ def find_flow_poles(diagram: WiredDiagram, point: OperatingPoint) -> np.ndarray:
     return _sorted_poles(model_continuous(diagram, flat, local, between, None).matrices[0])
 
 
+def _is_discrete(diagram: WiredDiagram, step: float | Fraction | None) -> bool:
+    """Return whether a linear model goes from one tick to the next."""
+    return diagram.has_clock or (diagram.has_fmu and step is not None)
+
+
 def _refuse_lost(diagram: WiredDiagram, at: OperatingPoint) -> None:
     """Refuse a point at which an FMU's output is no number: a run may have one that nothing reads, a model may not."""
     flat = diagram.flatten_like(at)
@@ -596,7 +608,7 @@ def _linearize(
     means = replace_stairs(diagram, flat, at, stairs)
     channels = list[str]()
     local = LocalDerivatives(flat, found[0], found[1], found[2], evaluators_at(flat, at), means)
-    if diagram.has_clock or (diagram.has_fmu and step is not None):
+    if _is_discrete(diagram, step):
         if loop:
             _check_loop(flat, local, at)
         if loop and period_of(flat) > 1:

@@ -16,6 +16,7 @@ period is that of the others.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -376,9 +377,12 @@ def confirm_loop(
     closed = Ac + B @ np.linalg.solve(back, C) if len(D) else Ac
     size = [float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) for a in (closed, A, 0.1 * Ac)]
     radius = 1.5 * max(size) or 1.0  # the open loop counts too: the poles of a deadbeat loop are rounding alone
+    points = [radius * np.exp(1j * angle) for angle in (0.3, 1.1, 2.0)]
+    if late is not None:  # where e^(−s τ) has a size near 1: to the left it overflows, far to the right it is nothing
+        slow = 1.0 / float(np.max(late.times))
+        points = [points[0], slow * (1.0 + 2.0j), slow + 0.7j * radius]
     worst = 0.0
-    for angle in (0.3, 1.1, 2.0):  # det(I − A/z) does not count states at zero, such as values held for later
-        z = radius * np.exp(1j * angle)
+    for z in points:  # det(I − A/z) does not count states at zero, such as values held for later
         if late is None or delays is None:
             both = [np.eye(len(a)) - a / z for a in (closed, A)]
         else:
@@ -386,7 +390,8 @@ def confirm_loop(
             made = closed, late.G + B @ through, late.Z + late.F @ into, late.H + late.F @ through
             both = [_with_delays(four, late.times, z) for four in (made, (A, delays.G, delays.Z, delays.H))]
         (s1, l1), (s2, l2) = map(np.linalg.slogdet, both)
-        worst = max(worst, float(abs(s1 / s2 * np.exp(l1 - l2) - 1.0)))
+        off = float(abs(s1 / s2 * np.exp(l1 - l2) - 1.0))
+        worst = max(worst, math.inf if math.isnan(off) else off)
     if not worst <= SAME_POLES + 100 * cut.uncertainty / radius:
         raise ConfirmationError(
             f"the loop at {', '.join(map(repr, wires))}, closed, has the poles of another system than the diagram: "

@@ -271,7 +271,8 @@ class Case:
             found = variant(cut_places(make(), tuple(self.loop_places.values())), self.point)
             if self.point is None and any(isinstance(f, UnusualStart) for f in found.model.findings):
                 found = variant(found.diagram, LATER * found.model.dt)
-            _ = found.model
+            if found.model.delays is not None:
+                _ = found.model.poles  # the roots of a dead time that is very long beside the loop may not be had
         except LoopwrightError as error:
             sampled_only = implementation is Implementation.CONTINUOUS and isinstance(error, SampleTimeError)
             found.problem = TEXTS.line("sampled_only", block=error.block) if sampled_only else str(error)

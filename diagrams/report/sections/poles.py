@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from ....blocks.core import enumerate_some
 from ...frequency import Number, order_key, with_findings
 from ..case import Case
 from ..pages import Section, TableForm, Texts
@@ -15,6 +16,8 @@ from .subject import SUBJECT_TITLE
 
 TEXTS = Texts(__package__, "poles")
 POLES_TITLE = "Closed-loop poles"
+MOST_SHOWN = 8
+"""Poles, pairs as one, that a text names; of more it says how many there are."""
 SAME = 1e-6
 """Relative distance up to which a pole is the conjugate of another one."""
 REAL = 1e-9
@@ -94,7 +97,7 @@ def list_poles(poles: Iterable[complex], dt: float = 0.0) -> str:
                 shown.append(f"{v.real:.6g} ± {abs(v.imag):.6g}j")
             else:
                 shown.append(f"{v.real:.6g} {'+' if v.imag > 0 else '−'} {abs(v.imag):.6g}j")
-    return ", ".join(shown) or "none"
+    return enumerate_some(shown, MOST_SHOWN) or "none"
 
 
 def unstable_first(case: Case) -> Section | None:
@@ -122,4 +125,4 @@ def show_poles(poles: np.ndarray, v: Variant) -> str:
         text = f"{s.real:.6g}" if one else f"{s.real:.6g} ± {s.imag:.6g}j"
         dt = v.model.dt
         shown.append(text + (f" (|z| = {np.exp(s.real * dt):.6g})" if dt else ""))
-    return ", ".join(shown)
+    return enumerate_some(shown, MOST_SHOWN)

@@ -443,6 +443,60 @@ class Unguarded(Amplifier):
         return f"{name} is {value}"
 
 
+class Starting(Amplifier):
+    """Passes its input at the start, and later the difference of two: after_start with a fault each."""
+
+    last = State()
+    running = State()
+
+    def output(self, t, x, u):
+        return np.where(x.running > 0.5, u.u - x.last, u.u)
+
+    def update(self, t, x, u):
+        return u.u, 1.0 + 0.0 * t
+
+    def after_start(self, x, u, T):
+        return np.where(x.running > 0.5, x.last, 0.0), np.ones(())
+
+
+class WronglyStarting(Starting):
+    """Its outputs after the start are others."""
+
+    def after_start(self, x, u, T):
+        return np.where(x.running > 0.5, x.last, u.u - 7.0), np.ones(())
+
+
+class StartingAgain(Starting):
+    """Leaves its start twice."""
+
+    def after_start(self, x, u, T):
+        return x.last + 1.0, np.ones(())
+
+
+class StartingNowhere(Starting):
+    """Divides by what is not there."""
+
+    def after_start(self, x, u, T):
+        return np.float64(np.nan), np.ones(())
+
+
+class StartingShort(Starting):
+    """Forgets a state."""
+
+    def after_start(self, x, u, T):
+        return np.ones(())
+
+
+class StartingByTime(Starting):
+    """Needs a sample time, where there is none."""
+
+    def derivative(self, t, x, u):
+        return 0.0 * u.u, 0.0 * u.u
+
+    def after_start(self, x, u, T):
+        return np.where(x.running > 0.5, x.last, 0.0 * T), np.ones(())
+
+
 SEEN = set()
 
 
@@ -486,6 +540,11 @@ BROKEN = {
     Flapping: (DefinitionError, r"flapping: events: at t = .* its events keep firing \(up\), 100 times"),
     Undefined: (DefinitionError, r"undefined\.up: events: its indicator is \[nan\]"),
     Unguarded: (DefinitionError, r"unguarded: guards: guard_error gave 'small is -1\.0'"),
+    WronglyStarting: (DefinitionError, r"wrongly_starting: after_start: with the states .* its outputs are .*expected"),
+    StartingAgain: (DefinitionError, r"starting_again: after_start: from its own states .* it gave .*; expected"),
+    StartingNowhere: (DefinitionError, r"starting_nowhere: after_start: it gave \[nan, 1\.0\].*; expected finite"),
+    StartingShort: (DefinitionError, r"starting_short: after_start: .*; expected"),
+    StartingByTime: (DefinitionError, r"starting_by_time: after_start: its after_start.* failed with T = None"),
     Remembering: (DefinitionError, r"remembering: runs: in a sampled subsystem a run that was saved at t = 0\.5 s"),
 }
 OPTIONS = {Typed: {"inputs": {"u": (-50.0, 50.0)}}}
@@ -500,6 +559,12 @@ def test_a_broken_rule_is_named(cls):
     if re.search(r": (purity|values|ports|units|shapes|trace|derivatives|events|next_instant|guards|runs): ", text):
         assert "; expected " in str(caught.value)
         assert str(caught.value).endswith(".")  # the next step
+
+
+def test_a_branch_of_the_start_is_checked():
+    report = check_block(Starting(), kinds=["sampled"])
+    assert report.checks["sampled: after_start"] == "2 states, at 6 points"
+    assert "after_start" not in " ".join(check_block(Gain(gain=2.0)).checks)
 
 
 def test_what_the_broken_ones_are_made_from_keeps_the_contract():

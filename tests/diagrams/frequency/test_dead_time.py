@@ -13,7 +13,7 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.special import lambertw
 
 from loopwright.blocks import Constant, Gain, Integrator, OptionError, Sum, TransferFunction, TransportDelay
-from loopwright.diagrams import Diagram
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.frequency.delay_matrices import DelayMatrices
 from loopwright.diagrams.frequency.delayed_system import DelayedSystem
 from loopwright.frequency import disk_margin, margins, nyquist_count
@@ -461,3 +461,61 @@ def test_a_smith_predictor_with_feedthrough_to_two_delays_is_not_neutral_and_kee
     found = margins(diagram.linearize().loop("u", to=["late.u"]))
     assert L(1j * at).real < 0
     assert abs(found.gain_margin_high.value * abs(L(1j * at)) - 1) < 1e-9
+
+
+@pytest.mark.parametrize("k", [99.0, 500.0, pytest.param(2000.0, marks=pytest.mark.slow)])
+def test_a_delay_far_from_stable_has_all_its_roots(k):
+    """s + k e^(−s): roots are Lambert's W_n(−k), a pair crosses the axis at each k = π/2 + 2π n."""
+    made = DelayMatrices(np.zeros((1, 1)), np.array([[-k]]), np.ones((1, 1)), np.zeros((1, 1)), np.ones(1))
+    count = 2 * (int((k - np.pi / 2) // (2 * np.pi)) + 1)
+    assert made.count_unstable() == count
+    poles = np.array(made.poles())
+    exact = np.array([lambertw(-k, n) for n in range(-count // 2, count // 2)])
+    exact = exact[np.lexsort((exact.imag, -exact.real))]
+    assert np.sum(poles.real > 0.0) == count
+    for pole in exact:
+        assert np.min(np.abs(poles - pole)) < 1e-9 * abs(pole)
+
+
+@pytest.mark.parametrize(("b", "tau"), [(0.9, 2000.0), (-0.9, 2000.0), (1.01, 2000.0), (-1.01, 2000.0)])
+def test_a_delay_that_is_long_beside_a_lag_has_all_its_roots(b, tau):
+    """s + 1 − b e^(−s τ): s τ = W_n(b τ e^τ) − τ, by w + ln w = ln b τ + τ + 2π i n."""
+    made = DelayMatrices(-np.ones((1, 1)), np.array([[b]]), np.ones((1, 1)), np.zeros((1, 1)), np.array([tau]))
+    exact = []
+    for n in range(-60, 61):
+        target = np.log(complex(b * tau)) + tau + 2j * np.pi * n
+        w = target - np.log(target)
+        for _ in range(50):
+            w -= (w + np.log(w) - target) / (1.0 + 1.0 / w)
+        exact.append((w - tau) / tau)
+    exact = np.array(exact)
+    beyond = exact[exact.real > 0.0]
+    assert made.count_unstable() == len(beyond)
+    poles = np.array(made.poles())
+    for pole in beyond:
+        assert np.min(np.abs(poles - pole)) < 1e-9 * (1.0 + abs(pole))
+
+
+@pytest.mark.parametrize("sensor", [1e-2, 1e-6])
+def test_a_dead_time_that_is_long_beside_a_sensor_has_its_margin(sensor):
+    """An oven by the SIMC rule: 90° − 0.02 · 25 rad, less the sensor's phase; nothing overflows on the way."""
+    oven, late, quick = rational([2.5], [180.0, 1.0], "oven"), delay(25.0), rational([1.0], [sensor, 1.0], "sensor")
+    loop = Diagram("oven", quick(late(oven(pi(quick.y, 1.44, 1.44 / 180.0))))).linearize().loop("u")
+    found = margins(loop)
+    assert found.stable
+    at = brentq(lambda w: 0.02 / w / np.hypot(1.0, sensor * w) - 1.0, 1e-3, 1.0, xtol=1e-15)
+    exact = 90.0 - np.degrees(25.0 * at + np.arctan(sensor * at))
+    assert found.phase_margin_deg.value == pytest.approx(exact, abs=1e-7)
+
+
+def test_pade_of_a_sampled_diagram_is_refused():
+    plant, late = rational([2.0], [5.0, 1.0], "lag"), delay(1.0)
+
+    @subsystem(sample_time=0.5)
+    def control(y):
+        return Gain(gain=0.4, name="k")(0.0 - y).named("u")
+
+    diagram = Diagram("sampled", late(plant(control(late.y))))
+    with pytest.raises(OptionError, match=r"delays: found 'pade' for a sampled model, which is rational as it is"):
+        diagram.linearize(delays="pade")
+    assert diagram.continuous().linearize(delays="pade").pade == 5
