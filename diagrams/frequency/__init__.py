@@ -16,6 +16,7 @@ from .measured_margins import MeasuredMargins, measured_margins, read_frequency_
 from .number import MARK, Confirmation, Interval, Number, method_of, with_findings
 from .nyquist import NyquistCount, nyquist_count
 from .periodic_margins import PeriodicMargins, periodic_margins
+from .pole_maps import plot_poles
 from .pole_placement import place, relative_difference
 from .poles_and_zeros import find_hidden_unstable
 from .python_control import Comparison, compare_margins, compare_with_control
@@ -107,6 +108,7 @@ __all__ = [
     "periodic_margins",
     "phase_of",
     "place",
+    "plot_poles",
     "read_frequency_data",
     "read_matrices",
     "realize",

@@ -25,6 +25,7 @@ from .delayed_realization import DelayedRealization, realize
 from .delayed_system import DelayedSystem
 from .loop_drawing import DrawnLoop, describe_margins, draw_bode_axes, draw_nichols_axes, draw_nyquist_axes
 from .loop_margins import Margins, margins
+from .pole_maps import plot_poles, plot_root_locus, refuse_delays
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -125,6 +126,44 @@ class LoopPlots:
         """Return gain over phase, with contours of |T| in dB. See `bode` for the parameters."""
         loops = (self, *others)
         return _plot_nichols(loops, drawn_loops(loops, _name_loops(loops, labels), omega, marked=margins), omega)
+
+    @accepts(gains=kinds.numbers, margins=kinds.flag)
+    def root_locus(self, gains: ArrayLike | None = None, *, margins: bool = True) -> Figure:
+        """Return the closed-loop poles over a gain k: those of the loop k L, in the s plane, or in the z plane.
+
+        Poles (×) and zeros (○) are those of L, squares are the closed-loop poles of the loop as it is, k = 1. Diamonds
+        are poles on the limit of stability, with their gains. Thin lines have equal damping ratios and natural
+        frequencies; in the z plane the dark circle is the limit of stability.
+
+        Parameters
+        ----------
+        gains : array_like, optional
+            Gains; without them 0 and 0.001 to 1000, dense where the poles move fast.
+        margins : bool
+            Whether the limits of stability are marked.
+
+        Raises
+        ------
+        OptionError
+            If the loop has several inputs or outputs, or delays.
+        """
+        (name,) = _name_loops((self,), None)
+        refuse_delays(self, name)
+        chosen = None if gains is None else np.unique(np.asarray(gains, dtype=float))
+        return plot_root_locus(self, name, chosen, _margins(self) if margins else None)
+
+    def pzmap(self) -> Figure:
+        """Return the poles and zeros of L in the s plane, or in the z plane with the unit circle.
+
+        Raises
+        ------
+        OptionError
+            If the loop has several inputs or outputs, or delays.
+        """
+        (name,) = _name_loops((self,), None)
+        refuse_delays(self, name)
+        loop: Any = self
+        return plot_poles(np.ravel(loop.poles()), np.ravel(loop.zeros()), float(self.dt or 0.0), f"poles of {name}")
 
     @accepts(t=kinds.numbers, labels=kinds.names)
     def step(self, *others: Any, t: float | None = None, labels: Sequence[str] | None = None) -> Figure:

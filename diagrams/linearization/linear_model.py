@@ -37,7 +37,15 @@ from ...blocks.core import (
 )
 from ...fmus.running import Derivation, DerivativeMethod
 from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
-from ..frequency import NEUTRAL, DelayMatrices, delayed_loop_class, delayed_system_class, loop_class, mu_bound
+from ..frequency import (
+    NEUTRAL,
+    DelayMatrices,
+    delayed_loop_class,
+    delayed_system_class,
+    loop_class,
+    mu_bound,
+    plot_poles,
+)
 from ..results import OperatingPoint
 from ..wiring import exact_time
 from .delay_channels import blocks_around
@@ -58,6 +66,7 @@ from .tick_chain import period_of
 
 if TYPE_CHECKING:
     from control import StateSpace
+    from matplotlib.figure import Figure
 
     from ..frequency import LoopTransfer
 
@@ -306,6 +315,16 @@ class Linearization(ShownAsTable):
             return np.array(self.characteristic.poles())
         keep = [i for i, name in enumerate(self.states) if name not in self.memory]
         return _sorted_poles(self.A[np.ix_(keep, keep)])
+
+    def pzmap(self) -> Figure:
+        """Return the poles in the s plane, or in the z plane with the unit circle, without those of `memory`.
+
+        Zeros are drawn where the model has as many inputs as outputs, and no delays. Thin lines have equal damping
+        ratios and natural frequencies. With delays there are infinitely many poles, of which the rightmost are drawn.
+        """
+        square = len(self.inputs) == len(self.outputs) > 0 and self.delays is None
+        zeros = np.ravel(self.system.zeros()) if square else None
+        return plot_poles(self.poles, zeros, self.dt, f"poles of {self.wired.name}", are_all=self.delays is None)
 
     @accepts(None, required=kinds.names)
     def free_motions(self, required: str | Iterable[str] = ()) -> FreeMotions:
