@@ -1,11 +1,12 @@
 """Names that users of other tools look for (Simulink, python-control, FMPy, pathsim, bdsim), and what to write here."""
 
+_LINEAR = 'diagram.linearize() returns the linear model, and its .loop("wire") the loop at a wire'
 _METHODS = {
     "simulate": "diagram.simulate(2.0) returns the run",
     "sim": "diagram.simulate(2.0) returns the run",
-    "linearize": 'diagram.linearize() returns the linear model, diagram.linearize().loop("wire") the loop at a wire',
-    "linmod": 'diagram.linearize() returns the linear model, diagram.linearize().loop("wire") the loop at a wire',
-    "dlinmod": 'diagram.linearize() returns the linear model, diagram.linearize().loop("wire") the loop at a wire',
+    "linearize": _LINEAR,
+    "linmod": _LINEAR,
+    "dlinmod": _LINEAR,
     "trim": "diagram.trim(…) finds the point",
     "report": 'diagram.report("loop.html") writes it',
     "draw": "diagram.draw() draws it",
@@ -17,13 +18,13 @@ _BLOCKS = {
     "Add": "a + b adds two signals, and the block is Sum",
     "Adder": "a + b adds two signals, and the block is Sum",
     "Amplifier": "the block is Gain, or 2.0 * signal",
-    "BusCreator": 'a mapping of signals is a bus: return {"speed": speed, "angle": angle} from a function with @subsystem',
+    "BusCreator": 'a mapping of signals is a bus: return {"speed": speed, "angle": angle} from a subsystem',
     "BusSelector": 'a bus is read by its names: bus["speed"]',
-    "Derivative": "the block is FilteredDerivative, and FeedbackLinearization or a block with its own equations where exact",
+    "Derivative": "the block is FilteredDerivative",
     "Differentiator": "the block is FilteredDerivative",
     "Divide": "a / b divides two signals",
     "Fcn": "the block is Function, and PythonFunction for Python that can't be traced",
-    "FirstOrderLag": "the block is TransferFunction(numerator=[1.0], denominator=[0.5, 1.0])",
+    "FirstOrderLag": "the block is PT1",
     "FromWorkspace": "the block is Recorded",
     "FromFile": "the block is Recorded",
     "LookupTable": "the blocks are Lookup1D and Lookup2D",
@@ -38,7 +39,7 @@ _BLOCKS = {
     "RandomNumber": "the block is BandLimitedNoise",
     "RateTransition": "none is needed: each @subsystem(sample_time=…) samples its inputs, and holds its outputs",
     "SFunction": "a block with its own equations is a class of loopwright.Block",
-    "SignalGenerator": "the blocks are Sine, PulseTrain, Ramp and others",
+    "SignalGenerator": "the blocks are Sine, Sawtooth, Triangle, PulseTrain and others",
     "SinusoidalSource": "the block is Sine",
     "SineWave": "the block is Sine",
     "Source": "the blocks are Constant, Step, Sine and others, and Function of a Clock for any other",
@@ -72,35 +73,37 @@ _PARTS = {
     "ToFile": 'every output is recorded: run.to_csv("run.csv")',
     "Workspace": 'every output is recorded: run["wire"]',
     "connect": "a call wires: plant(force=controller(plant.position))",
-    "dump": 'read_description("plant.fmu") describes an FMU, as does the command loopwright inspect plant.fmu',
+    "dump": 'an FMU is described by read_description("plant.fmu"), or the command loopwright inspect plant.fmu',
     "interconnect": "a call wires: plant(force=controller(plant.position))",
     "simulate_fmu": 'make Diagram("name", Fmu("plant.fmu")()), and run it by diagram.simulate(2.0)',
-    "plot_result": 'run.plot("wire") plots the run',
-    "validate_fmu": 'doctor("plant.fmu") examines an FMU, as does the command loopwright validate plant.fmu',
+    "plot_result": 'a run is plotted by run.plot("wire")',
+    "validate_fmu": 'an FMU is examined by doctor("plant.fmu"), or the command loopwright validate plant.fmu',
 }
 _CONTROL = {
-    "tf": "TransferFunction(numerator=…, denominator=…)",
-    "ss": "StateSpace(A=…, B=…, C=…, D=…)",
-    "zpk": "ZeroPoleGain(…)",
-    "c2d": "a subsystem with sample_time=… discretizes what is inside",
+    "tf": "the block is TransferFunction(numerator=…, denominator=…)",
+    "ss": "the block is StateSpace(A=…, B=…, C=…, D=…)",
+    "zpk": "the block is ZeroPoleGain",
+    "c2d": "@subsystem(sample_time=…) discretizes what is inside",
     "feedback": "a call wires: plant(force=controller(plant.position))",
     "series": "a call wires: second(first(u))",
-    "parallel": "first(u) + second(u)",
-    "pade": "PadeDelay(…)",
+    "parallel": "signals add up: first(u) + second(u)",
+    "pade": "the block is PadeDelay",
 }
-_CONTROL_ALONE = (
-    *("bode", "bode_plot", "nyquist", "nyquist_plot", "root_locus", "rlocus", "step_response", "impulse_response"),
-    *("forced_response", "margin", "lqr", "lqe", "dlqr", "dlqe", "care", "dare", "ctrb", "obsv", "gram", "frd"),
-    *("frequency_response", "stability_margins", "pole", "zero", "damp", "minreal", "balred", "nichols", "h2syn"),
+_OF_LOOPS = (
+    *("bode", "bode_plot", "nyquist", "nyquist_plot", "nichols", "nichols_plot", "root_locus", "rlocus"),
+    *("step_response", "impulse_response", "forced_response", "damp", "minreal"),
 )
+_OF_MATRICES = ("lqr", "lqe", "dlqr", "dlqe", "care", "dare", "ctrb", "obsv", "gram", "frd", "rss", "acker")
+_LOOP = 'diagram.linearize().loop("wire")'
 
 WAYS = {
     **{name: f"It is a method of a diagram: {text}." for name, text in _METHODS.items()},
-    **{name: f"Here {text}." for name, text in (*_BLOCKS.items(), *_PARTS.items())},
-    **{name: f"It is python-control's: control.{name}(…). Among blocks: {text}." for name, text in _CONTROL.items()},
-    **{
-        name: f'It is python-control\'s, and takes what diagram.linearize().loop("wire") returns: control.{name}(…).'
-        for name in _CONTROL_ALONE
-    },
+    **{name: f"Here {text}; blocks are in loopwright.blocks." for name, text in _BLOCKS.items()},
+    **{name: f"{text[0].upper()}{text[1:]}." for name, text in _PARTS.items()},
+    **{name: f"It is python-control's: control.{name}(…). Here {text}." for name, text in _CONTROL.items()},
+    **{name: f"It is python-control's, which takes a loop: control.{name}({_LOOP})." for name in _OF_LOOPS},
+    **{name: f"It is python-control's: from control import {name}." for name in _OF_MATRICES},
+    "margin": f"Here it is margins({_LOOP}): from loopwright import margins.",
+    "stability_margins": f"Here it is margins({_LOOP}): from loopwright import margins.",
 }
 """What an error says for such a name, where no package here has it or the name means something else."""

@@ -9,11 +9,14 @@ from __future__ import annotations
 import ast
 import sys
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from importlib import import_module
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+
+from .names_of_other_tools import WAYS
 
 ROOT = __name__.partition(".")[0]
 PLACES = (ROOT, *(f"{ROOT}.{name}" for name in ("blocks", "fmus", "diagrams", "frequency", "sweeps", "types")))
@@ -49,16 +52,18 @@ def explain_missing(module: str, name: str) -> str:
     if module not in PLACES or name.startswith("__"):
         return ""
     names = {place: import_module(place).__all__ for place in PLACES}
+    found = f"{module} has no {name!r}"
+    if name in WAYS:
+        return f"{found}. {WAYS[name]}"
     places = [place for place in PLACES if name in names[place]]
     if places:
-        return f"{module} has no {name!r}: it is in {places[0]} (from {places[0]} import {name})."
-    from .core import close_names
-
-    for place in (module, *PLACES):
-        close = close_names(name, names[place])
+        return f"{found}: it is in {places[0]} (from {places[0]} import {name})."
+    for nearby in ([module], PLACES):
+        known = {public.casefold(): (place, public) for place in reversed(nearby) for public in names[place]}
+        close = [known[folded] for folded in get_close_matches(name.casefold(), known, n=3, cutoff=0.75)]
         if close:
-            where = "" if place == module else f" of {place}"
-            return f"{module} has no {name!r}. Did you mean {' or '.join(close)}{where}?"
+            offers = (public if place == module else f"{public} of {place}" for place, public in close)
+            return f"{found}. Did you mean {' or '.join(offers)}?"
     return ""
 
 

@@ -20,6 +20,7 @@ from ..blocks.core import (
     check_name,
     explain_calls,
     kinds,
+    missing_member,
     without_collection,
 )
 from .coupling import Coupling, CouplingReport, report_coupling, to_coupling
@@ -41,6 +42,18 @@ if TYPE_CHECKING:
 LOOPS = ("error", "solve")
 PLUMBING = {"contact_port", "has_clock", "has_fmu", "is_continuous", "of_wired", "structure", "wired"}
 """Public members of a diagram that only functions below it use: completion leaves them out."""
+_LOOP = 'diagram.linearize().loop("wire")'
+WAYS = {
+    **dict.fromkeys(("run", "sim", "start", "execute"), "diagram.simulate(2.0)"),
+    **dict.fromkeys(("scope", "plot", "show"), 'run = diagram.simulate(2.0), then run.plot("wire")'),
+    **dict.fromkeys(("margin", "margins"), f"margins({_LOOP}), after from loopwright import margins"),
+    **dict.fromkeys(("bode", "nyquist", "root_locus", "pzmap", "nichols"), f"{_LOOP}, which such plots take"),
+    **dict.fromkeys(("loop", "poles", "linmod"), f"diagram.linearize(), and {_LOOP} for the loop at a wire"),
+    **dict.fromkeys(("add", "connect", "add_block", "add_connection"), "a call, which wires: plant(force=u)"),
+    **dict.fromkeys(("compile", "build"), "diagram.simulate(2.0, compile=True)"),
+    **dict.fromkeys(("set", "set_parameter", "set_param"), 'diagram.replace({"plant.mass": 2.0}), a new diagram'),
+}
+"""What to write for names that users of other tools look for in a diagram."""
 
 
 @explain_calls
@@ -116,6 +129,11 @@ class Diagram(ShownAsTable):
 
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"a diagram is a value: {name!r} can't be set. Use replace(…), or build another one.")
+
+    if not TYPE_CHECKING:  # a type checker knows all members
+
+        def __getattr__(self, name):
+            raise missing_member(self, name, "a diagram", WAYS)
 
     def __dir__(self) -> list[str]:
         return sorted(name for name in {*super().__dir__()} - PLUMBING if not name.startswith("_"))

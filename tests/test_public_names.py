@@ -4,9 +4,12 @@ import abc
 import ast
 import importlib
 import inspect
+import pickle
 import pydoc
+import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -15,7 +18,11 @@ import loopwright
 from loopwright.blocks import PID, Gain
 from loopwright.blocks.core import errors
 from loopwright.blocks.core.shown import documented
+from loopwright.blocks.names_of_other_tools import WAYS
+from loopwright.diagrams import OptionError, UnknownNameError
 from loopwright.diagrams.diagram import PLUMBING
+from loopwright.diagrams.solvers import SOLVERS
+from loopwright.diagrams.solvers.base import OTHER_NAMES
 from loopwright.fmus import mass_spring_damper
 
 ROOT = Path(__file__).parent.parent
@@ -93,6 +100,19 @@ def test_what_only_annotates_is_in_types():
         ("from loopwright.types import Margins", "from loopwright.frequency import Margins"),
         ("from loopwright.blocks import Satturation", "Did you mean Saturation"),
         ("import loopwright.diagrams.Margins", "from loopwright.frequency import Margins"),
+        ("from loopwright import TransferFunction", "from loopwright.blocks import TransferFunction"),
+        ("from loopwright import PID", "from loopwright.blocks import PID"),
+        ("from loopwright import Diagramm", "Did you mean Diagram"),
+        ("from loopwright.fmus import Diagram", "from loopwright import Diagram"),
+        ("from loopwright.blocks import Scope", 'run.plot("speed")'),
+        ("from loopwright import Scope", 'run.plot("speed")'),
+        ("from loopwright import Simulation", "diagram.simulate(2.0)"),
+        ("from loopwright import simulate_fmu", 'Diagram("name", Fmu("plant.fmu")())'),
+        ("from loopwright import tf", "TransferFunction(numerator=…, denominator=…)"),
+        ("from loopwright import ss", "StateSpace(A=…, B=…, C=…, D=…)"),
+        ("from loopwright import bode", 'control.bode(diagram.linearize().loop("wire"))'),
+        ("from loopwright.blocks import Adder", "the block is Sum"),
+        ("from loopwright import linearize", "a method of a diagram"),
     ],
 )
 def test_a_name_that_is_elsewhere_is_an_error_that_says_where(statement, hint):
@@ -104,6 +124,21 @@ def test_a_name_that_is_elsewhere_is_an_error_that_says_where(statement, hint):
     with pytest.raises(AttributeError) as caught:
         getattr(importlib.import_module(module), name)
     assert hint in str(caught.value)
+
+
+def test_names_of_other_tools_lead_to_names_that_exist():
+    control = importlib.import_module("control")
+    public = {name for package in PACKAGES for name in getattr(loopwright, package).__all__}
+    classes = re.compile(r"\b(?:[A-Z]\w*[a-z]\w*|PID|PT1)(?=[(,. ;])")
+    words = {"Here", "The", "It", "Among", "None", "An", "A", "At", "What", "Give", "Make", "Each", "Every", "Python"}
+    for name, text in WAYS.items():
+        assert name not in loopwright.blocks.__all__ + loopwright.fmus.__all__ + loopwright.diagrams.__all__, name
+        found = set(classes.findall(re.sub(r"\w+-control|plant\.fmu", "", text))) - words
+        assert found <= public, f"{name}: {found - public}"
+        methods = re.findall(r"diagram\.(\w+)\(", text)
+        assert all(hasattr(loopwright.Diagram, method) for method in methods)
+        assert all(hasattr(loopwright.Run, method) for method in re.findall(r"run\.(\w+)\(", text))
+        assert all(hasattr(control, function) for function in re.findall(r"control\.(\w+)\(", text))
 
 
 def test_an_unknown_name_is_plainly_unknown():
@@ -203,3 +238,72 @@ def test_an_abstract_class_may_be_a_second_base_of_a_block():
     assert isinstance(Still(), Plant)
     assert not isinstance(Gain(gain=1.0), Plant)
     assert issubclass(Still, loopwright.Block)
+
+
+# --- words of other tools --------------------------------------------------------------------------------------------------
+
+
+@cache
+def small():
+    return loopwright.Diagram(
+        "small", loopwright.blocks.Integrator()(loopwright.blocks.Constant(value=1.0)).named("speed")
+    )
+
+
+@cache
+def small_run():
+    return small().simulate(0.1, step=0.01, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("call", "hint"),
+    [
+        (lambda: small().simulate(1.0, solver="ode45"), "solver='RK45'"),
+        (lambda: small().simulate(1.0, solver="ode15s"), "solver='BDF'"),
+        (lambda: small().simulate(1.0, solver="ode4"), "solver='rk4'"),
+        (lambda: small().simulate(1.0, solver="RK54"), "or 'RK45'"),
+        (lambda: small().simulate(1.0, dt=0.1), "Did you mean step=… (seconds)?"),
+        (lambda: small().simulate(1.0, Ts=0.1), "Did you mean step=… (seconds)?"),
+        (lambda: small().simulate(1.0, method="RK45"), 'Did you mean solver="RK45"'),
+        (lambda: small().simulate(1.0, stop_time=2.0), "simulate(2.0)"),
+        (lambda: small().simulate(1.0, reltol=1e-3), "Did you mean rtol=…?"),
+        (lambda: loopwright.subsystem(dt=0.1), "Did you mean sample_time=… (seconds)?"),
+        (lambda: small().report("a.html", requirements={"phase_margin_deg": 40}), "Requirements(phase_margin_deg=40)"),
+        (lambda: loopwright.analyse(small(), requirements=[45]), "Requirements(phase_margin_deg=45)"),
+        (
+            lambda: small().worst_case({"integrator.initial_value": (0.0, 1.0)}, "speed", requirements={"ms": 1.6}),
+            "Requirements(ms=1.6)",
+        ),
+        (lambda: small_run().plot("speeed"), "Did you mean 'speed'?"),
+        (lambda: small().linearise, "Did you mean 'linearize'"),
+        (lambda: small().run, "Write diagram.simulate(2.0)."),
+        (lambda: small().bode, 'Write diagram.linearize().loop("wire")'),
+        (lambda: small_run().scope, 'Write run.plot("wire").'),
+        (lambda: small_run().to_dataframe, "Write run.to_pandas()."),
+        (lambda: small_run().final_stat, "Did you mean 'final_state'"),
+    ],
+)
+def test_a_word_of_another_tool_or_a_misspelt_one_is_an_error_that_says_what_to_write(call, hint):
+    with pytest.raises((OptionError, UnknownNameError)) as caught:
+        call()
+    assert hint in str(caught.value)
+
+
+def test_solvers_of_other_tools_lead_to_solvers():
+    assert set(OTHER_NAMES.values()) <= set(SOLVERS)
+    assert not {name.lower() for name in SOLVERS} & OTHER_NAMES.keys()
+
+
+def test_a_missing_attribute_is_an_attribute_error_and_a_failing_property_keeps_its_own():
+    assert not hasattr(small(), "scope")
+    assert not hasattr(small_run(), "_repr_nothing_")
+
+    class Failing(loopwright.Diagram):
+        @property
+        def total(self):
+            return self.blocks.no_such_attribute
+
+    with pytest.raises(AttributeError, match="no_such_attribute"):
+        _ = Failing("failing", loopwright.blocks.Constant(value=1.0)).total
+    copied = pickle.loads(pickle.dumps(small()))
+    assert copied.blocks == small().blocks

@@ -56,6 +56,7 @@ from .one_thread import on_one_thread, one_thread
 from .outside import EvaluationVectors, Wanted
 from .parameters import ParameterSpec
 from .ports import Event, Input, Output, Port, PortUnit, Shape, State, number_inputs
+from .shown import missing_member
 from .signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, check_name, primary_outputs, recorder
 from .source import Constant, Source
 from .tables import MOST_ROWS, Grid, Sheet, ShownAsTable, cell_text, decibels
@@ -170,6 +171,7 @@ __all__ = [
     "kinds",
     "lay_out",
     "left_of",
+    "missing_member",
     "move_earlier",
     "near",
     "next_edge",

@@ -36,7 +36,8 @@ class UnknownArgumentError(OptionError, UnknownNameError):
         super().__init__(self._describe(), block=block)
 
     def _describe(self) -> str:
-        close = close_names(self.argument, self.known | self.elsewhere.keys())
+        exact = [self.argument] if self.argument in self.elsewhere else []
+        close = exact or close_names(self.argument, self.known | self.elsewhere.keys())
         offered = " or ".join(self.elsewhere.get(name, repr(name)) for name in close)
         return f"{self.found} {self.argument!r}. " + (
             f"Did you mean {offered}?" if close else near(self.argument, self.known)

@@ -9,9 +9,12 @@ from __future__ import annotations
 import inspect
 import re
 from abc import ABCMeta
+from collections.abc import Mapping
 from functools import cache
 
+from .errors import near
 from .ports import Port
+from .signals import UnknownAttributeError
 
 _PACKAGE = __name__.partition(".")[0]
 _SECTION = re.compile(r"^(?:Attributes|Methods)\n-+\n((?:.+\n|\n(?!\S.*\n-+\n))*)", re.MULTILINE)
@@ -45,3 +48,26 @@ class ShownMembers(ABCMeta):
         inherited = {name for base in cls.__mro__[1:] for name in vars(base)}
         own = {name for name in vars(cls) if not name.startswith("_")} - inherited
         return sorted(own | {name for name in documented(cls) if hasattr(cls, name)})
+
+
+def missing_member(owner: object, name: str, kind: str, ways: Mapping[str, str]) -> AttributeError:
+    """Return the error of an attribute that an object doesn't have: what to write for it, or near names.
+
+    Parameters
+    ----------
+    owner : object
+        The object; what `dir` lists of it is known.
+    name : str
+        The attribute.
+    kind : str
+        What the object is, such as "a run".
+    ways : mapping of str
+        For names that users of other tools know: what to write.
+    """
+    if hasattr(type(owner), name):
+        object.__getattribute__(owner, name)  # a property that has failed: its own error
+    if name.startswith("_"):  # Python and notebooks ask for such names: no one has typed them
+        return AttributeError(f"{type(owner).__name__!r} object has no attribute {name!r}")
+    known = [member for member in dir(owner) if not member.startswith("_")]
+    step = f"Write {ways[name]}." if name in ways else near(name, known)
+    return UnknownAttributeError(f"{kind} has no {name!r}. {step}")

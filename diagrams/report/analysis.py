@@ -12,7 +12,7 @@ from ...fmus.running import Fmu
 from ..flat import WiredDiagram
 from ..linearization import find_signal
 from ..plotting import AxisUnits
-from ..requirements import Requirements, TomlFile, read_requirements
+from ..requirements import REQUIREMENTS, Requirements, TomlFile, read_requirements, write_requirements
 from ..studies import ContactTask, WorstCase, WorstCaseTask
 from ..sweeps import processors
 from .case import Case, ReportedExperiment
@@ -75,7 +75,7 @@ _REPORTED = Kind(
     diagram=_REPORTED,
     loops=kinds.names,
     only=kinds.names,
-    requirements=kinds.either(kinds.one_of_class(Requirements, "Requirements(…)"), kinds.path),
+    requirements=kinds.either(REQUIREMENTS, kinds.path).worded(step=write_requirements),
     about=kinds.mapping,
     decibels=kinds.flag,
     hertz=kinds.flag,

@@ -3,7 +3,7 @@
 from .contact_limits import ContactLimits, read_contact_limits
 from .explanations import UNREAD, explain
 from .number_limits import SENSES, STEP_UNITS, Limit, Reason, Sense, Verdict, is_doubtful, judge, judge_interval
-from .requirements import LoopLimits, Requirements, StepLimits
+from .requirements import REQUIREMENTS, LoopLimits, Requirements, StepLimits, write_requirements
 from .results import RequirementResult
 from .review import COLUMNS, DIGITS, MOST_REQUIREMENTS, NOTHING, Review, by_loop, rank, reason_in_table, row_of
 from .toml_file import REQUIRED, STUDIES, TomlFile, read_requirements
@@ -14,6 +14,7 @@ __all__ = [
     "MOST_REQUIREMENTS",
     "NOTHING",
     "REQUIRED",
+    "REQUIREMENTS",
     "SENSES",
     "STEP_UNITS",
     "STUDIES",
@@ -39,4 +40,5 @@ __all__ = [
     "read_requirements",
     "reason_in_table",
     "row_of",
+    "write_requirements",
 ]

@@ -8,7 +8,17 @@ from copy import copy
 from types import MappingProxyType
 from typing import Any, ClassVar
 
-from ...blocks.core import LoopwrightError, OptionError, UnknownNameError, accepts, brief, explain_calls, kinds, near
+from ...blocks.core import (
+    LoopwrightError,
+    OptionError,
+    UnknownNameError,
+    accepts,
+    brief,
+    explain_calls,
+    kinds,
+    near,
+    shorten,
+)
 from .contact_limits import ContactLimits, read_contacts
 from .number_limits import SENSES, STEP_SENSES, Limit, make_limit
 
@@ -376,3 +386,15 @@ def _loop_limits(given: Any, port: str) -> LoopLimits:
         return LoopLimits(**{str(name): limit for name, limit in given.items()})
     except OptionError as error:
         raise OptionError(error.message, port=f"{port}.{error.port}" if error.port else port) from None
+
+
+def write_requirements(value: Any) -> str:
+    """Return what to write in place of a mapping of limits, or of anything else that is no `Requirements`."""
+    limits = "phase_margin_deg=45"
+    if isinstance(value, Mapping) and value and all(isinstance(key, str) and key.isidentifier() for key in value):
+        limits = ", ".join(f"{key}={shorten(limit)}" for key, limit in value.items())
+    return f"Write requirements=Requirements({limits}), after from loopwright import Requirements."
+
+
+REQUIREMENTS = kinds.one_of_class(Requirements, "Requirements(…)").worded(step=write_requirements)
+"""Kind of an argument that takes requirements."""

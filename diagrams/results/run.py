@@ -23,6 +23,7 @@ from ...blocks.core import (
     enumerate_some,
     explain_calls,
     kinds,
+    missing_member,
     shorten,
     with_unit,
 )
@@ -46,6 +47,15 @@ _TIMES = kinds.row.where(lambda value: len(value) == 2 and value[0] < value[1]).
 )
 _MESSAGES, _SHOWN_MESSAGES = 3, 10
 """Messages that the short text and the table of a run show; the others are counted."""
+WAYS = {
+    **dict.fromkeys(("scope", "show", "display"), 'run.plot("wire")'),
+    **dict.fromkeys(("time", "times", "ts"), "run.t"),
+    **dict.fromkeys(("get", "read", "value", "values", "signal"), 'run["wire"]'),
+    **dict.fromkeys(("to_dataframe", "to_df", "dataframe", "df"), "run.to_pandas()"),
+    **dict.fromkeys(("step_info", "stepinfo"), 'diagram.report("loop.html"), which has overshoot and settling time'),
+    **dict.fromkeys(("signals", "keys", "channels", "logs"), "run.names, which has all signals"),
+}
+"""What to write for names that users of other tools look for in a run."""
 
 
 @explain_calls
@@ -149,6 +159,11 @@ class Run(ShownAsTable):
     def __post_init__(self) -> None:
         if not self.diagram_name:
             object.__setattr__(self, "diagram_name", getattr(self.diagram, "name", ""))
+
+    if not TYPE_CHECKING:  # a type checker knows all members
+
+        def __getattr__(self, name):
+            raise missing_member(self, name, "a run", WAYS)
 
     def __repr__(self) -> str:
         t = self.t

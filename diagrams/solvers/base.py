@@ -276,6 +276,20 @@ METHODS = {
 }
 """All methods, by the name that ``solver`` takes."""
 SOLVERS: tuple[str, ...] = ("auto", *METHODS)
+OTHER_NAMES = {
+    **dict.fromkeys(("ode45", "dopri5", "dopri", "rkdp54", "rkf45", "rkck54", "runge-kutta"), "RK45"),
+    **dict.fromkeys(("ode23", "rkbs32", "rkf21", "bogacki-shampine"), "RK23"),
+    **dict.fromkeys(("ode78", "ode89", "dopri8", "rkdp87", "rkf78", "rkv65"), "DOP853"),
+    **dict.fromkeys(("ode23s", "ode23t", "ode23tb", "ode14x", "esdirk32", "esdirk43", "esdirk54", "esdirk85"), "Radau"),
+    **dict.fromkeys(("ode15s", "ode15i", "ida", "dassl", "vode", "gear21", "gear32", "gear43", "gear52a"), "BDF"),
+    **dict.fromkeys(("ode113", "adams"), "CVODE_Adams"),
+    **dict.fromkeys(("odeint", "lsode", "auto-switching"), "LSODA"),
+    **dict.fromkeys(("ode1", "euf", "forward_euler", "explicit_euler"), "euler"),
+    **dict.fromkeys(("ode2", "ssprk22", "rk2"), "heun"),
+    **dict.fromkeys(("ode3", "ode4", "ode5", "ode8", "ssprk33", "ssprk34"), "rk4"),
+    **dict.fromkeys(("variable", "variablestepauto", "fixedstepauto"), "auto"),
+}
+"""Solvers of other tools (Simulink, SciPy, OpenModelica, pathsim) in small letters, and the one here of their kind."""
 FIXED = tuple(name for name, facts in METHODS.items() if facts.kind is MethodKind.FIXED_STEP)
 
 
@@ -289,6 +303,9 @@ def solver_name(name: str) -> str:
     """
     spelled = {known.lower(): known for known in SOLVERS} | {"cvode": "CVODE_BDF"}
     if not isinstance(name, str) or name.lower() not in spelled:
+        alike = OTHER_NAMES.get(str(name).lower())
+        if alike is not None:
+            raise OptionError(f"there is no solver {name!r}. A method of its kind is {alike!r}: give solver={alike!r}.")
         hint = near(str(name).lower(), spelled)
         for lower, known in spelled.items():
             hint = hint.replace(repr(lower), repr(known))

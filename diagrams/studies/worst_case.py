@@ -25,7 +25,7 @@ from ...blocks.core import (
 from ..flat import WiredDiagram
 from ..frequency import order_key
 from ..linearization import carry_point
-from ..requirements import Requirements
+from ..requirements import REQUIREMENTS, Requirements
 from ..sweeps import Box, Samples, read_samples
 from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe, make_goal
 from .confirmation import RunConfirmation, confirm_case
@@ -215,6 +215,7 @@ _FROM_0 = kinds.integer(0).worded(step="Give one.", found=kinds.by_name)
     starts=_FROM_0,
     steps=_FROM_0,
     delay=_FROM_0,
+    requirements=REQUIREMENTS,
     progress=kinds.function,
 )
 def find_worst_case(

@@ -24,6 +24,7 @@ from ...blocks.core import (
     check_name,
     explain_calls,
     near,
+    offer_elsewhere,
     read_time,
     recorder,
 )
@@ -363,6 +364,10 @@ def subsystem(
     triggered: str | None = None,
 ) -> Callable[[Callable[..., object]], Subsystem]: ...
 @explain_calls
+@offer_elsewhere(
+    **dict.fromkeys(("dt", "h", "Ts", "T", "period", "rate", "step", "sampletime"), "sample_time=… (seconds)"),
+    phase="offset=… (seconds)",
+)
 def subsystem(
     function: Callable[..., object] | None = None,
     /,

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import PID, Constant, Demux, Gain, Step, TransferFunction, UnknownNameError
-from loopwright.diagrams import Diagram, Requirements, Run, final, subsystem
+from loopwright.diagrams import Diagram, Requirements, Run, subsystem
+from loopwright.sweeps import final
 
 
 @pytest.fixture(scope="module")
