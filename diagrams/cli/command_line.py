@@ -33,9 +33,11 @@ from ...fmus.models import gantry
 from ..paper import DEFINITIONS, EXPERIMENTS, Experiment, key_numbers
 from ..results import Run
 from ..simulation import Interrupted
+from .diagrams import add_diagram_options, add_diagrams, draw_command, run_diagram, sweep_command
 from .fmu import COMMANDS, add_commands
 from .options import option_lines, parse_letters, parse_options, parse_renames, share
 from .report import add_report, report_command
+from .subjects import is_user_file
 from .text import fit as _fit
 from .text import say as _say
 
@@ -74,7 +76,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.print_help(sys.stderr)
         return 2
     try:
-        return {**COMMANDS, "report": report_command}.get(arguments.command, _run)(arguments)
+        own = {"report": report_command, "draw": draw_command, "sweep": sweep_command}
+        return {**COMMANDS, **own}.get(arguments.command, _run)(arguments)
     except OptionError as error:
         _say(f"loopwright: error: {error}", sys.stderr)
         return 2
@@ -98,13 +101,20 @@ def _make_parser() -> argparse.ArgumentParser:
     width = max(len(name) for name in DEFINITIONS)
     run = commands.add_parser(
         "run",
-        help="run the experiments of the paper",
+        help="run a diagram of yours, or the experiments of the paper",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Run experiments of the paper: A path following, B compliance, C hand guiding, D force tracking.\n"
+        usage="loopwright run FILE.py:NAME --duration S [options]\n       loopwright run [LETTER ...] [options]",
+        description="Run a diagram of yours, FILE.py:NAME, where NAME may be a function that returns one. Writes all\n"
+        "samples (NAME.csv), a summary (NAME.json) and a figure of the named wires (NAME.png, .svg) to the\n"
+        "folder --out, and prints the named wires.\n\n"
+        "Or run experiments of the paper: A path following, B compliance, C hand guiding, D force tracking.\n"
         "Writes the samples (A.csv), the key numbers (A.json, SI units) and two figures (A_path, A_signals;\n"
         ".png and .svg) of each, in place of an earlier run's. A run that fails writes its record until then, and the\n"
         'reason ("error" in A.json). A run without a record writes nothing, and an earlier run\'s files stay.',
-        epilog="options (--option), with their defaults:\n  "
+        epilog="examples:\n  loopwright run loop.py:loop --duration 2\n"
+        "  loopwright run loop.py:loop --duration 2 --set pid.kp=3 --json\n"
+        "  loopwright run C --option tool_mass=0.3 --option delay=1\n\n"
+        "options of experiments (--option), with their defaults:\n  "
         + "\n  ".join(option_lines())
         + "\n  An option that only some experiments have is given to those.\n\nkey numbers:\n"
         + "\n".join(f"  {name:{width}}  [{unit}] {text}" for name, (unit, text) in DEFINITIONS.items())
@@ -113,7 +123,12 @@ def _make_parser() -> argparse.ArgumentParser:
         "  2    wrong usage; nothing was run\n"
         "  130  interrupted (Ctrl-C); the record until then is written",
     )
-    run.add_argument("letters", nargs="*", metavar="LETTER", help="A, B, C, D, also as A,B or AB; all four without one")
+    run.add_argument(
+        "letters",
+        nargs="*",
+        metavar="FILE.py:NAME or LETTER",
+        help="a diagram of yours, or A, B, C, D, also as A,B or AB; all four experiments without one",
+    )
     run.add_argument("--out", metavar="DIR", default="out", help="folder for the files (default: out)")
     run.add_argument("--plant", metavar="FILE.fmu", help="another plant in place of the gantry")
     run.add_argument(
@@ -133,6 +148,8 @@ def _make_parser() -> argparse.ArgumentParser:
         dest="options",
         help="an option of the experiments; repeat it for several",
     )
+    add_diagram_options(run)
+    add_diagrams(commands)
     add_report(commands)
     add_commands(commands)
     return parser
@@ -164,6 +181,14 @@ def _make_folder(name: str) -> Path:
 
 def _run(arguments: argparse.Namespace) -> int:
     """Build all experiments first, so that wrong usage is found before anything runs; then run them."""
+    files = [given for given in arguments.letters if is_user_file(given)]
+    if files:
+        if len(arguments.letters) > 1:
+            raise OptionError(f"found {' '.join(arguments.letters)}; expected one diagram. Run them one by one.")
+        return run_diagram(files[0], arguments)
+    for name, given in (("--duration", arguments.duration), ("--set", arguments.changes), ("--step", arguments.step)):
+        if given:
+            raise OptionError("it is for diagrams, FILE.py:NAME; experiments have --option.", port=name)
     letters = parse_letters(arguments.letters)
     chosen, renames = share(letters, parse_options(arguments)), parse_renames(arguments)
     try:

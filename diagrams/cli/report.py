@@ -6,28 +6,24 @@ import argparse
 import contextlib
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...blocks.core import (
-    DefinitionError,
     FmuError,
     FmuFileError,
     LoopwrightError,
     OptionError,
     UnknownNameError,
     describe_disk_error,
-    near,
 )
-from ...fmus.models import gantry
 from ..diagram import Diagram
-from ..paper import EXPERIMENTS, Experiment
+from ..paper import Experiment
 from ..requirements import STUDIES, Requirements, Review, TomlFile, Verdict, explain, read_requirements
 from ..simulation import work_notes
-from .options import parse_options, share
+from .subjects import open_subject
 from .text import say
-from .user_models import load_user_file
 
 if TYPE_CHECKING:
     from ..report import Report
@@ -130,7 +126,7 @@ def report_command(arguments: argparse.Namespace) -> int:
     subject = arguments.diagram or DEFAULT
     with contextlib.ExitStack() as open_file:
         try:
-            diagram, experiment = open_file.enter_context(_open_subject(subject, arguments))
+            diagram, experiment = open_file.enter_context(open_subject(subject, arguments))
         except OptionError:
             raise
         except LoopwrightError as error:
@@ -276,66 +272,3 @@ def _analyse(
         _written=True,
     )
     return with_drawing(made, diagram.wired)
-
-
-# --- the diagram ---------------------------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def _open_subject(subject: str, arguments: argparse.Namespace) -> Iterator[tuple[Diagram, Experiment | None]]:
-    """Yield the diagram, and its experiment where it has one."""
-    if ".py" in subject:
-        for name, given in (("--option", arguments.options), ("--plant", arguments.plant)):
-            if given:
-                raise OptionError("it is for experiments; set it in the file.", port=name)
-        with load_user_file(subject, port="DIAGRAM") as (module, path, name):
-            found = _find_diagram(vars(module), str(path), path.name, name)
-            yield (found.diagram, found) if isinstance(found, Experiment) else (found, None)
-        return
-    experiment = _make_experiment(subject, arguments)
-    yield experiment.diagram, experiment
-
-
-def _make_experiment(name: str, arguments: argparse.Namespace) -> Experiment:
-    letter = name.upper()
-    if letter not in EXPERIMENTS:
-        raise OptionError(
-            f"found {name!r}; expected one of {', '.join(EXPERIMENTS)}, or FILE.py:NAME, such as loop.py:diagram.",
-            port="DIAGRAM",
-        )
-    options = share([letter], parse_options(arguments))[letter]
-    if options.get("plant") is None:
-        gantry.build(notify=lambda line: say(line, sys.stderr))
-    return EXPERIMENTS[letter](**options)
-
-
-def _find_diagram(names: Mapping[str, object], source: str, file: str, name: str) -> Diagram | Experiment:
-    """Return the diagram or experiment that a name stands for in a user's file."""
-    known = {key: value for key, value in names.items() if isinstance(value, Diagram | Experiment)}
-    if not name:
-        if len(known) == 1:
-            return next(iter(known.values()))
-        example = f" Write {file}:{next(iter(known), 'NAME')}."
-        raise OptionError(f"expected FILE.py:NAME. Its diagrams: {', '.join(known) or 'none'}.{example}", block=source)
-    if name not in names:
-        hint = near(name, known) if known else "There is no Diagram in it."
-        raise OptionError(f"there is no {name!r} in it. {hint}", block=source)
-    found = names[name]
-    if callable(found) and not isinstance(found, Diagram | Experiment | type):
-        try:
-            found = found()
-        except LoopwrightError:
-            raise
-        except Exception as error:
-            raise DefinitionError(
-                f"{name}() fails: {type(error).__name__}: {error}. Give a diagram, or a function without arguments "
-                "that returns one.",
-                block=source,
-            ) from error
-    if not isinstance(found, Diagram | Experiment):
-        raise OptionError(
-            f"found {type(found).__name__} for {name!r}; expected a Diagram. Its diagrams: "
-            f"{', '.join(known) or 'none'}.",
-            block=source,
-        )
-    return found

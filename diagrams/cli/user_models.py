@@ -108,7 +108,7 @@ def _load(path: Path) -> Iterator[ModuleType]:
             if isinstance(error, SystemExit):
                 step = 'Put its script behind if __name__ == "__main__".'
             raise DefinitionError(
-                f"importing it fails{_line_text(error, path)}: {type(error).__name__}: {_message(error)}. {step}",
+                f"importing it fails{line_text(error, path)}: {type(error).__name__}: {_message(error)}. {step}",
                 block=str(path),
             ) from error
         yield module
@@ -167,12 +167,12 @@ def _find_block(module: ModuleType, path: Path, name: str) -> Block:
         raise OptionError(f"{name}() can't be made: {error}", block=source) from error
     except Exception as error:
         raise DefinitionError(
-            f"{name}() can't be made{_line_text(error, path)}: {type(error).__name__}: {_message(error)}. Correct it.",
+            f"{name}() can't be made{line_text(error, path)}: {type(error).__name__}: {_message(error)}. Correct it.",
             block=source,
         ) from error
 
 
-def _line_text(error: BaseException, path: Path) -> str:
+def line_text(error: BaseException, path: Path) -> str:
     """Return the last line of a file that an error came through, as words."""
     if isinstance(error, SyntaxError) and error.filename is not None:
         return f" in line {error.lineno} of {error.filename}"
