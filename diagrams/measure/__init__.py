@@ -15,12 +15,13 @@ from .quanta import (
     remaining_oscillation,
 )
 from .step_measures import ExpectedStep, Measured, is_at_rest, measure_step
-from .step_response import StepResponse, step_response
+from .step_response import DivergenceError, StepResponse, step_response
 
 __all__ = [
     "LEAST",
     "LEAST_SINE",
     "Converter",
+    "DivergenceError",
     "ExpectedStep",
     "FrequencyResponse",
     "Measured",

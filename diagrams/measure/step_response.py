@@ -65,6 +65,10 @@ LONG = 2000
 """Ticks of a run from which on C is worth its start where a solver goes from one to the next; no chunk is so long."""
 
 
+class DivergenceError(SimulationError):
+    """A response to a step grows without end."""
+
+
 @explain_calls
 @dataclass(frozen=True, eq=False)
 class StepResponse:
@@ -222,7 +226,7 @@ def step_response(
     ------
     OptionError
         A wire with several entries, or a step or length that is none.
-    SimulationError
+    DivergenceError
         The response grows without end.
     """
     point = operating_point(diagram, at, {})
@@ -290,7 +294,7 @@ def step_response(
                 done += min(CHUNK, count - done)
                 found.append(tuple(part[1:] for part in some) if len(found) > 1 else some)
                 if not float(np.max(np.abs(some[0]))) <= largest:
-                    raise SimulationError(
+                    raise DivergenceError(
                         f"found a response that has grown to {float(np.max(np.abs(some[0]))):.3g} after a step of "
                         f"{size:g}; expected one that settles: the diagram is not stable there. Look at "
                         "linearize().poles.",

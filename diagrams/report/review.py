@@ -346,7 +346,10 @@ def _step(
         if number is None:
             result = replace(result, detail=reason_of(absent, f"steps.{key}.{v.key}"))
         result = _with(state, result, None if number is None else (path, number))
-        if number is not None and settled is not None and not settled.value and length is not None:
+        if (since := numbers.get(f"steps.{key}.{v.key}.diverges")) is not None:
+            detail = f"from t = {since.value:.4g} s after the step, where it leaves the linear model's response"
+            result = replace(result, verdict=Verdict.FAILED, reason=Reason.DIVERGES, detail=detail)
+        elif number is not None and settled is not None and not settled.value and length is not None:
             result = _not_settled(result, number, length)
         yield result if step.size is not None else _at_no_size(result, numbers, f"steps.{key}.{v.key}", name)
 

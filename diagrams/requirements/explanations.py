@@ -30,6 +30,8 @@ def explain(result: RequirementResult) -> str:
         return ""
     if result.verdict is not Verdict.UNDECIDED:
         is_contact = result.variant == CONTACT  # whose detail is its environment
+        if result.reason is Reason.DIVERGES:
+            return f"diverges {result.detail}"
         return f"{result.reason}: {result.detail}" if result.detail and not is_contact else str(result.reason)
     why, step = _find_reason(result)
     why = why.rstrip(".")
@@ -78,6 +80,7 @@ def _find_reason(result: RequirementResult) -> tuple[str, str]:
             f"the response to a small step is not that of the linear model: {detail}",
             "give the size for which the limit holds, size=…",
         ),
+        Reason.DIVERGES: (f"the response diverges{about}", ""),
         Reason.NOT_SETTLED: (f"the response has not settled in its record of {detail}", "give a longer length"),
         Reason.MOVING: (
             f"the operating point moves{f' ({detail})' if detail else ''}",

@@ -48,6 +48,8 @@ class Reason(StrEnum):
     """The running co-simulation was measured, and contradicts the linear model."""
     NOT_MEASURED = "not measured"
     """The co-simulation was to be measured, and gave no number."""
+    DIVERGES = "diverges"
+    """The response grows without end, though the linear model's doesn't."""
     NOT_SETTLED = "not settled"
     """The response still moves at the end of its record: its numbers so far are least values."""
     SIZE_NOT_GIVEN = "size not given"

@@ -69,7 +69,7 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities, confirmed: list
         try:
             made = _take_confirmed([found[name, quantity] for quantity in shown], confirmed)
             if not made:
-                case.tell(f"confirming the sensitivity at {wire} to {name}, by differences of {', '.join(shown)}")
+                case.tell(f"confirming the sensitivity at {wire} to {name}")
                 made = confirm_parameter(found, name, shown)
                 confirmed += made
         except LoopwrightError as error:

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from ....blocks import Saturation
-from ....blocks.core import LoopwrightError, PeriodicLoopError
+from ....blocks.core import LoopwrightError, NonFiniteError, PeriodicLoopError
 from ...flat import WiredDiagram
 from ...frequency import Confirmation, Number, realize
 from ...linearization import find_signal
 from ...measure import (
     LEAST,
     Converter,
+    DivergenceError,
     Quantum,
     StepResponse,
     columns_of,
@@ -59,6 +60,18 @@ SIZE = 100.0
 """Size of a step, in amplitudes of the injection check, where none is given."""
 SMALLER = 0.1
 """Factor by which a step of no given size is made smaller while its response is not that of the linear model."""
+OUTSIDE = 2.0
+"""Size of an answer in parts of the linear model's, or of the step, above which it is outside."""
+BEYOND_ALL = 1e3
+"""Size of an answer, in parts of the linear model's, that is called growth without end."""
+RISES = 3.0
+"""Least growth of such an answer in four times the time: a ramp's is 4."""
+FURTHER = (4.0, 16.0)
+"""Lengths, in those of the record, for which such an answer is followed to see whether it grows without end."""
+TIMES_SHORTER = 20
+"""Most times that a record is halved so that it ends before a response has grown without end."""
+ROOM = 1.5
+"""Length of the record of a response that diverges, in times at which it leaves the linear model's."""
 TIMES_SMALLER = 4
 """Most times that it is."""
 ALIKE = 1e-4
@@ -128,9 +141,9 @@ def steps(case: Case) -> Section | None:
             if ran is None:
                 absent[f"{test.key}.{v.key}"] = TEXTS.line("no_single", wire=test.wire)
                 continue
-            got, slowest, quantized = ran
+            got, slowest, quantized, diverges = ran
             where = f"{test.key}.{v.key}"
-            own = _numbers(got, test, v, slowest)
+            own = _numbers(got, test, v, slowest) | _diverging(got, test, v, diverges)
             numbers |= {f"{where}.{name}": number for name, number in own.items()}
             for name, said in NAMES.items():
                 linear = own.get(f"linear.{name}")
@@ -143,6 +156,8 @@ def steps(case: Case) -> Section | None:
                 numbers[f"{where}.{key}"] = Number(change, unit, off, _how(got))
                 at_first = Number(before, unit, 1e-9 * abs(before), "the run before the step", given=True)
                 effort.append((str(test), v.title, name, at_first, numbers[f"{where}.{key}"]))
+            if diverges is not None:
+                text.append(TEXTS.line("diverges", variant=v.title, wire=str(test), since=diverges))
             text += [TEXTS.line("saturated", variant=v.title, wire=test.wire, blocks=saturated)] if saturated else []
             text += _said_of_quanta(v, test, got, quantized, saturated)
             for name, number in quantized.oscillations.items():
@@ -152,7 +167,7 @@ def steps(case: Case) -> Section | None:
                 text.append(TEXTS.line("unread", variant=v.title, wire=test.wire, plants=got.unread))
             if got.prediction is None:
                 text.append(TEXTS.line("unpredicted", variant=v.title, wire=test.wire))
-            if not own["settled"].value:
+            if not own["settled"].value and diverges is None:
                 text.append(TEXTS.line("unsettled", variant=v.title, wire=test.wire, length=own["length"].value))
             if got.moved > 1e-6:
                 text.append(TEXTS.line("moved", variant=v.title, wire=test.wire, moved=got.moved))
@@ -271,8 +286,10 @@ def _rest(
         return 0.0
 
 
-def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | None, Quantized] | None:
+def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | None, Quantized, float | None] | None:
     """Return a response, the rate of its slowest mode in 1/s, None if it has none, and what converters do to it.
+
+    The last entry is the time in s from which it diverges, None where it does not.
 
     None at a wire with several entries, which has no single step.
     """
@@ -308,22 +325,115 @@ def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | 
     converters = find_converters(v.diagram.flatten_like(v.point))
     fed = list(dict.fromkeys(converter.signal for converter in converters))
 
-    def respond(size: float) -> StepResponse:
+    def respond(size: float, length: float = length) -> StepResponse:
         return step_response(
             diagram, test.wire, size=size, length=length, at=point, outputs=[*outputs, *fed], stairs=v.stairs
         )
 
+    diverges: float | None = None
     try:
         got = respond(size)
+    except (DivergenceError, NonFiniteError):
+        if given is None and size > usual:
+            got = respond(usual)
+        else:
+            got, diverges = _follow_diverging(lambda length: respond(size, length), test, length)
     except LoopwrightError:
         if given is not None or size <= usual:
             raise
         got = respond(usual)  # the diagram's range is smaller than the quanta ask for
-    if given is None:
+    if diverges is None and given is not None:
+        case_tells = f"step at {test!s}, {v.title}, for longer: it has left the linear model's"
+        if _grows_on(got, test, lambda length: respond(size, length), length, lambda: case.tell(case_tells)):
+            got, diverges = _follow_diverging(lambda length: respond(size, length), test, length)
+    if given is None and diverges is None:
         got = _small_response(got, respond, height)
     kept = sum(len(find_signal(diagram.flatten_like(point), name).labels) for name in outputs)
     got, left = _without_converters(got, converters, plan.variant, kept)
-    return got, slowest, Quantized(height, quantum, usual if given is None else None, left)
+    return got, slowest, Quantized(height, quantum, usual if given is None else None, left), diverges
+
+
+def _grows_on(
+    got: StepResponse,
+    test: StepTest,
+    respond: Callable[[float], StepResponse],
+    length: float,
+    tell: Callable[[], None],
+) -> bool:
+    """Return whether an answer that ends away from the linear model's grows without end.
+
+    It is followed for longer then. It does if it gets `BEYOND_ALL` times as large as the linear model's, or grows as a
+    ramp does at least.
+    """
+    if got.prediction is None:
+        return False
+    linear = float(np.max(np.abs(got.answer(bool(test.output), linear=True))))
+    off = got.answer(bool(test.output)) - got.answer(bool(test.output), linear=True)
+    if not linear or not np.max(np.abs(off[-max(1, len(off) // 20) :])) > AGREEMENT * linear:
+        return False
+    size = _size_at_end(got, test)
+    for times in FURTHER:
+        if size > BEYOND_ALL * linear:
+            return True
+        tell()
+        try:
+            further = _size_at_end(respond(times * length), test)
+        except (DivergenceError, NonFiniteError):
+            return True
+        if further < RISES * size:
+            return False
+        size = further
+    return size > OUTSIDE * linear
+
+
+def _size_at_end(got: StepResponse, test: StepTest) -> float:
+    answer = got.answer(bool(test.output))
+    return float(np.max(np.abs(answer[-max(1, len(answer) // 20) :])))
+
+
+def _follow_diverging(
+    respond: Callable[[float], StepResponse], test: StepTest, length: float
+) -> tuple[StepResponse, float]:
+    """Return the beginning of a response that grows without end, and the time in s since the step at which it leaves.
+
+    It is the time from which on the answer is not the linear model's any more, by `APART` of that; without a linear
+    model that from which on it is more than `OUTSIDE` times the step.
+    """
+    for _ in range(TIMES_SHORTER):
+        try:
+            got = respond(length)
+        except (DivergenceError, NonFiniteError):
+            length *= 0.5
+            continue
+        since = _find_departure(got, test)
+        if ROOM * since < 0.9 * length:
+            got = respond(max(ROOM * since, 1e-3 * length))
+        return got, since
+    got = respond(length)
+    return got, _find_departure(got, test)
+
+
+def _find_departure(got: StepResponse, test: StepTest) -> float:
+    answer = got.answer(bool(test.output))
+    if got.prediction is None:
+        off, room = np.abs(answer), OUTSIDE
+    else:
+        linear = got.answer(bool(test.output), linear=True)
+        off, room = np.abs(answer - linear), APART * float(np.max(np.abs(linear)))
+    near = np.flatnonzero(off <= room)
+    last = min(int(near[-1]) + 1 if near.size else 0, len(off) - 1)
+    return float(got.t[last] - got.t[int(np.argmax(got.d != 0.0))])
+
+
+def _diverging(got: StepResponse, test: StepTest, v: Variant, diverges: float | None) -> dict[str, Number]:
+    """Return the numbers of a response that grows without end, in place of those of its record; none of another."""
+    if diverges is None:
+        return {}
+    how = Confirmation("the nonlinear co-simulation, with and without the step: the response grows without end")
+    units = {**STEP_UNITS, "peak": unit_at(v.diagram, test.output or test.wire)}
+    found = {name: Number(math.inf, units.get(name, "1"), 0.0, how) for name in ("overshoot", "settling", "peak")}
+    step = float(np.max(np.diff(got.t), initial=0.0))
+    return found | {"diverges": Number(diverges, "s", step, how)}
 
 
 def _small_response(got: StepResponse, respond: Callable[[float], StepResponse], least: float) -> StepResponse:
