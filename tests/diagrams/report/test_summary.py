@@ -222,9 +222,10 @@ def test_progress_says_what_is_computed_and_confirmed():
         "confirming the margins at u, as it is",
         "step at u, as it is",
         "sensitivity at u",
-        "confirming the sensitivity at u to gain.gain",
     ):
         assert said in told
+    confirmed = [said for said in told if said.startswith("confirming the sensitivity at ")]
+    assert sum(said.endswith(" to gain.gain") for said in confirmed) == 1  # once for all wires of the loop
 
 
 def test_the_heading_of_the_contents_is_on_the_sheet_of_its_lines(tmp_path):
