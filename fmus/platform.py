@@ -38,6 +38,8 @@ def cache_folder() -> Path:
             "found no home folder for the cache, neither by HOME nor by the system's list of users; expected one. "
             f"{OWN_CACHE}"
         )
+    if folder.is_absolute():
+        return folder
     with explain_disk_errors(f"the cache folder {str(folder)!r} can't be found", folder, OWN_CACHE, FmuError):
         return folder.absolute()
 

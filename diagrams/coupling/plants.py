@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from typing import Any, Protocol
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -72,7 +73,14 @@ class Stepped(Protocol):
 
 def note_steps(flat: FlatDiagram, *, step: object) -> tuple[str, ...]:
     """Return messages on the communication steps of plants; ``step`` is that which the run was asked for, or None."""
-    return (*(_note_fine_steps(flat) if step is None else ()), *_note_parts_of_steps(flat))
+    known = _KNOWN.setdefault(flat, {})
+    if (is_own := step is None) not in known:
+        known[is_own] = (*(_note_fine_steps(flat) if is_own else ()), *_note_parts_of_steps(flat))
+    return known[is_own]
+
+
+_KNOWN: WeakKeyDictionary[FlatDiagram, dict[bool, tuple[str, ...]]] = WeakKeyDictionary()
+"""The messages on diagrams that have run, by whether a run has no step of its own: each run has the same."""
 
 
 def _note_fine_steps(flat: FlatDiagram) -> tuple[str, ...]:

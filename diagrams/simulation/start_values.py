@@ -35,7 +35,7 @@ class StartValues:
         self._sources = [path for path, block in blocks.items() if not block.inputs]
         self._bound: dict[tuple[Port, ...], _StartFunctions] = {}
         self._left: tuple[list[Block], dict[Port, np.ndarray]] | None = None
-        self._found: dict[str, tuple[Block, bytes, np.ndarray]] = {}
+        self._found = _known_of(flat).states
 
     @staticmethod
     def fits(flat: FlatDiagram) -> bool:
@@ -71,7 +71,7 @@ class StartValues:
                 x[flat.gates.slices[name]] = float(is_true(values))
 
     def _initial(self, flat: FlatDiagram, path: str, columns: dict[str, Any]) -> np.ndarray:
-        """Return a block's initial state; the last one, where neither the block nor its inputs have changed."""
+        """Return a block's initial state; that of the last run, where neither the block nor its inputs have changed."""
         block = flat.table.blocks[path]
         key = b"".join([b"-" if column is None else column.tobytes() for column in columns.values()])
         known = self._found.get(path)
@@ -136,9 +136,13 @@ class StartFunctions:
 
 @dataclass(eq=False)
 class _Known:
-    """The traced functions of a diagram's start by the sources before t = 0, and its number of runs so far."""
+    """The traced functions of a diagram's start by the sources before t = 0, and its number of runs so far.
+
+    And the last initial state of each block, with the block and its inputs, as many runs start from the same ones.
+    """
 
     functions: dict[tuple[Port, ...], StartFunctions] = field(default_factory=dict)
+    states: dict[str, tuple[Block, bytes, np.ndarray]] = field(default_factory=dict)
     runs: int = 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -31,8 +32,10 @@ def unpack(description: FmuDescription) -> Path:
         can't be loaded safely.
     """
     folder = cache_folder() / "unpacked" / description.digest[:32]
+    if os.path.exists(folder / RESOURCES):
+        return folder
     with explain_cache_errors():
-        if (folder / RESOURCES).exists():
+        if (folder / RESOURCES).exists():  # whoever may not look is told so
             return folder
     archive = FmuArchive.open(description.file, description.limits)
     if archive.digest != description.digest:

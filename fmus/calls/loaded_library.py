@@ -51,7 +51,7 @@ class LoadedFmu:
         self.log = MessageLog(block.label, list_limits(block.label, self.description, model_exchange=model_exchange))
         self._open = self._running = False
         self._start: BoundStart | None = None
-        self._began, self._given, self.is_built_here = 0.0, dict[str, Any](), is_built_here(block.description.digest)
+        self._began, self._given, self.is_built_here = 0.0, dict[str, Any](), is_built_here(self.description.digest)
         description, self.host = self.description, HostState(self.add_note)
         if make_calls is None:
             self._refuse_second()

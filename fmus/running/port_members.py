@@ -65,16 +65,17 @@ class PortMembers(Block):
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
         """The FMU's inputs, and the parameters among ``ports``."""
+        about = self.description
         return {
-            port: Input(v.shape, v.unit, v.description, default=self._default(v), name=port)
-            for port, v in self.input_variables.items()
+            port: Input(v.shape, v.unit, v.description, default=self._default(v, about), name=port)
+            for port, v in self._choose_ports(about).inputs.items()
         }
 
-    def _default(self, v: FmuVariable) -> Any:
+    def _default(self, v: FmuVariable, about: FmuDescription) -> Any:
         """Return the value of an input that is not wired; None where one must be."""
         if v.name in self.start:
             return self.start[v.name]
-        array, index = self.description.elements.get(v.name, ("", ()))
+        array, index = about.elements.get(v.name, ("", ()))
         if array in self.start:
             return self.start[array][index]
         return v.start if v.causality == "parameter" else None
@@ -88,9 +89,9 @@ class PortMembers(Block):
     @property
     def held_inputs(self) -> tuple[str, ...]:
         """Input ports that need no wire, as `start` gives them values; where they are not wired they keep these."""
-        return tuple(
-            port for port, v in self.input_variables.items() if v.causality == "input" and self._default(v) is not None
-        )
+        about = self.description
+        inputs = self._choose_ports(about).inputs
+        return tuple(p for p, v in inputs.items() if v.causality == "input" and self._default(v, about) is not None)
 
     def start_of(self, name: str, value: Any, unit: str) -> dict[str, Any]:
         """Return the entry of `start` for a value in a unit that need not be the FMU's: converted as the port's wires.
