@@ -1,6 +1,6 @@
 """Elasticity's cost to the admittance: limits of three robots, confirmed by runs: python benchmarks/admittance.py.
 
-It makes the table and the figure of docs/howto/frequency.md again: Fig. 3 with the impedances of Table III, sampled at
+It makes the table and the figure of docs/howto/contact.md again: Fig. 3 with the impedances of Table III, sampled at
 1 kHz, around the rigid gantry, the gantry with elastic screws, and the gantry with bristles; ``--figure`` names the
 file.
 """

@@ -1,7 +1,7 @@
 """A run next to C that was written by hand: python benchmarks/handwritten.py [--instructions].
 
 Experiment C, 12,000 ticks, from `handwritten/experiment_c.c`, which gcc compiles with -O3 and FMA (zig where there is
-no gcc), and by `simulate`, interpreted, compiled and fused (docs/howto/diagrams.md), everything recorded. All forms
+no gcc), and by `simulate`, interpreted, compiled and fused (benchmarks/README.md), everything recorded. All forms
 take turns, 15 times; a figure is the ratio of the smallest times, which other work on the machine disturbs least, with
 the median of the ratios within a turn. The trajectories are compared, too: the program ends with status 1 if they
 differ by more than 1e-9 of a signal's largest value.

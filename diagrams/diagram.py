@@ -280,7 +280,7 @@ class Diagram(ShownAsTable):
     def simulate(self, duration: float, *, progress: bool | None = None, **options: Unpack[RunKeywords]) -> Run:
         """Run the diagram and return what it recorded: from t = 0, or from a saved state.
 
-        The page docs/explanation/architecture.md says what happens in which order.
+        The page docs/explanation/time.md says what happens in which order.
 
         Parameters
         ----------
@@ -592,7 +592,7 @@ class Diagram(ShownAsTable):
         Linearization
             With `Linearization.system`, a `control.StateSpace` with names, and the loops: ``.loop("v_perp")``. Of a
             continuous diagram with transport delays these are systems with delays, which evaluate exactly and have no
-            matrices; see docs/howto/frequency.md.
+            matrices; see docs/howto/dead_time.md.
 
         Raises
         ------
@@ -653,7 +653,7 @@ class Diagram(ShownAsTable):
         """Measure a frequency response on the running diagram: a test signal d is added at a wire.
 
         With v the output of the wire's port and u = v + d the signal that all its consumers get, S = u/d, T = −v/d and
-        L = −v/u, as of `Linearization`. They are sampled where the linear model is; see docs/howto/frequency.md.
+        L = −v/u, as of `Linearization`. They are sampled where the linear model is; see docs/howto/measured_loops.md.
 
         The signal is ramped in; then windows of whole periods follow until two agree. Let the references stand still.
 

@@ -42,6 +42,7 @@ def stage(folder: Path) -> None:
         *(ROOT / "notebooks").glob("*.ipynb"),
         ROOT / "CHANGELOG.md",
         ROOT / "CONTRIBUTING.md",
+        ROOT / "benchmarks" / "README.md",
     ]
     for page in pages:
         place = folder / page.relative_to(HERE if HERE in page.parents else ROOT)
@@ -54,9 +55,11 @@ def stage(folder: Path) -> None:
 def write_reference(folder: Path) -> None:
     """Write the pages of the reference that are made of the package."""
     sys.path.insert(0, str(HERE / "site"))
+    import facts
     import names
     import responses
 
+    facts.write(folder)
     names.write(folder, responses.draw_all(folder / "responses"))
 
 

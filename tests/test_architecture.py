@@ -170,8 +170,8 @@ def test_neighbours_import_from_the_sub_package_and_nothing_private():
     assert not wrong, "\n".join(wrong)
 
 
-def test_the_page_names_what_exists():
-    text = PAGE.read_text(encoding="utf-8")
+def test_the_pages_name_what_exists():
+    text = PAGE.read_text(encoding="utf-8") + (PAGE.parent / "time.md").read_text(encoding="utf-8")
     named = set(re.findall(r"`((?:blocks|fmus|diagrams|front|tests|docs|benchmarks|notebooks)/[\w/.-]*)`", text))
     assert len(named) > 30
     assert not [name for name in named if not (ROOT / name).exists() and not (ROOT / f"{name}.py").exists()]

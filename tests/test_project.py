@@ -111,6 +111,7 @@ def test_the_root_holds_what_belongs_there():
     assert {path for path in kept if "/" not in path} == {
         ".gitignore",
         "CHANGELOG.md",
+        "CITATION.cff",
         "CONTRIBUTING.md",
         "LICENSE",
         "MANIFEST.in",

@@ -85,7 +85,7 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--contact",
         metavar="FILE.toml",
         help="contacts of environments with the plant, as the file's tables [contact.NAME] say, which the file of the "
-        "requirements may have, too; see docs/howto/frequency.md",
+        "requirements may have, too; see docs/howto/contact.md",
     )
     report.add_argument("--check", action="store_true", help="say by the exit status whether they are met")
     for name in ABOUT:

@@ -26,7 +26,10 @@ myst_enable_extensions = ["colon_fence", "dollarmath", "fieldlist"]
 myst_heading_anchors = 4
 nb_execution_mode = "off"  # the tests execute the notebooks; the site shows what is stored
 nb_merge_streams = True
-suppress_warnings = ["misc.highlighting_failure"]  # examples with "…" are no JSON
+suppress_warnings = [
+    "misc.highlighting_failure",  # examples with "…" are no JSON
+    "ref.python",  # attributes of one name in several classes
+]
 
 # Reference
 default_role = "literal"

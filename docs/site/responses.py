@@ -12,10 +12,11 @@ import numpy as np
 
 from loopwright import blocks as b
 from loopwright.blocks import Block
-from loopwright.types import Call, Signal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from loopwright.types import Call, Signal
 
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00")
 _GREY = "#808080"

@@ -2,7 +2,7 @@
 
 A diagram is a list of `Part`, each with its equations as functions of numbers. `ReferenceLoop` goes from one exact instant
 (a `Fraction`) to the next with DOP853 at 1e-12, finds events by Brent's method, and does at an instant what
-docs/explanation/architecture.md says under "At one instant". Where rounding would decide what happens, it raises `DelicateError`.
+docs/explanation/time.md says under "At one instant". Where rounding would decide what happens, it raises `DelicateError`.
 """
 
 from bisect import bisect_left, bisect_right

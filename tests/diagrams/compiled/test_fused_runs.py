@@ -12,7 +12,7 @@ from loopwright.diagrams.compiled.reordered import reorder
 from loopwright.fmus import Fmu, FmuError, FmuRuntimeError, dc_motor, gantry_contact
 
 QUIET = {"progress": False}
-BOUND = 1e-10  # of each signal's size where the motion doesn't magnify rounding, as docs/howto/diagrams.md states
+BOUND = 1e-10  # of each signal's size where the motion doesn't magnify rounding, as benchmarks/README.md states
 
 
 def differ(first, second):

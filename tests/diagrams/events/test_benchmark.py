@@ -27,7 +27,7 @@ def test_events_and_their_instants_are_counted_apart():
 def test_pages_say_what_is_counted():
     root = FILE.parents[1]
     for name, words in (
-        ("docs/howto/diagrams.md", "12,900 events of an anti-lock brake"),
+        ("benchmarks/README.md", "12,900 events of an anti-lock brake"),
         ("CHANGELOG.md", "12,900 events of an anti-lock brake"),
         ("benchmarks/events.py", "12,900 events at 9,675 instants"),
         ("benchmarks/side_by_side.py", "an anti-lock brake with 12,900 events"),

@@ -21,7 +21,7 @@ from loopwright.fmus.models import gantry
 from support.elementary import ONE_FUNCTION, RUNTIME, arguments, powers, signed, source
 
 BOUNDS = {"sin": 0.78, "cos": 0.78, "tanh": 0.58, "exp": 0.52, "expm1": 0.6, "log": 0.52, "pow": 0.54}
-"""Largest errors in ulp that docs/howto/export.md states, for results that are neither tiny nor near overflow."""
+"""Largest errors in ulp that docs/reference/exported_fmus.md states, for results that are neither tiny nor near overflow."""
 
 
 class Functions:
