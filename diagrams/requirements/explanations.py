@@ -80,7 +80,7 @@ def _find_reason(result: RequirementResult) -> tuple[str, str]:
             f"the response to a small step is not that of the linear model: {detail}",
             "give the size for which the limit holds, size=…",
         ),
-        Reason.DIVERGES: (f"the response diverges{about}", ""),
+        Reason.DIVERGES: (f"the response diverges{about}", "give a smaller size, or the actuator more room"),
         Reason.NOT_SETTLED: (f"the response has not settled in its record of {detail}", "give a longer length"),
         Reason.MOVING: (
             f"the operating point moves{f' ({detail})' if detail else ''}",
