@@ -20,7 +20,7 @@ from ...blocks.core import (
     shorten,
     with_unit,
 )
-from ..plotting import COLORS, GREY, LINES, AxisUnits, legend_above, shown_figure
+from ..plotting import COLORS, GREY, LINES, AxisUnits, legend_above, mark_zeros, shown_figure
 from .delayed_realization import DelayedRealization, realize
 from .delayed_system import DelayedSystem
 from .loop_drawing import DrawnLoop, describe_margins, draw_bode_axes, draw_nichols_axes, draw_nyquist_axes
@@ -569,6 +569,7 @@ def _plot_gang_of_four(systems: Sequence[Mapping[str, Any]], names: Sequence[str
                     top = _limit(system) * BELOW if system.dt else float(w[-1])
                     w = realize(system).grid(float(w[0]), top, POINTS)
                 axes.plot(w, np.abs(_response(system, w)), label=names[i], **_style_of(i, system))
+            mark_zeros(axes)
             axes.set_xscale("log")
             axes.set_yscale("log")
             axes.set_ylabel(f"|{key}|")

@@ -1,6 +1,6 @@
 """Figures: their style, axes, layout, and whether pyplot has them."""
 
-from .axes import AxisUnits, set_degrees, set_frequencies, set_magnitudes, set_powers
+from .axes import AxisUnits, mark_zeros, set_degrees, set_frequencies, set_magnitudes, set_powers
 from .figures import new_figure, save, shown_figure
 from .layout import lay_out
 from .style import (
@@ -37,6 +37,7 @@ __all__ = [
     "lay_out",
     "legend_above",
     "limit_time",
+    "mark_zeros",
     "marker_of",
     "new_figure",
     "save",

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
 
+ZERO = "0 at all frequencies"
+"""Words in a figure for a curve that a logarithmic axis can't show."""
 FINEST = 5
 """Smallest step in degrees between the ticks of a phase."""
 DECADES = 2.0
@@ -49,14 +51,31 @@ class AxisUnits(NamedTuple):
 
 
 def set_magnitudes(ax: Axes, axes: AxisUnits, most: int = 6) -> None:
-    """Set the scale of a magnitude's axis, with few ticks."""
+    """Set the scale of a magnitude's axis, with few ticks; a curve that is 0 at all frequencies is named."""
     from matplotlib.ticker import MaxNLocator
 
+    mark_zeros(ax)
     if axes.decibels:
         ax.yaxis.set_major_locator(MaxNLocator(most, steps=[1, 2, 4, 5, 10]))
     else:
         ax.set_yscale("log")
         set_powers(ax.yaxis, ax.get_ylim(), most)
+
+
+def mark_zeros(ax: Axes) -> None:
+    """Take curves that are 0 everywhere, which a logarithmic axis can't show, off an axis, and say so in the figure."""
+    curves = [(line, np.asarray(line.get_ydata(), dtype=float)) for line in ax.lines]
+    curves = [(line, y) for line, y in curves if len(y) > 1]
+    zero = [line for line, y in curves if np.all((y == 0.0) | np.isneginf(y))]
+    if not zero:
+        return
+    for line in zero:
+        line.set_ydata(np.full(len(line.get_ydata()), np.nan))
+    ax.relim()
+    names = [str(line.get_label()) for line in zero]
+    said = [f"{name}: {ZERO}" for name in names if not name.startswith("_")]
+    text = ZERO if len(zero) == len(curves) or not said else "\n".join(said)
+    ax.text(0.5, 0.5, text, transform=ax.transAxes, ha="center", va="center", fontsize="small")
 
 
 def set_powers(axis: Axis, ends: tuple[float, float], most: int) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from loopwright.blocks import Constant, Gain, Integrator, StateSpace, TransferFunction
 from loopwright.diagrams import Diagram, Section, Table, analyse
-from loopwright.diagrams.plotting import BLUE, set_degrees
+from loopwright.diagrams.plotting import BLUE, set_degrees, set_magnitudes
 from loopwright.diagrams.report.case import Case
 from loopwright.diagrams.report.figures import AxisUnits, MeasuredCurve, contact_admittance, contact_map, measured
 from loopwright.diagrams.report.figures.loop_figures import DrawnLoops, bode, nyquist
@@ -257,3 +257,21 @@ def test_a_phase_has_two_labels_at_least(ends, few):
     set_degrees(ax, few=few)
     ticks = [tick for tick in ax.get_yticks() if ends[0] <= tick <= ends[1]]
     assert 2 <= len(ticks) <= 8
+
+
+@pytest.mark.parametrize("decibels", [False, True])
+def test_a_curve_that_is_0_at_all_frequencies_is_named_in_words(decibels):
+    """Its logarithm has no place on the axis; matplotlib warned, and warnings are errors here."""
+    from matplotlib.figure import Figure
+
+    units, w = AxisUnits(decibels=decibels), np.geomspace(0.1, 10.0, 20)
+    alone, beside = Figure().subplots(1, 2)
+    alone.semilogx(w, units.magnitude(0.0 * w), label="as it is")
+    beside.semilogx(w, units.magnitude(0.0 * w), label="as it is")
+    beside.semilogx(w, units.magnitude(1.0 / w), label="other")
+    for ax in (alone, beside):
+        set_magnitudes(ax, units)
+        ax.figure.canvas.draw()
+    assert [text.get_text() for text in alone.texts] == ["0 at all frequencies"]
+    assert [text.get_text() for text in beside.texts] == ["as it is: 0 at all frequencies"]
+    assert np.allclose(beside.lines[1].get_ydata(), units.magnitude(1.0 / w))
