@@ -8,7 +8,7 @@ from .delay_matrices import NEUTRAL, DelayMatrices, find_pade_limit, replace_del
 from .delayed_hold import delayed_hold, delayed_hold_margin
 from .delayed_realization import DelayedRealization, realize
 from .disk_margins import DiskMargin, disk_margin, loop_at, mimo_disk_margin
-from .loop_drawing import DrawnLoop, draw_bode_axes, draw_nyquist_axes, in_decibels, phase_of
+from .loop_drawing import DrawnLoop, draw_bode_axes, draw_nyquist_axes, phase_of
 from .loop_margins import GainCrossover, Margins, PhaseCrossover, find_disk_frequency, margins, scan_margins
 from .margin_analysis import MARGIN_UNITS
 from .margin_slopes import MarginSlope, margin_slopes
@@ -94,7 +94,6 @@ __all__ = [
     "first_largest",
     "gang_of_four",
     "hold_inputs",
-    "in_decibels",
     "loop_at",
     "loop_class",
     "margin_slopes",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import with_unit
+from ...blocks.core import decibels, with_unit
 from ..plotting import DARK, GREY, STONE, AxisUnits, set_degrees, set_frequencies, set_magnitudes
 
 if TYPE_CHECKING:
@@ -218,16 +218,5 @@ def describe_margins(margins: Margins | None) -> str:
         getattr(margins, name).value for name in ("gain_margin_low", "gain_margin_high", "phase_margin_deg")
     )
     factors = [k for k in (low, high) if 0.0 < k < np.inf]
-    gains = "gain margin " + (" and ".join(f"{k:.4g} ({in_decibels(k)})" for k in factors) if factors else "∞")
+    gains = "gain margin " + (" and ".join(f"{k:.4g} ({decibels(k)})" for k in factors) if factors else "∞")
     return f"{gains}, phase margin {phase:.4g}°" if np.isfinite(phase) else gains
-
-
-def in_decibels(factor: float) -> str:
-    """Return a factor of the gain in decibels, as texts have it; "" where it has none.
-
-    Examples
-    --------
-    >>> in_decibels(2.0), in_decibels(0.5), in_decibels(0.0)
-    ('6.02 dB', '−6.02 dB', '')
-    """
-    return f"{20.0 * np.log10(factor):.2f} dB".replace("-", "−") if 0.0 < factor < np.inf else ""

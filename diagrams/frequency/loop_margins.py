@@ -293,7 +293,7 @@ class _LoopMarginFinder(MarginFinder[Margins]):
     def _make_phase_crossover(self, c: Crossing) -> PhaseCrossover:
         k = -1 / c.L.real
         how = self.by.confirm_crossing(c, k, "phase_crossover")
-        return PhaseCrossover(self._frequency(c, how), Number(k, "1", k * 2 * c.tolerance, how))
+        return PhaseCrossover(self._frequency(c, how), Number(k, "1", k * 2 * c.tolerance, how, is_gain=True))
 
     def _find_gain_margins(self) -> dict[str, Number]:
         factors = {-1 / c.L.real: c for c in self.phase}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
@@ -160,9 +160,10 @@ class MarginFinder(ABC, Generic[Found]):
         self, name: str, factor: float, tolerance: float, *, others: Sequence[float] = (), tried: Sequence[float]
     ) -> Number:
         """Return a gain margin; 0 or infinite where no factor ends stability."""
-        return number_of_limit(
+        number = number_of_limit(
             name, factor, "1", tolerance, self.r.is_stable, self.eigenvalues, nominal=1.0, others=others, tried=tried
         )
+        return replace(number, is_gain=True)
 
     def make_phase_margin(self, degrees: float, tolerance: float, *, others: Sequence[float] = ()) -> Number:
         """Return the phase margin; infinite where no rotation ends stability."""

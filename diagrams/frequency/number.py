@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, explain_calls
+from ...blocks.core import ConfirmationError, Finding, decibels, explain_calls
 from .state_space import findings_of, inexactness_of
 
 P = ParamSpec("P")
@@ -78,6 +78,8 @@ class Number:
     confirmed_by: str
     given: bool = False
     findings: tuple[Finding, ...] = ()
+    is_gain: bool = field(default=False, repr=False, compare=False)
+    """Whether it is a factor of the gain, whose text has decibels as well."""
 
     def __post_init__(self) -> None:
         for name in ("value", "tolerance"):
@@ -90,7 +92,13 @@ class Number:
 
     def __str__(self) -> str:
         unit = "" if self.unit == "1" else f" {self.unit}"
-        return f"{self.value:.6g}{unit}" + (f" {MARK}" if self.findings else "")
+        return f"{self.value:.6g}{unit}{self.gain_text}" + (f" {MARK}" if self.findings else "")
+
+    @property
+    def gain_text(self) -> str:
+        """Text of a factor of the gain in decibels, in brackets; empty for other numbers, and for 0 and infinity."""
+        text = decibels(self.value) if self.is_gain else ""
+        return f" ({text})" if text else ""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the four entries by name, as in a report's JSON, and ``findings`` if there are any."""

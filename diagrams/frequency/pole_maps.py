@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ...blocks.core import OptionError, with_unit
+from ...blocks.core import OptionError, decibels, with_unit
 from ..plotting import BLUE, COLORS, DARK, GREEN, GREY, STONE, VERMILION, legend_above, shown_figure
-from .loop_drawing import in_decibels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -126,7 +125,7 @@ def plot_root_locus(loop: Any, name: str, gains: np.ndarray | None, margins: Mar
             if not _is_in(np.array([pole]), view):
                 continue
             axes.plot([pole.real], [pole.imag], marker="d", color=GREEN, markersize=5.0, linestyle="none", zorder=4)
-            text = f"k = {factor:.4g} ({in_decibels(factor)})"
+            text = f"k = {factor:.4g} ({decibels(factor)})"
             white = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
             look: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "color": DARK, "bbox": white}
             axes.annotate(text, (pole.real, pole.imag), (7, 4), zorder=3.5, **look)

@@ -56,7 +56,7 @@ def quantity(number: Number, most: int = 6) -> str:
     """Return a number with its unit, with so many significant digits at most."""
     text, unit = value_text(number, most), print_unit(number.unit)
     if not unit or text == "–":
-        return text + mark(number)
+        return text + number.gain_text.replace("-", "−") + mark(number)
     return text + ("" if unit == "°" else "\u202f") + unit + mark(number)
 
 

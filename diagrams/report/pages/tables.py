@@ -140,7 +140,8 @@ class Numbered:
         if not isinstance(value, Number):
             return CellView(cell(value), kind, first)
         path = self.paths.get(id(value)) or ("" if term else self.equal.get(value))
-        text = quantity(value, digits) if with_unit else value_text(value, digits) + mark(value)
+        whole = with_unit or value.is_gain  # a factor has no unit, and its decibels next to it
+        text = quantity(value, digits) if whole else value_text(value, digits) + mark(value)
         why = reason(value) if value.given or not value.confirmed_by else f"confirmed by {reason(value)}"
         about = f"{path + ': ' if path else ''}{tolerance_text(value)}; {why}"
         letter = letters.get(_method(value), "")

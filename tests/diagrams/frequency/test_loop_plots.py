@@ -167,7 +167,7 @@ def test_margins_are_marked_in_all_three_diagrams():
     ((x, y),) = thick(gain_axes)
     assert y == pytest.approx([0.0, 20 * np.log10(K / 2)])
     factor = 2 / K
-    text = f"gain margin {factor:.4g} ({20 * np.log10(factor):.2f} dB), phase margin {phase + 180:.4g}°"
+    text = f"gain margin {factor:.4g} ({20 * np.log10(factor):.3g} dB), phase margin {phase + 180:.4g}°"
     assert gain_axes.get_title(loc="right") == text
     nichols = loop.nichols().axes[0]
     assert marks(nichols, "o") == [pytest.approx((phase, 0.0), abs=1e-6)]

@@ -541,3 +541,18 @@ def test_a_closed_loop_pole_that_is_the_rounding_of_a_difference_is_on_the_limit
     assert found.unstable_poles == found.closed_loop_poles
     with pytest.raises(ConfirmationError, match="a closed-loop pole on the limit of stability"):
         nyquist_count(loop)
+
+
+def test_gain_margins_have_decibels_next_to_the_factor_in_texts_and_on_pages():
+    from loopwright.diagrams.report.pages.printed_values import quantity
+
+    found = margins(control.tf([0.6], [1.0, 2.0, 1.0, 0.0]))  # −180° at 1 rad/s, where |L| = 0.6/2
+    high = found.gain_margin_high
+    assert str(high) == "3.33333 (10.5 dB)"
+    assert "gain_margin_high 3.33333 (10.5 dB)" in repr(found)
+    assert quantity(high, 4) == "3.333 (10.5 dB)"
+    assert [str(p.gain_margin) for p in found.phase_crossovers] == ["3.33333 (10.5 dB)"]
+    assert (str(found.gain_margin_low), str(found.disk_margin)[-1].isdigit()) == ("0", True)
+    low = margins(control.tf([4.0], [1.0, -1.0])).gain_margin_low  # k > 1/4
+    assert quantity(low, 4) == "0.25 (−12 dB)"
+    assert high.as_dict().keys() == {"value", "unit", "tolerance", "confirmed_by"}
