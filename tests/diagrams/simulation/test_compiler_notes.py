@@ -1,11 +1,15 @@
 """A run that waits for a compiler says so, where progress is shown."""
 
+import math
+import shutil
+
 import pytest
 
-from loopwright.blocks import Sine
-from loopwright.diagrams import Diagram, subsystem
+from loopwright import Diagram, Fmu, margins, subsystem
+from loopwright.blocks import Constant, Gain, Sine, StateSpace, Step
 from loopwright.fmus.build_notes import announce_build, hear_builds
 from loopwright.fmus.export import compile_shared, compiler
+from loopwright.fmus.models import gantry
 
 
 def test_what_is_compiled_is_told_and_its_end(tmp_path):
@@ -57,3 +61,20 @@ def test_a_run_says_that_it_compiles_where_progress_is_shown(show, monkeypatch):
     Diagram("d", box(Sine(frequency=0.1 + show)())).simulate(0.2, compile=True, progress=show)
     assert said[1:3] == (["start", "stop"] if show else [])
     assert not show or "compiling C code" in said[0]
+
+
+def test_a_first_loop_and_an_fmu_need_no_compiler(tmp_path, monkeypatch):
+    file = shutil.copy(gantry.build(), tmp_path / "foreign.fmu")
+    monkeypatch.setenv("LOOPWRIGHT_CC", "no-such-compiler")
+    monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "cache"))
+    lag = StateSpace(A=[[-2.0]], B=[2.0], C=[1.0], name="lag")
+    loop = Diagram("loop", lag(Gain(gain=3.0)(Step(times=0.0, values=1.0) - lag.y).named("u")).named("y"))
+    run = loop.simulate(1.0, step=0.1, progress=False)
+    assert run["y"][-1] == pytest.approx(0.75 * (1.0 - math.exp(-8.0)), rel=1e-3)
+    assert margins(loop.linearize().loop("u")).stable
+    force = Constant(value=(0.0, 0.0), name="force", unit="N")
+    fallen = Diagram("fallen", Fmu(file, name="plant")(motor_force=force, external_force=force))
+    made = fallen.simulate(0.01, step=0.001, progress=False)
+    assert made["velocity"][-1, 1] < 0.0  # the upper axis sinks by its weight
+    assert (run.tier, made.tier) == ("interpreted", "interpreted")
+    assert not list((tmp_path / "cache").rglob("*.so"))
