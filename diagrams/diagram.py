@@ -26,7 +26,7 @@ from ..blocks.core import (
 from .coupling import Coupling, CouplingReport, report_coupling, to_coupling
 from .flat import FlatDiagram, WiredDiagram
 from .results import OperatingPoint, Run
-from .simulation import KeptKeywords, RunKeywords, RunOptions, Simulation, simulate
+from .simulation import KeptKeywords, ProgressOption, RunKeywords, RunOptions, Simulation, simulate
 from .wiring import Collector, Structure, SubsystemSettings, Wire, sheet_of_structure
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ WAYS = {
     **dict.fromkeys(("bode", "nyquist", "root_locus", "pzmap", "nichols"), f"{_LOOP}, which such plots take"),
     **dict.fromkeys(("loop", "poles", "linmod"), f"diagram.linearize(), and {_LOOP} for the loop at a wire"),
     **dict.fromkeys(("add", "connect", "add_block", "add_connection"), "a call, which wires: plant(force=u)"),
+    "sensitivity": 'diagram.sensitivities(…), by parameters, or S: diagram.linearize().sensitivity("wire")',
     **dict.fromkeys(("compile", "build"), "diagram.simulate(2.0, compile=True)"),
     **dict.fromkeys(("set", "set_parameter", "set_param"), 'diagram.replace({"plant.mass": 2.0}), a new diagram'),
 }
@@ -277,7 +278,7 @@ class Diagram(ShownAsTable):
         """
         return self.wired.flatten(step)
 
-    def simulate(self, duration: float, *, progress: bool | None = None, **options: Unpack[RunKeywords]) -> Run:
+    def simulate(self, duration: float, *, progress: ProgressOption = None, **options: Unpack[RunKeywords]) -> Run:
         """Run the diagram and return what it recorded: from t = 0, or from a saved state.
 
         The page docs/explanation/time.md says what happens in which order.
@@ -287,8 +288,9 @@ class Diagram(ShownAsTable):
         duration : float
             Simulated time in s. One that is no multiple of the step between ticks ends with a sample between two of
             them; such a run has no ``final_state``.
-        progress : bool, optional
-            Show a progress bar; by default on a terminal, and in a notebook where ipywidgets is installed.
+        progress : bool or callable, optional
+            Show a progress bar, or a function that is called with the time in s; by default the bar is shown on a
+            terminal, and in a notebook where ipywidgets is installed.
         **options
             Options of the run by name: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step``, ``record``, ``every``,
             ``states``, ``to``, ``overwrite``, ``start``, ``coupling``, ``start_exchange``, ``compile`` (whether C goes
@@ -365,7 +367,7 @@ class Diagram(ShownAsTable):
         overwrite: bool = False,
         workers: int | None = None,
         client: Any = None,
-        progress: bool | None = None,
+        progress: ProgressOption = None,
         lanes: bool | int = False,
         **options: Unpack[KeptKeywords],
     ) -> Sweep:
@@ -404,8 +406,8 @@ class Diagram(ShownAsTable):
             Number of threads, or processes; as many as cores without it.
         client : distributed.Client, optional
             A Dask cluster that runs the samples.
-        progress : bool, optional
-            Show a progress bar; see `simulate`.
+        progress : bool or callable, optional
+            Show a progress bar, or a function that is called with the number of samples that are done; see `simulate`.
         lanes : bool or {2, 4, 8, 16}, optional
             Make so many runs side by side in the lanes of the processor's vectors, 8 for True: some times as fast.
             Their values then differ from those of single runs by rounding, and the sweep's messages say so. A motion
@@ -756,7 +758,7 @@ class Diagram(ShownAsTable):
 
         return make_contact(self.wired, PortNames(port, position, velocity, force), direction, at, options)
 
-    def sensitivity(
+    def sensitivities(
         self,
         loop: str | Iterable[str],
         parameters: str | Iterable[str] | None = None,
@@ -818,7 +820,7 @@ class Diagram(ShownAsTable):
         at: Any = None,
         points: Sequence[Any] | None = None,
         delay: int = 0,
-        progress: Callable[[str], None] | None = None,
+        progress: ProgressOption = None,
         **options: Any,
     ) -> WorstCase:
         """Find the worst case of a loop's margin, or of requirements, over ranges of parameters.
@@ -851,12 +853,13 @@ class Diagram(ShownAsTable):
         starts, steps : int
             Number of searches, 0 for samples alone, without corners, and the most steps of each.
         at : OperatingPoint, Snapshot, float or callable, optional
-            Point of each case, as of `sensitivity`; ``points`` is a list of them, each of which every case is tried at.
+            Point of each case, as of `sensitivities`; ``points`` is a list of them, at each of which every case is
+            tried.
         delay : int
             Whole samples of delay in series with sampled loops.
-        progress : callable, optional
-            Called with a line for every case; without it the lines are shown on a terminal, once the search has taken
-            2 s. ``options`` are those of `linearize`.
+        progress : bool or callable, optional
+            Show a line for every case once the search has taken 2 s, or a function that is called with it; by default
+            it is shown on a terminal. ``options`` are those of `linearize`.
 
         Returns
         -------

@@ -104,7 +104,7 @@ HANDED_ON = {
     "Diagram.linearize": (GOOD["Diagram.linearize"], "inputs openings solver"),
     "Diagram.linearize_batch": (GOOD["Diagram.linearize_batch"], "variants solver"),
     "Diagram.sweep": (GOOD["Diagram.sweep"], "parameters samples signals solver"),
-    "Diagram.sensitivity": (GOOD["Diagram.sensitivity"], "parameters delay solver"),
+    "Diagram.sensitivities": (GOOD["Diagram.sensitivities"], "parameters delay solver"),
     "Diagram.worst_case": (GOOD["Diagram.worst_case"], "quantity samples solver"),
     "Diagram.frequency_response": (GOOD["Diagram.frequency_response"], "amplitude solver"),
     "Input.__init__": (lambda: (Input, {}), "unit minimum"),

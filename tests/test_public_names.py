@@ -307,3 +307,67 @@ def test_a_missing_attribute_is_an_attribute_error_and_a_failing_property_keeps_
         _ = Failing("failing", loopwright.blocks.Constant(value=1.0)).total
     copied = pickle.loads(pickle.dumps(small()))
     assert copied.blocks == small().blocks
+
+
+# --- one word for one thing ------------------------------------------------------------------------------------------------
+
+
+def test_progress_is_true_false_or_a_function_everywhere(capsys):
+    diagram, seen = small(), {}
+
+    def note(key):
+        return lambda said: seen.setdefault(key, []).append(said)
+
+    diagram.simulate(1.0, step=0.5, progress=note("simulate"))
+    diagram.sweep(
+        {"constant.value": (1.0, 2.0)},
+        0.1,
+        step=0.05,
+        signals="speed",
+        workers=1,
+        compile=False,
+        progress=note("sweep"),
+    )
+    loopwright.analyse(diagram, only=("subject",), progress=note("analyse"))
+    with diagram.simulation(step=0.5) as simulation:
+        simulation.advance(1.0, progress=note("advance"))
+        simulation.advance(1.0, progress=False)
+        simulation.advance(1.0)
+    assert seen["simulate"][-1] == seen["advance"][-1] == pytest.approx(1.0)
+    assert seen["sweep"][-1] == 2
+    assert seen["analyse"][-1] == "subject"
+    diagram.simulate(1.0, step=0.5, progress=False)
+    loopwright.analyse(diagram, only=("subject",), progress=False)
+    assert capsys.readouterr().err == ""
+    diagram.simulate(1.0, step=0.5, progress=True)  # drawn, and taken away again at the end
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: small().simulate(1.0, progress="yes"),
+        lambda: small().sweep({"constant.value": (1.0, 2.0)}, 0.1, progress=1),
+        lambda: small().worst_case({"constant.value": (1.0, 2.0)}, "speed", progress="loud"),
+        lambda: small().report("a.html", progress="yes"),
+        lambda: loopwright.analyse(small(), progress="yes"),
+        lambda: loopwright.doctor("none.fmu", progress=2),
+    ],
+)
+def test_another_progress_is_refused_in_one_way(call):
+    with pytest.raises(OptionError, match="expected True, False or a function"):
+        call()
+
+
+def test_the_steps_of_blocks_that_round_have_one_name():
+    for name in loopwright.blocks.__all__:
+        value = getattr(loopwright.blocks, name)
+        if inspect.isclass(value) and issubclass(value, loopwright.Block) and value.quanta:
+            assert set(value.quanta.values()) == {"quantum"}, name
+
+
+def test_derivatives_by_parameters_are_sensitivities_and_s_is_the_sensitivity():
+    assert not hasattr(loopwright.Diagram, "sensitivity")
+    assert callable(loopwright.Diagram.sensitivities)
+    assert callable(loopwright.types.Linearization.sensitivity)
+    with pytest.raises(UnknownNameError, match=r"diagram\.sensitivities\(…\)"):
+        _ = small().sensitivity

@@ -272,6 +272,12 @@ path = Kind("a path", _is_path)
 paths = Kind("a list of paths", _is_paths)
 """A list of paths; one that is made as it is read is taken as it is."""
 function = Kind("a function", callable)
+progress = Kind(
+    "True, False or a function",
+    lambda value: flag.holds(value) or callable(value),
+    "Leave it out to have it shown on a terminal.",
+)
+"""Whether progress is shown, or a function that is called with it; None shows it on a terminal."""
 system = Kind(
     "a control.StateSpace or control.TransferFunction",
     lambda value: hasattr(value, "ninputs") and hasattr(value, "poles"),

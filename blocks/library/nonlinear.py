@@ -37,12 +37,12 @@ class Quantizer(Block):
     Raises
     ------
     ShapeError
-        For an interval of another shape than the signal's, and a vector in a continuous subsystem, when the diagram is
+        For a quantum of another shape than the signal's, and a vector in a continuous subsystem, when the diagram is
         built.
     """
 
-    quanta = MappingProxyType({"u": "interval"})
-    interval: Array = parameter(above=0.0, description="distance q of two levels, a number or one for each element")
+    quanta = MappingProxyType({"u": "quantum"})
+    quantum: Array = parameter(above=0.0, description="distance q of two levels, a number or one for each element")
     u = Input(shape=None, description="signal to quantize, of any shape")
     y = Output(like="u", description="the quantized signal")
     level = State(like="u", discrete=True, description="number of the level, y / q")
@@ -51,8 +51,8 @@ class Quantizer(Block):
 
     def nearest_level(self, u: Any) -> Array:
         """Return the number of the level nearest to u."""
-        check_shapes(interval=self.interval, u=u.u)
-        ratio = u.u / self.interval
+        check_shapes(quantum=self.quantum, u=u.u)
+        ratio = u.u / self.quantum
         level = np.floor(ratio + 0.5)
         return np.where(level - 0.5 > ratio, level - 1.0, level)  # just below a middle the sum is rounded up
 
@@ -62,15 +62,15 @@ class Quantizer(Block):
 
     def output(self, t: Array, x: Any, u: Any, T: Array = None) -> Array:
         """Return the quantized signal."""
-        return self.interval * (x.level if T is None else self.nearest_level(u))
+        return self.quantum * (x.level if T is None else self.nearest_level(u))
 
     def update(self, t: Array, x: Any, u: Any) -> Array:
         """Keep the level."""
         return self.nearest_level(u)
 
     def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
-        """Return the distances of u beyond the middles to both sides, in intervals."""
-        off = expect_scalar(u.u, "u") / self.interval - x.level
+        """Return the distances of u beyond the middles to both sides, in quanta."""
+        off = expect_scalar(u.u, "u") / self.quantum - x.level
         return off - 0.5, -0.5 - off
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> Array:

@@ -20,7 +20,7 @@ NEAR = 1e-9
 class Plant(Protocol):
     """A stepped block in a run, as its ``instantiate`` yields it: `bind`, `model_exchange`, `begin`, then each `step`.
 
-    A protocol: instances of FMUs come from the room `fmus`, which this sub-package doesn't know, others from users.
+    A protocol: instances of FMUs come from the package `fmus`, which this sub-package doesn't know, others from users.
     """
 
     @property

@@ -25,8 +25,8 @@ Values = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
 class ModelExchangeBlock(Protocol):
     """A block whose equations a run evaluates; see `loopwright.fmus.calls.ModelExchangeInstance`.
 
-    States and inputs are flat, in the order of the block's. A protocol: the instances come from the room `fmus`, which
-    this sub-package doesn't know, or from users.
+    States and inputs are flat, in the order of the block's. A protocol: the instances come from the package `fmus`,
+    which this sub-package doesn't know, or from users.
     """
 
     is_trial: bool

@@ -33,7 +33,7 @@ from ...fmus import Fmu
 from ...fmus.models import gantry
 from ..diagram import Diagram
 from ..results import Run
-from ..simulation import RunKeywords, RunOptions, simulate
+from ..simulation import ProgressOption, RunKeywords, RunOptions, simulate
 from .experiment_options import DEFAULTS, ELLIPSE, merge
 from .fig3_diagram import fig3
 from .wires import IMPEDANCE_PAR, IMPEDANCE_PERP, Channel, Rig, check_plant
@@ -98,13 +98,13 @@ class Experiment(ShownAsTable):
     def __reduce__(self) -> tuple[Any, ...]:
         return Experiment, (self.letter, self.title, self.diagram, self.duration, dict(self.options), self.path)
 
-    def simulate(self, *, progress: bool | None = None, **options: Unpack[RunKeywords]) -> Run:
+    def simulate(self, *, progress: ProgressOption = None, **options: Unpack[RunKeywords]) -> Run:
         """Run it to its end.
 
         Parameters
         ----------
-        progress : bool, optional
-            Show a progress bar; see `Diagram.simulate`.
+        progress : bool or callable, optional
+            Show a progress bar, or a function that is called with the time; see `Diagram.simulate`.
         **options
             Options of the run, such as ``record`` and ``every``; see `RunOptions`.
 

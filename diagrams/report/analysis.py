@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
-from typing import Any
+from functools import wraps
+from typing import Any, TypeVar
 
 from ...blocks.core import Kind, OptionError, accepts, kinds, offer_elsewhere, on_one_thread
 from ...fmus.running import Fmu
@@ -13,6 +14,7 @@ from ..flat import WiredDiagram
 from ..linearization import find_signal
 from ..plotting import AxisUnits
 from ..requirements import REQUIREMENTS, Requirements, TomlFile, read_requirements, write_requirements
+from ..simulation import ProgressOption, work_notes
 from ..studies import ContactTask, WorstCase, WorstCaseTask
 from ..sweeps import processors
 from .case import Case, ReportedExperiment
@@ -33,6 +35,7 @@ from .sections.subject import operating_points, remarks, subject, versions
 from .sections.summary import all_requirements, summarize, with_words
 from .sections.worst_case import find_reported, read_task, worst_case_of
 
+F = TypeVar("F", bound=Callable[..., Any])
 _HEADING = ("title", "author", "project", "date", "revision")  # lines of ``about``
 SUBJECT = ReportPart("subject", subject)
 REMARKS = ReportPart("subject", remarks)
@@ -71,6 +74,17 @@ _REPORTED = Kind(
 )
 
 
+def _with_notes(function: F) -> F:
+    """Make a function get a function for ``progress``, also where that is True, False or None."""
+
+    @wraps(function)
+    def noted(diagram: Any, **options: Any) -> Any:
+        with work_notes(getattr(diagram, "diagram", diagram).name, options.pop("progress", False)) as tell:
+            return function(diagram, **options, progress=tell)
+
+    return noted  # type: ignore[return-value]  # of the signature of the function that it wraps
+
+
 @accepts(
     diagram=_REPORTED,
     loops=kinds.names,
@@ -79,7 +93,7 @@ _REPORTED = Kind(
     about=kinds.mapping,
     decibels=kinds.flag,
     hertz=kinds.flag,
-    progress=kinds.function,
+    progress=kinds.progress,
     summary=kinds.flag,
     appendix=kinds.flag,
     measured=kinds.mapping,
@@ -87,6 +101,7 @@ _REPORTED = Kind(
 )
 @on_one_thread
 @offer_elsewhere(**{name: f"about={{'{name}': …}}" for name in _HEADING})
+@_with_notes
 def analyse(
     diagram: Any,
     *,
@@ -100,7 +115,7 @@ def analyse(
     about: Mapping[str, str] | None = None,
     decibels: bool = False,
     hertz: bool = False,
-    progress: Callable[[str], None] | None = None,
+    progress: ProgressOption = False,
     measured: Mapping[str, Any] | None = None,
     worst_case: WorstCase | WorstCaseTask | str | os.PathLike[str] | None = None,
     contacts: Mapping[str, Any] | ContactTask | str | os.PathLike[str] | None = None,
@@ -154,9 +169,10 @@ def analyse(
         be that of ``requirements``, too: it gets a section, with a run that confirms it, and a line on the first page.
         The limits that it was looked for with get verdicts of their own. Limits of its numbers fail where it is
         unstable. One that can't be looked for, as at a wire without a loop, is left out with the reason.
-    progress : callable, optional
-        Called with the key of each section before it is made, and with what is being computed or confirmed in it:
-        margins, steps, sensitivities and measurements, at which wire and of which variant, and cases of a worst case.
+    progress : bool or callable, optional
+        Show the key of each section before it is made, and what is being computed or confirmed in it (margins, steps,
+        sensitivities and measurements, at which wire and of which variant, and cases of a worst case), or a function
+        that is called with it. By default neither; `Diagram.report` shows it on a terminal.
     workers : int, optional
         1 makes all sections in this process; with 2, a second process makes some of a diagram with FMUs. The report is
         the same. Without it there are two where the report is written, and two processors.
@@ -193,7 +209,7 @@ def analyse(
     wires = None if loops is None else tuple([loops] if isinstance(loops, str) else loops)
     for wire in (*(wires or ()), *(measured or ())):
         find_signal(wired.flatten(None if wired.has_clock else STEP), wire)
-    tell = progress or (lambda key: None)
+    tell: Any = progress  # a function: see `_with_notes`
     file = None if isinstance(requirements, Requirements | None) else TomlFile.read(requirements, "requirements")
     asked = requirements if isinstance(requirements, Requirements | None) else read_requirements(file or requirements)
     touched = read_contacts(wired, contacts, file, asked)

@@ -14,26 +14,28 @@ from ...blocks.core import check_argument, kinds
 from ...fmus.build_notes import hear_builds
 from ..results import Run
 
+ProgressOption = bool | Callable[[Any], object] | None
+"""Option of whatever may take long: shown or not, a function that is called instead, or None: shown on a terminal."""
 LATE = 2.0
 """Time in s that some work takes before its progress is shown."""
 
 
-def _is_shown(show: bool | None) -> bool:
+def _is_shown(show: ProgressOption, name: str) -> bool:
     """Whether progress is shown: where it is asked for; by default on a terminal and in a notebook with widgets."""
     if show is not None:
-        check_argument(show, kinds.flag, "progress", "simulate")
-        return bool(show)
+        check_argument(show, kinds.progress, "progress", name)
+        return not callable(show) and bool(show)
     widgets = "ipykernel" in sys.modules and find_spec("ipywidgets") is not None
     return sys.stderr.isatty() or widgets
 
 
 @contextmanager
 def progress_bar(
-    name: str, start: float, end: float, show: bool | None, shown: str = "{task.completed:.2f} / {task.total:g} s"
+    name: str, start: float, end: float, show: ProgressOption, shown: str = "{task.completed:.2f} / {task.total:g} s"
 ) -> Iterator[Any]:
-    """Yield a function that is told the simulated time, or another count, and draws it where that is wanted."""
-    if not _is_shown(show):
-        yield lambda t: None
+    """Yield a function that takes the simulated time, or another count: the one given, or one that draws a bar."""
+    if not _is_shown(show, name):
+        yield show if callable(show) else lambda t: None
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -45,7 +47,9 @@ def progress_bar(
 
 
 @contextmanager
-def late_progress(name: str, start: float, end: float, show: bool | None = None) -> Iterator[Callable[[float], None]]:
+def late_progress(
+    name: str, start: float, end: float, show: ProgressOption = None
+) -> Iterator[Callable[[float], None]]:
     """Yield a function that is told how far some work is; it is drawn as by `progress_bar` once it has taken 2 s."""
     begun = time.monotonic()
     with ExitStack() as stack:
@@ -62,13 +66,13 @@ def late_progress(name: str, start: float, end: float, show: bool | None = None)
 
 
 @contextmanager
-def work_notes(name: str, given: Callable[[str], None] | None = None) -> Iterator[Callable[[str], None]]:
-    """Yield a function that is told in words what is being computed: the one given, or one that shows it with the time.
+def work_notes(name: str, show: ProgressOption = None) -> Iterator[Callable[[str], object]]:
+    """Yield a function that takes in words what is being computed: the one given, or one that shows it with the time.
 
-    It is shown on a terminal, and in a notebook with widgets, once the work has taken 2 s.
+    It is shown once the work has taken 2 s; without a choice on a terminal, and in a notebook with widgets.
     """
-    if given is not None or not _is_shown(None):
-        yield given or (lambda said: None)
+    if not _is_shown(show, name):
+        yield show if callable(show) else lambda said: None
         return
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -89,9 +93,9 @@ def work_notes(name: str, given: Callable[[str], None] | None = None) -> Iterato
 
 
 @contextmanager
-def compiler_notes(show: bool | None) -> Iterator[None]:
+def compiler_notes(show: ProgressOption, name: str) -> Iterator[None]:
     """Say within the ``with`` statement that a compiler runs, where progress is shown: a run may wait for it."""
-    if not _is_shown(show):
+    if not _is_shown(show, name):
         yield
         return
     from rich.console import Console

@@ -30,7 +30,7 @@ from ..results import (
 )
 from .engine import Engine
 from .held_inputs import note_held_inputs
-from .progress import Interrupted, compiler_notes, progress_bar
+from .progress import Interrupted, ProgressOption, compiler_notes, progress_bar
 from .run_options import RunOptions, default_step, refuse_rest, ticks_in
 from .save import can_save, restore_state, save_state
 from .start_at_point import apply_point
@@ -196,9 +196,16 @@ class Simulation:
 
     # --- continuing ------------------------------------------------------------------------------------------------
 
-    @accepts(progress=kinds.function)
-    def advance(self, duration: float, *, progress: Any = None) -> None:
+    @accepts(progress=kinds.progress)
+    def advance(self, duration: float, *, progress: ProgressOption = False) -> None:
         """Continue for a duration in s; one that is no multiple of the step between ticks ends the run.
+
+        Parameters
+        ----------
+        duration : float
+            Duration in s.
+        progress : bool or callable, optional
+            Show a progress bar, or a function that is called with the time; by default neither.
 
         Raises
         ------
@@ -226,17 +233,19 @@ class Simulation:
         end = float(position.tick * self.flat.base + count * self.flat.base + rest) if rest else None
         started = time.perf_counter()
 
-        def arrive(t: float) -> None:
-            self._recorder.flush()
-            if progress is not None:
-                progress(t)
-
+        begun = float(self.t)
         try:
-            if self.stopped is None:
-                if count:
-                    self._engine.go(last, self._recorder, arrive)
-                if end is not None and self.stopped is None:
-                    self._engine.end_between_ticks(end, self._recorder, arrive)
+            with progress_bar(self.wired.name, begun, begun + float(duration), progress) as show:
+
+                def arrive(t: float) -> None:
+                    self._recorder.flush()
+                    show(t)
+
+                if self.stopped is None:
+                    if count:
+                        self._engine.go(last, self._recorder, arrive)
+                    if end is not None and self.stopped is None:
+                        self._engine.end_between_ticks(end, self._recorder, arrive)
         except SimulationError as error:
             self._elapsed += time.perf_counter() - started
             raise self._with_run(error) from error.__cause__
@@ -397,16 +406,14 @@ class Simulation:
         self._recorder.row(state.t, self._engine.workspace.log)
 
 
-def simulate(diagram: WiredDiagram, duration: float, options: RunOptions, *, progress: bool | None = None) -> Run:
+def simulate(diagram: WiredDiagram, duration: float, options: RunOptions, *, progress: ProgressOption = None) -> Run:
     """Run a diagram; see `Diagram.simulate`."""
     span: float | None = duration  # None is a user's slip, and no run without an end
     if span is None:
         ticks_in(span, Fraction(1), diagram.name)  # refused
     with ExitStack() as stack:
-        with compiler_notes(progress):
+        with compiler_notes(progress, diagram.name):
             simulation = stack.enter_context(Simulation(diagram, options, duration=duration))
-        first = simulation.t
-        with progress_bar(diagram.name, first, first + float(duration), progress) as show:
-            if simulation.stopped is None:
-                simulation.advance(duration, progress=show)
+        if simulation.stopped is None:
+            simulation.advance(duration, progress=progress)
         return simulation.run(last=True)

@@ -306,7 +306,7 @@ def _read_growth(v: np.ndarray, t: np.ndarray) -> float:
 
 
 _SENSITIVITIES = Kind(  # their class is defined above this file
-    "the result of Diagram.sensitivity", lambda value: hasattr(value, "model") and hasattr(value, "of")
+    "the result of Diagram.sensitivities", lambda value: hasattr(value, "model") and hasattr(value, "of")
 )
 _SENSITIVITY = Kind(
     "one of the sensitivities found, such as found[name, 'ms']",

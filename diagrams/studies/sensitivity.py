@@ -249,7 +249,7 @@ def find_sensitivities(
     stairs: str | None = None,
     **options: Any,
 ) -> Sensitivities:
-    """Return the derivatives of a loop's margins by parameters; see `Diagram.sensitivity`."""
+    """Return the derivatives of a loop's margins by parameters; see `Diagram.sensitivities`."""
     wires = (loop,) if isinstance(loop, str) else tuple(loop)
     find: PointFinder | None = None
     if callable(at) and not isinstance(at, OperatingPoint):

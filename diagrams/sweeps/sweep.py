@@ -15,7 +15,7 @@ import numpy as np
 from ...blocks.core import Kind, OptionError, accepts, kinds, one_thread
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import Run, entries, machine_memory, resolve, select
-from ..simulation import RunOptions, Simulation, progress_bar
+from ..simulation import ProgressOption, RunOptions, Simulation, progress_bar
 from .outcome import SampleOutcome
 from .plan import Plan
 from .processes import processors, run_in_processes
@@ -65,7 +65,7 @@ _LANES_ASKED = Kind(
     duration=kinds.number,
     signals=kinds.names,
     seeds=kinds.names,
-    progress=kinds.flag,
+    progress=kinds.progress,
     workers=kinds.integer(1).worded("a positive integer, or None for every core", "Give one.", kinds.by_name),
     lanes=_LANES_ASKED,
 )
@@ -85,7 +85,7 @@ def sweep(
     overwrite: bool = False,
     workers: int | None = None,
     client: Any = None,
-    progress: bool | None = None,
+    progress: ProgressOption = None,
     lanes: bool | int = False,
     options: Mapping[str, Any],
 ) -> Sweep:
@@ -261,6 +261,6 @@ def _check_room(plan: Plan, flat: FlatDiagram, count: int) -> None:
 
 
 @contextmanager
-def _bar(name: str, total: int, show: bool | None) -> Iterator[Callable[[int], None]]:
+def _bar(name: str, total: int, show: ProgressOption) -> Iterator[Callable[[int], None]]:
     with progress_bar(name, 0, total, show, "{task.completed:.0f} of {task.total:.0f} samples") as advance:
         yield advance

@@ -155,7 +155,7 @@ def examples() -> dict[str, Example]:
         Example(b.Function(lambda u: np.tanh(3 * u), name="function"), {"u": wave}),
         Example(b.PythonFunction(abs, arguments=("u",), name="python_function"), {"u": wave}, sample_time=0.02),
         # nonlinear blocks with memory
-        Example(b.Quantizer(interval=0.25), {"u": wave}),
+        Example(b.Quantizer(quantum=0.25), {"u": wave}),
         Example(b.Relay(on_point=0.5, off_point=-0.5), {"u": wave}),
         Example(b.Backlash(width=0.6), {"u": wave}, sample_time=0.01),
         Example(b.RateLimiter(rising=4.0, falling=3.0), {"u": pulses}, sample_time=0.01),

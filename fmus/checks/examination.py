@@ -6,7 +6,7 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,14 +48,14 @@ _RUNNERS = {
     file=kinds.path,
     run=kinds.flag,
     limits=kinds.one_of_class(ArchiveLimits, "ArchiveLimits(…)"),
-    progress=kinds.flag,
+    progress=kinds.progress,
 )
 def doctor(
     file: str | os.PathLike[str],
     *,
     run: bool | None = None,
     limits: ArchiveLimits | None = None,
-    progress: bool = True,
+    progress: bool | Callable[[str], object] | None = None,
 ) -> FmuDiagnosis:
     """Examine an FMU of any tool: its content, whether it runs here, and violations of the standard.
 
@@ -69,8 +69,9 @@ def doctor(
         Whether to try it; without it, it is tried unless it says that it needs another program.
     limits : ArchiveLimits, optional
         Limits of its size; the usual ones without it.
-    progress : bool
-        Whether a trial run that takes more than 2 s is announced on the standard error, with the limit of its calls.
+    progress : bool or callable, optional
+        Announce a trial run that takes more than 2 s on the standard error, with the limit of its calls, or a function
+        that is called with that line; it is announced by default.
 
     Returns
     -------
@@ -319,7 +320,7 @@ def _try(
     run: bool | None,
     *,
     hopeless: bool,
-    progress: bool,
+    progress: bool | Callable[[str], object] | None,
 ) -> tuple[FmuTrial, FmuFinding | None]:
     """Run an interface in its own process, if it is to be tried."""
     attributes = summary["interfaces"][kind]

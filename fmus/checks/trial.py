@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from threading import Timer
 from typing import Any
@@ -65,7 +66,7 @@ def try_out(
     experiment: dict[str, Any],
     limits: ArchiveLimits | None = None,
     *,
-    progress: bool = True,
+    progress: bool | Callable[[str], object] | None = None,
 ) -> FmuProblem | None:
     """Run an FMU for some steps in its own process; return its fault, or None.
 
@@ -81,13 +82,14 @@ def try_out(
         Default experiment: ``start_time``, ``stop_time`` and ``step_size`` in s, where they are given.
     limits : ArchiveLimits, optional
         Limits of its size; the usual ones without it.
-    progress : bool
-        Whether it is announced on the standard error after some time.
+    progress : bool or callable, optional
+        Whether it is announced on the standard error after some time, or a function that is called with that line.
     """
     name = INTERFACES[interface]
-    notice = Timer(NOTICE, _announce, [file, interface])
+    say = progress if callable(progress) else partial(print, file=sys.stderr, flush=True)
+    notice = Timer(NOTICE, _announce, [file, interface, say])
     notice.daemon = True
-    if progress:
+    if progress is not False:
         notice.start()
     try:
         plant = Fmu(
@@ -115,12 +117,10 @@ def try_out(
     return None
 
 
-def _announce(file: Path, interface: str) -> None:
-    print(
+def _announce(file: Path, interface: str, say: Callable[[str], object]) -> None:
+    say(
         f"{file.name} is being {RUNS[interface]} by {INTERFACES[interface]}, in its own process. A call that "
-        f"takes longer than {PATIENCE:g} s counts as hung; Ctrl-C ends it before.",
-        file=sys.stderr,
-        flush=True,
+        f"takes longer than {PATIENCE:g} s counts as hung; Ctrl-C ends it before."
     )
 
 

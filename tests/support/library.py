@@ -181,8 +181,8 @@ CASES = [
     (UnitConversion(from_unit="degC", to_unit="K"), {}, BOTH),
     (UnitConversion(from_unit="mm", to_unit="m"), VECTOR, BOTH),
     # what jumps or remembers
-    (Quantizer(interval=0.3), {}, BOTH),
-    (Quantizer(interval=0.3), VECTOR, SAMPLED),
+    (Quantizer(quantum=0.3), {}, BOTH),
+    (Quantizer(quantum=0.3), VECTOR, SAMPLED),
     (Relay(on_point=0.5, off_point=-0.5), {}, BOTH),
     (Relay(on_point=0.5, off_point=-0.5), VECTOR, SAMPLED),
     (Backlash(width=0.6), {}, SAMPLED),

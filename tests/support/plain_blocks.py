@@ -518,7 +518,7 @@ def relay(d):
 @kind("real")
 def quantizer(d):
     q = d.uniform(0.1, 0.4)
-    made = lw.Quantizer(interval=q, name=d.name)
+    made = lw.Quantizer(quantum=q, name=d.name)
 
     def nearest(u):
         return float(np.floor(u[0] / q + 0.5))

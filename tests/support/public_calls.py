@@ -71,7 +71,7 @@ def swept():
 
 @cache
 def sensitivities():
-    return drive().sensitivity("u", ["kp.gain"])
+    return drive().sensitivities("u", ["kp.gain"])
 
 
 @cache
@@ -184,8 +184,8 @@ def calls():
                 "compile": False,
             },
         ),
-        "Diagram.sensitivity": lambda: (
-            d().sensitivity,
+        "Diagram.sensitivities": lambda: (
+            d().sensitivities,
             {"loop": "u", "parameters": ["kp.gain"], "at": 0.0, "delay": 0, "skew": 0.0},
         ),
         "Diagram.worst_case": lambda: (

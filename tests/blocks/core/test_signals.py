@@ -215,7 +215,7 @@ def test_a_source_names_its_wire():
         (lambda y: y // 2.0, r"Function(lambda u: np.floor(u / …))(u) in a sampled subsystem"),
         (np.floor, r"np.floor can't be applied to a signal: its values come with the run. It jumps, where a solver"),
         (np.sign, r"Write (u > 0.0) - (u < 0.0), whose"),
-        (np.round, r"Use Quantizer(interval=1.0)(u)"),
+        (np.round, r"Use Quantizer(quantum=1.0)(u)"),
         (lambda y: np.interp(y, [0, 1], [0, 1]), r"Use Lookup1D(breakpoints=…, values=…)(u)"),
         (np.shape, r"Its shape follows when the diagram is built"),
         (lambda y: np.sin(y, out=np.zeros(1)), r"np.sin can't be applied to a signal"),

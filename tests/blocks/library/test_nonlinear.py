@@ -28,17 +28,17 @@ def of(value):
 
 def test_a_quantizer_takes_the_nearest_level_and_the_upper_one_at_a_tie():
     u = np.array([-0.76, -0.75, -0.25, 0.0, 0.24, 0.25, 0.74, 0.75, 10.2])
-    y = at_ticks(Quantizer(interval=0.5), T, 1, u=of(u))["y"][0]
+    y = at_ticks(Quantizer(quantum=0.5), T, 1, u=of(u))["y"][0]
     assert y.tolist() == [-1.0, -0.5, 0.0, 0.0, 0.0, 0.5, 0.5, 1.0, 10.0]
 
 
 def test_each_element_can_have_an_interval_of_its_own():
-    y = at_ticks(Quantizer(interval=(1.0, 0.1)), T, 1, u=of(np.array([1.26, 1.26])))["y"][0]
+    y = at_ticks(Quantizer(quantum=(1.0, 0.1)), T, 1, u=of(np.array([1.26, 1.26])))["y"][0]
     np.testing.assert_allclose(y, [1.0, 1.3], rtol=1e-15)
 
 
 def test_a_quantizer_steps_where_the_signal_passes_the_middles():
-    outputs, log = in_time(Quantizer(interval=0.25), 2.0 * np.pi, u=np.sin)
+    outputs, log = in_time(Quantizer(quantum=0.25), 2.0 * np.pi, u=np.sin)
     up = np.arcsin(np.array([0.5, 1.5, 2.5, 3.5]) * 0.25)
     rise = np.concatenate([up, np.pi - up[::-1], np.pi + up, 2.0 * np.pi - up[::-1]])
     np.testing.assert_allclose([t for t, _ in log], rise, rtol=0, atol=1e-14)
@@ -48,16 +48,16 @@ def test_a_quantizer_steps_where_the_signal_passes_the_middles():
 
 
 def test_a_quantizer_follows_a_signal_that_jumps_over_several_levels():
-    outputs, log = in_time(Quantizer(interval=0.1), 3.0, u=lambda t: 0.0 if t < 1.0 else 0.73 if t < 2.0 else -0.31)
+    outputs, log = in_time(Quantizer(quantum=0.1), 3.0, u=lambda t: 0.0 if t < 1.0 else 0.73 if t < 2.0 else -0.31)
     assert len(log) == 2
     assert [float(outputs(t)["y"]) for t in (0.5, 1.5, 2.5)] == pytest.approx([0.0, 0.7, -0.3], abs=1e-15)
 
 
 def test_just_below_a_middle_the_lower_level_is_the_nearest():
     below = np.nextafter(0.5, 0.0)  # below + 1/2 is rounded to 1
-    assert at_ticks(Quantizer(interval=1.0), T, 1, u=of(below))["y"][0] == 0.0
-    start, _ = in_time(Quantizer(interval=1.0), 2.0, u=lambda t: below if t < 1.0 else 0.3)
-    fall, _ = in_time(Quantizer(interval=1.0), 3.0, u=lambda t: 0.7 if t < 1.0 else below if t < 2.0 else 0.3)
+    assert at_ticks(Quantizer(quantum=1.0), T, 1, u=of(below))["y"][0] == 0.0
+    start, _ = in_time(Quantizer(quantum=1.0), 2.0, u=lambda t: below if t < 1.0 else 0.3)
+    fall, _ = in_time(Quantizer(quantum=1.0), 3.0, u=lambda t: 0.7 if t < 1.0 else below if t < 2.0 else 0.3)
     assert [float(made["y"]) for made in (start(0.5), start(1.5), fall(0.5), fall(2.5))] == [0, 0, 1, 0]
 
 
@@ -208,7 +208,7 @@ def test_in_continuous_time_it_needs_a_lag():
 # --- all of them --------------------------------------------------------------------------------------------------------
 
 ALL = [
-    Quantizer(interval=0.1),
+    Quantizer(quantum=0.1),
     Relay(on_point=1.0, off_point=-1.0),
     Backlash(width=0.5, with_rate=True),
     RateLimiter(rising=1.0, time_constant=0.1),

@@ -106,7 +106,7 @@ def test_a_thermostat_switches_when_its_closed_form_does():
 def test_the_area_under_a_quantized_sine_is_that_of_its_steps():
     q, end = 0.25, 2.0
     area = Area()
-    run = Diagram("d", area(Quantizer(interval=q)(Wave().y))).simulate(end, **TIGHT)
+    run = Diagram("d", area(Quantizer(quantum=q)(Wave().y))).simulate(end, **TIGHT)
     middles = np.arcsin(q * (np.arange(4) + 0.5))
     steps = sum(q * (min(end, np.pi - t) - t) for t in middles)
     assert run["area.y"][-1] == pytest.approx(steps, abs=1e-11)

@@ -306,7 +306,7 @@ def test_disk_margin_and_encirclements_take_loops_with_delays():
 def test_sensitivities_of_a_loop_with_dead_time_are_those_of_its_closed_form():
     """K e^(−τ s)/s: the phase margin in degrees is 90 − K τ 180/π, the gain margin π/(2 K τ)."""
     diagram, _, _ = integrating()
-    found = diagram.sensitivity("u", ["k.gain", "late.delay"])
+    found = diagram.sensitivities("u", ["k.gain", "late.delay"])
     slopes = {(s.parameter, s.quantity): s.slope.value for s in found.rows}
     assert slopes["k.gain", "phase_margin_deg"] == pytest.approx(-0.8 * 180 / np.pi, rel=1e-8)
     assert slopes["k.gain", "gain_margin_high"] == pytest.approx(-np.pi / (2 * 0.7**2 * 0.8), rel=1e-8)

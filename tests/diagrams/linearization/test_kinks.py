@@ -150,9 +150,9 @@ def test_the_nominal_value_of_a_port_is_the_range_that_is_looked_at():
 
 STEPS = {
     "relay in continuous time": around(Relay(on_point=0.3, off_point=-0.3, off_value=-1.0, name="block")),
-    "quantizer in continuous time": around(Quantizer(interval=0.1, name="block"), 0.32),
+    "quantizer in continuous time": around(Quantizer(quantum=0.1, name="block"), 0.32),
     "sign": around(on(np.sign)),
-    "quantizer": sampled(Quantizer(interval=0.1, name="block"), 0.32),
+    "quantizer": sampled(Quantizer(quantum=0.1, name="block"), 0.32),
 }
 
 
@@ -340,7 +340,7 @@ def test_the_mean_slope_of_velocities_by_differences_is_that_of_the_differences(
 
 def test_a_quantizer_in_continuous_time_is_a_gain_wherever_the_loop_is_cut():
     x = Integrator(name="x", initial_value=0.32)
-    held = Quantizer(interval=0.1, name="quantizer")(x.y).named("q")
+    held = Quantizer(quantum=0.1, name="quantizer")(x.y).named("q")
     diagram = Diagram("d", x(Gain(gain=-2.0, name="back")(held).named("u")))
     assert diagram.linearize(stairs="zero").A.tolist() == [[0.0]]
     lin = diagram.linearize()
@@ -376,7 +376,7 @@ def test_encoders_and_quantizers_have_their_mean_slope_without_being_asked():
     lin = servo().linearize(2 * T)
     assert margins(lin.loop("u")).phase_margin_deg.value == pytest.approx(by_hand(), abs=1e-6)
     assert lin.notes == servo().linearize(2 * T, stairs="gain").notes
-    assert sampled(Quantizer(interval=0.1, name="block"), 0.32).linearize().findings == (
+    assert sampled(Quantizer(quantum=0.1, name="block"), 0.32).linearize().findings == (
         MeanSlope("box.block", "y", "u", pytest.approx(1.0, rel=1e-14)),
     )
 
@@ -409,7 +409,7 @@ FLAT = {
     "sign": (on(np.sign), "frequency_response(wire, …, amplitude=…)"),
     "abs": (on(np.abs), "linearize(point)"),
     "gear": (on(lambda u: np.floor(u / 10.0)), 'linearize(…, stairs="gain")'),
-    "quantizer": (Quantizer(interval=0.1, name="block"), 'linearize(…, stairs="gain")'),
+    "quantizer": (Quantizer(quantum=0.1, name="block"), 'linearize(…, stairs="gain")'),
 }
 
 

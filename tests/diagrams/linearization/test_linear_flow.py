@@ -39,7 +39,7 @@ def test_the_slopes_of_a_moving_linear_plant_are_exact(monkeypatch):
     monkeypatch.setattr(scipy.integrate, "solve_ivp", lambda *_, **__: pytest.fail("integrated"))
     tau = 0.3
     diagram = loop(TransferFunction(numerator=(1.0,), denominator=(tau, 1.0), name="plant"))
-    found = diagram.sensitivity("u", ["plant.denominator[1]"])
+    found = diagram.sensitivities("u", ["plant.denominator[1]"])
     e = np.exp(-T / tau)
     high = (1.0 + e) / (3.0 * (1.0 - e))  # largest factor of k: z = −1
     assert found["plant.denominator[1]", "gain_margin_high"].number.value == pytest.approx(high, rel=1e-9)
@@ -95,7 +95,7 @@ def test_an_fmu_in_model_exchange_at_rest_is_no_integration(cache, monkeypatch):
     closed = held[:2, :2] - 3.0 * held[:2, 2:] @ [[1.0, 0.0]]
     found = np.sort_complex(model.poles[np.abs(model.poles) > 1e-12])
     assert found == pytest.approx(np.sort_complex(np.linalg.eigvals(closed)), rel=1e-12)
-    diagram.sensitivity("f", ["k.gain"])
+    diagram.sensitivities("f", ["k.gain"])
     assert len(asked) <= 60  # 400 and more where it is integrated, along the gain four times as many again
 
 

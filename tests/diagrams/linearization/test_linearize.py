@@ -402,7 +402,7 @@ def test_an_encoder_by_its_slope_of_zero_says_so():
     @subsystem(sample_time=T)
     def box(x, v):
         p, _ = Encoder(quantum=1e-3, name="encoder")(x, v)
-        return Gain(gain=-1.0)(Quantizer(interval=0.1)(p))
+        return Gain(gain=-1.0)(Quantizer(quantum=0.1)(p))
 
     u = box(x.y, Constant(value=0.0)).named("u")
     lin = Diagram("d", x(u)).linearize(0.1, stairs="zero")

@@ -73,7 +73,7 @@ def test_the_quantum_of_a_signal_is_its_largest_change_by_one_step():
 
 def test_nothing_is_asked_for_where_no_converter_moves_the_signal():
     x, other = Integrator(name="x"), Integrator(name="other")
-    seen = Quantizer(interval=0.1, name="seen")(other.y)
+    seen = Quantizer(quantum=0.1, name="seen")(other.y)
     diagram = Diagram("d", x(Gain(gain=-2.0)(x.y).named("u")), other(Gain(gain=-1.0)(seen)))
     assert find_least_step(diagram.wired, diagram.operating_point(), "u", "u", 1.0) is None
 
@@ -116,7 +116,7 @@ def test_a_report_says_how_many_quanta_a_required_step_has():
 def cubic(gain):
     """A quantizer of step 0.1 ahead of gain/(s (s + 1) (s + 2)), whose gain margin is 6/gain."""
     plant = TransferFunction(name="plant", numerator=[gain], denominator=[1.0, 3.0, 2.0, 0.0])
-    seen = Quantizer(interval=0.1, name="seen")(plant.y)
+    seen = Quantizer(quantum=0.1, name="seen")(plant.y)
     return Diagram("cubic", plant(Gain(gain=-1.0, name="minus")(seen).named("u")))
 
 
@@ -170,7 +170,7 @@ def rounded(block):
 
 
 def test_a_worst_case_is_confirmed_with_its_treatment_of_stairs():
-    found = rounded(Quantizer(interval=1e-3, name="seen")).worst_case({"k.gain": (6.0, 10.0)}, "u", count=2, starts=0)
+    found = rounded(Quantizer(quantum=1e-3, name="seen")).worst_case({"k.gain": (6.0, 10.0)}, "u", count=2, starts=0)
     assert found.confirm().agrees
     gear = rounded(Function(lambda u: 1e-3 * np.floor(u / 1e-3 + 0.5), name="gear"))
     found = gear.worst_case({"k.gain": (6.0, 10.0)}, "u", count=2, starts=0, stairs="gain")

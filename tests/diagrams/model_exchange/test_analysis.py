@@ -184,7 +184,7 @@ def test_a_loop_has_its_slopes_by_the_parameters_of_its_controller(file):
     steps = A[integral, position] / 3.0  # the integral of ki e
     assert by_ki.slopes[0][integral, position] == pytest.approx(steps, rel=1e-9)
     assert abs(steps) == pytest.approx(0.02, rel=1e-9)
-    found = model.diagram.sensitivity("u")
+    found = model.diagram.sensitivities("u")
     assert {"controller.pi.kp", "controller.pi.ki"}.isdisjoint(found.without_effect)
 
 
@@ -198,6 +198,6 @@ def test_a_loop_has_its_slopes_by_parameters_of_the_fmu(file):
         expected = np.zeros_like(found.slopes[0])
         expected[speed, column] = -1.0
         np.testing.assert_allclose(found.slopes[0], expected, atol=1e-7)
-    found = model.diagram.sensitivity("u", ["plant.stiffness"])
+    found = model.diagram.sensitivities("u", ["plant.stiffness"])
     short, full = (found[name, "ms"] for name in ("plant.stiffness", "plant.start.stiffness"))
     assert short is full

@@ -62,7 +62,7 @@ def test_an_input_that_is_no_integer_is_refused_with_the_way_to_convert_it(file)
 def test_a_sampled_integer_output_reaches_the_fmu_at_its_tick(file):
     @subsystem(sample_time=0.1)
     def sampler(x):
-        return Quantizer(interval=1.0, name="whole")(Gain(gain=10.0, name="tenfold")(x))
+        return Quantizer(quantum=1.0, name="whole")(Gain(gain=10.0, name="tenfold")(x))
 
     fmu = plant(file)
     run = Diagram("d", fmu(u=Constant(value=1.0, name="u"), n=sampler(fmu.x))).simulate(0.5, progress=False)

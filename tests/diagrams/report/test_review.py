@@ -131,7 +131,7 @@ def loop(limit=None, encoder=None, start=0.0):
 
     @subsystem(sample_time=0.01)
     def controller(y):
-        seen = Quantizer(interval=encoder, name="encoder")(y) if encoder else y
+        seen = Quantizer(quantum=encoder, name="encoder")(y) if encoder else y
         command = Gain(gain=3.0, name="gain")(0.0 - seen)
         return (Saturation(lower=-5.0, upper=limit, name="limit")(command) if limit is not None else command).named("u")
 

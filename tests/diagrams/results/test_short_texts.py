@@ -49,8 +49,8 @@ def test_texts_of_results_are_short_and_say_units_or_next_steps(diagram, run):
     shown = [
         *(run, run.at(1.0), run.final_state, diagram.trim(), diagram.flatten(), diagram.flatten().log, diagram.draw()),
         *(model, loop, margins(loop), disk_margin(loop), periodic_margins(loop), gang_of_four(loop, loop)),
-        *(margins(drive(ki=2.0).linearize().loop("u")), diagram.sensitivity("u", ["kp.gain"])),
-        *(diagram.sensitivity("u", ["kp.gain"])[0], Requirements(ms=2.0), check_block(Gain(gain=1.0))),
+        *(margins(drive(ki=2.0).linearize().loop("u")), diagram.sensitivities("u", ["kp.gain"])),
+        *(diagram.sensitivities("u", ["kp.gain"])[0], Requirements(ms=2.0), check_block(Gain(gain=1.0))),
         diagram.worst_case({"kp.gain": (0.1, 0.3)}, "u", count=2, starts=0),
         diagram.sweep({"kp.gain": (0.1, 0.3)}, 0.1, signals="y", progress=False, workers=1, compile=False),
     ]

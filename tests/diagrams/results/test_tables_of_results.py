@@ -128,7 +128,7 @@ def test_everything_that_shows_itself_has_a_table_a_short_text_and_no_file(diagr
     loop = model.loop("u")
     shown = [
         *(diagram, run, model, margins(loop), disk_margin(loop), periodic_margins(loop), nyquist_count(loop)),
-        *(diagram["plant"], diagram.operating_point(1.0), diagram.sensitivity("u", ["kp.gain"])),
+        *(diagram["plant"], diagram.operating_point(1.0), diagram.sensitivities("u", ["kp.gain"])),
         diagram.worst_case({"kp.gain": (0.1, 0.3)}, "u", count=2, starts=0),
         diagram.sweep({"kp.gain": (0.1, 0.3)}, 0.1, signals="y", progress=False, workers=1, compile=False),
         experiments.path_following(),

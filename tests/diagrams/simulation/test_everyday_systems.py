@@ -300,7 +300,7 @@ def test_an_encoder_with_a_differentiator_behind_it_is_its_recursion():
 
     @subsystem(sample_time=T)
     def speed(position):
-        counts = Quantizer(interval=step, name="encoder")(position)
+        counts = Quantizer(quantum=step, name="encoder")(position)
         rate = (counts - UnitDelay(initial_value=0.0, name="last")(counts)) / T
         smooth = UnitDelay(initial_value=0.0, name="smooth")
         return smooth(keep * smooth.y + (1 - keep) * rate).named("speed")

@@ -156,7 +156,7 @@ def test_parameters_that_an_fmu_in_model_exchange_sets_are_among_the_sensitiviti
     def phase_margin(J):
         return control.margin(control.tf([3.0 * k], np.polyadd(np.polymul([L, R], [J, b]), [k * k])))[1]
 
-    slope = made.sensitivity("u")["motor.inertia", "phase_margin_deg"].slope.value
+    slope = made.sensitivities("u")["motor.inertia", "phase_margin_deg"].slope.value
     assert slope == pytest.approx((phase_margin(2.002e-5) - phase_margin(1.998e-5)) / 4e-8, rel=1e-5)
 
 

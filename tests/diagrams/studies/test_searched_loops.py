@@ -147,7 +147,7 @@ def test_a_vector_has_a_disk_margin_alone_and_says_so():
 
 def test_tables_are_plain_numbers():
     diagram = make_pi_loop()
-    rows = json.loads(json.dumps(diagram.sensitivity("u", ["p.gain", "ki.gain"]).table()))
+    rows = json.loads(json.dumps(diagram.sensitivities("u", ["p.gain", "ki.gain"]).table()))
     assert {row["parameter"] for row in rows} == {"p.gain", "ki.gain"}
     cases = diagram.worst_case({"p.gain": (0.5, 2.0)}, "u", requirements=Requirements(ms=1.6), count=2, starts=0)
     rows = json.loads(json.dumps(cases.table()))

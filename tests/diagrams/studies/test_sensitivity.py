@@ -19,7 +19,7 @@ NAMES = ["p.gain", "ki.gain", "rate.gain"]
 
 def test_phase_margins_have_the_slopes_of_their_closed_form():
     values = np.array([1.0, 0.5, 2.0])
-    found = make_pi_loop(*values).sensitivity("u", NAMES)
+    found = make_pi_loop(*values).sensitivities("u", NAMES)
     h = 1e-3
     for i, name in enumerate(NAMES):
         moves = [values + s * h * np.eye(3)[i] for s in (1.0, -1.0, 2.0, -2.0)]
@@ -37,7 +37,7 @@ def test_phase_margins_have_the_slopes_of_their_closed_form():
 
 
 def test_without_names_all_numbers_are_taken_and_zeros_are_told():
-    found = make_pi_loop().sensitivity("u")
+    found = make_pi_loop().sensitivities("u")
     assert {row.parameter for row in found} == set(NAMES)
     assert "r.value" in found.left_out
     assert "phase_margin_deg" in str(found)
@@ -46,7 +46,7 @@ def test_without_names_all_numbers_are_taken_and_zeros_are_told():
 
 
 def test_a_plot_has_our_colours_and_labels_that_stand_apart():
-    figure = make_pi_loop().sensitivity("u", NAMES).plot("ms")
+    figure = make_pi_loop().sensitivities("u", NAMES).plot("ms")
     axes = figure.axes[0]
     colours = {to_hex(bar.get_facecolor()).upper() for bar in axes.patches}
     assert colours <= {BLUE, VERMILION}
@@ -58,19 +58,19 @@ def test_a_plot_has_our_colours_and_labels_that_stand_apart():
 
 
 def test_parameters_that_change_nothing_are_named():
-    found = make_pi_loop().replace({"r.value": 1.0}).sensitivity("u", ["r.value", "p.gain"])
+    found = make_pi_loop().replace({"r.value": 1.0}).sensitivities("u", ["r.value", "p.gain"])
     assert found.without_effect == ("r.value",)
     assert {row.parameter for row in found} == {"p.gain"}
 
 
 def test_a_slope_is_confirmed_by_differences_of_the_margin():
-    found = make_pi_loop().sensitivity("u", "p.gain")
+    found = make_pi_loop().sensitivities("u", "p.gain")
     row = confirm_sensitivity(found, found["p.gain", "ms"])
     assert "differences of the margin" in row.slope.confirmed_by
 
 
 def test_an_unstable_loop_has_no_sensitivities():
-    found = make_pi_loop(kp=-2.0).sensitivity("u", "p.gain")
+    found = make_pi_loop(kp=-2.0).sensitivities("u", "p.gain")
     assert not found.stable
     assert np.isnan(found["p.gain", "phase_margin_deg"].slope.value)
     assert found.of("phase_margin_deg") == []
@@ -80,8 +80,8 @@ def test_an_unstable_loop_has_no_sensitivities():
 def test_names_that_are_not_there_are_told_with_near_ones():
     diagram = make_pi_loop()
     with pytest.raises(UnknownNameError, match="Did you mean 'gain'"):
-        diagram.sensitivity("u", "p.gian")
-    found = diagram.sensitivity("u", "p.gain")
+        diagram.sensitivities("u", "p.gian")
+    found = diagram.sensitivities("u", "p.gain")
     with pytest.raises(UnknownNameError, match="phase_margin_deg"):
         found["p.gain", "phase_margin"]
     with pytest.raises(UnknownNameError, match="ms"):
@@ -91,7 +91,7 @@ def test_names_that_are_not_there_are_told_with_near_ones():
 @pytest.mark.slow
 def test_the_weakest_margin_of_fig3_leans_on_the_friction_that_is_compensated():
     """α at the motor forces, by an FMU's start value (differences) and by the model's (exact); each confirmed."""
-    found = experiments.compliance().diagram.sensitivity(
+    found = experiments.compliance().diagram.sensitivities(
         "motor_force", ["plant.coulomb_scale", "feedback_linearization.model.coulomb_scale", "pid_par.a2"]
     )
     for row in found:

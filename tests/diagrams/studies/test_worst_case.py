@@ -77,7 +77,7 @@ def lag_delay_margin(a0, a1, b=2.0, k=3.0):
 
 def test_entries_of_an_array_are_ranges_by_the_names_that_sensitivity_gives():
     diagram = make_lag_loop()
-    slopes = diagram.sensitivity("u", ["motor.denominator[1]", "motor.numerator"])
+    slopes = diagram.sensitivities("u", ["motor.denominator[1]", "motor.numerator"])
     assert [row.parameter for row in slopes.of("delay_margin_s")] == ["motor.numerator[1]", "motor.denominator[1]"]
     h = 1e-5
     by_hand = (lag_delay_margin(0.1 + h, 1.0) - lag_delay_margin(0.1 - h, 1.0)) / (2 * h)
@@ -279,7 +279,7 @@ def test_structure_is_no_parameter_of_a_study(name, kind):
         diagram.worst_case({name: (0.0, 1.0)}, "control.u", progress=told.append)
     assert (caught.value.block, caught.value.port, told) == (head, last, [])
     with pytest.raises(OptionError, match=rf"{head}.{last}: found {kind} among the parameters of a sensitivity"):
-        diagram.sensitivity("control.u", [name])
+        diagram.sensitivities("control.u", [name])
 
 
 @pytest.mark.slow

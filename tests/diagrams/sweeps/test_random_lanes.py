@@ -85,7 +85,7 @@ class Chooser:
                 lambda n: u - 0.5 * v,
                 lambda n: Saturation(lower=-limit, upper=limit, name=n("clip"))(u),
                 lambda n: DeadZone(lower=-limit, upper=limit, name=n("dead"))(u),
-                lambda n: Quantizer(interval=limit, name=n("steps"))(u + 0.01),
+                lambda n: Quantizer(quantum=limit, name=n("steps"))(u + 0.01),
                 lambda n: Relay(on_point=limit, off_point=-limit, name=n("relay"))(u),
                 lambda n: RateLimiter(rising=20.0 * limit, name=n("slow"))(u),
                 lambda n: Backlash(width=limit, name=n("play"))(u),

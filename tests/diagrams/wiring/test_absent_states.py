@@ -129,6 +129,6 @@ def test_a_gain_of_zero_can_be_freed_in_a_trim_and_tried_in_a_worst_case():
 
 def test_what_a_zero_leaves_out_has_no_derivative():
     with pytest.raises(LoopwrightError, match=r"found 0, which is structure .* diagram.replace\(\{'pid.ki': …\}\)"):
-        p_loop(sampled=False).sensitivity("pid.u", ["pid.ki"])
+        p_loop(sampled=False).sensitivities("pid.u", ["pid.ki"])
     with pytest.raises(LoopwrightError, match=r"pid.ki came out as 0, which is structure"):
         p_loop(sampled=False).trim(free=["pid.ki"], targets={"plant.y": 0.9})
