@@ -97,7 +97,7 @@ static bool lw_next_step(lw_instance *self, lw_run *run, double t, double *to) {
     if (run->integrator != LW_RK4) return lw_adaptive_step(self, run, t, to);
 #endif
     if (run->fresh) {
-        if (t != run->segment || LW_N_Z) run->length = run->end - t;
+        if (t != run->segment || LW_N_Z > 0) run->length = run->end - t;
         run->segment = t;
         run->i = 0;
         run->n = lw_substeps(self, run->length);
@@ -220,7 +220,7 @@ static bool lw_advance(lw_instance *self, double t, double h, double *end) {
         if (!lw_intermediate_update(self, &run, t, &leave)) return false;
         if (leave || t >= run.end || !lw_inputs_jumped(self)) continue; /* inputs set at the end belong to the next step */
         self->s.step_size = 0.0;
-        if (run.integrator != LW_RK4 && LW_N_X) run.fresh = true;
+        if (run.integrator != LW_RK4 && LW_N_X > 0) run.fresh = true;
 #if LW_N_Z
         if (!lw_meet_inputs(self, t, u, &self->event_found)) return false;
         leave = self->event_found;

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from loopwright.fmus import CompilerError, FmuError, build_notes, gantry
+from loopwright.fmus import CompilerError, FmuError, bouncing_ball, build_notes, gantry, mass_spring_damper
 from loopwright.fmus.export import compiler as _compiler
 from loopwright.fmus.export.compiler import Compiler, compile_shared
 from support.waiting import FAR, is_there, wait_for
@@ -33,6 +33,16 @@ def spinning(tmp_path):
     (tmp_path / "spin.py").write_text(SPINNING)
     pids = tmp_path / "pids"
     return Compiler((sys.executable, str(tmp_path / "spin.py"), str(pids)), "spinning"), pids
+
+
+@pytest.mark.parametrize("model", [mass_spring_damper, bouncing_ball])
+def test_an_exported_model_compiles_without_a_word(model, tmp_path, monkeypatch):
+    """A warning would compile each model again in each session: tests keep what is clean (`support.kept_libraries`)."""
+    compile_it, said = _compiler._wait, []
+    monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(_compiler, "_wait", lambda *of: said.append(compile_it(*of)) or said[-1])
+    model.build(out=tmp_path)
+    assert said == [(0, "", "")]
 
 
 def assert_ended(pids):
