@@ -229,6 +229,11 @@ class Block(ShownAsTable, Value, Wireable, metaclass=ShownMembers):
         return ""
 
     @property
+    def idle_parameters(self) -> frozenset[str]:
+        """Names of the parameters that have no effect with the values of the others; a report doesn't list them."""
+        return frozenset()
+
+    @property
     def absent_states(self) -> Mapping[str, str]:
         """Reason, and a next step, for each state that other parameters give the block, and its own leave out."""
         return {}

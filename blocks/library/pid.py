@@ -198,6 +198,19 @@ class PID(Block):
         return absent
 
     @property
+    def idle_parameters(self) -> frozenset[str]:
+        """Those of anti-windup where nothing limits an integral, and weights of parts whose gain is 0."""
+        bounded = self.has_integral and (self.has_limits or self.tracking)
+        used = {
+            "anti_windup": bounded,
+            "tracking_time": bounded and self.tracks,
+            "clearance": self.clamps,
+            "b": self.kp != 0.0,
+            "c": self.kd != 0.0,
+        }
+        return frozenset(name for name, is_used in used.items() if not is_used)
+
+    @property
     def events(self) -> Mapping[str, Event]:  # type: ignore[override]
         """``clamp`` and ``release``, with clamping."""
         return {"clamp": type(self).clamp, "release": type(self).release} if self.clamps else {}

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks import ErrorDynamics, PlanarModel
+from ...blocks import ErrorDynamics, ForceSensor, PlanarModel
 from ...blocks.core import LoopwrightError
 from ...fmus.models import Gantry
 from ..frequency import Number, Realization, relative_difference, sampled_gains, sampled_poles, with_findings
@@ -218,7 +218,10 @@ class _Claims:
     def section(self) -> Section:
         """Return the section that is added to that on poles."""
         table = CLAIMS.fill(self.rows, TEXTS.line("columns"))
-        part = Section("claims", "The paper's claims", TEXTS.paragraphs("claims"), (table,))
+        blocks = self.case.diagram.blocks.values()
+        tool = max((block.tool_mass for block in blocks if isinstance(block, ForceSensor)), default=0.0)
+        text = [*TEXTS.paragraphs("claims"), *([TEXTS.line("claims_with_tool", tool=tool)] if tool else [])]
+        part = Section("claims", "The paper's claims", tuple(text), (table,))
         return Section("poles", POLES_TITLE, sections=(part,))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ....blocks.core import LoopwrightError
+from ....blocks.core import BetweenTicksError, LoopwrightError
 from ....fmus.running import DerivativeMethod
 from ...flat import WiredDiagram
 from ...frequency import (
@@ -131,8 +131,8 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
                 return several(case, key, wire)
             m = margins(L)
         except LoopwrightError as error:
-            notes.append(f"{v.title}: {error.message}")
-            absent[v.key] = error.message
+            notes.append(_no_margins(wire, v, error))
+            absent[v.key] = error.message.partition("; expected ")[0]
             continue
         at = cut_key(v, cut)
         found[at], loops[at], titles[at] = m, L, title
@@ -326,8 +326,21 @@ def left_out(case: Case, wire: str, on_cycles: Collection[str]) -> list[str]:
             else:
                 margins(L)
         except LoopwrightError as error:
-            said |= dict.fromkeys([f"{wire}, {v.title}: {error.message}"])
+            said |= dict.fromkeys([_no_margins(wire, v, error)])
     return list(said)
+
+
+def _no_margins(wire: str, v: Variant, error: LoopwrightError) -> str:
+    """Return why a wire has no margins in a variant, for readers of a report; a hint for its author comes last.
+
+    An error's text has what was found, what was expected, and one next step.
+    """
+    found, _, rest = error.message.partition("; expected ")
+    why = f"{found[:1].upper()}{found[1:]}".rstrip(".")
+    if isinstance(error, BetweenTicksError):
+        return TEXTS.line("between_ticks", wire=wire, variant=v.title, why=why)
+    _, _, step = rest.partition(". ")
+    return TEXTS.line("not_shown", wire=wire, variant=v.title, why=why, step=step)
 
 
 def _is_zero(L: Any) -> bool:

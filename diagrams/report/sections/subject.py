@@ -78,7 +78,8 @@ def subject(case: Case) -> Section:
     for path, block in sorted(diagram.blocks.items()):
         rows = list(_fmu_parameters(block) if isinstance(block, Fmu) else _parameters(block))
         for name, shown, unit, value in rows:
-            parameters.append((path, type(block).__name__, name, shown, print_unit(unit)))
+            if name not in block.idle_parameters:
+                parameters.append((path, type(block).__name__, name, shown, print_unit(unit)))
             if isinstance(value, float) and np.isfinite(value):
                 numbers[f"{path}.{name}"] = Number(value, unit or "1", 0.0, "given", given=True)
         if isinstance(block, Fmu):
@@ -95,7 +96,11 @@ def subject(case: Case) -> Section:
         tables.append(Table("FMUs", columns, tuple(plants)))
     tables.insert(0, _variants(case))
     listed = Table("Parameters", ("block", "type", "parameter", "value", "unit"), tuple(parameters))
-    parts = (Section("parameters", "Parameters", tables=(listed,)),) if parameters else ()
+    idle = [
+        f"{path}.{name}" for path, block in sorted(diagram.blocks.items()) for name in sorted(block.idle_parameters)
+    ]
+    said = (TEXTS.line("idle", names=idle),) if idle else ()
+    parts = (Section("parameters", "Parameters", said, tables=(listed,)),) if parameters else ()
     tables.append(Table("Versions", ("package", "version"), tuple(versions().items()), details=True))
     text = [TEXTS.line("diagram", name=diagram.name, blocks=len(diagram.blocks), wires=len(diagram.names))]
     if case.experiment is not None:
