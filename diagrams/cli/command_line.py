@@ -30,7 +30,7 @@ from ...blocks.core import (
 from ...fmus import Fmu
 from ...fmus.child_processes import folder_in
 from ...fmus.models import gantry
-from ..paper import DEFINITIONS, EXPERIMENTS, Experiment, key_numbers
+from ..paper import DEFINITIONS, EXPERIMENTS, Experiment, Theory, key_numbers, theory_numbers
 from ..results import Run
 from ..simulation import Interrupted
 from .diagrams import add_diagram_options, add_diagrams, draw_command, run_diagram, sweep_command
@@ -56,6 +56,8 @@ SIGNALS = (
     "xi_p",
 )
 """Signals of the CSV file, in order."""
+HOLDS = "✓"
+"""Mark of a closed form that holds."""
 _SHOWN = {"m": ("mm", 1e3), "1": ("%", 100.0), "m/s2": ("m/s²", 1.0)}
 
 
@@ -203,6 +205,7 @@ def _run(arguments: argparse.Namespace) -> int:
     # From here on one experiment that fails, or is interrupted, leaves the files of the others.
     folder = _make_folder(arguments.out)
     table: dict[str, dict[str, float | None]] = {}
+    theory: dict[str, dict[str, Theory]] = {}
     written: list[list[str]] = []
     failed: dict[str, str] = {}
     interrupted = False
@@ -223,6 +226,7 @@ def _run(arguments: argparse.Namespace) -> int:
             stay = _earlier_files_text(letter, folder)
             try:
                 table[letter], names = _write(experiment, run, problem, folder)
+                theory[letter] = theory_numbers(experiment, run)
                 written.append(names)
             except OSError as error:
                 found = describe_disk_error(error, folder, "Name another folder: --out.")
@@ -233,7 +237,7 @@ def _run(arguments: argparse.Namespace) -> int:
                 _say(f"loopwright: interrupted; nothing of {letter} is written{stay}.", sys.stderr)
         if interrupted:
             break
-    _print_table(table, failed)
+    _print_table(table, failed, theory)
     if written:
         _say(f"Written to {folder}:")
     for names in written:
@@ -293,8 +297,12 @@ def _earlier_files_text(letter: str, folder: Path) -> str:
 # --- printing -------------------------------------------------------------------------------------------------------
 
 
-def _print_table(table: Mapping[str, Mapping[str, float | None]], failed: Mapping[str, str]) -> None:
-    """Print the key numbers, one column for each experiment."""
+def _print_table(
+    table: Mapping[str, Mapping[str, float | None]],
+    failed: Mapping[str, str],
+    theory: Mapping[str, Mapping[str, Theory]],
+) -> None:
+    """Print the key numbers, one column for each experiment, and their closed forms, marked where they hold."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -306,13 +314,26 @@ def _print_table(table: Mapping[str, Mapping[str, float | None]], failed: Mappin
     shown.add_column("unit", no_wrap=True)
     for letter in table:
         shown.add_column(f"{letter} failed" if letter in failed else letter, justify="right", no_wrap=True)
+    shown.add_column("theory")
+    mark = _fit(HOLDS, sys.stdout)
     for name, (unit, _) in DEFINITIONS.items():
         label, factor = ("", 1.0) if name == "real_time_factor" else _SHOWN.get(unit, (unit, 1.0))
         values = [_number_text(numbers[name], factor) for numbers in table.values()]
+        known = {
+            letter: (own[name], numbers[name])
+            for letter, numbers in table.items()
+            if name in (own := theory.get(letter, {})) and numbers[name] is not None
+        }
+        forms = (
+            f"{letter}: {_number_text(form.value, factor)}{f' {mark}' if form.holds(number) else ''}"
+            for letter, (form, number) in known.items()
+        )
         if set(values) != {"-"}:
-            shown.add_row(name, _fit(label, sys.stdout), *values)
-    console = Console(file=sys.stdout, width=None if sys.stdout.isatty() else 80, highlight=False)
+            shown.add_row(name, _fit(label, sys.stdout), *values, "\n".join(forms))
+    console = Console(file=sys.stdout, width=None if sys.stdout.isatty() else 100, highlight=False)
     console.print(shown)
+    if any(theory.values()):
+        _say(f"theory: closed forms; {HOLDS} where the run is within 1 % of them")
 
 
 def _number_text(value: float | None, factor: float) -> str:

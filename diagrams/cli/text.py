@@ -24,6 +24,7 @@ _PLAIN = str.maketrans(
         "–": "-",
         "’": "'",
         "′": "'",
+        "✓": "ok",
     }
 )
 _POWERS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")

@@ -11,7 +11,7 @@ from .coupled_stability import (
     stability_map,
     stiffness_limits,
 )
-from .experiment_numbers import DEFINITIONS, key_numbers
+from .experiment_numbers import DEFINITIONS, Theory, key_numbers, theory_numbers
 from .experiments import DEFAULTS, EXPERIMENTS, Experiment
 from .fig3_diagram import Fig3Diagram, fig3
 from .figures import plot_experiment, plot_path
@@ -35,6 +35,7 @@ __all__ = [
     "Rig",
     "StabilityLimit",
     "StabilityMap",
+    "Theory",
     "crossing_frequency",
     "experiments",
     "fig3",
@@ -52,4 +53,5 @@ __all__ = [
     "stability_map",
     "stiffness_limits",
     "target_admittance",
+    "theory_numbers",
 ]

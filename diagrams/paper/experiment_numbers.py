@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +14,10 @@ if TYPE_CHECKING:
     from ..results import Run
     from .experiments import Experiment
 
+CLOSE = 0.01
+"""Difference from a closed form, relative to its size, up to which the closed form holds: sampling adds some."""
+SCATTER = 1e-3
+"""Relative spread of poles up to which they are one: of a triple pole roots differ by the third root of rounding."""
 BAND = 0.02
 """Half-width of the band of the settling time, relative to the step."""
 
@@ -112,6 +118,50 @@ def key_numbers(experiment: Experiment, run: Run) -> dict[str, float | None]:
     return numbers
 
 
+@dataclass(frozen=True)
+class Theory:
+    """The value of a key number by its closed form, and the size that a difference is relative to."""
+
+    value: float
+    size: float
+
+    def holds(self, number: float) -> bool:
+        """Return whether a number is within 1 % of the size."""
+        return abs(number - self.value) <= CLOSE * self.size
+
+
+def theory_numbers(experiment: Experiment, run: Run) -> dict[str, Theory]:
+    """Return the closed forms of key numbers, by name, as far as they hold for the experiment's parameters.
+
+    * The error of a triple pole overshoots by 5 e⁻³ on its way to zero, whatever the pole is.
+    * An admittance in free space: overshoot exp(−π ζ/√(1 − ζ²)), offset −F^d/k.
+    * Without stiffness the force is the desired one at rest.
+    """
+    found: dict[str, Theory] = {}
+    if not len(run.t):
+        return found
+    for name in ("par", "perp"):
+        side = _Side(experiment, run, name)
+        if not side.admittance:
+            block: Any = experiment.diagram.blocks[f"controller.pid_{name}"]
+            poles = np.array(block.poles)
+            if np.ptp(poles.real) + np.ptp(poles.imag) < SCATTER * abs(np.mean(poles)):
+                found[f"overshoot_{name}"] = _relative(5.0 * math.exp(-3.0))
+        elif side.tracks_force:
+            found["force_error_final"] = Theory(0.0, float(np.max(np.abs(side.desired_force))))
+        elif side.stiffness and not np.any(side.force):
+            zeta = side.damping_ratio
+            if 0.0 < zeta < 1.0:
+                found[f"overshoot_{name}"] = _relative(math.exp(-math.pi * zeta / math.sqrt(1.0 - zeta**2)))
+            if (force := side.first_force()) is not None:
+                found[f"offset_{name}"] = _relative(-force / side.stiffness)
+    return found
+
+
+def _relative(value: float) -> Theory:
+    return Theory(value, abs(value))
+
+
 class _Side:
     """The signals of one direction."""
 
@@ -126,10 +176,24 @@ class _Side:
         self.has_desired_force = desired in run
         self.desired_force = run[desired] if self.has_desired_force else zero
         self.set_point = run[set_point] if side == "par" and set_point in run else zero
-        block = experiment.diagram.blocks.get(f"controller.admittance_{side}")
+        block: Any = experiment.diagram.blocks.get(f"controller.admittance_{side}")
         self.admittance = block is not None
         self.stiffness = float(getattr(block, "stiffness", 0.0))
+        self.block = block
         self.tracks_force = self.admittance and not self.stiffness and self.has_desired_force
+
+    @property
+    def damping_ratio(self) -> float:
+        """ζ of the admittance, d/(2 √(m k)) where it has a damping d."""
+        given = getattr(self.block, "damping_ratio", None)
+        if given is not None:
+            return float(given)
+        return float(getattr(self.block, "damping", 0.0)) / (2.0 * math.sqrt(self.block.mass * self.stiffness))
+
+    def first_force(self) -> float | None:
+        """Return the first desired force that is not zero; None without any."""
+        ticks = np.flatnonzero(self.desired_force)
+        return float(self.desired_force[ticks[0]]) if ticks.size else None
 
     @property
     def changes(self) -> np.ndarray:

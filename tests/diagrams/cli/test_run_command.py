@@ -116,9 +116,9 @@ def test_table_fits_eighty_columns(tmp_path, capsys, undrawn):
     assert len(table) >= 1 + len(DEFINITIONS) / 2
     assert max(map(len, table)) <= 80
     head = lines[first]
-    assert head.split() == ["key", "number", "unit", "D", "B"]
+    assert head.split() == ["key", "number", "unit", "D", "B", "theory"]
     row = next(line for line in lines if "offset_perp" in line)
-    assert row.split() == ["offset_perp", "mm", "-", "-25"]
+    assert row.split() == ["offset_perp", "mm", "-", "-25", "B:", "-25", "✓"]
     assert "force_error_final" in out
     assert all(f"{letter}{ending}" in out for letter in "DB" for ending in ALL)
     assert "B: without cubic, which only D has." in err
@@ -185,7 +185,7 @@ def test_a_failed_run_keeps_its_files_and_the_others_run(tmp_path, capsys, undra
     assert content["settling_par"] is None
     assert content["end_time"] == run.t[-1]
     assert "error" not in json.loads((tmp_path / "A.json").read_text())
-    assert next(line for line in out.splitlines() if "key number" in line).split()[3:] == ["B", "failed", "A"]
+    assert next(line for line in out.splitlines() if "key number" in line).split()[3:] == ["B", "failed", "A", "theory"]
 
 
 @pytest.mark.parametrize("older", [True, False])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from loopwright.diagrams import experiments
-from loopwright.diagrams.paper.experiment_numbers import DEFINITIONS, key_numbers
+from loopwright.diagrams.paper.experiment_numbers import DEFINITIONS, Theory, key_numbers, theory_numbers
 
 TANGENTIAL, TRANSVERSAL = (0.5, 10.0, 0.6), (2.0, 200.0, 0.3)  # m, k, ζ of Table III
 
@@ -44,6 +44,25 @@ def step_response(t, m, k, zeta):
 def test_every_experiment_has_every_number(numbers):
     assert all(list(n) == list(DEFINITIONS) for n in numbers.values())
     assert all(v is None or type(v) is float for n in numbers.values() for v in n.values())
+
+
+def test_theory_is_known_where_it_holds(runs, numbers):
+    found = {letter: theory_numbers(*pair) for letter, pair in runs.items()}
+    beyond = {side: math.exp(-math.pi * z / math.sqrt(1 - z**2)) for side, z in (("par", 0.6), ("perp", 0.3))}
+    assert found["A"]["overshoot_par"].value == found["A"]["overshoot_perp"].value == pytest.approx(0.248935, abs=1e-6)
+    assert {name: form.value for name, form in found["B"].items()} == pytest.approx(
+        {f"overshoot_{side}": value for side, value in beyond.items()} | {"offset_par": -0.2, "offset_perp": -0.025}
+    )
+    assert found["C"] == {}  # the hand is no closed form
+    assert {name: (form.value, form.size) for name, form in found["D"].items()} == {"force_error_final": (0.0, 5.0)}
+    for letter, forms in found.items():
+        assert all(form.holds(numbers[letter][name]) for name, form in forms.items())
+
+
+def test_theory_does_not_hold_beyond_one_percent():
+    assert Theory(0.25, 0.25).holds(0.2524)
+    assert not Theory(0.25, 0.25).holds(0.2526)
+    assert not Theory(0.25, 0.25).holds(math.nan)
 
 
 @pytest.mark.parametrize(("side", "pole"), [("par", 20.0), ("perp", 40.0)])
