@@ -96,9 +96,8 @@ def subject(case: Case) -> Section:
         tables.append(Table("FMUs", columns, tuple(plants)))
     tables.insert(0, _variants(case))
     listed = Table("Parameters", ("block", "type", "parameter", "value", "unit"), tuple(parameters))
-    idle = [
-        f"{path}.{name}" for path, block in sorted(diagram.blocks.items()) for name in sorted(block.idle_parameters)
-    ]
+    found = [(path, block, name) for path, block in sorted(diagram.blocks.items()) for name in block.idle_parameters]
+    idle = sorted(f"{path}.{name}" for path, block, name in found if getattr(block, name) is not None)
     said = (TEXTS.line("idle", names=idle),) if idle else ()
     parts = (Section("parameters", "Parameters", said, tables=(listed,)),) if parameters else ()
     tables.append(Table("Versions", ("package", "version"), tuple(versions().items()), details=True))
