@@ -144,6 +144,7 @@ def of(unit):
         (lambda: np.minimum(of("m"), of("m")), "m"),
         (lambda: np.clip(of("m"), 0.0, 1.0), "m"),
         (lambda: np.where(of("m") > of("m"), of("N"), of("N")), "N"),
+        (lambda: np.where(of("m") > 0.0, Constant(value=1.0), of("N")), "N"),
         (lambda: np.sin(of("rad")), "1"),
         (lambda: np.sin(np.radians(of("deg"))), "1"),
         (lambda: np.arcsin(of("1")), "rad"),
