@@ -152,6 +152,7 @@ class LoopPlots:
         chosen = None if gains is None else np.unique(np.asarray(gains, dtype=float))
         return plot_root_locus(self, name, chosen, _margins(self) if margins else None)
 
+    @accepts()
     def pzmap(self) -> Figure:
         """Return the poles and zeros of L in the s plane, or in the z plane with the unit circle.
 
