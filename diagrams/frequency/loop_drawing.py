@@ -117,9 +117,9 @@ def draw_bode_axes(top: Axes, bottom: Axes, loops: Sequence[DrawnLoop], units: A
             bottom.plot(x, reference, marker="s", **mark)
         if loop.dt:
             for ax in (top, bottom):
-                ax.axvline(units.frequency(np.pi / loop.dt), color=GREY, linewidth=0.6, linestyle=":")
+                ax.axvline(float(units.frequency(np.pi / loop.dt)), color=GREY, linewidth=0.6, linestyle=":")
     set_magnitudes(top, units, 5 if few else 6)
-    top.axhline(units.magnitude(1.0), color=DARK, linewidth=0.6)
+    top.axhline(float(units.magnitude(1.0)), color=DARK, linewidth=0.6)
     low, high = bottom.get_ylim()
     for reference in references:
         if reference == -180.0 or low < reference < high:

@@ -146,12 +146,12 @@ def _limits(margins: Margins | None, dt: float) -> list[tuple[float, complex]]:
 
 def plot_poles(poles: np.ndarray, zeros: np.ndarray | None, dt: float, title: str, *, are_all: bool = True) -> Figure:
     """Return a map of poles and zeros; see `Linearization.pzmap`."""
-    shown = [np.ravel(poles), np.ravel(np.zeros(0) if zeros is None else zeros)]
-    view = _view(shown, dt, 0.0)
+    crosses, circles = np.ravel(poles), np.ravel(np.zeros(0) if zeros is None else zeros)
+    view = _view([crosses, circles], dt, 0.0)
     with shown_figure(*_size(view)) as figure:
         axes = figure.subplots()
         _draw_plane(axes, view, dt)
-        _draw_points(axes, *shown, color=BLUE)
+        _draw_points(axes, crosses, circles, color=BLUE)
         axes.set_title(
             title + ("" if are_all else ": the rightmost ones of infinitely many"), loc="right", fontsize="small"
         )

@@ -70,7 +70,7 @@ def mark_zeros(ax: Axes) -> None:
     if not zero:
         return
     for line in zero:
-        line.set_ydata(np.full(len(line.get_ydata()), np.nan))
+        line.set_ydata(np.full(np.size(line.get_ydata()), np.nan))
     ax.relim()
     names = [str(line.get_label()) for line in zero]
     said = [f"{name}: {ZERO}" for name in names if not name.startswith("_")]

@@ -114,15 +114,9 @@ def keep_style(ax: Axes) -> None:
     """Give ticks that come later, as those of a zoom, the style of now: they would take that of their time."""
     from matplotlib import rcParams
 
-    for axis in ("x", "y"):
-        ax.tick_params(
-            axis=axis,  # type: ignore[arg-type]
-            labelsize=rcParams[f"{axis}tick.labelsize"],
-            color=rcParams[f"{axis}tick.color"],
-            grid_color=rcParams["grid.color"],
-            grid_linewidth=rcParams["grid.linewidth"],
-            grid_alpha=rcParams["grid.alpha"],
-        )
+    grid = {f"grid_{name}": rcParams[f"grid.{name}"] for name in ("color", "linewidth", "alpha")}
+    ax.tick_params("x", labelsize=rcParams["xtick.labelsize"], color=rcParams["xtick.color"], **grid)
+    ax.tick_params("y", labelsize=rcParams["ytick.labelsize"], color=rcParams["ytick.color"], **grid)
 
 
 def save(figure: Figure, stem: Path) -> tuple[Path, Path]:

@@ -63,7 +63,7 @@ Panel = Sequence[DrawnSignal]
 def plot_signals(
     panels: Sequence[Panel],
     events: Sequence[Occurrence] = (),
-    axes: Sequence[Axes] | None = None,
+    axes: Sequence[Axes] | np.ndarray | None = None,
     xlim: tuple[float, float] | None = None,
 ) -> Figure:
     """Draw signals over time, one axis below the other; see `Run.plot`."""
@@ -81,7 +81,7 @@ def plot_signals(
         return drawn
 
 
-def _check_axes(axes: Sequence[Axes], count: int) -> list[Axes]:
+def _check_axes(axes: Sequence[Axes] | np.ndarray, count: int) -> list[Axes]:
     """Return axes that are given, as many as are drawn into."""
     rows: list[Axes] = list(np.ravel(np.asarray(axes, dtype=object)))
     if len(rows) != count:

@@ -408,7 +408,7 @@ class Run(ShownAsTable):
         against: Run | Mapping[str, Run] | None = None,
         label: str = "this run",
         xlim: tuple[float, float] | None = None,
-        axes: Sequence[Axes] | None = None,
+        axes: Sequence[Axes] | np.ndarray | None = None,
     ) -> Figure:
         """Draw signals over time, one axis below the other, and return the figure.
 

@@ -40,7 +40,9 @@ def plot_sweep(sweep: DrawnSweep, names: Sequence[object], xlim: tuple[float, fl
                 f"found {name!r} to draw. {near(str(name), kept)}", block=sweep.diagram_name, port="names"
             )
     chosen = [str(name) for name in names] or kept
-    made = [(k, o) for k, o in enumerate(sweep.outcomes) if o is not None and o.t is not None and len(o.t)]
+    made = [(k, o.t, o) for k, o in enumerate(sweep.outcomes) if o is not None and o.t is not None and len(o.t)]
+    ends = [end for _, t, _ in made for end in (t[0], t[-1])]
+    shown = np.array(xlim or (min(ends, default=0.0), max(ends, default=1.0)))
     columns = [(name, entry) for name in chosen for entry in _entries(name, made)]
     with shown_figure(0.6 + 1.5 * len(columns)) as figure:
         rows: list[Axes] = list(figure.subplots(len(columns), 1, sharex=True, squeeze=False)[:, 0])
@@ -53,23 +55,20 @@ def plot_sweep(sweep: DrawnSweep, names: Sequence[object], xlim: tuple[float, fl
             low, high = float(values.min()), float(values.max())
             scale = ScalarMappable((LogNorm if low > 0.0 and high > 30.0 * low else Normalize)(low, high), "viridis")
         for ax, (name, entry) in zip(rows, columns, strict=True):
-            for k, outcome in made:
-                y = outcome.signals[name] if not entry else outcome.signals[name][(slice(None), *entry)]
-                color = COLORS[k % len(COLORS)] if len(made) <= len(COLORS) else BLUE
+            for k, t, outcome in made:
+                y = np.asarray(outcome.signals[name])[(slice(None), *entry)]  # type: ignore[arg-type]
+                color: Any = COLORS[k % len(COLORS)] if len(made) <= len(COLORS) else BLUE
                 color = scale.to_rgba(values[k]) if scale is not None and values is not None else color
-                look: dict[str, Any] = {
-                    "color": color,
-                    "alpha": 0.4 if color == BLUE and len(made) > len(COLORS) else 1.0,
-                }
-                ax.plot(outcome.t, y, label=_label(sweep, k), **look)
-                if outcome.failure is not None and len(y):
-                    ax.plot(outcome.t[-1:], y[-1:], marker="x", color=VERMILION, markersize=6, linestyle="none")
+                faint = scale is None and len(made) > len(COLORS)
+                ax.plot(t, y, label=_label(sweep, k), color=color, alpha=0.4 if faint else 1.0)
+                if outcome.failure is not None:
+                    ax.plot(t[-1:], y[-1:], marker="x", color=VERMILION, markersize=6, linestyle="none")
             label = name if not entry else f"{name}[{','.join(str(i + 1) for i in entry)}]"
             ax.set_ylabel(with_unit(label, sweep.units.get(name, "1")))
-            limit_time(ax, np.array([o.t[e] for _, o in made for e in (0, -1)]) if xlim is None else np.array(xlim))
+            limit_time(ax, shown)
             if xlim is not None:
                 ax.set_xlim(*xlim)
-        failed = sum(o.failure is not None for _, o in made)
+        failed = sum(o.failure is not None for _, _, o in made)
         if failed:
             rows[0].set_title(f"×: end of a run that failed ({failed})", loc="right", fontsize="small", color=VERMILION)
         rows[-1].set_xlabel("t [s]")
@@ -83,9 +82,9 @@ def plot_sweep(sweep: DrawnSweep, names: Sequence[object], xlim: tuple[float, fl
     return figure
 
 
-def _entries(name: str, made: Sequence[tuple[int, SampleOutcome]]) -> list[tuple[int, ...]]:
+def _entries(name: str, made: Sequence[tuple[int, np.ndarray, SampleOutcome]]) -> list[tuple[int, ...]]:
     """Return the entries of a signal, one () of a number."""
-    shape = next((o.signals[name].shape[1:] for _, o in made if name in o.signals), ())
+    shape = next((o.signals[name].shape[1:] for _, _, o in made if name in o.signals), ())
     return list(np.ndindex(*shape)) if shape else [()]
 
 
