@@ -114,9 +114,10 @@ def keep_style(ax: Axes) -> None:
     """Give ticks that come later, as those of a zoom, the style of now: they would take that of their time."""
     from matplotlib import rcParams
 
-    grid = {f"grid_{name}": rcParams[f"grid.{name}"] for name in ("color", "linewidth", "alpha")}
-    ax.tick_params("x", labelsize=rcParams["xtick.labelsize"], color=rcParams["xtick.color"], **grid)
-    ax.tick_params("y", labelsize=rcParams["ytick.labelsize"], color=rcParams["ytick.color"], **grid)
+    settings: Any = rcParams
+    grid = {f"grid_{name}": settings[f"grid.{name}"] for name in ("color", "linewidth", "alpha")}
+    ax.tick_params("x", labelsize=settings["xtick.labelsize"], color=settings["xtick.color"], **grid)
+    ax.tick_params("y", labelsize=settings["ytick.labelsize"], color=settings["ytick.color"], **grid)
 
 
 def save(figure: Figure, stem: Path) -> tuple[Path, Path]:
