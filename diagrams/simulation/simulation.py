@@ -196,7 +196,7 @@ class Simulation:
 
     # --- continuing ------------------------------------------------------------------------------------------------
 
-    @accepts(progress=kinds.progress)
+    @accepts(progress=kinds.progress.or_none())
     def advance(self, duration: float, *, progress: ProgressOption = False) -> None:
         """Continue for a duration in s; one that is no multiple of the step between ticks ends the run.
 
