@@ -274,7 +274,7 @@ paths = Kind("a list of paths", _is_paths)
 function = Kind("a function", callable)
 progress = Kind(
     "True, False or a function",
-    lambda value: flag.holds(value) or callable(value),
+    lambda value: value is None or flag.holds(value) or callable(value),
     "Leave it out to have it shown on a terminal.",
 )
 """Whether progress is shown, or a function that is called with it; None shows it on a terminal."""

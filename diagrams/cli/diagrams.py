@@ -248,7 +248,8 @@ def _write_run(name: str, run: Run, problem: str | None, folder: Path) -> list[P
             write_text(new / f"{name}.json", json.dumps(_facts(run, problem), indent=2) + "\n")
             if drawn:
                 figure = new_figure(0.5 + 1.35 * len(drawn))
-                save(run.plot(*drawn, axes=np.atleast_1d(figure.subplots(len(drawn), 1, sharex=True))), new / name)
+                axes = list(figure.subplots(len(drawn), 1, sharex=True, squeeze=False)[:, 0])
+                save(run.plot(*drawn, axes=axes), new / name)
             made = sorted(file.name for file in new.iterdir())
             for file in made:
                 (new / file).replace(folder / file)
