@@ -22,7 +22,7 @@ from .number import Confirmation, Number, carries_findings
 from .poles_and_zeros import SIDES
 from .realization import Realization
 from .scan_refine_confirm import find_first_limit, find_largest, first_largest
-from .sensitivity_peaks import sensitivity_at
+from .sensitivity_peaks import confirm_peak, sensitivity_at
 
 if TYPE_CHECKING:
     from .state_space import LinearSystem
@@ -60,6 +60,12 @@ class PeriodicMargins(StabilityMargins):
         the period it is that of `disk_margin`.
     disk_frequency : Number
         Frequency θ/T of the closed-loop pole that this factor puts on the limit, T the period.
+    ms, mt : Number
+        Largest gain, in energy over all times and for disturbances of every shape, from a disturbance at the wire to
+        what its consumers get, and to the answer that comes back: the largest singular values of the lifted S and T
+        over frequency. For a loop with one renewal in the period they are max |S| and max |T|.
+    modulus_margin : Number
+        1/M_s: L may be changed by anything of a smaller gain, with memory and varying in time.
     destabilizing : complex
         The factor.
     closed_loop_poles : tuple of complex
@@ -80,6 +86,9 @@ class PeriodicMargins(StabilityMargins):
     delay_margin_s: Number
     disk_margin: Number
     disk_frequency: Number
+    modulus_margin: Number
+    ms: Number
+    mt: Number
     destabilizing: complex
     closed_loop_poles: tuple[complex, ...]
     renewals: int
@@ -167,7 +176,8 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
 
     def find_numbers(self) -> dict[str, Number]:  # noqa: D102 - as in the base
         disk, self.factor = self._find_disk_margin()
-        return {**self._find_gain_margins(), **self._find_phase_margin(), **self._find_delay_margin(), **disk}
+        limits = {**self._find_gain_margins(), **self._find_phase_margin(), **self._find_delay_margin()}
+        return {**limits, **disk, **self._find_peaks()}
 
     def describe(self) -> dict[str, Any]:  # noqa: D102 - as in the base
         return {"destabilizing": self.factor, "renewals": len(self.r.D)}
@@ -266,6 +276,21 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
             "disk_margin": Number(alpha, "1", 1e-8 * alpha, how),
             "disk_frequency": Number(theta / self.r.dt, "rad/s", 1e-3 * theta / self.r.dt, how),
         }, factor
+
+    def _find_peaks(self) -> dict[str, Number]:
+        """Return the largest singular values of the lifted S and T, confirmed by Hamiltonian eigenvalues."""
+        found = {}
+        for name, a, b in (("ms", 1.0, 0.0), ("mt", 0.0, 1.0)):
+
+            def gain(theta: float, a: float = a, b: float = b) -> float:
+                S = sensitivity_at(self.r, theta / self.r.dt)
+                return float(np.linalg.norm(b * np.eye(len(S)) + (a - b) * S, 2))
+
+            value, _ = find_largest(gain, self.theta, np.array([gain(theta) for theta in self.theta]))
+            found[name] = Number(value, "1", 1e-8 * value, confirm_peak(self.r, a, b, value, name))
+        ms = found["ms"]
+        modulus = Number(1 / ms.value, "1", ms.tolerance / ms.value**2, ms.confirmed_by)
+        return {"modulus_margin": modulus, **found}
 
     def _confirm_disk(self, alpha: float, factor: complex, theta: float) -> Confirmation:
         """Confirm a disk margin by eigenvalues around the rim and at the factor; return the computation."""

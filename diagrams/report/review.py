@@ -39,7 +39,7 @@ MANY = 10.0
 
 HAS_NONE = (
     "the wire is renewed several times in the period of all clocks, so that S and T change frequencies there and have "
-    "no value at a single one; limit disk_margin, gain_margin_high or phase_margin_deg, which the loop has"
+    "no value at a single one; limit ms, disk_margin, gain_margin_high or phase_margin_deg, which the loop has"
 )
 """Reason why a periodically time-varying loop lacks a number, with a next step."""
 

@@ -54,7 +54,7 @@ def _find_reason(result: RequirementResult) -> tuple[str, str]:
         ),
         Reason.PERIODIC: (
             "a wire that is renewed several times in the period has no such number",
-            "limit disk_margin, gain_margin_high or phase_margin_deg",
+            "limit ms, disk_margin, gain_margin_high or phase_margin_deg",
         ),
         Reason.NO_VALUE: (
             "one of the cases has no such number"

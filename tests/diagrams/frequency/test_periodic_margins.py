@@ -184,6 +184,8 @@ def test_a_loop_with_one_renewal_has_the_margins_of_any_sampled_loop(loop):
     assert found.gain_margin_high.value == pytest.approx(plain.gain_margin_high.value, rel=1e-6)
     assert found.disk_margin.value == pytest.approx(disk_margin(loop).alpha.value, rel=1e-6)
     assert found.phase_margin_deg.value == pytest.approx(plain.phase_margin_deg.value, rel=1e-6)
+    assert found.ms.value == pytest.approx(plain.ms.value, rel=1e-6)
+    assert found.mt.value == pytest.approx(plain.mt.value, rel=1e-6)
     return True
 
 
@@ -264,3 +266,24 @@ def test_a_disk_that_is_too_large_is_not_confirmed(monkeypatch, model):
     monkeypatch.setattr(PeriodicMarginFinder, "sensitivities", lambda self, theta: 0.25 + right(self, theta) / 2)
     with pytest.raises(ConfirmationError, match="factors just inside"):
         periodic_margins(L)
+
+
+@pytest.mark.parametrize("gains", [(0.4, 0.4), (0.3, 1.2)])
+def test_ms_of_a_periodic_loop_is_the_largest_gain_of_the_renewals_gone_through_by_hand(gains):
+    """x⁺ = x + g u with two gains in turn, u = d − x: the norm of the matrix from 600 values of d to those of u and x."""
+    first, second = gains
+    D = [[0.0, 0.0], [first, 0.0]]
+    found = periodic_margins(control.ss([[1.0]], [[first, second]], [[1.0], [1.0]], D, 0.2))
+    count = 600
+    x, rows = np.zeros(count), []
+    for k in range(count):
+        rows.append(x)
+        x = x + gains[k % 2] * (np.eye(count)[k] - x)
+    T = np.array(rows)
+    S = np.eye(count) - T
+    assert found.ms.value == pytest.approx(np.linalg.norm(S, 2), rel=2e-4)  # a finite record's is less
+    assert found.ms.value >= np.linalg.norm(S, 2) - 1e-9
+    assert found.mt.value == pytest.approx(np.linalg.norm(T, 2), rel=2e-4)
+    assert found.modulus_margin.value == pytest.approx(1 / found.ms.value, rel=1e-12)
+    if first == second:  # S = (z − 1)/(z − 0.6), which is largest at z = −1
+        assert found.ms.value == pytest.approx(2 / 1.6, rel=1e-9)
