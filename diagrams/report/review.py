@@ -351,6 +351,12 @@ def _step(
             result = replace(result, verdict=Verdict.FAILED, reason=Reason.DIVERGES, detail=detail)
         elif number is not None and settled is not None and not settled.value and length is not None:
             result = _not_settled(result, number, length)
+            cycle, period = (numbers.get(f"steps.{key}.{v.key}.limit_cycle{end}") for end in ("", "_period"))
+            if result.reason is Reason.NOT_SETTLED and cycle is not None and period is not None:
+                unit = "" if cycle.unit == "1" else f" {cycle.unit}"
+                size = f"± {cycle.value:.3g}{unit}"
+                detail = f"by {size} with a period of {period.value:.3g} s, in a record of {result.detail}"
+                result = replace(result, reason=Reason.OSCILLATES, detail=detail)
         yield result if step.size is not None else _at_no_size(result, numbers, f"steps.{key}.{v.key}", name)
 
 

@@ -81,6 +81,10 @@ def _find_reason(result: RequirementResult) -> tuple[str, str]:
             "give the size for which the limit holds, size=…",
         ),
         Reason.DIVERGES: (f"the response diverges{about}", "give a smaller size, or the actuator more room"),
+        Reason.OSCILLATES: (
+            f"the response keeps oscillating{about}",
+            "give a size of which 2 % are more than that, or make quanta or friction on the loop smaller",
+        ),
         Reason.NOT_SETTLED: (f"the response has not settled in its record of {detail}", "give a longer length"),
         Reason.MOVING: (
             f"the operating point moves{f' ({detail})' if detail else ''}",

@@ -50,6 +50,8 @@ class Reason(StrEnum):
     """The co-simulation was to be measured, and gave no number."""
     DIVERGES = "diverges"
     """The response grows without end, though the linear model's doesn't."""
+    OSCILLATES = "oscillates"
+    """The response keeps oscillating to the end of its record, which its linear model doesn't: a limit cycle."""
     NOT_SETTLED = "not settled"
     """The response still moves at the end of its record: its numbers so far are least values."""
     SIZE_NOT_GIVEN = "size not given"

@@ -72,6 +72,12 @@ TIMES_SHORTER = 20
 """Most times that a record is halved so that it ends before a response has grown without end."""
 ROOM = 1.5
 """Length of the record of a response that diverges, in times at which it leaves the linear model's."""
+TAIL = 0.4
+"""Part of a record at its end in which an oscillation is looked for."""
+LEAST_CROSSINGS = 6
+"""Crossings of its mean that an oscillation has there at least."""
+SUSTAINED = 0.2
+"""Difference of its amplitudes in the halves of that part, relative to the larger one, up to which it is kept."""
 TIMES_SMALLER = 4
 """Most times that it is."""
 ALIKE = 1e-4
@@ -144,6 +150,8 @@ def steps(case: Case) -> Section | None:
             got, slowest, quantized, diverges = ran
             where = f"{test.key}.{v.key}"
             own = _numbers(got, test, v, slowest) | _diverging(got, test, v, diverges)
+            if not own["settled"].value and diverges is None:
+                own |= _oscillation(got, test, v)
             numbers |= {f"{where}.{name}": number for name, number in own.items()}
             for name, said in NAMES.items():
                 linear = own.get(f"linear.{name}")
@@ -423,6 +431,31 @@ def _find_departure(got: StepResponse, test: StepTest) -> float:
     near = np.flatnonzero(off <= room)
     last = min(int(near[-1]) + 1 if near.size else 0, len(off) - 1)
     return float(got.t[last] - got.t[int(np.argmax(got.d != 0.0))])
+
+
+def _oscillation(got: StepResponse, test: StepTest, v: Variant) -> dict[str, Number]:
+    """Return amplitude and period of an oscillation that a response keeps to the end of its record; none without one.
+
+    It is what the linear model doesn't have, in the last part of the record: as large in the first half of that as in
+    the second, and around its mean several times.
+    """
+    answer = got.answer(bool(test.output))
+    if got.prediction is not None:
+        answer = answer - got.answer(bool(test.output), linear=True)
+    tail = slice(int((1.0 - TAIL) * len(answer)), None)
+    t, y = got.t[tail], answer[tail] - 0.5 * (np.max(answer[tail]) + np.min(answer[tail]))
+    crossings = np.flatnonzero((y[:-1] < 0.0) != (y[1:] < 0.0))
+    halves = [float(np.ptp(half)) for half in np.array_split(y, 2)]
+    if len(crossings) < LEAST_CROSSINGS or not min(halves) > (1.0 - SUSTAINED) * max(halves):
+        return {}
+    amplitude, step = 0.5 * max(halves) * abs(got.size), float(np.max(np.diff(t)))
+    period = 2.0 * float(t[crossings[-1]] - t[crossings[0]]) / (len(crossings) - 1)
+    error = SUSTAINED * amplitude
+    unit = unit_at(v.diagram, test.output or test.wire)
+    return {
+        "limit_cycle": Number(amplitude, unit, error, _how(got)),
+        "limit_cycle_period": Number(period, "s", 4.0 * step / (len(crossings) - 1), _how(got)),
+    }
 
 
 def _diverging(got: StepResponse, test: StepTest, v: Variant, diverges: float | None) -> dict[str, Number]:
