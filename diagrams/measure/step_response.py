@@ -262,7 +262,8 @@ def step_response(
     entries = 1 + sum(len(tap.labels) for tap in taps)
     follows = [_follows_states(flat, tap.port) for tap in (signal, *taps)]
     moves = np.repeat(follows, [1, *(len(tap.labels) for tap in taps)]) if sampled else np.zeros(entries, dtype=bool)
-    instants, within, unread = Instants(), None, tuple[str, ...]()
+    instants, unread = Instants(), tuple[str, ...]()
+    within: WithinSamples | None = None
     if moves.any():
         instants = choose_instants(variant, begins, every, count)
         if not wait and slow == 1 and (not diagram.has_fmu or instants.turns > SMOOTH):
