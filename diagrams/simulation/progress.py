@@ -66,7 +66,7 @@ def late_progress(
 
 
 @contextmanager
-def work_notes(name: str, show: ProgressOption = None) -> Iterator[Callable[[str], object]]:
+def work_notes(name: str, show: ProgressOption = None) -> Iterator[Callable[[str], Any]]:
     """Yield a function that takes in words what is being computed: the one given, or one that shows it with the time.
 
     It is shown once the work has taken 2 s; without a choice on a terminal, and in a notebook with widgets.
