@@ -249,7 +249,7 @@ class DelayMatrices:
     @cached_property
     def near_axis(self) -> np.ndarray:
         """Those of the roots that are near the axis, or beyond it."""
-        return self._search(self.starts[self.starts.real > -NEAR * np.abs(self.starts)])
+        return self._search(self.starts[self.starts.real > -NEAR * (np.abs(self.starts) + 1e-3 * self.bound)])
 
     def _search(self, starts: np.ndarray) -> np.ndarray:
         """Return the different roots that Newton's method finds, the rightmost first."""

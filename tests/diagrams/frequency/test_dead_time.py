@@ -12,7 +12,7 @@ import pytest
 from scipy.optimize import brentq, minimize_scalar
 from scipy.special import lambertw
 
-from loopwright.blocks import Constant, Gain, Integrator, OptionError, Sum, TransferFunction, TransportDelay
+from loopwright.blocks import PID, Constant, Gain, Integrator, OptionError, Sum, TransferFunction, TransportDelay
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.frequency.delay_matrices import DelayMatrices
 from loopwright.diagrams.frequency.delayed_system import DelayedSystem
@@ -519,3 +519,27 @@ def test_pade_of_a_sampled_diagram_is_refused():
     with pytest.raises(OptionError, match=r"delays: found 'pade' for a sampled model, which is rational as it is"):
         diagram.linearize(delays="pade")
     assert diagram.continuous().linearize(delays="pade").pade == 5
+
+
+@pytest.mark.parametrize("ki", [0.05, 0.1, 0.15, 0.2, 0.3])
+def test_an_integrator_behind_a_predictor_is_a_root_at_zero_whatever_the_gain(ki):
+    """A Smith predictor whose PI cancels the lag: L = a e^(-8 s) / (s + a (1 - e^(-8 s))), a = 2 ki, with a pole at 0.
+
+    |L| = 1 and the phase there from the closed form; a root at 0 came out as 1e-17 to either side, and was missed.
+    """
+    pipe, model_pipe = TransportDelay(delay=8.0, name="pipe"), TransportDelay(delay=8.0, name="model_pipe")
+    model = TransferFunction(numerator=2.0, denominator=[10.0, 1.0], name="model")
+    lag = TransferFunction(numerator=2.0, denominator=[10.0, 1.0], name="lag")
+    u = PID(kp=10.0 * ki, ki=ki)(1.0, model.y + (pipe.y - model_pipe.y)).named("u")
+    loop = Diagram("smith", pipe(lag(u)).named("y"), model_pipe(model(u))).linearize().loop("u", to="lag.u")
+    a, found = 2.0 * ki, margins(loop)
+
+    def at(w):
+        return a * np.exp(-8j * w) / (1j * w + a * (1.0 - np.exp(-8j * w)))
+
+    w = np.linspace(1e-3, 40.0 * a, 400001)
+    turns = np.flatnonzero(np.diff(np.sign(np.abs(at(w)) - 1.0)))
+    crossings = [brentq(lambda x: abs(at(x)) - 1.0, w[i], w[i + 1], xtol=1e-15) for i in turns]
+    assert found.stable
+    least = min(np.degrees(np.abs(np.angle(-at(x)))) for x in crossings)
+    assert found.phase_margin_deg.value == pytest.approx(least, abs=1e-7)
