@@ -50,7 +50,7 @@ def row_of(result: RequirementResult) -> tuple[Any, ...]:
     """Return the entries of the columns; the verdict is the `Verdict`, found and distance are numbers or "–"."""
     distance: Any = NOTHING
     if result.number is not None and not math.isnan(result.distance):
-        distance = replace(result.number, value=result.distance, given=False)
+        distance = replace(result.number, value=result.distance, given=False, is_gain=False)  # no factor any more
     return (
         result.verdict,
         result.words or result.quantity,

@@ -17,6 +17,7 @@ from loopwright.diagrams.requirements import (
     judge,
     read_requirements,
 )
+from loopwright.diagrams.requirements.review import row_of
 from loopwright.frequency import Number
 from loopwright.types import Kink, Verdict
 
@@ -287,3 +288,19 @@ def test_an_error_in_the_file_names_line_and_key(tmp_path, text, said):
     file.write_text(text, encoding="utf-8")
     with pytest.raises(OptionError, match=said):
         read_requirements(file)
+
+
+def test_the_distance_of_a_gain_margin_is_no_gain():
+    """A factor of 8.7 is 18.8 dB; its distance from 2 is 6.7, which has no decibels."""
+    kept = RequirementResult(
+        "gain_margin_high",
+        "u",
+        "sampled_d0",
+        Limit(2.0, OPEN),
+        Verdict.PASSED,
+        Reason.COMPARED,
+        distance=6.7,
+        number=number(8.7, is_gain=True),
+    )
+    *_, found, distance = row_of(kept)
+    assert (str(found), str(distance)) == ("8.7 (18.8 dB)", "6.7")
