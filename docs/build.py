@@ -16,6 +16,7 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
+_NO_SEARCH = "---\nnosearch: true\n---\n\n"  # the changelog has every word
 LINK = re.compile(r"(?<=\]\()([^)#\s:]+)(?=[)#])")
 
 
@@ -47,17 +48,22 @@ def stage(folder: Path) -> None:
     for page in pages:
         place = folder / page.relative_to(HERE if HERE in page.parents else ROOT)
         place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_text(_restaged(page, page.read_text(encoding="utf-8")), encoding="utf-8")
+        head = _NO_SEARCH if page.name == "CHANGELOG.md" else ""
+        place.write_text(head + _restaged(page, page.read_text(encoding="utf-8")), encoding="utf-8")
     for pictures in (HERE / "images", ROOT / "benchmarks" / "images"):
         shutil.copytree(pictures, folder / pictures.relative_to(HERE if HERE in pictures.parents else ROOT))
 
 
-def write_reference(folder: Path) -> None:
-    """Write the pages of the reference that are made of the package."""
+def write_made_pages(folder: Path) -> None:
+    """Write the pages that are made of the package and of the notebooks."""
     sys.path.insert(0, str(HERE / "site"))
     import facts
+    import gallery
     import names
     import responses
+
+    gallery.write(folder)
+    folder = folder / "reference"
 
     facts.write(folder)
     names.write(folder, responses.draw_all(folder / "responses"))
@@ -70,7 +76,7 @@ def build(folder: Path) -> int:
     with tempfile.TemporaryDirectory() as temporary:
         sources, trees = Path(temporary) / "pages", Path(temporary) / "trees"
         stage(sources)
-        write_reference(sources / "reference")
+        write_made_pages(sources)
         options = ["-W", "--keep-going", "-q", "-j", "auto", "-d", str(trees), "-c", str(HERE / "site")]
         return sphinx([*options, str(sources), str(folder)])
 

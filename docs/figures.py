@@ -1,4 +1,4 @@
-"""Make the figures of the README and of the page on sweeps again: python docs/figures.py."""
+"""Make the figures of the README, of the first tutorial and of the page on sweeps again: python docs/figures.py."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 import sys
 from contextlib import chdir
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -18,6 +18,14 @@ def first_example(page: Path) -> str:
     """Return the first code of a page."""
     text = page.read_text(encoding="utf-8")
     return re.search(r"```python\n(.*?)```", text, re.DOTALL)[1]
+
+
+def first_loop(page: Path) -> None:
+    """Write the drawing and the plot of the tutorial's first loop into the working folder."""
+    drawn: dict[str, Any] = {}
+    for code in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)[:3]:
+        exec(code, drawn)  # it writes speed_loop.svg
+    drawn["figure"].savefig("first_loop.png", dpi=120)
 
 
 def bode() -> Figure:
@@ -47,6 +55,7 @@ def main(folder: Path) -> None:
     with chdir(folder):
         exec(first_example(HERE.parent / "README.md"), {})  # it writes loop.png
         exec(first_example(HERE / "howto" / "sweeps.md"), {})  # sweep.png
+        first_loop(HERE / "tutorial" / "first_loop.md")
     experiment = experiments.hand_guiding()
     plot_path(experiment, experiment.simulate(progress=False), is_shown=False).savefig(folder / "C_path.png", dpi=120)
     bode().savefig(folder / "frequency.png", dpi=120)

@@ -287,4 +287,11 @@ def test_the_figures_of_the_pages_are_made(tmp_path):
         env=os.environ,
     )
     assert done.returncode == 0, done.stderr
-    assert {file.name for file in tmp_path.iterdir()} == {"C_path.png", "frequency.png", "loop.png", "sweep.png"}
+    assert {file.name for file in tmp_path.iterdir()} == {
+        "C_path.png",
+        "first_loop.png",
+        "speed_loop.svg",
+        "frequency.png",
+        "loop.png",
+        "sweep.png",
+    }

@@ -1,5 +1,6 @@
 """The documentation's site: links between pages, and the site itself, without warnings and without a network."""
 
+import json
 import os
 import posixpath
 import re
@@ -77,6 +78,57 @@ def test_the_site_asks_nothing_of_a_network(site):
         )
     ]
     assert not asked
+
+
+USEFUL = {
+    "scope": "howto/from_simulink",
+    "mux": "howto/formulas",
+    "demux": "reference/blocks/Demux",
+    "goto": "howto/from_simulink",
+    "gain": "reference/blocks/Gain",
+    "transfer function": "reference/blocks/TransferFunction",
+    "PID": "reference/blocks/PID",
+    "anti-windup": "howto/anti_windup",
+    "rate transition": "howto/from_simulink",
+    "zero-order hold": "reference/blocks/Hold",
+    "dead time": "howto/dead_time",
+    "lookup table": "reference/blocks/Lookup1D",
+    "algebraic loop": "howto/algebraic_loop",
+    "solver": "howto/choose_a_solver",
+    "sample time": "explanation/time",
+    "linearize": "tutorial/margins",
+    "bode": "tutorial/margins",
+    "phase margin": "howto/frequency",
+    "root locus": "howto/from_python_control",
+    "FMU": "tutorial/fmu",
+    "co-simulation": "reference/fmus",
+    "S-function": "howto/from_simulink",
+}
+"""Words that users of other tools type, and a page that answers them."""
+
+
+@pytest.mark.slow
+def test_the_search_finds_a_useful_page(site):
+    from sphinx.search.en import SearchEnglish
+
+    script = (site / "searchindex.js").read_text(encoding="utf-8")
+    index = json.loads(script[script.index("{") : script.rindex("}") + 1])
+    language = SearchEnglish({})
+
+    def pages_with(word):
+        stem, found = language.stem(word.lower()), set()
+        for terms in (index["terms"], index["titleterms"]):
+            numbers = terms.get(stem, [])
+            found |= {numbers} if isinstance(numbers, int) else {*numbers}
+        return {index["docnames"][number] for number in found}
+
+    missed = {}
+    for words, page in USEFUL.items():
+        asked = [word for word in re.split(r"[^\w]+", words) if len(word) > 1]
+        found = set.intersection(*map(pages_with, asked))
+        if page not in found:
+            missed[words] = sorted(found)
+    assert not missed
 
 
 @pytest.mark.slow
