@@ -51,15 +51,15 @@ _NO_METHODS_FOR_USERS = (
 
 _TABLE = """.. list-table::
    :header-rows: 1
-   :widths: 24 20 56
+   :widths: 36 64
 
-   * - name
-     - import it from
+   * - name, and where to import it from
      - description
 """
 
 _ROW = """   * - :doc:`{name} </reference/{page}>`
-     - ``{place}``
+
+       ``{place}``
      - {summary}
 """
 
