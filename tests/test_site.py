@@ -80,6 +80,15 @@ def test_the_site_asks_nothing_of_a_network(site):
     assert not asked
 
 
+@pytest.mark.slow
+def test_every_block_of_the_library_shows_its_response(site):
+    page = (ROOT / "docs" / "reference" / "blocks.md").read_text(encoding="utf-8")
+    names = set(re.findall(r"(?m)^\| `(\w+)` \| \w+ \| .* \|$", page)) - {"PathTracking"}  # a base of blocks
+    assert len(names) > 60
+    pages = {name: (site / "reference" / "blocks" / f"{name}.html").read_text(encoding="utf-8") for name in names}
+    assert not [name for name, text in pages.items() if f"Response of {name} " not in text]
+
+
 USEFUL = {
     "scope": "howto/from_simulink",
     "mux": "howto/formulas",
