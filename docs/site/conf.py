@@ -43,7 +43,9 @@ add_module_names = False
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 napoleon_use_ivar = True
-napoleon_custom_sections = [(name, "params_style") for name in ("Inputs", "Outputs", "States", "Events", "Guards")]
+napoleon_custom_sections = [
+    (name, "params_style") for name in ("Inputs", "Outputs", "States", "Events", "Guards", "Methods")
+]
 
 # Theme: all of it is local; nothing is asked of a network.
 html_theme = "furo"
