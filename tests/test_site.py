@@ -101,7 +101,7 @@ USEFUL = {
     "rate transition": "howto/from_simulink",
     "zero-order hold": "reference/blocks/Hold",
     "dead time": "howto/dead_time",
-    "lookup table": "reference/blocks/Lookup1D",
+    "lookup table": "howto/from_simulink",
     "algebraic loop": "howto/algebraic_loop",
     "solver": "howto/choose_a_solver",
     "sample time": "explanation/time",
