@@ -26,6 +26,7 @@ myst_enable_extensions = ["colon_fence", "dollarmath", "fieldlist"]
 myst_heading_anchors = 4
 nb_execution_mode = "off"  # the tests execute the notebooks; the site shows what is stored
 nb_merge_streams = True
+nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # scripts of widgets would come from a network
 suppress_warnings = [
     "misc.highlighting_failure",  # examples with "…" are no JSON
     "ref.python",  # attributes of one name in several classes
