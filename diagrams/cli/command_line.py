@@ -320,9 +320,9 @@ def _print_table(
         label, factor = ("", 1.0) if name == "real_time_factor" else _SHOWN.get(unit, (unit, 1.0))
         values = [_number_text(numbers[name], factor) for numbers in table.values()]
         known = {
-            letter: (own[name], numbers[name])
+            letter: (own[name], number)
             for letter, numbers in table.items()
-            if name in (own := theory.get(letter, {})) and numbers[name] is not None
+            if name in (own := theory.get(letter, {})) and (number := numbers[name]) is not None
         }
         forms = (
             f"{letter}: {_number_text(form.value, factor)}{f' {mark}' if form.holds(number) else ''}"
