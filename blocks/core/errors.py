@@ -39,6 +39,9 @@ from collections.abc import Iterable
 from enum import Enum
 from typing import Any, Self
 
+EXPECTED = "; expected "
+"""What is between the two parts of every message: what was found, and what was expected."""
+
 
 class LoopwrightError(Exception):
     """The root of all errors raised on purpose.
@@ -58,6 +61,16 @@ class LoopwrightError(Exception):
     def __init__(self, message: str, *, block: str | None = None, port: str | None = None, t: float | None = None):
         self.message, self.block, self.port, self.t = message, block, port, t
         super().__init__(message)
+
+    @property
+    def what_was_found(self) -> str:
+        """What was found, the part of the message ahead of what was expected."""
+        return self.message.partition(EXPECTED)[0]
+
+    @property
+    def next_step(self) -> str:
+        """The next step, which is behind what was expected; empty where the message has none."""
+        return self.message.partition(EXPECTED)[2].partition(". ")[2]
 
     def __str__(self) -> str:
         who = ".".join(part for part in (self.block, self.port) if part)

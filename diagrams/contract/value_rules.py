@@ -247,7 +247,9 @@ def check_after_start(exercise: Exercise, sampled: bool, places: list[Point], sh
                 block,
             )
         ends = np.cumsum([0, *(size(shape) for shape in shapes.values())])
-        split = {n: found[a:b].reshape(s) for (n, s), a, b in zip(shapes.items(), ends, ends[1:], strict=False)}
+        split: dict[str, Any] = {
+            n: found[a:b].reshape(s) for (n, s), a, b in zip(shapes.items(), ends, ends[1:], strict=False)
+        }
         again = evaluate(split, u)
         if np.max(np.abs(again - found) / (1.0 + np.abs(found)), initial=0.0) > 1e-9:
             raise rule_error(

@@ -13,7 +13,7 @@ from .loop_margins import GainCrossover, Margins, PhaseCrossover, find_disk_freq
 from .margin_analysis import MARGIN_UNITS
 from .margin_slopes import MarginSlope, margin_slopes
 from .measured_margins import MeasuredMargins, measured_margins, read_frequency_data
-from .number import MARK, Confirmation, Interval, Number, method_of, with_findings
+from .number import MARK, Confirmation, Interval, Number, is_at_steps_only, method_of, with_findings
 from .nyquist import NyquistCount, nyquist_count
 from .periodic_margins import PeriodicMargins, periodic_margins
 from .pole_maps import plot_poles
@@ -94,6 +94,7 @@ __all__ = [
     "first_largest",
     "gang_of_four",
     "hold_inputs",
+    "is_at_steps_only",
     "loop_at",
     "loop_class",
     "margin_slopes",

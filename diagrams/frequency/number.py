@@ -22,20 +22,31 @@ NOT_IN_DATA = "not in the data"
 
 
 class Confirmation(str):
-    """Text on how a number was confirmed, with ``method``: the same without values that differ between numbers."""
+    """Text on how a number was confirmed, with ``method``: the same without values that differ between numbers.
+
+    ``at_steps_only`` says whether a signal is known at communication points alone.
+    """
 
     method: str
+    at_steps_only: bool
 
-    def __new__(cls, text: str, method: str | None = None) -> Confirmation:
+    def __new__(cls, text: str, method: str | None = None, *, at_steps_only: bool = False) -> Confirmation:
         """Make a text with its method."""
         made = super().__new__(cls, text)
         made.method = method_of(text) if method is None else method
+        made.at_steps_only = at_steps_only
         return made
 
-    def and_by(self, text: str, method: str | None = None) -> Confirmation:
+    def and_by(self, text: str, method: str | None = None, *, at_steps_only: bool = False) -> Confirmation:
         """Return this confirmation followed by a further one; an empty method leaves the method as it is."""
         own = method_of(text) if method is None else method
-        return Confirmation(f"{self}; {text}", "; ".join(part for part in (self.method, own) if part))
+        both = "; ".join(part for part in (self.method, own) if part)
+        return Confirmation(f"{self}; {text}", both, at_steps_only=at_steps_only or self.at_steps_only)
+
+
+def is_at_steps_only(text: str) -> bool:
+    """Return whether a confirmation says that a signal is known at communication points alone."""
+    return isinstance(text, Confirmation) and text.at_steps_only
 
 
 def method_of(text: str) -> str:

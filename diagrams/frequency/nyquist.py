@@ -98,8 +98,11 @@ def nyquist_count(loop: LinearSystem, *, delay: int = 0) -> NyquistCount:
     Two equal lags in parallel have a mode that the loop doesn't see:
 
     >>> print(nyquist_count(control.ss([[1, 0], [0, 1]], [[1], [1]], [[1, 1]], 0)))
-    NyquistCount(encirclements=-1, open_loop=2, closed_loop=1, hidden_unstable=((1+0j),))
-    hidden_unstable       1: not in this loop, and not moved by feedback around it
+    Nyquist criterion
+      N                -1 clockwise encirclements of −1
+      P                2 unstable poles of the open loop
+      Z = N + P        1 unstable poles of the closed loop
+      hidden_unstable  1: not in this loop, and not moved by feedback around it
     """
     r = realize(loop, delay=delay)
     return count_encirclements(r, r.features() if isinstance(r, DelayedRealization) else Features.of(r))

@@ -79,9 +79,11 @@ def _without_own_steps(diagram: WiredDiagram) -> WiredDiagram:
     """Return a diagram whose FMUs step at any tick: a linear model of their equations does."""
     plants = stepped_blocks(diagram.structure).items()
     own = {
-        f"{path}.stepping": getattr(plant, "stepping", None) for path, plant in plants if own_step(plant) is not None
+        f"{path}.stepping": replace(given, communication_step=None)
+        for path, plant in plants
+        if own_step(plant) is not None and (given := getattr(plant, "stepping", None)) is not None
     }
-    return diagram.replace({name: replace(given, communication_step=None) for name, given in own.items()})
+    return diagram.replace(own)
 
 
 class WithinSamples:

@@ -125,9 +125,9 @@ class Theory:
     value: float
     size: float
 
-    def holds(self, number: float) -> bool:
-        """Return whether a number is within 1 % of the size."""
-        return abs(number - self.value) <= CLOSE * self.size
+    def holds(self, number: float | None) -> bool:
+        """Return whether there is a number, and it is within 1 % of the size."""
+        return number is not None and abs(number - self.value) <= CLOSE * self.size
 
 
 def theory_numbers(experiment: Experiment, run: Run) -> dict[str, Theory]:

@@ -1,7 +1,7 @@
 """Requirements on a design, and the verdicts on its numbers."""
 
 from .contact_limits import ContactLimits, read_contact_limits
-from .explanations import UNREAD, explain
+from .explanations import explain
 from .number_limits import SENSES, STEP_UNITS, Limit, Reason, Sense, Verdict, is_doubtful, judge, judge_interval
 from .requirements import REQUIREMENTS, LoopLimits, Requirements, StepLimits, write_requirements
 from .results import RequirementResult
@@ -18,7 +18,6 @@ __all__ = [
     "SENSES",
     "STEP_UNITS",
     "STUDIES",
-    "UNREAD",
     "ContactLimits",
     "Limit",
     "LoopLimits",

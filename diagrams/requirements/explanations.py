@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 
-from ..frequency import Number
+from ..frequency import Number, is_at_steps_only
 from .number_limits import Reason, Verdict
 from .results import RequirementResult
 
-UNREAD = "the communication points"
-"""Words in a step response's confirmation that say that nothing is known between them."""
 MEASURED, WORST_CASE, CONTACT = "measured", "worst_case", "contact"
 """Keys of results that belong to no variant of the diagram: of measured loops, searches and contacts."""
 
@@ -111,7 +109,7 @@ def _sharpen(result: RequirementResult) -> str:
     """Return how the tolerance of a number gets smaller."""
     if result.variant == MEASURED:
         return "measure more points, or with less uncertainty"
-    if result.is_step and result.number is not None and UNREAD in result.number.confirmed_by:
+    if result.is_step and result.number is not None and is_at_steps_only(result.number.confirmed_by):
         return "give the FMU shorter communication steps, which show what it does between its points"
     if result.is_step:
         return "give a longer length or a larger size, or a limit farther away"

@@ -132,7 +132,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
             m = margins(L)
         except LoopwrightError as error:
             notes.append(_no_margins(wire, v, error))
-            absent[v.key] = error.message.partition("; expected ")[0]
+            absent[v.key] = error.what_was_found
             continue
         at = cut_key(v, cut)
         found[at], loops[at], titles[at] = m, L, title
@@ -335,12 +335,11 @@ def _no_margins(wire: str, v: Variant, error: LoopwrightError) -> str:
 
     An error's text has what was found, what was expected, and one next step.
     """
-    found, _, rest = error.message.partition("; expected ")
+    found = error.what_was_found
     why = f"{found[:1].upper()}{found[1:]}".rstrip(".")
     if isinstance(error, BetweenTicksError):
         return TEXTS.line("between_ticks", wire=wire, variant=v.title, why=why)
-    _, _, step = rest.partition(". ")
-    return TEXTS.line("not_shown", wire=wire, variant=v.title, why=why, step=step)
+    return TEXTS.line("not_shown", wire=wire, variant=v.title, why=why, step=error.next_step)
 
 
 def _is_zero(L: Any) -> bool:

@@ -29,7 +29,7 @@ from ...measure import (
     remaining_oscillation,
     step_response,
 )
-from ...requirements import STEP_UNITS, UNREAD, StepLimits
+from ...requirements import STEP_UNITS, StepLimits
 from ...results import OperatingPoint
 from .. import figures
 from ..case import Case
@@ -631,9 +631,11 @@ def _how(got: StepResponse) -> Confirmation:
     if got.unread:
         plants = ", ".join(got.unread)
         run = run.and_by(
-            f"read at {UNREAD} of {plants} alone: the tolerance has what the linear model does between them"
+            f"read at the communication points of {plants} alone: the tolerance has what the linear model does between "
+            "them"
             if _keeps_steps(got)
-            else f"with shorter communication steps of {plants}, which moves on between its own"
+            else f"with shorter communication steps of {plants}, which moves on between its own",
+            at_steps_only=_keeps_steps(got),
         )
     if got.prediction is None:
         return run

@@ -63,7 +63,7 @@ def test_a_triangle_needs_a_fall():
 def test_a_run_that_was_written_plays_again(tmp_path):
     first = Diagram("d", Sine(frequency=1.0, name="a").named("arc"), (2.0 * Clock(name="b")).named("ramp"))
     run = first.simulate(1.0, step=0.1, progress=False)
-    run.to_csv(tmp_path / "run.csv")
+    run.to_csv(tmp_path / "run.csv", "arc", "ramp")
     for again in (
         Recorded.from_csv(tmp_path / "run.csv", ("arc", "ramp"), name="again"),
         Recorded.from_csv(tmp_path / "run.csv", time="t", name="again"),

@@ -230,7 +230,7 @@ def test_a_path_is_for_python(capsys):
     assert main(["run", "A", "--option", "path=circle"]) == 2
     assert (
         "--option path: a path can't be given on the command line; take Python: "
-        "loopwright.diagrams.experiments.path_following(path=…).simulate()."
+        "loopwright.experiments.path_following(path=…).simulate()."
     ) in capsys.readouterr().err
     assert main(["run", "A", "--option", "pth=circle"]) == 2
     assert "'path'" not in capsys.readouterr().err

@@ -64,7 +64,9 @@ def test_texts_of_results_are_short_and_say_units_or_next_steps(diagram, run):
     assert loop._repr_html_() is None
     assert "unstable, poles" in repr(shown[13])
     assert "margins(loop)" in repr(loop)
-    assert repr(margins(loop)).startswith("<margins: stable, gain_margin_high 2.84646, phase_margin_deg 42.8762 deg, ")
+    assert repr(margins(loop)).startswith(
+        "<margins: stable, gain_margin_high 2.84646 (9.09 dB), phase_margin_deg 42.8762 deg, "
+    )
 
 
 def test_the_loop_is_a_state_space_still(diagram):
