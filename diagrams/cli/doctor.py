@@ -21,7 +21,8 @@ def add_doctor(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Examine an FMU of any tool: content, libraries for this machine, violations of the standard, a\n"
         "trial run of each interface in its own process, and a verdict in the first line.",
-        epilog="exit status: 0 done: it runs here, or should; 1 it does not; 2 wrong usage",
+        epilog="examples:\n  loopwright doctor plant.fmu\n  loopwright doctor plant.fmu --no-run --json\n\n"
+        "exit status: 0 done: it runs here, or should; 1 it does not; 2 wrong usage",
     )
     parser.add_argument("file", metavar="FILE.fmu")
     parser.add_argument(

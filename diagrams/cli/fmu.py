@@ -50,7 +50,8 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description="Build an FMU from a model, with co-simulation and model exchange and no Python inside.\n\n"
         f"MODEL is a plant of the library ({', '.join(plants())})\nor FILE.py:Name, a Block class of yours or an "
         "instance with its parameters.",
-        epilog=f"platforms: {', '.join(TARGETS)}, all" + _STATUS.format(one="the build failed; nothing is written"),
+        epilog="examples:\n  loopwright build gantry\n  loopwright build tank.py:Tank --fmi 2 --platform all\n\n"
+        f"platforms: {', '.join(TARGETS)}, all" + _STATUS.format(one="the build failed; nothing is written"),
     )
     build.add_argument("model", metavar="MODEL", help="a plant's name, or FILE.py:Name")
     build.add_argument("--fmi", type=int, choices=(2, 3), help="version of FMI (default: 3; 2 with --python)")
@@ -75,7 +76,8 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="show an FMU's description",
         formatter_class=raw,
         description="Show the description of an FMU of any tool (FMI 1.0 to 3.0), without running it.",
-        epilog=_STATUS.format(one="it can't be read").strip(),
+        epilog="examples:\n  loopwright inspect plant.fmu\n  loopwright inspect plant.fmu --json"
+        + _STATUS.format(one="it can't be read"),
     )
     inspect.add_argument("file", metavar="FILE.fmu")
     inspect.add_argument("--all", action="store_true", help="local variables, too")
@@ -86,7 +88,8 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         formatter_class=raw,
         description="Check an FMU of any tool: archive, description, model structure, binaries, sources; then run each "
         "interface\nfor some steps, in its own process.",
-        epilog=_STATUS.format(one="problems were found").strip(),
+        epilog="examples:\n  loopwright validate plant.fmu\n  loopwright validate plant.fmu --no-run"
+        + _STATUS.format(one="problems were found"),
     )
     check.add_argument("file", metavar="FILE.fmu")
     check.add_argument("--no-run", action="store_true", help="don't run it: an FMU is a program of its maker's")

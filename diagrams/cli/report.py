@@ -53,7 +53,9 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "coupled stability, each number confirmed by an independent computation; and write it as one HTML page.\n\n"
         "DIAGRAM is an experiment of the paper (A, B, C or D; B without one: Fig. 3 with both admittances)\n"
         "or FILE.py:NAME, a diagram of yours, or a function without arguments that returns one.",
-        epilog="options of the experiments: as in loopwright run --help\n\n"
+        epilog="examples:\n  loopwright report loop.py:loop --out loop.html --pdf\n"
+        "  loopwright report loop.py:loop --requirements loop.toml --check\n  loopwright report C --option delay=1\n\n"
+        "options of the experiments: as in loopwright run --help\n\n"
         "exit status:\n  0    done; with --check: all requirements are met\n"
         "  1    the analysis failed, or a plant could not be built; nothing is written\n"
         "  2    wrong usage; nothing was analysed\n  3    with --check: a requirement fails; the files are written\n"

@@ -3,6 +3,8 @@
 import io
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -345,6 +347,16 @@ def test_terminal_without_greek(tmp_path):
     assert b"peak_acceleration  | m/s2 |" in result.stdout
     assert b"Nearest foot point theta = " in result.stderr
     assert files(tmp_path / "ö") == sorted(f"B{ending}" for ending in ALL)
+
+
+@pytest.mark.parametrize("command", ["run", "draw", "sweep", "report", "build", "inspect", "validate", "doctor"])
+def test_the_help_of_each_command_has_examples_that_it_takes(command, capsys):
+    assert main([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    examples = re.findall(r"^  loopwright (.+)$", text.partition("examples:\n")[2].partition("\n\n")[0], re.MULTILINE)
+    assert len(examples) >= 2
+    for example in examples:
+        assert vars(_cli._make_parser().parse_args(shlex.split(example)))["command"] == command
 
 
 def test_version_and_help(capsys):
