@@ -1,5 +1,6 @@
 """The pages for users: the README's code, the pages under docs/ and the notebooks run, and say what is so."""
 
+import json
 import os
 import re
 import shlex
@@ -262,6 +263,19 @@ def test_a_notebook_with_old_numbers_is_noticed(stored, made, fresh):
 
     with nullcontext() if fresh else pytest.raises(AssertionError, match="cell 0"):
         check_printed(notebook(stored), notebook(made))
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_saved_notebook_has_no_empty_outputs_errors_or_folders(path):
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    outputs = [o for cell in cells for o in cell.get("outputs", [])]
+    assert outputs
+    for output in outputs:
+        data = output.get("data", {"text/plain": output.get("text", "")})
+        assert output["output_type"] != "error"
+        assert not any("widget" in kind for kind in data), "progress bars and sliders are drawn again where it runs"
+        assert any("".join(text).strip() for text in data.values())
+        assert not re.search(r"(?<![\w.])/(root|home|tmp|Users)/", json.dumps(data)), "the folders of one machine"
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -153,7 +154,8 @@ def _is_within(path: str, subsystem: str) -> bool:
 
 
 def _short(value: Any) -> str:
-    text = shorten(value)
+    """Write a value; of a file its name alone, as the page may go to others."""
+    text = value.name if isinstance(value, Path) else shorten(value)
     return text if len(text) <= LONGEST else text[:LONGEST] + "…"
 
 

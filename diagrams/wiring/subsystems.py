@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, KeysView
+from collections.abc import Callable, Iterator, KeysView, Mapping
 from fractions import Fraction
 from typing import Any, SupportsFloat, TypedDict, Unpack, overload
 
@@ -272,7 +272,7 @@ class SubsystemCall(ShownAsTable, Wireable):
             outer.append(self)
 
     def _name_results(self, result: object) -> dict[str, Signal]:
-        if result is None:
+        if result is None or (isinstance(result, Mapping) and not result):  # it puts nothing out
             return {}
         if is_bus(result):
             signals = flatten(result, self.label, "")

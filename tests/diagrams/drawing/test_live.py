@@ -11,6 +11,7 @@ import pytest
 
 from loopwright.blocks import Gain, Integrator, Sine, Sum
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.fmus import Fmu, dc_motor
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -53,6 +54,13 @@ def test_a_block_says_its_parameters_and_where_its_inputs_come_from():
     assert kp["title"] == "controller.inner.kp · Gain"
     assert ["gain", "3"] in kp["facts"]
     assert ["input u", "controller.error.y"] in kp["facts"]
+
+
+def test_a_file_is_named_without_its_folders(uncompiled):
+    motor = Fmu(dc_motor.build(), name="motor")
+    html = Diagram("drive", motor(voltage=1.0, load_torque=0.0)).draw().html
+    assert ["file", "dc_motor.fmu"] in content(html)["blocks"]["motor"]["facts"]
+    assert str(motor.file.parent) not in html
 
 
 def test_a_wire_says_its_names_unit_readers_and_the_signal_of_a_run():

@@ -123,7 +123,7 @@ def test_a_bus_of_one_signal_stands_for_it():
         (lambda bus: bus.sped, UnknownNameError, r"box: the bus has no signal 'sped'\. Did you mean 'speed'"),
         (lambda bus: Gain(gain=1.0)(bus), WiringError, r"found a bus of 2 signals \(speed, force\).*bus\['speed'\]"),
         (lambda bus: bus + 1.0, WiringError, r"found a bus of 2 signals"),
-        (lambda bus: {}, WiringError, r"box: found a bus without signals"),
+        (lambda bus: {"a": {}}, WiringError, r"box: found a bus without signals"),
         (lambda bus: {"a b": bus.speed}, WiringError, r"box: found the name 'a b'; expected letters"),
         (lambda bus: {"a": {"b": bus.speed}, "a_b": bus.force}, DuplicateNameError, r"two signals are called 'a_b'"),
         (lambda bus: {"a": "speed"}, WiringError, r"box\.a: found 'speed'; expected a signal"),
@@ -135,6 +135,16 @@ def test_mistakes_are_named(wrong, error, text):
 
     with pytest.raises(error, match=text):
         subsystem(box)({"speed": Constant(value=1.0), "force": Constant(value=2.0)})
+
+
+def test_a_subsystem_may_put_nothing_out():
+    @subsystem
+    def box(u):
+        Gain(gain=2.0, name="inner")(u).named("twice")
+        return {}
+
+    run = Diagram("d", box(Constant(value=1.0))).simulate(0.1, step=0.1, progress=False)
+    assert run["twice"][-1] == 2.0
 
 
 # --- mux and demux -----------------------------------------------------------------------------------------------------
