@@ -140,11 +140,11 @@ def test_mistakes_are_named(wrong, error, text):
 def test_a_subsystem_may_put_nothing_out():
     @subsystem
     def box(u):
-        Gain(gain=2.0, name="inner")(u).named("twice")
+        Gain(gain=2.0, name="inner")(u)
         return {}
 
     run = Diagram("d", box(Constant(value=1.0))).simulate(0.1, step=0.1, progress=False)
-    assert run["twice"][-1] == 2.0
+    assert run["inner"][-1] == 2.0
 
 
 # --- mux and demux -----------------------------------------------------------------------------------------------------
