@@ -219,8 +219,9 @@ TINY = 1e-6
 
 
 def printed(cell):
-    """Return the text that a cell has printed, without empty lines."""
-    texts = [o["text"] if "text" in o else o.get("data", {}).get("text/plain", "") for o in cell.get("outputs", [])]
+    """Return the text that a cell has printed, without empty lines and without progress, which slow machines show."""
+    shown = [o for o in cell.get("outputs", []) if not any("widget" in kind for kind in o.get("data", {}))]
+    texts = [o["text"] if "text" in o else o.get("data", {}).get("text/plain", "") for o in shown]
     return "\n".join(line for line in "".join(texts).splitlines() if line.strip())
 
 
