@@ -209,7 +209,7 @@ class LoopScan:
                 left, right = h[k], h[k + 1]
                 if not (np.isfinite(left) and np.isfinite(right) and (wanted[k] or wanted[k + 1])):
                     continue
-                turns = left * slope[k] < 0 and right * slope[k + 1] > 0
+                turns = left * slope[k] < 0 and right * slope[k + 1] > 0 and self._may_reach_zero(omega, h, slope, k)
                 if left * right > 0 and not turns:
                     continue
                 if max(abs(left), abs(right)) <= float(np.max(self._find_rounding(omega[k : k + 2], L[k : k + 2]))):
@@ -229,6 +229,18 @@ class LoopScan:
                     if self._evaluate(function, turn, 0) * left < 0:
                         yield self._polish(lambda w: self._evaluate(function, w, 0), (span[0], turn))
                         yield (last := self._polish(lambda w: self._evaluate(function, w, 0), (turn, span[1])))
+
+    @staticmethod
+    def _may_reach_zero(omega: np.ndarray, h: np.ndarray, slope: np.ndarray, k: int) -> bool:
+        """Whether a function that turns between two samples may reach 0 there: its slopes bound how far it goes.
+
+        A slope that grows evenly takes it by half of the step times the larger one; four times that is allowed. Where
+        the function is constant but for rounding, its slope has any sign at every sample, and no turn is searched.
+        """
+        with np.errstate(divide="ignore"):
+            step = float(np.log(omega[k + 1] / omega[k]))
+        reach = 2.0 * step * max(abs(slope[k]), abs(slope[k + 1]))
+        return bool(min(abs(h[k]), abs(h[k + 1])) <= reach)
 
     def _find_rounding(self, omega: np.ndarray, L: np.ndarray) -> np.ndarray:
         """Return bounds of the relative rounding error of L at frequencies, at least that of a constant.
