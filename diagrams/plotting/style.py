@@ -120,6 +120,6 @@ def limit_time(ax: Axes, t: np.ndarray) -> None:
     from matplotlib.ticker import MaxNLocator
 
     ax.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 5, 10]))
-    if len(t) > 1:
+    if len(t) > 1 and t[-1] > t[0]:
         margin = 0.015 * float(t[-1] - t[0])  # the border of the axes must not hide the first tick
         ax.set_xlim(float(t[0]) - margin, float(t[-1]) + margin)

@@ -65,7 +65,7 @@ def test_a_limited_integrator_leaves_its_limit_at_once(T):
         drive = Function(np.cos, name="drive")(t)
         return LimitedIntegrator(upper=0.5, name="i")(drive)
 
-    run = (tight if T is None else simulate)(box(Clock()()), duration=4.0)
+    run = (tight if T is None else simulate)(box(Clock(unit="rad")()), duration=4.0)
     t, y = run.t, run["box.i.y"]
     want = np.where(t < np.pi / 6, np.sin(t), np.where(t < np.pi / 2, 0.5, np.sin(t) - 0.5))
     np.testing.assert_allclose(y, want, rtol=0, atol=1e-8 if T is None else 2 * 0.01)
