@@ -16,7 +16,7 @@ def test_a_required_step_that_ends_in_a_limit_cycle_says_its_amplitude_and_perio
 
     @subsystem(sample_time=0.1)
     def control(wish, level):
-        return (2.0 * (wish - Quantizer(interval=0.5, name="converter")(level))).named("flow")
+        return (2.0 * (wish - Quantizer(quantum=0.5, name="converter")(level))).named("flow")
 
     diagram = Diagram("loop", tank(control(wish, tank.y.named("level"))))
     asked = Requirements(step=[{"input": "wish", "output": "level", "size": 0.7, "settling": 1.0}])
