@@ -5,6 +5,7 @@ import importlib.util
 import os
 import sys
 from collections import defaultdict
+from contextlib import ExitStack
 from functools import cache as keep
 from functools import lru_cache
 
@@ -12,6 +13,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, an
 
 import pytest
 
+from support.disturbed import NUMBERS
 from support.drawn import draw, identify
 
 WORKER = os.environ.get("PYTEST_XDIST_WORKER", "")
@@ -43,28 +45,6 @@ def pytest_terminal_summary(terminalreporter, config):
         terminalreporter.write_line(f"runs in both tiers: {told}")
 
 
-@pytest.fixture(autouse=True)
-def both_tiers(request):
-    """Compile every run as well with ``--both-tiers``, and in tests that are marked so."""
-    wanted = request.config.getoption("--both-tiers") or request.node.get_closest_marker("both_tiers") is not None
-    if not wanted or request.node.get_closest_marker("one_tier") is not None:
-        yield
-        return
-    from support import tiers
-
-    with pytest.MonkeyPatch.context() as patch:
-        tiers.install(patch)
-        yield
-
-
-@pytest.fixture(autouse=True)
-def closed_figures():
-    """Close the figures that a test has shown, which pyplot keeps."""
-    yield
-    if pyplot := sys.modules.get("matplotlib.pyplot"):
-        pyplot.close("all")
-
-
 @pytest.fixture(scope="session")
 def disturbance(cache, tmp_path_factory):
     """Linear algebra that can be disturbed, see `support.disturbed`."""
@@ -77,27 +57,28 @@ def disturbance(cache, tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def disturbed(request):
-    """Disturb linear algebra in the tests of numbers, with seed 1 or that of ``--disturbed``; that in all tests."""
-    from support.disturbed import NUMBERS
+def as_asked(request):
+    """Do what the options ask of each test, and close the figures that it has shown, which pyplot keeps.
 
-    seed = request.config.getoption("--disturbed")
-    if seed is None:
-        seed = int(request.node.nodeid.startswith(NUMBERS))
-    if not seed or request.node.get_closest_marker("equal_bits") is not None:
-        yield
-        return
-    with request.getfixturevalue("disturbance").on(seed):
-        yield
+    This is one fixture, as it runs for every test: four took a millisecond. ``--both-tiers``, or the mark: every run is
+    compiled as well. ``--disturbed``: linear algebra is disturbed in all tests by that seed, else in those of numbers
+    by seed 1. ``--grouped``: every diagram is taken for a large one.
+    """
+    marks, asked = {mark.name for mark in request.node.iter_markers()}, request.config.option
+    seed = request.node.nodeid.startswith(NUMBERS) if asked.disturbed is None else asked.disturbed
+    with ExitStack() as during:
+        if (asked.both_tiers or "both_tiers" in marks) and "one_tier" not in marks:
+            from support import tiers
 
-
-@pytest.fixture(autouse=True)
-def by_block(request):
-    """Take every diagram for a large one, with ``--grouped``."""
-    with pytest.MonkeyPatch.context() as patch:
-        if request.config.getoption("--grouped"):
+            tiers.install(during.enter_context(pytest.MonkeyPatch.context()))
+        if seed and "equal_bits" not in marks:
+            during.enter_context(request.getfixturevalue("disturbance").on(int(seed)))
+        if asked.grouped:
+            patch = during.enter_context(pytest.MonkeyPatch.context())
             patch.setattr("loopwright.diagrams.flat.flat_diagram.LARGEST", 0)
         yield
+    if pyplot := sys.modules.get("matplotlib.pyplot"):
+        pyplot.close("all")
 
 
 @pytest.hookimpl(wrapper=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,6 +37,9 @@ from .coupled_stability import growth_rate
 from .fig3_case import Fig3Case
 from .reduced_loops import FRICTION, OPTIONS, ReducedLoops, each_implementation
 from .rendered import passivity, rendered_admittance
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TEXTS = Texts(__package__, "admittance")
 TITLE = "Admittance and coupled stability"
@@ -164,7 +167,7 @@ def _draw_admittances(case: Fig3Case, side: str, variants: Variants, a: Admittan
         if (key := facts["key"] + facts["suffix"]) == ROUGH or not facts["suffix"]:
             look = case.looks.get(key) or look_of(key, len(drawn))
             drawn.append((facts["variant"], c.admittance(w).rendered, look))
-    return Plot(f"admittance_{side}", TEXTS.line("rendered", along=side == "par"), draw_admittances(w, drawn))
+    return Plot(f"admittance_{side}", TEXTS.line("rendered", along=side == "par"), lambda: draw_admittances(w, drawn))
 
 
 # --- a rigid gantry: reduced loops ------------------------------------------------------------------------------------
@@ -198,6 +201,13 @@ def _reduced_stiffness(loops: ReducedLoops, side: str, titles: Mapping[str, str]
 
 
 def _stability_map(case: Fig3Case, loops: ReducedLoops, side: str, titles: Mapping[str, str]) -> Plot:
+    draw = partial(_draw_stability_map, loops, side, titles, case.looks)
+    return Plot(f"stability_{side}", TEXTS.line("map", along=side == "par"), draw)
+
+
+def _draw_stability_map(
+    loops: ReducedLoops, side: str, titles: Mapping[str, str], looks: Mapping[str, dict[str, Any]]
+) -> Figure:
     loop = loops.plain[side]
     k, b = np.geomspace(10.0, 1e6, 120), np.geomspace(0.1, 1e3, 41)
 
@@ -214,10 +224,10 @@ def _stability_map(case: Fig3Case, loops: ReducedLoops, side: str, titles: Mappi
         ax = figure.subplots()
         fill_growth(ax, k, b, shown, least=-100.0)
         for name, rates in lines.items():
-            ax.plot(_first_unstable(k, rates), b, label=titles.get(name, name), **case.looks.get(name, {}))
+            ax.plot(_first_unstable(k, rates), b, label=titles.get(name, name), **looks.get(name, {}))
         ax.plot((d + b) / (0.5 * loop.sample_time), b, label="rule of thumb, no delay", **DOTTED)
         legend_above(figure, ax)
-    return Plot(f"stability_{side}", TEXTS.line("map", along=side == "par"), figure)
+    return figure
 
 
 def _first_unstable(k: np.ndarray, growth: np.ndarray) -> np.ndarray:

@@ -56,8 +56,9 @@ def contact_admittance(
 ) -> Plot:
     """Draw the admittance of a contact over ω in rad/s, and that of its filter: magnitude and phase."""
     filtered = [] if target is None else [("filter", target, DOTTED)]
-    figure = draw_admittances(w, [*filtered, ("rendered", rendered, {"color": BLUE})])
-    return Plot(key, TEXTS.line("contact_admittance", name=name, filtered=target is not None), figure)
+    curves = [*filtered, ("rendered", rendered, {"color": BLUE})]
+    caption = TEXTS.line("contact_admittance", name=name, filtered=target is not None)
+    return Plot(key, caption, lambda: draw_admittances(w, curves))
 
 
 LEVELS = (-1000.0, -100.0, -10.0, -1.0, -0.1, 0.0, 0.1, 1.0, 10.0, 100.0, 1000.0)
@@ -94,10 +95,14 @@ def fill_growth(ax: Axes, k: np.ndarray, b: np.ndarray, growth: np.ndarray, leas
 
 def contact_map(key: str, name: str, k: np.ndarray, b: np.ndarray, growth: np.ndarray) -> Plot:
     """Draw growth rates in 1/s over stiffness in N/m and damping in N·s/m, with the limit as a line."""
-    with style():
-        figure = new_figure(2.9)
-        ax = figure.subplots()
-        fill_growth(ax, k, b, growth)
-        if np.min(growth) < 0.0 < np.max(growth):
-            ax.contour(k, b, np.clip(growth, -999.0, 999.0), levels=[0.0], colors=[DARK], linewidths=1.6)
-    return Plot(key, TEXTS.line("contact_map", name=name), figure)
+
+    def draw() -> Figure:
+        with style():
+            figure = new_figure(2.9)
+            ax = figure.subplots()
+            fill_growth(ax, k, b, growth)
+            if np.min(growth) < 0.0 < np.max(growth):
+                ax.contour(k, b, np.clip(growth, -999.0, 999.0), levels=[0.0], colors=[DARK], linewidths=1.6)
+        return figure
+
+    return Plot(key, TEXTS.line("contact_map", name=name), draw)

@@ -76,7 +76,7 @@ def _response(L: Any, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
 
 def bode(key: str, of: DrawnLoops) -> Plot:
     """Draw L over frequency, with the margins marked."""
-    return Plot(key, TEXTS.line("bode", wire=of.wire), draw_bode(of, 3.0, WIDTH))
+    return Plot(key, TEXTS.line("bode", wire=of.wire), lambda: draw_bode(of, 3.0, WIDTH))
 
 
 def draw_bode(of: DrawnLoops, height: float, width: float) -> Figure:
@@ -92,6 +92,10 @@ def draw_bode(of: DrawnLoops, height: float, width: float) -> Figure:
 
 def nyquist(key: str, of: DrawnLoops) -> Plot:
     """Draw L in the complex plane: near −1, and beside it so far that all crossings of the real axis are in view."""
+    return Plot(key, TEXTS.line("nyquist", wire=of.wire), lambda: _draw_nyquist(of))
+
+
+def _draw_nyquist(of: DrawnLoops) -> Figure:
     low, high = _span(of.loops, of.found)
     crossings = [-1 / p.gain_margin.value for m in of.found.values() for p in m.phase_crossovers if p.gain_margin.value]
     farthest = min([-1.0, *(x for x in crossings if np.isfinite(x))])
@@ -111,8 +115,7 @@ def nyquist(key: str, of: DrawnLoops) -> Plot:
             panels[0].set_title("all crossings")
             near.set_title("near −1")
         legend_above(figure, panels[0])
-    caption = TEXTS.line("nyquist", wire=of.wire)
-    return Plot(key, caption, figure)
+    return figure
 
 
 NEAR = (-2.6, 1.4)
@@ -121,6 +124,10 @@ NEAR = (-2.6, 1.4)
 
 def sensitivities(key: str, of: DrawnLoops) -> Plot:
     """Draw |S| and |T|."""
+    return Plot(key, TEXTS.line("sensitivities", wire=of.wire), lambda: _draw_sensitivities(of))
+
+
+def _draw_sensitivities(of: DrawnLoops) -> Figure:
     low, high = _span(of.loops, of.found)
     with style():
         figure = new_figure(2.1)
@@ -142,7 +149,7 @@ def sensitivities(key: str, of: DrawnLoops) -> Plot:
             set_frequencies(ax)
             ax.set_ylim(bottom=of.axes.magnitude(1e-3))
         legend_above(figure, left)
-    return Plot(key, TEXTS.line("sensitivities", wire=of.wire), figure)
+    return figure
 
 
 def gang(
@@ -154,20 +161,24 @@ def gang(
     looks: Mapping[str, dict[str, Any]],
 ) -> Plot:
     """Draw the responses from a disturbance at a wire to the next one on the loop, and from there back."""
-    with style():
-        figure = new_figure(2.1)
-        left, right = figure.subplots(1, 2)
-        for name, (title, w, there, back) in curves.items():
-            look = looks[name]
-            left.semilogx(axes.frequency(w), axes.magnitude(there), label=title, **look)
-            right.semilogx(axes.frequency(w), axes.magnitude(back), **look)
-        for ax, name in ((left, f"|PS|: {wire} to {other}"), (right, f"|CS|: {other} to {wire}")):
-            set_magnitudes(ax, axes)
-            set_frequencies(ax)
-            ax.set_title(axes.magnitude_label(name), fontsize="small")
-            ax.set_xlabel(axes.frequency_label)
-        legend_above(figure, left)
-    return Plot(key, TEXTS.line("gang", wire=wire, other=other), figure)
+
+    def draw() -> Figure:
+        with style():
+            figure = new_figure(2.1)
+            left, right = figure.subplots(1, 2)
+            for name, (title, w, there, back) in curves.items():
+                look = looks[name]
+                left.semilogx(axes.frequency(w), axes.magnitude(there), label=title, **look)
+                right.semilogx(axes.frequency(w), axes.magnitude(back), **look)
+            for ax, name in ((left, f"|PS|: {wire} to {other}"), (right, f"|CS|: {other} to {wire}")):
+                set_magnitudes(ax, axes)
+                set_frequencies(ax)
+                ax.set_title(axes.magnitude_label(name), fontsize="small")
+                ax.set_xlabel(axes.frequency_label)
+            legend_above(figure, left)
+        return figure
+
+    return Plot(key, TEXTS.line("gang", wire=wire, other=other), draw)
 
 
 def response(L: Any, w: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from ..pages import Plot, Texts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 TEXTS = Texts(__package__, "figures")
 
@@ -34,25 +35,33 @@ def injected(
     wire: str, curves: Mapping[str, MeasuredCurve], axes: AxisUnits, looks: Mapping[str, dict[str, Any]], key: str
 ) -> Plot:
     """Draw points that were measured in the running co-simulation over linear models, each in its variant's color."""
-    with style():
-        figure = new_figure(2.3)
-        left, right = figure.subplots(1, 2)
-        for name, curve in curves.items():
-            _draw_measured(left, right, curve, axes, looks[name], looks[name]["color"])
-        _label_measured(left, right, axes)
-        legend_above(figure, left)
-    return Plot(key, TEXTS.line("injected", wire=wire), figure)
+
+    def draw() -> Figure:
+        with style():
+            figure = new_figure(2.3)
+            left, right = figure.subplots(1, 2)
+            for name, curve in curves.items():
+                _draw_measured(left, right, curve, axes, looks[name], looks[name]["color"])
+            _label_measured(left, right, axes)
+            legend_above(figure, left)
+        return figure
+
+    return Plot(key, TEXTS.line("injected", wire=wire), draw)
 
 
 def measured(key: str, wire: str, curve: MeasuredCurve, axes: AxisUnits) -> Plot:
     """Draw points that were measured elsewhere, with their uncertainty, over the linear model in another color."""
-    with style():
-        figure = new_figure(2.3)
-        left, right = figure.subplots(1, 2)
-        _draw_measured(left, right, curve, axes, {"color": BLUE}, VERMILION, measured="measured")
-        _label_measured(left, right, axes)
-        legend_above(figure, left)
-    return Plot(key, TEXTS.line("measured", wire=wire, bars=curve.uncertainty is not None), figure)
+
+    def draw() -> Figure:
+        with style():
+            figure = new_figure(2.3)
+            left, right = figure.subplots(1, 2)
+            _draw_measured(left, right, curve, axes, {"color": BLUE}, VERMILION, measured="measured")
+            _label_measured(left, right, axes)
+            legend_above(figure, left)
+        return figure
+
+    return Plot(key, TEXTS.line("measured", wire=wire, bars=curve.uncertainty is not None), draw)
 
 
 def _draw_measured(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ...plotting import WIDTH
@@ -11,6 +13,8 @@ from .loop_figures import DrawnLoops, draw_bode
 from .step_figures import draw_answer
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from ...measure import StepResponse
 
 TEXTS = Texts(__package__, "figures")
@@ -22,21 +26,28 @@ HALF = 0.5 * WIDTH
 
 def overview_bode(key: str, of: DrawnLoops) -> Plot:
     """Draw L of a loop over frequency, with the margins marked."""
-    figure = draw_bode(of, HEIGHTS[0], HALF)
-    return Plot(f"overview_{key}_bode", TEXTS.line("overview_bode", wire=of.wire), figure, group=key)
+    caption = TEXTS.line("overview_bode", wire=of.wire)
+    return Plot(f"overview_{key}_bode", caption, lambda: draw_bode(of, HEIGHTS[0], HALF), group=key)
 
 
 def overview_step(
     key: str, said: str, curves: Mapping[str, StepResponse], looks: Mapping[str, dict[str, Any]], *, to_output: bool
 ) -> Plot:
     """Draw the answer to a step; ``said`` names where it begins and ends."""
-    figure = draw_answer(curves, looks, HEIGHTS[0], HALF, to_output=to_output)
-    return Plot(f"overview_{key}_step", TEXTS.line("overview_step", said=said), figure, group=key)
+
+    def draw() -> Figure:
+        return draw_answer(curves, looks, HEIGHTS[0], HALF, to_output=to_output)
+
+    return Plot(f"overview_{key}_step", TEXTS.line("overview_step", said=said), draw, group=key)
 
 
 def fit_overview(groups: Sequence[Sequence[Plot]]) -> tuple[Plot, ...]:
     """Return the figures of all groups, `HEIGHTS` at most, as high as two pages have room for."""
-    for group in groups:
-        for plot in group:
-            plot.figure.set_size_inches(HALF, HEIGHTS[len(groups) - 1])
-    return tuple(plot for group in groups for plot in group)
+    height = HEIGHTS[len(groups) - 1]
+    return tuple(replace(plot, figure=partial(_resized, plot, height)) for group in groups for plot in group)
+
+
+def _resized(plot: Plot, height: float) -> Figure:
+    figure: Figure = plot.figure
+    figure.set_size_inches(HALF, height)
+    return figure

@@ -89,23 +89,43 @@ class Judged(str):
         return made
 
 
+class _DrawnWhenAsked:
+    """The figure of a plot. Where the plot has a function that draws it, this calls it once, when it is first asked."""
+
+    def __get__(self, plot: Plot | None, owner: type | None = None) -> Any:
+        if plot is None:
+            raise AttributeError("figure")  # so that the field has no default
+        given = plot.__dict__["figure"]
+        if callable(given):
+            given = plot.__dict__["figure"] = given()
+        return given
+
+    def __set__(self, plot: Plot, given: Any) -> None:
+        plot.__dict__["figure"] = given
+
+
 @explain_calls
 @dataclass(frozen=True, eq=False)
 class Plot:
     """A figure: a key for its file, a caption, the matplotlib figure or the `Drawing`; ``ahead`` of the tables or not.
 
-    One of ``details`` stands in the appendix. Figures with the same ``group`` are small and stand side by side.
+    In place of the figure it can have a function without arguments that draws it: who reads the numbers alone waits for
+    no figure. One of ``details`` stands in the appendix. Figures with the same ``group`` are small and stand side by
+    side.
     """
 
     key: str
     caption: str
-    figure: Any
+    figure: Any = _DrawnWhenAsked()
     ahead: bool = False
     details: bool = False
     group: str = ""
 
     def __repr__(self) -> str:
         return brief(f"figure {self.key!r}", self.caption[:80], then=".figure")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "figure": self.figure}
 
 
 @explain_calls

@@ -682,8 +682,9 @@ def _plot(case: Case, test: StepTest, curves: Mapping[str, StepResponse], others
     said = " and ".join([str(test), *others])
     titles = {key: case.variants[key].title for key in curves}
     caption = TEXTS.line("figure_to", said=said) if test.output else TEXTS.line("figure", said=said)
+    looks, to_output = case.looks, bool(test.output)
     return Plot(
-        f"steps_{test.key}", caption, figures.step_responses(curves, titles, case.looks, to_output=bool(test.output))
+        f"steps_{test.key}", caption, lambda: figures.step_responses(curves, titles, looks, to_output=to_output)
     )
 
 

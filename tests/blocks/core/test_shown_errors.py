@@ -5,8 +5,6 @@ import sys
 import traceback
 from types import SimpleNamespace
 
-import nbclient
-import nbformat
 import pytest
 from IPython.core.ultratb import AutoFormattedTB
 
@@ -91,6 +89,9 @@ CELLS = {
 @pytest.mark.filterwarnings("ignore")  # of the kernel's transport
 def test_in_a_notebook_the_message_is_within_the_first_twelve_lines():
     """Before, 21 to 109 lines stood above it."""
+    import nbclient  # which takes longer to import than most files of tests
+    import nbformat
+
     cells = [nbformat.v4.new_code_cell(source) for source in CELLS.values()]
     notebook = nbformat.v4.new_notebook(cells=cells)
     nbclient.NotebookClient(notebook, timeout=120, allow_errors=True).execute()

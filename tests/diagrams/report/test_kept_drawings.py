@@ -2,6 +2,10 @@
 
 import pickle
 
+import pytest
+
+from loopwright.blocks import Integrator
+from loopwright.diagrams import Diagram, analyse
 from loopwright.diagrams.drawing import Drawing
 from loopwright.diagrams.plotting import new_figure
 from loopwright.diagrams.report.pages import Plot, Section, draw_section, keep_drawings
@@ -31,3 +35,18 @@ def test_a_drawing_is_used_once():
     assert "<g></g>" in embedded(figure, "f").screen
     figure.axes[0].set_title("changed")  # a figure that is changed later is drawn anew
     assert embedded(figure, "f").screen not in (plain, "<svg><g></g></svg>")
+
+
+def test_no_figure_is_drawn_before_it_is_looked_at(monkeypatch):
+    plant = Integrator(name="plant")
+    report = analyse(Diagram("loop", plant((0.0 - plant.y).named("u"))), only=("inner", "steps"))
+    monkeypatch.setattr("matplotlib.figure.Figure.subplots", lambda *_, **__: 1 / 0)
+    plots = report.sections[0].plots
+    assert len(plots) == 2
+    for plot in plots:
+        with pytest.raises(ZeroDivisionError):
+            plot.figure  # noqa: B018  # it is drawn here
+    monkeypatch.undo()
+    (first, _) = plots
+    assert first.figure is first.figure
+    assert type(pickle.loads(pickle.dumps(plots[1])).figure) is type(first.figure)
