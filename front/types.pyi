@@ -35,7 +35,7 @@ from .diagrams.paper import StabilityLimit, StabilityMap
 from .diagrams.report import Report
 from .diagrams.requirements import Review, Verdict
 from .diagrams.results import Occurrence, OperatingPoint, RunState, Snapshot, Stopped, TextSignal
-from .diagrams.simulation import RunOptions, Simulation, SimulationView
+from .diagrams.simulation import LiveRun, RunOptions, Simulation, SimulationView
 from .diagrams.studies import RunConfirmation, Sensitivities, Sensitivity, WorstCase
 from .diagrams.wiring import Bus, Subsystem, SubsystemSettings, Wire
 from .fmus.archive import FmuDescription, FmuFault, FmuFinding, FmuSeverity, FmuVariable
@@ -80,6 +80,7 @@ __all__ = [
     "Layout",
     "LinearDelays",
     "Linearization",
+    "LiveRun",
     "MeanSlope",
     "Occurrence",
     "OperatingPoint",

@@ -238,7 +238,7 @@ PUBLIC = {
         ApproximateDelay Array BlockReport Bus Call CoarseValues Contact ContactAdmittance ContactConfirmation ContactLimit
         ContactMap ContactTrial CouplingReport Drawing FlatDiagram FmuDescription FmuDiagnosis FmuEnd FmuFault
         FmuFinding FmuInstance FmuLinearization FmuSeverity FmuState FmuTrial FmuVariable FmuVerdict Frame FreeMotion
-        FreeMotions FrequencyResponse InexactDerivatives Kink Layout LinearDelays Linearization MeanSlope Occurrence
+        FreeMotions FrequencyResponse InexactDerivatives Kink Layout LinearDelays Linearization LiveRun MeanSlope Occurrence
         OperatingPoint Passivity PassivityReason PortPassivity RefutedDerivatives Report Review RunConfirmation
         RunOptions RunState Sensitivities Sensitivity Signal Simulation SimulationView Snapshot StabilityLimit
         StabilityMap StepResponse StepsOnly Stopped Subsystem SubsystemSettings TextSignal TrialMethod Unit Verdict Wire

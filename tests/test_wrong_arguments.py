@@ -78,6 +78,7 @@ RESULTS = {
     "LinearDelays",
     "Linearization",
     "Margins",
+    "LiveRun",
     "MeanSlope",
     "MeasuredMargins",
     "Number",

@@ -11,6 +11,7 @@ from .flat_functions import indicators_of
 from .flat_layout import FlatEvent, StateLayout, sample_time_of
 from .flatten import renumber, write_numbers
 from .logic import TRUE, is_true
+from .movable import Target, with_movable
 from .plant_ticks import StepTable, own_step, takes_any_step
 from .program import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE_OF, Ids, Operation, PartProgram, Program, TickProgram
 from .stages import Bound, Evaluators, OpaqueStage, Schedule, bind_function, evaluate_apart
@@ -51,6 +52,7 @@ __all__ = [
     "Schedule",
     "StateLayout",
     "StepTable",
+    "Target",
     "TickPattern",
     "TickProgram",
     "Times",
@@ -81,5 +83,6 @@ __all__ = [
     "ticks_after",
     "times_of",
     "trace_schedule",
+    "with_movable",
     "write_numbers",
 ]

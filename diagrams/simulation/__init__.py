@@ -5,6 +5,7 @@ from .diagnosis import START_SETTLED
 from .engine import Engine
 from .held_inputs import note_held_inputs
 from .initialize import find_initial_state, values_from_left
+from .live_run import LiveRun
 from .progress import Interrupted, ProgressOption, late_progress, progress_bar, work_notes
 from .run_options import START_EXCHANGES, KeptKeywords, RunKeywords, RunOptions, default_step, refuse_rest, ticks_in
 from .simulation import Simulation, simulate
@@ -20,6 +21,7 @@ __all__ = [
     "Engine",
     "Interrupted",
     "KeptKeywords",
+    "LiveRun",
     "Port",
     "ProgressOption",
     "RunKeywords",

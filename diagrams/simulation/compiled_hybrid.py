@@ -306,6 +306,10 @@ class HybridTicks:
 
     # --- between Python and C ----------------------------------------------------------------------------------------
 
+    def prepare(self, recorder: Recorder) -> None:
+        """Bind the loop before its first tick."""
+        self._bind(recorder)
+
     def _bind(self, recorder: Recorder) -> CompiledHybrid:
         if self._loop is None or recorder is not self._recorder:
             self._loop, self._handed = bind_hybrid(

@@ -236,6 +236,10 @@ class CompiledTicks:
         unknown = np.flatnonzero(kinds < 0)
         return _Window(k, ticks, times_of(flat, ends), times_of(flat, np.diff(ends)), kinds, unknown)
 
+    def prepare(self, recorder: Recorder) -> None:
+        """Bind the loop before its first tick."""
+        self._bind(recorder)
+
     def _bind(self, recorder: Recorder) -> CompiledLoop:
         if self._loop is None or recorder is not self._recorder:
             self._recorder = recorder

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Block, FmuRuntimeError, OptionError, SimulationError
+from ...blocks.core import Block, FmuRuntimeError, OptionError, ParameterError, SimulationError
 from ..compiled import delays_of
 from ..events import Domains
-from ..flat import FlatDiagram, announcers
+from ..flat import FlatDiagram, announcers, renumber
 from ..model_exchange import BlocksInModelExchange, OutsideEvents
 from ..results import Occurrence
 from ..solvers import METHODS, Method, MethodKind, Problem
@@ -112,6 +112,7 @@ class Continuous:
         self._crossed: dict[int, float] = {}
         """When indicators of FMUs have crossed zero last, in s."""
         self._fresh = self.save()
+        self._changed: dict[str, Block] = {}  # blocks with other parameters than at the start, by path
 
     def begin(self, *, at_start: bool) -> None:
         """Take the domains of the indicators where a run begins, at t = 0 from the left; elsewhere as they are."""
@@ -229,6 +230,26 @@ class Continuous:
         later = x + h * self._rate(t, x)
         return h, np.abs(self.indicators(t, later)[0] - self.indicators(t, x)[0])
 
+    # --- parameters that change ------------------------------------------------------------------------------------
+
+    def plan_with(self, path: str, block: Block) -> None:
+        """Plan steps with the instants that a variant of a block announces, or moves; see `Workspace.set_parameters`.
+
+        Raises
+        ------
+        ParameterError
+            If the block changes within another time than before: the longest step of the method follows from that.
+        """
+        if block.time_scale() != self.flat.table.blocks[path].time_scale():
+            raise ParameterError(
+                "the solver's longest step follows from how fast it changes, such as the frequency of a sine, so this "
+                "can't change in a run. Start a run of diagram.replace(…).",
+                block=path,
+            )
+        self._changed[path] = block
+        self.sources = announcers(renumber(self.flat, self._changed))
+        self.late = find_late(self.sources)
+
     # --- what is kept from step to step ------------------------------------------------------------------------------
 
     def save(self) -> dict[str, Any]:
@@ -260,6 +281,7 @@ class Continuous:
     def begin_again(self, flat: FlatDiagram) -> None:
         """Forget the run before: another one begins, with other numbers of the diagram."""
         self.flat, self.sources = flat, announcers(flat)
+        self._changed.clear()
         self.late, self.beyond = find_late(self.sources), None
         self.stand_in(math.inf, math.inf)
         self.restore(self._fresh)

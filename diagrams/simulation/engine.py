@@ -304,6 +304,10 @@ class Engine:
         self._compiled.hand_over(self._change_over.code)
         self._changed = self._generated = True
 
+    def prepare(self, recorder: Recorder) -> None:
+        """Make what the first tick of `go` needs, which takes time, before a clock runs."""
+        self._ticks().prepare(recorder)
+
     def end_between_ticks(self, end: float, recorder: Recorder, progress: Progress) -> None:
         """Continue from a tick to the end of the run, before the next tick, and record it; see `go`."""
         position, workspace = self.position, self.workspace
@@ -416,6 +420,10 @@ class Engine:
             raise UnknownNameError(
                 f"no block there is evaluated in this run. {near(path, self.flat.checked.traced)}", block=path
             )
+        table = self.flat.table
+        if self.continuous is not None and not table.is_sampled(table.subsystem_of[path]):
+            self.workspace.check_equations(path, block)
+            self.continuous.plan_with(path, block)
         self.workspace.set_parameters(path, block)
 
     def take_over(self, x: np.ndarray, of: FlatDiagram) -> None:

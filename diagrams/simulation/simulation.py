@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from ...blocks.core import Block, OptionError, SimulationError, accepts, explain_calls, kinds
 from ..coupling import note_loops, note_steps
-from ..flat import EVERY, FlatDiagram, WiredDiagram
+from ..flat import EVERY, FlatDiagram, WiredDiagram, with_movable
 from ..results import (
     Occurrence,
     OperatingPoint,
@@ -30,6 +31,7 @@ from ..results import (
 )
 from .engine import Engine
 from .held_inputs import note_held_inputs
+from .live_run import FRAME, Controls, LiveRun, Pace
 from .progress import Interrupted, ProgressOption, compiler_notes, progress_bar
 from .run_options import RunOptions, default_step, refuse_rest, ticks_in
 from .save import can_save, restore_state, save_state
@@ -61,6 +63,7 @@ class Simulation:
 
     def __init__(self, diagram: WiredDiagram, options: RunOptions | None = None, *, duration: float | None = None):
         options = options or RunOptions()
+        self._asked = diagram, options, duration
         start, step = options.start, options.step
         self._point = start if isinstance(start, OperatingPoint) else None
         if self._point is not None:
@@ -254,6 +257,101 @@ class Simulation:
             raise Interrupted(self.run(final=False)) from interrupt
         self._elapsed += time.perf_counter() - started
 
+    @accepts(
+        duration=kinds.positive.or_none(),
+        speed=kinds.positive,
+        inputs=kinds.mapping.or_none(),
+        frame=kinds.positive,
+        catch_up=kinds.number.where(lambda value: value >= 0).worded("0 s or more"),
+        stop=kinds.function.or_none(),
+        on_frame=kinds.function.or_none(),
+        background=kinds.flag,
+        clock=kinds.function,
+        sleep=kinds.function,
+    )
+    def run_realtime(
+        self,
+        duration: float | None = None,
+        *,
+        speed: float = 1.0,
+        inputs: Mapping[str, Any] | None = None,
+        frame: float = FRAME,
+        catch_up: float = 0.25,
+        stop: Callable[[], object] | None = None,
+        on_frame: Callable[[SimulationView], object] | None = None,
+        background: bool = False,
+        clock: Callable[[], float] = time.perf_counter,
+        sleep: Callable[[float], object] = time.sleep,
+    ) -> LiveRun:
+        """Continue at the pace of the clock, with parameters that are moved by hand; see docs/howto/live.md.
+
+        Without a ``with`` statement the simulation begins and ends here. Ctrl-C ends the run after the frame that
+        runs, and what was recorded is kept.
+
+        Parameters
+        ----------
+        duration : float, optional
+            Simulated time in s; without one the run continues until it is stopped.
+        speed : float
+            Simulated seconds in a second of the clock.
+        inputs : mapping of str, optional
+            What is moved, by dotted path as `Diagram.replace` takes it; the name of a `Constant`, or of the wire that
+            comes out of it, is its ``value``. Each is a function of the simulated time in s, an object with a
+            ``value`` (a slider of ipywidgets) or a number. They are read at the beginning of every frame; a value
+            acts after the samples of that time.
+        frame : float
+            Seconds of the clock between two looks at the inputs, rounded to whole ticks, one at least.
+        catch_up : float
+            Seconds of the clock that a delay may have to be caught up. A longer one is given up: simulated time is
+            then behind for good, and a warning says so once.
+        stop : callable, optional
+            Called before every frame and while the run waits; it ends when this returns true, such as
+            ``threading.Event().is_set``.
+        on_frame : callable, optional
+            Called after every frame with the `view`, for a figure that follows.
+        background : bool
+            Return at once while a thread runs it: a notebook passes a slider's moves on only between its cells.
+        clock, sleep : callable
+            The clock in s, and what waits for some seconds of it.
+
+        Returns
+        -------
+        LiveRun
+            With ``run``, overruns, and how late frames began.
+
+        Raises
+        ------
+        SimulationError
+            As `advance`; a function of ``inputs`` that fails.
+        UnknownNameError, ParameterError, OptionError
+            A name that is no parameter; one that a run can't take over, see `set_parameters`; an option out of range.
+        """
+        pace = Pace(float(speed), float(frame), float(catch_up), clock, sleep)
+        live = LiveRun(self.wired.name, pace)
+        controls = Controls(self.wired.structure, inputs or {}, self.wired.name)
+        self._let_move(controls)
+        live.drive(self, duration, controls, on_frame, stop, background=bool(background))
+        return live
+
+    def _let_move(self, controls: Controls) -> None:
+        """Take functions in which zeros that are moved are numbers; a run that has begun keeps those that it has."""
+        diagram, options, duration = self._asked
+        free = with_movable(diagram, controls.targets)
+        if self._open is None and free is not diagram:
+            if self._recorder.is_open:
+                self._recorder.finish()
+                options = replace(options, overwrite=True)
+            self.__init__(free, options, duration=duration)  # type: ignore[misc]
+
+    def prepare(self) -> None:
+        """Make what the first tick needs, before a clock runs."""
+        self._engine.prepare(self._recorder)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it has begun, and has not ended."""
+        return bool(self._open)
+
     def _on_event(self, event: Occurrence) -> None:
         self._recorder.event(event)
 
@@ -275,7 +373,7 @@ class Simulation:
         UnknownNameError
             If no block that is evaluated is there; a plant that is stepped takes no parameters in a run.
         ParameterError
-            If the block's equations change, or the times at which a source is not smooth: they are planned ahead.
+            If the block's equations change, or how fast a source in continuous time changes: steps are limited by that.
         """
         self._engine.set_parameters(path, block)
 

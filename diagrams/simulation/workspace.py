@@ -184,22 +184,18 @@ class Workspace:
         ------
         ParameterError
             If its equations change with them: another class, other options, another number in the place of a zero.
-            If it is a source in continuous time that announces when it is not smooth.
         """
-        flat = self.flat
-        if not is_traced_by(block, flat.table.blocks[path]):
+        self.check_equations(path, block)
+        self.p[self.flat.parameters.slices[path]] = self.flat.pack(path, block)
+
+    def check_equations(self, path: str, block: Block) -> None:
+        """Refuse a block whose equations are not those of the block at a path; see `set_parameters`."""
+        if not is_traced_by(block, self.flat.origin.table.blocks[path]):
             raise ParameterError(
                 "its equations change with these parameters, so that a run can't take them over: it takes numbers of "
                 "the same shape, and none in the place of a zero. Start a run of diagram.replace(…).",
                 block=path,
             )
-        if not flat.table.is_sampled(flat.table.subsystem_of[path]) and _plans_ahead(block):
-            raise ParameterError(
-                "a solver plans ahead with the times at which it is not smooth, so its parameters can't change in a "
-                "run. Start a run of diagram.replace(…).",
-                block=path,
-            )
-        self.p[flat.parameters.slices[path]] = flat.pack(path, block)
 
     # --- trials of a solver -----------------------------------------------------------------------------------------
 
@@ -314,11 +310,6 @@ class Workspace:
             loops.solve()
             loops.check_determined()
             self.messages = (loops.describe(others),) if (others := loops.others()) else ()
-
-
-def _plans_ahead(block: Block) -> bool:
-    kind = type(block)
-    return kind.next_instant is not Block.next_instant or kind.time_scale is not Block.time_scale
 
 
 def _one_after_the_other(first: Callable[[], None], second: Callable[[], None]) -> Callable[[], None]:

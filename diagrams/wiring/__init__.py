@@ -10,7 +10,7 @@ from .entry_names import index_of, split_entry
 from .entry_order import OrderStep
 from .first_order_hold import first_order_hold
 from .order import Order, find_orders
-from .parameter_names import find_name, find_path, find_place, split_path
+from .parameter_names import find_control, find_name, find_path, find_place, split_path
 from .structure import Structure, SubsystemSettings, Wire, join, stepped_blocks
 from .structure_table import sheet_of_structure
 from .subsystems import Subsystem, exact_time, subsystem
@@ -35,6 +35,7 @@ __all__ = [
     "check",
     "exact_time",
     "explain_absent_state",
+    "find_control",
     "find_cyclic_parts",
     "find_name",
     "find_orders",

@@ -76,6 +76,34 @@ def find_place(table: Structure, name: str, diagram: str) -> tuple[str, list[str
     return path, _inside(table.blocks[path], path, keys)
 
 
+def find_control(table: Structure, name: object, diagram: str) -> tuple[str, list[str]]:
+    """Return the path of a block, and the names that lead to a parameter in it, of what is moved by hand in a run.
+
+    Next to a parameter (`find_place`), a source is named by its own name, or by that of the wire that comes out of it:
+    ``value`` of the `Constant` or `Reference` there is meant.
+
+    Raises
+    ------
+    OptionError, UnknownNameError
+        As `find_place`; a wire that comes out of another block, with the parameters of that.
+    """
+    name = check_name(name, diagram)
+    found = [name] if name in table.blocks else [path for path in table.blocks if path.endswith("." + name)]
+    if not found and name in table.names:
+        found = [table.names[name].block]
+    if len(found) != 1:
+        return find_place(table, name, diagram)
+    path, block = found[0], table.blocks[found[0]]
+    if "value" not in type(block).parameter_specs:
+        what = "a block" if name in path else f"a wire that comes out of {path}"
+        raise UnknownNameError(
+            f"{name!r} is {what}, {type(block).__name__}, which has no value to be moved by hand; expected a Constant, "
+            f"or a parameter: {name_parameters(block, path)}.",
+            block=diagram,
+        )
+    return path, ["value"]
+
+
 def split_path(table: Structure, path: str, diagram: str) -> tuple[str, list[str]]:
     """Split a dotted path into the path of a block and the names of a parameter in it, which are not looked at."""
     parts = path.split(".")

@@ -1,5 +1,6 @@
 """Calls of everything public with good arguments, for tests that spoil one of them."""
 
+import time
 from functools import cache
 
 import control
@@ -365,6 +366,21 @@ def calls():
         "Contact.confirm": lambda: (cart_contact().confirm, {"limit": limit(), "push": 1e-6, "method": "solver"}),
         "Simulation.time_of": lambda: (simulation().time_of, {"k": 1}),
         "Simulation.advance": lambda: (simulation().advance, {"duration": 0.02, "progress": None}),
+        "Simulation.run_realtime": lambda: (
+            simulation().run_realtime,
+            {
+                "duration": 0.02,
+                "speed": 100.0,
+                "inputs": {"kp.gain": 0.3},
+                "frame": 0.01,
+                "catch_up": 100.0,
+                "stop": None,
+                "on_frame": None,
+                "background": False,
+                "clock": time.perf_counter,
+                "sleep": time.sleep,
+            },
+        ),
         "Simulation.save": lambda: (simulation().save, {}),
         "Simulation.restore": lambda: (simulation().restore, {"state": run().final_state}),
         "Simulation.run": lambda: (simulation().run, {"final": True}),

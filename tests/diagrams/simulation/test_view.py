@@ -153,7 +153,7 @@ def test_a_sampled_block_is_discretized_anew_with_its_parameters():
         ("rate", Gain(gain=np.ones(2)), ParameterError, "its equations change"),
         ("rate", Constant(value=1.0), ParameterError, "its equations change"),
         ("zero", Gain(gain=1.0), ParameterError, "none in the place of a zero"),
-        ("wave", Sine(frequency=2.0), ParameterError, "a solver plans ahead"),
+        ("wave", Sine(frequency=2.0), ParameterError, "longest step follows"),
     ],
 )
 def test_parameters_that_a_run_cannot_take_over_are_refused(path, block, error, words):
