@@ -3,6 +3,7 @@
 from .background import BackgroundCode
 from .code import LARGEST, TickCode, compile_ticks, find_obstacle, interpret_ticks, write_ticks
 from .compiled_libraries import load_compiled
+from .exported_memory import NamedCode, function_text, read_memory
 from .function_code import Code
 from .fused import FusedPlant, compile_fused, fuse
 from .grouping import make_tables
@@ -30,6 +31,7 @@ from .library_method import StepFailure
 from .loop import CompiledLoop, NewtonOptions, Outcome, ReturnReason
 from .native_tick import bind_call
 from .remote import REFUSED, TAKEN_BY_PYTHON, UNDER_WAY, PythonStep, compile_other_side
+from .runtime import load_runtime
 from .staged import NativeModelExchange, OwnEvent
 from .transport_delays import Delays, delays_of
 from .watch import Fired, Pile
@@ -54,6 +56,7 @@ __all__ = [
     "Kernel",
     "Lost",
     "MethodOptions",
+    "NamedCode",
     "NativeModelExchange",
     "NewtonOptions",
     "Outcome",
@@ -73,12 +76,15 @@ __all__ = [
     "delays_of",
     "find_code_obstacle",
     "find_obstacle",
+    "function_text",
     "fuse",
     "hybrid_sources",
     "interpret_hybrid",
     "interpret_ticks",
     "load_compiled",
+    "load_runtime",
     "make_tables",
+    "read_memory",
     "write_hybrid",
     "write_ticks",
 ]

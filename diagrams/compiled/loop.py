@@ -266,6 +266,11 @@ class CompiledLoop:
         self._run.restype = None
         self._run.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 5]
 
+    @property
+    def kept(self) -> list[Any]:
+        """All that lives as long as the loop: whatever its pointers lead to."""
+        return self._kept
+
     def _array(self, values: np.ndarray) -> int | None:
         self._kept.append(values)
         return at(values)

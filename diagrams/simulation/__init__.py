@@ -4,7 +4,7 @@ from .algebraic_loops import newton_options
 from .diagnosis import START_SETTLED
 from .engine import Engine
 from .held_inputs import note_held_inputs
-from .initialize import find_initial_state, values_from_left
+from .initialize import find_initial_state, find_start_values, initialize, values_from_left
 from .live_run import LiveRun
 from .progress import Interrupted, ProgressOption, late_progress, progress_bar, work_notes
 from .run_options import START_EXCHANGES, KeptKeywords, RunKeywords, RunOptions, default_step, refuse_rest, ticks_in
@@ -36,6 +36,8 @@ __all__ = [
     "copy_states",
     "default_step",
     "find_initial_state",
+    "find_start_values",
+    "initialize",
     "late_progress",
     "newton_options",
     "note_held_inputs",

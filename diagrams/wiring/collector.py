@@ -182,6 +182,8 @@ class Collector:
                 table.controls[path] = _resolve(inner.wires[inner.subsystem.control_input], paths)
             for output, result in inner.results.items():
                 table.results[path, output] = _resolve(result, paths)
+            for name, signal in inner.wires.items():
+                table.arguments[path, name] = _resolve(signal, paths)
 
     def _add_names(self, table: Structure, places: _Places, paths: dict[int, str]) -> None:
         """Add the sources of named wires; a name belongs to the place where it is used."""

@@ -89,6 +89,8 @@ class Structure:
         For an input, by (block path, input): the subsystems, each with its output, that only pass its signal through.
     results : dict
         The source of every output of a subsystem, by (the subsystem's path, output).
+    arguments : dict
+        The source of every input of a subsystem, by (the subsystem's path, input).
     """
 
     blocks: dict[str, Block] = field(default_factory=dict)
@@ -99,6 +101,7 @@ class Structure:
     controls: dict[str, Wire] = field(default_factory=dict)
     handed: dict[tuple[str, str], tuple[tuple[str, str], ...]] = field(default_factory=dict)
     results: dict[tuple[str, str], Wire] = field(default_factory=dict)
+    arguments: dict[tuple[str, str], Wire] = field(default_factory=dict)
 
     def copy(self) -> Structure:
         """Return a structure with its own dictionaries."""

@@ -1,8 +1,10 @@
 """Export of a block as an FMU: equations, C code, model description, binaries."""
 
 from .compiler import compile_shared, describe_compiler
-from .from_block import build, model_spec
+from .from_block import build, model_spec, parameter_variable
 from .inlined import inline_model, own_functions
+from .loop_memory import Field, LoopMemory, c_number
+from .loop_spec import LoopSpec, Placed, write_unit
 from .model import Integrator, ModelSpec, Variable
 from .package import build_fmu, clear_cache
 from .python_fmu import build_python
@@ -10,13 +12,18 @@ from .tuning import describe_processor, processor_flags, tune
 from .written_equations import WrittenEquations, read_equations
 
 __all__ = [
+    "Field",
     "Integrator",
+    "LoopMemory",
+    "LoopSpec",
     "ModelSpec",
+    "Placed",
     "Variable",
     "WrittenEquations",
     "build",
     "build_fmu",
     "build_python",
+    "c_number",
     "clear_cache",
     "compile_shared",
     "describe_compiler",
@@ -24,7 +31,9 @@ __all__ = [
     "inline_model",
     "model_spec",
     "own_functions",
+    "parameter_variable",
     "processor_flags",
     "read_equations",
     "tune",
+    "write_unit",
 ]

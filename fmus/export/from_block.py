@@ -71,7 +71,7 @@ def _model_spec(block: Block, name: str, **experiment: Any) -> ModelSpec:
             for n, port in block.inputs.items()
         ),
         outputs=tuple(_variable(block.outputs[n], "output", shape=traced.outputs[n]) for n in computed),
-        parameters=tuple(_parameter(block, n, v) for n, v in traced_parameters(block)),
+        parameters=tuple(parameter_variable(block, n, v) for n, v in traced_parameters(block)),
         states=tuple(_state(block, n, traced.states[n], shapes) for n in equations.order),
         derivative=equations.derivative(),
         output=equations.output(computed),
@@ -249,7 +249,8 @@ def _variable(port: Port, causality: Any, **more: Any) -> Variable:
     return Variable(name=port.name, causality=causality, unit=unit, description=port.description, **limits, **more)
 
 
-def _parameter(block: Block, name: str, value: Any) -> Variable:
+def parameter_variable(block: Block, name: str, value: Any, full: str | None = None) -> Variable:
+    """Return a parameter of a block as a variable, under another name if one is given."""
     owner: Any = block
     *outer, last = name.split(".")
     for part in outer:
@@ -257,7 +258,7 @@ def _parameter(block: Block, name: str, value: Any) -> Variable:
     spec: ParameterSpec = type(owner).parameter_specs[last]
     above = spec.above if spec.above is None else float(np.nextafter(spec.above, np.inf)) if spec.above else _TINY
     return Variable(
-        name=name,
+        name=full or name,
         causality="parameter",
         variability="tunable" if spec.tunable else "fixed",
         shape=np.shape(value),

@@ -12,10 +12,12 @@
 #include <stdint.h>
 #include <string.h>
 
+#ifndef VISIBLE /* of functions that are found in the library; static where nothing outside of the unit calls them */
 #ifdef _WIN32
 #define VISIBLE __declspec(dllexport)
 #else
 #define VISIBLE __attribute__((visibility("default")))
+#endif
 #endif
 
 #include "linear.c"

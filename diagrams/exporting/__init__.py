@@ -1,0 +1,6 @@
+"""Diagrams as they leave: a diagram or a subsystem as a plain value, of which FMUs, C and web pages are made."""
+
+from .loop_of_diagram import loop_spec
+from .open_diagram import OpenDiagram, choose_outputs, open_part, open_subsystem, open_whole
+
+__all__ = ["OpenDiagram", "choose_outputs", "loop_spec", "open_part", "open_subsystem", "open_whole"]

@@ -1,0 +1,33 @@
+"""What of a diagram can't be exported: each is named by its path, with one next step."""
+
+from __future__ import annotations
+
+from ...blocks.core import DefinitionError
+from .open_diagram import OpenDiagram
+
+
+def refuse(opened: OpenDiagram) -> None:
+    """Refuse a diagram with parts that can't be exported.
+
+    Raises
+    ------
+    DefinitionError
+        For the first one.
+    """
+    table = opened.wired.scheduled
+    for path, block in table.blocks.items():
+        if path == opened.outside:
+            continue
+        shown = opened.shown(path)
+        if block.evaluated_outside or (block.stepped and not block.transport):
+            raise DefinitionError(
+                "it is an FMU, which is not exported with the diagram. Export the subsystem around it, and couple the "
+                "two where the exported one is used.",
+                block=shown,
+            )
+        if block.opaque:
+            raise DefinitionError(
+                "Python evaluates it, and nothing exported has Python inside. Write its equations with NumPy functions "
+                "that can be traced, or export the part of the diagram without it.",
+                block=shown,
+            )

@@ -1,0 +1,238 @@
+"""Diagrams with inputs and outputs: what is exported of a diagram, with everything around it as one block."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import UnknownNameError, near
+from ..flat import WiredDiagram
+from ..wiring import Collector, Structure, Subsystem, Wire, find_path, join
+from .outside import Outside
+from .start import find_start
+
+_OUTSIDE = "outside"
+
+
+@dataclass(frozen=True, eq=False)
+class OpenDiagram:
+    """A diagram with inputs and outputs.
+
+    Attributes
+    ----------
+    wired : WiredDiagram
+        Its blocks and wires; the inputs are outputs of a block that nothing steps.
+    outside : str
+        Path of that block; empty without inputs.
+    outputs : mapping of str to Wire
+        The outputs: by name, where their values come from, in the diagram as it was wired.
+    inside : str
+        Path of the subsystem that it is a part of; names are shown from there on.
+    states : mapping of str to ndarray
+        States of blocks at the start, flat, by path, as the diagram around it finds them.
+    """
+
+    wired: WiredDiagram
+    outside: str
+    outputs: Mapping[str, Wire]
+    inside: str = ""
+    states: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def shown(self, path: str) -> str:
+        """Return a path as it is shown."""
+        return path.removeprefix(f"{self.inside}.") if self.inside else path
+
+    @property
+    def starts(self) -> np.ndarray:
+        """Start values of the inputs, in their order in w."""
+        if not self.outside:
+            return np.zeros(0)
+        block = self.wired.blocks[self.outside]
+        assert isinstance(block, Outside)
+        return np.concatenate([block.start_of(name) for name in block.outputs])
+
+
+def open_subsystem(subsystem: Subsystem, facade_class: type[Any], name: str) -> OpenDiagram:
+    """Return a subsystem with its arguments as inputs; shapes and units are those that its blocks declare.
+
+    Raises
+    ------
+    WiringError, TraceError
+        As for a diagram of it.
+    """
+    names = [p.name for p in subsystem.parameters]
+    if subsystem.control_input and subsystem.control_input not in names:
+        names.append(subsystem.control_input)
+    guessed = Outside([(n, (), None, "", 0.0) for n in names], name=_OUTSIDE)
+    table = _wire(subsystem, guessed, names)
+    ports = [_declared(table, n) for n in names]
+    table = _wire(subsystem, Outside(ports, name=_OUTSIDE), names)
+    path = next(p for p in table.subsystems if p and "." not in p)
+    wired = WiredDiagram(name, table, "error", facade_class)
+    outputs = {output: wired.scheduled.results[p, output] for p, output in table.results if p == path}
+    return OpenDiagram(wired, _OUTSIDE if names else "", outputs, path)
+
+
+def _wire(subsystem: Subsystem, outside: Outside, names: list[str]) -> Structure:
+    return Collector([subsystem(**{n: getattr(outside, n) for n in names})]).structure()
+
+
+def _declared(table: Structure, name: str) -> tuple[str, tuple[int, ...], str | None, str, float]:
+    """Return an input with the shape and the unit that the blocks declare that read it."""
+    shape: tuple[int, ...] = ()
+    unit, description = None, ""
+    for (path, port), wire in table.wires.items():
+        if (wire.block, wire.port) != (_OUTSIDE, name):
+            continue
+        declared = table.blocks[path].inputs[port]
+        if wire.index is None and declared.shape:
+            shape = declared.shape
+        if wire.index is None and isinstance(declared.unit, str):
+            unit = declared.unit
+        description = description or declared.description
+    return name, shape, unit, description, 0.0
+
+
+def open_part(wired: WiredDiagram, path: str, name: str) -> OpenDiagram:
+    """Return a subsystem of a diagram with whatever it reads from around it as inputs.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such subsystem.
+    """
+    table = wired.structure
+    found = find_path(path, {p: p for p in table.subsystems if p}, "subsystem", wired.name)
+    inside = {p for p in table.blocks if p.startswith(f"{found}.")}
+    start = find_start(wired)
+    ports: dict[tuple[str, str, Any], tuple[Any, ...]] = {}
+    taken: set[str] = set()
+
+    def enter(wire: Wire) -> Wire:
+        if wire.block in inside:
+            return wire
+        argument = next(
+            (n for (p, n), w in table.arguments.items() if p == found and w in (wire, replace(wire, index=None))), None
+        )
+        whole = argument is not None and table.arguments[found, argument].index is None
+        index = None if argument is None or whole else wire.index
+        key = (wire.block, wire.port, index)
+        if key not in ports:
+            base = label = argument or f"{wire.block}_{wire.port}".replace(".", "_")
+            count = 2
+            while label in taken:
+                label, count = f"{base}_{count}", count + 1
+            taken.add(label)
+            shape = wired.checked.shapes[wire.block, wire.port]
+            shape = shape if index is None else np.empty(shape)[index].shape
+            unit = wired.checked.units.get((wire.block, wire.port))
+            unit = unit if index is None or not isinstance(unit, tuple) else unit[index]
+            description = table.blocks[wire.block].outputs[wire.port].description
+            value = start.signal(wire.block, wire.port)
+            ports[key] = (label, shape, unit, description, value if index is None else value[index])
+        return Wire(_OUTSIDE, ports[key][0], wire.index if index is None else None)
+
+    part = table.copy()
+    around = [f.path for f in table.subsystems_around(found)]
+    part.subsystems = {p: s for p, s in table.subsystems.items() if not p or p in around or p.startswith(f"{found}.")}
+    part.blocks = {p: table.blocks[p] for p in table.blocks if p in inside}
+    part.subsystem_of = {p: table.subsystem_of[p] for p in part.blocks}
+    part.wires = {(p, q): enter(w) for (p, q), w in table.wires.items() if p in inside}
+    part.controls = {p: enter(w) for p, w in table.controls.items() if p in part.subsystems}
+    part.names = {n: w for n, w in table.names.items() if w.block in inside}
+    part.handed = {
+        key: tuple(one for one in passed if one[0] in part.subsystems)
+        for key, passed in table.handed.items()
+        if key[0] in inside
+    }
+    part.results = {
+        key: enter(w) for key, w in table.results.items() if key[0] == found or key[0].startswith(f"{found}.")
+    }
+    part.arguments = {}
+    if ports:
+        part.blocks[_OUTSIDE] = Outside(tuple(ports.values()), name=_OUTSIDE)
+        part.subsystem_of[_OUTSIDE] = ""
+    opened = WiredDiagram(name, part, wired.loops, wired.facade_class)
+    outputs = {output: opened.scheduled.results[p, output] for p, output in part.results if p == found}
+    return OpenDiagram(opened, _OUTSIDE if ports else "", outputs, found, start.states)
+
+
+def open_whole(wired: WiredDiagram, outside: Sequence[str], name: str) -> OpenDiagram:
+    """Return a diagram without some of its blocks, such as the plant or a source, whose place is outside.
+
+    What they put out are its inputs, and what they read its outputs; if they read nothing, the named wires are.
+
+    Parameters
+    ----------
+    outside : sequence of str
+        Paths of the blocks.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such block.
+    """
+    table = wired.structure.copy()
+    ports: list[tuple[Any, ...]] = []
+    moved: dict[tuple[str, str], str] = {}
+    read: dict[str, Wire] = {}
+    paths = [find_path(given, table.blocks, "block", wired.name) for given in outside]
+    start = find_start(wired)
+
+    def label(path: str, port: str, taken: Collection[str], *, alone: bool) -> str:
+        """Return the name of a port: its own, or where that is taken with its block's in front."""
+        own, full = port.replace(".", "_"), f"{path}_{port}".replace(".", "_")
+        return path.replace(".", "_") if alone else own if own not in taken and len(paths) == 1 else full
+
+    for path in paths:
+        block = table.blocks.pop(path)
+        del table.subsystem_of[path]
+        for port, declared in block.outputs.items():
+            unit = wired.checked.units.get((path, port))
+            key = label(path, port, [p[0] for p in ports], alone=len(block.outputs) == 1 and not block.inputs)
+            ports.append((key, wired.checked.shapes[path, port], unit, declared.description, start.signal(path, port)))
+            moved[path, port] = key
+        for port in block.inputs:
+            if (wire := table.wires.pop((path, port), None)) is not None:
+                read[label(path, port, read, alone=False)] = wire
+            table.handed.pop((path, port), None)
+
+    def move(wire: Wire) -> Wire:
+        key = moved.get((wire.block, wire.port))
+        return wire if key is None else Wire(_OUTSIDE, key, wire.index)
+
+    table.wires = {key: move(wire) for key, wire in table.wires.items()}
+    table.controls = {key: move(wire) for key, wire in table.controls.items()}
+    table.results = {key: move(wire) for key, wire in table.results.items()}
+    table.names = {key: move(wire) for key, wire in table.names.items()}
+    table.results |= {("", key): move(wire) for key, wire in read.items()}
+    table.arguments = {}
+    if ports:
+        table.blocks[_OUTSIDE] = Outside(tuple(ports), name=_OUTSIDE)
+        table.subsystem_of[_OUTSIDE] = ""
+    opened = WiredDiagram(name, table, wired.loops, wired.facade_class)
+    scheduled = opened.scheduled
+    outputs = {key: scheduled.results["", key] for key in read} or dict(scheduled.names)
+    outputs = {n: w for n, w in outputs.items() if w.block != _OUTSIDE}
+    return OpenDiagram(opened, _OUTSIDE if ports else "", outputs, states=start.states)
+
+
+def choose_outputs(opened: OpenDiagram, outputs: tuple[str, ...] | None) -> OpenDiagram:
+    """Return a diagram with some outputs: named wires, or outputs of blocks by their paths."""
+    if outputs is None:
+        return opened
+    chosen: dict[str, Wire] = {}
+    wired = opened.wired
+    known = {
+        **{opened.shown(join(p, q)): Wire(p, q) for p, q in wired.checked.shapes if p != opened.outside},
+        **{opened.shown(n): w for n, w in wired.scheduled.names.items()},
+        **opened.outputs,
+    }
+    for name in outputs:
+        if name not in known:
+            raise UnknownNameError(f"there is no signal {name!r} in it. {near(name, known)}", block=wired.name)
+        chosen[name] = known[name]
+    return replace(opened, outputs=chosen)

@@ -1,0 +1,50 @@
+"""The start of a diagram of which a part is exported: signals and states at t = 0, with the plants of its runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..flat import FlatDiagram, WiredDiagram
+from ..simulation import RunOptions, Simulation
+from ..wiring import join
+
+
+@dataclass(frozen=True, eq=False)
+class DiagramStart:
+    """Signals and states of a diagram at t = 0.
+
+    Attributes
+    ----------
+    flat : FlatDiagram
+        The diagram.
+    log : ndarray
+        All outputs.
+    states : mapping of str to ndarray
+        States of blocks, flat, by path.
+    """
+
+    flat: FlatDiagram
+    log: np.ndarray
+    states: Mapping[str, np.ndarray]
+
+    def signal(self, path: str, port: str) -> np.ndarray:
+        """Return an output of a block."""
+        full = join(path, port)
+        return np.array(self.log[self.flat.log.slices[full]].reshape(self.flat.log.shapes[full]))
+
+
+def find_start(wired: WiredDiagram) -> DiagramStart:
+    """Begin a run of a diagram, and return its start.
+
+    Raises
+    ------
+    LoopwrightError
+        As a run does.
+    """
+    with Simulation(wired, RunOptions()) as simulation:
+        flat, view = simulation.flat, simulation.view
+        log, x = view.log.copy(), view.x.copy()
+    return DiagramStart(flat, log, {path: x[where] for path, where in flat.states.slices.items()})

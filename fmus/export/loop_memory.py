@@ -1,0 +1,111 @@
+"""The memory of an exported loop: every struct and vector that its C code reads or writes, as one C struct."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+_C_TYPES = {"float64": "double", "int64": "int64_t", "int32": "int32_t", "uint8": "uint8_t"}
+_LINE = 8  # values in a line of a table
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """A member of the memory: a struct, several of them, pointers, or a vector of numbers.
+
+    Attributes
+    ----------
+    name : str
+        Its name.
+    kind : str
+        C type of an entry.
+    length : int
+        Number of entries; 0 for a single one.
+    start : ndarray, optional
+        Start values of a vector.
+    """
+
+    name: str
+    kind: str
+    length: int = 0
+    start: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, name: str, vector: np.ndarray) -> Field:
+        """Return the member that holds a vector of numbers."""
+        return cls(name, _C_TYPES[vector.dtype.name], max(1, vector.size), vector.ravel().copy())
+
+    @property
+    def declaration(self) -> str:
+        """The member's declaration."""
+        return f"{self.kind} {self.name}{f'[{self.length}]' if self.length else ''};"
+
+
+@dataclass(frozen=True, eq=False)
+class LoopMemory:
+    """The memory of a loop: an instance is one block of it, and nothing else is allocated.
+
+    Attributes
+    ----------
+    fields : tuple of Field
+        The members of the struct ``lw_memory``.
+    numbers : tuple of (str, str)
+        Numbers in structs that are not 0 at the start: the member, and the number, as C text.
+    pointers : tuple of (str, str)
+        Pointers: the member, and what it points to; ``m`` is the memory.
+    """
+
+    fields: tuple[Field, ...]
+    numbers: tuple[tuple[str, str], ...]
+    pointers: tuple[tuple[str, str], ...]
+
+    def write(self) -> str:
+        """Return the C text: the struct ``lw_memory``, ``lw_fill``, which sets start values, and ``lw_bind``.
+
+        ``lw_bind`` sets the pointers. It has to be called again for a memory that was copied to another place.
+        """
+        return "\n".join([*self._declare(), *self._tables(), *self._fill(), *self._bind()]) + "\n"
+
+    def _declare(self) -> Iterator[str]:
+        yield "typedef struct {"
+        yield "    int64_t tick; /* the next one */"
+        yield "    double now;   /* time that has been reached, s */"
+        yield from (f"    {field.declaration}" for field in self.fields)
+        yield "} lw_memory;\n"
+
+    def _started(self) -> Iterator[tuple[Field, np.ndarray]]:
+        for field in self.fields:
+            if field.start is not None and field.start.any():
+                yield field, field.start
+
+    def _tables(self) -> Iterator[str]:
+        for field, start in self._started():
+            texts = [c_number(value) for value in start.tolist()]
+            lines = [", ".join(texts[i : i + _LINE]) for i in range(0, len(texts), _LINE)]
+            yield f"static const {field.kind} lw_start_{field.name}[] = {{\n    " + ",\n    ".join(lines) + "\n};"
+
+    def _fill(self) -> Iterator[str]:
+        yield "static void lw_fill(lw_memory *m) {"
+        yield "    memset(m, 0, sizeof *m);"
+        for field, _ in self._started():
+            yield f"    memcpy(m->{field.name}, lw_start_{field.name}, sizeof lw_start_{field.name});"
+        yield from (f"    m->{member} = {value};" for member, value in self.numbers)
+        yield "}\n"
+
+    def _bind(self) -> Iterator[str]:
+        yield "static void lw_bind(lw_memory *m) {"
+        yield from (f"    m->{member} = {target};" for member, target in self.pointers)
+        yield "}\n"
+
+
+def c_number(value: float) -> str:
+    """Return a number as C text, exactly."""
+    if isinstance(value, int):
+        return str(value)
+    if value != value:
+        return "NAN"
+    if value in (np.inf, -np.inf):
+        return "-INFINITY" if value < 0 else "INFINITY"
+    return repr(float(value))

@@ -1,0 +1,86 @@
+"""A diagram's loop as one C text with one block of memory: the numbers of a run, without Python and without a plant."""
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import PID, Step, TransferFunction
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams.exporting import loop_spec, open_part
+from support.exported_loops import Loop
+
+
+@subsystem(sample_time=1e-2)
+def controller(reference, level):
+    """PI with a filtered derivative."""
+    return PID(kp=2.0, ki=3.0, kd=0.1, filter_time=0.02, name="pid")(reference, level).named("effort")
+
+
+@pytest.fixture(scope="module")
+def diagram():
+    plant = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="plant")
+    return Diagram("level", plant(controller(Step(times=0.05, values=1.0, name="wanted"), plant.y)))
+
+
+@pytest.fixture(scope="module")
+def spec(diagram):
+    return loop_spec(open_part(diagram.wired, "controller", "pi"), name="pi", description="")
+
+
+def replay(loop, run, steps, names, output):
+    """Give the inputs of a run's samples to an exported loop; return its output after each."""
+    assert loop.start()
+    found = []
+    for k in range(steps):
+        for name, signal in names.items():
+            loop[name] = run[signal][k]
+        assert loop.advance(run.t[k + 1])
+        found.append(loop[output])
+    return np.array(found)
+
+
+def test_an_exported_controller_has_the_bits_of_the_run(diagram, spec):
+    run = diagram.simulate(1.0, progress=False)
+    signals = {"reference": "wanted.y", "level": "plant.y"}
+    assert {one.variable.name for one in spec.inputs} == {"reference", "level"}
+    assert [one.variable.name for one in spec.outputs] == ["effort"]
+    found = replay(Loop(spec), run, 100, signals, "effort")
+    np.testing.assert_array_equal(found, run["effort"][:100])
+    assert np.ptp(found) > 1.0
+
+
+def test_the_memory_is_all_there_is_of_an_instance(diagram, spec):
+    run = diagram.simulate(1.0, progress=False)
+    signals = {"reference": "wanted.y", "level": "plant.y"}
+    one, other = Loop(spec), Loop(spec)
+    replay(one, run, 50, signals, "effort")
+    other.memory[:] = one.memory[:]  # of another instance, elsewhere: all pointers lead to the first one
+    other.bind()
+    one.memory[:] = b"\xff" * len(one.memory)
+    for k in range(50, 100):
+        other["reference"], other["level"] = run["wanted.y"][k], run["plant.y"][k]
+        assert other.advance(run.t[k + 1])
+        assert other["effort"] == run["effort"][k]
+
+
+def test_a_communication_step_may_span_ticks_and_lie_between_them(spec):
+    """The inputs of a step are held over it; a tick acts at its start, and not at its end."""
+    fine, coarse = Loop(spec), Loop(spec)
+    for loop in (fine, coarse):
+        assert loop.start()
+        loop["reference"] = 1.0
+    for k in range(1, 41):
+        assert fine.advance(k * 2.5e-3)
+    assert coarse.advance(0.1)
+    assert fine["effort"] == coarse["effort"]
+    # by hand: P + D + I with T_f = 0.02 s, T = 0.01 s, ten ticks, of which the last one has seen nine integrations
+    assert coarse["effort"] == pytest.approx(2.0 + 3.0 * 9 * 0.01, rel=1e-14)
+
+
+def test_a_value_that_is_not_finite_stops_it_before_the_tick(spec):
+    loop = Loop(spec)
+    assert loop.start()
+    loop["level"] = np.nan
+    assert not loop.advance(0.01)
+    loop["level"] = 0.0
+    assert loop.advance(0.01)
+    assert np.isfinite(loop["effort"])
