@@ -126,39 +126,41 @@ def test_what_rounding_decides_is_refused():
 # --- random diagrams ---------------------------------------------------------------------------------------------------
 
 
-def check(family, seeds, compiled):
-    """Hold the random diagrams with these numbers against the reference loop."""
-    told, compared = [], 0
-    for seed in seeds:
+def check(family, first, count, compiled):
+    """Hold `count` random diagrams, those with the next numbers that rounding does not decide, against the reference loop."""
+    seeds = iter(range(first, first + 2 * count + 1))
+    wrong, compared = [], 0
+    while compared < count:
+        seed = next(seeds, None)
+        assert seed is not None, f"only {compared} of {2 * count + 1} diagrams are well conditioned"
         case = make_if_possible(family, seed)
         expected = None if case is None else reference(case)
         if expected is not None:
             compared += 1
             found = run(case, compiled=compiled)
-            told += [f"{case.diagram.name}: {text}" for text in differences(case, expected, found)]
-    assert not told, "\n".join(told)
-    assert compared > 0.7 * len(seeds), f"only {compared} of {len(seeds)} diagrams are well conditioned"
+            wrong += [f"{case.diagram.name}: {text}" for text in differences(case, expected, found)]
+    assert not wrong, "\n".join(wrong)
 
 
 @pytest.mark.drawn(3)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_random_diagrams_are_what_the_reference_loop_says(family):
-    check(family, range(1000, 1003), "auto")
+    check(family, 1000, 3, "auto")
 
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_compiled_random_diagrams_are_what_the_reference_loop_says(family):
-    check(family, range(1005, 1006), True)
+    check(family, 1005, 1, True)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(5))
 @pytest.mark.parametrize("family", FAMILIES)
 def test_many_random_diagrams_are_what_the_reference_loop_says(family, part):
-    check(family, range(15 * part, 15 * part + 15), "auto")
+    check(family, 15 * part, 9, "auto")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
 def test_many_compiled_random_diagrams_are_what_the_reference_loop_says(family):
-    check(family, range(20), True)
+    check(family, 0, 16, True)
