@@ -30,6 +30,7 @@ from .simulation import KeptKeywords, ProgressOption, RunKeywords, RunOptions, S
 from .wiring import Collector, Structure, SubsystemSettings, Wire, sheet_of_structure
 
 if TYPE_CHECKING:
+    from ..fmus import ArchiveLimits
     from .contact import Contact
     from .drawing import Drawing, Facts
     from .linearization import Linearization
@@ -105,6 +106,51 @@ class Diagram(ShownAsTable):
         if not roots:
             raise WiringError("a diagram needs at least one call, such as plant(motor_force=u).", block=name)
         self._hold(WiredDiagram(check_name(name), Collector(roots).structure(), loops, type(self)))
+
+    @classmethod
+    def from_ssp(
+        cls,
+        file: str | os.PathLike[str],
+        variant: str | None = None,
+        *,
+        inputs: Mapping[str, Any] | None = None,
+        limits: ArchiveLimits | None = None,
+        loops: str = "error",
+    ) -> Self:
+        """Return the diagram of an SSP (System Structure and Parameterization 1.0 or 2.0); see docs/howto/ssp.md.
+
+        Its components are FMUs, its systems subsystems, of the same names; inputs of the root system are constants,
+        which `replace` takes other sources for, and its outputs are named wires. Conversions of units and linear
+        transformations become blocks, and parameter sets the FMUs' start values.
+
+        Parameters
+        ----------
+        file : path
+            The ``.ssp``, or a ``.ssd`` with its files next to it. An archive is unpacked into the cache.
+        variant : str, optional
+            File name of the description in it, or its name; ``SystemStructure.ssd`` without it.
+        inputs : mapping, optional
+            Values of inputs of the root system, by name and in their units; by default those of the parameter sets,
+            else the start values of what they drive.
+        limits : ArchiveLimits, optional
+            Limits of the file, and of each FMU in it.
+        loops : {"error", "solve"}
+            Treatment of algebraic loops.
+
+        Raises
+        ------
+        SspFileError
+            If the file is no SSP, is unsafe, breaks the standard, or has something that can't become a diagram: the
+            message names the element.
+        FmuFileError
+            If an FMU in it can't be used here.
+        WiringError
+            One of its kinds, for connections that don't fit.
+        """
+        from .ssp import read_structure
+
+        name, structure = read_structure(file, variant, inputs, limits)
+        return cls._of(name, structure, loops)
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()

@@ -24,6 +24,7 @@
     │       └── FmuProcessError           the process of an isolated FMU ended, or had to be ended
     ├── FmuError (RuntimeError)           an FMU that can't be read, built or loaded
     │   ├── FmuFileError
+    │   │   └── SspFileError              a file that is no SSP, or one that can't become a diagram
     │   └── CompilerError
     ├── DiskError (OSError)               a file or folder that can't be used: permission, space, limits
     └── ConfirmationError (RuntimeError)  two independent computations of one number disagree
@@ -312,6 +313,10 @@ class FmuFileError(FmuError):
     ):
         super().__init__(message, block=block, port=port, t=t)
         self.fault, self.subject = fault, subject
+
+
+class SspFileError(FmuFileError):
+    """A file is no SSP, or one with something that can't become a diagram here; its attributes are those above."""
 
 
 class CompilerError(FmuError):

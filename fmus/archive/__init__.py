@@ -1,4 +1,4 @@
-"""FMU files: their archive and description, read, checked and unpacked."""
+"""FMU files: their archive and description, read, checked and unpacked; the archives of SSPs, too."""
 
 from .archive_limits import ArchiveLimits
 from .binaries import check_binary, find_binary, missing_functions
@@ -10,6 +10,7 @@ from .library import SharedLibrary, read_library
 from .model import read_model
 from .model_exchange import ModelExchangeInfo
 from .repair import repair
+from .unit_definitions import FmuUnits
 from .unpacking import unpack, unpack_archive, write_files
 from .variables import FmuVariable, OtherVariable, inexact
 from .xml_text import parse_xml
@@ -24,6 +25,7 @@ __all__ = [
     "FmuFault",
     "FmuFinding",
     "FmuSeverity",
+    "FmuUnits",
     "FmuVariable",
     "ModelExchangeInfo",
     "OtherVariable",

@@ -1,4 +1,4 @@
-"""Files in an FMU's archive: their names and sizes, checked before anything is unpacked."""
+"""Files in the archive of an FMU or an SSP: their names and sizes, checked before anything is unpacked."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _AGAIN = "Export it again, or ask its maker; don't unpack it with other programs
 
 
 def check_entries(
-    path: Path, items: Iterable[zipfile.ZipInfo], packed: int, limits: ArchiveLimits
+    path: Path, items: Iterable[zipfile.ZipInfo], packed: int, limits: ArchiveLimits, noun: str = "FMU"
 ) -> tuple[dict[str, zipfile.ZipInfo], list[FmuFinding]]:
     """Return an archive's files by their paths with forward slashes, and findings about them.
 
@@ -38,6 +38,8 @@ def check_entries(
         Size of the archive in bytes.
     limits : ArchiveLimits
         Limits of its content.
+    noun : str
+        What the archive is, for messages: "FMU" or "SSP".
 
     Raises
     ------
@@ -56,7 +58,7 @@ def check_entries(
     findings: list[FmuFinding] = []
     backslashes: list[str] = []
     for item in items:
-        name = _check_name(path, item.orig_filename)
+        name = _check_name(path, item.orig_filename, noun)
         if "\\" in item.orig_filename:
             backslashes.append(item.orig_filename)
         _check_kind(path, name, item)
@@ -72,8 +74,8 @@ def check_entries(
                 FmuFault.BACKSLASH,
                 backslashes[0],
                 f"{len(backslashes)} of {len(items)} paths in the archive have backslashes, such as "
-                f"{backslashes[0]!r}; expected slashes. They are taken for slashes here; other tools refuse the FMU or "
-                "write files with wrong names.",
+                f"{backslashes[0]!r}; expected slashes. They are taken for slashes here; other tools refuse the "
+                f"{noun} or write files with wrong names.",
                 "Report it to its maker, or pack it again.",
             )
         )
@@ -113,14 +115,14 @@ def _check_sizes(path: Path, items: list[zipfile.ZipInfo], packed: int, limits: 
         )
 
 
-def _check_name(path: Path, given: str) -> str:
+def _check_name(path: Path, given: str, noun: str) -> str:
     """Return the path of a file in the archive with forward slashes, without empty parts and dots."""
     name = given.replace("\\", "/")
     parts = [part for part in name.split("/") if part not in ("", ".")]
     if name.startswith("/") or _DRIVE.match(name) or ".." in parts:
         raise FmuFileError(
-            f"{str(path)!r} holds a file {given!r}, which points out of the FMU's folder; expected a path within it. "
-            f"It may be made to overwrite your files. {_AGAIN}",
+            f"{str(path)!r} holds a file {given!r}, which points out of the {noun}'s folder; expected a path within "
+            f"it. It may be made to overwrite your files. {_AGAIN}",
             fault=FmuFault.UNSAFE_PATH,
             subject=given,
         )

@@ -1,4 +1,4 @@
-"""Unpacking of an FMU into the cache, once for each content."""
+"""Unpacking of an FMU or an SSP into the cache, once for each content."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def unpack_archive(archive: FmuArchive, folder: Path) -> None:
         If a file in the archive is damaged.
     """
     check_cache()
-    with explain_cache_errors(f"the FMU {str(archive.path)!r} can't be unpacked"):
+    with explain_cache_errors(f"the {archive.noun} {str(archive.path)!r} can't be unpacked"):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with folder_in(folder.parent, "tmp") as fresh:
             write_files(archive, fresh)
@@ -90,7 +90,8 @@ def write_files(archive: FmuArchive, folder: Path, names: Iterable[str] | None =
         target = root.joinpath(*name.split("/"))
         if not target.resolve().is_relative_to(root):  # the names were checked; this holds on any system
             raise FmuFileError(
-                f"{str(archive.path)!r} holds a file {name!r}, which points out of the FMU's folder. Don't unpack it.",
+                f"{str(archive.path)!r} holds a file {name!r}, which points out of the {archive.noun}'s folder. Don't "
+                "unpack it.",
                 fault=FmuFault.UNSAFE_PATH,
                 subject=name,
             )

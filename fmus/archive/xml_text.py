@@ -1,4 +1,4 @@
-"""XML of an FMU, parsed without expanding or fetching anything."""
+"""XML of an FMU or an SSP, parsed without expanding or fetching anything."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from ...blocks.core import FmuFileError
 from .faults import FmuFault
 
 
-def parse_xml(path: Path, name: str, text: bytes) -> Any:
-    """Return the root element of an XML file of an FMU, as lxml has it, without comments.
+def parse_xml(path: Path, name: str, text: bytes, noun: str = "FMU") -> Any:
+    """Return the root element of an XML file of an FMU or an SSP, as lxml has it, without comments.
 
     Entities are refused, since no tool writes any: an entity can hold others many times over, or another file. The
     parser has its own limits: for the depth of elements, and for the size of one text.
@@ -18,11 +18,13 @@ def parse_xml(path: Path, name: str, text: bytes) -> Any:
     Parameters
     ----------
     path : Path
-        The FMU, for messages.
+        The FMU or SSP, for messages.
     name : str
         The file's path in the archive.
     text : bytes
         Its content.
+    noun : str
+        What it is part of, for messages: "FMU" or "SSP".
 
     Raises
     ------
@@ -41,7 +43,7 @@ def parse_xml(path: Path, name: str, text: bytes) -> Any:
         raise FmuFileError(
             f"the {name} of {str(path)!r} "
             + ("defines XML entities, which may be made to fill the memory" if bomb else "is no XML")
-            + f": {error.msg}. Export the FMU again.",
+            + f": {error.msg}. Export the {noun} again.",
             fault=FmuFault.ENTITY if bomb else FmuFault.XML,
             subject=name,
         ) from None
@@ -50,14 +52,14 @@ def parse_xml(path: Path, name: str, text: bytes) -> Any:
     if entity is not None:
         raise FmuFileError(
             f"the {name} of {str(path)!r} defines the XML entity {entity!r}; expected none. Entities may be made to "
-            "read your files or to fill the memory. Export the FMU again, or ask its maker.",
+            f"read your files or to fill the memory. Export the {noun} again, or ask its maker.",
             fault=FmuFault.ENTITY,
             subject=name,
         )
     if kinds is not None and (kinds.system_url or kinds.external_id):
         raise FmuFileError(
-            f"the {name} of {str(path)!r} refers to another file, {kinds.system_url!r}; expected none. Export the FMU "
-            "again, or ask its maker.",
+            f"the {name} of {str(path)!r} refers to another file, {kinds.system_url!r}; expected none. Export the "
+            f"{noun} again, or ask its maker.",
             fault=FmuFault.ENTITY,
             subject=name,
         )

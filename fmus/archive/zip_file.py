@@ -1,4 +1,4 @@
-"""Archive of an FMU, opened and read with all checks."""
+"""Archive of an FMU or an SSP, opened and read with all checks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _END = struct.Struct("<4s4H2LH")
 
 @dataclass(frozen=True, eq=False)
 class FmuArchive:
-    """Archive of an FMU: the table of contents is checked, files are read within the limits.
+    """Archive of an FMU, or of an SSP: the table of contents is checked, files are read within the limits.
 
     The file is read once, so that a file that changes meanwhile can't pass for the one that was checked.
 
@@ -48,6 +48,8 @@ class FmuArchive:
         SHA-256 of the file.
     size : int
         Size of the file in bytes.
+    noun : str
+        What the file is expected to be, for messages: "FMU" or "SSP".
     """
 
     path: Path
@@ -57,9 +59,12 @@ class FmuArchive:
     digest: str
     size: int
     _zip: zipfile.ZipFile = field(repr=False)
+    noun: str = "FMU"
 
     @classmethod
-    def open(cls, file: str | os.PathLike[str], limits: ArchiveLimits | None = None) -> FmuArchive:
+    def open(
+        cls, file: str | os.PathLike[str], limits: ArchiveLimits | None = None, *, noun: str = "FMU"
+    ) -> FmuArchive:
         """Open an archive and check its table of contents.
 
         Raises
@@ -68,10 +73,10 @@ class FmuArchive:
             If the file is missing or no zip archive, or is refused by `check_entries`.
         """
         path, limits = Path(file).expanduser(), limits or ArchiveLimits()
-        with _reading(path):
+        with _reading(path, noun):
             if not path.is_file():
                 found = f"{str(path)!r} is a folder" if path.is_dir() else f"there is no file {str(path)!r}"
-                raise FmuFileError(f"{found}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
+                raise FmuFileError(f"{found}; expected an {noun}. Check the path.", fault=FmuFault.NO_FILE)
             if path.stat().st_size > limits.size:
                 raise FmuFileError(
                     f"{str(path)!r} has {path.stat().st_size:.3g} bytes; expected at most {limits.size:.3g}. If you "
@@ -79,10 +84,10 @@ class FmuArchive:
                     fault=FmuFault.TOO_LARGE,
                 )
             data = path.read_bytes()
-            _check_end(path, data, limits)
+            _check_end(path, data, limits, noun)
             content = zipfile.ZipFile(io.BytesIO(data))
-            files, findings = check_entries(path, content.infolist(), len(data), limits)
-        return cls(path, limits, files, tuple(findings), hashlib.sha256(data).hexdigest(), len(data), content)
+            files, findings = check_entries(path, content.infolist(), len(data), limits, noun)
+        return cls(path, limits, files, tuple(findings), hashlib.sha256(data).hexdigest(), len(data), content, noun)
 
     def read(self, name: str, most: int | None = None) -> bytes:
         """Return the content of a file.
@@ -116,7 +121,7 @@ class FmuArchive:
                 subject=name,
             )
         left = item.file_size
-        with _reading(self.path), self._zip.open(item) as stream:
+        with _reading(self.path, self.noun), self._zip.open(item) as stream:
             while part := stream.read(_CHUNK):
                 left -= len(part)
                 if left < 0:
@@ -164,7 +169,7 @@ class FmuArchive:
 
 
 @contextmanager
-def _reading(path: Path) -> Iterator[None]:
+def _reading(path: Path, noun: str) -> Iterator[None]:
     """Turn every error of reading a zip archive into one of ours."""
     try:
         yield
@@ -172,8 +177,8 @@ def _reading(path: Path) -> Iterator[None]:
         raise
     except MemoryError:
         raise FmuFileError(
-            f"{str(path)!r} can't be read: its content does not fit into memory; expected an FMU of a few MB. Look at "
-            "the sizes of the files in it, or export it again.",
+            f"{str(path)!r} can't be read: its content does not fit into memory; expected an {noun} of a few MB. Look "
+            "at the sizes of the files in it, or export it again.",
             fault=FmuFault.TOO_LARGE,
         ) from None
     except OSError as error:
@@ -182,26 +187,26 @@ def _reading(path: Path) -> Iterator[None]:
         ) from error
     except Exception as error:  # zipfile raises many kinds of errors on damaged archives
         raise FmuFileError(
-            f"{str(path)!r} is no FMU: it is a damaged zip archive ({str(error) or type(error).__name__}). Copy it "
+            f"{str(path)!r} is no {noun}: it is a damaged zip archive ({str(error) or type(error).__name__}). Copy it "
             "again, or export it again.",
             fault=FmuFault.DAMAGED,
         ) from None
 
 
-def _check_end(path: Path, data: bytes, limits: ArchiveLimits) -> None:
+def _check_end(path: Path, data: bytes, limits: ArchiveLimits, noun: str) -> None:
     """Refuse a file without a table of contents, or with one that is far too long to be read."""
     at = data.rfind(b"PK\5\6", max(0, len(data) - 65557))
     if at < 0 or len(data) < at + _END.size:
         found = f"it starts with {data[:8]!r}" if data else "it is empty"
         cut = data.startswith(b"PK\3\4")
         kind = "a zip archive that is cut off: its table of contents is missing" if cut else f"no zip archive ({found})"
-        step = "Copy or download it again." if cut else "Give the .fmu that the tool exported."
+        step = "Copy or download it again." if cut else f"Give the .{noun.lower()} that the tool exported."
         if data.startswith(LFS_POINTER):
             kind, step = "a pointer of Git LFS in place of the file", "Get the file with 'git lfs pull'."
         elif data[:200].lstrip()[:9].lower() in (b"<!doctype", b"<html>", b"<html lan"):
             kind, step = "a web page", "Download the file itself, such as by the page's link to the raw file."
         raise FmuFileError(
-            f"{str(path)!r} is no FMU: it is {kind}. {step}", fault=FmuFault.DAMAGED if cut else FmuFault.NO_ARCHIVE
+            f"{str(path)!r} is no {noun}: it is {kind}. {step}", fault=FmuFault.DAMAGED if cut else FmuFault.NO_ARCHIVE
         )
     count, size = _END.unpack_from(data, at)[4:6]
     wide = data.rfind(b"PK\6\6", max(0, at - 10**6), at)
