@@ -16,6 +16,7 @@ from ..blocks.core import (
     SampleTimeError,
     ShapeError,
     SimulationError,
+    SspFileError,
     UnitError,
     UnknownNameError,
     UnwiredInputError,
@@ -48,6 +49,7 @@ from .report import Plot, Section, Table, analyse
 from .requirements import Requirements
 from .results import Run
 from .simulation import Interrupted
+from .ssp import read_ssp
 from .studies import confirm_sensitivity
 from .wiring import first_order_hold, subsystem
 
@@ -80,6 +82,7 @@ __all__ = [
     "Section",
     "ShapeError",
     "SimulationError",
+    "SspFileError",
     "Table",
     "UnitError",
     "UnknownNameError",
@@ -95,6 +98,7 @@ __all__ = [
     "growth_rate",
     "passivity",
     "poles",
+    "read_ssp",
     "rendered_admittance",
     "rendered_response",
     "rendered_system",

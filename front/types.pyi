@@ -36,6 +36,7 @@ from .diagrams.report import Report
 from .diagrams.requirements import Review, Verdict
 from .diagrams.results import Occurrence, OperatingPoint, RunState, Snapshot, Stopped, TextSignal
 from .diagrams.simulation import LiveRun, RunOptions, Simulation, SimulationView
+from .diagrams.ssp import SspDescription
 from .diagrams.studies import RunConfirmation, Sensitivities, Sensitivity, WorstCase
 from .diagrams.wiring import Bus, Subsystem, SubsystemSettings, Wire
 from .fmus.archive import FmuDescription, FmuFault, FmuFinding, FmuSeverity, FmuVariable
@@ -99,6 +100,7 @@ __all__ = [
     "Simulation",
     "SimulationView",
     "Snapshot",
+    "SspDescription",
     "StabilityLimit",
     "StabilityMap",
     "StepResponse",

@@ -219,9 +219,9 @@ PUBLIC = {
         AdmittanceLoop AlgebraicLoopError BetweenTicksError Channel CompilerError ConfirmationError Coupling
         DefinitionError Diagram DiskError DoubleDriveError DuplicateNameError Fig3Diagram FmuError FmuRuntimeError
         Interrupted NonFiniteError OptionError ParameterError PeriodicLoopError Plot Requirements Rig Run
-        SampleTimeError Section ShapeError SimulationError Table UnitError UnknownNameError UnwiredInputError
-        WiringError analyse check_block confirm_sensitivity crossing_frequency experiments fig3 first_order_hold growth_rate passivity
-        poles rendered_admittance rendered_response rendered_system rule_of_thumb stability_limit stability_map
+        SampleTimeError Section ShapeError SimulationError SspFileError Table UnitError UnknownNameError
+        UnwiredInputError WiringError analyse check_block confirm_sensitivity crossing_frequency experiments fig3 first_order_hold growth_rate passivity
+        poles read_ssp rendered_admittance rendered_response rendered_system rule_of_thumb stability_limit stability_map
         stiffness_limits subsystem target_admittance
     """,
     "loopwright.frequency": """
@@ -240,7 +240,7 @@ PUBLIC = {
         FmuFinding FmuInstance FmuLinearization FmuSeverity FmuState FmuTrial FmuVariable FmuVerdict Frame FreeMotion
         FreeMotions FrequencyResponse InexactDerivatives Kink Layout LinearDelays Linearization LiveRun MeanSlope Occurrence
         OperatingPoint Passivity PassivityReason PortPassivity RefutedDerivatives Report Review RunConfirmation
-        RunOptions RunState Sensitivities Sensitivity Signal Simulation SimulationView Snapshot StabilityLimit
+        RunOptions RunState Sensitivities Sensitivity Signal Simulation SimulationView Snapshot SspDescription StabilityLimit
         StabilityMap StepResponse StepsOnly Stopped Subsystem SubsystemSettings TextSignal TrialMethod Unit Verdict Wire
         WorstCase ZeroSlope
     """,
