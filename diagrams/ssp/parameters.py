@@ -53,6 +53,7 @@ class Given:
 
     def _read(self, items: Mapping[str, int]) -> Any:
         value = self.value
+        words: list[float]
         try:
             if value.type == "String":
                 return value.text
