@@ -13,7 +13,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, an
 
 import pytest
 
-from support.disturbed import NUMBERS
+from support.disturbed import IN_QUICK
 from support.drawn import draw, identify
 
 WORKER = os.environ.get("PYTEST_XDIST_WORKER", "")
@@ -61,11 +61,11 @@ def as_asked(request):
     """Do what the options ask of each test, and close the figures that it has shown, which pyplot keeps.
 
     This is one fixture, as it runs for every test: four took a millisecond. ``--both-tiers``, or the mark: every run is
-    compiled as well. ``--disturbed``: linear algebra is disturbed in all tests by that seed, else in those of numbers
-    by seed 1. ``--grouped``: every diagram is taken for a large one.
+    compiled as well. ``--disturbed``: linear algebra is disturbed in all tests by that seed, else in most of those of
+    numbers by seed 1. ``--grouped``: every diagram is taken for a large one.
     """
     marks, asked = {mark.name for mark in request.node.iter_markers()}, request.config.option
-    seed = request.node.nodeid.startswith(NUMBERS) if asked.disturbed is None else asked.disturbed
+    seed = request.node.nodeid.startswith(IN_QUICK) if asked.disturbed is None else asked.disturbed
     with ExitStack() as during:
         if (asked.both_tiers or "both_tiers" in marks) and "one_tier" not in marks:
             from support import tiers

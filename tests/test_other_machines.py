@@ -1,6 +1,6 @@
 """Numbers do not depend on the machine: the tests of numbers again, with linear algebra disturbed by other seeds.
 
-The quick set disturbs them with seed 1, see `support.disturbed`.
+The quick set disturbs most of them with seed 1, see `support.disturbed`.
 """
 
 import os
@@ -18,7 +18,7 @@ ROOT = Path(__file__).parent.parent
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, *range(2, 21)])  # 0: as this machine computes
+@pytest.mark.parametrize("seed", [*range(21)])  # 0: as this machine computes
 def test_the_tests_of_numbers_pass(seed):
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST_", "LOOPWRIGHT_"))}
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=short"]

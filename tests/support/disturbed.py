@@ -44,6 +44,8 @@ NUMBERS = (
     "tests/diagrams/studies/",
 )
 """Tests whose numbers come out of linear algebra."""
+IN_QUICK = tuple(folder for folder in NUMBERS if folder != "tests/diagrams/report/")
+"""Those that the quick set disturbs: the numbers of reports are those of the other folders, and the long set disturbs all."""
 NUMPY = [
     "cholesky",
     "cond",

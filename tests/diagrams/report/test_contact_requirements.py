@@ -13,6 +13,8 @@ from loopwright.diagrams.requirements import ContactLimits, Reason, Verdict
 from loopwright.diagrams.studies import ContactTask
 from support.carts import DRAG, SHARE, TAU, M, cart_diagram
 
+pytestmark = pytest.mark.usefixtures("without_drawings")
+
 PORTS = {"position": "cart.position", "velocity": "cart.velocity", "force": "felt", "direction": [1.0]}
 SOFT = DRAG / (TAU * SHARE)
 B = 10.0
@@ -46,7 +48,7 @@ def review(contact, contacts=None, **asked):
     return analyse(made, only=(), contacts=contacts, requirements=Requirements(contact=contact, **asked))
 
 
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize(
     ("limit", "verdict", "distance"),
     [

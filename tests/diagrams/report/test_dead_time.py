@@ -9,6 +9,8 @@ from loopwright.blocks import PID, Gain, Step, TransferFunction, TransportDelay
 from loopwright.diagrams import Diagram, Requirements, subsystem
 from loopwright.diagrams.requirements import Reason, Verdict, explain
 
+pytestmark = pytest.mark.usefixtures("without_drawings")
+
 
 def process(sample_time, dead_time=1.05, gain=2.0):
     """PI with kp = 1 and ki = 0.25 1/s, a lag of 5 s, and dead time between valve and room."""

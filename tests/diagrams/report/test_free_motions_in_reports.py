@@ -26,6 +26,8 @@ from loopwright.diagrams.report.pages.json import to_json
 from loopwright.diagrams.requirements import Reason
 from loopwright.types import Verdict
 
+pytestmark = pytest.mark.usefixtures("without_drawings")
+
 DRIFTS = "angle.y drifts: nothing feeds it back"
 
 

@@ -32,6 +32,8 @@ from loopwright.diagrams.report.pages.printed_values import (
 )
 from loopwright.diagrams.report.pages.report import Report, check_files, write_report
 
+pytestmark = pytest.mark.usefixtures("drawn_once")
+
 BY_EIGENVALUES, BY_GRID = "closed-loop eigenvalues <both> sides", "a grid ten times as fine"
 
 

@@ -8,6 +8,8 @@ from loopwright.diagrams import Requirements
 from loopwright.diagrams.requirements import Verdict
 from support.predictors import T, observed, observed_by_hand, smith, smith_by_hand
 
+pytestmark = pytest.mark.usefixtures("without_drawings")
+
 INNER = ("inner",)
 Z = np.exp(1j * T * np.linspace(1e-3, np.pi / T, 20001))
 

@@ -40,11 +40,11 @@ def response(w):
 
 @cache
 def analysed():
-    return process().report(only=("poles", "inner"))
+    return results_of(process(), phase_margin_deg=45, ms=1.9)
 
 
 def judged(**limits):
-    found = judge_again(process(), analysed(), **limits)
+    found = judge_again(process(), analysed()[0], **limits)
     return found, {(r.loop, r.quantity): r for r in found.results}
 
 
@@ -59,7 +59,7 @@ def line_about(report, wire):
 
 
 def test_a_general_limit_does_not_apply_between_ticks_where_the_loop_is_judged_at_another_wire():
-    report, results = results_of(process(), phase_margin_deg=45, ms=1.9)
+    report, results = analysed()
     assert report.review.verdict is Verdict.PASSED, report.review.results
     assert sorted(key for key in results if key[0]) == [("power", "ms"), ("power", "phase_margin_deg")]
     crossover = brentq(lambda w: abs(response(w)) - 1.0, 1e-2, 1.0, xtol=1e-14)
@@ -90,6 +90,7 @@ def test_a_loop_that_no_other_wire_judges_stays_open():
     assert line_about(report, "temperature") == "- The loop at temperature: it has no margins here."
 
 
+@pytest.mark.slow
 def test_an_inner_loop_in_continuous_time_that_the_other_wire_does_not_cut_stays_open():
     report, results = results_of(process(local=0.2), phase_margin_deg=45)
     assert results["power", "phase_margin_deg"].verdict is Verdict.PASSED

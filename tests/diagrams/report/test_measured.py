@@ -15,6 +15,8 @@ from loopwright.diagrams.report.pages.json import to_json
 from loopwright.diagrams.requirements import Limit, Reason, judge_interval
 from loopwright.types import Verdict
 
+pytestmark = pytest.mark.usefixtures("without_drawings")
+
 
 def drive(gain=4.0):
     """L = gain/(s (0.1 s + 1))."""
@@ -92,6 +94,7 @@ TURN = float(np.degrees(np.arcsin(0.05)))
         (MARGIN + 4 * TURN, Verdict.FAILED),
     ],
 )
+@pytest.mark.drawn(2)
 def test_an_interval_that_straddles_a_limit_is_not_decided(limit, verdict):
     found, report = judged(limit)
     measured = found["measured"]

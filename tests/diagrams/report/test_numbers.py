@@ -115,10 +115,11 @@ def test_compensated_friction_at_rest_changes_the_sampled_margins():
     assert rough < 0.3 * plain
 
 
+@pytest.mark.parametrize("part", [fig3_wires, pytest.param(fig3_loops, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("side", ["par", "perp"])
 @pytest.mark.parametrize("variant", DESIGN)
-def test_the_paths_that_are_promised_exist(side, variant):
-    numbers = fig3_loops().numbers()
+def test_the_paths_that_are_promised_exist(side, variant, part):
+    numbers = part().numbers()
     for name in MARGINS:
         assert f"inner.{side}.{variant}.{name}" in numbers
     assert f"operating_points.{variant}.residual" in numbers
@@ -135,7 +136,10 @@ def test_the_paths_of_poles_and_limits_exist(side, variant):
     assert f"poles.{side}.{variant}.polynomial_difference" in fig3_poles().numbers()
 
 
-PARTS = [fig3_loops, *(pytest.param(part, marks=pytest.mark.slow) for part in (fig3_poles, fig3_admittance))]
+PARTS = [
+    fig3_wires,
+    *(pytest.param(part, marks=pytest.mark.slow) for part in (fig3_loops, fig3_poles, fig3_admittance)),
+]
 
 
 @pytest.mark.slow

@@ -10,6 +10,8 @@ from loopwright.diagrams.cli.report import verdict_text
 from loopwright.diagrams.report.pages.tables import Numbered
 from loopwright.diagrams.requirements import Limit, Reason, RequirementResult, Verdict, by_loop
 
+pytestmark = pytest.mark.usefixtures("without_drawings")
+
 
 def spring(start=0.0):
     """s² + 3 s + 40: L = (3 s + 40)/s² at the command of a double integrator."""

@@ -26,6 +26,8 @@ from loopwright.frequency import Number
 from loopwright.types import Verdict
 from support import reviewed
 
+pytestmark = pytest.mark.usefixtures("without_drawings")
+
 PARTS = ("poles", "inner")
 ASKED = {
     "drive": {

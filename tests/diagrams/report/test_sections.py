@@ -64,6 +64,7 @@ def test_sections_that_do_not_apply_do_not_appear(name, keys):
 
 
 @pytest.mark.parametrize("name", MADE)
+@pytest.mark.drawn(2)
 def test_no_table_is_empty_and_no_section_has_nothing(name):
     for section in walk(report(name).sections):
         assert section.text or section.tables or section.plots or section.sections, section.key

@@ -14,6 +14,8 @@ from loopwright.diagrams.studies import CaseState, ConfirmationKind, RunConfirma
 from loopwright.types import Verdict
 from support.tuned_loops import make_pi_loop, pi_phase_margin
 
+pytestmark = pytest.mark.usefixtures("without_drawings")
+
 NOTHING = Requirements(stable=False, phase_margin_deg=1.0)
 
 

@@ -22,6 +22,8 @@ from loopwright.diagrams.report.sections.summary import MOST_REQUIREMENTS
 from loopwright.frequency import Number
 from loopwright.types import Report, Verdict
 
+pytestmark = pytest.mark.usefixtures("drawn_once")
+
 PARTS = ("poles", "inner", "steps")
 GAIN, LAG = 3.0, 0.1
 

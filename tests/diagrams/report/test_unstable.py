@@ -11,6 +11,8 @@ from loopwright.diagrams.report import Case
 from loopwright.diagrams.report.sections.poles import unstable_first
 from loopwright.diagrams.report.stability import Stability
 
+pytestmark = pytest.mark.usefixtures("without_drawings")
+
 K, T = 200.0, 0.01
 
 
