@@ -40,7 +40,7 @@ def _sets_of(clocks: Sequence[TickPattern]) -> list[frozenset[TickPattern]]:
     for end in range(len(clocks), 0, -_AT_ONCE):
         bits = group << _AT_ONCE
         for i, clock in enumerate(clocks[max(0, end - _AT_ONCE) : end]):
-            bits |= clock.among(ticks).astype(np.int64) << i
+            bits[clock.offset :: clock.every] |= 1 << i
         group = np.unique(bits, return_inverse=True)[1]
     _, first, count = np.unique(group, return_index=True, return_counts=True)
     commonest = np.sort(np.argsort(-count, kind="stable")[:_MOST_SETS])

@@ -46,6 +46,7 @@ def by_steps(t, delay=1.0):
 @pytest.mark.parametrize(
     "solver", ["auto", "RK23", "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "CVODE_Adams", "rk4"]
 )
+@pytest.mark.drawn(4)
 def test_delayed_feedback_is_the_method_of_steps(solver):
     slow, machine, code = forms(delayed_feedback(), 6.0, step=0.01, solver=solver, rtol=1e-7, atol=1e-9)
     for run in (machine, code):
@@ -141,7 +142,7 @@ def exchanged(model, isolate):
 
 @pytest.mark.parametrize("isolate", [False, True])
 @pytest.mark.parametrize("solver", ["RK45", "Radau", "BDF", "rk4"])
-@pytest.mark.drawn
+@pytest.mark.drawn(2)
 def test_a_mass_of_another_tool_is_damped_late(solver, isolate):
     """F = −3 N s/m of the velocity 0.15 s ago: SciPy from delay to delay; its late acceleration is integrated."""
     delay, k, plant = 0.15, 3.0, exchanged(mass_spring_damper, isolate)
@@ -190,6 +191,7 @@ def test_late_edges_reach_an_fmu_in_model_exchange(isolate):
 
 
 @pytest.mark.parametrize("isolate", [False, True])
+@pytest.mark.drawn(1)
 def test_what_jumps_at_an_impact_comes_out_late_with_its_jump(isolate):
     """The velocity of a ball that falls from 1 m and keeps 0.7 of it, 0.2 s late, and its integral."""
     plant = exchanged(bouncing_ball, isolate)

@@ -184,6 +184,7 @@ def relay_loop(files):
 
 
 @pytest.mark.parametrize("solver", ["RK45", "Radau", "rk4"])
+@pytest.mark.drawn(1)
 def test_events_of_other_blocks_whose_jumps_are_inputs_of_an_fmu(files, solver):
     """The force is −5 N from the start, as the mass is above 0.02 m, and 5 N below −0.02 m: matrix exponentials."""
     x, force, level, begun, switches, expected = np.array([START, 0.0]), -5.0, -0.02, 0.0, [], []
@@ -289,6 +290,7 @@ def test_an_fmu_of_co_simulation_beside_one_of_model_exchange(files):
 
 
 @pytest.mark.parametrize("place", ["continuous", "between ticks", "at a tick"])
+@pytest.mark.drawn(2)
 def test_stop_conditions_at_ticks_and_between_them(files, place):
     """The position reaches 0.15 m, under a force that is a sine, or a sine that is held over 0.01 s."""
 

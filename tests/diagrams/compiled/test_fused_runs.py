@@ -73,6 +73,7 @@ def test_a_fused_run_goes_on_branches_and_is_saved():
 
 
 @pytest.mark.parametrize("fuse", [True, False])
+@pytest.mark.drawn(1)
 def test_a_state_of_the_other_kind_of_run_is_refused_and_fuse_is_named(fuse):
     made = experiments.hand_guiding().diagram
     first = made.simulate(0.01, fuse=fuse, **QUIET)

@@ -65,6 +65,7 @@ def exact_lags(n):
     ("solver", "bound"),
     [("euler", 8e-3), ("heun", 2e-4), ("rk4", 3e-8), ("RK23", 1e-6), ("RK45", 1e-10), ("DOP853", 1e-13)],
 )
+@pytest.mark.drawn(3)
 def test_a_controller_around_two_lags_is_that_of_the_matrix_exponential(solver, bound):
     run = compiled(loop_with_lags(), 0.5, solver=solver)
     assert np.max(np.abs(run["y"] - exact_lags(500))) < bound

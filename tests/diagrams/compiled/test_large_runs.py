@@ -205,6 +205,7 @@ def test_indicators_and_jumps_find_the_events_of_the_closed_form():
         (lambda: ring(20)[0], {"step": 0.002, "solver": "Radau"}),
     ],
 )
+@pytest.mark.drawn(2)
 def test_it_makes_no_difference_when_generated_code_takes_over(swapped, make, options):
     run = make().simulate(20.0, **options, **QUIET)
     assert run.tier == "both"

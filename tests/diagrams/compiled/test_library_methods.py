@@ -81,6 +81,7 @@ def test_samples_between_steps_are_those_of_scipy(solver):
 
 
 @pytest.mark.parametrize("solver", METHODS)
+@pytest.mark.drawn(2)
 def test_a_controller_that_restarts_them_at_every_tick_is_that_of_the_matrix_exponential(solver):
     @subsystem(sample_time=T, name="controller")
     def controller(y):
@@ -102,7 +103,7 @@ def test_a_controller_that_restarts_them_at_every_tick_is_that_of_the_matrix_exp
     np.testing.assert_allclose(runs[1].data, runs[0].data, rtol=0.0, atol=1e-12)
 
 
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("solver", METHODS)
 @pytest.mark.parametrize("rtol", [1e-5, 1e-8])
 def test_a_relay_switches_at_the_instants_of_the_closed_form(solver, rtol):
@@ -159,7 +160,7 @@ def failures(made, duration, **options):
 
 
 @pytest.mark.parametrize("solver", METHODS)
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_growth_beyond_all_bounds_says_the_same_and_keeps_the_same(solver):
     x = Integrator(name="x", initial_value=1.0)
     error = failures(Diagram("d", x(Function(lambda x: x**2, name="square")(x.y))), 2.0, step=0.01, solver=solver)
@@ -168,6 +169,7 @@ def test_growth_beyond_all_bounds_says_the_same_and_keeps_the_same(solver):
 
 
 @pytest.mark.parametrize("solver", METHODS)
+@pytest.mark.drawn(1)
 def test_a_root_that_leaves_its_domain_names_the_block_that_took_it(solver):
     x = Integrator(name="x", initial_value=1.0)
     made = Diagram("d", x(Function(lambda x: -1.0 - np.sqrt(x), name="root")(x.y)))
@@ -175,6 +177,7 @@ def test_a_root_that_leaves_its_domain_names_the_block_that_took_it(solver):
 
 
 @pytest.mark.parametrize("solver", METHODS)
+@pytest.mark.drawn(1)
 def test_an_error_of_a_python_function_is_that_of_the_run(solver):
     def rate(x):
         if x > 1.5:
@@ -191,7 +194,7 @@ def test_an_error_of_a_python_function_is_that_of_the_run(solver):
 
 @pytest.mark.parametrize("solver", METHODS)
 @pytest.mark.parametrize("place", ["rates", "between"])
-@pytest.mark.drawn
+@pytest.mark.drawn(2)
 def test_ctrl_c_ends_it_and_keeps_what_was_recorded(solver, place):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     seen = []

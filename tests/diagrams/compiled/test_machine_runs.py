@@ -78,6 +78,7 @@ def two_rates(table=False):
         ("auto", {"rtol": 1e-9, "atol": 1e-12}, 1e-7),
     ],
 )
+@pytest.mark.drawn(3)
 def test_a_solution_is_that_of_the_matrix_exponential_without_generated_code(solver, options, bound):
     run = oscillator().simulate(3.0, step=1e-3, solver=solver, compile=False, **options, **QUIET)
     assert run.tier == "interpreted"
@@ -124,6 +125,7 @@ def test_generated_code_has_the_same_bits(solver):
 
 
 @pytest.mark.parametrize("solver", ["rk4", "RK45", "Radau"])
+@pytest.mark.drawn(2)
 def test_it_makes_no_difference_when_generated_code_takes_its_place(swapped, solver):
     options = {"step": 1e-4, "solver": solver, **QUIET}
     runs = []

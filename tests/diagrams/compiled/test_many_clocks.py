@@ -31,7 +31,7 @@ def expected(period, ticks):
 
 @pytest.mark.parametrize("form", ["auto", True])
 @pytest.mark.parametrize("continuous", [False, True])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_each_of_22_subsystems_acts_at_its_ticks(monkeypatch, all_in_c, form, continuous):
     monkeypatch.setattr(clock_sets, "_MOST_SETS", 10_000)
     clock_sets._sets_of.cache_clear()
@@ -88,6 +88,7 @@ def test_sets_of_more_than_64_clocks_have_their_numbers():
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
 @pytest.mark.parametrize("continuous", [False, True])
+@pytest.mark.drawn(2)
 def test_what_was_recorded_before_an_error_at_such_a_set_is_kept(monkeypatch, continuous, error):
     """The clocks of 2, 3, 5 and 7 ms act together at 210 ms, for which there is no code; samples end before."""
     monkeypatch.setattr(clock_sets, "_MOST_SETS", 3)

@@ -126,7 +126,7 @@ def points(period, end, offset=Fraction(0)):
 )
 @pytest.mark.parametrize("end", [26 * MS, Fraction(263, 10) * MS])
 @pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(2)
 def test_each_plant_steps_at_its_own_ticks_with_inputs_held_from_there(folder, fmi, end, isolate, solved):
     """Inputs are t, 2 t, -t and 3 t at the plant's last tick; the run ends within steps of three of the plants."""
     file = zoo_fmu(folder, fmi)
@@ -154,6 +154,7 @@ def test_each_plant_steps_at_its_own_ticks_with_inputs_held_from_there(folder, f
 
 
 @pytest.mark.parametrize("solved", [False, True], ids=["ticks", "solver"])
+@pytest.mark.drawn(1)
 def test_a_plant_of_one_step_length_stays_behind_the_end(folder, monkeypatch, solved):
     monkeypatch.setattr(Fmu, "variable_step", property(lambda self: self.name == "other"))
     file, t = zoo_fmu(folder, 3), Clock(name="clock")
@@ -168,6 +169,7 @@ def test_a_plant_of_one_step_length_stays_behind_the_end(folder, monkeypatch, so
     assert run["other.y"][-1] - run["even.y"][-1] == pytest.approx(16e-6, abs=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("isolate", [False, True])
 @pytest.mark.parametrize("solved", [False, True], ids=["ticks", "solver"])
 @pytest.mark.drawn
@@ -215,7 +217,7 @@ def test_a_plant_that_takes_whole_steps_is_saved_on_its_way(folder, monkeypatch,
 @pytest.mark.parametrize("isolate", [False, True])
 @pytest.mark.parametrize("solved", [False, True], ids=["ticks", "solver"])
 @pytest.mark.parametrize("fault", ["step error", "step discard", "get error", "step segfault", "step fatal"])
-@pytest.mark.drawn(5)
+@pytest.mark.drawn(2)
 def test_an_error_has_the_time_and_the_width_of_the_plant_s_own_step(folder, fault, solved, isolate):
     """The step from 60 ms over 20 ms fails, between ticks of 1 ms; the fast plant has gone on to 79 ms.
 
@@ -257,6 +259,7 @@ def test_an_input_that_does_not_fit_is_refused_before_any_step_begins(folder):
 
 
 @pytest.mark.parametrize("solved", [False, True], ids=["ticks", "solver"])
+@pytest.mark.drawn(1)
 def test_a_stop_condition_on_a_slow_output_ends_the_run_at_its_tick(folder, solved):
     """y is the sum of 16 k · 1e-6 at 4 k ms: above 1e-4 at 20 ms for the first time."""
     slow, t = zoo(zoo_fmu(folder, 3), "slow", 4 * MS), Clock(name="clock")
@@ -270,6 +273,7 @@ def test_a_stop_condition_on_a_slow_output_ends_the_run_at_its_tick(folder, solv
 
 @pytest.mark.parametrize("rollback", [False, True])
 @pytest.mark.parametrize("isolate", [False, True])
+@pytest.mark.drawn(1)
 def test_events_within_longer_steps(folder, isolate, rollback):
     """x' = u turns round at 0.5, within the step from 0.45 s; the fast tick beside it makes no difference."""
     file = small_fmu(folder, "fmi3", EVENTS, MODEL.format(clock="", outputs=OUTPUTS, variable="true"))
@@ -285,7 +289,7 @@ def test_events_within_longer_steps(folder, isolate, rollback):
 
 @pytest.mark.parametrize("solved", [False, True], ids=["ticks", "solver"])
 @pytest.mark.parametrize("isolate", [False, True])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_a_run_goes_on_behind_steps_that_python_has_looked_at(folder, solved, isolate):
     """From 50 ms on every step of the slow plant warns: its inputs and the next step are as without that."""
     slow = zoo(zoo_fmu(folder, 3, "step warning 0.05"), "slow", 4 * MS, isolate=isolate)
@@ -300,6 +304,7 @@ def test_a_run_goes_on_behind_steps_that_python_has_looked_at(folder, solved, is
 
 
 @pytest.mark.parametrize("solved", [False, True], ids=["ticks", "solver"])
+@pytest.mark.drawn(1)
 def test_a_run_goes_on_behind_ticks_that_python_has_evaluated(folder, monkeypatch, solved):
     """C's method for the algebraic loop, x = t - x, gives up at once."""
 
@@ -329,6 +334,7 @@ def test_a_run_goes_on_behind_ticks_that_python_has_evaluated(folder, monkeypatc
 
 
 @pytest.mark.parametrize("solved", [False, True], ids=["ticks", "solver"])
+@pytest.mark.drawn(1)
 def test_rare_sets_of_clocks_are_python_s_and_the_steps_go_on(folder, monkeypatch, solved):
     """There is no code for the ticks at which both boxes act."""
     for module in (compiled_ticks, compiled_hybrid):
@@ -406,6 +412,7 @@ class FaultyTank(Tank):
 
 @pytest.mark.parametrize("solved", [False, True], ids=["ticks", "solver"])
 @pytest.mark.parametrize("isolate", [False, True])
+@pytest.mark.drawn(2)
 def test_plants_of_python_step_beside_fmus(folder, solved, isolate):
     """The slow tank takes whole steps alone: it stays at 8 ms where the run ends at 10 ms."""
     t = Ramp(slope=1.0, name="ramp")
@@ -427,7 +434,7 @@ def test_plants_of_python_step_beside_fmus(folder, solved, isolate):
 
 @pytest.mark.parametrize("solved", [False, True], ids=["ticks", "solver"])
 @pytest.mark.parametrize("error", [SimulationError("it leaks."), ValueError("no number")], ids=["ours", "any"])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_what_a_plant_of_python_raises_ends_the_run(folder, solved, error):
     t = Ramp(slope=1.0, name="ramp")
     aside = [Integrator(name="aside")(t)] if solved else []
@@ -484,7 +491,7 @@ def chain(file, *more, isolate=None, fault=None):
 
 @pytest.mark.parametrize("isolate", [True, False])
 @pytest.mark.parametrize("coupling", SCHEMES, ids=NAMES)
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(2)
 def test_coupled_plants_step_in_c_s_loop(folder, coupling, isolate):
     """Ticks are at 0, 5, 15, 25, … ms and the end. b gets a of the step's end, or the mean of both ends.
 
@@ -510,7 +517,7 @@ def test_coupled_plants_step_in_c_s_loop(folder, coupling, isolate):
 @pytest.mark.parametrize("isolate", [False, True])
 @pytest.mark.parametrize("coupling", SCHEMES[:3], ids=NAMES[:3])
 @pytest.mark.parametrize("fault", ["step error", "step segfault"])
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(1)
 def test_an_error_in_a_coupled_step_is_told_as_ever(folder, coupling, isolate, fault):
     isolate = isolate or "segfault" in fault
     made = chain(zoo_fmu(folder, 3), isolate=isolate, fault=zoo_fmu(folder, 3, f"{fault} 0.05"))
@@ -526,6 +533,7 @@ def test_an_iteration_that_does_not_converge_is_told_as_ever(folder):
 
 
 @pytest.mark.parametrize("coupling", SCHEMES[:3], ids=NAMES[:3])
+@pytest.mark.drawn(1)
 def test_coupled_plants_are_saved_and_go_on_in_every_form(cache, coupling):
     file = build_fmu(mass_spring_damper())
     left, right = Fmu(file, name="left", start={"position": 0.1}), Fmu(file, name="right")
@@ -543,7 +551,7 @@ def test_coupled_plants_are_saved_and_go_on_in_every_form(cache, coupling):
             assert again.data.tobytes() == whole.data[-len(again.t) :].tobytes()
 
 
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("coupling", SCHEMES, ids=NAMES)
 def test_coupled_plants_step_beside_continuous_states(folder, coupling, compiled):

@@ -54,14 +54,15 @@ def sampled(function):
 
 
 def test_a_function_of_python_in_a_sampled_loop_is_solved(all_in_c):
-    run = sampled(lambda u: float(0.5 * np.tanh(u))).simulate(2.0, **QUIET)
+    run = sampled(lambda u: float(0.5 * np.tanh(u))).simulate(0.5, **QUIET)
     for u, y in zip(run["source.y"], run["box.total.y"], strict=True):
         assert y == pytest.approx(brentq(lambda y, u=u: y - u + 0.5 * np.tanh(y), -3, 3, xtol=1e-14), abs=1e-9)
-    own = sampled(lambda u: float(0.5 * np.tanh(u))).simulate(2.0, compile=False, **QUIET)
+    own = sampled(lambda u: float(0.5 * np.tanh(u))).simulate(0.5, compile=False, **QUIET)
     assert own.data.tobytes() == run.data.tobytes()
 
 
 @pytest.mark.parametrize("solver", ["rk4", "RK45", "Radau"])
+@pytest.mark.drawn(2)
 def test_a_function_of_python_beside_a_loop_between_ticks_is_evaluated(all_in_c, solver):
     """y = u − 0.5 y, so y = 2 u / 3; the lag x' = 2 u / 3 − x of a sine by Python."""
     total, half = Sum(signs="+-", name="total"), Gain(gain=0.5, name="half")
@@ -148,7 +149,7 @@ def test_a_root_that_fails_within_a_loop_is_told(form):
 
 @pytest.mark.parametrize("solver", ["RK45", "Radau"])
 @pytest.mark.parametrize("isolate", [False, True])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_a_function_of_python_beside_an_fmu_in_model_exchange(all_in_c, solver, isolate):
     """A force by Python that damps the mass further, 3 N s/m: the exponential of the matrix."""
     plant = Fmu(mass_spring_damper.build(), interface="model_exchange", name="plant", isolate=isolate)

@@ -81,6 +81,7 @@ def test_a_loop_with_an_isolated_fmu_is_compiled(folder, fmi):
     assert np.allclose(1.0 - two["plant.y"], 0.98 ** np.arange(501), atol=ROUNDED)
 
 
+@pytest.mark.slow
 def test_several_fmus_here_and_there_share_their_ticks(folder, cache):
     file = zoo_fmu(folder, 3)
     plants = [zoo(file, "a"), zoo(file, "b", False), zoo(file, "c"), zoo(file, "d", False)]
@@ -133,7 +134,7 @@ FAULTS = [
 @pytest.mark.parametrize("beside", [False, True], ids=["alone", "beside"])
 @pytest.mark.parametrize("fmi", [2, 3])
 @pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.drawn
+@pytest.mark.drawn(4)
 def test_a_fault_is_told_as_in_an_interpreted_run(folder, fault, fmi, beside):
     file = zoo_fmu(folder, fmi, f"{fault} 0.05")
     isolate = SHORT if "hang" in fault else Isolation(memory=200e6) if "memory" in fault else True
@@ -155,7 +156,7 @@ def test_a_fault_is_told_as_in_an_interpreted_run(folder, fault, fmi, beside):
 
 @pytest.mark.parametrize("fmi", [2, 3])
 @pytest.mark.parametrize("fault", ["warning", "print", "slow", "rounding", "thread", "fork_on", "odd_log", "leak"])
-@pytest.mark.drawn
+@pytest.mark.drawn(3)
 def test_an_odd_fmu_runs_on_in_c_and_its_words_are_told_once(folder, fault, fmi):
     made = loop(zoo(zoo_fmu(folder, fmi, f"step {fault} 0.05")))
     one, two = both(made, 0.2)
@@ -203,6 +204,7 @@ def typed(folder, fmi, isolate=None, **values):
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.drawn(1)
 def test_numbers_of_every_type_pass_through(folder, fmi):
     made, given = typed(folder, fmi)
     one, two = both(made, 0.05, step=0.01)
@@ -223,7 +225,7 @@ def test_numbers_of_every_type_pass_through(folder, fmi):
         ("u_UInt16", -1.0),
     ],
 )
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(1)
 def test_an_input_that_does_not_fit_is_told_as_in_an_interpreted_run(folder, port, value):
     made, _ = typed(folder, 3, **{port: value})
     found = []
@@ -305,6 +307,7 @@ def test_a_run_is_streamed_and_stopped(folder, tmp_path):
 
 
 @pytest.mark.parametrize("fault", ["count", "slow", "deaf_hang 0.1"])
+@pytest.mark.drawn(1)
 def test_ctrl_c_ends_a_run_soon(folder, meeting, fault):
     """Long before its end, and before the limit of a step."""
     limits, period = Isolation(step_time=1e4), 1e-3 if fault == "count" else 0.01
@@ -339,6 +342,7 @@ def beside(folder, fault="", isolate=True):
 
 
 @pytest.mark.parametrize("solver", ["rk4", "RK45"])
+@pytest.mark.drawn(1)
 def test_fmus_stand_beside_continuous_states(folder, solver):
     one, two = both(beside(folder), 1.0, step=0.01, solver=solver)
     if solver == "rk4":
@@ -349,7 +353,7 @@ def test_fmus_stand_beside_continuous_states(folder, solver):
 
 
 @pytest.mark.parametrize("fault", ["warning", "slow", "segfault", "error", "deaf_hang"])
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(1)
 def test_faults_beside_continuous_states_are_told_as_in_an_interpreted_run(folder, fault):
     made, found = beside(folder, f"step {fault} 0.05", SHORT if "hang" in fault else True), []
     for in_c in (False, True):

@@ -41,7 +41,7 @@ def steps_of(diagram):
 
 @pytest.mark.parametrize("solver", ["rk4", "RK23", "RK45"])
 @pytest.mark.parametrize("make", [controlled, nonlinear, switching])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_inlined_steps_have_the_bits_of_steps_for_every_diagram(make, solver, monkeypatch):
     options = {"solver": solver, "step": 0.01, **QUIET}
     assert "step_rk4" in steps_of(make())
