@@ -171,8 +171,13 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
     @cached_property
     def all_factors(self) -> np.ndarray:
         """All factors that destabilize, with their conjugates."""
-        upper = np.concatenate([self.destabilizing(theta) for theta in self.theta])
+        upper = np.concatenate([s / (s - 1.0) for s in map(_moved, np.linalg.eigvals(self.on_grid))])
         return np.concatenate([upper, np.conj(upper)])
+
+    @cached_property
+    def on_grid(self) -> np.ndarray:
+        """S = (I + L)⁻¹ at the angles of the grid, shape (angles, n, n)."""
+        return sensitivity_at(self.r, self.theta / self.r.dt)
 
     def find_numbers(self) -> dict[str, Number]:  # noqa: D102 - as in the base
         disk, self.factor = self._find_disk_margin()
@@ -184,13 +189,7 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
 
     def sensitivities(self, theta: float) -> np.ndarray:
         """Return the eigenvalues of S = (I + L)⁻¹ at e^(jθ) that aren't 1: S is finite where L is not."""
-        s = np.linalg.eigvals(sensitivity_at(self.r, theta / self.r.dt))
-        return np.asarray(s[np.abs(s - 1.0) > 1e-14])
-
-    def destabilizing(self, theta: float) -> np.ndarray:
-        """Return the finite factors −1/λ = s/(s − 1) that put a closed-loop pole at e^(jθ)."""
-        s = self.sensitivities(theta)
-        return np.asarray(s / (s - 1.0))
+        return _moved(np.linalg.eigvals(sensitivity_at(self.r, theta / self.r.dt)))
 
     def _distance(self, f: complex) -> float:
         """Return the distance of a factor to the nearest one of the grid that destabilizes."""
@@ -255,17 +254,18 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
     def _is_small(self) -> bool:
         """Return whether the largest singular value of the lifted loop is below 1 at all frequencies."""
         try:
-            return all(np.linalg.norm(self.r.matrix(np.array([1j * w / self.r.dt]))[0], 2) < 1 for w in self.theta)
+            L = self.r.matrix(1j * self.theta / self.r.dt)
+            return bool(np.all(np.linalg.norm(L, 2, axis=(-2, -1)) < 1))
         except np.linalg.LinAlgError:  # a pole on the limit, such as an integrator's: the loop is unbounded there
             return False
 
     def _find_disk_margin(self) -> tuple[dict[str, Number], complex]:
-        def reach(theta: float) -> float:
+        def reach(s: np.ndarray) -> float:
             """Return the largest |s − 1/2|, 1/α of the factors of an angle: (f + 1)/(f − 1) = 2 s − 1."""
-            s = self.sensitivities(theta)
             return float(np.max(np.abs(s - 0.5), initial=0.0))
 
-        largest, theta = find_largest(reach, self.theta, np.array([reach(theta) for theta in self.theta]))
+        on_grid = np.array([reach(_moved(s)) for s in np.linalg.eigvals(self.on_grid)])
+        largest, theta = find_largest(lambda theta: reach(self.sensitivities(theta)), self.theta, on_grid)
         values = self.sensitivities(theta)
         s = complex(values[first_largest(np.abs(values - 0.5))])
         alpha, factor = 1 / largest, s / (s - 1.0)
@@ -282,11 +282,13 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
         found = {}
         for name, a, b in (("ms", 1.0, 0.0), ("mt", 0.0, 1.0)):
 
-            def gain(theta: float, a: float = a, b: float = b) -> float:
-                S = sensitivity_at(self.r, theta / self.r.dt)
-                return float(np.linalg.norm(b * np.eye(len(S)) + (a - b) * S, 2))
+            def gain(S: np.ndarray, a: float = a, b: float = b) -> np.ndarray:
+                return np.linalg.norm(b * np.eye(S.shape[-1]) + (a - b) * S, 2, axis=(-2, -1))
 
-            value, _ = find_largest(gain, self.theta, np.array([gain(theta) for theta in self.theta]))
+            def gain_at(theta: float, gain: Callable[[np.ndarray], np.ndarray] = gain) -> float:
+                return float(gain(sensitivity_at(self.r, theta / self.r.dt)))
+
+            value, _ = find_largest(gain_at, self.theta, gain(self.on_grid))
             found[name] = Number(value, "1", 1e-8 * value, confirm_peak(self.r, a, b, value, name))
         ms = found["ms"]
         modulus = Number(1 / ms.value, "1", ms.tolerance / ms.value**2, ms.confirmed_by)
@@ -318,6 +320,11 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
             f"{EIGENVALUES}: stable at {len(inner)} factors of {1 - INSIDE:g} α, unstable at {1 + INSIDE:g} α, "
             "a pole on the limit at the factor itself"
         )
+
+
+def _moved(s: np.ndarray) -> np.ndarray:
+    """Return the eigenvalues of S that aren't 1: the finite factors −1/λ = s/(s − 1) put a closed-loop pole there."""
+    return np.asarray(s[np.abs(s - 1.0) > 1e-14])
 
 
 def _make_grid(r: Realization) -> np.ndarray:

@@ -11,14 +11,18 @@ LEVEL = 1e-3
 """Relative distance from a peak of the levels that confirm it."""
 
 
-def sensitivity_at(r: Realization, omega: float) -> np.ndarray:
-    """Return S = (I + L)⁻¹ at ω, by the closed loop: it is finite where the loop has poles on the axis."""
-    n = len(r.D)
-    if np.isinf(omega):
-        return np.asarray(np.linalg.inv(np.eye(n) + r.D))
-    p = complex(r.point(np.array(1j * omega)))
-    inverse = np.linalg.inv(np.eye(n) + r.D)
-    states = np.linalg.solve(p * np.eye(r.order) - r.closed_matrix(), r.B @ inverse)
+def sensitivity_at(r: Realization, omega: float | np.ndarray) -> np.ndarray:
+    """Return S = (I + L)⁻¹ at ω, by the closed loop: it is finite where the loop has poles on the axis.
+
+    Of an array of finite ω it has the shape of that array, and then (n, n).
+    """
+    inverse = np.linalg.inv(np.eye(len(r.D)) + r.D)
+    if np.any(np.isinf(omega)):
+        return np.asarray(inverse)
+    p = r.point(1j * np.asarray(omega))[..., None, None]
+    pencil = p * np.eye(r.order) - r.closed_matrix()
+    inputs = r.B @ inverse
+    states = np.linalg.solve(pencil, np.broadcast_to(inputs, (*pencil.shape[:-2], *inputs.shape)))
     return np.asarray(inverse - inverse @ r.C @ states)
 
 

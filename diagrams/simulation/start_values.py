@@ -30,12 +30,14 @@ class StartValues:
     def __init__(self, workspace: Workspace):
         flat = workspace.flat
         self._workspace = workspace
-        blocks = {path: flat.table.blocks[path] for path in flat.checked.traced}
-        self._starting = [path for path, block in blocks.items() if block.starts_from_inputs]
-        self._sources = [path for path, block in blocks.items() if not block.inputs]
+        known = _known_of(flat)
+        blocks = [flat.table.blocks[path] for path in flat.checked.traced]
+        if known.sorted is None or not all(map(is_, blocks, known.sorted[0])):
+            known.sorted = blocks, *_sort(flat, blocks)
+        _, self._starting, self._sources = known.sorted
         self._bound: dict[tuple[Port, ...], _StartFunctions] = {}
         self._left: tuple[list[Block], dict[Port, np.ndarray]] | None = None
-        self._found = _known_of(flat).states
+        self._found = known.states
 
     @staticmethod
     def fits(flat: FlatDiagram) -> bool:
@@ -138,16 +140,24 @@ class StartFunctions:
 class _Known:
     """The traced functions of a diagram's start by the sources before t = 0, and its number of runs so far.
 
-    And the last initial state of each block, with the block and its inputs, as many runs start from the same ones.
+    And the last initial state of each block, with the block and its inputs, as many runs start from the same ones. And
+    the blocks, with the paths of those that start from their inputs, and of the sources.
     """
 
     functions: dict[tuple[Port, ...], StartFunctions] = field(default_factory=dict)
     states: dict[str, tuple[Block, bytes, np.ndarray]] = field(default_factory=dict)
     runs: int = 0
+    sorted: tuple[list[Block], list[str], list[str]] | None = None
 
 
 def _known_of(flat: FlatDiagram) -> _Known:
     return flat.keep("start values", _Known)
+
+
+def _sort(flat: FlatDiagram, blocks: list[Block]) -> tuple[list[str], list[str]]:
+    """Return the paths of the blocks that start from their inputs, and of those without inputs."""
+    paths = [*zip(flat.checked.traced, blocks, strict=True)]
+    return [p for p, block in paths if block.starts_from_inputs], [p for p, block in paths if not block.inputs]
 
 
 def choose_start_values(workspace: Workspace) -> Callable[[Workspace], None]:

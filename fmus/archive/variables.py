@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,7 @@ class FmuVariable:
         """Type and value reference of each scalar, or of the array: alike for all names of a variable."""
         return tuple((self.type, reference) for reference in self.references)
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Number of elements."""
         return math.prod(self.shape)
@@ -74,7 +75,7 @@ class FmuVariable:
         """Whether only integers are values of its type; a Boolean has the values 0 and 1."""
         return self.type not in ("Float64", "Float32")
 
-    @property
+    @cached_property
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Smallest and largest value of each element, infinite without one, in the variable's shape."""
         low, high = (

@@ -218,9 +218,12 @@ class LoadedFmu:
         numbers = {n: v for n in given if n not in about.texts and (v := about.find(n)).causality in _SET}
         numbers = dict(sorted(numbers.items(), key=lambda item: item[1].type))  # those of a type are read in one call
         found = self.read_variables(numbers.values())
+        values = {name: np.ravel(given[name]).astype(float) for name in numbers}
+        if not values or np.array_equal(found, np.concatenate([*values.values()])):
+            return lost  # as nearly always
         for name, v in numbers.items():
-            put, at = np.ravel(given[name]).astype(float), at + v.size
-            if not is_kept(found[at - v.size : at], put, single=v.type == "Float32"):
+            at += v.size
+            if not is_kept(found[at - v.size : at], values[name], single=v.type == "Float32"):
                 lost[name] = given[name]
         return lost
 

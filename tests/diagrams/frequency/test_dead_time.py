@@ -201,7 +201,7 @@ def test_roots_of_a_delayed_integrator_are_those_of_lamberts_w(k):
 
 
 @pytest.mark.parametrize(("k", "count"), [(0.9, 1), (1.1, 0), (3.2, 0), (6.0, 2), (40.0, 4)])
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(2)
 def test_the_count_includes_the_poles_of_the_loop_itself(k, count):
     """(s − 1) + k e^(−0.3 s), whose roots mpmath finds: the plant alone is unstable."""
     plant = rational([1.0], [1.0, -1.0], "plant")
@@ -497,6 +497,7 @@ def test_a_delay_that_is_long_beside_a_lag_has_all_its_roots(b, tau):
 
 
 @pytest.mark.parametrize("sensor", [1e-2, 1e-6])
+@pytest.mark.drawn(1)
 def test_a_dead_time_that_is_long_beside_a_sensor_has_its_margin(sensor):
     """An oven by the SIMC rule: 90° − 0.02 · 25 rad, less the sensor's phase; nothing overflows on the way."""
     oven, late, quick = rational([2.5], [180.0, 1.0], "oven"), delay(25.0), rational([1.0], [sensor, 1.0], "sensor")
@@ -522,6 +523,7 @@ def test_pade_of_a_sampled_diagram_is_refused():
 
 
 @pytest.mark.parametrize("ki", [0.05, 0.1, 0.15, 0.2, 0.3])
+@pytest.mark.drawn(1)
 def test_an_integrator_behind_a_predictor_is_a_root_at_zero_whatever_the_gain(ki):
     """A Smith predictor whose PI cancels the lag: L = a e^(-8 s) / (s + a (1 - e^(-8 s))), a = 2 ki, with a pole at 0.
 

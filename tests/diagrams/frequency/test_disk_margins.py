@@ -149,7 +149,7 @@ def test_the_closed_form_for_two_channels_is_what_scaling_by_scipy_finds(entries
     return True
 
 
-@random_cases(20, 100, st.lists(complex_entries, min_size=4, max_size=4), reaching=0.5)
+@random_cases(10, 100, st.lists(complex_entries, min_size=4, max_size=4), reaching=0.5)
 def test_the_bound_is_exact_for_two_channels(entries):
     M = np.array(entries).reshape(2, 2)
     bound = disk.mu_bound(M)

@@ -134,6 +134,7 @@ BRANCHES = {
 
 
 @pytest.mark.parametrize("name", BRANCHES)
+@pytest.mark.drawn(6)
 def test_the_phase_is_on_the_branch_on_which_the_phase_margin_is_read(name):
     system, phase = BRANCHES[name]
     (loop,) = drawn_loops([system], [name], None, marked=True)
@@ -327,6 +328,7 @@ def test_resonances_are_drawn_to_their_peaks_and_legends_stand_above(loop):
 
 
 @pytest.mark.parametrize("end", [0.6, 1.2, 1.4])  # divided by 0.2 s, they are just below a whole number
+@pytest.mark.drawn(1)
 def test_a_sampled_step_response_has_its_last_sample(end):
     figure = drive(0.2).replace({"pi.numerator": [1.0, 0.5]}).linearize().loop("u").step(t=end)
     assert figure.axes[0].lines[0].get_xdata()[-1] == pytest.approx(end, rel=1e-12)

@@ -392,12 +392,12 @@ def test_margins_that_are_nearer_than_a_thousandth_are_confirmed():
     assert check(control.ss(A, [[1.23693659], [1.12977513], [0.04877058]], C, 0.0, 0.05))
 
 
-@random_cases(6, 200, open_loops(sampled=False), reaching=0.1)
+@random_cases(4, 200, open_loops(sampled=False), reaching=0.1)
 def test_margins_of_random_continuous_loops_are_confirmed(loop):
     return check(loop)
 
 
-@random_cases(6, 200, open_loops(sampled=True), reaching=0.1)
+@random_cases(4, 200, open_loops(sampled=True), reaching=0.1)
 def test_margins_of_random_sampled_loops_are_confirmed(loop):
     return check(loop)
 
@@ -408,7 +408,7 @@ def test_margins_of_random_continuous_state_feedbacks_are_confirmed(loop):
     return check(loop)
 
 
-@random_cases(6, 60, stabilized_loops(sampled=True), reaching=0.5)
+@random_cases(3, 60, stabilized_loops(sampled=True), reaching=0.5)
 def test_margins_of_random_sampled_state_feedbacks_are_confirmed(loop):
     return check(loop)
 

@@ -1,5 +1,7 @@
 """Margins of fast loops in slow ones: the oracle is the period, gone through by hand with matrix exponentials."""
 
+import sys
+
 import control
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from scipy.optimize import brentq
 
 from loopwright.blocks import PID, Constant, Gain, OptionError, ParameterError, TransferFunction
 from loopwright.diagrams import ConfirmationError, Diagram, PeriodicLoopError, subsystem
-from loopwright.diagrams.frequency.periodic_margins import PeriodicMarginFinder
+from loopwright.diagrams.frequency.sensitivity_peaks import sensitivity_at
 from loopwright.frequency import disk_margin, margins, periodic_margins
 from support.loops import open_loops
 from support.random_cases import random_cases
@@ -94,6 +96,7 @@ def model():
 
 
 @pytest.mark.parametrize("wire", ["voltage", "reference"])
+@pytest.mark.drawn(1)
 def test_gain_phase_and_delay_margins_are_the_limits_of_the_period_gone_through_by_hand(model, wire):
     L = model.loop(wire, lifted=True)
     found = periodic_margins(L)
@@ -262,13 +265,14 @@ def test_slower_loops_need_a_clock_at_the_wire():
 
 def test_a_disk_that_is_too_large_is_not_confirmed(monkeypatch, model):
     L = model.loop("voltage", lifted=True)
-    right = PeriodicMarginFinder.sensitivities
-    monkeypatch.setattr(PeriodicMarginFinder, "sensitivities", lambda self, theta: 0.25 + right(self, theta) / 2)
+    nearer = lambda r, omega: 0.25 * np.eye(len(r.D)) + sensitivity_at(r, omega) / 2  # noqa: E731
+    monkeypatch.setattr(sys.modules["loopwright.diagrams.frequency.periodic_margins"], "sensitivity_at", nearer)
     with pytest.raises(ConfirmationError, match="factors just inside"):
         periodic_margins(L)
 
 
 @pytest.mark.parametrize("gains", [(0.4, 0.4), (0.3, 1.2)])
+@pytest.mark.drawn(1)
 def test_ms_of_a_periodic_loop_is_the_largest_gain_of_the_renewals_gone_through_by_hand(gains):
     """x⁺ = x + g u with two gains in turn, u = d − x: the norm of the matrix from 600 values of d to those of u and x."""
     first, second = gains

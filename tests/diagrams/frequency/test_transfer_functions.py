@@ -31,7 +31,7 @@ def held_triple_states(T):
 
 @pytest.mark.parametrize("T", [1e-2, 1e-4, 1e-5, 1e-6])
 @pytest.mark.parametrize("factor", [1.0, 0.1])
-@pytest.mark.drawn
+@pytest.mark.drawn(2)
 def test_three_integrators_sampled_fast_have_the_margins_of_their_state_space(T, factor):
     found, exact = margins(held_triple(T, factor)), margins(held_triple_states(T))
     # rounding of the numerator's coefficients, 3 P T each, relative to its value 3 P T (ω T)² at the crossing
@@ -144,6 +144,7 @@ def test_poles_at_zero_are_a_chain_of_delays():
             assert got == pytest.approx(exact_value(over, under, z), rel=1e-11)
 
 
+@pytest.mark.slow
 def test_a_filter_of_delays_alone_has_its_margins():
     """L = K (1 + z⁻¹ + … + z⁻²⁹)/30 · z⁻¹: at z = 1 it is K, and 1/M_t = 1 + 1/K there."""
     K = 0.5

@@ -64,6 +64,7 @@ CASES = {
 
 @pytest.mark.parametrize("solver", ["auto", "DOP853", "Radau", "CVODE_BDF", "rk4"])
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.drawn(10)
 def test_the_integral_of_a_short_pulse_is_its_area(case, solver):
     source, area = CASES[case]
     run = Diagram("d", Integrator()(source())).simulate(10.0, step=0.5, solver=solver, progress=False)

@@ -152,6 +152,7 @@ def joined(model):
 
 
 @pytest.mark.parametrize("name", [*CASES, *FLOATS])
+@pytest.mark.drawn(6)
 def test_every_entry_is_right_within_its_uncertainty(folder, name):
     plant, point, J, is_fine = made(folder, name, 2 + list(CASES | FLOATS).index(name) % 2)
     for interface in WAYS:
@@ -164,6 +165,7 @@ def test_every_entry_is_right_within_its_uncertainty(folder, name):
 
 
 @pytest.mark.parametrize("name", ["linear", "single precision next to an offset", "floats"])
+@pytest.mark.drawn(2)
 def test_a_step_of_a_coarse_fmu_is_right_within_its_uncertainty(folder, name):
     plant, point, J, _ = made(folder, name, 3)
     model = plant.step_difference(0.01, **point)
@@ -173,6 +175,7 @@ def test_a_step_of_a_coarse_fmu_is_right_within_its_uncertainty(folder, name):
 
 
 @pytest.mark.parametrize("interface", WAYS)
+@pytest.mark.drawn(1)
 def test_a_diagram_around_coarse_values_says_so_and_its_numbers_are_as_uncertain(folder, interface):
     plant, point, *_ = made(folder, "single precision next to an offset", 3)
     plant = plant.replace(interface=interface, name="plant", start={**plant.start, **point["state"]})
@@ -201,6 +204,7 @@ STAIRS = {
 
 
 @pytest.mark.parametrize("name", list(STAIRS))
+@pytest.mark.drawn(4)
 def test_slopes_are_right_within_their_errors_wherever_the_point_is_on_the_stairs(name):
     function, slope = STAIRS[name]
     rng = np.random.default_rng(3)
@@ -215,6 +219,7 @@ def test_slopes_are_right_within_their_errors_wherever_the_point_is_on_the_stair
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.drawn(1)
 def test_derivatives_that_are_computed_in_their_own_function_alone_are_not_stale(tmp_path, fmi):
     rates = (
         "instance *c = p; number d[9] = {0}, y[9] = {0}; find(c, c->x, d, y);\n    for (size_t i = 0; i < n; i++) dx"

@@ -94,6 +94,7 @@ def test_it_runs_with_its_parameters_types_and_texts(file, isolate):
 
 
 @pytest.mark.parametrize("isolate", [False, True])
+@pytest.mark.drawn(1)
 def test_its_booleans_and_new_steps_are_those_of_both_tiers(file, isolate):
     """``on`` is put out a step after it has changed; it refuses steps that are told to be a repetition."""
     plant, window = Fmu(file, name="plant", isolate=isolate), Window(name="window")

@@ -72,6 +72,7 @@ def file(cache, tmp_path_factory):
 
 @pytest.mark.parametrize("in_c", [False, True], ids=["interpreted", "compiled"])
 @pytest.mark.parametrize("isolate", [False, True])
+@pytest.mark.drawn(2)
 def test_a_ball_bounces_and_counts_as_in_closed_form(file, tmp_path, isolate, in_c):
     plant = Fmu(file, name="plant", isolate=isolate)
     assert plant.used_interface == "model_exchange"

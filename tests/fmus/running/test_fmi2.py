@@ -100,6 +100,7 @@ def test_a_free_motion_is_the_matrix_exponential(msd):
 
 
 @pytest.mark.parametrize("letter", "ABCD")
+@pytest.mark.drawn(2)
 def test_the_experiments_run_with_either_version(letter, file, cache):
     make = experiments.EXPERIMENTS[letter]
     two, three = (

@@ -26,6 +26,7 @@ def held(file, **options):
 @pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
 @pytest.mark.parametrize("isolate", [False, True], ids=["here", "isolated"])
 @TIERS
+@pytest.mark.drawn(3)
 def test_it_keeps_its_value_and_the_run_says_so_once(file, interface, isolate, compiled):
     diagram = held(file, interface=interface, isolate=isolate)
     run = diagram.simulate(1.0, step=0.1, rtol=1e-9, atol=1e-11, progress=False, compile=compiled)

@@ -50,6 +50,7 @@ def test_a_run_is_the_closed_form(file, isolate, rest):
 
 @pytest.mark.parametrize("rest", [{}, {"compile": True}], ids=["interpreted", "compiled"])
 @pytest.mark.parametrize("isolate", [False, True], ids=["here", "isolated"])
+@pytest.mark.drawn(2)
 def test_a_run_in_model_exchange_is_the_closed_form(file, isolate, rest):
     diagram = driven(file, isolate=isolate, interface="model_exchange")
     run = diagram.simulate(1.0, step=0.1, rtol=1e-9, atol=1e-11, progress=False, **rest)
@@ -233,6 +234,7 @@ def gantries(cache, tmp_path_factory):
 
 
 @pytest.mark.parametrize("fmi", ["fmi1", "fmi2"])
+@pytest.mark.drawn(1)
 def test_experiment_a_with_a_gantry_of_scalar_ports(gantries, fmi):
     """The same method and steps as the gantry's own build: rounding remains, of tanh and of the order of additions."""
     run, own = (

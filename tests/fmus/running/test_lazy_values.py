@@ -68,6 +68,7 @@ def test_it_is_in_c_too(cache, tmp_path, isolate):
 
 
 @pytest.mark.parametrize("isolate", [True, False], ids=["apart", "here"])
+@pytest.mark.drawn(4)
 def test_evaluations_at_one_point_hold_in_any_order(file, isolate):
     """Derivatives alone, then outputs alone: an FMU that compares what is set has nothing new to compute between them."""
     plant = Fmu(file, interface="model_exchange", name="plant", isolate=isolate)
@@ -84,7 +85,7 @@ def test_evaluations_at_one_point_hold_in_any_order(file, isolate):
                 np.testing.assert_allclose(instance.evaluation(wanted)(t, x, u), expected, rtol=0, atol=1e-14)
 
 
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_the_linear_model_of_the_loop_has_its_matrix(file):
     made = loop(file).linearize(0.0)
     np.testing.assert_allclose(made.A, CLOSED, rtol=0, atol=1e-8)
@@ -149,7 +150,7 @@ int NAME(EnterEventMode)"""
 
 @pytest.mark.parametrize("in_c", [False, True], ids=["interpreted", "compiled"])
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_an_indicator_of_a_value_that_is_kept_crosses_in_time(cache, tmp_path, kind, in_c):
     """The getter of the indicators computes the derivatives at most, as those of the tools with such getters do."""
     more = "settle(c, false);" if kind != "derivatives" else ""
@@ -172,7 +173,7 @@ def test_an_indicator_of_a_value_that_is_kept_crosses_in_time(cache, tmp_path, k
     assert [e.t for e in run.events] == pytest.approx([np.sqrt(0.5)], abs=1e-8)
 
 
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_a_structure_that_leaves_out_an_input_is_named_and_one_that_leaves_out_states_runs(cache, tmp_path, fmi, kind):
     wrong = {**STRUCTURE, "dx1": "x1"}
     file = lazy_fmu(tmp_path, fmi, kind, EQUATIONS, states=2, dependencies=wrong)

@@ -84,6 +84,7 @@ WANT_MOTOR = matrices(A_MOTOR, B_MOTOR, np.vstack([np.eye(3), [KM, 0, 0]]), np.z
 
 
 @pytest.mark.parametrize(("interface", "exact"), WAYS)
+@pytest.mark.drawn(2)
 def test_the_mass_spring_damper_has_its_matrices(msd, interface, exact):
     state = {"position": 0.3, "velocity": -1.2}
     model = Fmu(msd).linear_model(1.5, state=state, inputs={"force": 4.0}, interface=interface, exact=exact)

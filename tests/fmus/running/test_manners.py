@@ -67,6 +67,7 @@ def modes():
 @pytest.mark.skipif(sys.platform != "linux", reason="modes are kept on Linux alone")
 @pytest.mark.parametrize(("isolate", "compiled"), [(False, False), (True, False), (False, True)])
 @pytest.mark.parametrize(("place", "kind"), [(1, 1), (2, 1), (3, 1), (1, 2), (2, 2), (1, 3), (2, 3), (3, 3)])
+@pytest.mark.drawn(8)
 def test_modes_of_this_process_stay_as_they_are(file, place, kind, isolate, compiled):
     before = modes()
     plant = Fmu(file, name="plant", start={"fault": place, "kind": kind}, isolate=isolate)
@@ -213,7 +214,7 @@ print("done", 1 / 3 + 1 / 7)
 )
 @pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
 @pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_nothing_is_computed_with_the_traps_of_an_fmu(cache, tmp_path, fmi, traps, interface, compiled):
     """A process of its own, as a trap that is set off ends it: in FMI 2.0 a step's end is compared with no number."""
     ends = [

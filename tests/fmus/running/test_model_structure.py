@@ -24,6 +24,7 @@ def damped(file):
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.drawn(1)
 def test_an_input_that_is_left_out_is_named(tmp_path, fmi):
     for given, value in ((RATE, r"der\(v\)"), (OUTPUT, "a")):
         file = misstated_fmu(tmp_path, fmi, [(given[fmi], given[fmi].replace("1 2 5", "1 2"))])
@@ -38,7 +39,7 @@ def test_an_input_that_is_left_out_is_named(tmp_path, fmi):
 
 @pytest.mark.parametrize("kept", ["5", "2 5"])
 @pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_states_that_are_left_out_change_neither_a_run_nor_a_linear_model(tmp_path, fmi, kept):
     changes = [(given[fmi], given[fmi].replace("1 2 5", kept)) for given in (RATE, OUTPUT)]
     file = misstated_fmu(tmp_path, fmi, changes)
@@ -59,6 +60,7 @@ def test_states_that_are_left_out_change_neither_a_run_nor_a_linear_model(tmp_pa
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.drawn(1)
 def test_a_dependency_that_shows_in_a_mode_alone_is_named_by_a_linear_model_there(tmp_path, fmi):
     equations = "dx[0] = 1.0; y[0] = 4*x[0] + (x[0] > 1.0 ? 5*u[0] : 0.0);"
     file = closed_form_fmu(tmp_path, fmi, equations, dependencies={"y1": "x1", "dx1": ""})
@@ -73,6 +75,7 @@ def test_a_dependency_that_shows_in_a_mode_alone_is_named_by_a_linear_model_ther
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.drawn(1)
 def test_a_right_structure_and_one_that_says_nothing_run_as_the_equations_do(tmp_path, fmi):
     M = np.array([[0.0, 1.0, 0.0], [-100.0, -6.0, 10.0], [0.0, 0.0, 0.0]])
     for changes in ((), [(RATE[fmi], RATE[fmi].replace(' dependencies="1 2 5"', ""))]):
@@ -148,7 +151,7 @@ BY_ITSELF = {
 @pytest.mark.one_tier  # a second run reads other values of y2
 @pytest.mark.parametrize("fmi", [2, 3])
 @pytest.mark.parametrize("kind", BY_ITSELF)
-@pytest.mark.drawn
+@pytest.mark.drawn(2)
 def test_an_output_that_changes_by_itself_is_not_the_structures_fault(tmp_path, fmi, kind):
     equations = f"dx[0] = -x[0] + u[0]; y[0] = 2 * x[0]; {BY_ITSELF[kind]}"
     stated = {"dx1": "x1 u1", "y1": "x1", "y2": ""}
@@ -174,7 +177,7 @@ def test_a_wrong_structure_beside_an_output_that_changes_by_itself_is_named(tmp_
 
 @pytest.mark.parametrize("in_c", [False, True], ids=["interpreted", "compiled"])
 @pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_a_wrong_structure_is_left_aside_where_everything_may_depend_on_everything(tmp_path, fmi, in_c):
     """The structure leaves out the feedthrough, and the way from the state to its derivative."""
     equations = "dx[0] = -x[0] + u[0]; y[0] = 2 * x[0] + 0.5 * u[0];"

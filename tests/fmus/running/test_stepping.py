@@ -85,6 +85,7 @@ def test_periodic_clocks_tick_at_their_times_whatever_the_step(clocked):
 
 
 @pytest.mark.parametrize(("step", "every"), [(0.1, 1e-12), (1e-7, 1e-12), (0.1, 2e-5), (1e-3, 1e-5)])
+@pytest.mark.drawn(2)
 def test_a_clock_that_ticks_very_often_is_told_with_its_rate(folder, step, every):
     clock = CLOCK.replace("0.15", f"{every:g}")
     file = small_fmu(

@@ -170,6 +170,7 @@ def test_arrays_of_integers_count_from_0_too(folder):
 
 @pytest.mark.parametrize("name", ["gain", "fixed"])
 @pytest.mark.parametrize("isolate", [None, False], ids=["isolated", "in process"])
+@pytest.mark.drawn(2)
 def test_a_parameter_that_is_lost_when_initialization_ends_is_an_error(folder, name, isolate):
     place = {"gain": 30, "fixed": 31}[name]
     leave = "((instance *)p)->running = 1;"
@@ -259,7 +260,7 @@ def test_names_are_looked_up_among_texts_too(file3):
 
 
 @pytest.mark.drawn(1)
-def test_ports_of_integers_have_no_derivatives_and_the_model_says_so(file):
+def test_ports_of_integers_have_no_derivatives(file):
     plant = Fmu(file, name="plant", isolate=False)
     real = next(iter(plant.inputs))
     point = {"inputs": rest(plant, **{real: 0.5})}
@@ -271,6 +272,12 @@ def test_ports_of_integers_have_no_derivatives_and_the_model_says_so(file):
         k = [*model.inputs].index("u_Float32")
         want[[*model.outputs].index("y_Float32"), k] = model.D[[*model.outputs].index("y_Float32"), k]
     assert np.abs(model.D - want).max() < 1e-9
+
+
+@pytest.mark.slow
+def test_a_diagram_says_which_inputs_of_integers_are_left_out_of_its_model(file):
+    plant = Fmu(file, name="plant", isolate=False)
+    real = next(iter(plant.inputs))
     whole = "u_Integer" if "u_Integer" in plant.inputs else "u_Int32"
     held = {n: v for n, v in rest(plant).items() if n not in (real, whole)}
     plant = plant.replace(start=held)
