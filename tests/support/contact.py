@@ -56,8 +56,9 @@ def moored():
     return build(Moored(), name="moored", internal_step=1.0 / 10000.0)
 
 
+@cache
 def loop(side="perp", model=SMOOTH, tracking=False, **options):
-    """The loop of the diagram below, by its parameters."""
+    """The loop of the diagram below, by its parameters; one object for equal ones, as it finds its contact once."""
     filters = FORCE_TRACKING if tracking else {}
     return AdmittanceLoop(
         options.pop("path", PATH),

@@ -23,6 +23,7 @@ VALUES = {"anti_windup": "clamping", "tracking_time": None, "clearance": 0.3, "b
         ({"kp": 0.0, "ki": 2.0}, {"anti_windup", "tracking_time", "clearance", "b", "c"}),
     ],
 )
+@pytest.mark.drawn(3)
 def test_a_controllers_idle_parameters_change_no_bit(given, idle):
     def run(**more):
         plant = Integrator(name="plant")

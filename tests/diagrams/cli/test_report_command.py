@@ -150,6 +150,7 @@ def test_help_names_what_can_be_analysed(capsys):
     assert "exit status" in told
 
 
+@pytest.mark.slow
 def test_the_real_report_of_a_users_loop(folder):
     assert main(["report", "loop.py:loop", "--json"]) == 0
     made = json.loads((folder / "loop.json").read_text(encoding="utf-8"))

@@ -92,6 +92,7 @@ def test_figures_are_pictures_and_reproducible(done, tmp_path):
             assert ET.parse(file).getroot().tag.endswith("svg")
 
 
+@pytest.mark.slow
 def test_drawing_leaves_matplotlib_alone(done):
     _, experiment, run = done
     assert all(matplotlib.rcParams[name] == matplotlib.rcParamsOrig[name] for name in STYLE)  # after the command, too

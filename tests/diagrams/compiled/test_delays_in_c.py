@@ -142,7 +142,7 @@ def exchanged(model, isolate):
 
 @pytest.mark.parametrize("isolate", [False, True])
 @pytest.mark.parametrize("solver", ["RK45", "Radau", "BDF", "rk4"])
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_a_mass_of_another_tool_is_damped_late(solver, isolate):
     """F = −3 N s/m of the velocity 0.15 s ago: SciPy from delay to delay; its late acceleration is integrated."""
     delay, k, plant = 0.15, 3.0, exchanged(mass_spring_damper, isolate)

@@ -78,7 +78,7 @@ FAULTS = {
     "hang": "for (;;) { volatile int never = 0; (void)never; }",
     "exit": "exit(0);",
 }
-QUICK = {("error", 3), ("crash", 3)}
+QUICK = {("crash", 3)}
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ def test_samples_between_steps_are_those_of_scipy(solver):
 
 
 @pytest.mark.parametrize("solver", METHODS)
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_a_controller_that_restarts_them_at_every_tick_is_that_of_the_matrix_exponential(solver):
     @subsystem(sample_time=T, name="controller")
     def controller(y):
@@ -103,7 +103,7 @@ def test_a_controller_that_restarts_them_at_every_tick_is_that_of_the_matrix_exp
     np.testing.assert_allclose(runs[1].data, runs[0].data, rtol=0.0, atol=1e-12)
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("solver", METHODS)
 @pytest.mark.parametrize("rtol", [1e-5, 1e-8])
 def test_a_relay_switches_at_the_instants_of_the_closed_form(solver, rtol):

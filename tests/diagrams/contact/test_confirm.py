@@ -62,6 +62,7 @@ def moved(here, limit, factor):
     return replace(limit, value=value, growth_below=below, growth_above=above)
 
 
+@pytest.mark.slow
 def test_a_limit_that_is_none_is_refuted():
     here = contact("gantry", "perp")
     limit = here.stability_limit("stiffness", damping=10.0)

@@ -106,7 +106,7 @@ def root(function, near):
 @pytest.mark.parametrize(
     ("plant", "method"),
     [
-        ("block", "SOLVER"),
+        pytest.param("block", "SOLVER", marks=pytest.mark.slow),
         pytest.param("both", "SOLVER", marks=pytest.mark.slow),
         ("co_simulation", "HELD"),
         pytest.param("model_exchange", "SOLVER", marks=pytest.mark.slow),

@@ -53,7 +53,7 @@ def agree(found, expected, tolerance=1e-9):
 # --- the rigid gantry, beside the reduction by hand ------------------------------------------------------------------
 
 
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 @SIDE
 @pytest.mark.parametrize("name", IMPLEMENTATIONS)
 @pytest.mark.parametrize("damping", [0.0, 10.0, 100.0])
@@ -75,7 +75,7 @@ def test_mass_limits_of_the_rigid_gantry_are_those_by_hand(side):
 
 @SIDE
 @pytest.mark.parametrize("name", IMPLEMENTATIONS)
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_admittance_and_passivity_of_the_rigid_gantry_are_those_by_hand(side, name):
     here, loop = contact(name, side), by_hand(name, side)
     omega = np.geomspace(0.1, 3000.0, 41)

@@ -25,6 +25,7 @@ class Thing:
     [None, "x", [math.nan], [0.0], [], ["a"], [1.0, 0.0], [1j], {"a": 1}, Thing(), True, [[1], [1, 2]], [math.inf]],
     ids=repr,
 )
+@pytest.mark.drawn(4)
 def test_a_direction_is_a_vector(value):
     with pytest.raises(OptionError, match="direction: found .*; expected .*vector"):
         cart_diagram().contact("cart.push", direction=value, **PORTS)

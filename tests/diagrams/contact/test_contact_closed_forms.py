@@ -24,7 +24,7 @@ from support.haptic import DRAG, HANDLE, MASS, T, haptic
         (0.0, 1, 2.0 * DRAG / (3.0 * T)),  # T/2 Re((1 − 1/z)/z K)/(1 − cos ωT) = K T (1 + 2 cos ωT)/2
     ],
 )
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_a_virtual_wall_is_passive_up_to_the_stiffness_of_colgate_and_schenkel(damping, delay, limit):
     for factor in (0.999, 1.001):
         here = haptic(factor * limit, damping, delay).contact("handle.push", direction=[1.0], **HANDLE)
@@ -118,7 +118,7 @@ def flexible_poles(k=0.0, b=0.0, m=0.0, tool=0.0):
         ("tool_mass", {"stiffness": 20.0}),
     ],
 )
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(1)
 def test_a_flexible_joint_has_the_limits_of_its_polynomial(vary, held):
     found = flexible().stability_limit(vary, **held)
     names = {"stiffness": "k", "damping": "b", "mass": "m", "tool_mass": "tool"}
@@ -208,7 +208,7 @@ def plate_growth(k, first, direction):
 
 @pytest.mark.parametrize("first", [0.0, 0.7])
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (0.0, -2.0), (0.6, 0.8)])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_directions_and_operating_points_of_a_plate(first, direction):
     plate = Plate(name="plate", start_place=(first, 0.3))
     hand = Constant(value=(0.0, 0.0), unit="N", name="hand")

@@ -48,6 +48,7 @@ def test_a_cart_on_a_damper_has_the_limit_of_routh():
     assert cart_contact().stability_limit(damping=b).value == pytest.approx(k, rel=1e-10)
 
 
+@pytest.mark.slow
 def test_a_cart_without_friction_bounces_on_any_spring_for_ever():
     # M s² + k = 0: undamped for every k, which is not unstable
     cart, hand = Cart(name="cart"), Constant(value=0.0, unit="N", name="hand")
@@ -230,6 +231,7 @@ def arm_growth(k, b, m, direction, T=1e-3, tool=0.1):
     return np.log(np.abs(np.linalg.eigvals(closed)).max()) / T
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (0.6, 0.8)])
 @pytest.mark.parametrize(("vary", "held"), [("stiffness", {"damping": 5.0}), ("mass", {"stiffness": 50.0})])

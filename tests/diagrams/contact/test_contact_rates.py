@@ -93,7 +93,7 @@ def growth(k, b=0.0, m=0.0, **rates):
     return math.log(np.max(np.abs(np.linalg.eigvals(monodromy(k, b, m, **rates))))) / rates.get("slow", SLOW)
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(
     ("vary", "held"),
     [("stiffness", {}), ("stiffness", {"damping": 10.0}), ("stiffness", {"mass": 0.5}), ("mass", {"stiffness": 50.0})],
@@ -117,6 +117,7 @@ def test_limits_in_two_rates_are_those_of_the_monodromy_matrix(vary, held, slow)
     assert found.direction == (1.0,)
 
 
+@pytest.mark.slow
 def test_a_period_of_equal_ticks_has_the_numbers_of_one_rate():
     one = contact(fast=0.002, slow=0.002)
     same = diagram(0.002, 0.002, watched=0.01).contact("cart.push", direction=[1.0], **PORTS)

@@ -50,7 +50,7 @@ MORE_FRICTION = ROUGH.replace(coulomb_scale=1.2)
 @SIDE
 @pytest.mark.parametrize("share", [1.0, 0.4])
 @pytest.mark.parametrize("xi", [0.0, -0.025])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_continuous_poles_are_the_roots_of_the_characteristic_polynomial(side, share, xi):
     # M p̈ = M̂ q v + (Ĉ − C) ṗ + F − β F_meas, all by polynomials in s: p times each of them
     plant = ROUGH.replace(coulomb_scale=1.3, translational_mass=(9.0, 5.0))
@@ -176,7 +176,7 @@ ENVIRONMENTS = (
 
 @SIDE
 @pytest.mark.parametrize("name", [*VARIANTS, *OTHERS])
-@pytest.mark.drawn(8)
+@pytest.mark.drawn(2)
 def test_growth_and_admittance_are_those_of_the_reduction_by_hand(side, name):
     model = loop(side, **{**VARIANTS, **OTHERS}[name])
     for environment in ENVIRONMENTS:
@@ -194,7 +194,9 @@ def test_the_friction_slope_is_that_at_the_operating_velocity():
     assert stability_limit(moving).value > 2.0 * stability_limit(at_rest).value
 
 
+@pytest.mark.slow
 @SIDE
+@pytest.mark.drawn(1)
 def test_continuous_poles_depend_on_neither_path_point_nor_offset(side):
     # without environment, and with matched parameters: the paper's claim
     want = np.sort_complex(poles(loop(side, implementation="continuous")))
@@ -225,7 +227,7 @@ def test_growth_rates_of_arrays_are_those_of_their_numbers():
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(2)
 def test_python_controls_interconnection_has_the_same_growth(name):
     model = loop(**VARIANTS[name])
     for k in (100.0, 5000.0, 1e5):
@@ -238,7 +240,7 @@ def test_python_controls_interconnection_has_the_same_growth(name):
 CONTINUOUS = {"implementation": "continuous"}
 
 
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("side", ["par", "perp"])
 @pytest.mark.parametrize("implementation", ["ideal", "continuous"])
 @pytest.mark.parametrize("over", ["stiffness", "mass", "tool_mass"])
@@ -348,6 +350,7 @@ def test_the_rule_of_thumb_counts_the_hold_and_the_delay():
 
 
 @SIDE
+@pytest.mark.drawn(1)
 def test_the_tool_may_weigh_about_the_virtual_mass(side):
     limit = stability_limit(loop(side), "tool_mass")  # E25
     assert limit.value == pytest.approx(loop(side).admittance.mass, rel=0.15)
@@ -403,7 +406,8 @@ def test_limits_stand_side_by_side_by_the_names_of_a_report():
     found = stiffness_limits(loop(delay=7), (0.0, 10.0))
     assert list(found)[::3] == ["admittance.perp.ke_limit.continuous.be_0", "admittance.perp.ke_limit.sampled_d0.be_10"]
     assert found["admittance.perp.ke_limit.continuous.be_10"].value == math.inf
-    assert found["admittance.perp.ke_limit.sampled_d1.be_10"] == stability_limit(loop(delay=1), damping=10.0)
+    own = stability_limit(loop(delay=1), damping=10.0).value
+    assert found["admittance.perp.ke_limit.sampled_d1.be_10"].value == pytest.approx(own, rel=1e-9)
     assert len(found) == 6
 
 
@@ -502,7 +506,7 @@ LIMITS = {
     "par on the ellipse, next to it": (loop("par", ROUGH, path=ELLIPSE, eta=0.18, xi=-0.03), {"damping": 5.0}),
     "perp on the ellipse, d1": (loop(path=ELLIPSE, eta=0.09, delay=1), {"damping": 5.0}),
 }
-QUICK = 3
+QUICK = 1
 GROWTH = 2e-3  # of the factor over 1 s: a fifth of what is asked for
 
 
@@ -519,6 +523,7 @@ def test_the_co_simulation_grows_as_predicted_on_both_sides_of_a_limit(name):
         assert bool(growth < 0.0) is (factor < 1.0)
 
 
+@pytest.mark.slow
 def test_the_co_simulation_is_stable_again_beyond_an_unstable_region():
     model = loop("par", ROUGH, plant=MORE_FRICTION, tool_mass=0.3)
     again = stability_limit(model).restabilizes[0]

@@ -17,7 +17,7 @@ IMPEDANCE = {"par": 0.5, "perp": 2.0}
 """Mass of the admittance in kg, Table III."""
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize("delay", DELAYS)
@@ -47,7 +47,7 @@ def test_limits_are_confirmed_by_poles_and_by_runs(name, side, delay, eta, frict
         assert (trial.measured > 0.0) is (factor > 1.0)
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize("delay", DELAYS)
 @pytest.mark.parametrize("eta", POINTS)
@@ -63,6 +63,7 @@ def test_limits_of_the_rigid_gantry_are_those_by_hand(side, delay, eta, friction
     assert found.frequency == pytest.approx(expected.frequency, rel=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize("delay", DELAYS)
@@ -101,6 +102,7 @@ def mass_by_hand(here, side):
 
 @pytest.mark.parametrize("name", ["gantry", "scara"])
 @pytest.mark.parametrize("side", SIDES)
+@pytest.mark.drawn(2)
 def test_mass_limits_without_delay_follow_the_impedance_and_the_mobility(name, side):
     here = contact(name, side, 0.5, 0, friction=False)
     expected = mass_by_hand(here, side)

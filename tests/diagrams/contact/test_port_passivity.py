@@ -21,7 +21,7 @@ def colgate(stiffness, damping, delay):
 
 
 @pytest.mark.parametrize(("damping", "delay"), [(0.0, 0), (0.3, 0), (-0.2, 0), (0.0, 1), (0.2, 1)])
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(1)
 def test_a_virtual_wall_is_passive_against_everything_up_to_the_condition_of_colgate(damping, delay):
     limit = brentq(lambda K: colgate(K, damping, delay), 1.0, 1e5)
     for factor in (0.95, 0.9999, 1.0001):

@@ -41,6 +41,7 @@ def filtered(model):
 @SIDE
 @pytest.mark.parametrize("plant", [SMOOTH, ROUGH], ids=["smooth", "rough"])
 @pytest.mark.parametrize("implementation", ["ideal", "continuous"])
+@pytest.mark.drawn(4)
 def test_a_matched_continuous_loop_renders_the_target(side, plant, implementation):
     model = loop(side, plant, implementation=implementation)
     np.testing.assert_allclose(rendered_admittance(model, OMEGA), target_admittance(model, OMEGA), rtol=1e-11)
@@ -67,6 +68,7 @@ def test_without_feed_forward_the_inner_loop_shows(side):
 
 @SIDE
 @pytest.mark.parametrize("share", [0.0, 0.5, 36.87])
+@pytest.mark.drawn(3)
 def test_force_that_is_not_cancelled_moves_the_error_dynamics(side, share):
     # M (p̈ − ë) = … − M (a2 ṗ_e + …) + (1 − β) F: what is left of F meets the stiffness of the error dynamics
     model = loop(side, implementation="continuous", cancelled=share)
@@ -115,7 +117,7 @@ def test_the_response_is_an_object_of_python_control():
 @SIDE
 @pytest.mark.parametrize("delay", [0, 1])
 @pytest.mark.parametrize("method", ["exact", "semi_implicit"])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_sampling_costs_the_first_order_in_the_sample_time(side, delay, method):
     omega = np.geomspace(0.1, 60.0, 20)
     target = target_admittance(loop(side), omega)
@@ -207,6 +209,7 @@ def test_without_feed_forward_passivity_ends_where_the_polynomial_says(side):
 
 
 @pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.drawn(1)
 def test_a_sampled_loop_is_not_passive_and_a_spring_at_that_frequency_is_the_limit(name):
     # where Y = jB, the spring k = −ω/B oscillates undamped with it; the aliases shift that by 1e-6
     model = loop(**LOOPS[name])

@@ -191,6 +191,7 @@ ELASTIC = (
 
 
 @pytest.mark.parametrize("side", ["par", "perp"])
+@pytest.mark.drawn(1)
 def test_an_elastic_plant_has_no_reduced_loop(side):
     assert refusal(diagram(gantry_elastic), side=side) == ELASTIC
     assert refusal(diagram(gantry_elastic), side=side, plant=gantry.nominal) == ELASTIC

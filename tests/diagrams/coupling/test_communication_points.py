@@ -60,7 +60,7 @@ def one_step_only(monkeypatch):
 
 @pytest.mark.parametrize("between", [False, True], ids=["ticks", "solver"])
 @pytest.mark.parametrize("even", [False, True], ids=["any", "even"])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_a_fast_subsystem_that_has_nothing_to_do_with_an_fmu_leaves_its_steps(cache, steps, monkeypatch, between, even):
     if even:
         one_step_only(monkeypatch)

@@ -27,6 +27,7 @@ def stepped(inputs):
 
 
 @pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.drawn(1)
 def test_a_ramp_is_held_from_the_beginning_of_a_step_or_from_its_end(lag, compiled):
     ramp = Integrator(name="ramp")(Constant(value=(1.0,)))
     diagram = Diagram("d", Fmu(lag, name="plant")(ramp))

@@ -14,6 +14,7 @@ TRUNCATES = "{ double n = floor(20.0 * h / 0.01 + 1e-9); h = n * 0.01 / 20.0; }"
 
 @pytest.mark.parametrize(("T", "fits"), [(0.01, True), (0.03, True), (0.015, False), (0.004, False)])
 @pytest.mark.parametrize("step", [None, "T"])
+@pytest.mark.drawn(3)
 def test_steps_that_are_no_multiples_of_the_fmus_own_are_told(tmp_path, T, fits, step):
     file = closed_form_fmu(
         tmp_path,

@@ -101,7 +101,7 @@ def check_end(run, t, at=None):
 @pytest.mark.parametrize("compiled", [False, True], ids=["interpreted", "compiled"])
 @pytest.mark.parametrize("isolate", [False, True])
 @pytest.mark.parametrize("fmi", ["fmi3", "fmi2", "fmi1"])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_a_run_ends_where_its_fmu_asks_for_that(files, fmi, isolate, compiled):
     options = {"step": 0.1, "compile": compiled, "progress": False}
     run = driven(files[fmi], 0.5, isolate=isolate).simulate(1.0, **options)
@@ -115,6 +115,7 @@ def test_a_run_ends_where_its_fmu_asks_for_that(files, fmi, isolate, compiled):
 
 @pytest.mark.parametrize("last", [0.5, 0.53])
 @pytest.mark.parametrize(("isolate", "compiled"), [(False, False), (True, False), (False, True)])
+@pytest.mark.drawn(2)
 def test_with_a_solver_it_ends_at_a_communication_point(files, last, isolate, compiled):
     plant = Fmu(files["fmi3"], name="plant", start={"last": last}, isolate=isolate)
     wired = plant(u=Constant(value=1.0))
@@ -158,6 +159,7 @@ def test_a_compiled_run_ends_there_too(files, last):
     ids=["jacobi", "gauss_seidel", "iterated", "adaptive"],
 )
 @pytest.mark.parametrize("compiled", [False, "auto", True])
+@pytest.mark.drawn(4)
 def test_coupled_fmus_end_the_run_together(files, coupling, ends, compiled):
     def other(last):
         plant = Fmu(files["fmi3"], name="plant", start={"last": last})
@@ -303,6 +305,7 @@ def test_a_linear_model_at_an_end_in_model_exchange_is_refused(cache, tmp_path):
 @pytest.mark.parametrize("isolate", [False, True])
 @pytest.mark.parametrize("last", [0.5, 0.53])
 @pytest.mark.parametrize("fmi", ["fmi2", "fmi1"])
+@pytest.mark.drawn(3)
 def test_an_end_in_a_part_of_a_discarded_step_ends_the_run_there(cache, tmp_path, fmi, last, isolate):
     """It discards steps above 0.03 s, and says that it has not gone on; parts of them are taken until the end."""
     real, source = _REAL[fmi], _SOURCES[fmi].replace("c->ended ? 3 :", "c->ended ? 3 : h > 0.03 ? 2 :")

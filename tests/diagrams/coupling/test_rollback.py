@@ -48,12 +48,14 @@ def make(tmp_path_factory):
 
 @pytest.mark.parametrize("coupling", ["iterated", ADAPTIVE], ids=str)
 @pytest.mark.parametrize("restore", ["", "c->u = o->u;"], ids=["nothing", "inputs alone"])
+@pytest.mark.drawn(2)
 def test_an_fmu_that_restores_nothing_is_named(cache, make, restore, coupling):
     with pytest.raises(FmuRuntimeError, match=r"^a\.y, t = 0 s: the FMU does not restore its state.*expected 0,"):
         make(restore).simulate(0.1, step=0.01, progress=False, coupling=coupling)
 
 
 @pytest.mark.parametrize(("coupling", "off"), [("iterated", 1e-5), (ADAPTIVE, 2e-3)], ids=str)
+@pytest.mark.drawn(1)
 def test_an_fmu_that_restores_its_state_goes_on(cache, make, coupling, off):
     run = make("*c = *o;").simulate(2.0, step=0.01, progress=False, coupling=coupling)
     A = np.array([[-1.0, -1.0, 1.0], [1.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
@@ -86,6 +88,7 @@ def in_a_loop(file):
 
 
 @pytest.mark.parametrize("coupling", ["iterated", ADAPTIVE], ids=str)
+@pytest.mark.drawn(1)
 def test_an_fmu_that_takes_steps_back_by_itself_is_refused_where_steps_may_be_repeated(cache, tmp_path, coupling):
     diagram = in_a_loop(small_fmu(tmp_path, "fmi2", TAKING_BACK, MODEL))
     run = diagram.simulate(2.0, step=0.01, progress=False)

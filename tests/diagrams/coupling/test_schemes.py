@@ -61,6 +61,7 @@ def test_two_masses_converge_with_the_order_of_the_scheme(cache, scheme, order):
 
 
 @pytest.mark.parametrize(("scheme", "order"), ORDERS)
+@pytest.mark.drawn(2)
 def test_blocks_in_continuous_time_take_part(cache, scheme, order):
     signals = ("a.position", "filter.y")
     errors = [
@@ -86,7 +87,7 @@ def test_an_fmu_in_model_exchange_beside_one_in_co_simulation(cache, monkeypatch
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9, 1.5])  # plain repetition diverges from 1 on
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_iteration_solves_a_loop_of_direct_feedthrough_between_two_fmus(cache, share):
     signals = ("a.position", "b.position", "a.acceleration", "b.acceleration")
     errors = [
@@ -112,6 +113,7 @@ def test_a_loop_of_direct_feedthrough_is_told_where_it_is_not_solved(cache):
 
 
 @pytest.mark.parametrize("scheme", ["jacobi", "gauss_seidel", "iterated"])
+@pytest.mark.drawn(1)
 def test_adaptive_steps_follow_the_allowed_error(cache, scheme):
     found = []
     for error in (1e-3, 1e-4):

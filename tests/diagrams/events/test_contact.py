@@ -38,7 +38,7 @@ class Drop(Block):
 @pytest.mark.parametrize("solver", METHODS)
 @pytest.mark.parametrize("to_floor", [True, False])
 @pytest.mark.parametrize("floor", [0.0, 0.1, 1000.0])
-@pytest.mark.drawn(8)
+@pytest.mark.drawn(4)
 def test_an_inelastic_impact_rests_in_contact_and_says_so(solver, to_floor, floor):
     block = Drop(name="mass", floor=floor, to_floor=to_floor, start_height=floor + 1.0)
     with pytest.raises(SimulationError, match=r"mass, t = 0\.45.*'impact' rests in contact.*state of rest") as caught:
@@ -52,6 +52,7 @@ def test_an_inelastic_impact_rests_in_contact_and_says_so(solver, to_floor, floo
 
 @pytest.mark.parametrize("to_floor", [True, False])
 @pytest.mark.parametrize(("speed", "solver"), [(-2.0, "auto"), (-2.0, "LSODA"), (-1e-3, "RK45"), (-2.0, "rk4")])
+@pytest.mark.drawn(4)
 def test_a_start_in_contact_that_moves_into_it_is_an_impact(speed, solver, to_floor):
     block = Drop(name="mass", restitution=0.5, start_height=0.0, start_speed=speed, to_floor=to_floor)
     end = round(0.6 * abs(speed) / G, 6)  # the first flight takes |v|/g
@@ -82,7 +83,7 @@ def test_a_start_on_the_floor_without_a_way_out_is_a_rest(speed):
     ("restitution", "height", "floor"),
     [(0.8, 0.0, 0.0), (0.8, 0.0, 1000.0), (0.99, 0.0, 0.0), (0.5, 1e-12, 0.0), (0.8, 1e-9, 0.1), (0.8, 1e-6, 0.0)],
 )
-@pytest.mark.drawn(6)
+@pytest.mark.drawn(3)
 def test_a_ball_whose_flights_shrink_to_nothing_ends_in_an_error_soon_after(
     restitution, height, floor, solver, compiled
 ):

@@ -39,6 +39,7 @@ def oscillator(level, start=(1.0, 0.0)):
         ("CVODE_BDF", 0.99, (1.0, 0.0), {"rtol": 1e-10, "atol": 1e-10}),
     ],
 )
+@pytest.mark.drawn(2)
 def test_a_crossing_is_counted_once(solver, level, start, options):
     run = oscillator(level, start).simulate(24.0, solver=solver, progress=False, **options)
     phase = np.arctan2(start[1], start[0])  # x = cos(t − phase)
@@ -52,6 +53,7 @@ def test_a_crossing_is_counted_once(solver, level, start, options):
 
 
 @pytest.mark.parametrize("name", ["BDF", "LSODA", "CVODE_BDF", "CVODE_Adams"])
+@pytest.mark.drawn(2)
 def test_the_dense_output_leaves_the_start_of_a_step_along_the_rates(name):
     """ẍ = −x: within 1e-12 of a step, x is x₀ + t f(x₀) to the last bit."""
     turn = np.array([[0.0, 1.0], [-1.0, 0.0]])
@@ -135,7 +137,7 @@ def crossings(block, begin, end):
 
 @pytest.mark.parametrize("size", [3e-16, 3e-13])
 @pytest.mark.parametrize("restart", [1e-12, 1e-9, 1e-6, 1e-3, 0.1])
-@pytest.mark.drawn
+@pytest.mark.drawn(2)
 def test_an_indicator_with_rounding_errors_crosses_zero_once_however_short_the_next_step_is(restart, size):
     for seed in range(8):
         draw = np.random.default_rng(seed)
@@ -147,7 +149,7 @@ def test_an_indicator_with_rounding_errors_crosses_zero_once_however_short_the_n
 
 @pytest.mark.parametrize("apart", [1e-3, 1e-5, 1e-7])
 @pytest.mark.parametrize("restart", [1e-9, 1e-6, 0.1])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_a_second_crossing_soon_after_is_found(restart, apart):
     """(t − a)(a + d − t), with errors of 1e-12 d²: the second one is where it is to 1e-12 d, and to ulps of the time."""
     for seed in range(5):
@@ -179,7 +181,7 @@ class Angle(Block):
 @pytest.mark.parametrize(
     "solver", ["auto", "RK45", "DOP853", "Radau", "rk4", "BDF", "LSODA", "CVODE_Adams", "CVODE_BDF"]
 )
-@pytest.mark.drawn(6)
+@pytest.mark.drawn(2)
 def test_the_phase_of_an_oscillator_crosses_a_level_twice_a_turn(solver, compiled):
     for level in (0.3, 0.99):
         for rtol in (1e-5, 1e-8):

@@ -39,7 +39,7 @@ def watch(indicator):
     ],
     ids=["line", "sinh", "atan", "root", "jump"],
 )
-@pytest.mark.drawn
+@pytest.mark.drawn(2)
 def test_a_root_is_found_to_the_resolution_and_from_its_far_side(f, most, side):
     _, quiet = watch(lambda t: side * f(t - 9.0))
     for root in (1e-3, 0.3, 0.7251, 0.999):

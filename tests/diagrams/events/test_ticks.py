@@ -74,6 +74,7 @@ class Saw(Block):
 
 @pytest.mark.parametrize("compiled", ["auto", True])
 @pytest.mark.parametrize("solver", ["auto", "rk4", "RK45", "Radau", "LSODA", "CVODE_Adams", "BDF"])
+@pytest.mark.drawn(6)
 def test_a_sample_of_a_diagram_in_continuous_time_sees_an_event_that_belongs_to_it(solver, compiled):
     """y = t modulo 1, from the right, at 1, 2, … 6 s."""
     run = Diagram("d", Saw(name="saw")).simulate(6.0, step=0.5, solver=solver, compile=compiled, progress=False)

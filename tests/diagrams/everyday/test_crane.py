@@ -115,6 +115,7 @@ def test_the_verdict_of_a_crane_by_hand(variant):
     check_by_hand(PROJECT, variant)
 
 
+@pytest.mark.slow
 @reports(quick=True)
 def test_the_report_has_the_verdict_of_a_crane(variant):
     check_report(PROJECT, variant)

@@ -1,7 +1,6 @@
 """Ticks of clocks as arrays, beside clocks that are asked one tick after the other."""
 
 import numpy as np
-import pytest
 
 from loopwright.diagrams.flat import EVERY, TickPattern, ticks_after
 
@@ -20,14 +19,14 @@ def draw(rng):
     return patterns, k, k + int(rng.integers(0, 120)), int(rng.integers(1, 40))
 
 
-@pytest.mark.parametrize("seed", range(200))
-def test_chunks_of_ticks_are_those_of_the_clocks_one_by_one(seed):
-    patterns, k, last, count = draw(np.random.default_rng(seed))
-    found = []
-    while (ticks := ticks_after(patterns, found[-1] if found else k, last, count)).size:
-        assert len(ticks) <= count
-        found += ticks.tolist()
-    assert found == one_by_one(patterns, k, last)
+def test_chunks_of_ticks_are_those_of_the_clocks_one_by_one():
+    for seed in range(200):
+        patterns, k, last, count = draw(np.random.default_rng(seed))
+        found = []
+        while (ticks := ticks_after(patterns, found[-1] if found else k, last, count)).size:
+            assert len(ticks) <= count, seed
+            found += ticks.tolist()
+        assert found == one_by_one(patterns, k, last), seed
 
 
 def test_large_ticks_are_exact():

@@ -54,7 +54,7 @@ def response(model, count):
     return np.array(found)
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("coupling", SCHEMES, ids=NAMES)
 @pytest.mark.parametrize("make", [masses_and_filter, feedthrough_loop])
 def test_the_step_response_is_that_of_the_run(cache, make, coupling):

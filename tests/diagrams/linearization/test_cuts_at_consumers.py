@@ -55,6 +55,7 @@ def by_hand(sample_time=None):
 
 
 @pytest.mark.parametrize("sample_time", [None, T])
+@pytest.mark.drawn(1)
 def test_the_loop_to_the_plant_alone_leaves_the_tracking_closed(sample_time):
     model = level(sample_time).linearize()
     one = margins(model.loop("opening", to="tank.u"))

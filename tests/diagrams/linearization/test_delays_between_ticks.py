@@ -75,7 +75,7 @@ def loop_of(theta, where):
 
 @pytest.mark.parametrize("where", ["before", "behind", "both"])
 @pytest.mark.parametrize("theta", [0.2, 0.25, 0.033, 1.2345])
-@pytest.mark.drawn
+@pytest.mark.drawn(2)
 def test_a_lag_with_dead_time_has_the_modified_z_transform(theta, where):
     L = loop_of(theta, where).linearize().loop("u")
     none = Diagram("d", (plant := lag(2.0, 1.0, "lag"))(sampled_pi(plant.y))).linearize().loop("u")
@@ -94,6 +94,7 @@ def test_no_more_is_kept_of_the_past_than_is_needed(theta, steps):
 
 
 @pytest.mark.parametrize(("theta", "high"), [(0.137, 9.0), (0.4, 6.0), (0.77, 3.0)])
+@pytest.mark.drawn(1)
 def test_margins_of_a_sampled_loop_with_a_dead_time_off_the_grid_are_those_of_the_closed_form(theta, high):
     """PI and two lags with dead time; crossovers by Brent's method on the sum of the pulse response."""
     first, second, late = lag(2.0, 1.0, "first"), lag(1.0, 0.3, "second"), delay(theta, "late")

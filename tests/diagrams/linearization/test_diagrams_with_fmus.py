@@ -79,6 +79,7 @@ def model_around_the_mass():
 
 
 @pytest.mark.parametrize(("interface", "exact"), WAYS)
+@pytest.mark.drawn(2)
 def test_a_sampled_loop_around_an_fmu_at_rest(monkeypatch, interface, exact):
     bound = forced(monkeypatch, interface, exact)
     lin = around_the_mass(mass(position=0.0)).linearize(inputs="u", outputs="u")
@@ -125,6 +126,7 @@ def test_the_loop_of_an_fmu_is_closed_again_wherever_it_is_cut():
 
 
 @pytest.mark.parametrize(("interface", "exact"), WAYS)
+@pytest.mark.drawn(2)
 def test_a_continuous_diagram_with_a_feedthrough_back_to_its_own_fmu(monkeypatch, interface, exact):
     """F = −0.5 a − 3 ∫s: the outputs depend on the inputs, which depend on the outputs."""
     bound = forced(monkeypatch, interface, exact)
@@ -329,7 +331,7 @@ def test_the_frictionless_loops_at_rest_have_the_known_margins():
     assert phase_margin(lin.loop("v_perp")) == pytest.approx(67.88699231, abs=1e-7)
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(("theta", "offset"), PLACES)
 def test_with_matched_parameters_poles_are_those_asked_for_at_every_point_and_offset(theta, offset):
     ideal = at_rest(theta, offset).continuous().linearize()
@@ -343,7 +345,7 @@ def test_with_matched_parameters_poles_are_those_asked_for_at_every_point_and_of
     assert lin.memory == ("controller.path_projection.foot",)
 
 
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(("theta", "offset"), PLACES)
 def test_with_matched_parameters_the_directions_are_decoupled(theta, offset):
     L = at_rest(theta, offset).linearize().loop("v_par", "v_perp")

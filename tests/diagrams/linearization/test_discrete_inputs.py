@@ -15,6 +15,7 @@ DT = 0.1
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
 @pytest.mark.parametrize("interface", ["model_exchange", "co_simulation"])
+@pytest.mark.drawn(2)
 def test_the_slope_by_a_discrete_input_is_right_or_said_to_be_missing(tmp_path, interface, kind):
     depends = {"y1": "x1 u1", "dx1": "x1 u1"}
     equations = "dx[0] = -3*x[0] + 2*u[0]; y[0] = 4*x[0] + 5*u[0];"

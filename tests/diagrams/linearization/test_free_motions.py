@@ -163,7 +163,7 @@ def encoder_drive(rates):
 
 @pytest.mark.parametrize("stairs", [None, "gain"])
 @pytest.mark.parametrize("rates", [(1e-2, 1e-2), (1e-2, 1e-3)], ids=["one rate", "two rates"])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_a_speed_that_an_encoder_takes_from_the_angle_leaves_it_free(rates, stairs):
     model = encoder_drive(rates).linearize(0.02, stairs=stairs)
     free = model.free_motions()
@@ -327,7 +327,7 @@ def fmu_drive(**options):
 
 @pytest.mark.parametrize("at", [0.0, 0.4], ids=["standing", "running"])
 @pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_the_angle_of_a_motor_that_is_an_fmu_is_free(interface, at):
     model = fmu_drive(interface=interface).linearize(at)
     free = model.free_motions()
@@ -533,7 +533,7 @@ class Inside(Block):
 
 @pytest.mark.parametrize("kind", ["none", "cube", "play", "far stops", "detents", "cogging", "commutation", "stuck"])
 @pytest.mark.parametrize("sample_time", [None, T], ids=["continuous", "sampled"])
-@pytest.mark.drawn
+@pytest.mark.drawn(4)
 def test_a_torque_that_is_zero_at_this_angle_alone_is_found_by_finite_shifts(sample_time, kind):
     plant = Inside(kind=kind, name="plant")
     gain = control(lambda y: Gain(gain=-2.0, name="gain")(y), sample_time)

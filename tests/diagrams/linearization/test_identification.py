@@ -34,6 +34,7 @@ def got(m, count):
 
 
 @pytest.mark.parametrize("saves", [True, False])
+@pytest.mark.drawn(1)
 def test_a_mass_on_a_spring_is_found_with_its_poles_and_feedthrough(tmp_path, saves):
     """m s̈ + d ṡ + k s = F; the acceleration's feedthrough is a pole at z = 0."""
     block = Fmu(hidden(mass_spring_damper.build(), tmp_path, saves=saves), start={"position": 0.0})

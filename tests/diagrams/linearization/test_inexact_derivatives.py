@@ -29,7 +29,7 @@ def file3(tmp_path_factory):
 
 
 @pytest.mark.parametrize("interface", WAYS)
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_the_uncertainty_is_the_error_of_the_derivatives(file, interface):
     whole = np.block([[A, B], [np.eye(2), np.zeros((2, 1))], [A[1:], B[1:]]])
     for e in (0.0, 5e-9, 1e-7, 1e-5):
@@ -45,6 +45,7 @@ def test_the_uncertainty_is_the_error_of_the_derivatives(file, interface):
 
 @pytest.mark.parametrize("interface", WAYS)
 @pytest.mark.parametrize("e", [0.01, -1.0, -2.0])
+@pytest.mark.drawn(4)
 def test_derivatives_that_are_plainly_wrong_are_replaced_by_differences(file, interface, e):
     model = Fmu(file, start={"e": e}).linear_model(state=POINT, interface=interface)
     np.testing.assert_allclose(model.A, A, atol=1e-7)
@@ -91,6 +92,7 @@ def test_a_model_along_a_motion_is_as_exact_as_the_derivatives_and_takes_no_more
 
 
 @pytest.mark.parametrize("interface", WAYS)
+@pytest.mark.drawn(1)
 def test_margins_of_a_loop_with_a_hidden_integrator_are_those_of_exact_derivatives(file3, interface):
     exact = margins(sampled(file3, interface).linearize().loop("u"))
     assert exact.findings == ()
@@ -103,6 +105,7 @@ def test_margins_of_a_loop_with_a_hidden_integrator_are_those_of_exact_derivativ
 
 
 @pytest.mark.parametrize("interface", WAYS)
+@pytest.mark.drawn(1)
 def test_a_diagram_says_that_derivatives_are_wrong_and_does_not_use_them(file3, interface):
     wrong, right = (sampled(file3, interface, e=e).linearize() for e in (-2.0, 0.0))
     np.testing.assert_allclose(wrong.A, right.A, atol=1e-8)
@@ -121,7 +124,7 @@ def test_a_trim_and_a_stiff_run_do_not_depend_on_wrong_derivatives(file3):
 
 @pytest.mark.parametrize("interface", WAYS)
 @pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_local_variables_as_ports_have_slopes_though_the_fmu_may_not_be_asked_for_them(tmp_path, fmi, interface):
     file = misstated_fmu(tmp_path, fmi, hides_state=True)
     plant = Fmu(file, interface=interface, ports=["u", "v", "x", "w"], name="plant")
@@ -174,6 +177,7 @@ ROUGH = (("return -100.0 * x - v + c->u; }", "return single(single(101325.0 - 10
 
 
 @pytest.mark.parametrize("interface", WAYS)
+@pytest.mark.drawn(1)
 def test_numbers_that_rest_on_derivatives_of_unknown_error_have_an_unknown_tolerance(tmp_path, interface):
     single = "static double single(double v) { volatile float s = (float)v; return s; }\nstatic double rate("
     file = misstated_fmu(tmp_path, 3, (*ROUGH, ("static double rate(", single)))

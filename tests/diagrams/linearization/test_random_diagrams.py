@@ -109,7 +109,7 @@ def all_of(net, diagram, **options):
     check(cut, (A, B[:, e], C[e], D[np.ix_(e, e)]))
 
 
-@random_cases(3, 30, seeds, fresh=True)
+@random_cases(2, 30, seeds, fresh=True)
 def test_continuous_diagrams(seed):
     net = Net(seed)
     diagram = Diagram("net", *net.wire(StateSpace))
@@ -120,7 +120,7 @@ def test_continuous_diagrams(seed):
     close(np.poly(lin.poles), np.poly(net.model()[0]))
 
 
-@random_cases(3, 30, seeds, fresh=True)
+@random_cases(2, 30, seeds, fresh=True)
 def test_sampled_diagrams(seed):
     net = Net(seed)
     diagram = Diagram("net", sampled(net)())
@@ -136,7 +136,7 @@ def sampled(net):
     return box
 
 
-@random_cases(3, 30, seeds, fresh=True)
+@random_cases(2, 30, seeds, fresh=True)
 def test_solved_algebraic_loops(seed):
     net = Net(seed, loops=True)
     all_of(net, Diagram("net", *net.wire(StateSpace), loops="solve"))
@@ -266,7 +266,7 @@ def test_several_rates_and_offsets(seed, clocks):
 
 
 @pytest.mark.slow
-@random_cases(3, 30, seeds, fresh=True)
+@random_cases(2, 30, seeds, fresh=True)
 def test_the_poles_do_not_depend_on_the_tick_at_which_the_period_begins(seed):
     diagram = Loop(seed, [(2, 1), (3, 0)]).diagram()
     found = [diagram.linearize(k * 1e-2, step=1e-2).A for k in range(6)]

@@ -24,7 +24,7 @@ def lag_loop():
 
 @pytest.mark.parametrize("t", [1000.0, 0.37, 1e-3, 1 / 3])
 @pytest.mark.parametrize("length", [2.0, 0.002, 30.0])
-@pytest.mark.drawn
+@pytest.mark.drawn(2)
 def test_a_continuous_diagram_answers_a_step_at_any_time(t, length):
     """T = 2 / (s + 3): 2/3 (1 − e^(−3 t)), whatever has gone before."""
     found = step_response(lag_loop().wired, "u", size=0.1, length=length, at=t, outputs=["plant.y"])
@@ -37,6 +37,7 @@ def test_a_continuous_diagram_answers_a_step_at_any_time(t, length):
 
 @pytest.mark.parametrize("t", [1000.0, 0.37])
 @pytest.mark.parametrize("how", ["time", "point", "instant"])
+@pytest.mark.drawn(2)
 def test_a_continuous_diagram_is_measured_at_any_time(t, how):
     diagram = lag_loop()
     given = {"time": lambda: t, "point": lambda: diagram.operating_point(t), "instant": lambda: _instant(diagram, t)}

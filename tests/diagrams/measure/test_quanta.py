@@ -169,6 +169,7 @@ def rounded(block):
     return Diagram("rounded", x(Sum(signs="+-")(Constant(value=0.0), box(x.y)).named("u")))
 
 
+@pytest.mark.slow
 def test_a_worst_case_is_confirmed_with_its_treatment_of_stairs():
     found = rounded(Quantizer(quantum=1e-3, name="seen")).worst_case({"k.gain": (6.0, 10.0)}, "u", count=2, starts=0)
     assert found.confirm().agrees

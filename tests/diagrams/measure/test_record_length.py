@@ -91,7 +91,7 @@ class NoisyWindows(Windows):
 def test_the_noise_in_an_uncertainty_covers_the_true_value_in_its_share_of_draws(deviation):
     """The share is 95 %, of v; that of L is more, as the errors of v and u add up, which are one noise."""
     (part,) = plan_signal("sine", np.array([20.0]), 0.01, 1.0)
-    draws, covered, settled, sizes = 400, np.zeros(3), 0, []
+    draws, covered, settled, sizes = 200, np.zeros(3), 0, []
     for seed in range(draws):
         run, found = NoisyWindows(part, deviation, seed), Measurement(1, 1, 0)
         measure_part(run, part, 0, 0, 1, 40, 1e-6, found, 0)
@@ -103,7 +103,7 @@ def test_the_noise_in_an_uncertainty_covers_the_true_value_in_its_share_of_draws
         sizes.append(found.uncertainty[0])
     share = covered / draws
     assert settled == draws
-    assert np.all(np.abs(share[:2] - 0.95) < 0.04)  # 3.7 standard deviations of 400 draws
+    assert np.all(np.abs(share[:2] - 0.95) < 0.04)  # 2.6 standard deviations of 200 draws
     assert share[2] >= 0.95
     # a phasor of n samples has the deviation 2 σ/√n, and the mean of some windows less
     assert np.median(sizes) < 3 * 1.5 * 2 * deviation / np.sqrt(part.samples)

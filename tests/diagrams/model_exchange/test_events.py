@@ -29,6 +29,7 @@ RADAU = pytest.param("Radau", marks=pytest.mark.one_tier)  # its output `steps` 
 
 
 @pytest.mark.parametrize("solver", ["RK45", RADAU, "BDF", "CVODE_Adams", "rk4", "euler"])
+@pytest.mark.drawn(3)
 def test_a_solver_lands_on_time_events(file, solver):
     diagram = Diagram("d", plant(file)(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
     run = diagram.simulate(1.1, step=0.1, solver=solver, progress=False)

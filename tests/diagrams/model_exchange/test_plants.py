@@ -85,7 +85,7 @@ def fmi(request):
 
 
 @pytest.mark.parametrize("interface", ["model_exchange", "co_simulation", "block"])
-@pytest.mark.drawn
+@pytest.mark.drawn(2)
 def test_a_driven_van_der_pol_oscillator_meets_its_equation_in_all_three_ways(cache, tmp_path, fmi, interface):
     model = DrivenVanDerPol(name="oscillator")
     if interface == "block":
@@ -103,7 +103,7 @@ def test_a_driven_van_der_pol_oscillator_meets_its_equation_in_all_three_ways(ca
 
 
 @pytest.mark.parametrize("interface", ["model_exchange", "co_simulation", "block"])
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 def test_a_mass_on_a_belt_sticks_and_slips_as_in_closed_form(cache, tmp_path, fmi, interface):
     model = StickSlip(name="mass")
     if interface == "block":

@@ -41,7 +41,7 @@ def exact_motion(t):
 
 
 @pytest.mark.parametrize("solver", ["auto", "RK45", "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "CVODE_Adams"])
-@pytest.mark.drawn
+@pytest.mark.drawn(4)
 def test_a_driven_mass_meets_its_equations_to_the_tolerance_of_each_solver(files, fmi, solver):
     diagram = driven(Fmu(files[mass_spring_damper, fmi], interface="model_exchange", name="plant"))
     run = diagram.simulate(2.0, step=0.1, solver=solver, rtol=1e-8, atol=1e-11, progress=False)

@@ -188,6 +188,7 @@ def test_an_experiment_can_be_pickled(letter, runs):
 
 
 @pytest.mark.parametrize("letter", EXPERIMENTS)
+@pytest.mark.drawn(2)
 def test_references_have_units(letter, runs):
     _, run = runs(letter)
     for name in ("eta_p", "xi_p", "eta_d.y", "xi_d.y"):

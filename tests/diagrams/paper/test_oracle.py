@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from support import oracle
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("width", [0.1, 0.01, 0.001])
 def test_the_plant_of_the_independent_solution_moves_as_scipy_says(width):
     plant, rng = oracle.Plant(oracle.Options(friction_width=width)), np.random.default_rng(5)

@@ -45,6 +45,7 @@ def test_a_report_has_the_loop_at_the_plants_input_and_says_what_the_wire_has():
 
 
 @pytest.mark.parametrize("to", ["plant.u", ["plant.u"], []])
+@pytest.mark.drawn(2)
 def test_requirements_name_the_place(to):
     w = np.geomspace(0.01, 100.0, 40001)
     by_hand = peak(observed_by_hand(1j * w))
@@ -82,6 +83,7 @@ def test_a_worst_case_is_looked_for_at_the_place_that_is_required():
     assert found.confirm().agrees
 
 
+@pytest.mark.slow
 def test_a_files_worst_case_is_looked_for_where_the_report_cuts_the_loop(tmp_path):
     file = tmp_path / "limits.toml"
     file.write_text(

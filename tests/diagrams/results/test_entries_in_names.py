@@ -75,6 +75,7 @@ def test_columns_of_a_matrix_are_counted_row_by_row_and_by_row_and_column():
 
 
 @pytest.mark.parametrize("i", [1, 2, 3])
+@pytest.mark.drawn(1)
 def test_the_loop_at_an_entry_is_that_of_the_entry(i):
     """L = g / z, with g = i / 10, computed by hand."""
     L = three().linearize().loop(f"motor_force[{i}]")

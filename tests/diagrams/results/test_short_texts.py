@@ -3,34 +3,12 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Gain, Integrator, OptionError, StateSpace, Step
-from loopwright.diagrams import Diagram, Interrupted, Requirements, check_block, subsystem
+from loopwright.blocks import Gain, OptionError
+from loopwright.diagrams import Interrupted, Requirements, check_block
 from loopwright.frequency import disk_margin, gang_of_four, margins, periodic_margins, sensitivity
+from support.shown_drive import drive
 
 LONGEST = 300
-
-
-def drive(ki=0.3):
-    """Return a sampled PI controller around a damped oscillator."""
-    A, B = np.array([[0.0, 1.0], [-9.0, -0.6]]), np.array([0.0, 9.0])
-    plant = StateSpace(A=A, B=B, C=np.array([1.0, 0.0]), D=0.0, name="plant")
-
-    @subsystem(sample_time=0.02)
-    def control(e):
-        return Gain(gain=0.2, name="kp")(e) + Gain(gain=ki, name="ki")(Integrator(name="i")(e))
-
-    e = (Step(times=0.1, values=1.0, name="step") - plant.y).named("e")
-    return Diagram("drive", plant(control(e).named("u")).named("y"))
-
-
-@pytest.fixture(scope="module")
-def diagram():
-    return drive()
-
-
-@pytest.fixture(scope="module")
-def run(diagram):
-    return diagram.simulate(2.0, progress=False)
 
 
 def test_texts_of_a_run_say_its_samples_and_next_steps(run):

@@ -4,7 +4,6 @@ import math
 import re
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 import loopwright
@@ -16,42 +15,19 @@ from loopwright import (
     experiments,
     frequency,
     margins,
-    subsystem,
     sweeps,
     types,
 )
-from loopwright.blocks import Gain, Integrator, StateSpace, Step
+from loopwright.blocks import Gain, StateSpace, Step
 from loopwright.blocks.core import ShownAsTable
 from loopwright.frequency import nyquist_count, periodic_margins
-
-
-def drive(ki=0.3):
-    """Return a sampled PI controller around an oscillator of 3 rad/s with damping 0.1."""
-    A, B = np.array([[0.0, 1.0], [-9.0, -0.6]]), np.array([0.0, 9.0])
-    plant = StateSpace(A=A, B=B, C=np.array([1.0, 0.0]), D=0.0, name="plant")
-
-    @subsystem(sample_time=0.02)
-    def control(e):
-        return Gain(gain=0.2, name="kp")(e) + Gain(gain=ki, name="ki")(Integrator(name="i")(e))
-
-    e = (Step(times=0.1, values=1.0, name="step") - plant.y).named("e")
-    return Diagram("drive", plant(control(e).named("u")).named("y"))
+from support.shown_drive import drive
 
 
 def row(text, first):
     """Return the entries of a table's row behind its first one."""
     (line,) = re.findall(rf"^{re.escape(first)} {{2,}}(.*)$", text, re.MULTILINE)
     return re.split(" {2,}", line)
-
-
-@pytest.fixture(scope="module")
-def diagram():
-    return drive()
-
-
-@pytest.fixture(scope="module")
-def run(diagram):
-    return diagram.simulate(2.0, progress=False)
 
 
 def test_a_run_shows_the_range_and_the_end_of_each_named_wire(run):

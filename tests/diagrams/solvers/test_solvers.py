@@ -156,6 +156,7 @@ def test_a_step_is_at_most_max_step(name):
 
 
 @pytest.mark.parametrize("name", VARIABLE)
+@pytest.mark.drawn(4)
 def test_each_state_has_its_own_absolute_tolerance(name):
     """An oscillator in nanometres, once with nominal values that say so, and once with those of megametres."""
 
@@ -294,6 +295,7 @@ def jumps():
 
 @pytest.mark.one_tier
 @pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.drawn(6)
 def test_a_solver_lands_on_jumps_and_never_looks_beyond(name):
     """x' = −x and x' = 0 in turns; rounding in t + (s − t) does not carry a stage beyond s, either."""
     times, seen = jumps(), []
@@ -333,6 +335,7 @@ def test_a_jump_is_met_with_a_step_that_shrinks(name):
 
 
 @pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.drawn(4)
 def test_a_diagram_without_states_is_stepped_to_its_ticks(name):
     made = Diagram("d", Crossings(name="c")(Clock() - 0.7123456789))
     run, _ = simulate_counted(made, 1.0, step=0.25, solver=name)
@@ -395,6 +398,7 @@ def test_a_rate_that_is_not_finite_behind_a_jump_is_named(name):
 
 
 @pytest.mark.parametrize("name", VARIABLE)
+@pytest.mark.drawn(3)
 def test_growth_to_infinity_ends_in_an_error_that_names_the_state(name):
     with pytest.raises(SimulationError, match=r"^block, .*block\.x\[2\]") as caught:
         end(name, system(lambda t, x: [1.0, x[1] ** 2], [0.0, 1.0]), 3.0)  # infinite at t = 1
@@ -420,6 +424,7 @@ def test_a_jump_that_is_no_event_ends_in_an_error_not_in_a_hang(name):
 
 
 @pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.drawn(4)
 def test_an_error_in_the_rates_passes_through(name):
     def rate(x):
         if x < 0.4:

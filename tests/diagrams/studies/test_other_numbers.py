@@ -126,6 +126,7 @@ damping = 2.0
         WorstCaseTask.read(file).find(cart_diagram().wired)
 
 
+@pytest.mark.slow
 def test_start_values_of_an_fmu_in_model_exchange_are_varied():
     """Without its default in the block, an FMU's parameter has that of its description."""
     motor = Fmu(dc_motor.build(), name="motor", interface="model_exchange")
@@ -161,6 +162,7 @@ def test_parameters_that_an_fmu_in_model_exchange_sets_are_among_the_sensitiviti
 
 
 @pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
+@pytest.mark.drawn(1)
 def test_a_trim_frees_a_parameter_of_an_fmu(interface):
     """At rest the motor's torque is friction: k (V − k w)/R = b w."""
     k, R, V, w = dc_motor.nominal.motor_constant, dc_motor.nominal.resistance, 5.0, 70.0

@@ -41,6 +41,7 @@ def rooted(file):
 
 
 @pytest.mark.parametrize("lanes", [False, 2])
+@pytest.mark.drawn(1)
 def test_the_error_of_a_run_quotes_the_messages_of_no_run_before(tmp_path, lanes):
     diagram, rates = rooted(build(Root(), out=tmp_path / "root.fmu")), (2.0, 0.1, 1.5, 1.0)
     found = diagram.sweep({"plant.rate": rates}, 2.5, signals="plant.x", workers=1, progress=False, lanes=lanes)

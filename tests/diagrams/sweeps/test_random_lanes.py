@@ -194,7 +194,7 @@ def random_diagram(seed):
     return Diagram("random", *calls, *shown, loops="solve"), names + [f"x{i}" for i in range(len(plants))]
 
 
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_random_diagrams_go_side_by_side_as_each_run_by_itself(seed):
     diagram, names = random_diagram(seed)

@@ -155,6 +155,7 @@ def test_settling_is_zero_within_the_band_nan_outside_at_the_end_and_reckoned_to
 
 
 @pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.drawn(1)
 def test_runs_with_several_rates_gates_and_computed_starts_are_single_runs_to_the_last_bit(compiled):
     diagram = many_rates()
     table = [
@@ -245,6 +246,7 @@ def guarded():
 
 
 @pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.drawn(1)
 def test_a_run_that_fails_is_data_with_its_samples_and_harms_no_other(workers):
     diagram = guarded()
     limits = (2.0, 0.1, 3.0, 0.5, 4.0)
@@ -532,6 +534,7 @@ def test_a_reduction_that_returns_nothing_is_a_failure():
 
 
 @pytest.mark.parametrize("how", [{"workers": 1}, {"workers": 2}, {"workers": 1, "compile": False}])
+@pytest.mark.drawn(1)
 def test_fused_runs_have_the_bits_of_fused_single_runs(how):
     experiment = experiments.hand_guiding()
     single = experiment.simulate(fuse=True, compile=how.get("compile", True), **QUIET)

@@ -61,6 +61,7 @@ def pathsim(kind, path, n_outputs, end, *, inputs=(), **options):
     return np.array(t), np.array(y).T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fmi", FMI)
 def test_cosimulation_in_pathsim(fmi):
     path = mass_spring_damper.build(fmi=fmi)
