@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from fractions import Fraction
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, Unpack
 
 from ..blocks.core import (
@@ -941,6 +942,46 @@ class Diagram(ShownAsTable):
                 progress=tell,
                 **options,
             )
+
+    # --- other tools' formats ----------------------------------------------------------------------------------------
+
+    def to_ssp(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        stop: float | None = None,
+        step: float | None = None,
+        flat: bool = False,
+    ) -> Path:
+        """Write the diagram as an SSP (System Structure and Parameterization), and return the file.
+
+        FMUs are components, subsystems with FMUs in them systems; gains, sums with constants and conversions of units
+        between them become the connections' transformations. Constants are inputs of the root system, named wires its
+        outputs, start values parameter sets. It is SSP 1.0; 2.0 where an FMU has arrays or integers of more than 32
+        bits. See docs/howto/ssp.md.
+
+        Parameters
+        ----------
+        path : path
+            File to write, ``.ssp``.
+        stop : float, optional
+            Proposed end of a simulation in s.
+        step : float, optional
+            Proposed communication step in s, in an annotation of the Open Simulation Platform.
+        flat : bool
+            Write components and connections between them only, all in the root system, for readers that know no more
+            (libcosim, ecos): no systems within it, no inputs and outputs; constants are start values.
+
+        Raises
+        ------
+        SspFileError
+            A block that has no place in an SSP: the message names it.
+        OptionError
+            A path that does not end in ``.ssp``, or a folder that isn't there; a time that is not positive.
+        """
+        from .ssp import write_ssp
+
+        return write_ssp(self.wired, path, stop=stop, step=step, flat=flat)
 
     # --- report and drawing ------------------------------------------------------------------------------------------
 

@@ -37,6 +37,7 @@ from .diagrams import add_diagram_options, add_diagrams, draw_command, run_diagr
 from .fmu import COMMANDS, add_commands
 from .options import option_lines, parse_letters, parse_options, parse_renames, share
 from .report import add_report, report_command
+from .ssp import add_ssp, ssp_command
 from .subjects import is_user_file
 from .text import fit as _fit
 from .text import say as _say
@@ -78,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.print_help(sys.stderr)
         return 2
     try:
-        own = {"report": report_command, "draw": draw_command, "sweep": sweep_command}
+        own = {"report": report_command, "draw": draw_command, "sweep": sweep_command, "ssp": ssp_command}
         return {**COMMANDS, **own}.get(arguments.command, _run)(arguments)
     except OptionError as error:
         _say(f"loopwright: error: {error}", sys.stderr)
@@ -154,6 +155,7 @@ def _make_parser() -> argparse.ArgumentParser:
     add_diagrams(commands)
     add_report(commands)
     add_commands(commands)
+    add_ssp(commands)
     return parser
 
 

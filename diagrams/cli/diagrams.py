@@ -27,7 +27,7 @@ from ..diagram import Diagram
 from ..results import Run
 from ..simulation import Interrupted
 from .options import parse_value
-from .subjects import open_user_diagram
+from .subjects import open_user_diagram, proposed
 from .text import say
 
 MOST_DRAWN = 12
@@ -35,7 +35,10 @@ MOST_DRAWN = 12
 REDUCTIONS = ("final", "maximum", "minimum", "mean")
 """Numbers of a signal that a sweep takes."""
 _RAW = argparse.RawDescriptionHelpFormatter
-_DIAGRAM = "DIAGRAM is FILE.py:NAME: a diagram in a file of yours, or a function without arguments that returns one.\n"
+_DIAGRAM = (
+    "DIAGRAM is FILE.py:NAME: a diagram in a file of yours, or a function without arguments that returns one;\n"
+    "or FILE.ssp, an SSP of any tool.\n"
+)
 _STATUS = (
     "\nexit status:\n  0    done\n  1    {one}\n  2    wrong usage; nothing was run\n"
     "  130  interrupted (Ctrl-C){interrupted}"
@@ -46,10 +49,10 @@ def add_diagram_options(run: argparse.ArgumentParser) -> None:
     """Add the options of ``loopwright run`` that are for diagrams of users."""
     group = run.add_argument_group("of FILE.py:NAME")
     group.add_argument(
-        "--duration", type=_parse_positive, metavar="S", help="simulated time in s (experiments: theirs)"
+        "--duration", type=parse_positive, metavar="S", help="simulated time in s (experiments: theirs)"
     )
-    _add_set(group)
-    group.add_argument("--step", type=_parse_positive, metavar="S", help="step between ticks, where there is no clock")
+    add_set(group)
+    group.add_argument("--step", type=parse_positive, metavar="S", help="step between ticks, where there is no clock")
     group.add_argument("--solver", metavar="NAME", help="solver of the continuous part, such as RK45")
     group.add_argument("--json", action="store_true", help="print the results as JSON in place of the table")
 
@@ -79,7 +82,7 @@ def add_diagrams(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         + _STATUS.format(one="a run failed; the others are written", interrupted="; nothing is written"),
     )
     sweep.add_argument("diagram", metavar="DIAGRAM", help="FILE.py:NAME")
-    sweep.add_argument("--duration", type=_parse_positive, metavar="S", required=True, help="simulated time in s")
+    sweep.add_argument("--duration", type=parse_positive, metavar="S", required=True, help="simulated time in s")
     sweep.add_argument(
         "--vary",
         metavar="PATH=VALUES",
@@ -99,15 +102,16 @@ def add_diagrams(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help=f"a number of each run: {', '.join(REDUCTIONS)} of a signal; repeat it for several (default: final of "
         "all named wires)",
     )
-    _add_set(sweep)
-    sweep.add_argument("--step", type=_parse_positive, metavar="S", help="step between ticks, where there is no clock")
+    add_set(sweep)
+    sweep.add_argument("--step", type=parse_positive, metavar="S", help="step between ticks, where there is no clock")
     sweep.add_argument("--solver", metavar="NAME", help="solver of the continuous part")
     sweep.add_argument("--workers", type=int, metavar="N", help="number of threads (default: as many as cores)")
     sweep.add_argument("--out", metavar="FILE.csv", help="file for the table")
     sweep.add_argument("--json", action="store_true", help="print the table as JSON")
 
 
-def _add_set(parser: Any) -> None:
+def add_set(parser: Any) -> None:
+    """Add the option of other values of parameters."""
     parser.add_argument(
         "--set",
         metavar="PATH=VALUE",
@@ -118,7 +122,8 @@ def _add_set(parser: Any) -> None:
     )
 
 
-def _parse_positive(text: str) -> float:
+def parse_positive(text: str) -> float:
+    """Return a positive number that was given as a text."""
     try:
         value = float(text)
     except ValueError:
@@ -143,13 +148,14 @@ def run_diagram(subject: str, arguments: argparse.Namespace) -> int:
         out.mkdir(parents=True, exist_ok=True)
     try:
         with open_user_diagram(subject) as (diagram, experiment):
-            diagram = _with_changes(diagram, arguments)
-            duration = arguments.duration or (None if experiment is None else experiment.duration)
+            diagram = change_diagram(diagram, arguments)
+            file = proposed(subject)
+            duration = arguments.duration or (file.get("duration") if experiment is None else experiment.duration)
             if duration is None:
                 raise OptionError(
                     "a diagram has none of its own. Give it in s, such as --duration 2.", port="--duration"
                 )
-            run, problem, interrupted = _simulate(diagram, duration, _run_options(arguments))
+            run, problem, interrupted = _simulate(diagram, duration, _run_options(arguments, file))
             if run is not None and len(run.t):
                 files = _write_run(diagram.name, run, problem, out)
     except OptionError:
@@ -169,7 +175,8 @@ def run_diagram(subject: str, arguments: argparse.Namespace) -> int:
     return 130 if interrupted else int(problem is not None)
 
 
-def _with_changes(diagram: Diagram, arguments: argparse.Namespace) -> Diagram:
+def change_diagram(diagram: Diagram, arguments: argparse.Namespace) -> Diagram:
+    """Return a diagram with the parameters that ``--set`` gives."""
     changes: dict[str, Any] = {}
     for text in arguments.changes:
         name, value = _split(text, "--set", "pid.kp=3")
@@ -191,8 +198,9 @@ def _split(text: str, port: str, example: str) -> tuple[str, str]:
     return name.strip(), value.strip()
 
 
-def _run_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    return {name: value for name in ("step", "solver") if (value := getattr(arguments, name)) is not None}
+def _run_options(arguments: argparse.Namespace, file: Mapping[str, float] | None = None) -> dict[str, Any]:
+    given = {name: value for name in ("step", "solver") if (value := getattr(arguments, name)) is not None}
+    return {**({"step": file["step"]} if file and "step" in file else {}), **given}
 
 
 def _simulate(diagram: Diagram, duration: float, options: Mapping[str, Any]) -> tuple[Run | None, str | None, bool]:
@@ -289,7 +297,7 @@ def sweep_command(arguments: argparse.Namespace) -> int:
         raise OptionError("it is for ranges; a list of values has its own number. Leave it out.", port="--count")
     try:
         with open_user_diagram(arguments.diagram) as (diagram, _):
-            diagram = _with_changes(diagram, arguments)
+            diagram = change_diagram(diagram, arguments)
             found = diagram.sweep(
                 parameters,
                 arguments.duration,

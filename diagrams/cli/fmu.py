@@ -31,6 +31,8 @@ from ...fmus.models import gantry
 from ...fmus.platform import native_platform
 from ...fmus.toolchain import TARGETS
 from .doctor import add_doctor, run_doctor
+from .ssp import inspect_ssp
+from .subjects import is_ssp
 from .text import check_file, fit, say
 from .user_models import load_user_model
 
@@ -73,13 +75,14 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     inspect = commands.add_parser(
         "inspect",
-        help="show an FMU's description",
+        help="show the description of an FMU or an SSP",
         formatter_class=raw,
-        description="Show the description of an FMU of any tool (FMI 1.0 to 3.0), without running it.",
-        epilog="examples:\n  loopwright inspect plant.fmu\n  loopwright inspect plant.fmu --json"
+        description="Show the description of an FMU of any tool (FMI 1.0 to 3.0), or of an SSP, without running it.",
+        epilog="examples:\n  loopwright inspect plant.fmu\n  loopwright inspect plant.fmu --json\n"
+        "  loopwright inspect system.ssp"
         + _STATUS.format(one="it can't be read"),
     )
-    inspect.add_argument("file", metavar="FILE.fmu")
+    inspect.add_argument("file", metavar="FILE", help="a .fmu, .ssp or .ssd")
     inspect.add_argument("--all", action="store_true", help="local variables, too")
     inspect.add_argument("--json", action="store_true", help="the same as JSON, all variables")
     check = commands.add_parser(
@@ -231,6 +234,8 @@ def _size_text(n: int) -> str:
 
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright inspect``."""
+    if is_ssp(arguments.file):
+        return inspect_ssp(arguments.file, as_json=arguments.json)
     path = check_file(arguments.file)
     try:
         summary = summarize(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -12,9 +13,12 @@ from ...blocks.core import DefinitionError, LoopwrightError, OptionError, near
 from ...fmus.models import gantry
 from ..diagram import Diagram
 from ..paper import EXPERIMENTS, Experiment
+from ..ssp import read_ssp
 from .options import parse_options, share
 from .text import say
 from .user_models import line_text, load_user_file
+
+_SSP = re.compile(r"(?P<file>.*?\.(?:ssp|ssd))(?::(?P<variant>.+))?", re.IGNORECASE)
 
 
 @contextlib.contextmanager
@@ -33,12 +37,32 @@ def open_subject(subject: str, arguments: argparse.Namespace) -> Iterator[tuple[
 
 def is_user_file(subject: str) -> bool:
     """Return whether a subject names a file of a user's, and no experiment."""
-    return ".py" in subject
+    return ".py" in subject or is_ssp(subject)
+
+
+def is_ssp(subject: str) -> bool:
+    """Return whether a subject names an SSP, or a description that is a file of its own."""
+    return _SSP.fullmatch(subject) is not None
+
+
+def split_ssp(subject: str) -> tuple[str, str | None]:
+    """Return the file of an SSP, and the name of the variant behind its colon; None without one."""
+    match = _SSP.fullmatch(subject)
+    return (subject, None) if match is None else (match["file"], match["variant"])
+
+
+def proposed(subject: str) -> dict[str, float]:
+    """Return what an SSP proposes for a run: ``duration`` and ``step``, as far as it does."""
+    if not is_ssp(subject):
+        return {}
+    about = read_ssp(*split_ssp(subject))
+    found = {"duration": about.stop, "step": about.step}
+    return {name: value for name, value in found.items() if value is not None and value > 0.0}
 
 
 @contextlib.contextmanager
 def open_user_diagram(subject: str) -> Iterator[tuple[Diagram, Experiment | None]]:
-    """Yield the diagram of ``FILE.py:NAME``, and its experiment where it has one.
+    """Yield the diagram of ``FILE.py:NAME`` or ``FILE.ssp``, and its experiment where it has one.
 
     Raises
     ------
@@ -47,6 +71,9 @@ def open_user_diagram(subject: str) -> Iterator[tuple[Diagram, Experiment | None
     DefinitionError
         The file, or the function that makes the diagram, raises: with the line in the user's file.
     """
+    if is_ssp(subject):
+        yield Diagram.from_ssp(*split_ssp(subject)), None
+        return
     with load_user_file(subject, port="DIAGRAM") as (module, path, name):
         found = _find_diagram(vars(module), path, name)
         yield (found.diagram, found) if isinstance(found, Experiment) else (found, None)

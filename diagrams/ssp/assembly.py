@@ -126,13 +126,19 @@ class Assembly:
                     path, None, None, tuple(ports[False]), tuple(ports[True])
                 )
 
-    def _add_block(self, block: type[Block], name: str, subsystem: str, **parameters: Any) -> str:
-        """Add a block and return its path; a name that is taken gets a number."""
+    def _add_block(
+        self, block: type[Block], name: str, subsystem: str, *, is_named: bool = False, **parameters: Any
+    ) -> str:
+        """Add a block and return its path; a name that is taken gets a number.
+
+        Named are blocks that stand for something in the file; those of its transformations have a path alone.
+        """
         path, count = join(subsystem, name), 2
         while path in self._taken:
             path, count = join(subsystem, f"{name}_{count}"), count + 1
         self._taken.add(path)
-        self.table.blocks[path] = block(name=path.rpartition(".")[2], **parameters)
+        label = {"name": path.rpartition(".")[2]} if is_named else {}
+        self.table.blocks[path] = block(**label, **parameters)
         self.table.subsystem_of[path] = subsystem
         return path
 
@@ -260,7 +266,12 @@ class Assembly:
                     block=self.root.name,
                 )
             path = self._add_block(
-                Constant, _identifier(origin.connector), "", value=np.asarray(value, dtype=float), unit=connector.unit
+                Constant,
+                _identifier(origin.connector),
+                "",
+                is_named=True,
+                value=np.asarray(value, dtype=float),
+                unit=connector.unit,
             )
             self._sources[origin] = Wire(path, "y")
 
@@ -400,19 +411,22 @@ class Assembly:
         return Wire(total, "y")
 
     def _name_outputs(self) -> None:
-        """Name the wires of systems' outputs by their connectors."""
+        """Name the wires of systems' outputs by their connectors, and note where their inputs come from."""
         for names, system in self.systems.items():
             for name, connector in system.connectors.items():
                 node = Node(names, name)
-                if connector.kind not in OUTPUTS or node not in self.flow.hops:
+                if node not in self.flow.hops:
                     continue
-                feed = self._feed(node)
+                feed, path = self._feed(node), self.paths[names]
                 if feed.origin.element not in self.parts and feed.origin not in self._sources:
                     continue
-                path = self.paths[names]
+                if connector.kind not in OUTPUTS:
+                    if path in self.table.subsystems and not feed.operations:
+                        self.table.arguments[path, _identifier(name)] = self._source(feed.origin)[0]
+                    continue
                 wire = self._operate(self._source(feed.origin)[0], feed.operations, path, join(path, _identifier(name)))
                 self.table.names[join(path, _identifier(name))] = wire
-                if names:
+                if path in self.table.subsystems and names:
                     self.table.results[path, _identifier(name)] = wire
 
 

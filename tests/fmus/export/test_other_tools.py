@@ -4,16 +4,14 @@ FMPy and CasADi's own import are in most tests of this folder. Both peers read s
 FMI 2.0 or as scalars of FMI 3.0.
 """
 
-import ctypes
 import importlib
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from loopwright.fmus import bouncing_ball, gantry, mass_spring_damper
+from support.ecos import load_ecospy
 from support.exported import ball, bounces
 
 FMI = (2, 3)
@@ -110,21 +108,7 @@ def test_events_in_pathsim(fmi, kind, ahead):
 
 @pytest.fixture(scope="module")
 def ecospy():
-    if sys.platform == "linux":  # its library needs libtbb, which the package tbb puts where no loader looks
-        for name in ("libtbb.so.12", str(Path(sys.prefix) / "lib" / "libtbb.so.12")):
-            try:
-                ctypes.CDLL(name, ctypes.RTLD_GLOBAL)
-                break
-            except OSError:
-                continue
-        else:
-            pytest.skip("ecospy needs libtbb.so.12, which is missing: pip install tbb, or apt-get install libtbb12")
-    try:
-        return importlib.import_module("ecospy")
-    except ImportError:
-        pytest.skip("ecospy is not installed (extra: test)")
-    except OSError as error:
-        pytest.skip(f"ecospy's own library is not made for this platform: {error}")
+    return load_ecospy()
 
 
 def ecos(ecospy, path, parameters, names, steps):

@@ -1,0 +1,401 @@
+"""A diagram of FMUs, written as an SSP."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import Constant, OptionError, SspFileError, check_file, replace_file, same_unit
+from ...fmus import Fmu
+from ...fmus.archive import FmuDescription, FmuVariable
+from ..flat import WiredDiagram
+from ..wiring import Wire
+from .documents import (
+    WrittenConnection,
+    WrittenConnector,
+    WrittenElement,
+    WrittenValue,
+    needs_version_2,
+    write_description,
+    write_dictionary,
+    write_values,
+)
+from .geometry import lay_out
+from .package import DEFAULT
+from .terms import Term, Terms
+
+_TIME = (2020, 1, 1, 0, 0, 0)
+"""Time of all files in an archive, so that the same diagram gives the same bytes."""
+SET = "parameters"
+"""Name of all parameter sets: tools that let a user choose one by its name apply those of all components."""
+_KINDS = {"input": "input", "output": "output", "parameter": "parameter"}
+
+
+@dataclass
+class Part:
+    """Component that is written."""
+
+    path: str
+    """Path of its block in the diagram."""
+    system: str
+    """Path of the system that it is in; empty for the root system."""
+    block: Fmu
+    element: WrittenElement
+    description: FmuDescription
+    values: list[WrittenValue] = field(default_factory=list)
+    scalars: dict[str, list[str]] = field(default_factory=dict)
+    """Variables of each port, in the order of its entries."""
+
+
+@dataclass
+class Writer:
+    """A diagram on its way to an SSP; parameters are those of `write_ssp`."""
+
+    wired: WiredDiagram
+    flat: bool
+
+    def __post_init__(self) -> None:
+        self.table = self.wired.scheduled
+        self.root = WrittenElement(self.wired.name)
+        self.systems: dict[str, WrittenElement] = {"": self.root}
+        self.parts: dict[str, Part] = {}
+        self.inputs: dict[str, WrittenValue] = {}
+        self.files: dict[str, Path] = {}
+        self._digests: dict[str, str] = {}
+        self._borders: dict[tuple[str, str, str, int | None], str] = {}
+
+    def fill(self) -> None:
+        """Make the root system with all that is in it.
+
+        Raises
+        ------
+        SspFileError
+            For a block that is no FMU, and no transformation between FMUs.
+        """
+        for path, block in sorted(self.table.blocks.items()):
+            if isinstance(block, Fmu):
+                self._add_part(path, block)
+            elif block.stepped:
+                raise SspFileError(
+                    f"found {block.drawn_as}, which a run steps from outside and which is no FMU; expected FMUs. "
+                    "Replace it by an FMU.",
+                    block=path,
+                )
+        if not self.parts:
+            raise SspFileError(
+                "found no FMU in it; expected one at least, as an SSP is a system of FMUs. Build one of a block: "
+                "loopwright.build(…).",
+                block=self.wired.name,
+            )
+        constants = (
+            set()
+            if self.flat
+            else {
+                path
+                for path, block in self.wired.structure.blocks.items()
+                if isinstance(block, Constant) and block.name and not self.table.subsystem_of[path]
+            }
+        )
+        self.terms = Terms(self.wired, {*self.parts, *constants})
+        for part in self.parts.values():
+            for port in part.block.inputs:
+                wire = self.table.wires.get((part.path, port))
+                if wire is not None:
+                    self._wire_port(part, port, wire)
+        if not self.flat:
+            self._name_outputs()
+        self._refuse_the_rest(constants)
+
+    def _refuse_the_rest(self, constants: set[str]) -> None:
+        """Refuse blocks that have no place in it."""
+        known = {*self.parts, *self.terms.through, *constants}
+        known |= {path for path, block in self.table.blocks.items() if isinstance(block, Constant)}
+        for path in sorted(self.table.blocks):
+            if path not in known:
+                raise self._no_place(path)
+
+    def _no_place(self, path: str) -> SspFileError:
+        block = self.table.blocks[path]
+        return SspFileError(
+            f"found {block.drawn_as}, which is neither an FMU nor a linear transformation of one signal; expected "
+            "these. Export it as an FMU, and put that in its place.",
+            block=path,
+        )
+
+    # --- components --------------------------------------------------------------------------------------------------
+
+    def _system(self, path: str) -> WrittenElement:
+        """Return the system of a subsystem, which is made with those around it."""
+        if path not in self.systems:
+            settings = self.table.subsystems[path]
+            if settings.sample_time is not None or settings.control:
+                kind = settings.control or "sampled"
+                raise SspFileError(
+                    f"found FMUs in a subsystem that is {kind}; expected them outside of it, as a system of an SSP has "
+                    "no rate. Take them out.",
+                    block=path,
+                )
+            outer = self._system(path.rpartition(".")[0])
+            made = WrittenElement(path.rpartition(".")[2])
+            self.systems[path] = outer.elements[made.name] = made
+        return self.systems[path]
+
+    def _add_part(self, path: str, block: Fmu) -> None:
+        system, name = self.table.subsystem_of[path], path.rpartition(".")[2]
+        if self.flat:
+            system, name = "", path.replace(".", "_")
+        about = block.description
+        implementation = {"co_simulation": "CoSimulation", "model_exchange": "ModelExchange"}.get(block.interface or "")
+        element = WrittenElement(name, self._add_file(Path(about.file), about.digest), implementation or "")
+        self._system(system).elements[name] = element
+        part = self.parts[path] = Part(path, system, block, element, about)
+        arrays: dict[str, list[tuple[tuple[int, ...], str]]] = {}
+        for scalar, (array, index) in about.elements.items():
+            arrays.setdefault(array, []).append((index, scalar))
+        for port, variable in {**block.input_variables, **block.output_variables}.items():
+            gathered = variable.name in arrays and variable.shape
+            part.scalars[port] = [s for _, s in sorted(arrays[variable.name])] if gathered else [variable.name]
+        for variable_name, value in block.start.items():
+            members = [s for _, s in sorted(arrays.get(variable_name, []))]
+            numbers = np.ravel(value) if members else [value]
+            for scalar, number in zip(members or [variable_name], numbers, strict=True):
+                self._set_value(part, scalar, number)
+        for port in block.outputs:
+            for scalar in part.scalars.get(port, ()):
+                self._connector(part, scalar)
+
+    def _add_file(self, file: Path, digest: str) -> str:
+        """Return the place of an FMU in the archive; FMUs of one content share it."""
+        if digest in self._digests:
+            return self._digests[digest]
+        name, count = f"resources/{file.stem}.fmu", 2
+        while name in self.files:
+            name, count = f"resources/{file.stem}_{count}.fmu", count + 1
+        self.files[name] = file
+        self._digests[digest] = name
+        return name
+
+    def _set_value(self, part: Part, name: str, value: Any) -> None:
+        about = part.description
+        if name in about.other:
+            part.values.append(WrittenValue(name, about.other[name].type, value))
+            return
+        variable = about.find(name)
+        shown = value if variable.shape else float(np.ravel(value)[0])
+        part.values = [v for v in part.values if v.name != name]
+        if variable.start is not None and np.array_equal(shown, np.asarray(variable.start, dtype=float)):
+            return  # the FMU's own
+        part.values.append(WrittenValue(name, variable.type, shown, variable.unit, variable.items))
+
+    def _connector(self, part: Part, name: str) -> WrittenConnector:
+        if name not in part.element.connectors:
+            variable: FmuVariable = part.description.find(name)
+            kind = "constant" if variable.variability == "constant" else variable.causality
+            part.element.connectors[name] = WrittenConnector(
+                name, kind, variable.type, variable.unit, variable.shape, variable.items
+            )
+        return part.element.connectors[name]
+
+    # --- connections -------------------------------------------------------------------------------------------------
+
+    def _wire_port(self, part: Part, port: str, wire: Wire) -> None:
+        """Write the connections of an input, one for each of its variables; numbers become start values."""
+        terms, scalars = self.terms.entries(wire), part.scalars[port]
+        for term in terms:
+            if term.stopped:
+                raise self._no_place(term.stopped)
+        if len(scalars) < len(terms):  # an array of FMI 3.0
+            terms = [self._whole(part, port, terms)]
+        for name, term in zip(scalars, terms, strict=True):
+            if term.source is None:
+                variable = part.description.find(name)
+                self._set_value(part, name, np.full(variable.shape, term.offset))
+                continue
+            end = self._connector(part, name)
+            self._connect(term, part.system, (part.element.name, name), end)
+
+    def _whole(self, part: Part, port: str, terms: Sequence[Term]) -> Term:
+        """Return the one term of an array, whose entries come from one array in order."""
+        first = terms[0]
+        if first.source is not None and all(
+            term == replace(first, source=(first.source[0], first.source[1], i)) for i, term in enumerate(terms)
+        ):
+            block, out, _ = first.source
+            if self.terms.shape(Wire(block, out)) == part.block.inputs[port].shape:
+                return replace(first, source=(block, out, None))
+        raise SspFileError(
+            "found an array of FMI 3.0 whose entries come from several signals; expected one array, as a connection of "
+            "an SSP is one of whole arrays. Export its FMU with scalars: build(…, arrays=False).",
+            block=part.path,
+            port=port,
+        )
+
+    def _start(self, source: tuple[str, str, int | None]) -> tuple[str, str, WrittenConnector]:
+        """Return the system where a source is, the name of its element, and its connector."""
+        path, port, i = source
+        if path in self.parts:
+            part = self.parts[path]
+            scalars = part.scalars[port]
+            name = scalars[i or 0] if len(scalars) > 1 else scalars[0]
+            return part.system, part.element.name, self._connector(part, name)
+        block = self.wired.structure.blocks[path]
+        assert isinstance(block, Constant)
+        name = path if i is None else f"{path}[{i + 1}]"
+        if name not in self.root.connectors:
+            value = np.asarray(block.value, dtype=float)
+            shown = value if i is None and value.shape else float(np.ravel(value)[i or 0])
+            self.root.connectors[name] = WrittenConnector(name, "input", unit=block.unit, shape=np.shape(shown))
+            self.inputs[name] = WrittenValue(name, "Float64", shown, block.unit)
+        return "", "", self.root.connectors[name]
+
+    def _connect(self, term: Term, system: str, end: tuple[str, str], target: WrittenConnector) -> None:
+        """Write a connection, through the borders of systems; its transformation is in the last one."""
+        assert term.source is not None
+        at, element, connector = self._start(term.source)
+        start = (element, connector.name)
+        around = _around(system)
+        while at not in around:  # out of the systems that hold the source alone
+            outer = at.rpartition(".")[0]
+            name = self._border(at, term.source, connector, "output")
+            if name is None:
+                name = self._add_border(at, term.source, connector, "output")
+                self.systems[at].connections.append(WrittenConnection(start, ("", name)))
+            start, at = (at.rpartition(".")[2], name), outer
+        for inner in around[around.index(at) + 1 :]:
+            name = self._border(inner, term.source, connector, "input")
+            if name is None:
+                name = self._add_border(inner, term.source, connector, "input")
+                self.systems[at].connections.append(WrittenConnection(start, (inner.rpartition(".")[2], name)))
+            start, at = ("", name), inner
+        units = connector.unit, target.unit
+        differ = units[0] is not None and units[1] is not None and not same_unit(*units)  # type: ignore[arg-type]
+        plain = replace(term, source=None)
+        self.systems[system].connections.append(WrittenConnection(start, end, plain, differ))
+
+    def _border(
+        self, system: str, source: tuple[str, str, int | None], connector: WrittenConnector, kind: str
+    ) -> str | None:
+        return self._borders.get((system, kind, f"{source[0]}.{source[1]}", source[2]))
+
+    def _add_border(
+        self, system: str, source: tuple[str, str, int | None], connector: WrittenConnector, kind: str
+    ) -> str:
+        """Add a connector to a system, by the name that the diagram's subsystem has for this signal."""
+        path, port, i = source
+        wires = self.table.results if kind == "output" else self.table.arguments
+        label = f"{path.rpartition('.')[2]}_{port}" if path in self.parts else path
+        for (at, known), wire in wires.items():
+            if at == system and (wire.block, wire.port, wire.index) == (path, port, None):
+                label = known
+        base = name = label if i is None else f"{label}[{i + 1}]"
+        count = 2
+        while name in self.systems[system].connectors:
+            name, count = f"{base}_{count}", count + 1
+        made = replace(connector, name=name, kind=kind, place=None)
+        self.systems[system].connectors[name] = made
+        self._borders[system, kind, f"{path}.{port}", i] = name
+        return name
+
+    def _name_outputs(self) -> None:
+        """Write the named wires as outputs of their systems, where they come from FMUs."""
+        for full, wire in sorted(self.wired.names.items()):
+            system, _, name = full.rpartition(".")
+            if system not in self.systems:
+                continue
+            terms = self.terms.entries(wire)
+            if any(term.source is None or term.source[0] not in self.parts for term in terms):
+                continue
+            unit = self.wired.checked.units.get((wire.block, wire.port))
+            for i, term in enumerate(terms):
+                label = name if not self.terms.shape(wire) else f"{name}[{i + 1}]"
+                if label in self.systems[system].connectors:
+                    continue  # the border of this very signal
+                of = unit[i] if isinstance(unit, tuple) else unit
+                plain = term.is_plain and term.source is not None
+                type_ = self._start(term.source)[2].type if plain and term.source else "Float64"
+                made = WrittenConnector(label, "output", type_ if type_ != "Enumeration" else "Int32", of)
+                self.systems[system].connectors[label] = made
+                self._connect(term, system, ("", label), made)
+
+    # --- files -------------------------------------------------------------------------------------------------------
+
+    def content(self, stop: float | None, step: float | None) -> Iterator[tuple[str, bytes | Path]]:
+        """Yield the files of the archive by their names."""
+        connectors = [c for e in _walk(self.root) for c in e.connectors.values()]
+        values = [v for part in self.parts.values() for v in part.values]
+        version = "2.0" if needs_version_2(connectors, values) else "1.0"
+        taken: set[str] = set()
+        for part in self.parts.values():
+            if part.values:
+                part.element.binding = _free(f"resources/{part.element.name}", ".ssv", taken)
+                yield part.element.binding, write_values(version, SET, part.values)
+        if self.inputs:
+            self.root.binding = _free("resources/inputs", ".ssv", taken)
+            yield self.root.binding, write_values(version, SET, [*self.inputs.values()])
+        signals = [c for c in self.root.connectors.values() if c.kind in _KINDS]
+        if signals:
+            self.root.dictionary = _free("resources/signals", ".ssb", taken)
+            yield self.root.dictionary, write_dictionary(version, signals)
+        lay_out(self.root)
+        yield DEFAULT, write_description(version, self.wired.name, self.root, stop, step)
+        yield from self.files.items()
+
+
+def write_ssp(
+    wired: WiredDiagram,
+    path: str | os.PathLike[str],
+    *,
+    stop: float | None = None,
+    step: float | None = None,
+    flat: bool = False,
+) -> Path:
+    """Write a diagram as an SSP, and return the file; see `Diagram.to_ssp`.
+
+    Raises
+    ------
+    OptionError
+        A path that does not end in ``.ssp``, a folder that isn't there, a time that is not positive.
+    SspFileError
+        A block that has no place in it.
+    """
+    file = check_file(path)
+    if file.suffix.lower() != ".ssp":
+        raise OptionError(f"found {str(path)!r}; expected a file for an SSP; name it {file.stem}.ssp.", port="path")
+    for name, value in (("stop", stop), ("step", step)):
+        if value is not None and not (isinstance(value, int | float) and 0.0 < value < float("inf")):
+            raise OptionError(f"found {name}={value!r}; expected seconds, such as 10.0. Give them.", port=name)
+    writer = Writer(wired, flat)
+    writer.fill()
+    with replace_file(file) as fresh, zipfile.ZipFile(fresh, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in sorted(writer.content(stop, step), key=lambda item: (item[0] != DEFAULT, item[0])):
+            item = zipfile.ZipInfo(name, _TIME)
+            item.compress_type = zipfile.ZIP_STORED if name.endswith(".fmu") else zipfile.ZIP_DEFLATED
+            item.external_attr = 0o644 << 16
+            archive.writestr(item, content if isinstance(content, bytes) else content.read_bytes())
+    return file
+
+
+def _walk(element: WrittenElement) -> Iterator[WrittenElement]:
+    yield element
+    for inner in element.elements.values():
+        yield from _walk(inner)
+
+
+def _around(system: str) -> list[str]:
+    """Return the root, and the systems down to one."""
+    parts = system.split(".") if system else []
+    return ["", *(".".join(parts[: i + 1]) for i in range(len(parts)))]
+
+
+def _free(base: str, ending: str, taken: set[str]) -> str:
+    name, count = f"{base}{ending}", 2
+    while name in taken:
+        name, count = f"{base}_{count}{ending}", count + 1
+    taken.add(name)
+    return name

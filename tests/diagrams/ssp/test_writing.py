@@ -1,0 +1,179 @@
+"""Diagrams of FMUs go out as SSPs by the standard's schemas, come in again with the same bits, and run in other tools."""
+
+import zipfile
+
+import numpy as np
+import pytest
+from fmpy.ssp.simulation import simulate_ssp
+from fmpy.ssp.ssd import ParameterSet, read_ssd, read_ssv, validate_tree
+from lxml import etree
+
+from loopwright import Diagram, Fmu, subsystem
+from loopwright.blocks import Constant, Gain, Integrator, Sine, Stack, UnitConversion
+from loopwright.diagrams import OptionError, SspFileError, read_ssp
+from support.ecos import load_ecospy
+from support.ssp_files import adder
+
+H, N = 0.125, 16  # exact in binary
+OTHERS = {"mode": 1, "number": 0, "flag": 0, "s": [0.0, 0.0]}
+pytestmark = pytest.mark.equal_bits
+
+
+@pytest.fixture(scope="module")
+def fmu(tmp_path_factory):
+    return adder(tmp_path_factory.mktemp("adder"))
+
+
+def run(diagram, **options):
+    return diagram.simulate(H * N, step=H, progress=False, **options)
+
+
+def assert_same(one, other, *names):
+    """Assert that two runs have the same bits in some signals; by name, or a pair of names."""
+    for name in names:
+        a, b = (name, name) if isinstance(name, str) else name
+        assert np.array_equal(one[a], other[b]), name
+
+
+def check_schemas(file):
+    """Hold all descriptions and parameter sets of an SSP against the standard's schemas, which FMPy has."""
+    read_ssd(str(file))
+    with zipfile.ZipFile(file) as archive:
+        for name in archive.namelist():
+            if name.endswith(".ssv"):
+                read_ssv(str(file), name)
+            if name.endswith(".ssb"):
+                validate_tree(etree.fromstring(archive.read(name)), "SystemStructureSignalDictionary.xsd")
+
+
+def pair(fmu):
+    """Return two adders in a loop with gains, an offset, a constant, and an array between them."""
+    a = Fmu(fmu, name="a", start={**OTHERS, "mode": 2, "number": 3, "flag": 1, "text": "ab", "s": [1.5, 2.5]})
+    b = Fmu(fmu, name="b", start={**OTHERS, "k": 0.3})
+    reference = Constant(value=0.7, name="reference", unit="m/s")
+    back = Gain(gain=-0.3)(b.y).named("back")
+    return Diagram("pair", a(u=back + 0.125), b(u=reference, s=a.d).y.named("out"))
+
+
+def test_a_diagram_goes_out_and_comes_in_with_the_same_bits(fmu, tmp_path, cache):
+    diagram = pair(fmu)
+    file = diagram.to_ssp(tmp_path / "pair.ssp", stop=2.0, step=H)
+    check_schemas(file)
+    assert (read_ssp(file).stop, read_ssp(file).step, read_ssp(file).version) == (2.0, H, "1.0")
+    again = Diagram.from_ssp(file)
+    assert_same(run(diagram), run(again), "a.y", "b.y", "b.d", "a.sum", "out", "back")
+    assert again["a"].start["text"] == "ab"
+    assert again["reference"].value == 0.7
+    more = {"reference.value": -1.0}
+    assert_same(run(diagram.replace(more)), run(again.replace(more)), "a.y", "b.y")
+    assert diagram.to_ssp(tmp_path / "again.ssp", stop=2.0, step=H).read_bytes() == file.read_bytes()
+    with zipfile.ZipFile(file) as archive:
+        assert sum(name.endswith(".fmu") for name in archive.namelist()) == 1  # both components are of one file
+
+
+def test_the_second_way_out_is_the_first(fmu, tmp_path, cache):
+    """What was read is written with the same elements, connectors and connections."""
+    first = pair(fmu).to_ssp(tmp_path / "first.ssp")
+    second = Diagram.from_ssp(first).to_ssp(tmp_path / "second.ssp")
+    texts = []
+    for file in (first, second):
+        root = etree.fromstring(zipfile.ZipFile(file).read("SystemStructure.ssd"))
+        texts.append(sorted(tuple(e.items()) for e in root.iter("{*}Connection", "{*}Connector", "{*}Component")))
+    assert texts[0] == texts[1]
+
+
+def test_systems_within_systems_and_conversions_of_units(fmu, tmp_path, cache):
+    """Two adders in a system without a rate, one of them a system deeper, and two around it."""
+
+    @subsystem
+    def deepest(fed):
+        return Fmu(fmu, name="c", start=OTHERS)(u=fed * 2.0).y
+
+    @subsystem
+    def inner(fed, speed):
+        return Fmu(fmu, name="a", start=OTHERS)(u=speed).y, deepest(fed)
+
+    outer = Fmu(fmu, name="outer", start=OTHERS, convert_units=True)
+    fast = UnitConversion(from_unit="mm/s", to_unit="m/s")(Constant(value=250.0, unit="mm/s", name="fast"))
+    slow, deep = inner(Gain(gain=1.0)(outer.y), fast)
+    twice = Gain(gain=np.array([[0.0, 2.0], [1.0, 0.0]]))(outer.d)
+    root = Diagram(
+        "nested",
+        outer(u=Gain(gain=0.5)(slow), s=Stack(count=2)(Gain(gain=3.0)(deep), 0.25)),
+        Fmu(fmu, name="last", start=OTHERS)(s=twice, u=0.0),
+        deep.named("deep"),
+    )
+    file = root.to_ssp(tmp_path / "nested.ssp")
+    check_schemas(file)
+    again = Diagram.from_ssp(file)
+    assert [s for s in again.subsystems if s] == ["inner", "inner.deepest"]
+    assert_same(run(root), run(again), "inner.a.y", "inner.deepest.c.y", "outer.y", "outer.d", "last.d", "deep")
+    flat = Diagram.from_ssp(root.to_ssp(tmp_path / "flat.ssp", flat=True))
+    assert_same(run(root), run(flat), ("inner.a.y", "inner_a.y"), ("inner.deepest.c.y", "inner_deepest_c.y"), "outer.d")
+
+
+def test_fmpy_runs_a_flat_one_with_the_same_bits(fmu, tmp_path, cache):
+    """FMPy takes neither transformations nor bindings: a chain without them, and its parameter sets by hand."""
+    b, c = (Fmu(fmu, name=name, start={"k": k, "b": 0.1, **OTHERS}) for name, k in (("b", 0.3), ("c", 0.7)))
+    diagram = Diagram("chain", b(u=Gain(gain=1.0)(c.y)), c(u=Gain(gain=1.0)(b.y)))
+    file = diagram.to_ssp(tmp_path / "chain.ssp", flat=True)
+    given = ParameterSet(name="all")
+    for name in ("b", "c"):
+        for parameter in read_ssv(str(file), f"resources/{name}.ssv").parameters:
+            if parameter.type == "Real":
+                parameter.name = f"{name}.{parameter.name}"
+                given.parameters.append(parameter)
+    theirs = simulate_ssp(str(file), stop_time=H * N, step_size=H, parameter_set=given)
+    ours = run(diagram)
+    for name in ("b.y", "c.y"):
+        assert np.array_equal(theirs[name], ours[name][1:])
+
+
+@pytest.mark.slow
+def test_ecos_runs_a_flat_one_with_the_same_bits(fmu, tmp_path, cache):
+    """Ecos takes transformations and parameter sets of components; Jacobi, too."""
+    ecospy = load_ecospy()
+    b, c = (Fmu(fmu, name=name, start={"k": k, "b": 0.1, **OTHERS, "mode": 1}) for name, k in (("b", 0.3), ("c", 0.7)))
+    diagram = Diagram("chain", b(u=-0.25 * c.y + 0.5), c(u=Gain(gain=1.0)(b.y)))
+    file = diagram.to_ssp(tmp_path / "chain.ssp", flat=True)
+    ours = run(diagram)
+    with ecospy.EcosSimulation(H, ssp_path=str(file)) as simulation:
+        assert simulation.init(parameter_set="parameters"), ecospy.EcosLib.get_last_error()
+        for i in range(1, N + 1):
+            simulation.step()
+            assert [simulation.get_real(f"{name}::y") for name in "bc"] == [ours["b.y"][i], ours["c.y"][i]]
+        simulation.terminate()
+
+
+def test_arrays_of_fmi_3_make_it_ssp_2(tmp_path, cache):
+    """An array of FMI 3.0 is one connector with a dimension, and one value of a parameter set."""
+    from loopwright.fmus import gantry
+
+    file = gantry.build()
+    a, b = (Fmu(file, name=name, start={"external_force": [0.5, -0.5]}) for name in "ab")
+    diagram = Diagram(
+        "two", a(motor_force=Constant(value=(1.0, 2.0), name="push", unit="N")), b(motor_force=a.velocity * 3.0)
+    )
+    written = diagram.to_ssp(tmp_path / "two.ssp")
+    assert read_ssp(written).version == "2.0"
+    again = Diagram.from_ssp(written)
+    one, two = (d.simulate(0.1, step=0.01, progress=False) for d in (diagram, again))
+    assert_same(one, two, "a.position", "b.velocity")
+
+
+@pytest.mark.parametrize("block", [Sine(frequency=1.0, name="wave"), Integrator(name="wave")(1.0)])
+def test_a_block_that_has_no_place_is_named(fmu, tmp_path, cache, block):
+    diagram = Diagram("d", Fmu(fmu, name="a", start=OTHERS)(u=block))
+    with pytest.raises(SspFileError, match=r"^wave: found (Sine|Integrator), .* expected"):
+        diagram.to_ssp(tmp_path / "x.ssp")
+    assert not (tmp_path / "x.ssp").exists()
+
+
+def test_a_file_of_another_ending_is_refused(fmu, tmp_path, cache):
+    diagram = pair(fmu)
+    with pytest.raises(OptionError, match=r"name it x\.ssp"):
+        diagram.to_ssp(tmp_path / "x.zip")
+    with pytest.raises(OptionError, match="stop=0"):
+        diagram.to_ssp(tmp_path / "x.ssp", stop=0)
+    with pytest.raises(SspFileError, match="no FMU in it"):
+        Diagram("d", Gain(gain=2.0)(1.0)).to_ssp(tmp_path / "x.ssp")
