@@ -48,9 +48,7 @@ _STATUS = (
 def add_diagram_options(run: argparse.ArgumentParser) -> None:
     """Add the options of ``loopwright run`` that are for diagrams of users."""
     group = run.add_argument_group("of FILE.py:NAME")
-    group.add_argument(
-        "--duration", type=parse_positive, metavar="S", help="simulated time in s (experiments: theirs)"
-    )
+    group.add_argument("--duration", type=parse_positive, metavar="S", help="simulated time in s (experiments: theirs)")
     add_set(group)
     group.add_argument("--step", type=parse_positive, metavar="S", help="step between ticks, where there is no clock")
     group.add_argument("--solver", metavar="NAME", help="solver of the continuous part, such as RK45")

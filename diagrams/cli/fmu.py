@@ -79,8 +79,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         formatter_class=raw,
         description="Show the description of an FMU of any tool (FMI 1.0 to 3.0), or of an SSP, without running it.",
         epilog="examples:\n  loopwright inspect plant.fmu\n  loopwright inspect plant.fmu --json\n"
-        "  loopwright inspect system.ssp"
-        + _STATUS.format(one="it can't be read"),
+        "  loopwright inspect system.ssp" + _STATUS.format(one="it can't be read"),
     )
     inspect.add_argument("file", metavar="FILE", help="a .fmu, .ssp or .ssd")
     inspect.add_argument("--all", action="store_true", help="local variables, too")
