@@ -283,7 +283,7 @@ class PeriodicMarginFinder(MarginFinder[PeriodicMargins]):
         for name, a, b in (("ms", 1.0, 0.0), ("mt", 0.0, 1.0)):
 
             def gain(S: np.ndarray, a: float = a, b: float = b) -> np.ndarray:
-                return np.linalg.norm(b * np.eye(S.shape[-1]) + (a - b) * S, 2, axis=(-2, -1))
+                return np.asarray(np.linalg.norm(b * np.eye(S.shape[-1]) + (a - b) * S, 2, axis=(-2, -1)))
 
             def gain_at(theta: float, gain: Callable[[np.ndarray], np.ndarray] = gain) -> float:
                 return float(gain(sensitivity_at(self.r, theta / self.r.dt)))
