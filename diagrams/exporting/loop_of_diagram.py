@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from ...blocks.core import DefinitionError, SimulationError
-from ...blocks.tracing import constants_of, traced_parameters
-from ...fmus.export import LoopSpec, Placed, Variable, parameter_variable
+from ...blocks.tracing import GUARDS, constants_of, traced_parameters
+from ...fmus.export import Guards, LoopSpec, Placed, Variable, parameter_variable
 from ..compiled import CompiledLoop, NamedCode, function_text, load_runtime, read_memory, write_ticks
-from ..flat import FlatDiagram, kinds_of, sample_time_of
+from ..flat import FlatDiagram, TickPattern, evaluate, kinds_of, sample_time_of, share_terms, speed_up
 from ..model_exchange import BlocksInModelExchange
 from ..simulation import Workspace, find_start_values, initialize, newton_options
 from ..wiring import Wire, join
@@ -20,8 +22,15 @@ from .open_diagram import OpenDiagram
 _MOST_CLOCKS, _MOST_SETS = 64, 250
 
 
-def loop_spec(opened: OpenDiagram, *, name: str, description: str) -> LoopSpec:
+def loop_spec(opened: OpenDiagram, *, name: str, description: str = "", **options: Any) -> LoopSpec:
     """Return a diagram as it is exported.
+
+    Parameters
+    ----------
+    opened : OpenDiagram
+        The diagram, with its inputs and outputs.
+    name, description, **options
+        Fields of `LoopSpec`.
 
     Raises
     ------
@@ -52,6 +61,7 @@ def loop_spec(opened: OpenDiagram, *, name: str, description: str) -> LoopSpec:
     )
     vectors = {"t": here.t, "x": here.x, "w": here.w, "p": here.p}
     vectors |= {"x_next": workspace.x_next, "z": workspace.z, "log": workspace.log, "ok": workspace.ok}
+    guards = [_guards(flat, clocks, i, opened) for i, clocks in enumerate(acting)]
     memory = read_memory({"loop": loop.structure}, vectors, loop.kept, code)
     variables = _Variables(opened, flat)
     return LoopSpec(
@@ -67,9 +77,30 @@ def loop_spec(opened: OpenDiagram, *, name: str, description: str) -> LoopSpec:
         sets=tuple(sum(1 << i for i, clock in enumerate(flat.distinct) if clock in one) for one in acting),
         hybrid=False,
         memory=memory,
-        code=function_text(code.functions),
+        code=function_text([*code.functions, *(function for _, function in guards if function is not None)]),
         labels=variables.labels(),
+        guards=tuple(found for found, _ in guards),
+        depends=variables.depends(acting),
+        **options,
     )
+
+
+def _guards(flat: FlatDiagram, clocks: frozenset[TickPattern], kind: int, opened: OpenDiagram) -> tuple[Guards, Any]:
+    """Return what must stay positive at a kind of tick, and the function of their values; None without any."""
+    names: list[tuple[str, str]] = []
+
+    def visit(instant: Any, path: str, inputs: Any, made: Any) -> None:
+        if GUARDS in made:
+            names.extend((opened.shown(path), name) for name in flat.checked.traced[path].guards)
+
+    symbols = flat.symbols()
+    instant = evaluate(flat, flat.blocks, clocks, **symbols, visit=visit)
+    if not names:
+        return Guards(), None
+    made = ca.Function(f"lw_guards_of{kind}", [*symbols.values()], [ca.densify(ca.vertcat(*instant.guards))])
+    function = share_terms(speed_up(made), made.name())
+    sizes = function.sz_arg(), function.sz_res(), function.sz_iw(), function.sz_w()
+    return Guards(tuple(names), function.name(), sizes), function
 
 
 def _start(opened: OpenDiagram, flat: FlatDiagram) -> Workspace:
@@ -190,6 +221,20 @@ class _Variables:
                 )
                 found.append(Placed(variable, "x", tuple(range(where.start, where.stop)), sampled=True))
         return tuple(found)
+
+    def depends(self, acting: Sequence[frozenset[TickPattern]]) -> dict[str, tuple[int, ...]]:
+        """Return the entries of w on which outputs and signals depend at an instant, at any kind of tick."""
+        flat = self._flat
+        found: dict[int, set[int]] = {}
+        for clocks in acting:
+            tick = flat.at_tick(clocks)
+            sparsity = tick.last.fast.jac_sparsity(tick.results.index("log"), tick.arguments.index("w"))
+            for row, column in zip(*sparsity.get_triplet(), strict=True):
+                found.setdefault(row, set()).add(column)
+        every = (*self.outputs(), *self.signals())
+        return {
+            one.variable.name: tuple(sorted({w for place in one.places for w in found.get(place, ())})) for one in every
+        }
 
     def labels(self) -> tuple[tuple[str, str, int, int], ...]:
         """Return the outputs of blocks in the order of evaluation, with their places in the log."""

@@ -13,7 +13,7 @@ from .order import Order, find_orders
 from .parameter_names import find_control, find_name, find_path, find_place, split_path
 from .structure import Structure, SubsystemSettings, Wire, join, stepped_blocks
 from .structure_table import sheet_of_structure
-from .subsystems import Subsystem, exact_time, subsystem
+from .subsystems import Subsystem, SubsystemCall, exact_time, subsystem
 from .variants import apply_changes, change_parameter, change_parameters
 from .wire_units import add_unit_conversions
 
@@ -25,6 +25,7 @@ __all__ = [
     "OrderStep",
     "Structure",
     "Subsystem",
+    "SubsystemCall",
     "SubsystemSettings",
     "Wire",
     "add_delay_blocks",

@@ -25,7 +25,7 @@ Kind = Literal["time", "fixed", "tunable", "input", "state", "discrete", "deriva
 _SHARED = ("linear.c", "fixed_step.c", "embedded.c", "crossings.c")  # of loopwright.fmus.runtime
 _COMMON = ("model.h", "elementary.c", "core.c", "integrators.c", "events.c", "stepping.c")
 RUNTIME = {3: (*_COMMON, "fmi3.c", "fmi3_events.c", "fmi3_refused.c"), 2: (*_COMMON, "fmi2.c", "fmi2_refused.c")}
-_ORDER = {3: "FMI 3.0, 2.3, 3.2 and 4.2", 2: "FMI 2.0, 3.2.3 and 4.2.4"}
+ORDER = {3: "FMI 3.0, 2.3, 3.2 and 4.2", 2: "FMI 2.0, 3.2.3 and 4.2.4"}
 
 # Longest function that is expanded; beyond it, calls of shared functions keep the code small (compile time grows fast).
 _SCALAR_LIMIT = 20_000
@@ -286,7 +286,7 @@ def _dimensions(spec: ModelSpec, token: str, equations: _Functions, n: int, fmi:
     groups = {"P": spec.parameters, "U": spec.inputs, "X": spec.continuous, "D": spec.discrete, "Y": spec.outputs}
     nonzeros = equations.nonzeros
     lines = [f'#define LW_MODEL_NAME "{spec.name}"', f'#define LW_TOKEN "{token}"']
-    lines += [f'#define LW_API "fmi{fmi}"', f"#define LW_FMI {fmi}", f'#define LW_ORDER "{_ORDER[fmi]}"']
+    lines += [f'#define LW_API "fmi{fmi}"', f"#define LW_FMI {fmi}", f'#define LW_ORDER "{ORDER[fmi]}"']
     lines += [f"#define LW_N_{letter} {sum(v.size for v in group)}" for letter, group in groups.items()]
     lines += [f"#define LW_N_Z {len(spec.events)}", f"#define LW_N_J {len(nonzeros or ())}"]
     lines += [f"#define LW_N_VARIABLES {n}", f"#define LW_HAS_DERIVATIVES {int(nonzeros is not None)}"]

@@ -4,13 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import Block, DefinitionError, Layout, LoopwrightError, ParameterSpec, Port, Shape, accepts, kinds
+from ...blocks.core import (
+    Block,
+    DefinitionError,
+    Layout,
+    LoopwrightError,
+    OptionError,
+    ParameterSpec,
+    Port,
+    Shape,
+    accepts,
+    kinds,
+)
 from ...blocks.tracing import GUARDS, NEXT, Traced, constants_of, trace, traced_parameters
+from ..exported_models import make_exported
 from .html_page import block_text
 from .model import EventSpec, Integrator, ModelSpec, Variable
 from .package import build_fmu
@@ -145,44 +157,54 @@ def _state(block: Block, name: str, shape: Shape, shapes: dict[str, Shape]) -> V
 
 @accepts(name=kinds.text)
 def build(
-    block: Block,
+    block: Any,
     out: Path | str | None = None,
     *,
     name: str | None = None,
-    internal_step: float = 1e-3,
+    internal_step: float | None = None,
     stop_time: float = 1.0,
-    step_size: float = 1e-3,
-    integrator: Integrator = "rk4",
-    tolerance: float = 1e-8,
+    step_size: float | None = None,
+    integrator: Integrator | None = None,
+    tolerance: float | None = None,
     fmi: int = 3,
     arrays: bool = True,
     platform: str | Iterable[str] | None = None,
     documentation: str | None = None,
     notify: Callable[[str], None] | None = None,
+    subsystem: str | None = None,
+    outside: Iterable[str] = (),
+    outputs: Iterable[str] | None = None,
+    communication: Literal["any", "ticks"] = "any",
 ) -> Path:
-    """Export a continuous block as an FMU and return the file.
+    """Export a continuous block, a subsystem or a diagram as an FMU and return the file.
 
     The equations become C, compiled without Python inside; the build is cached by content.
 
+    A block is a plant, with co-simulation and model exchange. A diagram, or a subsystem such as a controller, is for
+    co-simulation; sampled subsystems act at their own ticks inside. A tick acts at the start of a communication step,
+    with the inputs that were set for it: step the controller before the plant.
+
     Parameters
     ----------
-    block : Block
-        A block with a ``derivative``; its parameters become the FMU's start values.
+    block : Block, Diagram or Subsystem
+        A block with a ``derivative``; its parameters become the FMU's start values. Or a diagram, or a function that
+        `subsystem` has made a subsystem; then parameters are the FMU's by their paths, named wires are its variables.
     out : path, optional
         File, or folder for it; without it, the file in the cache is returned. A file gets the ending ``.fmu`` if it
         lacks it.
     name : str, optional
-        Name of the model; without it, the class name in lower case.
-    internal_step : float
-        Start value, in s, of the FMU's parameter ``internal_step``: the longest step of its Runge-Kutta integrator of
-        order 4. The adaptive integrators choose their steps.
-    integrator : {"rk4", "dopri5", "rodas"}
-        Start value of the FMU's parameter ``integrator``, for co-simulation: explicit with a fixed step, explicit with
-        an adaptive one, or implicit for stiff models.
-    tolerance : float
-        Start value of the FMU's parameter ``tolerance``: relative error of a step of the adaptive integrators.
+        Name of the model; without it, the class name in lower case, or the name of the diagram or subsystem.
+    internal_step : float, optional
+        Of a block: start value, in s, of the FMU's parameter ``internal_step``, 1e-3 without it: the longest step of
+        its Runge-Kutta integrator of order 4. The adaptive integrators choose their steps.
+    integrator : {"rk4", "dopri5", "rodas"}, optional
+        Of a block: start value of the FMU's parameter ``integrator``, for co-simulation: explicit with a fixed step,
+        explicit with an adaptive one, or implicit for stiff models.
+    tolerance : float, optional
+        Of a block: start value of the FMU's parameter ``tolerance``, 1e-8 without it: relative error of a step of the
+        adaptive integrators.
     stop_time, step_size : float
-        Default experiment, s.
+        Default experiment, s; the step is 1e-3, or the time between two ticks of a diagram.
     fmi : {3, 2}
         FMI 3.0 or FMI 2.0.
     arrays : bool
@@ -194,25 +216,84 @@ def build(
         equations.
     notify : callable, optional
         Called with a line of text when a compilation starts.
+    subsystem : str, optional
+        Of a diagram: path of the subsystem to export, in place of the whole. What it reads from around it is the
+        FMU's inputs.
+    outside : iterable of str, optional
+        Of a diagram: paths of blocks that are not exported, such as the plant or a source. What they put out is the
+        FMU's inputs, and what they read its outputs.
+    outputs : iterable of str, optional
+        Of a diagram or subsystem: the signals that are outputs. Without it, those of the subsystem, what the blocks
+        outside read, or the named wires of a diagram.
+    communication : {"any", "ticks"}
+        Of a diagram or subsystem: whether communication steps may have any length, with ticks inside them, or must go
+        from tick to tick.
 
     Raises
     ------
     DefinitionError, TraceError
-        For a block that can't be exported.
+        For what can't be exported, by its path.
+    OptionError
+        For an option of the other kind of model.
     CompilerError
         If there is no compiler, or it fails.
+
+    Examples
+    --------
+    ``build(fig3, subsystem="controller")`` and ``build(fig3, outside=["plant"])`` are two ways to export a controller.
     """
+    made = None
+    if not isinstance(block, Block | type):
+        _refuse_options(block, internal_step=internal_step, integrator=integrator, tolerance=tolerance)
+        made = make_exported(
+            block,
+            name=name,
+            subsystem=subsystem,
+            outside=outside,
+            outputs=outputs,
+            steps_on_ticks=_is_on_ticks(communication),
+            stop_time=stop_time,
+            step_size=step_size,
+        )
+    if made is not None:
+        return build_fmu(
+            made, out, fmi=fmi, arrays=arrays, platform=platform, documentation=documentation or "", notify=notify
+        )
+    if subsystem is not None or tuple(outside) or outputs is not None or communication != "any":
+        raise OptionError(
+            "subsystem=, outside=, outputs= and communication= are options of diagrams and subsystems. Leave them out.",
+            block=name or type(block).__name__.lower(),
+        )
     spec = model_spec(
         block,
         name=name,
-        internal_step=internal_step,
+        internal_step=1e-3 if internal_step is None else internal_step,
         stop_time=stop_time,
-        step_size=step_size,
-        integrator=integrator,
-        tolerance=tolerance,
+        step_size=1e-3 if step_size is None else step_size,
+        integrator=integrator or "rk4",
+        tolerance=1e-8 if tolerance is None else tolerance,
     )
     text = block_text(block) if documentation is None else documentation
     return build_fmu(spec, out, fmi=fmi, arrays=arrays, platform=platform, documentation=text, notify=notify)
+
+
+def _refuse_options(model: object, **options: object) -> None:
+    """Refuse options of a block's own integrator for a diagram."""
+    given = [name for name, value in options.items() if value is not None]
+    if given and not isinstance(model, Block) and (hasattr(model, "wired") or hasattr(model, "control_input")):
+        raise OptionError(
+            f"found {given[0]}=, which sets the integrator of an exported block; a diagram has none. Leave it out.",
+            block=getattr(model, "name", None),
+            port=given[0],
+        )
+
+
+def _is_on_ticks(communication: str) -> bool:
+    if communication not in ("any", "ticks"):
+        raise OptionError(
+            f"found communication={communication!r}; expected 'any' or 'ticks'. Give one of them.", port="communication"
+        )
+    return communication == "ticks"
 
 
 def _check_exportable(block: object, name: str) -> None:

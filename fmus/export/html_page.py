@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -154,31 +154,38 @@ def index_html(spec: ModelSpec, text: str = "", *, fmi: int = 3) -> str:
     str
         HTML 5 without references to other files.
     """
-    rows = [_row(e) for e in layout(spec)]
-    head = "".join(f'<th scope="col">{name}</th>' for name in _COLUMNS)
-    note = "Arrays are listed row by row." if fmi == 3 else "Elements of arrays count from 1."
     traced = _equations(spec)
     if traced:
         printed = [f"<p>{escape(title)}:</p>\n<pre>{escape(lines)}</pre>" for title, lines in traced]
         printed.append("<p>These equations are compiled; <code>where(c, a, b)</code> is a where c holds, else b.</p>")
     else:
         printed = ["<p>The equations are too long to print, or have tables; see <code>sources/model.c</code>.</p>"]
+    sections = {"Equations": printed, "Events": _events(spec)}
+    return page_of(spec.name, spec.description, text, sections, layout(spec), fmi=fmi)
+
+
+def page_of(
+    name: str, description: str, text: str, sections: Mapping[str, Sequence[str]], entries: Iterable[Entry], *, fmi: int
+) -> str:
+    """Return the page of a model: its description, sections by title, and the table of its variables."""
+    rows = [_row(e) for e in entries]
+    head = "".join(f'<th scope="col">{column}</th>' for column in _COLUMNS)
+    note = "Arrays are listed row by row." if fmi == 3 else "Elements of arrays count from 1."
     lines = [
         "<!DOCTYPE html>",
         '<html lang="en">',
         "<head>",
         '<meta charset="utf-8"/>',
         '<meta name="viewport" content="width=device-width, initial-scale=1"/>',
-        f"<title>{escape(spec.name)}</title>",
+        f"<title>{escape(name)}</title>",
         f"<style>{_STYLE}</style>",
         "</head>",
         "<body>",
-        f"<h1>{escape(spec.name)}</h1>",
-        *([f"<p>{escape(spec.description)}</p>"] if spec.description else []),
+        f"<h1>{escape(name)}</h1>",
+        *([f"<p>{escape(description)}</p>"] if description else []),
         f"<p>An FMU of FMI {fmi}.0. It needs no other software to run.</p>",
         *_section("Description", [f'<pre class="text">{escape(text.strip())}</pre>'] if text.strip() else []),
-        *_section("Equations", printed),
-        *_section("Events", _events(spec)),
+        *(line for title, body in sections.items() for line in _section(title, body)),
         *_section(
             "Variables",
             [

@@ -62,15 +62,18 @@ class LoopMemory:
     pointers: tuple[tuple[str, str], ...]
 
     def write(self) -> str:
-        """Return the C text: the struct ``lw_memory``, ``lw_fill``, which sets start values, and ``lw_bind``.
+        """Return the C text: the struct ``lw_memory``, and the functions ``lw_fill``, ``lw_bind`` and ``lw_unbind``.
 
-        ``lw_bind`` sets the pointers. It has to be called again for a memory that was copied to another place.
+        ``lw_fill`` sets start values. ``lw_bind`` sets the pointers. It has to be called again for a
+        memory that was copied to another place.
+        ``lw_unbind`` sets them all to NULL, so that equal memories have equal bytes.
         """
         return "\n".join([*self._declare(), *self._tables(), *self._fill(), *self._bind()]) + "\n"
 
     def _declare(self) -> Iterator[str]:
         yield "typedef struct {"
         yield "    int64_t tick; /* the next one */"
+        yield "    int64_t lost; /* kind of the tick that can't be evaluated */"
         yield "    double now;   /* time that has been reached, s */"
         yield from (f"    {field.declaration}" for field in self.fields)
         yield "} lw_memory;\n"
@@ -97,6 +100,10 @@ class LoopMemory:
     def _bind(self) -> Iterator[str]:
         yield "static void lw_bind(lw_memory *m) {"
         yield from (f"    m->{member} = {target};" for member, target in self.pointers)
+        yield "}\n"
+        yield "static void lw_unbind(lw_memory *m) {"
+        yield "    (void)m;"
+        yield from (f"    m->{member} = NULL;" for member, _ in self.pointers)
         yield "}\n"
 
 

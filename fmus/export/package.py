@@ -24,10 +24,12 @@ import numpy as np
 from ...blocks.core import FmuError, accepts, explain_calls, explain_disk_errors, kinds, replace_file
 from ..child_processes import temporary_folder
 from ..platform import OWN_CACHE, cache_folder, explain_cache_errors, native_platform, record_build
-from ..toolchain import SUFFIXES, TARGETS, flags
+from ..toolchain import DIAGRAM_FLAGS, SUFFIXES, TARGETS, flags
 from .c_code import generate, runtime
 from .compiler import Compiler, check_platform, compile_shared, find_compiler
 from .html_page import index_html
+from .loop_fmu import describe_loop, generate_loop, loop_page, loop_runtime, scalarize_loop
+from .loop_spec import LoopSpec, write_unit
 from .model import ModelSpec
 from .scalars import scalarize
 from .xml_fmi2 import model_description2
@@ -91,18 +93,21 @@ def _text(value: Any) -> str:
     return repr(value)
 
 
-def _code_parts(fmi: int) -> list[str]:
+def _code_parts(spec: ModelSpec | LoopSpec, fmi: int) -> list[str]:
     """Return the text of the modules that write the files, so that a change of them builds again."""
     folder = Path(__file__).parent
     written = ("c_code", "elementary_tables", "html_page", "package", "quantities", "scalars", "xml_fmi2", "xml_fmi3")
+    if isinstance(spec, LoopSpec):
+        written += ("loop_fmu", "loop_memory", "loop_spec")
     modules = [(folder / f"{name}.py").read_text(encoding="utf-8") for name in written]
-    return [package_version(), *(text for _, text in sorted(runtime(fmi).items())), *modules]
+    unit = [write_unit(spec)] if isinstance(spec, LoopSpec) else []
+    return [package_version(), *(text for _, text in sorted(_runtime_of(spec, fmi).items())), *modules, *unit]
 
 
-def build_key(spec: ModelSpec, options: Options, compiler: Compiler) -> str:
+def build_key(spec: ModelSpec | LoopSpec, options: Options, compiler: Compiler) -> str:
     """Return the hash of everything that goes into a build; nothing is generated for it."""
     toolchain = [f"{p} {flags(p, zig=compiler.zig)}" for p in options.platforms]
-    made = [_text(spec), _text(options), *_code_parts(options.fmi)]
+    made = [_text(spec), _text(options), *_code_parts(spec, options.fmi)]
     return _hash(*made, compiler.identity, fmi_headers()[1], *toolchain)
 
 
@@ -120,13 +125,22 @@ def zip_files(files: Mapping[str, bytes]) -> bytes:
 
 
 def _binary(
-    spec: ModelSpec, fmi: int, platform: str, sources: Mapping[str, str], compiler: Compiler
+    spec: ModelSpec | LoopSpec, fmi: int, platform: str, sources: Mapping[str, str], compiler: Compiler
 ) -> dict[str, bytes]:
     suffix = SUFFIXES.get(platform.rpartition("-")[2], ".so")
     with temporary_folder(f"the FMU {spec.name!r} can't be built", FmuError) as folder:
         library = folder / f"{spec.name}{suffix}"
         headers = fmi_headers()[0]
-        compile_shared(sources, library, platform=platform, compiled=["model.c"], include=[headers], compiler=compiler)
+        more = DIAGRAM_FLAGS if isinstance(spec, LoopSpec) else ()  # as a run of it is compiled, to the last bit
+        compile_shared(
+            sources,
+            library,
+            platform=platform,
+            compiled=["model.c"],
+            include=[headers],
+            compiler=compiler,
+            more_flags=more,
+        )
         name = FOLDERS2.get(platform, platform) if fmi == 2 else platform
         return {f"binaries/{name}/{library.name}": library.read_bytes()}
 
@@ -136,16 +150,26 @@ def _first_build(platform: str) -> str:
     return {"x86_64-windows": "minutes"}.get(platform, "longer")
 
 
-def _archive(spec: ModelSpec, options: Options, compiler: Compiler, notify: Callable[[str], None]) -> bytes:
+def _runtime_of(spec: ModelSpec | LoopSpec, fmi: int) -> Mapping[str, str]:
+    return loop_runtime(fmi) if isinstance(spec, LoopSpec) else runtime(fmi)
+
+
+def _archive(spec: ModelSpec | LoopSpec, options: Options, compiler: Compiler, notify: Callable[[str], None]) -> bytes:
     fmi = options.fmi
-    model, derivatives = generate(spec, _TOKEN, fmi)
-    describe = model_description2 if fmi == 2 else model_description
-    description = describe(spec, _TOKEN, derivatives=derivatives)
-    token = _hash(description, model, *runtime(fmi).values())[:32]
-    sources = {**runtime(fmi), "model.c": model.replace(_TOKEN, token)}
+    included = _runtime_of(spec, fmi)
+    if isinstance(spec, LoopSpec):
+        model, description = generate_loop(spec, _TOKEN, fmi), describe_loop(spec, _TOKEN, fmi)
+        page = loop_page(spec, options.documentation, fmi=fmi)
+    else:
+        model, derivatives = generate(spec, _TOKEN, fmi)
+        describe = model_description2 if fmi == 2 else model_description
+        description = describe(spec, _TOKEN, derivatives=derivatives)
+        page = index_html(spec, options.documentation, fmi=fmi)
+    token = _hash(description, model, *included.values())[:32]
+    sources = {**included, "model.c": model.replace(_TOKEN, token)}
     files = {
         "modelDescription.xml": description.replace(_TOKEN, token).encode(),
-        "documentation/index.html": index_html(spec, options.documentation, fmi=fmi).encode(),
+        "documentation/index.html": page.encode(),
     }
     if fmi == 3:
         files["sources/buildDescription.xml"] = build_description(spec).encode()
@@ -189,7 +213,7 @@ def write_atomically(path: Path, data: bytes, instead: str = OTHER_FOLDER) -> No
 
 
 @accepts(
-    spec=kinds.one_of_class(ModelSpec, "a ModelSpec, such as model_spec(block)"),
+    spec=kinds.one_of_class((ModelSpec, LoopSpec), "a ModelSpec, such as model_spec(block)"),
     out=kinds.path,
     fmi=kinds.whole,
     arrays=kinds.flag,
@@ -198,7 +222,7 @@ def write_atomically(path: Path, data: bytes, instead: str = OTHER_FOLDER) -> No
     notify=kinds.function,
 )
 def build_fmu(
-    spec: ModelSpec,
+    spec: ModelSpec | LoopSpec,
     out: Path | str | None = None,
     *,
     fmi: int = 3,
@@ -213,8 +237,8 @@ def build_fmu(
 
     Parameters
     ----------
-    spec : ModelSpec
-        The model.
+    spec : ModelSpec or LoopSpec
+        The model, or a diagram.
     out : path, optional
         File to copy it to, which gets the ending ``.fmu`` if it lacks it; a folder gets
         ``<name>.fmu``. Without it, the file in the cache is returned.
@@ -246,7 +270,8 @@ def build_fmu(
         raise FmuError(f"found fmi={fmi!r}, expected 3 (FMI 3.0) or 2 (FMI 2.0). Give one of them.")
     chosen = TARGETS if platform == "all" else (platform,) if isinstance(platform, str) else platform
     platforms = tuple(sorted(set(chosen or (native_platform(),))))
-    spec = spec if arrays and fmi == 3 else scalarize(spec)
+    if not (arrays and fmi == 3):
+        spec = scalarize_loop(spec) if isinstance(spec, LoopSpec) else scalarize(spec)
     options = Options(fmi, platforms, documentation)
     compiler = find_compiler()
     for name in platforms:

@@ -12,9 +12,9 @@
 #define LW_NEAR 1e-3 /* of the time between two ticks: a communication point within it is the tick */
 #endif
 #if LW_HYBRID
-#define LW_LOOP(m) (&(m)->hybrid.l)
+#define LW_LOOP_OF(m) (&(m)->hybrid.l)
 #else
-#define LW_LOOP(m) (&(m)->loop)
+#define LW_LOOP_OF(m) (&(m)->loop)
 #endif
 
 /* The time of a tick, or the length of so many, in s: the double that is nearest as long as they are integers of 53 bits. */
@@ -52,24 +52,30 @@ static inline bool lw_acts_before(const lw_memory *m, double to) {
 }
 
 /* Put the time to where a run begins. */
-static void lw_set_time(lw_memory *m, double start) {
+static void lw_put_time(lw_memory *m, double start) {
     const double ticks = start / lw_time_of(1);
-    m->now = *LW_LOOP(m)->t = start;
+    m->now = *LW_LOOP_OF(m)->t = start;
     m->tick = lw_tick_from((int64_t)ceil(ticks - LW_NEAR));
     const bool acts = m->tick != INT64_MAX && !lw_comes_before(start, lw_time_of(m->tick));
-    if (acts) m->now = *LW_LOOP(m)->t = lw_time_of(m->tick);
+    if (acts) m->now = *LW_LOOP_OF(m)->t = lw_time_of(m->tick);
 }
 
 /* Compute the numbers that depend on parameters; to be called when some of m->p have been set. */
 static void lw_renew(lw_memory *m) { (void)m; }
 
+/* Evaluate a tick of some kind; false: it can't be, and m->lost is the kind. */
+static bool lw_evaluate(lw_memory *m, int64_t kind) {
+    m->lost = kind;
+    return evaluate(LW_LOOP_OF(m), kind) == DONE;
+}
+
 #if !LW_HYBRID
 
 /* Evaluate everything at the start, with the parameters, inputs and states in the memory; false: it can't be. */
 static bool lw_begin(lw_memory *m, double start) {
-    lw_set_time(m, start);
+    lw_put_time(m, start);
     if (m->tick == INT64_MAX || lw_comes_before(m->now, lw_time_of(m->tick))) return true;
-    return evaluate(&m->loop, lw_kind_of(m->tick)) == DONE;
+    return lw_evaluate(m, lw_kind_of(m->tick));
 }
 
 /* Continue to a time with the inputs in the memory: ticks from the present instant on, before that time. False: the tick
@@ -78,7 +84,7 @@ static bool lw_go(lw_memory *m, double to) {
     loop *l = &m->loop;
     while (lw_acts_before(m, to)) {
         *l->t = m->now = lw_time_of(m->tick);
-        if (evaluate(l, lw_kind_of(m->tick)) != DONE) return false;
+        if (!lw_evaluate(m, lw_kind_of(m->tick))) return false;
         memcpy(l->x, l->x_next, (size_t)l->states * sizeof(double));
         m->tick = lw_tick_from(m->tick + 1);
     }

@@ -10,7 +10,9 @@
 #include <stdlib.h>
 #include <string.h>
 
+#if !LW_LOOP
 #include "linear.c"
+#endif
 
 #define LW_MAGIC UINT64_C(0x4c57303032464d55)
 #define LW_MIN_TOLERANCE 1e-14
@@ -85,6 +87,11 @@ static bool lw_check_finite(lw_instance *self, const double *values, size_t firs
                    first + i - lw_variables[v].first, values[i], t);
 }
 
+#if LW_LOOP
+static bool lw_update_outputs(lw_instance *self);
+static bool lw_update_derivatives(lw_instance *self) { return (void)self, true; }
+static bool lw_update_indicators(lw_instance *self) { return (void)self, true; }
+#else
 /* The inputs at t: u, held over the step, or if u is NULL those that move by their derivatives since its start. */
 static inline const double *lw_inputs(lw_instance *self, const double *u, double t) {
 #if LW_MOVING_INPUTS
@@ -153,7 +160,7 @@ static bool lw_update_derivatives(lw_instance *self) {
 static bool lw_update_indicators(lw_instance *self) {
     uint8_t have = self->s.have_indicators;
     if (!lw_update(self, &self->s.have_indicators, lw_indicator, LW_Z, LW_N_Z)) return false;
-    const lw_memory *events = &self->s.events;
+    const lw_event_memory *events = &self->s.events;
     for (size_t i = 0; i < LW_N_Z && !have; i++) {
         const bool border = events->domain[i] == LW_BORDER, above = border ? events->lean[i] : events->domain[i] == LW_ABOVE;
         self->s.values[LW_Z + i] += (above ? LW_HYSTERESIS : -LW_HYSTERESIS) * lw_events[i].nominal;
@@ -166,6 +173,7 @@ static bool lw_update_indicators(lw_instance *self) {
     (void)self;
     return true;
 }
+#endif
 #endif
 
 /* Mark outputs, derivatives and event indicators as out of date. */
@@ -352,6 +360,10 @@ static void lw_reset(lw_instance *self) {
     self->s.mode = LW_INSTANTIATED;
     self->s.model_exchange = model_exchange;
     memcpy(self->s.values, lw_start_values, sizeof lw_start_values);
+#if LW_LOOP
+    lw_fill(&self->s.memory);
+    lw_bind(&self->s.memory);
+#endif
     lw_changed(self);
 }
 
@@ -398,6 +410,9 @@ static bool lw_copy_state(lw_instance *self, const char *function, const void *f
     lw_state *copy = *state ? *state : malloc(sizeof *copy);
     if (!copy) return lw_fail(self, "%s: out of memory.", function);
     memcpy(copy, from, sizeof *copy);
+#if LW_LOOP
+    lw_unbind(&copy->memory); /* its pointers lead into an instance */
+#endif
     *state = copy;
     return true;
 }
@@ -417,6 +432,9 @@ static bool lw_accept_state(lw_instance *self, const char *function, const lw_st
         return lw_fail(self, "%s: this is the state of a %s instance. Give one of the same interface type.", function,
                        state->model_exchange ? "Model Exchange" : "Co-Simulation");
     self->s = *state;
+#if LW_LOOP
+    lw_bind(&self->s.memory);
+#endif
     return true;
 }
 

@@ -36,7 +36,7 @@ static double lw_value_at(const lw_search *s, int64_t i, double t, bool *lost);
 
 /* The domain of indicator i at its value z, from the present one. */
 static int lw_domain(const lw_instance *self, int i, double z) {
-    const lw_memory *events = &self->s.events;
+    const lw_event_memory *events = &self->s.events;
     if (events->domain[i] != LW_BORDER) return z > 0.0 ? LW_ABOVE : LW_BELOW;
     return z > fmax(events->level[i], 0.0) ? LW_ABOVE : z < fmin(events->level[i], 0.0) ? LW_BELOW : LW_BORDER;
 }
@@ -60,7 +60,7 @@ static bool lw_find_fired(lw_instance *self, double t, const double *x, const do
 }
 
 static void lw_set_domain(lw_instance *self, int i, int domain) {
-    lw_memory *events = &self->s.events;
+    lw_event_memory *events = &self->s.events;
     if (events->side[i] && domain != LW_BORDER) {
         if (domain != events->side[i] - 1) events->side[i] = events->resting[i] = 0; /* it has left contact */
         else if (events->domain[i] == LW_BORDER) events->resting[i]++;
@@ -124,7 +124,7 @@ static bool lw_find_motion(lw_instance *self, double t, const double *x, const d
 /* Put indicator i on the border. It leans to the side from where the importer sees it leave in the declared direction;
  * if both are declared, to the side from where it will come, after `ahead`. */
 static void lw_set_border(lw_instance *self, int i, double z, double ahead) {
-    lw_memory *events = &self->s.events;
+    lw_event_memory *events = &self->s.events;
     events->domain[i] = LW_BORDER;
     events->level[i] = z;
     events->lean[i] = lw_events[i].direction ? lw_events[i].direction < 0 : !(ahead > 0.0);
@@ -132,7 +132,7 @@ static void lw_set_border(lw_instance *self, int i, double z, double ahead) {
 
 /* The jump of the events that have fired, and the border for those that it leaves in contact. */
 static bool lw_jump_and_land(lw_instance *self, double t, double *x, const double *u, const double *fired) {
-    lw_memory *events = &self->s.events;
+    lw_event_memory *events = &self->s.events;
     for (int i = 0; i < LW_N_Z; i++)
         if (fired[i] != 0.0 && events->resting[i] >= LW_RESTS)
             return lw_fail(self, "the event %s rests in contact at t = %.9g s: its jump leaves its indicator at zero, and the motion "
@@ -259,7 +259,7 @@ static double lw_value_at(const lw_search *s, int64_t i, double t, bool *lost) {
 
 /* The time at which indicator i comes into a domain, after a and not after b: as near to the crossing as times resolve. */
 static bool lw_locate(lw_instance *self, const lw_span *span, int i, int domain, double a, double b, double *found) {
-    const lw_memory *events = &self->s.events;
+    const lw_event_memory *events = &self->s.events;
     const lw_search search = {self, span};
     const bool border = events->domain[i] == LW_BORDER;
     const double level = border ? events->level[i] : 0.0;

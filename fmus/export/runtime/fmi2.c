@@ -71,6 +71,8 @@ fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2Str
                      "this binary: unzip the FMU again.", fmuGUID ? fmuGUID : "missing");
     else if (fmuType != fmi2CoSimulation && fmuType != fmi2ModelExchange)
         ok = lw_fail(self, "the type is %d, expected fmi2ModelExchange (0) or fmi2CoSimulation (1).", (int)fmuType);
+    else if (LW_LOOP && fmuType == fmi2ModelExchange)
+        ok = lw_fail(self, "this FMU is for Co-Simulation only. Instantiate it as fmi2CoSimulation.");
     if (ok) return self;
     lw_destroy(self);
     return NULL;
@@ -164,7 +166,7 @@ fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference
     return LW_OK(lw_set_slopes(self, function, vr, nvr, order, value));
 #else
     (void)vr, (void)order, (void)value;
-    return LW_OK(!nvr || lw_fail(self, "%s: this FMU has no inputs.", function));
+    return LW_OK(!nvr || lw_fail(self, "%s: this FMU has no inputs that move within a step (canInterpolateInputs = false).", function));
 #endif
 }
 

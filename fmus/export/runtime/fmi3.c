@@ -54,6 +54,8 @@ static lw_instance *lw_instantiate_fmi3(fmi3String instanceName, fmi3String inst
     else if (!instantiationToken || strcmp(instantiationToken, LW_TOKEN))
         ok = lw_fail(self, "the instantiation token is %s, expected " LW_TOKEN ". The modelDescription.xml that was read "
                      "doesn't belong to this binary: unzip the FMU again.", instantiationToken ? instantiationToken : "missing");
+    else if (LW_LOOP && model_exchange)
+        ok = lw_fail(self, "this FMU is for Co-Simulation only. Use fmi3InstantiateCoSimulation.");
     if (ok) return self;
     lw_destroy(self);
     return NULL;
@@ -113,7 +115,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String instanceName, fmi3String ins
                      "references, or 0.", nRequiredIntermediateVariables);
     for (size_t i = 0; ok && i < nRequiredIntermediateVariables; i++)
         ok = lw_is_intermediate(self, requiredIntermediateVariables[i]);
-    if (ok && intermediateUpdate) {
+    if (ok && intermediateUpdate && !LW_LOOP) {
         self->update = lw_update_fmi3;
         self->update_sink = (void (*)(void))intermediateUpdate;
         if (!(self->before = malloc(sizeof *self->before))) ok = lw_fail(self, "out of memory.");

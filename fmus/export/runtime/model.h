@@ -20,6 +20,9 @@
 /* Generated: LW_MODEL_NAME, LW_TOKEN; LW_FMI, the version; elements: LW_N_P, LW_N_U, LW_N_X (continuous states), LW_N_D (discrete states),
  * LW_N_Y; LW_N_Z events; LW_N_J nonzeros of the Jacobian; LW_N_VARIABLES; LW_HAS_DERIVATIVES; LW_SZ_ARG, LW_SZ_RES,
  * LW_SZ_IW, LW_SZ_W (work of the equations, the largest of all); LW_API, the prefix of names of FMI's functions. */
+#ifndef LW_LOOP
+#define LW_LOOP 0 /* 1: of a diagram, whose loop (fmus/runtime/exported.c) stands before this file; loop.c says what differs */
+#endif
 #define LW_N_S (LW_N_X + LW_N_D) /* all states, as the equations take them */
 #define LW_P 1
 #define LW_U (LW_P + LW_N_P)
@@ -34,13 +37,15 @@
 #define LW_HELD (LW_STEP + 3)
 #define LW_N_VALUES (LW_HELD + LW_N_U)
 #define LW_N_UNKNOWNS (LW_N_X + LW_N_Y + LW_N_Z) /* derivatives, outputs, event indicators: from LW_DX on */
+#ifndef LW_INLINE
 #if defined(__GNUC__)
 #define LW_INLINE static inline __attribute__((always_inline))
 #else
 #define LW_INLINE static inline
 #endif
+#endif
 #define LW_AT_LEAST_1(n) ((n) > 0 ? (n) : 1)
-#define LW_MOVING_INPUTS (LW_FMI == 2 && LW_N_U > 0) /* may inputs move within a step, by given derivatives? */
+#define LW_MOVING_INPUTS (LW_FMI == 2 && LW_N_U > 0 && !LW_LOOP) /* may inputs move within a step, by given derivatives? */
 #define LW_MAX_ORDER 4                               /* of these derivatives */
 
 /* Scratch of a state's size: on the stack for small models, else the instance's own. */
@@ -91,7 +96,7 @@ typedef struct {
     uint8_t lean[LW_N_Z8];    /* on the border: does the importer see it above zero? */
     uint8_t side[LW_N_Z8];    /* the domain in which its jump has left it in contact, plus 1; 0 for none */
     uint8_t resting[LW_N_Z8]; /* events in a row that led back into contact */
-} lw_memory;
+} lw_event_memory;
 #endif
 
 /* Content of an FMU state, which is copied and serialized unchanged. */
@@ -109,7 +114,10 @@ typedef struct {
     double slopes[LW_MAX_ORDER][LW_N_U]; /* derivatives of the inputs by time at the start of the next step, from order 1 on */
 #endif
 #if LW_N_Z
-    lw_memory events;
+    lw_event_memory events;
+#endif
+#if LW_LOOP
+    lw_memory memory;
 #endif
 } lw_state;
 

@@ -273,7 +273,7 @@ static inline bool lw_try_step(lw_instance *self, double t, double h) {
 static inline bool lw_step(lw_instance *self, double t, double h) {
     double step_size = self->s.step_size;
 #if LW_N_Z
-    const lw_memory events = self->s.events;
+    const lw_event_memory events = self->s.events;
 #endif
     self->event_found = false;
 #if LW_MOVING_INPUTS

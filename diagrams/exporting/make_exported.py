@@ -1,0 +1,74 @@
+"""What is exported of a diagram, of a subsystem in it, or of a subsystem by itself."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterable
+from typing import Any
+
+from ...blocks.core import OptionError
+from ...fmus.export import LoopSpec
+from ..flat import WiredDiagram
+from ..wiring import Subsystem, SubsystemCall
+from .loop_of_diagram import loop_spec
+from .open_diagram import OpenDiagram, choose_outputs, open_part, open_subsystem, open_whole
+
+
+def make_exported(
+    model: object,
+    *,
+    name: str | None = None,
+    subsystem: str | None = None,
+    outside: Iterable[str] = (),
+    outputs: Iterable[str] | None = None,
+    **options: Any,
+) -> LoopSpec | None:
+    """Return what is exported of a diagram or a subsystem; None for anything else.
+
+    Parameters
+    ----------
+    name : str, optional
+        Its name; without one, the diagram's or the subsystem's.
+    subsystem : str, optional
+        Path of the subsystem of a diagram that is exported; without it, the diagram.
+    outside : iterable of str
+        Paths of blocks of a diagram that are not exported; see `open_whole`.
+    outputs : iterable of str, optional
+        Signals that are outputs.
+    **options
+        Fields of `LoopSpec`.
+    """
+    if isinstance(model, SubsystemCall):
+        model = model.subsystem
+    names = (outside,) if isinstance(outside, str) else tuple(outside)
+    about = ""
+    opened: OpenDiagram
+    if isinstance(model, Subsystem):
+        label = name or _identifier(model.name)
+        if subsystem is not None or names:
+            raise OptionError(
+                "subsystem= and outside= choose a part of a diagram; this is a subsystem by itself. Leave them out.",
+                block=label,
+            )
+        about = inspect.cleandoc(model.__doc__ or "").partition("\n")[0]
+        opened = open_subsystem(model, object, label)
+    else:
+        wired = getattr(model, "wired", None)
+        if not isinstance(wired, WiredDiagram):
+            return None
+        if subsystem is not None and names:
+            raise OptionError(
+                "found subsystem= and outside=; expected one of them. Give one.", block=wired.name, port="outside"
+            )
+        label = name or _identifier(wired.name if subsystem is None else subsystem.rpartition(".")[2])
+        opened = open_whole(wired, names, label) if subsystem is None else open_part(wired, subsystem, label)
+    opened = choose_outputs(opened, None if outputs is None else tuple(outputs))
+    base = float(opened.wired.flatten().base)
+    chosen = {"step_size": base, **{key: value for key, value in options.items() if value is not None}}
+    return loop_spec(opened, name=label, description=about, **chosen)
+
+
+def _identifier(name: str) -> str:
+    found = re.sub(r"\W", "_", name, flags=re.ASCII)
+    return f"_{found}" if found[:1].isdigit() or not found else found

@@ -1,0 +1,341 @@
+"""FMU of a diagram: its C text behind FMI's functions, its descriptions in FMI 3.0 and 2.0, its page of documentation.
+
+The functions of FMI are those of exported models (``runtime/fmi3.c``, ``fmi2.c``), for co-simulation alone; behind them
+is the loop of the diagram (``runtime/loop.c``) in place of a model's integrators.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from functools import lru_cache
+from html import escape
+from importlib import resources
+
+from ...blocks.core import lay_out
+from .c_code import ORDER, Entry, Kind, _array, _starts, _table
+from .html_page import page_of
+from .loop_spec import LoopSpec, Placed, write_unit
+from .model import Variable
+from .quantities import type_names
+from .scalars import _elements
+from .xml_fmi3 import LOG_CATEGORIES, _element, _types, _units_and_types, package_version
+
+_COMMON = ("model.h", "core.c", "loop.c")
+RUNTIME = {3: (*_COMMON, "fmi3.c", "fmi3_events.c", "fmi3_refused.c"), 2: (*_COMMON, "fmi2.c", "fmi2_refused.c")}
+_CAUSALITY = {"time": "independent", "fixed": "parameter", "tunable": "parameter", "input": "input"}
+
+
+def scalarize_loop(spec: LoopSpec) -> LoopSpec:
+    """Return the diagram with every array replaced by its elements."""
+
+    def scalars(group: Iterable[Placed]) -> Iterator[Placed]:
+        for one in group:
+            if not one.variable.shape:
+                yield one
+                continue
+            for element, place in zip(_elements(one.variable), one.places, strict=True):
+                yield replace(one, variable=element, places=(place,))
+
+    groups = ("inputs", "outputs", "signals", "parameters", "states")
+    return replace(spec, **{name: tuple(scalars(getattr(spec, name))) for name in groups})
+
+
+def loop_rows(spec: LoopSpec) -> list[tuple[Kind, Placed]]:
+    """Return the variables behind the time, in the order of ``model.h``."""
+    rows: list[tuple[Kind, Placed]] = [
+        ("tunable" if one.variable.variability == "tunable" else "fixed", one) for one in spec.parameters
+    ]
+    rows += [("input", one) for one in spec.inputs]
+    rows += [("discrete", one) for one in spec.states if one.variable.state]
+    rows += [("output", one) for one in (*spec.outputs, *spec.signals)]
+    rows += [("output", one) for one in spec.states if not one.variable.state]
+    return rows
+
+
+def loop_layout(spec: LoopSpec) -> tuple[Entry, ...]:
+    """Return all variables with value references and places among the values, in the order of ``model.h``."""
+    time = Variable("t", unit="s", description="Simulation time")
+    rows: list[tuple[Kind, Variable, str]] = [("time", time, "time")]
+    rows += [(kind, one.variable, one.variable.name) for kind, one in loop_rows(spec)]
+    places = lay_out(v.size for _, v, _ in rows)
+    return tuple(
+        Entry(reference, kind, variable, name, place.start)
+        for reference, ((kind, variable, name), place) in enumerate(zip(rows, places, strict=True))
+    )
+
+
+# ---- C text ----
+
+
+def generate_loop(spec: LoopSpec, token: str, fmi: int) -> str:
+    """Return the text of ``model.c``; see `loopwright.fmus.export.c_code.generate`."""
+    entries = loop_layout(spec)
+    parts = [
+        _dimensions(spec, entries, token, fmi),
+        write_unit(spec, own_functions=spec.own_functions),
+        '#include "model.h"\n',
+        _table(entries),
+        _starts(entries),
+        *_places(spec),
+        *_labels(spec),
+        "static const double lw_nominals[] = {1.0};\n",
+        "".join(f'#include "{name}"\n' for name in RUNTIME[fmi][1:]),
+    ]
+    return "\n".join(parts)
+
+
+def _dimensions(spec: LoopSpec, entries: tuple[Entry, ...], token: str, fmi: int) -> str:
+    def count(*kinds: str) -> int:
+        return sum(e.variable.size for e in entries if e.kind in kinds)
+
+    numbers = {"P": count("fixed", "tunable"), "U": count("input"), "X": 0, "D": count("discrete")}
+    numbers |= {"Y": count("output"), "Z": 0, "J": 0, "VARIABLES": len(entries), "LABELS": len(spec.labels)}
+    lines = [
+        "#define LW_LOOP 1",
+        f'#define LW_MODEL_NAME "{spec.name}"',
+        f'#define LW_TOKEN "{token}"',
+        f'#define LW_API "fmi{fmi}"',
+        f"#define LW_FMI {fmi}",
+        f'#define LW_ORDER "{ORDER[fmi]}"',
+        f"#define LW_ON_TICKS {int(spec.steps_on_ticks)}",
+        "#define LW_HAS_DERIVATIVES 0",
+        *(f"#define LW_N_{letter} {number}" for letter, number in numbers.items()),
+        *(f"#define LW_SZ_{kind} 1" for kind in ("ARG", "RES", "IW", "W")),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _places(spec: LoopSpec) -> Iterator[str]:
+    """Yield the tables that say where each value is in the memory."""
+    groups = {"p": ("fixed", "tunable"), "u": ("input",), "d": ("discrete",), "y": ("output",)}
+    for letter, kinds in groups.items():
+        found = [
+            -1 - place if letter == "y" and one.vector == "x" else place
+            for kind, one in loop_rows(spec)
+            if kind in kinds
+            for place in one.places
+        ]
+        yield _array("int32_t", f"lw_places_{letter}", found)
+
+
+def _labels(spec: LoopSpec) -> Iterator[str]:
+    """Yield the table of the outputs of blocks."""
+    yield "typedef struct {\n    const char *block, *port;\n    uint32_t first, size;\n} lw_label;\n"
+    rows = [f'{{"{block}", "{port}", {first}, {size}}}' for block, port, first, size in spec.labels]
+    yield _array("lw_label", "lw_labels", rows or ['{"", "", 0, 0}'])
+
+
+@lru_cache(maxsize=2)
+def loop_runtime(fmi: int) -> dict[str, str]:
+    """Return the text of the files that ``model.c`` of a diagram includes, by name."""
+    folder = resources.files(__package__) / "runtime"
+    return {name: (folder / name).read_text(encoding="utf-8") for name in RUNTIME[fmi]}
+
+
+# ---- descriptions ----
+
+
+def about_steps(spec: LoopSpec) -> str:
+    """Return in words when ticks act, which an importer has to know."""
+    base = f"{float(spec.base):.9g} s"
+    ticks = f"It is sampled (time between two ticks: {base}). " if spec.clocks else ""
+    fit = (
+        "Communication steps go from tick to tick. "
+        if spec.steps_on_ticks
+        else "Communication steps may have any length. "
+    )
+    acts = (
+        "A tick acts at the start of a communication step, with the inputs that are set for it: step this FMU before "
+        "the plant that it acts on, after its inputs were set from the plant's outputs. An importer that exchanges all "
+        "values at once between two steps has one sample more of delay in the loop. "
+        if spec.clocks
+        else ""
+    )
+    return f"{ticks}{fit}{acts}".strip()
+
+
+def _variability(kind: str, one: Placed | None) -> str:
+    if one is None:
+        return "continuous"
+    if kind in ("fixed", "tunable"):
+        return kind
+    return "discrete" if one.sampled and kind != "input" else "continuous"
+
+
+def describe_loop(spec: LoopSpec, token: str, fmi: int) -> str:
+    """Return the text of ``modelDescription.xml`` (FMI 3.0, 2.4; FMI 2.0, 2.2)."""
+    return (_describe2 if fmi == 2 else _describe3)(spec, token)
+
+
+def _attributes(entry: Entry, one: Placed | None) -> dict[str, object]:
+    v = entry.variable
+    initial = {"fixed": "exact", "tunable": "exact", "discrete": "exact", "output": "calculated"}
+    return {
+        "name": entry.name,
+        "valueReference": entry.reference,
+        "description": v.description or None,
+        "causality": _CAUSALITY.get(entry.kind, "output" if entry.is_output else "local"),
+        "variability": _variability(entry.kind, one),
+        "initial": initial.get(entry.kind),
+    }
+
+
+def _limits(entry: Entry, types: dict[str, str]) -> dict[str, object]:
+    v = entry.variable
+    return {
+        "declaredType": types.get(v.unit or ""),
+        "unit": v.unit,
+        "min": None if v.minimum is None else float(v.minimum),
+        "max": None if v.maximum is None else float(v.maximum),
+        "nominal": None if v.nominal is None else float(v.nominal),
+    }
+
+
+def _experiment(spec: LoopSpec) -> str:
+    about = {"startTime": 0.0, "stopTime": float(spec.stop_time), "stepSize": float(spec.step_size)}
+    return _element("DefaultExperiment", about)
+
+
+def _dependencies(spec: LoopSpec, entry: Entry, inputs: dict[int, Entry]) -> list[Entry]:
+    """Return the inputs that an output or another signal depends on at an instant."""
+    found = spec.depends.get(entry.name.partition("[")[0], tuple(inputs))
+    return [inputs[i] for i in found if i in inputs]
+
+
+def _inputs(spec: LoopSpec, entries: tuple[Entry, ...]) -> dict[int, Entry]:
+    """Return the inputs by the entry of w that they begin with."""
+    given = [e for e in entries if e.kind == "input"]
+    return {place: e for e, one in zip(given, spec.inputs, strict=True) for place in one.places}
+
+
+def _rows(spec: LoopSpec) -> list[tuple[Entry, Placed | None]]:
+    return [*zip(loop_layout(spec), (None, *(one for _, one in loop_rows(spec))), strict=True)]
+
+
+def _describe3(spec: LoopSpec, token: str) -> str:
+    rows = _rows(spec)
+    entries = tuple(entry for entry, _ in rows)
+    types = type_names(entries)
+    inputs = _inputs(spec, entries)
+    root = {
+        "fmiVersion": "3.0",
+        "modelName": spec.name,
+        "instantiationToken": token,
+        "description": f"{spec.description} {about_steps(spec)}".strip(),
+        "generationTool": f"Loopwright {package_version()}",
+        "variableNamingConvention": "structured",
+    }
+    stepping: dict[str, object] = {
+        "modelIdentifier": spec.name,
+        "canGetAndSetFMUState": True,
+        "canSerializeFMUState": True,
+        "canHandleVariableCommunicationStepSize": True,
+        "fixedInternalStepSize": float(spec.base) if spec.steps_on_ticks else None,
+        "maxOutputDerivativeOrder": 0,
+    }
+    variables = [
+        _element(
+            "Float64",
+            _attributes(entry, one)
+            | _limits(entry, types)
+            | {"start": " ".join(map(repr, entry.variable.flat_start)) or None},
+            [_element("Dimension", {"start": n}) for n in entry.variable.shape],
+        )
+        for entry, one in rows
+    ]
+    structure = []
+    for entry in entries:
+        if entry.is_output:
+            needed = dict.fromkeys(e.reference for e in _dependencies(spec, entry, inputs))
+            about = {
+                "valueReference": entry.reference,
+                "dependencies": " ".join(map(str, needed)),
+                "dependenciesKind": " ".join(["dependent"] * len(needed)),
+            }
+            structure.append(_element("Output", about))
+    structure += [_element("InitialUnknown", {"valueReference": e.reference}) for e in entries if e.kind == "output"]
+    categories = [_element("Category", {"name": n, "description": d}) for n, d in LOG_CATEGORIES.items()]
+    children = [
+        _element("CoSimulation", stepping),
+        *_units_and_types(types, [_element("Float64Type", about) for about in _types(types)]),
+        _element("LogCategories", {}, categories),
+        _experiment(spec),
+        _element("ModelVariables", {}, variables),
+        _element("ModelStructure", {}, structure),
+    ]
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + _element("fmiModelDescription", root, children) + "\n"
+
+
+def _describe2(spec: LoopSpec, token: str) -> str:
+    rows = _rows(spec)
+    entries = tuple(entry for entry, _ in rows)
+    types = type_names(entries)
+    inputs = _inputs(spec, entries)
+    root = {
+        "fmiVersion": "2.0",
+        "modelName": spec.name,
+        "guid": token,
+        "description": f"{spec.description} {about_steps(spec)}".strip(),
+        "generationTool": f"Loopwright {package_version()}",
+        "variableNamingConvention": "structured",
+        "numberOfEventIndicators": 0,
+    }
+    stepping: dict[str, object] = {
+        "modelIdentifier": spec.name,
+        "canHandleVariableCommunicationStepSize": True,
+        "canInterpolateInputs": False,
+        "maxOutputDerivativeOrder": 0,
+        "canRunAsynchronuously": False,
+        "canNotUseMemoryManagementFunctions": True,
+        "canGetAndSetFMUstate": True,
+        "canSerializeFMUstate": True,
+        "providesDirectionalDerivative": False,
+    }
+    sources = _element("SourceFiles", {}, [_element("File", {"name": "model.c"})])
+    variables = [
+        _element(
+            "ScalarVariable",
+            _attributes(entry, one),
+            [
+                _element(
+                    "Real",
+                    _limits(entry, types)
+                    | {"start": entry.variable.flat_start[0] if entry.variable.flat_start else None},
+                )
+            ],
+        )
+        for entry, one in rows
+    ]
+    outputs = []
+    for entry in entries:
+        if entry.is_output:
+            needed = dict.fromkeys(e.reference + 1 for e in _dependencies(spec, entry, inputs))
+            about = {
+                "index": entry.reference + 1,
+                "dependencies": " ".join(map(str, needed)),
+                "dependenciesKind": " ".join(["dependent"] * len(needed)),
+            }
+            outputs.append(_element("Unknown", about))
+    unknown = [_element("Unknown", {"index": e.reference + 1}) for e in entries if e.kind == "output"]
+    lists = (("Outputs", outputs), ("InitialUnknowns", unknown))
+    structure = [_element(tag, {}, items) for tag, items in lists if items]
+    simple = [_element("SimpleType", {"name": about.pop("name")}, [_element("Real", about)]) for about in _types(types)]
+    categories = LOG_CATEGORIES | {"logAll": "All of them"}
+    children = [
+        _element("CoSimulation", stepping, [sources]),
+        *_units_and_types(types, simple),
+        _element(
+            "LogCategories", {}, [_element("Category", {"name": n, "description": d}) for n, d in categories.items()]
+        ),
+        _experiment(spec),
+        _element("ModelVariables", {}, variables),
+        _element("ModelStructure", {}, structure),
+    ]
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + _element("fmiModelDescription", root, children) + "\n"
+
+
+def loop_page(spec: LoopSpec, text: str = "", *, fmi: int = 3) -> str:
+    """Return the text of ``documentation/index.html``: when ticks act, and the table of variables."""
+    steps = [f"<p>{escape(about_steps(spec))}</p>"]
+    return page_of(spec.name, spec.description, text, {"Steps": steps}, loop_layout(spec), fmi=fmi)
