@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from ..core import Array, Block, Event, Input, Output, ParameterError, State, kinds, parameter
-from ..tracing import find_hold
+from ..tracing import find_hold, is_nonzero
 from .integrators import check_limits, clip
 
 _WAYS = ("back_calculation", "clamping", "none")
@@ -156,7 +156,7 @@ class PID(Block):
     @property
     def has_integral(self) -> bool:
         """Whether anything moves the integral, or sets it to another value than 0."""
-        moved = self.ki != 0.0 or (self.tracks and self.tracking_time is not None)
+        moved = is_nonzero(self.ki) or (self.tracks and self.tracking_time is not None)
         return moved or self.initial_output is not None
 
     @property
@@ -220,28 +220,30 @@ class PID(Block):
         """Whether `initial` computes the states."""
         return not self.tracking and (bool(self.states.keys() - {"integral"}) or self.initial_output is not None)
 
-    def initial(self, u: Any) -> tuple[float, ...] | float:
+    def initial(self, u: Any) -> tuple[Array, ...] | Array:
         """Return the states at the start."""
         proportional = self.kp * (self.b * u.r - u.y)
         integral = 0.0 if self.initial_output is None else self.initial_output - proportional
         start = {"integral": integral, "filtered": self.c * u.r - u.y}
-        start["clamped"] = float(self.clamps and self.outward_excess(proportional + integral, u) > 0.0)
-        states: tuple[float, ...] | float = _together(start, self.states)
+        outward = self.outward_excess(proportional + integral, u) > 0.0 if self.clamps else False
+        start["clamped"] = np.where(outward, 1.0, 0.0)
+        states: tuple[Array, ...] | Array = _together(start, self.states)
         return states
 
     def tracking_rate(self) -> Array:
         """Return 1 / T_t."""
         return self.ki / self.kp if self.tracking_time is None else 1.0 / self.tracking_time
 
-    def constants(self, T: float, method: str) -> dict[str, float]:
+    def constants(self, T: float, method: str) -> dict[str, Array]:
         """Return the numbers of the filter and of back-calculation for one sample."""
         made = {}
         if self.filter_time is not None:
-            decay, gain = find_hold(np.array([[-1.0 / self.filter_time]]), T, method)
-            made = {"filter_decay": float(decay[0, 0]), "filter_gain": float(gain[0, 0])}
+            decay, gain = find_hold([[-1.0 / self.filter_time]], T, method)
+            made = {"filter_decay": decay[0, 0], "filter_gain": gain[0, 0]}
         if self.tracks:
-            rate = self.tracking_rate() if self.ki or self.tracking_time is not None else 0.0
-            made["tracking_share"] = 1.0 - float(find_hold(np.array([[-rate]]), T, method)[0][0, 0])
+            moves = is_nonzero(self.ki) or self.tracking_time is not None
+            rate = self.tracking_rate() if moves else 0.0
+            made["tracking_share"] = 1.0 - find_hold([[-rate]], T, method)[0][0, 0]
         return made
 
     def unlimited_output(self, x: Any, u: Any) -> Array:

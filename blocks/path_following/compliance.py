@@ -170,7 +170,7 @@ class AdmittanceFilter(Block):
 
     def constants(self, T: float, method: str) -> dict[str, np.ndarray]:
         """Return transition and forcing of the free filter over one sample."""
-        A = np.array([[0.0, 1.0], [-self.stiffness / self.mass, -self.effective_damping / self.mass]])
+        A = [[0.0, 1.0], [-self.stiffness / self.mass, -self.effective_damping / self.mass]]
         transition, forcing = find_hold(A, T, method)
         return {"transition": transition, "forcing": forcing}
 

@@ -1,5 +1,6 @@
 """Equations of blocks as CasADi functions, and their discretization."""
 
+from .computed import trace_initial, trace_numbers
 from .differences import differentiate, extrapolate
 from .discretization import check_method, find_hold, hold
 from .equations import initial_state, start_shapes, start_values, state_after_start
@@ -8,7 +9,7 @@ from .opaque_equations import raise_failure
 from .outside import describe_outside
 from .structure import has_structure, is_traced_by, structure, traced_parameters
 from .switching_times import Line, switching_times
-from .symbols import bundle, count_uses, flat_column, has_large_product, size, with_values, wrap
+from .symbols import bundle, count_uses, flat_column, has_large_product, is_nonzero, size, with_values, wrap
 from .traced import Traced, constants_of, trace
 from .traced_array import as_traced
 
@@ -32,6 +33,7 @@ __all__ = [
     "has_structure",
     "hold",
     "initial_state",
+    "is_nonzero",
     "is_traced_by",
     "raise_failure",
     "size",
@@ -41,6 +43,8 @@ __all__ = [
     "structure",
     "switching_times",
     "trace",
+    "trace_initial",
+    "trace_numbers",
     "traced_parameters",
     "with_values",
     "wrap",

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from ..core import ParameterError, SampleTimeError, accepts, kinds
+from .symbolic_hold import hold_of_symbols, holds_symbols
 
 Method = Literal["exact", "forward", "semi_implicit", "trapezoidal"]
 METHODS = ("exact", "forward", "semi_implicit", "trapezoidal")
@@ -43,9 +44,14 @@ def hold(A: np.ndarray, T: float, method: str) -> tuple[np.ndarray, np.ndarray]:
     return find_hold(A, T, method)
 
 
-def find_hold(A: np.ndarray, T: float, method: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return what `hold` does, from arguments of known kinds: a sweep does so for each of its runs."""
+def find_hold(A: Any, T: float, method: str) -> tuple[Any, Any]:
+    """Return what `hold` does, from arguments of known kinds: a sweep does so for each of its runs.
+
+    A may be rows of symbols, as a block's parameters are where it is exported.
+    """
     check_method(method)
+    if holds_symbols(A):
+        return hold_of_symbols(A, T, method)
     A = np.atleast_2d(np.asarray(A, dtype=float))
     n = len(A)
     if A.shape != (n, n):

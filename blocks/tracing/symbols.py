@@ -85,6 +85,11 @@ def with_zeros(column: Any, zero: np.ndarray) -> Any:
     return ca.MX(ca.Sparsity(len(zero), 1, [0, len(kept)], kept), column[kept])
 
 
+def is_nonzero(value: Any) -> bool:
+    """Whether a number is other than 0; a symbol that stands for one is, since exact zeros are structure."""
+    return not value.to_casadi().is_zero() if isinstance(value, ArrayInterface) else bool(value != 0.0)
+
+
 def wrap(flat: Any, shape: Shape) -> Any:
     """Give a flat CasADi column NumPy's interface, in C order."""
     if shape == ():

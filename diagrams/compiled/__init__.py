@@ -4,7 +4,7 @@ from .background import BackgroundCode
 from .code import LARGEST, TickCode, compile_ticks, find_obstacle, interpret_ticks, write_ticks
 from .compiled_libraries import load_compiled
 from .exported_memory import NamedCode, function_text, read_memory
-from .function_code import Code
+from .function_code import Code, Sources
 from .fused import FusedPlant, compile_fused, fuse
 from .grouping import make_tables
 from .handed_over import HandedOver
@@ -65,6 +65,7 @@ __all__ = [
     "PythonStep",
     "ReturnReason",
     "Sign",
+    "Sources",
     "Span",
     "StepFailure",
     "TickCode",

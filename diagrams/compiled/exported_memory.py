@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...fmus.export import Field, LoopMemory, c_number
+from ..flat import share_terms
 from .bound_functions import BoundFunction, CodeOfFunctions, CompiledFunction, TickStructure
 from .hybrid_structures import DelaysStructure, HybridStructure, MethodStructure, ProblemStructure
 from .loop import LoopStructure, NewtonStructure
@@ -48,9 +49,9 @@ class NamedCode(CodeOfFunctions):
     functions: list[Any]
 
     def find(self, function: Any) -> CompiledFunction:
-        """Return a function with a number in the place of its address."""
-        self.functions.append(function)
-        return CompiledFunction(function, _FIRST + 16 * len(self.functions))
+        """Return a function under a name that nothing in the loop has; a number takes the place of its address."""
+        self.functions.append(share_terms(function, f"lw_of_{function.name()}"))
+        return CompiledFunction(self.functions[-1], _FIRST + 16 * len(self.functions))
 
     def address(self, name: str) -> int:
         """Return no address: C finds what it needs by its name."""

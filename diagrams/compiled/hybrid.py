@@ -196,6 +196,8 @@ class CompiledHybrid:
         Called where no more events can be logged: takes those that have been.
     coupled : bool
         Whether the continuous states continue within the steps of the plants, by `run_between`.
+    logged : int, optional
+        Bytes of events that have fired, which are taken before there are more; see `Watch`.
     """
 
     def __init__(
@@ -216,6 +218,7 @@ class CompiledHybrid:
         tolerances: tuple[float, float] = (0.0, 0.0),
         drain: Callable[[], None],
         coupled: bool = False,
+        logged: int | None = None,
     ):
         self.ticks, self._kept = loop, list[Any]([code, arguments, x_next])
         self.kinds: Mapping[frozenset[TickPattern], int] = loop.kinds
@@ -290,8 +293,9 @@ class CompiledHybrid:
         self.watch: Watch | None = None
         """The events; None without any."""
         if domains is not None:
+            more = {} if logged is None else {"logged": logged}
             self.watch = Watch(
-                flat, code.between, trial, arguments, x_next, domains=domains, step=step, exchange=exchange
+                flat, code.between, trial, arguments, x_next, domains=domains, step=step, exchange=exchange, **more
             )
             hybrid.w = self.watch.structure
         if exchange is not None:
@@ -315,6 +319,18 @@ class CompiledHybrid:
         self._run.restype = self._run_between.restype = self._note_beyond.restype = None
         self._guard = loop.guard
         self._fresh = [(structure, bytes(structure)) for structure in (hybrid, *self.methods)]
+
+    @property
+    def structure(self) -> HybridStructure:
+        """The loop as C knows it."""
+        return self._hybrid
+
+    @property
+    def kept(self) -> list[Any]:
+        """All that lives as long as the loop: whatever its pointers lead to."""
+        events = [] if self.watch is None else self.watch.kept
+        solver = [] if self._solver is None else [self._solver]
+        return [*self.ticks.kept, *self._kept, *events, *solver, *self.methods]
 
     def note_taken(self, states: np.ndarray) -> None:
         """Note which states the tick renews that Python has just evaluated for C; see `CompiledLoop`."""

@@ -149,12 +149,15 @@ def hybrid_sources(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], 
     return known[key]
 
 
-def write_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, stiff: bool) -> Sources[HybridCode]:
+def write_hybrid(
+    flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, stiff: bool, straight: bool = False
+) -> Sources[HybridCode]:
     """Return the functions of a diagram with continuous states, to be written as C code; see `compile_hybrid`.
 
     Small diagrams are expanded: each function is one of scalar operations. Large ones, by the rule of
     `FlatDiagram.by_block`, are grouped, so that the compiler sees each kind of block once. The derivative of the rates
-    is computed by differences then. Diagrams with algebraic loops between ticks are expanded.
+    is computed by differences then. Diagrams with algebraic loops between ticks are expanded, and so are all with
+    ``straight``.
 
     Raises
     ------
@@ -162,7 +165,7 @@ def write_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *,
         If a function is too large for a compiler.
     """
     kinds = (NONE, *(clocks for clocks in acting if clocks))
-    grouped = flat.by_block and not flat.active_loops(NONE)
+    grouped = flat.by_block and not flat.active_loops(NONE) and not straight
     write = _write_staged if flat.outside else _write_grouped if grouped else _write_straight
     written = write(flat, kinds, stiff=stiff)
     loops, judged = loop_functions(flat, kinds), bool(flat.outside) or may_fail_at_steps(flat)

@@ -82,6 +82,8 @@ class Watch:
         Fixed step of the method in s; None where it chooses its steps.
     exchange : NativeModelExchange, optional
         FMUs in model exchange, whose events they are, too.
+    logged : int
+        Bytes of what has fired, which is taken before there are more.
 
     Attributes
     ----------
@@ -100,6 +102,7 @@ class Watch:
         domains: Domains,
         step: float | None,
         exchange: NativeModelExchange | None = None,
+        logged: int = _LOGGED,
     ):
         self._kept: list[Any] = []
         events, n = flat.events, flat.continuous.size
@@ -135,7 +138,7 @@ class Watch:
         self._slid = np.full(m, np.nan)
         self._put("slid", self._slid)
         row = 2 + 2 * self._width
-        self._log = np.zeros((max(200, m, _LOGGED // (8 * row)), row))
+        self._log = np.zeros((max(200 if logged else 1, m, logged // (8 * row)), row))
         self._put("log", self._log)
         self.structure.capacity = len(self._log)
         for name in ("times", "seen", "gates", "domains"):
@@ -149,6 +152,11 @@ class Watch:
         """Which events fire at the instant that C has come to."""
         self._put("fires", self.fires)
         self._put("following", np.zeros(m, dtype=np.uint8))
+
+    @property
+    def kept(self) -> list[Any]:
+        """All that lives as long as it: whatever the pointers of its structure lead to."""
+        return self._kept
 
     def _put(self, name: str, vector: np.ndarray) -> None:
         self._kept.append(vector)

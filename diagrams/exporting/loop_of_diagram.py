@@ -2,33 +2,69 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
-from ...blocks.core import DefinitionError, SimulationError
-from ...blocks.tracing import GUARDS, constants_of, traced_parameters
-from ...fmus.export import Guards, LoopSpec, Placed, Variable, parameter_variable
-from ..compiled import CompiledLoop, NamedCode, function_text, load_runtime, read_memory, write_ticks
-from ..flat import FlatDiagram, TickPattern, evaluate, kinds_of, sample_time_of, share_terms, speed_up
+from ...blocks.core import DefinitionError, OptionError, SimulationError
+from ...blocks.tracing import traced_parameters
+from ...fmus.export import ROOM_FOR_EDGES, CFunction, LoopSpec, Numbers, Placed, Variable, parameter_variable
+from ..compiled import (
+    CompiledHybrid,
+    CompiledLoop,
+    NamedCode,
+    Sources,
+    TickCode,
+    function_text,
+    load_runtime,
+    read_memory,
+    write_hybrid,
+    write_ticks,
+)
+from ..flat import NONE, FlatDiagram, TickPattern, flatten, kinds_of
 from ..model_exchange import BlocksInModelExchange
-from ..simulation import Workspace, find_start_values, initialize, newton_options
-from ..wiring import Wire, join
+from ..simulation import (
+    Continuous,
+    Workspace,
+    accepts_of,
+    find_start_values,
+    initialize,
+    is_stiff,
+    methods_of,
+    newton_options,
+)
+from ..solvers import METHODS, MethodKind
+from ..wiring import Wire, exact_time, join
+from .edges import find_edges
+from .more_functions import trace_computed_numbers, trace_guards
 from .obstacles import refuse
 from .open_diagram import OpenDiagram
+from .start_function import trace_left, trace_start_values
 
 _MOST_CLOCKS, _MOST_SETS = 64, 250
 
 
-def loop_spec(opened: OpenDiagram, *, name: str, description: str = "", **options: Any) -> LoopSpec:
+def loop_spec(
+    opened: OpenDiagram,
+    *,
+    name: str,
+    description: str = "",
+    solver: str = "auto",
+    rtol: float = 1e-6,
+    atol: float = 1e-8,
+    **options: Any,
+) -> LoopSpec:
     """Return a diagram as it is exported.
 
     Parameters
     ----------
     opened : OpenDiagram
         The diagram, with its inputs and outputs.
+    solver : str
+        Method between ticks; "auto" is RK45.
+    rtol, atol : float
+        Relative and absolute tolerance of a method of variable step.
     name, description, **options
         Fields of `LoopSpec`.
 
@@ -40,30 +76,36 @@ def loop_spec(opened: OpenDiagram, *, name: str, description: str = "", **option
         If its start isn't found.
     """
     refuse(opened)
-    flat = opened.wired.flatten()
+    flat = _flatten(opened, name, options.get("step_size", 1e-3))
     workspace = _start(opened, flat)
-    acting = kinds_of(flat, every=False)
+    here = workspace.here
+    acting = kinds_of(flat, every=False) if flat.distinct else []
+    hybrid = not _is_sampled(flat)
+    acting = [NONE, *(clocks for clocks in acting if clocks)] if hybrid else acting
     _check_clocks(flat, len(acting), name)
     code = NamedCode(load_runtime())
-    sources = write_ticks(flat, acting, straight=True)
-    ticks = sources.make([code] * len(sources.writers))
-    here = workspace.here
-    loop = CompiledLoop(
-        ticks,
-        [here.t, here.x, here.w, here.p],
-        [workspace.x_next, workspace.z, workspace.log, workspace.ok],
-        [],
-        columns=None,
-        width=0,
-        every=1,
-        stops=[],
-        loops={clocks: newton_options(flat, clocks, here.x) for clocks in ticks.loops},
-    )
-    vectors = {"t": here.t, "x": here.x, "w": here.w, "p": here.p}
+    vectors = {"t": here.t, "x": here.x, "w": here.w, "p": here.p, "seen_p": here.p.copy()}
     vectors |= {"x_next": workspace.x_next, "z": workspace.z, "log": workspace.log, "ok": workspace.ok}
-    guards = [_guards(flat, clocks, i, opened) for i, clocks in enumerate(acting)]
-    memory = read_memory({"loop": loop.structure}, vectors, loop.kept, code)
-    variables = _Variables(opened, flat)
+    facts: dict[str, Any] = {}
+    functions: list[Any] = []
+    if hybrid:
+        vectors |= {"edge": np.zeros(ROOM_FOR_EDGES), "late": np.zeros(ROOM_FOR_EDGES)}
+        continuous = _continuous(workspace, name, solver, rtol, atol)
+        bound = _bind_hybrid(workspace, continuous, acting, code)
+        memory = read_memory({"hybrid": bound.structure}, vectors, bound.kept, code)
+        facts["edges"], facts["periodic"] = find_edges(opened, continuous.sources)
+        facts["events"] = tuple((opened.shown(e.path), e.name, e.subsystem) for e in flat.events)
+        left = trace_left(workspace)
+        facts["left"] = None if left is None else CFunction.of(left)
+        functions += [] if left is None else [left]
+    else:
+        loop = _bind_ticks(workspace, write_ticks(flat, acting, straight=True), code)
+        memory = read_memory({"loop": loop.structure}, vectors, loop.kept, code)
+    guards = [trace_guards(flat, clocks, i, opened) for i, clocks in enumerate(acting)]
+    start, untraced = trace_start_values(flat, workspace)
+    numbers = trace_computed_numbers(flat)
+    variables = _Variables(opened, flat, here.x.copy(), untraced, numbers)
+    functions += [start, *(f for _, f in numbers.values()), *(f for _, f in guards)]
     return LoopSpec(
         name=name,
         description=description,
@@ -75,32 +117,100 @@ def loop_spec(opened: OpenDiagram, *, name: str, description: str = "", **option
         base=flat.base,
         clocks=tuple((clock.every, clock.offset) for clock in flat.distinct),
         sets=tuple(sum(1 << i for i, clock in enumerate(flat.distinct) if clock in one) for one in acting),
-        hybrid=False,
+        hybrid=hybrid,
         memory=memory,
-        code=function_text([*code.functions, *(function for _, function in guards if function is not None)]),
+        code=function_text([*code.functions, *dict.fromkeys(f for f in functions if f is not None)]),
         labels=variables.labels(),
         guards=tuple(found for found, _ in guards),
+        start=None if start is None else CFunction.of(start),
+        start_kind=_start_kind(flat, acting, name),
+        numbers=tuple(one for one, f in numbers.values() if f is not None),
         depends=variables.depends(acting),
+        **facts,
         **options,
     )
 
 
-def _guards(flat: FlatDiagram, clocks: frozenset[TickPattern], kind: int, opened: OpenDiagram) -> tuple[Guards, Any]:
-    """Return what must stay positive at a kind of tick, and the function of their values; None without any."""
-    names: list[tuple[str, str]] = []
+def _is_sampled(flat: FlatDiagram) -> bool:
+    """Whether all blocks act at ticks only."""
+    return all(flat.table.is_sampled(flat.table.subsystem_of[path]) for path in flat.checked.traced)
 
-    def visit(instant: Any, path: str, inputs: Any, made: Any) -> None:
-        if GUARDS in made:
-            names.extend((opened.shown(path), name) for name in flat.checked.traced[path].guards)
 
-    symbols = flat.symbols()
-    instant = evaluate(flat, flat.blocks, clocks, **symbols, visit=visit)
-    if not names:
-        return Guards(), None
-    made = ca.Function(f"lw_guards_of{kind}", [*symbols.values()], [ca.densify(ca.vertcat(*instant.guards))])
-    function = share_terms(speed_up(made), made.name())
-    sizes = function.sz_arg(), function.sz_res(), function.sz_iw(), function.sz_w()
-    return Guards(tuple(names), function.name(), sizes), function
+def _flatten(opened: OpenDiagram, name: str, step: float) -> FlatDiagram:
+    """Return the diagram with its ticks; without any, a step takes their place. Outputs are had between ticks."""
+    wired = opened.wired
+    if not wired.has_base:
+        base = exact_time(step, block=name)
+        return flatten(wired.scheduled, wired.checked, wired.orders, base, name=name, asked=False, between=True)
+    flat = wired.flatten()
+    if _is_sampled(flat):
+        return flat
+    return flatten(wired.scheduled, wired.checked, wired.orders, name=name, between=True)
+
+
+def _continuous(workspace: Workspace, name: str, solver: str, rtol: float, atol: float) -> Continuous:
+    """Return the continuous part, with a method that C has.
+
+    Raises
+    ------
+    OptionError
+        For a method of another library.
+    """
+    chosen = "RK45" if solver == "auto" else solver
+    known = METHODS.get(chosen)
+    if known is not None and known.kind is MethodKind.LIBRARY:
+        raise OptionError(
+            f"found solver={solver!r}, whose steps another library takes, which isn't exported. Give 'RK45', or "
+            "'Radau' for a stiff diagram.",
+            block=name,
+            port="solver",
+        )
+    continuous = Continuous(workspace, name, chosen, rtol, atol, None, lambda event: None)
+    continuous.begin(at_start=True)
+    return continuous
+
+
+def _bind_ticks(
+    workspace: Workspace, sources: Sources[TickCode], code: NamedCode, ticks: TickCode | None = None
+) -> CompiledLoop:
+    """Return the loop over ticks, bound to the numbers of a start, without plants."""
+    flat, here = workspace.flat, workspace.here
+    made = sources.make([code] * len(sources.writers)) if ticks is None else ticks
+    return CompiledLoop(
+        made,
+        [here.t, here.x, here.w, here.p],
+        [workspace.x_next, workspace.z, workspace.log, workspace.ok],
+        [],
+        columns=None,
+        width=0,
+        every=1,
+        stops=[],
+        loops={clocks: newton_options(flat, clocks, here.x) for clocks in made.loops},
+    )
+
+
+def _bind_hybrid(
+    workspace: Workspace, continuous: Continuous, acting: Sequence[frozenset[TickPattern]], code: NamedCode
+) -> CompiledHybrid:
+    """Return the loop with continuous states, bound to the numbers of a start, without plants."""
+    flat, here = workspace.flat, workspace.here
+    sources = write_hybrid(flat, acting, stiff=is_stiff(continuous), straight=True)
+    made = sources.make([code] * len(sources.writers))
+    return CompiledHybrid(
+        made,
+        flat,
+        _bind_ticks(workspace, sources, code, made.ticks),
+        [here.t, here.x, here.w, here.p],
+        workspace.x_next,
+        methods_of(continuous),
+        step=float(flat.base) if continuous.fixed else None,
+        domains=continuous.domains,
+        accepts=accepts_of(workspace, continuous, judged=made.judged),
+        loops=newton_options(flat, NONE, here.x) if flat.active_loops(NONE) else None,
+        tolerances=continuous.resolution,
+        drain=lambda: None,
+        logged=0,
+    )
 
 
 def _start(opened: OpenDiagram, flat: FlatDiagram) -> Workspace:
@@ -126,11 +236,33 @@ def _check_clocks(flat: FlatDiagram, sets: int, name: str) -> None:
         )
 
 
+def _start_kind(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], name: str) -> int:
+    """Return the kind of the tick at which all clocks act; -1 without algebraic loops."""
+    if not flat.loops.slices:
+        return -1
+    every = frozenset(flat.distinct)
+    if every not in acting:
+        raise DefinitionError(
+            "it has an algebraic loop, and subsystems that never act at the same tick; an exported diagram can't find "
+            "its start then. Leave out the offset of a sample time, or break the loop by a UnitDelay.",
+            block=name,
+        )
+    return acting.index(every)
+
+
 class _Variables:
     """The variables of an exported diagram."""
 
-    def __init__(self, opened: OpenDiagram, flat: FlatDiagram):
-        self._opened, self._flat = opened, flat
+    def __init__(
+        self,
+        opened: OpenDiagram,
+        flat: FlatDiagram,
+        x: np.ndarray,
+        untraced: Sequence[str],
+        numbers: Mapping[str, tuple[Numbers, Any]],
+    ):
+        self._x = x
+        self._opened, self._flat, self._untraced, self._numbers = opened, flat, untraced, numbers
         self._outputs = {self._place(wire): name for name, wire in opened.outputs.items()}
 
     def _place(self, wire: Wire) -> tuple[int, ...]:
@@ -156,13 +288,8 @@ class _Variables:
             start = block.start_of(name).reshape(port.shape)
             about = _unit(port.unit), port.description
             variable = Variable(name, "input", "continuous", port.shape, *about, start=start)
-            found.append(Placed(variable, "w", tuple(range(where.start, where.stop)), self._is_sampled))
+            found.append(Placed(variable, "w", tuple(range(where.start, where.stop)), _is_sampled(flat)))
         return tuple(found)
-
-    @property
-    def _is_sampled(self) -> bool:
-        flat = self._flat
-        return all(flat.table.is_sampled(flat.table.subsystem_of[path]) for path in flat.checked.traced)
 
     def _signal(self, name: str, wire: Wire, causality: Any) -> Placed:
         opened = self._opened
@@ -189,12 +316,12 @@ class _Variables:
         return tuple(found)
 
     def parameters(self) -> tuple[Placed, ...]:
-        """Return the parameters that are symbols in the functions, and from which no other numbers are computed."""
+        """Return the parameters that are symbols in the functions, with all that is computed from them."""
         flat = self._flat
         found = []
-        for path, trace in flat.checked.traced.items():
+        for path in flat.checked.traced:
             block = flat.table.blocks[path]
-            if trace.system_matrix is not None or constants_of(block, sample_time_of(flat.table, path), trace.method):
+            if path in self._numbers and self._numbers[path][1] is None:
                 continue
             first = flat.parameters.slices[path].start
             for key, value in traced_parameters(block):
@@ -214,11 +341,11 @@ class _Variables:
             for name, where in own.slices.items():
                 port = block.states[name]
                 shape = own.shapes[name]
-                start = np.asarray(flat.x0[where]).reshape(shape)
-                label = join(self._opened.shown(path), name)
-                variable = Variable(
-                    label, "local", "discrete", shape, _unit(port.unit), port.description, start=start, state=True
-                )
+                computed = block.starts_from_inputs and path not in self._untraced
+                start = None if computed else np.array(self._x[where]).reshape(shape)
+                label, about = join(self._opened.shown(path), name), (_unit(port.unit), port.description)
+                kind = "continuous" if computed else "discrete"
+                variable = Variable(label, "local", kind, shape, *about, start=start, state=not computed)
                 found.append(Placed(variable, "x", tuple(range(where.start, where.stop)), sampled=True))
         return tuple(found)
 

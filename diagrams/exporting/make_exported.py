@@ -64,8 +64,8 @@ def make_exported(
         label = name or _identifier(wired.name if subsystem is None else subsystem.rpartition(".")[2])
         opened = open_whole(wired, names, label) if subsystem is None else open_part(wired, subsystem, label)
     opened = choose_outputs(opened, None if outputs is None else tuple(outputs))
-    base = float(opened.wired.flatten().base)
-    chosen = {"step_size": base, **{key: value for key, value in options.items() if value is not None}}
+    base = {"step_size": float(opened.wired.flatten().base)} if opened.wired.has_base else {}
+    chosen = {**base, **{key: value for key, value in options.items() if value is not None}}
     return loop_spec(opened, name=label, description=about, **chosen)
 
 

@@ -25,6 +25,12 @@ def refuse(opened: OpenDiagram) -> None:
                 "two where the exported one is used.",
                 block=shown,
             )
+        if block.transport and not table.is_sampled(table.subsystem_of[path]):
+            raise DefinitionError(
+                "it is a transport delay in continuous time, whose memory has no bound; an exported diagram has a "
+                "fixed one. Put it into a sampled subsystem, where it is a delay by whole samples.",
+                block=shown,
+            )
         if block.opaque:
             raise DefinitionError(
                 "Python evaluates it, and nothing exported has Python inside. Write its equations with NumPy functions "

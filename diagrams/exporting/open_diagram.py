@@ -12,7 +12,7 @@ from ...blocks.core import UnknownNameError, near
 from ..flat import WiredDiagram
 from ..wiring import Collector, Structure, Subsystem, Wire, find_path, join
 from .outside import Outside
-from .start import find_start
+from .start import DiagramStart, find_start
 
 _OUTSIDE = "outside"
 
@@ -180,7 +180,7 @@ def open_whole(wired: WiredDiagram, outside: Sequence[str], name: str) -> OpenDi
     moved: dict[tuple[str, str], str] = {}
     read: dict[str, Wire] = {}
     paths = [find_path(given, table.blocks, "block", wired.name) for given in outside]
-    start = find_start(wired)
+    start = find_start(wired) if paths else DiagramStart.none()
 
     def label(path: str, port: str, taken: Collection[str], *, alone: bool) -> str:
         """Return the name of a port: its own, or where that is taken with its block's in front."""

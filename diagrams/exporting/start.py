@@ -11,6 +11,8 @@ from ..flat import FlatDiagram, WiredDiagram
 from ..simulation import RunOptions, Simulation
 from ..wiring import join
 
+_STEP = 1e-3  # s, of a diagram without any; its start has none
+
 
 @dataclass(frozen=True, eq=False)
 class DiagramStart:
@@ -18,7 +20,7 @@ class DiagramStart:
 
     Attributes
     ----------
-    flat : FlatDiagram
+    flat : FlatDiagram or None
         The diagram.
     log : ndarray
         All outputs.
@@ -26,12 +28,18 @@ class DiagramStart:
         States of blocks, flat, by path.
     """
 
-    flat: FlatDiagram
+    flat: FlatDiagram | None
     log: np.ndarray
     states: Mapping[str, np.ndarray]
 
+    @classmethod
+    def none(cls) -> DiagramStart:
+        """Return the start of which nothing is asked."""
+        return cls(None, np.zeros(0), {})
+
     def signal(self, path: str, port: str) -> np.ndarray:
         """Return an output of a block."""
+        assert self.flat is not None
         full = join(path, port)
         return np.array(self.log[self.flat.log.slices[full]].reshape(self.flat.log.shapes[full]))
 
@@ -44,7 +52,7 @@ def find_start(wired: WiredDiagram) -> DiagramStart:
     LoopwrightError
         As a run does.
     """
-    with Simulation(wired, RunOptions()) as simulation:
+    with Simulation(wired, RunOptions(step=None if wired.has_base else _STEP)) as simulation:
         flat, view = simulation.flat, simulation.view
         log, x = view.log.copy(), view.x.copy()
     return DiagramStart(flat, log, {path: x[where] for path, where in flat.states.slices.items()})

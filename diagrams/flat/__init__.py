@@ -9,7 +9,7 @@ from .fast_functions import share_terms, speed_up
 from .flat_diagram import EXACT_LOOP, FlatDiagram
 from .flat_functions import indicators_of
 from .flat_layout import FlatEvent, StateLayout, sample_time_of
-from .flatten import renumber, write_numbers
+from .flatten import flatten, renumber, write_numbers
 from .logic import TRUE, is_true
 from .movable import Target, with_movable
 from .plant_ticks import StepTable, own_step, takes_any_step
@@ -62,6 +62,7 @@ __all__ = [
     "bind_function",
     "evaluate",
     "evaluate_apart",
+    "flatten",
     "indicators_of",
     "is_true",
     "join_columns",

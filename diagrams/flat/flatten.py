@@ -29,6 +29,7 @@ def flatten(
     *,
     asked: bool | None = None,
     name: str = "",
+    between: bool = False,
 ) -> FlatDiagram:
     """Flatten a checked diagram.
 
@@ -42,6 +43,8 @@ def flatten(
         Whether ``step`` was asked for, and is not that of the clocks; by default it was if it is given.
     name : str
         The diagram's name, for errors.
+    between : bool, default False
+        Whether outputs are evaluated between ticks though nothing happens there: all sampled ones are held then.
 
     Raises
     ------
@@ -53,7 +56,7 @@ def flatten(
     paths = sorted(traced)
     order, start_order = orders
     events = tuple(_events(table, checked))
-    between = bool(events) or any(traced[path].advance == "derivative" for path in paths)
+    between = between or bool(events) or any(traced[path].advance == "derivative" for path in paths)
     between = between or any(block.transport and path not in traced for path, block in blocks.items())
     around = {subsystem: table.gates(subsystem) for subsystem in table.subsystems}
     gated = {path: around[table.subsystem_of[path]] for path in paths}

@@ -1,6 +1,9 @@
 """The loop over ticks, and between them."""
 
 from .algebraic_loops import newton_options
+from .compiled_hand_over import accepts_of, methods_of
+from .compiled_hybrid import is_stiff
+from .continuous import Continuous
 from .diagnosis import START_SETTLED
 from .engine import Engine
 from .held_inputs import note_held_inputs
@@ -9,6 +12,7 @@ from .live_run import LiveRun
 from .progress import Interrupted, ProgressOption, late_progress, progress_bar, work_notes
 from .run_options import START_EXCHANGES, KeptKeywords, RunKeywords, RunOptions, default_step, refuse_rest, ticks_in
 from .simulation import Simulation, simulate
+from .solver_setup import find_late, next_instant
 from .start_at_point import apply_point, copy_states
 from .start_values import Port, StartFunctions, StartValues, trace_start
 from .stops import StopConditions
@@ -18,6 +22,7 @@ from .workspace import Workspace
 __all__ = [
     "START_EXCHANGES",
     "START_SETTLED",
+    "Continuous",
     "Engine",
     "Interrupted",
     "KeptKeywords",
@@ -32,14 +37,19 @@ __all__ = [
     "StartValues",
     "StopConditions",
     "Workspace",
+    "accepts_of",
     "apply_point",
     "copy_states",
     "default_step",
     "find_initial_state",
+    "find_late",
     "find_start_values",
     "initialize",
+    "is_stiff",
     "late_progress",
+    "methods_of",
     "newton_options",
+    "next_instant",
     "note_held_inputs",
     "progress_bar",
     "refuse_rest",

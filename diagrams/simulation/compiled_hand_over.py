@@ -91,8 +91,6 @@ def bind_hybrid(
     )
     native = None if handed is None else handed.native
     ticks = bind_loop(workspace, plants, code.ticks, recorder, stops, native, rest)
-    always = bool(plants.entries) or workspace.looped or remembers(flat) or has_guards(flat)
-    judged = code.judged and not continuous.fixed
     loop = CompiledHybrid(
         code,
         flat,
@@ -102,7 +100,9 @@ def bind_hybrid(
         methods,
         step=float(flat.base) if continuous.fixed else None,
         domains=domains,
-        accepts=1 if always or (judged and native is None) else 2 if judged else 0,
+        accepts=accepts_of(
+            workspace, continuous, judged=code.judged, plants=bool(plants.entries), exchanged=native is not None
+        ),
         loops=newton_options(flat, NONE, here.x) if flat.active_loops(NONE) else None,
         exchange=native,
         delays=continuous.delays,
@@ -111,6 +111,23 @@ def bind_hybrid(
         coupled=plants.are_coupled,
     )
     return loop, handed
+
+
+def accepts_of(
+    workspace: Workspace, continuous: Continuous, *, judged: bool, plants: bool = False, exchanged: bool = False
+) -> int:
+    """Return after which steps blocks are evaluated; see `CompiledHybrid`.
+
+    Parameters
+    ----------
+    judged : bool
+        Whether outputs may be non-finite while states are finite.
+    plants, exchanged : bool
+        Whether there are FMUs, and some in model exchange.
+    """
+    flat, judged = workspace.flat, judged and not continuous.fixed
+    always = plants or workspace.looped or remembers(flat) or has_guards(flat)
+    return 1 if always or (judged and not exchanged) else 2 if judged else 0
 
 
 def _report_own_event(continuous: Continuous, event: OwnEvent) -> None:

@@ -254,7 +254,7 @@ def _describe3(spec: LoopSpec, token: str) -> str:
                 "dependenciesKind": " ".join(["dependent"] * len(needed)),
             }
             structure.append(_element("Output", about))
-    structure += [_element("InitialUnknown", {"valueReference": e.reference}) for e in entries if e.kind == "output"]
+    structure += [_element("InitialUnknown", {"valueReference": e.reference}) for e in entries if e.is_output]
     categories = [_element("Category", {"name": n, "description": d}) for n, d in LOG_CATEGORIES.items()]
     children = [
         _element("CoSimulation", stepping),
@@ -317,7 +317,7 @@ def _describe2(spec: LoopSpec, token: str) -> str:
                 "dependenciesKind": " ".join(["dependent"] * len(needed)),
             }
             outputs.append(_element("Unknown", about))
-    unknown = [_element("Unknown", {"index": e.reference + 1}) for e in entries if e.kind == "output"]
+    unknown = [_element("Unknown", {"index": e.reference + 1}) for e in entries if e.is_output]
     lists = (("Outputs", outputs), ("InitialUnknowns", unknown))
     structure = [_element(tag, {}, items) for tag, items in lists if items]
     simple = [_element("SimpleType", {"name": about.pop("name")}, [_element("Real", about)]) for about in _types(types)]

@@ -74,6 +74,7 @@ class LoopMemory:
         yield "typedef struct {"
         yield "    int64_t tick; /* the next one */"
         yield "    int64_t lost; /* kind of the tick that can't be evaluated */"
+        yield "    int64_t reason; /* why the loop with continuous states can't continue, see instants.c */"
         yield "    double now;   /* time that has been reached, s */"
         yield from (f"    {field.declaration}" for field in self.fields)
         yield "} lw_memory;\n"

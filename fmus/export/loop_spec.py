@@ -6,17 +6,20 @@ diagram. `ModelSpec` is the same for a single continuous model, whose equations 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from importlib import resources
+from typing import Any
 
 from ...blocks.core import brief, count_of
 from ..runtime import read_sources
 from .elementary_tables import prepare_functions, restore_functions
-from .loop_memory import LoopMemory
+from .loop_memory import LoopMemory, c_number
 from .model import Variable
 
+ROOM_FOR_EDGES = 64
+"""Discontinuities of sources in a stretch of a loop with continuous states."""
 _TICKS = ("newton.c", "alone.c", "master.c")
 _BETWEEN = ("problem.c", "delays.c", "methods.c", "radau.c", "events.c", "instants.c", "hybrid.c")
 
@@ -44,6 +47,35 @@ class Placed:
 
 
 @dataclass(frozen=True)
+class CFunction:
+    """A function in the code, as CasADi writes it.
+
+    Attributes
+    ----------
+    name : str
+        Its name.
+    sizes : tuple of int
+        Entries of its lists of arguments and results, and of its memory of integers and numbers.
+    """
+
+    name: str
+    sizes: tuple[int, int, int, int]
+
+    @classmethod
+    def of(cls, function: Any) -> CFunction:
+        """Return a CasADi function as it is in the code."""
+        return cls(function.name(), (function.sz_arg(), function.sz_res(), function.sz_iw(), function.sz_w()))
+
+    def call(self, arguments: Iterable[str], result: str, indent: str) -> Iterator[str]:
+        """Yield C text that declares all that a call needs, up to the call itself."""
+        count, results, integers, numbers = self.sizes
+        given = ", ".join(arguments)
+        yield f"{indent}const double *arguments[{max(4, count)}] = {{{given}}};"
+        yield f"{indent}double *results[{max(1, results)}] = {{{result}}}, w[{numbers + 1}];"
+        yield f"{indent}long long iw[{integers + 1}];"
+
+
+@dataclass(frozen=True)
 class Guards:
     """What must stay positive at a kind of tick.
 
@@ -51,15 +83,30 @@ class Guards:
     ----------
     names : tuple of (str, str)
         Block and name of each.
-    function : str
-        Name of the function of (t, x, w, p) in the code that has their values; empty without any.
-    sizes : tuple of int
-        Entries of its arguments, results, integers and numbers, as CasADi says.
+    function : CFunction or None
+        The function of (t, x, w, p) that has their values; None without any.
     """
 
     names: tuple[tuple[str, str], ...] = ()
-    function: str = ""
-    sizes: tuple[int, int, int, int] = (0, 0, 0, 0)
+    function: CFunction | None = None
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Numbers that are computed from the parameters of a block, behind these.
+
+    Attributes
+    ----------
+    first, parameters, count : int
+        Entry of p with which the block's parameters begin, their number, and that of the computed numbers.
+    function : CFunction
+        The function from one to the other.
+    """
+
+    first: int
+    parameters: int
+    count: int
+    function: CFunction
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -90,6 +137,20 @@ class LoopSpec:
         Outputs of blocks in the order of evaluation: block, port, first entry of the log, number of entries.
     guards : tuple of Guards
         What must stay positive at each kind of tick.
+    start : CFunction or None
+        The states at the start, of (t, x, w, p); None where none are computed.
+    start_kind : int
+        Kind of the tick at which all clocks act, by which algebraic loops are solved at the start; -1: there are none.
+    numbers : tuple of Numbers
+        Numbers that are computed from parameters.
+    events : tuple of (str, str, bool)
+        Events between ticks: block, name, whether it enables or triggers a subsystem.
+    left : CFunction or None
+        The indicators of all events just before the start, then at it, where sources jump at the start; else None.
+    edges : tuple of (float, float)
+        Discontinuities of sources, s: each with the time at which it is seen there, which may be just after it.
+    periodic : tuple of (float, float)
+        Discontinuities of sources that repeat without end: the first one and the period, s.
     depends : mapping of str to tuple of int
         Entries of w on which each output and each signal depends at an instant; all where it is missing.
     steps_on_ticks : bool
@@ -115,6 +176,13 @@ class LoopSpec:
     code: str
     labels: tuple[tuple[str, str, int, int], ...]
     guards: tuple[Guards, ...] = ()
+    start: CFunction | None = None
+    start_kind: int = -1
+    numbers: tuple[Numbers, ...] = ()
+    events: tuple[tuple[str, str, bool], ...] = ()
+    left: CFunction | None = None
+    edges: tuple[tuple[float, float], ...] = ()
+    periodic: tuple[tuple[float, float], ...] = ()
     depends: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     steps_on_ticks: bool = False
     own_functions: bool = False
@@ -175,9 +243,59 @@ def _describe(spec: LoopSpec) -> Iterator[str]:
     clocks = ", ".join(f"{{{every}, {offset}}}" for every, offset in spec.clocks) or "{1, 0}"
     yield f"static const struct {{\n    int64_t every, offset;\n}} lw_clocks[] = {{{clocks}}};"
     yield f"static const uint64_t lw_sets[] = {{{', '.join(map(str, spec.sets)) or 0}}};"
+    yield f"#define LW_START_KIND {spec.start_kind}"
     yield spec.memory.write()
+    yield from _start(spec)
+    yield from _numbers(spec)
+    if spec.hybrid:
+        yield from _between_ticks(spec)
     yield read_sources("exported.c")
     yield from _guards(spec)
+
+
+def _between_ticks(spec: LoopSpec) -> Iterator[str]:
+    """Yield the C text of events, and of discontinuities of sources."""
+    yield f"#define LW_N_EVENTS {len(spec.events)}"
+    yield f"#define LW_N_EDGES {len(spec.edges)}"
+    yield f"#define LW_N_PERIODIC {len(spec.periodic)}"
+    yield f"#define LW_ROOM_FOR_EDGES {ROOM_FOR_EDGES}"
+    yield f"#define LW_HAS_LEFT {int(spec.left is not None)}"
+    yield "static const struct {\n    const char *block, *name;\n    bool subsystem;\n} lw_events_of[] = {"
+    rows = [f'    {{"{block}", "{name}", {str(gate).lower()}}},' for block, name, gate in spec.events]
+    yield "\n".join(rows or ['    {"", "", false},']) + "\n};"
+    for name, members, values in (("edges", "t, late", spec.edges), ("periodic", "t, period", spec.periodic)):
+        yield f"static const struct {{\n    double {members};\n}} lw_{name}[] = {{"
+        yield "\n".join(f"    {{{c_number(a)}, {c_number(b)}}}," for a, b in values or [(0.0, 1.0)]) + "\n};"
+    if spec.left is not None:
+        yield "static bool lw_compute_left(lw_memory *m, double *found) {"
+        yield from spec.left.call(("m->t", "m->x", "m->w", "m->p"), "found", " " * 4)
+        yield f"    return !{spec.left.name}(arguments, results, iw, w, 0);"
+        yield "}\n"
+
+
+def _start(spec: LoopSpec) -> Iterator[str]:
+    """Yield the C text that computes the states at the start into m->x_next."""
+    yield f"#define LW_HAS_START {int(spec.start is not None)}"
+    if spec.start is not None:
+        yield "static bool lw_compute_start(lw_memory *m) {"
+        yield from spec.start.call(("m->t", "m->x", "m->w", "m->p"), "m->x_next", " " * 4)
+        yield f"    return !{spec.start.name}(arguments, results, iw, w, 0);"
+        yield "}\n"
+
+
+def _numbers(spec: LoopSpec) -> Iterator[str]:
+    """Yield the C text of ``lw_renew``, which computes the numbers of blocks whose parameters have been set."""
+    yield "/* Compute the numbers that depend on parameters of blocks; to be called when some of m->p have been set. */"
+    yield "static void lw_renew(lw_memory *m) {"
+    yield "    (void)m;"
+    for one in spec.numbers:
+        first, size = one.first, f"{one.parameters} * sizeof(double)"
+        yield f"    if (memcmp(m->p + {first}, m->seen_p + {first}, {size})) {{"
+        yield from one.function.call((f"m->p + {first}",), f"m->p + {first + one.parameters}", " " * 8)
+        yield f"        memcpy(m->seen_p + {first}, m->p + {first}, {size});"
+        yield f"        {one.function.name}(arguments, results, iw, w, 0);"
+        yield "    }"
+    yield "}\n"
 
 
 def _guards(spec: LoopSpec) -> Iterator[str]:
@@ -190,14 +308,11 @@ def _guards(spec: LoopSpec) -> Iterator[str]:
     first = 0
     for kind, guards in enumerate(spec.guards):
         count = len(guards.names)
-        if count:
-            arguments, results, integers, numbers = guards.sizes
+        if guards.function is not None:
             yield f"    if (m->lost == {kind}) {{"
-            yield f"        double found[{count}], w[{numbers + 1}];"
-            yield f"        const double *arguments[{max(4, arguments)}] = {{m->t, m->x, m->w, m->p}};"
-            yield f"        double *results[{max(1, results)}] = {{found}};"
-            yield f"        long long iw[{integers + 1}];"
-            yield f"        if ({guards.function}(arguments, results, iw, w, 0)) return -1;"
+            yield f"        double found[{count}];"
+            yield from guards.function.call(("m->t", "m->x", "m->w", "m->p"), "found", " " * 8)
+            yield f"        if ({guards.function.name}(arguments, results, iw, w, 0)) return -1;"
             yield f"        for (int i = 0; i < {count}; i++)"
             yield f"            if (!(found[i] > 0.0)) return {first} + i;"
             yield "    }"

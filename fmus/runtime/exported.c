@@ -3,7 +3,7 @@
    It comes after the loop's files and the diagram's own text, which defines: `lw_memory`, `lw_fill` and `lw_bind`; the seconds
    between two ticks, LW_BASE_NUMERATOR / LW_BASE_DENOMINATOR; LW_N_CLOCKS clocks, `lw_clocks`; LW_N_SETS sets of clocks that
    act together, as bits in `lw_sets`, in the order of the loop's kinds of ticks; LW_HYBRID, whether anything happens between
-   ticks. Then `m->hybrid` is the loop with continuous states, else `m->loop` that over ticks.
+   ticks; LW_HAS_START and `lw_compute_start`; `lw_renew`. Then `m->hybrid` is the loop with continuous states, else `m->loop` that over ticks.
 
    A tick acts at the start of a communication step, with the inputs of that step, and not at its end. So a diagram that
    samples the outputs of a plant sees those at the tick if the plant has made its step before. */
@@ -11,6 +11,7 @@
 #ifndef LW_NEAR
 #define LW_NEAR 1e-3 /* of the time between two ticks: a communication point within it is the tick */
 #endif
+enum { LW_START_PASSES = 5 }; /* with algebraic loops: states that begin with their values, which depend on these */
 #if LW_HYBRID
 #define LW_LOOP_OF(m) (&(m)->hybrid.l)
 #else
@@ -60,13 +61,25 @@ static void lw_put_time(lw_memory *m, double start) {
     if (acts) m->now = *LW_LOOP_OF(m)->t = lw_time_of(m->tick);
 }
 
-/* Compute the numbers that depend on parameters; to be called when some of m->p have been set. */
-static void lw_renew(lw_memory *m) { (void)m; }
-
 /* Evaluate a tick of some kind; false: it can't be, and m->lost is the kind. */
 static bool lw_evaluate(lw_memory *m, int64_t kind) {
     m->lost = kind;
     return evaluate(LW_LOOP_OF(m), kind) == DONE;
+}
+
+/* Compute the states and the held outputs at the start; false: an algebraic loop is not solved, or it can't be done. */
+static bool lw_find_start(lw_memory *m) {
+    loop *l = LW_LOOP_OF(m);
+    newton *loops = LW_START_KIND >= 0 && l->loops ? l->loops + LW_START_KIND : NULL;
+    m->lost = LW_START_KIND;
+    for (int pass = 0; pass < (loops ? LW_START_PASSES : 1); pass++) {
+        if (loops && loops->n && !solve_loops(loops, l->x)) return false;
+#if LW_HAS_START
+        if (!lw_compute_start(m)) return false;
+        memcpy(l->x, m->x_next, (size_t)l->states * sizeof(double));
+#endif
+    }
+    return true;
 }
 
 #if !LW_HYBRID
@@ -74,6 +87,7 @@ static bool lw_evaluate(lw_memory *m, int64_t kind) {
 /* Evaluate everything at the start, with the parameters, inputs and states in the memory; false: it can't be. */
 static bool lw_begin(lw_memory *m, double start) {
     lw_put_time(m, start);
+    if (!lw_find_start(m)) return false;
     if (m->tick == INT64_MAX || lw_comes_before(m->now, lw_time_of(m->tick))) return true;
     return lw_evaluate(m, lw_kind_of(m->tick));
 }
@@ -90,5 +104,150 @@ static bool lw_go(lw_memory *m, double to) {
     }
     m->now = to;
     return true;
+}
+#else
+
+/* Write the discontinuities of sources after t, up to and with `end`, in order; where there is no room for all of them, the
+   stretch ends at the last one that is written. `late` is when each is seen. Return the end. */
+static double lw_find_edges(lw_memory *m, double t, double end, int64_t *count) {
+    int64_t n = 0;
+    for (double from = t;;) {
+        double next = INFINITY, late = INFINITY;
+        for (int64_t i = 0; i < LW_N_EDGES; i++)
+            if (lw_edges[i].t > from && lw_edges[i].t < next) next = lw_edges[i].t, late = lw_edges[i].late;
+        for (int64_t i = 0; i < LW_N_PERIODIC; i++) {
+            const double start = lw_periodic[i].t, period = lw_periodic[i].period;
+            double k = from < start ? 0.0 : floor((from - start) / period);
+            double at = start + k * period;
+            while (!is_before(from, at)) at = start + ++k * period;
+            if (at < next) next = late = at;
+        }
+        if (!(next <= end)) break;
+        m->edge[n] = next;
+        m->late[n++] = late;
+        if (n == LW_ROOM_FOR_EDGES) {
+            end = next;
+            break;
+        }
+        from = next;
+    }
+    *count = n;
+    return end;
+}
+
+static bool lw_note_lost(lw_memory *m, const outcome *out) {
+    const hybrid *h = &m->hybrid;
+    m->reason = out->reason;
+    m->lost = h->p.lost == AT_INSTANT ? h->lost_at : h->between;
+    m->now = h->t;
+    return false;
+}
+
+/* Go through the instant that is reached, with the events there and a tick of some kind. */
+static bool lw_land(lw_memory *m, double t, int64_t kind) {
+    hybrid *h = &m->hybrid;
+    const double times[2] = {t, t}, width = 0.0;
+    const int32_t kinds = (int32_t)kind;
+    const uint8_t lands = 1;
+    double row[1];
+    outcome out = {0};
+    span s = {.count = 1, .times = times, .widths = &width, .kinds = &kinds, .lands = &lands, .beyond = t, .stays = 1};
+    for (int64_t i = 0; i < LW_N_EDGES; i++) /* a source that is seen at a time just after */
+        if (lw_edges[i].t == t) m->edge[0] = t, m->late[0] = lw_edges[i].late, s.edges = 1;
+    s.edge = m->edge;
+    s.late = m->late;
+    h->l.skip = INT64_MAX;
+    h->inside = 0;
+    h->t = t;
+    h->w.logged = 0;
+    loopwright_go(h, &s, row, &out);
+    return out.reason == DONE ? true : lw_note_lost(m, &out);
+}
+
+/* Continue between ticks, up to a time. */
+static bool lw_flow(lw_memory *m, double t, double to) {
+    hybrid *h = &m->hybrid;
+    const double width = to - t;
+    const int32_t kind = (int32_t)h->between;
+    const uint8_t lands = 1;
+    double row[1];
+    outcome out = {0};
+    h->inside = 0;
+    h->t = t;
+    while (h->t < to) {
+        int64_t edges;
+        const double end = lw_find_edges(m, h->t, to, &edges), times[2] = {h->t, end};
+        const span s = {.count = 1, .times = times, .widths = &width, .kinds = &kind, .lands = &lands, .beyond = end,
+                        .edges = edges, .edge = m->edge, .late = m->late};
+        h->l.skip = INT64_MAX;
+        loopwright_go_between(h, &s, row, &out);
+        if (out.reason == SUSPENDED || (out.reason == DONE && h->t < to)) {
+            if (out.reason == DONE) h->inside = 0;
+            continue;
+        }
+        if (out.reason != DONE) return lw_note_lost(m, &out);
+    }
+    return true;
+}
+
+/* Take the domains of the events where everything begins. */
+static bool lw_begin_events(lw_memory *m) {
+#if LW_N_EVENTS
+    hybrid *h = &m->hybrid;
+    watch *w = &h->w;
+    double *x = here_states(h, w->x);
+    memcpy(h->p.x, h->l.x, (size_t)h->l.states * sizeof(double));
+    h->p.edge = h->p.left = INFINITY;
+    h->p.at = NAN;
+    if (!indicate(w, &h->p, m->now, x)) return false;
+    for (int64_t i = 0; i < LW_N_EVENTS; i++) {
+        const double z = w->z[i];
+        w->domain[i] = z > 0.0 ? 1.0 : z == 0.0 && !lw_events_of[i].subsystem ? 0.0 : -1.0;
+        ((double *)w->start)[i] = w->domain[i];
+        w->slack[i] = 0.0;
+        w->low[i] = -w->hysteresis[i];
+        w->high[i] = w->hysteresis[i];
+    }
+#if LW_HAS_LEFT
+    double both[2 * LW_N_EVENTS];
+    if (!lw_compute_left(m, both)) return false;
+    for (int64_t i = 0; i < LW_N_EVENTS; i++)
+        if (both[i] != both[LW_N_EVENTS + i] && isfinite(both[i])) w->domain[i] = both[i] > 0.0 ? 1.0 : -1.0;
+#endif
+#endif
+    return (void)m, true;
+}
+
+static bool lw_begin(lw_memory *m, double start) {
+    hybrid *h = &m->hybrid;
+    lw_put_time(m, start);
+    m->reason = DONE;
+    if (!lw_find_start(m)) return false;
+    memcpy(h->p.x, h->l.x, (size_t)h->l.states * sizeof(double));
+    if (!lw_begin_events(m)) return m->lost = h->between, false;
+    const bool acts = m->tick != INT64_MAX && !lw_comes_before(m->now, lw_time_of(m->tick));
+    return lw_evaluate(m, acts ? lw_kind_of(m->tick) : h->between);
+}
+
+/* Continue to a time with the inputs in the memory. What is at the present instant comes first: events of inputs that have
+   jumped, and a tick; ticks up to that time follow, but not one at it. */
+static bool lw_go(lw_memory *m, double to) {
+    hybrid *h = &m->hybrid;
+    const double ticks = to / lw_time_of(1), nearest = floor(ticks + 0.5);
+    if (LW_N_CLOCKS && fabs(ticks - nearest) <= LW_NEAR) to = lw_time_of((int64_t)nearest); /* as a run has it */
+    m->reason = DONE;
+    for (bool first = true;; first = false) {
+        const bool acts = m->tick != INT64_MAX && !lw_comes_before(m->now, lw_time_of(m->tick));
+        if (!first && !acts) break;
+        if (acts) m->now = lw_time_of(m->tick);
+        if (!lw_land(m, m->now, acts ? lw_kind_of(m->tick) : h->between)) return false;
+        if (acts) m->tick = lw_tick_from(m->tick + 1);
+        const double next = lw_acts_before(m, to) ? lw_time_of(m->tick) : to;
+        if (next > m->now && !lw_flow(m, m->now, next)) return false;
+        m->now = next;
+        if (!(next < to)) break;
+    }
+    *h->l.t = m->now;
+    return lw_evaluate(m, h->between);
 }
 #endif

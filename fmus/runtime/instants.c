@@ -39,7 +39,7 @@ typedef struct hybrid {
     double looked_at;   /* step in s at which it seemed so */
     outside *o;         /* FMUs in model exchange; NULL without any */
     double jump;        /* first discontinuity of a source, or event of time of an FMU, behind the stretch's begin */
-    void (*drain)(void); /* Python takes the events that have been logged */
+    void (*drain)(void); /* Python takes the events that have been logged; NULL: nobody does */
     int64_t coupled;    /* whether the continuous states continue within the steps of the plants */
     int64_t lost_at;    /* kind of the tick that can't be evaluated */
     double looked;      /* tick at which they have been looked at, and before which nothing changes any more */
@@ -336,7 +336,12 @@ static void log_before(hybrid *h, double t) {
     const int64_t width = h->l.states, row = 2 + 2 * width;
     int64_t count = 0;
     for (int64_t i = 0; i < w->m; i++) count += w->fires[i];
-    if (w->logged + count > w->capacity) h->drain();
+    if (w->logged + count > w->capacity) {
+        if (h->drain)
+            h->drain();
+        else
+            w->logged = 0; /* nobody takes them */
+    }
     double *log = w->log + w->logged * row;
     for (int64_t i = 0; i < w->m; i++) {
         if (!w->fires[i]) continue;

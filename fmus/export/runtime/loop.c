@@ -35,6 +35,15 @@ static void lw_take_values(lw_instance *self) {
 static bool lw_blame(lw_instance *self) {
     lw_memory *m = &self->s.memory;
     const double t = *LW_LOOP_OF(m)->t;
+#if LW_HYBRID
+    const hybrid *h = &m->hybrid;
+    if (m->reason == PILED_UP && LW_N_EVENTS)
+        return lw_fail(self, "%s.%s at t = %.9g s: this event fires without end, so that time doesn't go on. Declare a hysteresis, or "
+                       "give the block a state of rest.", lw_events_of[h->w.culprit].block, lw_events_of[h->w.culprit].name, h->t);
+    if (m->reason == BROKEN_OFF && h->p.lost != AT_INSTANT)
+        return lw_fail(self, LW_MODEL_NAME " at t = %.9g s: the solver finds no step. Is there a solution beyond? Check the inputs and "
+                       "parameters; a stiff diagram needs solver='Radau' when it is built.", h->t);
+#endif
     int guard = lw_find_guard(m);
     if (guard >= 0)
         return lw_fail(self, "%s.%s at t = %.9g s: this guard is not positive. The block's equations are not valid there; look up "
