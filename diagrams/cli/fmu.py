@@ -30,6 +30,7 @@ from ...fmus.export import build_python
 from ...fmus.models import gantry
 from ...fmus.platform import native_platform
 from ...fmus.toolchain import TARGETS
+from ..exporting import name_of
 from .doctor import add_doctor, run_doctor
 from .ssp import inspect_ssp
 from .subjects import is_ssp
@@ -51,8 +52,9 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         formatter_class=raw,
         description="Build an FMU from a model, with co-simulation and model exchange and no Python inside.\n\n"
         f"MODEL is a plant of the library ({', '.join(plants())})\nor FILE.py:Name, a Block class of yours or an "
-        "instance with its parameters.",
-        epilog="examples:\n  loopwright build gantry\n  loopwright build tank.py:Tank --fmi 2 --platform all\n\n"
+        "instance with its parameters,\na diagram or a subsystem.",
+        epilog="examples:\n  loopwright build gantry\n  loopwright build tank.py:Tank --fmi 2 --platform all\n"
+        "  loopwright build loop.py:loop --subsystem controller\n\n"
         f"platforms: {', '.join(TARGETS)}, all" + _STATUS.format(one="the build failed; nothing is written"),
     )
     build.add_argument("model", metavar="MODEL", help="a plant's name, or FILE.py:Name")
@@ -69,6 +71,17 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     build.add_argument(
         "--internal-step", type=_parse_positive, metavar="S", help="longest step of the integrator, in s"
     )
+    build.add_argument("--subsystem", metavar="PATH", help="export this subsystem of a diagram")
+    build.add_argument(
+        "--outside", nargs="+", action="extend", metavar="BLOCK", help="leave out these blocks of a diagram: the plant"
+    )
+    build.add_argument(
+        "--outputs", nargs="+", action="extend", metavar="NAME", help="signals of a diagram that are outputs"
+    )
+    build.add_argument(
+        "--communication", choices=("any", "ticks"), help="steps of any length, or from tick to tick (default: any)"
+    )
+    build.add_argument("--solver", metavar="NAME", help="of a diagram with continuous states (default: RK45)")
     build.add_argument("--no-arrays", action="store_true", help="a scalar variable for each element of a vector")
     build.add_argument(
         "--python", action="store_true", help="put the Python code inside, for equations that can't be traced"
@@ -161,6 +174,7 @@ def run_build(arguments: argparse.Namespace) -> int:
 def _build_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the given keywords for ``build``, checked against each other."""
     names = ("name", "integrator", "tolerance", "internal_step", "fmi", "platform")
+    names += ("subsystem", "outside", "outputs", "communication", "solver")
     options = {name: value for name in names if (value := getattr(arguments, name)) is not None}
     if arguments.no_arrays:
         options["arrays"] = False
@@ -178,7 +192,8 @@ def _build_options(arguments: argparse.Namespace) -> dict[str, Any]:
     if arguments.python:
         if options.pop("fmi", 2) != 2:
             raise OptionError("found 3; an FMU with Python inside is one of FMI 2.0. Give --fmi 2.", port="--fmi")
-        for name in ("platform", "integrator", "tolerance", "arrays"):
+        own = ("subsystem", "outside", "outputs", "communication", "solver")
+        for name in ("platform", "integrator", "tolerance", "arrays", *own):
             if name in options:
                 raise OptionError("it can't be chosen with --python. Leave it out.", port=_option_text(name))
     return options
@@ -201,18 +216,16 @@ def _find_model(arguments: argparse.Namespace) -> Iterator[Make]:
         yield _make_builder(module.nominal, arguments.python, module.build, text)
     elif text.endswith(".py") or ".py:" in text:
         with load_user_model(text) as model:
-            yield _make_builder(
-                model.block, arguments.python, build_model, type(model.block).__name__.lower(), model.beside
-            )
+            is_block = isinstance(model.block, Block)
+            name = type(model.block).__name__.lower() if is_block else name_of(model.block, arguments.subsystem)
+            yield _make_builder(model.block, arguments.python, build_model, name, model.beside)
     else:
         hint = near(text, plants())  # names all of them where none is close
         known = f" The plants: {', '.join(plants())}." if close_names(text, plants()) else ""
         raise OptionError(f"there is no model {text!r}. {hint}{known} A model of yours is FILE.py:Name.", port="MODEL")
 
 
-def _make_builder(
-    block: Block, python: bool, build: Callable[..., Path], name: str, beside: Iterable[Path] = ()
-) -> Make:
+def _make_builder(block: Any, python: bool, build: Callable[..., Path], name: str, beside: Iterable[Path] = ()) -> Make:
     def make(options: dict[str, Any], file: Path | None, folder: Path) -> Path:
         chosen = {"name": name, **options}
         target = file or folder / f"{chosen['name']}.fmu"

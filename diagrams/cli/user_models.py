@@ -1,4 +1,4 @@
-"""Models in users' files: ``FILE.py:Name``, a Block class or an instance."""
+"""Models in users' files: ``FILE.py:Name``, a Block class or an instance, a diagram or a subsystem."""
 
 from __future__ import annotations
 
@@ -11,23 +11,25 @@ from pathlib import Path
 from types import ModuleType
 
 from ...blocks.core import Block, DefinitionError, LoopwrightError, OptionError, explain_disk_errors, near
+from ..diagram import Diagram
+from ..wiring import Subsystem
 
 _MODULE = "loopwright_user_model"
 
 
 @dataclass(frozen=True)
 class UserModel:
-    """A block in a user's file.
+    """A block, a diagram or a subsystem in a user's file.
 
     Parameters
     ----------
-    block : Block
-        The block.
+    block : Block, Diagram or Subsystem
+        It.
     beside : tuple of Path
         The modules next to the file that it has imported: files, or folders of packages.
     """
 
-    block: Block
+    block: Block | Diagram | Subsystem
     beside: tuple[Path, ...]
 
 
@@ -130,12 +132,12 @@ def _is_in(module: ModuleType, name: str, folder: Path) -> bool:
     return any(p == top.with_suffix(".py") or p == top or top in p.parents for p in found)
 
 
-def _find_block(module: ModuleType, path: Path, name: str) -> Block:
+def _find_block(module: ModuleType, path: Path, name: str) -> Block | Diagram | Subsystem:
     source = str(path)
     blocks = {
         key: value
         for key, value in vars(module).items()
-        if isinstance(value, Block)
+        if isinstance(value, Block | Diagram | Subsystem)
         or (isinstance(value, type) and issubclass(value, Block) and value.__module__ == _MODULE)
     }
     if not name:
@@ -145,12 +147,12 @@ def _find_block(module: ModuleType, path: Path, name: str) -> Block:
     if found is None:
         hint = near(name, blocks) if blocks else "There is no Block in it."
         raise OptionError(f"there is no {name!r} in it. {hint}", block=source)
-    if isinstance(found, Block):
+    if isinstance(found, Block | Diagram | Subsystem):
         return found
     if not (isinstance(found, type) and issubclass(found, Block)):
         raise OptionError(
             f"found {type(found).__name__} for {name!r}; expected a Block: a class, or an instance with its "
-            f"parameters. Its models: {', '.join(blocks) or 'none'}.",
+            f"parameters; a diagram, or a subsystem. Its models: {', '.join(blocks) or 'none'}.",
             block=source,
         )
     needed = [key for key, spec in found.parameter_specs.items() if spec.required]

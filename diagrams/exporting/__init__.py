@@ -1,7 +1,16 @@
 """Diagrams as they leave: a diagram or a subsystem as a plain value, of which FMUs, C and web pages are made."""
 
 from .loop_of_diagram import loop_spec
-from .make_exported import make_exported
+from .make_exported import make_exported, name_of
 from .open_diagram import OpenDiagram, choose_outputs, open_part, open_subsystem, open_whole
 
-__all__ = ["OpenDiagram", "choose_outputs", "loop_spec", "make_exported", "open_part", "open_subsystem", "open_whole"]
+__all__ = [
+    "OpenDiagram",
+    "choose_outputs",
+    "loop_spec",
+    "make_exported",
+    "name_of",
+    "open_part",
+    "open_subsystem",
+    "open_whole",
+]

@@ -126,6 +126,7 @@ def loop_spec(
         start_kind=_start_kind(flat, acting, name),
         numbers=tuple(one for one, f in numbers.values() if f is not None),
         depends=variables.depends(acting),
+        found_at_build=variables.found_at_build(),
         **facts,
         **options,
     )
@@ -348,6 +349,11 @@ class _Variables:
                 variable = Variable(label, "local", kind, shape, *about, start=start, state=not computed)
                 found.append(Placed(variable, "x", tuple(range(where.start, where.stop)), sampled=True))
         return tuple(found)
+
+    def found_at_build(self) -> tuple[str, ...]:
+        """Return the names of the states whose start is not computed by the exported code."""
+        own = self._flat.states.of_block
+        return tuple(join(self._opened.shown(path), name) for path in self._untraced for name in own[path].slices)
 
     def depends(self, acting: Sequence[frozenset[TickPattern]]) -> dict[str, tuple[int, ...]]:
         """Return the entries of w on which outputs and signals depend at an instant, at any kind of tick."""

@@ -45,7 +45,7 @@ def make_exported(
     about = ""
     opened: OpenDiagram
     if isinstance(model, Subsystem):
-        label = name or _identifier(model.name)
+        label = name or name_of(model)
         if subsystem is not None or names:
             raise OptionError(
                 "subsystem= and outside= choose a part of a diagram; this is a subsystem by itself. Leave them out.",
@@ -61,12 +61,19 @@ def make_exported(
             raise OptionError(
                 "found subsystem= and outside=; expected one of them. Give one.", block=wired.name, port="outside"
             )
-        label = name or _identifier(wired.name if subsystem is None else subsystem.rpartition(".")[2])
+        label = name or name_of(model, subsystem)
         opened = open_whole(wired, names, label) if subsystem is None else open_part(wired, subsystem, label)
     opened = choose_outputs(opened, None if outputs is None else tuple(outputs))
     base = {"step_size": float(opened.wired.flatten().base)} if opened.wired.has_base else {}
     chosen = {**base, **{key: value for key, value in options.items() if value is not None}}
     return loop_spec(opened, name=label, description=about, **chosen)
+
+
+def name_of(model: Any, subsystem: str | None = None) -> str:
+    """Return the name of the FMU of a diagram or subsystem without another one."""
+    if subsystem is not None:
+        return _identifier(subsystem.rpartition(".")[2])
+    return _identifier(model.wired.name if hasattr(model, "wired") else model.name)
 
 
 def _identifier(name: str) -> str:

@@ -175,6 +175,7 @@ def build(
     outside: Iterable[str] = (),
     outputs: Iterable[str] | None = None,
     communication: Literal["any", "ticks"] = "any",
+    solver: str | None = None,
 ) -> Path:
     """Export a continuous block, a subsystem or a diagram as an FMU and return the file.
 
@@ -201,8 +202,8 @@ def build(
         Of a block: start value of the FMU's parameter ``integrator``, for co-simulation: explicit with a fixed step,
         explicit with an adaptive one, or implicit for stiff models.
     tolerance : float, optional
-        Of a block: start value of the FMU's parameter ``tolerance``, 1e-8 without it: relative error of a step of the
-        adaptive integrators.
+        Relative error of a step of an adaptive integrator. Of a block it is the start value of the FMU's parameter
+        ``tolerance``, 1e-8 without it; of a diagram it is that of the solver, 1e-6 without it.
     stop_time, step_size : float
         Default experiment, s; the step is 1e-3, or the time between two ticks of a diagram.
     fmi : {3, 2}
@@ -228,6 +229,9 @@ def build(
     communication : {"any", "ticks"}
         Of a diagram or subsystem: whether communication steps may have any length, with ticks inside them, or must go
         from tick to tick.
+    solver : str, optional
+        Of a diagram with continuous states: its solver, as `Diagram.simulate` takes it, but for those of other
+        libraries; "RK45" without it.
 
     Raises
     ------
@@ -244,7 +248,7 @@ def build(
     """
     made = None
     if not isinstance(block, Block | type):
-        _refuse_options(block, internal_step=internal_step, integrator=integrator, tolerance=tolerance)
+        _refuse_options(block, internal_step=internal_step, integrator=integrator)
         made = make_exported(
             block,
             name=name,
@@ -254,14 +258,17 @@ def build(
             steps_on_ticks=_is_on_ticks(communication),
             stop_time=stop_time,
             step_size=step_size,
+            solver=solver,
+            rtol=tolerance,
         )
     if made is not None:
         return build_fmu(
             made, out, fmi=fmi, arrays=arrays, platform=platform, documentation=documentation or "", notify=notify
         )
-    if subsystem is not None or tuple(outside) or outputs is not None or communication != "any":
+    if subsystem or tuple(outside) or outputs is not None or communication != "any" or solver is not None:
         raise OptionError(
-            "subsystem=, outside=, outputs= and communication= are options of diagrams and subsystems. Leave them out.",
+            "subsystem=, outside=, outputs=, communication= and solver= are options of diagrams and subsystems. Leave "
+            "them out.",
             block=name or type(block).__name__.lower(),
         )
     spec = model_spec(

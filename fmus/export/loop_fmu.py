@@ -152,7 +152,13 @@ def about_steps(spec: LoopSpec) -> str:
         if spec.clocks
         else ""
     )
-    return f"{ticks}{fit}{acts}".strip()
+    starts = (
+        f"The start of {', '.join(spec.found_at_build)} was found by Python when this was built, for the start values "
+        "of the inputs: set it where these start elsewhere. "
+        if spec.found_at_build
+        else ""
+    )
+    return f"{ticks}{fit}{acts}{starts}".strip()
 
 
 def _variability(kind: str, one: Placed | None) -> str:

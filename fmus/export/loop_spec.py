@@ -153,6 +153,8 @@ class LoopSpec:
         Discontinuities of sources that repeat without end: the first one and the period, s.
     depends : mapping of str to tuple of int
         Entries of w on which each output and each signal depends at an instant; all where it is missing.
+    found_at_build : tuple of str
+        States whose start the blocks' Python code has found when it was exported: start values, which can be set.
     steps_on_ticks : bool
         Whether communication steps must go from tick to tick.
     own_functions : bool
@@ -184,6 +186,7 @@ class LoopSpec:
     edges: tuple[tuple[float, float], ...] = ()
     periodic: tuple[tuple[float, float], ...] = ()
     depends: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    found_at_build: tuple[str, ...] = ()
     steps_on_ticks: bool = False
     own_functions: bool = False
     step_size: float = 1e-3
