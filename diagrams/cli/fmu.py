@@ -173,7 +173,7 @@ def run_build(arguments: argparse.Namespace) -> int:
 
 def _build_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the given keywords for ``build``, checked against each other."""
-    names = ("name", "integrator", "tolerance", "internal_step", "fmi", "platform")
+    names: tuple[str, ...] = ("name", "integrator", "tolerance", "internal_step", "fmi", "platform")
     names += ("subsystem", "outside", "outputs", "communication", "solver")
     options = {name: value for name in names if (value := getattr(arguments, name)) is not None}
     if arguments.no_arrays:

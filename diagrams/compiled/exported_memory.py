@@ -104,8 +104,9 @@ class _Reader:
             self._inside.append((begin, begin + ctypes.sizeof(structure), name))
             self._fields[name] = Field(name, _STRUCTS[type(structure)])
         for owner in self._owners:
-            if (name := self._names.get(_span(owner)[0])) is not None and isinstance(owner, np.ndarray):
-                self._fields[name] = Field.of(name, owner)
+            known = self._names.get(_span(owner)[0])
+            if known is not None and isinstance(owner, np.ndarray):
+                self._fields[known] = Field.of(known, owner)
         for name, structure in roots.items():
             self._read_struct(name, structure)
         return LoopMemory(tuple(self._fields.values()), tuple(self._numbers), tuple(self._pointers))

@@ -30,7 +30,7 @@ def find_edges(opened: OpenDiagram, sources: Sequence[tuple[str, Announcer]]) ->
     single, periodic = set[float](), list[tuple[float, float]]()
     for path, source in sources:
         found: list[float] = []
-        t = -math.inf if path in late else -1e-300
+        t = -1e-300  # an instant at 0 is one
         while len(found) < _MOST and (t := next_instant(path, source, t)) < math.inf:
             found.append(t)
             if len(found) == _LISTED and (repeats := _find_period(found)) is not None:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from ...blocks.core import DefinitionError, OptionError, SimulationError
 from ...blocks.tracing import traced_parameters
-from ...fmus.export import ROOM_FOR_EDGES, CFunction, LoopSpec, Numbers, Placed, Variable, parameter_variable
+from ...fmus.export import ROOM_FOR_EDGES, CFunction, ComputedNumbers, LoopSpec, Placed, Variable, parameter_variable
 from ..compiled import (
     CompiledHybrid,
     CompiledLoop,
     NamedCode,
-    Sources,
     TickCode,
     function_text,
     load_runtime,
@@ -99,7 +98,8 @@ def loop_spec(
         facts["left"] = None if left is None else CFunction.of(left)
         functions += [] if left is None else [left]
     else:
-        loop = _bind_ticks(workspace, write_ticks(flat, acting, straight=True), code)
+        sources = write_ticks(flat, acting, straight=True)
+        loop = _bind_ticks(workspace, sources.make([code] * len(sources.writers)))
         memory = read_memory({"loop": loop.structure}, vectors, loop.kept, code)
     guards = [trace_guards(flat, clocks, i, opened) for i, clocks in enumerate(acting)]
     start, untraced = trace_start_values(flat, workspace)
@@ -171,14 +171,11 @@ def _continuous(workspace: Workspace, name: str, solver: str, rtol: float, atol:
     return continuous
 
 
-def _bind_ticks(
-    workspace: Workspace, sources: Sources[TickCode], code: NamedCode, ticks: TickCode | None = None
-) -> CompiledLoop:
+def _bind_ticks(workspace: Workspace, ticks: TickCode) -> CompiledLoop:
     """Return the loop over ticks, bound to the numbers of a start, without plants."""
     flat, here = workspace.flat, workspace.here
-    made = sources.make([code] * len(sources.writers)) if ticks is None else ticks
     return CompiledLoop(
-        made,
+        ticks,
         [here.t, here.x, here.w, here.p],
         [workspace.x_next, workspace.z, workspace.log, workspace.ok],
         [],
@@ -186,7 +183,7 @@ def _bind_ticks(
         width=0,
         every=1,
         stops=[],
-        loops={clocks: newton_options(flat, clocks, here.x) for clocks in made.loops},
+        loops={clocks: newton_options(flat, clocks, here.x) for clocks in ticks.loops},
     )
 
 
@@ -200,7 +197,7 @@ def _bind_hybrid(
     return CompiledHybrid(
         made,
         flat,
-        _bind_ticks(workspace, sources, code, made.ticks),
+        _bind_ticks(workspace, made.ticks),
         [here.t, here.x, here.w, here.p],
         workspace.x_next,
         methods_of(continuous),
@@ -260,7 +257,7 @@ class _Variables:
         flat: FlatDiagram,
         x: np.ndarray,
         untraced: Sequence[str],
-        numbers: Mapping[str, tuple[Numbers, Any]],
+        numbers: Mapping[str, tuple[ComputedNumbers, Any]],
     ):
         self._x = x
         self._opened, self._flat, self._untraced, self._numbers = opened, flat, untraced, numbers
@@ -345,7 +342,7 @@ class _Variables:
                 computed = block.starts_from_inputs and path not in self._untraced
                 start = None if computed else np.array(self._x[where]).reshape(shape)
                 label, about = join(self._opened.shown(path), name), (_unit(port.unit), port.description)
-                kind = "continuous" if computed else "discrete"
+                kind: Literal["continuous", "discrete"] = "continuous" if computed else "discrete"
                 variable = Variable(label, "local", kind, shape, *about, start=start, state=not computed)
                 found.append(Placed(variable, "x", tuple(range(where.start, where.stop)), sampled=True))
         return tuple(found)

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.tracing import GUARDS, trace_numbers, traced_parameters
-from ...fmus.export import CFunction, Guards, Numbers
+from ...fmus.export import CFunction, ComputedNumbers, Guards
 from ..flat import FlatDiagram, TickPattern, evaluate, sample_time_of, share_terms, speed_up
 from .open_diagram import OpenDiagram
 
@@ -32,9 +32,9 @@ def trace_guards(
     return Guards(tuple(names), CFunction.of(function)), function
 
 
-def trace_computed_numbers(flat: FlatDiagram) -> dict[str, tuple[Numbers, Any]]:
+def trace_computed_numbers(flat: FlatDiagram) -> dict[str, tuple[ComputedNumbers, Any]]:
     """Return the blocks with numbers that are computed from parameters, and their functions; None where none is had."""
-    found: dict[str, tuple[Numbers, Any]] = {}
+    found: dict[str, tuple[ComputedNumbers, Any]] = {}
     known: dict[tuple[int, float], Any] = {}  # equal blocks share a function
     for path, trace in flat.checked.traced.items():
         block, where = flat.table.blocks[path], flat.parameters.slices[path]
@@ -48,5 +48,5 @@ def trace_computed_numbers(flat: FlatDiagram) -> dict[str, tuple[Numbers, Any]]:
             known[key] = None if made is None else share_terms(made, f"lw_numbers{len(known)}")
         function = known[key]
         of = CFunction("", (0, 0, 0, 0)) if function is None else CFunction.of(function)
-        found[path] = Numbers(where.start, count, computed, of), function
+        found[path] = ComputedNumbers(where.start, count, computed, of), function
     return found

@@ -31,7 +31,7 @@ def trace_start_values(flat: FlatDiagram, workspace: Workspace) -> tuple[Any, tu
     untraced : tuple of str
         Paths of blocks whose states are not computed.
     """
-    left = values_from_left(workspace)
+    left = {port: np.ravel(np.asarray(tap(None))) for port, tap in values_from_left(workspace).items()}
     functions = trace_start(flat, left)
     if not functions.inputs and functions.held is None and functions.gates is None and not flat.starts.slices:
         return None, ()
@@ -39,7 +39,7 @@ def trace_start_values(flat: FlatDiagram, workspace: Workspace) -> tuple[Any, tu
     t, x, w, p = (symbols[name] for name in "txwp")
     before = ca.vertcat(*_sources(flat, tuple(left), symbols), t)
     here, untraced = workspace.here, list[str]()
-    numbers = np.concatenate([*(np.ravel(np.asarray(tap(None))) for tap in left.values()), here.t])
+    numbers = np.concatenate([*left.values(), here.t])
     for path, (f, names) in functions.inputs.items():
         trace, block = flat.checked.traced[path], flat.table.blocks[path]
         where, own = flat.states.slices[path], flat.parameters.slices[path]

@@ -4,7 +4,7 @@ from .compiler import compile_shared, describe_compiler
 from .from_block import build, model_spec, parameter_variable
 from .inlined import inline_model, own_functions
 from .loop_memory import Field, LoopMemory, c_number
-from .loop_spec import ROOM_FOR_EDGES, CFunction, Guards, LoopSpec, Numbers, Placed, write_unit
+from .loop_spec import ROOM_FOR_EDGES, CFunction, ComputedNumbers, Guards, LoopSpec, Placed, write_unit
 from .model import Integrator, ModelSpec, Variable
 from .package import build_fmu, clear_cache
 from .python_fmu import build_python
@@ -14,13 +14,13 @@ from .written_equations import WrittenEquations, read_equations
 __all__ = [
     "ROOM_FOR_EDGES",
     "CFunction",
+    "ComputedNumbers",
     "Field",
     "Guards",
     "Integrator",
     "LoopMemory",
     "LoopSpec",
     "ModelSpec",
-    "Numbers",
     "Placed",
     "Variable",
     "WrittenEquations",

@@ -37,8 +37,14 @@ def scalarize_loop(spec: LoopSpec) -> LoopSpec:
             for element, place in zip(_elements(one.variable), one.places, strict=True):
                 yield replace(one, variable=element, places=(place,))
 
-    groups = ("inputs", "outputs", "signals", "parameters", "states")
-    return replace(spec, **{name: tuple(scalars(getattr(spec, name))) for name in groups})
+    return replace(
+        spec,
+        inputs=tuple(scalars(spec.inputs)),
+        outputs=tuple(scalars(spec.outputs)),
+        signals=tuple(scalars(spec.signals)),
+        parameters=tuple(scalars(spec.parameters)),
+        states=tuple(scalars(spec.states)),
+    )
 
 
 def loop_rows(spec: LoopSpec) -> list[tuple[Kind, Placed]]:

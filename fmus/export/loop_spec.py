@@ -92,8 +92,8 @@ class Guards:
 
 
 @dataclass(frozen=True)
-class Numbers:
-    """Numbers that are computed from the parameters of a block, behind these.
+class ComputedNumbers:
+    """ComputedNumbers that are computed from the parameters of a block, behind these.
 
     Attributes
     ----------
@@ -141,8 +141,8 @@ class LoopSpec:
         The states at the start, of (t, x, w, p); None where none are computed.
     start_kind : int
         Kind of the tick at which all clocks act, by which algebraic loops are solved at the start; -1: there are none.
-    numbers : tuple of Numbers
-        Numbers that are computed from parameters.
+    numbers : tuple of ComputedNumbers
+        ComputedNumbers that are computed from parameters.
     events : tuple of (str, str, bool)
         Events between ticks: block, name, whether it enables or triggers a subsystem.
     left : CFunction or None
@@ -180,7 +180,7 @@ class LoopSpec:
     guards: tuple[Guards, ...] = ()
     start: CFunction | None = None
     start_kind: int = -1
-    numbers: tuple[Numbers, ...] = ()
+    numbers: tuple[ComputedNumbers, ...] = ()
     events: tuple[tuple[str, str, bool], ...] = ()
     left: CFunction | None = None
     edges: tuple[tuple[float, float], ...] = ()

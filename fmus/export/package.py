@@ -96,9 +96,18 @@ def _text(value: Any) -> str:
 def _code_parts(spec: ModelSpec | LoopSpec, fmi: int) -> list[str]:
     """Return the text of the modules that write the files, so that a change of them builds again."""
     folder = Path(__file__).parent
-    written = ("c_code", "elementary_tables", "html_page", "package", "quantities", "scalars", "xml_fmi2", "xml_fmi3")
+    written = ["c_code", "elementary_tables", "html_page", "package", "quantities", "scalars", "xml_fmi2", "xml_fmi3"]
+        "c_code",
+        "elementary_tables",
+        "html_page",
+        "package",
+        "quantities",
+        "scalars",
+        "xml_fmi2",
+        "xml_fmi3",
+    )
     if isinstance(spec, LoopSpec):
-        written += ("loop_fmu", "loop_memory", "loop_spec")
+        written += ["loop_fmu", "loop_memory", "loop_spec"]
     modules = [(folder / f"{name}.py").read_text(encoding="utf-8") for name in written]
     unit = [write_unit(spec)] if isinstance(spec, LoopSpec) else []
     return [package_version(), *(text for _, text in sorted(_runtime_of(spec, fmi).items())), *modules, *unit]
@@ -172,7 +181,7 @@ def _archive(spec: ModelSpec | LoopSpec, options: Options, compiler: Compiler, n
         "documentation/index.html": page.encode(),
     }
     if fmi == 3:
-        files["sources/buildDescription.xml"] = build_description(spec).encode()
+        files["sources/buildDescription.xml"] = build_description(spec.name).encode()
     files |= {f"sources/{name}": text.encode() for name, text in sources.items()}
     for platform in options.platforms:
         notify(f"compiling {spec.name} for {platform} (the first build on a machine takes {_first_build(platform)})")

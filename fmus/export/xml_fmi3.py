@@ -301,9 +301,9 @@ def model_description(spec: ModelSpec, token: str, *, derivatives: bool) -> str:
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + _element("fmiModelDescription", root, children) + "\n"
 
 
-def build_description(spec: ModelSpec) -> str:
-    """Return the text of ``sources/buildDescription.xml`` (FMI 3.0, 2.5.1.3), with the one file to compile."""
+def build_description(name: str) -> str:
+    """Return the text of ``sources/buildDescription.xml`` (FMI 3.0, 2.5.1.3) of a model, with one file to compile."""
     files = _element("SourceFileSet", {"language": "C11"}, [_element("SourceFile", {"name": "model.c"})])
-    configuration = _element("BuildConfiguration", {"modelIdentifier": spec.name}, [files])
+    configuration = _element("BuildConfiguration", {"modelIdentifier": name}, [files])
     root = _element("fmiBuildDescription", {"fmiVersion": "3.0"}, [configuration])
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{root}\n'
