@@ -97,15 +97,6 @@ def _code_parts(spec: ModelSpec | LoopSpec, fmi: int) -> list[str]:
     """Return the text of the modules that write the files, so that a change of them builds again."""
     folder = Path(__file__).parent
     written = ["c_code", "elementary_tables", "html_page", "package", "quantities", "scalars", "xml_fmi2", "xml_fmi3"]
-        "c_code",
-        "elementary_tables",
-        "html_page",
-        "package",
-        "quantities",
-        "scalars",
-        "xml_fmi2",
-        "xml_fmi3",
-    )
     if isinstance(spec, LoopSpec):
         written += ["loop_fmu", "loop_memory", "loop_spec"]
     modules = [(folder / f"{name}.py").read_text(encoding="utf-8") for name in written]
