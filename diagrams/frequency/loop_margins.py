@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, ParameterError, accepts, explain_calls, kinds, on_one_thread
+from ...blocks.core import (
+    ConfirmationError,
+    Finding,
+    ParameterError,
+    accepts,
+    brief,
+    explain_calls,
+    kinds,
+    on_one_thread,
+)
 from .delayed_margins import ByArgument
 from .delayed_realization import DelayedRealization, realize
 from .loop_scan import Crossing, LoopScan, Peak
@@ -28,26 +37,34 @@ GAINS = (1.5, 2.0, 5.0, 10.0, 100.0, 1e3)
 """Factors, and reciprocals of factors, that are tried where no limit of the gain was found."""
 MOST_SAMPLES = 100
 """Samples of delay up to which closed-loop eigenvalues count the unstable poles; beyond, encirclements do."""
+PRINTED = 4
+"""Crossovers of each kind that the printed table of margins has; the others are counted."""
 SHOWN = 24
 """Phase crossovers that are given of a loop which has them up to infinite frequency."""
 
 
 @explain_calls
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class GainCrossover:
     """A frequency at which |L| = 1, and the rotation that takes L to −1 there (−180° to 180°)."""
 
     frequency: Number
     phase_margin_deg: Number
 
+    def __repr__(self) -> str:
+        return brief(f"gain crossover at {self.frequency}", f"phase margin {self.phase_margin_deg}")
+
 
 @explain_calls
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PhaseCrossover:
     """A frequency at which L is real and negative, and the factor that takes it to −1 there."""
 
     frequency: Number
     gain_margin: Number
+
+    def __repr__(self) -> str:
+        return brief(f"phase crossover at {self.frequency}", f"gain margin {self.gain_margin}")
 
 
 @explain_calls
@@ -122,11 +139,21 @@ class Margins(StabilityMargins):
     dt: float = 0.0
     findings: tuple[Finding, ...] = ()
 
+    def deciding_frequencies(self) -> list[float]:
+        """Return the frequencies in rad/s at which the gain and phase margins are read: positive finite ones."""
+        limits = (self.gain_margin_low.value, self.gain_margin_high.value)
+        found = [c.frequency.value for c in self.gain_crossovers]
+        found += [p.frequency.value for p in self.phase_crossovers if p.gain_margin.value in limits]
+        return [w for w in found if 0.0 < w < np.inf]
+
     def _further_facts(self) -> list[tuple[str, str]]:
+        gains = [f"{c.frequency}, phase margin {c.phase_margin_deg}" for c in self.gain_crossovers]
+        phases = [f"{p.frequency}, factor {p.gain_margin}" for p in self.phase_crossovers]
         facts = []
-        if not self.stable:
-            facts += [("gain_crossover", str(c.frequency)) for c in self.gain_crossovers]
-            facts += [("phase_crossover", f"{c.frequency}, factor {c.gain_margin}") for c in self.phase_crossovers]
+        for name, texts in (("gain_crossover", gains), ("phase_crossover", phases)):
+            facts += [(name, text) for text in texts[:PRINTED]]
+            if (more := len(texts) - PRINTED) > 0:
+                facts.append(("", f"and {more} more: margins.{name}s"))
         return [*facts, *tell_hidden_unstable(self.hidden_unstable)]
 
 

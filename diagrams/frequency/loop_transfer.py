@@ -17,6 +17,7 @@ from ...blocks.core import (
     count_of,
     explain_calls,
     kinds,
+    missing_member,
     shorten,
     with_unit,
 )
@@ -35,8 +36,24 @@ if TYPE_CHECKING:
 POINTS = 800
 BELOW = 1 - 1e-6
 """Part of π/T up to which a sampled loop is drawn."""
+AROUND = 3.0
+"""Factor by which what is drawn goes beyond the crossovers at which margins are read."""
 FAR = 8.0
 """Largest part of the plane that a Nyquist plot shows: the real and imaginary part up to this."""
+
+
+WAYS = {
+    **dict.fromkeys(
+        ("margins", "margin", "stability_margins", "gain_margin", "phase_margin", "gain_margin_high"),
+        "margins(loop): from loopwright import margins",
+    ),
+    **dict.fromkeys(("rlocus", "root_locus_plot"), "loop.root_locus()"),
+    **dict.fromkeys(("bode_plot", "freqresp", "magnitude"), "loop.bode()"),
+    **dict.fromkeys(("nyquist_plot", "nichols_plot"), "loop.nyquist() or loop.nichols()"),
+    **dict.fromkeys(("step_response", "impulse_response"), "loop.step(), which closes the loop"),
+    **dict.fromkeys(("step_info", "stepinfo"), 'diagram.simulate(2.0).step_info("wire")'),
+}
+"""What to write for names that users of other tools look for in a loop."""
 
 
 class LoopPlots:
@@ -48,6 +65,11 @@ class LoopPlots:
     findings: tuple[Any, ...] = ()
     dt: Any
     nstates: int
+
+    if not TYPE_CHECKING:  # a type checker knows all members
+
+        def __getattr__(self, name):
+            raise missing_member(self, name, "a loop", WAYS)
 
     def __repr__(self) -> str:
         sampling = f"T = {self.dt:g} s" if self.dt else "continuous"
@@ -77,8 +99,8 @@ class LoopPlots:
         *others : control.StateSpace, control.TransferFunction or control.FrequencyResponseData
             Further loops.
         omega : array_like, optional
-            Frequencies in rad/s, in any order; without them those around the crossovers. A sampled loop ends at π/T,
-            and the figure says so where higher ones were asked for.
+            Frequencies in rad/s, in any order; without them those around the crossovers, of a sampled loop up to π/T.
+            A sampled loop ends at π/T, and the figure says so where higher ones were asked for.
         labels : sequence of str, optional
             A label for each loop, in place of their names.
         db : bool
@@ -397,17 +419,25 @@ def _response(loop: Any, omega: np.ndarray) -> np.ndarray:
     return np.asarray(realize(loop).response(omega)[0])
 
 
-def _span(loops: Sequence[Any], omega: ArrayLike | None) -> list[np.ndarray]:
-    """Return the frequencies of each loop: those that are asked for, below half its sampling frequency."""
+def _span(loops: Sequence[Any], found: Sequence[Margins | None], omega: ArrayLike | None) -> list[np.ndarray]:
+    """Return the frequencies of each loop: those that are asked for, below half its sampling frequency.
+
+    Without any, all loops are drawn over the same ones: around their crossovers, and up to half the sampling frequency
+    of the fastest loop. The crossovers at which their margins are read are well within.
+    """
     own = [_frequencies(loop) for loop in loops]
-    low, high = min(float(w[0]) for w in own), max(float(w[-1]) for w in own)
+    read = [w for one in found if one is not None for w in one.deciding_frequencies()]
+    low = min([*(float(w[0]) for w in own), *(w / AROUND for w in read)])
+    high = max([*(float(w[-1]) for w in own), *(w * AROUND for w in read)])
+    ends = [end for end in map(_limit, loops) if np.isfinite(end)]
+    high = max([high, *ends]) if omega is None else high
     spans = []
     for loop, w in zip(loops, own, strict=True):
         if _is_measured(loop):
             spans.append(w)
             continue
         if omega is None:
-            spans.append(realize(loop).grid(low, high, POINTS))
+            spans.append(realize(loop).grid(low, min(high, BELOW * _limit(loop)), POINTS))
             continue
         asked = _read_omega(omega)
         limit = _limit(loop)
@@ -465,17 +495,18 @@ def drawn_loops(
     loops: Sequence[Any], names: Sequence[str], omega: ArrayLike | None, *, marked: bool
 ) -> list[DrawnLoop]:
     """Return loops as they are drawn."""
+    found = [_margins(loop) if marked else None for loop in loops]
     return [
         DrawnLoop(
             name,
             w,
             _response(loop, w),
             _style_of(i, loop),
-            _margins(loop) if marked else None,
+            own,
             0.0 if _is_measured(loop) else float(loop.dt or 0.0),
             _is_measured(loop),
         )
-        for i, (loop, name, w) in enumerate(zip(loops, names, _span(loops, omega), strict=True))
+        for i, (loop, name, own, w) in enumerate(zip(loops, names, found, _span(loops, found, omega), strict=True))
     ]
 
 
@@ -564,7 +595,7 @@ def _plot_gang_of_four(systems: Sequence[Mapping[str, Any]], names: Sequence[str
         panels = figure.subplots(2, 2, sharex=True)
         for axes, key in zip(np.ravel(panels), ("S", "PS", "CS", "T"), strict=True):
             own = [found[key] for found in systems]
-            spans = _span([found["L"] for found in systems], omega)
+            spans = _span([found["L"] for found in systems], (), omega)
             for i, (system, w) in enumerate(zip(own, spans, strict=True)):
                 if omega is None:  # closed loops have resonances of their own, up to π/T
                     top = _limit(system) * BELOW if system.dt else float(w[-1])

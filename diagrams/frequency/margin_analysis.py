@@ -6,11 +6,11 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
-from ...blocks.core import Finding, Grid, Sheet, ShownAsTable, brief, decibels, explain_calls
+from ...blocks.core import Finding, Grid, Sheet, ShownAsTable, brief, decibels, explain_calls, missing_member
 from .delayed_realization import DelayedRealization
 from .number import MARK, NOT_IN_DATA, Interval, Number
 from .realization import Realization
@@ -35,9 +35,35 @@ ROTATIONS = (30.0, 60.0, 90.0, 120.0, 150.0, 180.0)
 """Rotations in degrees that are tried where no limit was found."""
 
 
+WAYS = {
+    **dict.fromkeys(
+        ("gain_margin", "gain_margin_db", "gm"),
+        "margins.gain_margin_high, the smallest factor above 1 that ends stability, or margins.gain_margin_low, the "
+        "largest below 1; print(margins) has both in dB",
+    ),
+    **dict.fromkeys(("phase_margin", "pm"), "margins.phase_margin_deg"),
+    **dict.fromkeys(("delay_margin",), "margins.delay_margin_s or margins.delay_margin_samples"),
+    **dict.fromkeys(
+        ("wc", "wcp", "wpc", "gain_crossover", "crossover", "crossover_frequency", "gain_crossover_frequency"),
+        "margins.gain_crossovers[0].frequency",
+    ),
+    **dict.fromkeys(
+        ("w180", "wcg", "wgc", "phase_crossover", "phase_crossover_frequency"), "margins.phase_crossovers[0].frequency"
+    ),
+    "sm": "margins.modulus_margin",
+    "poles": "margins.closed_loop_poles",
+}
+"""What to write for names that users of other tools look for in margins."""
+
+
 @explain_calls
 class MarginTable(ShownAsTable):
     """Margins by name. The results for a linear, a periodic and a measured loop are such tables."""
+
+    if not TYPE_CHECKING:  # a type checker knows all members
+
+        def __getattr__(self, name):
+            raise missing_member(self, name, "a table of margins", WAYS)
 
     def numbers(self) -> dict[str, Any]:
         """Return the single numbers by name, in the order of the report."""

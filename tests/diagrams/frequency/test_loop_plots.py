@@ -8,6 +8,7 @@ from loopwright.blocks import Constant, Gain, Integrator, OptionError, TransferF
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.frequency.loop_drawing import phase_of
 from loopwright.diagrams.frequency.loop_transfer import drawn_loops
+from loopwright.frequency import margins
 
 KP, KI, TAU = 5.0, 4.0, 0.05
 
@@ -352,3 +353,49 @@ def test_the_gang_of_four_goes_to_half_the_sampling_frequency(sampled):
 def test_frequencies_that_all_lie_beyond_a_sampled_loop_are_refused(sampled, kind):
     with pytest.raises(OptionError, match=r"omega: found .* none below π/T = 157\.08 rad/s"):
         getattr(sampled, kind)(omega=[200.0, 1000.0])
+
+
+def test_a_sampled_loop_is_drawn_up_to_half_its_sampling_frequency_with_the_crossovers_of_its_title(sampled):
+    """A fast pole puts ω_180 84 times above ω_c: the curve reaches it, and π/T, and the margin is marked."""
+    lag = TransferFunction(numerator=[0.8], denominator=[0.026, 1.0], name="lag")
+    pi = TransferFunction(numerator=[0.5, 8.0], denominator=[1.0, 0.0], name="pi")
+
+    @subsystem(sample_time=2e-3, delay=1)
+    def controller(y):
+        return pi(Constant(value=0.0, name="r") - y)
+
+    slow = Diagram("slow", lag(controller(lag.y).named("u"))).linearize().loop("u")
+    crossover = margins(slow).phase_crossovers[-1].frequency.value
+    figure = slow.bode()
+    w, _ = curve(figure.axes[0])
+    assert w[-1] == pytest.approx(np.pi / 2e-3, rel=2e-6)
+    assert [x for x, _ in marks(figure.axes[1], "s")] == pytest.approx([crossover])
+    continuous = control.tf([1.0], [1.0, 0.0]) * control.tf([1.0], [1 / 300.0, 1.0]) ** 2  # ω_c = 1, ω_180 = 300
+    assert curve(sampled.bode(continuous).axes[0], 1)[0][-1] > 800.0
+
+
+@pytest.mark.parametrize(
+    ("ask", "text"),
+    [
+        (lambda L: L.margins(), r"a loop has no 'margins'\. Write margins\(loop\): from loopwright import margins\."),
+        (lambda L: L.nyqist, "Did you mean 'nyquist'"),
+        (lambda L: margins(L).gain_margin, "Write margins.gain_margin_high, .* or margins.gain_margin_low"),
+        (lambda L: margins(L).phase_margin_degrees, "Did you mean 'phase_margin_deg'"),
+    ],
+)
+def test_names_that_a_loop_or_its_margins_do_not_have_lead_to_those_that_they_have(loop, ask, text):
+    with pytest.raises(AttributeError, match=text):
+        ask(loop)
+
+
+def test_printed_margins_begin_with_the_crossovers():
+    """|k/(jω (jω τ + 1))| = 1 where ω √(1 + ω² τ²) = k, for k = 2 and τ = 0.1 s."""
+    plant = TransferFunction(numerator=[2.0], denominator=[0.1, 1.0, 0.0], name="plant")
+    own = Diagram("servo", plant((Constant(value=0.0, name="r") - plant.y).named("u"))).linearize().loop("u")
+    omega = np.sqrt((np.sqrt(1.0 + 4.0 * (2.0 * 0.1) ** 2) - 1.0) / (2.0 * 0.1**2))
+    phase = 90.0 - np.degrees(np.arctan(0.1 * omega))
+    lines = [" ".join(line.split()) for line in str(margins(own)).splitlines()]
+    assert f"gain_crossover {omega:.6g} rad/s, phase margin {phase:.6g} deg" in lines
+    assert repr(margins(own).gain_crossovers) == (
+        f"(<gain crossover at {omega:.6g} rad/s: phase margin {phase:.6g} deg>,)"
+    )
