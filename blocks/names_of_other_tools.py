@@ -25,13 +25,21 @@ _BLOCKS = {
     "Differentiator": "the block is FilteredDerivative",
     "Divide": "a / b divides two signals",
     "Fcn": "the block is Function, and PythonFunction for Python that can't be traced",
+    "Comparator": "a < b of two signals makes the block Compare",
+    "DeadTime": "the block is TransportDelay",
+    "FirstOrder": "the block is PT1",
     "FirstOrderHold": "the function is loopwright.diagrams.first_order_hold",
     "FirstOrderLag": "the block is PT1",
     "FOH": "the function is loopwright.diagrams.first_order_hold",
     "FromWorkspace": "the block is Recorded",
     "FromFile": "the block is Recorded",
+    "Hysteresis": "the block is Relay, which switches at two points, and play is Backlash",
     "KalmanFilter": "the blocks are Observer.from_lqe(…) and DiscreteObserver.from_lqe(…)",
     "Lag": "the block is PT1",
+    "Limiter": "the block is Saturation",
+    "LowPass": "the blocks are PT1 and PT2",
+    "LowPassFilter": "the blocks are PT1 and PT2",
+    "Lookup": "the blocks are Lookup1D and Lookup2D",
     "LookupTable": "the blocks are Lookup1D and Lookup2D",
     "LUT": "the block is Lookup2D",
     "LUT1D": "the block is Lookup1D",
@@ -41,9 +49,13 @@ _BLOCKS = {
     "MathFunction": "NumPy's functions of signals make the block: np.exp(a), np.hypot(a, b)",
     "MATLABFunction": "the block is Function, and PythonFunction for Python that can't be traced",
     "Multiplier": "a * b multiplies two signals, and the block is Product",
+    "Memory": "the block is Delay",
     "MinMax": "np.minimum(a, b) and np.maximum(a, b) make the blocks Minimum and Maximum",
     "MultiPortSwitch": "the block is Switch",
     "Noise": "the block is BandLimitedNoise",
+    "PI": "the block is PID, with kp=… and ki=…",
+    "PIController": "the block is PID, with kp=… and ki=…",
+    "PD": "the block is PID, with kp=…, kd=… and filter_time=…",
     "PIDController": "the block is PID",
     "PulseGenerator": "the block is PulseTrain",
     "RandomNumber": "the block is BandLimitedNoise",
@@ -54,9 +66,11 @@ _BLOCKS = {
     "SignalGenerator": "the blocks are Sine, Sawtooth, Triangle, PulseTrain and others",
     "SinusoidalSource": "the block is Sine",
     "SineWave": "the block is Sine",
+    "SecondOrder": "the block is PT2",
     "SecondOrderLag": "the block is PT2",
     "Sqrt": "np.sqrt(a) of a signal makes the block",
     "Source": "the blocks are Constant, Step, Sine and others, and Function of a Clock for any other",
+    "SquareWave": "the block is PulseTrain",
     "StepSource": "the block is Step",
     "Subtract": "a - b subtracts two signals, and the block is Sum",
     "TransferFcn": "the block is TransferFunction",
@@ -128,5 +142,104 @@ WAYS = {
     **{name: f"It is python-control's: from control import {name}." for name in _OF_MATRICES},
     "margin": f"Here it is margins({_LOOP}): from loopwright import margins.",
     "stability_margins": f"Here it is margins({_LOOP}): from loopwright import margins.",
+    **dict.fromkeys(("step_info", "stepinfo"), 'It is a method of a run: diagram.simulate(2.0).step_info("wire").'),
 }
 """What an error says for such a name, where no package here has it or the name means something else."""
+
+_IDEAL = "PID.from_ideal_form(gain=…, integral_time=…, derivative_time=…), or kp=K, ki=K/Ti, kd=K*Td"
+_LIMITS = {
+    **dict.fromkeys(("min", "umin", "u_min", "minimum", "lower_limit", "lo", "low"), "lower=…"),
+    **dict.fromkeys(("max", "umax", "u_max", "maximum", "upper_limit", "hi", "high"), "upper=…"),
+    **dict.fromkeys(("limits", "bounds", "output_limits"), "lower=…, upper=…"),
+}
+_MATRICES = dict.fromkeys(("A", "B", "C", "D", "L"), "the plant by position: Observer(control.ss(A, B, C, D), gain=L)")
+_LAG = {
+    **dict.fromkeys(("K", "k", "Kp"), "gain=…"),
+    **dict.fromkeys(("T", "T1", "tau", "time"), "time_constant=…"),
+    **dict.fromkeys(("x0", "y0"), "initial_value=…"),
+}
+
+KEYWORDS: dict[str, dict[str, str]] = {
+    "PID": {
+        **_LIMITS,
+        **dict.fromkeys(("K", "Kc", "gain", "Ti", "ti", "Td", "td", "Tv", "Tn"), _IDEAL),
+        **dict.fromkeys(("P", "p", "Kp", "KP"), "kp=…"),
+        **dict.fromkeys(("I", "i", "Ki", "KI"), "ki=…"),
+        **dict.fromkeys(("D", "d", "Kd", "KD"), "kd=…"),
+        **dict.fromkeys(("N", "n"), "filter_time=1/N, or PID.from_ideal_form(…, ratio=N)"),
+        **dict.fromkeys(("Tf", "tf", "tau"), "filter_time=…"),
+        **dict.fromkeys(("setpoint", "reference", "target"), "it as a wire: pid(r=…, y=…)"),
+    },
+    "Saturation": _LIMITS,
+    "DeadZone": {**_LIMITS, "start": "lower=…", "end": "upper=…", "width": "limit=…, which is half of it"},
+    "Observer": _MATRICES,
+    "DiscreteObserver": _MATRICES,
+    "StateFeedback": dict.fromkeys(("K", "k", "F", "gains"), "gain=…"),
+    "TransferFunction": dict.fromkeys(("b", "B"), "numerator=…") | dict.fromkeys(("a", "A"), "denominator=…"),
+    "StateSpace": dict.fromkeys(("x0", "initial_value"), "initial_state=…"),
+    "Gain": dict.fromkeys(("k", "K", "value", "factor"), "gain=…"),
+    "Constant": dict.fromkeys(("c", "k", "y"), "value=…"),
+    "Step": {
+        **dict.fromkeys(("time", "t", "t0", "step_time", "start_time", "at"), "times=…"),
+        **dict.fromkeys(("value", "amplitude", "height", "final_value", "size", "after", "y"), "values=…"),
+        **dict.fromkeys(("initial", "before", "offset"), "initial_value=…"),
+    },
+    "Sine": {
+        **dict.fromkeys(("f", "freq"), "frequency=…, in Hz"),
+        **dict.fromkeys(("omega", "w"), "frequency=omega/(2*np.pi), which is in Hz"),
+        **dict.fromkeys(("a", "A", "amp"), "amplitude=…"),
+        "offset": "bias=…",
+    },
+    "PT1": _LAG,
+    "PT2": _LAG | dict.fromkeys(("d", "D", "zeta", "damping"), "damping_ratio=…"),
+    "Integrator": dict.fromkeys(("x0", "y0", "initial_state"), "initial_value=…")
+    | dict.fromkeys(("gain", "k", "K"), "Integrator()(k * u)"),
+    "TransportDelay": dict.fromkeys(("Td", "td", "T", "tau", "time", "theta"), "delay=…, in s"),
+    "Delay": dict.fromkeys(("delay", "n", "samples", "length"), "steps=…"),
+    "Quantizer": dict.fromkeys(("interval", "step", "q", "resolution"), "quantum=…"),
+    "Encoder": {
+        **dict.fromkeys(("interval", "step", "q", "resolution"), "quantum=…"),
+        **dict.fromkeys(("counts", "lines", "cpr", "ppr"), "quantum=2*np.pi/counts"),
+    },
+    "RateLimiter": dict.fromkeys(("rate", "slew", "limit", "slew_rate", "max_rate"), "rising=…, falling=…"),
+    "Lookup1D": dict.fromkeys(("x", "xs", "points", "bp"), "breakpoints=…") | dict.fromkeys(("y", "ys"), "values=…"),
+    "BandLimitedNoise": {
+        **dict.fromkeys(("power", "density", "psd"), "BandLimitedNoise.from_density(density=…, sample_time=…)"),
+        **dict.fromkeys(("std", "sigma"), "variance=std**2"),
+    },
+}
+"""By a block's class: what to write for keywords that other tools and textbooks have for its parameters."""
+BY_POSITION = {
+    "Saturation": ("lower", "upper"),
+    "DeadZone": ("lower", "upper"),
+}
+"""By a block's class: the parameters that people mean by position, where it is not the order of declaration."""
+OF_ANY_BLOCK = dict.fromkeys(
+    ("sample_time", "Ts", "dt", "ts"), "a sample time of the subsystem that the block is in: @subsystem(sample_time=…)"
+)
+"""The same for keywords that are no block's."""
+UNITS = {
+    **dict.fromkeys(("meter", "metre", "meters"), "m"),
+    **dict.fromkeys(("second", "seconds", "sec"), "s"),
+    **dict.fromkeys(("minute", "minutes"), "min"),
+    **dict.fromkeys(("hour", "hours"), "h"),
+    **dict.fromkeys(("kilogram", "kilograms"), "kg"),
+    **dict.fromkeys(("newton", "newtons"), "N"),
+    **dict.fromkeys(("volt", "volts"), "V"),
+    **dict.fromkeys(("ampere", "amperes", "amp", "amps"), "A"),
+    **dict.fromkeys(("ohm", "ohms"), "Ohm"),
+    **dict.fromkeys(("watt", "watts"), "W"),
+    **dict.fromkeys(("joule", "joules"), "J"),
+    **dict.fromkeys(("pascal", "pascals"), "Pa"),
+    **dict.fromkeys(("kelvin",), "K"),
+    **dict.fromkeys(("celsius",), "degC"),
+    **dict.fromkeys(("hertz",), "Hz"),
+    **dict.fromkeys(("radian", "radians"), "rad"),
+    **dict.fromkeys(("degree", "degrees"), "deg"),
+    **dict.fromkeys(("percent",), "%"),
+    **dict.fromkeys(("litre", "liter"), "L"),
+    **dict.fromkeys(("henry",), "H"),
+    **dict.fromkeys(("farad",), "F"),
+    **dict.fromkeys(("tesla",), "T"),
+}
+"""Symbols of units that are written out, in lower case."""

@@ -3,10 +3,11 @@
 from . import arguments as kinds
 from . import arithmetic, source
 from .arguments import Kind, accepts, check_argument, shorten
-from .arithmetic import Demux, Gain, Mux, Product, Stack, Sum, check_shapes, shape_of
+from .arithmetic import Demux, Gain, Mux, Product, Stack, Sum, check_shapes, describe_shape, shape_of
 from .block import SOLVED, Block
 from .brief import brief, count_of, enumerate_some
 from .collection import without_collection
+from .control_systems import as_block
 from .disk import (
     OTHER_TEMPORARY,
     describe_disk_error,
@@ -150,6 +151,7 @@ __all__ = [
     "WiringError",
     "accepts",
     "arithmetic",
+    "as_block",
     "as_signal",
     "brief",
     "cell_text",
@@ -163,6 +165,7 @@ __all__ = [
     "decibels",
     "describe_disk_error",
     "describe_mismatch",
+    "describe_shape",
     "elements",
     "enumerate_some",
     "explain_calls",

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from .control_systems import system_text
 from .errors import LoopwrightError, OptionError, close_names, near
 from .explained_calls import BY_PLACE, EXPLAINED, UnknownArgumentError, misuse, name_of, own_names
 
@@ -28,6 +29,8 @@ def shorten(value: Any) -> str:
     """Return a parameter value as a short text, with numbers as people type them."""
     if isinstance(value, np.ndarray):
         return repr(value.tolist()) if value.size <= 12 else f"<{'×'.join(map(str, value.shape))} numbers>"
+    if text := system_text(value):
+        return text
     if isinstance(value, float) and abs(value) < 1e6 and value == int(value):
         return str(int(value))
     return repr(value)

@@ -22,6 +22,17 @@ def shape_of(value: Array) -> Shape:
     return tuple(getattr(value, "shape", ()))
 
 
+def describe_shape(shape: tuple[int, ...]) -> str:
+    """Return a shape in words, for messages.
+
+    Examples
+    --------
+    >>> describe_shape(()), describe_shape((2,))
+    ('a scalar', '(2,)')
+    """
+    return str(shape) if shape else "a scalar"
+
+
 def check_shapes(**values: Array) -> None:
     """Refuse values of different shapes; a scalar goes with any.
 

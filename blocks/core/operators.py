@@ -13,6 +13,7 @@ from typing import Any, Generic, NoReturn, TypeVar
 
 import numpy as np
 
+from .control_systems import as_block, system_text
 from .errors import ShapeError, WiringError
 from .numpy_functions import RULES, NumpyCall, Place
 
@@ -155,6 +156,13 @@ class Operators(Generic[S]):
             "a function of numbers", "Use NumPy's functions, which make blocks: np.sin(u) for math.sin"
         )
 
+    def __complex__(self) -> NoReturn:
+        raise self._number_error(
+            "a function of complex numbers",
+            "A linear system of python-control is made a block first: TransferFunction.from_control(system)(u) for "
+            "system(u)",
+        )
+
     def __rshift__(self, other: Any) -> NoReturn:
         raise WiringError(
             "blocks are wired by calls, not by >>. Call the second block with the first: second(first).",
@@ -192,7 +200,7 @@ _JUMPS = (
 _INSTEAD: dict[Any, str] = {
     np.remainder: _JUMPS.format("Function(lambda u: np.mod(u, …))(u)"),
     np.floor_divide: _JUMPS.format("Function(lambda u: np.floor(u / …))(u)"),
-    np.sign: "Write (u > 0.0) - (u < 0.0), whose comparisons are events",
+    np.sign: "Write (u > 0.0) - (u < 0.0), whose comparisons are events, or np.tanh(u / width), which is smooth",
     np.interp: "Use Lookup1D(breakpoints=…, values=…)(u)",
     np.rint: "Use Quantizer(quantum=1.0)(u)",
     np.round: "Use Quantizer(quantum=1.0)(u)",
@@ -250,6 +258,8 @@ def _multiply(left: Operators[S], other: Any) -> S:
     if has_signals(other):
         return _make(left, "Product", f"{_operand(left)}_times_{_operand(other)}", left, other)
     other = np.asarray(other) if isinstance(other, list | tuple) else other
+    if made := as_block(other, "(u)"):
+        raise ShapeError(f"found {system_text(other)}; expected a number, a vector or another signal. {made}.")
     if not isinstance(other, int | float | np.number | np.ndarray) or np.ndim(other) > 1:
         raise ShapeError(
             f"found a factor of shape {np.shape(other)}; expected a number, a vector or another signal. Apply a "

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from .arguments import shorten
+from .control_systems import as_block
 from .errors import (
     LoopwrightError,
     UnknownNameError,
@@ -232,8 +234,10 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
         with suppress(ValueError):
             constant: Signal = operate("Constant", "constant", value=value)
             return constant
+    made = as_block(value, "(…)")
     raise WiringError(
-        f"found {value!r}; expected a signal, a call, a block with one output, numbers, or a list of these.",
+        f"found {shorten(value)}; expected a signal, a call, a block with one output, numbers, or a list of these."
+        + f" {made}." * bool(made),
         block=block,
         port=port,
     )

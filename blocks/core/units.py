@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
 
+from ..names_of_other_tools import UNITS
 from .errors import UnitError, near
 from .explained_calls import explain_calls
 
@@ -144,7 +145,8 @@ def _symbol(symbol: str, text: str) -> Unit:
     if prefix in _PREFIXES and rest in _PREFIXED:
         base = _PREFIXED[rest]
         return Unit("", base.exponents, base.factor * _PREFIXES[prefix])
-    hint = near(symbol, {**_PLAIN, **_PREFIXED})
+    known = UNITS.get(symbol.casefold())
+    hint = near(symbol, {**_PLAIN, **_PREFIXED}) if known is None else f"Did you mean {known!r}?"
     raise UnitError(f"the unit {text!r} has an unknown symbol {symbol!r}. {hint} {_NEXT}")
 
 

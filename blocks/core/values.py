@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import numbers
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace as replace_fields
 from functools import lru_cache
 from math import isfinite
@@ -17,13 +17,19 @@ from typing import Any, ClassVar, Self, dataclass_transform
 
 import numpy as np
 
+from ..names_of_other_tools import BY_POSITION, KEYWORDS, OF_ANY_BLOCK
 from .arguments import Kind, check_argument, shorten
+from .brief import count_of
+from .control_systems import as_block
 from .docstrings import ParameterSignature, parameter_section, with_section
 from .errors import DefinitionError, ParameterError, near
 from .frozen import freeze
 from .parameters import MISSING, ParameterSpec
 from .parameters import Array as Array
 from .parameters import parameter as parameter
+
+_LONGEST = 60
+"""Characters of a value up to which an error repeats it in the call that it offers."""
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, eq_default=False, field_specifiers=(parameter,))
@@ -70,8 +76,7 @@ class Value:
         if len(args) > len(positional):
             allowed = f"only {', '.join(positional)} may come by position" if positional else "all go by keyword"
             raise ParameterError(
-                f"{len(args)} positional arguments were given; {allowed}. "
-                f"Write {cls.__name__}({', '.join(f'{k}=…' for k in cls.parameter_specs)}).",
+                f"{count_of(len(args), 'argument')} came by position; {allowed}. {_by_keyword(cls, args, kwargs)}.",
                 block=who,
             )
         for name, value in zip(positional, args, strict=False):
@@ -81,7 +86,7 @@ class Value:
         for name in kwargs:
             if name not in cls.parameter_specs and name not in cls._keywords:
                 raise ParameterError(
-                    f"{cls.__name__} has no parameter {name!r}. {near(name, cls.parameter_specs)}", block=who, port=name
+                    f"{cls.__name__} has no parameter {name!r}. {_instead_of(cls, name)}", block=who, port=name
                 )
         for name, spec in cls.parameter_specs.items():
             if name not in kwargs and spec.required:
@@ -148,6 +153,46 @@ class Value:
         return f"{type(self).__name__}({', '.join(shown)})"
 
 
+def _by_keyword(cls: type[Value], args: Sequence[Any], kwargs: Mapping[str, Any]) -> str:
+    """Return how a call with arguments by position is written; the required parameters come first."""
+    if len(args) == 1 and (made := as_block(args[0])):
+        return made
+    order = _order_by_position(cls, len(args) + len(kwargs))
+    given = dict(zip((name for name in order if name not in kwargs), args, strict=False)) | dict(kwargs)
+    texts = {name: shorten(value) for name, value in given.items()}
+    texts = {name: text if len(text) <= _LONGEST and "\n" not in text else "…" for name, text in texts.items()}
+    texts |= {name: "…" for name in order if _is_required(cls, name) and name not in texts}
+    by_place = [texts.pop(name) for name in order if not cls.parameter_specs[name].kw_only and name in texts]
+    return f"Write {cls.__name__}({', '.join([*by_place, *(f'{name}={text}' for name, text in texts.items())])})"
+
+
+def _order_by_position(cls: type[Value], count: int) -> list[str]:
+    """Return the parameters in the order in which people give that many by position.
+
+    It is the order of declaration, without a source's unit, where that has all required ones; else these come first.
+    """
+    known = BY_POSITION.get(cls.__name__, ())
+    if 1 < count == len(known):
+        return [*known, *(name for name in cls.parameter_specs if name not in known)]
+    declared = sorted(cls.parameter_specs, key=lambda name: (cls.parameter_specs[name].kw_only, name == "unit"))
+    if any(_is_required(cls, name) for name in declared[count:]):
+        declared.sort(key=lambda name: (cls.parameter_specs[name].kw_only, not _is_required(cls, name)))
+    return declared
+
+
+def _is_required(cls: type[Value], name: str) -> bool:
+    return cls.parameter_specs[name].required
+
+
+def _instead_of(cls: type[Value], name: str) -> str:
+    """Return what to write for a keyword that is no parameter of a class."""
+    known = [KEYWORDS[base.__name__] for base in cls.__mro__ if base.__name__ in KEYWORDS]
+    ways = {**OF_ANY_BLOCK, **(known[0] if known else {})} if "name" in cls._keywords else {}
+    if name not in ways or name in cls.parameter_specs:
+        return near(name, cls.parameter_specs)
+    return f"Write {ways[name]}." if name not in OF_ANY_BLOCK else f"It is {ways[name]}."
+
+
 def identity(value: Any) -> Any:
     """Return a hashable stand-in for a parameter value that is equal exactly when type and value are.
 
@@ -205,7 +250,7 @@ def convert(value: Any, spec: ParameterSpec, owner: str, name: str) -> Any:
         try:
             result = np.array(value, dtype=float)
         except (TypeError, ValueError):
-            raise error(repr(value), "numbers") from None
+            raise error(shorten(value), "rows of one length" if _is_ragged(value) else "numbers") from None
         if spec.shape is not None:
             try:
                 result = np.array(np.broadcast_to(result, spec.shape))
@@ -233,6 +278,13 @@ def convert(value: Any, spec: ParameterSpec, owner: str, name: str) -> Any:
             return float(result)
         result.flags.writeable = False
     return result
+
+
+def _is_ragged(value: Any) -> bool:
+    """Whether a value is a list of rows of numbers that differ in length."""
+    if not isinstance(value, list | tuple) or not all(isinstance(row, list | tuple | np.ndarray) for row in value):
+        return False
+    return len({len(row) for row in value}) > 1
 
 
 _FLOAT = frozenset({"float", "None"})

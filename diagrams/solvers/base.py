@@ -41,6 +41,7 @@ from ...blocks.core import NonFiniteError, OptionError, SimulationError, near
 
 STRETCH = 2_000  # steps between two looks at the progress
 HOPELESS = 1e7  # steps to go, at which a run is given up
+LARGE = 1e6  # size of a state beside its scale, from which on its growth is what an error names
 
 
 @dataclass(frozen=True)
@@ -175,6 +176,15 @@ class Integration:
         found = found or f"can't meet rtol = {self.rtol:g} even with a step of {h:.2g} s"
         beyond = "changes fastest" if np.isfinite(weighted[i]) else "is not finite just beyond"
         other = "a larger atol" if self.stiff else "a larger atol or, if it is stiff, solver='Radau'"
+        if self._grows(i, t, x, f):
+            text = (
+                f"{self.problem.names[i]} grows without limit: it is {x[i]:.6g} and its rate {f[i]:.6g}; expected a "
+                "state that stays bounded. Look at the sign of a feedback, for a plant that is unstable without its "
+                f"controller, or for growth to infinity in finite time. {self.name} {found}."
+            )
+            stuck = SimulationError(text, t=t)
+            stuck.state = self.problem.names[i]
+            return stuck
         stuck = SimulationError(
             f"{self.name} {found}: the rate of {self.problem.names[i]} = {x[i]:.6g} is {f[i]:.6g} there and {beyond}. "
             "Expected rates that are finite, and smooth between events; look for growth to infinity, a root or a "
@@ -184,6 +194,15 @@ class Integration:
         )
         stuck.state = self.problem.names[i]
         return stuck
+
+    def _grows(self, i: int, t: float, x: np.ndarray, f: np.ndarray) -> bool:
+        """Whether a state is on its way to infinity: far above its scale, and growing fast beside the time so far.
+
+        The scale of a state is that at which both its tolerances are equal. A growth at the present rate by a factor of
+        e takes less than a tenth of the time so far.
+        """
+        scale = float(np.broadcast_to(self.atol, x.shape)[i]) / self.rtol
+        return bool(abs(x[i]) > LARGE * scale and (x[i] > 0.0) == (f[i] > 0.0) and abs(x[i]) < 0.1 * t * abs(f[i]))
 
     def no_progress(self, t: float, x: np.ndarray, h: float) -> SimulationError:
         """Return the error of steps of a mean length h, in s, that are so small that the run would never end."""

@@ -17,6 +17,7 @@ from ...blocks.core import (
     UnknownNameError,
     UnwiredInputError,
     WiringError,
+    describe_shape,
     near,
 )
 from ...blocks.library import FixedSampleTime
@@ -177,15 +178,16 @@ def _check_shapes(
             expected = shapes[path, "y"]
         if found == expected:
             continue
+        has = f"{wire} has shape {found}" if found else f"{wire} is a scalar"
         if (path, port) in assumed:
             raise ShapeError(
-                f"{wire} has shape {found}, where the loop that it closes asks for {expected}. Give the loop's shape "
+                f"{has}, where the loop that it closes asks for {describe_shape(expected)}. Give the loop's shape "
                 "where it starts, for instance UnitDelay(initial_value=…).",
                 block=path,
                 port=port,
             )
         raise ShapeError(
-            f"{wire} has shape {found}; expected {expected}. {_next_step(found, expected)}",
+            f"{has}; expected {describe_shape(expected)}. {_next_step(found, expected)}",
             block=path,
             port=port,
         )

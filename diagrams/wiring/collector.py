@@ -14,6 +14,8 @@ from ...blocks.core import (
     UnwiredInputError,
     Wireable,
     WiringError,
+    as_block,
+    shorten,
 )
 from .buses import Bus
 from .structure import Structure, SubsystemSettings, Wire, join
@@ -63,7 +65,11 @@ class Collector:
         self.stack: list[tuple[Wireable, _Consumer]] = []
         for root in roots:
             if not isinstance(root, Wireable):
-                raise WiringError(f"found {root!r}; expected calls of blocks or subsystems, such as plant(force=u).")
+                made = as_block(root, "(u)")
+                raise WiringError(
+                    f"found {shorten(root)}; expected calls of blocks or subsystems, such as plant(force=u)."
+                    + f" {made}." * bool(made)
+                )
             self._follow(root, _Root())
             while self.stack:
                 self._follow(*self.stack.pop())

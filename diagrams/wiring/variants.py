@@ -15,6 +15,7 @@ from ...blocks.core import (
     UnknownNameError,
     Value,
     WiringError,
+    as_block,
     enumerate_some,
     near,
     shorten,
@@ -116,9 +117,10 @@ def _find_target(table: Structure, path: str, diagram: str) -> tuple[str, list[s
 def _change(table: Structure, path: str, keys: list[str], value: object) -> None:
     """Change a setting of the subsystem at a path; a block has to be named with a parameter."""
     if not keys:
+        made = as_block(value)
         raise WiringError(
             f"found {shorten(value)}; expected a block in its place, such as Fmu('other.fmu'), or the name of a "
-            f"parameter of it: {name_parameters(table.blocks[path], path)}.",
+            f"parameter of it: {name_parameters(table.blocks[path], path)}." + f" {made}." * bool(made),
             block=path,
         )
     table.subsystems[path] = _change_subsystem(table.subsystems[path], keys[0], value)

@@ -23,6 +23,7 @@ from ...blocks.core import (
     UnwiredInputError,
     WiringError,
     describe_mismatch,
+    describe_shape,
     same_dimension,
     same_unit,
 )
@@ -91,6 +92,11 @@ def check_replacement(fmu: _WithVariables, old: Block, wired: Collection[str], r
             f"Perhaps scalars are elements of a port: Fmu({str(fmu.file)!r}, rename={named!r}); "
             "name the others that are missing, too."
         )
+    elif guess := _guess_names(fmu, old, wired, read):
+        advice = (
+            f"If only names differ, say which is which: Fmu({str(fmu.file)!r}, rename={guess!r}), the FMU's name "
+            f"first. Several fit, so these pairs are a guess by order: look at them. {advice}"
+        )
     raise (kinds.pop() if len(kinds) == 1 else WiringError)(
         f"{fmu.drawn_as} does not fit the wires of {old.drawn_as}:\n{lines}\n{advice}", block=old.name or fmu.label
     )
@@ -107,6 +113,32 @@ def _find_names(
         return {}
     left = [misfit for misfit in _find_misfits(renamed, old, wired, read)[0] if misfit.error is not UnwiredInputError]
     return {} if left else both
+
+
+def _guess_names(fmu: _WithVariables, old: Block, wired: Collection[str], read: Collection[str]) -> dict[str, str]:
+    """Return names with which an FMU fits where several ports may be meant by one; empty if none do.
+
+    A port that is missing gets, of those of its shape and unit, the one that is most alike by name if that is alike at
+    all, else the first that is left.
+    """
+    guess: dict[str, str] = {}
+    for ports, before, used, variables in (
+        (fmu.inputs, old.inputs, wired, fmu.input_variables),
+        (fmu.outputs, old.outputs, read, fmu.output_variables),
+    ):
+        missing = {name: port for name, port in before.items() if name in used and name not in ports}
+        spare = {name: port for name, port in ports.items() if name not in before}
+        pairs = _match(missing, spare, converts=fmu.convert_units)
+        for name, port in missing.items():
+            left = [n for n, p in spare.items() if n not in pairs.values() and _may_be(p, port, fmu.convert_units)]
+            if name not in pairs and left:
+                pairs[name] = left[0]
+        guess |= {variables[pairs[name]].name: name for name in missing if name in pairs}
+    return _find_names(fmu, old, wired, read, guess) if guess else {}
+
+
+def _may_be(new: Input | Output | State, old: Input | Output | State, converts: bool) -> bool:
+    return new.shape == old.shape and _fits(new.unit, old.unit, converts=converts)
 
 
 def _find_misfits(
@@ -197,7 +229,8 @@ def _compare(
     """Return the differences in shape, unit and type of a port that both blocks have."""
     found = list[_Misfit]()
     if old.shape is not None and new.shape != old.shape:
-        found.append(_Misfit(ShapeError, f"{side} {name}: found shape {new.shape}; expected {old.shape}"))
+        shapes = f"found {'shape ' * bool(new.shape)}{describe_shape(new.shape)}; expected {describe_shape(old.shape)}"
+        found.append(_Misfit(ShapeError, f"{side} {name}: {shapes}"))
     one, other = new.unit, old.unit
     if isinstance(one, str) and isinstance(other, str) and not _fits(one, other, converts=converts):
         way = (other, one) if side == "input" else (one, other)
@@ -232,10 +265,7 @@ def _match(
     An FMU that ``converts`` units may have one of the same dimension. A port without one that is alike by name gets the
     only one of its shape and unit, if it is the only one for it, too.
     """
-    fits = {
-        name: [other for other, q in spare.items() if q.shape == p.shape and _fits(q.unit, p.unit, converts=converts)]
-        for name, p in missing.items()
-    }
+    fits = {name: [other for other, q in spare.items() if _may_be(q, p, converts)] for name, p in missing.items()}
     found: dict[str, str] = {}
     likeness = sorted(((-_alike(name, other), name, other) for name, others in fits.items() for other in others))
     for value, name, other in likeness:

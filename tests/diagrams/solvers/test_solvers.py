@@ -400,7 +400,7 @@ def test_a_rate_that_is_not_finite_behind_a_jump_is_named(name):
 @pytest.mark.parametrize("name", VARIABLE)
 @pytest.mark.drawn(3)
 def test_growth_to_infinity_ends_in_an_error_that_names_the_state(name):
-    with pytest.raises(SimulationError, match=r"^block, .*block\.x\[2\]") as caught:
+    with pytest.raises(SimulationError, match=r"^block, [^:]*: block\.x\[2\] grows without limit") as caught:
         end(name, system(lambda t, x: [1.0, x[1] ** 2], [0.0, 1.0]), 3.0)  # infinite at t = 1
     assert caught.value.t == pytest.approx(1.0, abs=1e-3)
     assert caught.value.state == "block.x[2]"

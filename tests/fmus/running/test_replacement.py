@@ -75,6 +75,23 @@ def test_a_rename_that_does_not_help_is_not_suggested(diagram, file, tmp_path):
     assert "Perhaps only names differ" not in str(e.value)
 
 
+def test_ports_that_could_be_each_other_are_offered_in_their_order_as_a_guess(diagram, file, tmp_path):
+    """Without units and likeness, each of two inputs may be either."""
+    changes = (
+        (r'"motor_force\[', '"in1['),
+        (r'"external_force\[', '"in2['),
+        (r'unit="N"', ""),
+        (r'"position\[', '"pos['),
+    )
+    other = edited(file, tmp_path, *changes)
+    with pytest.raises(WiringError) as e:
+        diagram.replace(plant=Fmu(other))
+    rename = {"in1": "motor_force", "in2": "external_force", "pos": "position"}
+    assert f"If only names differ, say which is which: Fmu({str(other)!r}, rename={rename!r})" in str(e.value)
+    assert "a guess by order" in str(e.value)
+    diagram.replace(plant=Fmu(other, rename=rename))
+
+
 def test_another_unit_is_said_with_its_factor(diagram, file, tmp_path):
     other = edited(file, tmp_path, (r'(?s)(name="position\[.\]".{0,300}?unit=)"m"', r'\1"mm"'))
     with pytest.raises(UnitError, match=r"- output position: found the unit mm; expected m: .*by a factor of 0\.001"):

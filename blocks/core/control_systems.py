@@ -1,0 +1,35 @@
+"""Linear systems of python-control where something else is expected: a short text, and the block to make of one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+_BLOCKS = {"StateSpace": "StateSpace", "TransferFunction": "TransferFunction"}
+
+
+def kind_of_system(value: Any) -> str:
+    """Return the class of python-control's that a linear system is of, "" of anything else; it isn't imported."""
+    names = (base.__name__ for base in type(value).__mro__ if base.__module__.partition(".")[0] == "control")
+    return next((name for name in names if name in _BLOCKS), "")
+
+
+def system_text(value: Any) -> str:
+    """Return a short text of a linear system of python-control, "" of anything else."""
+    kind = kind_of_system(value)
+    return f"<control.{kind}, {value.ninputs} → {value.noutputs}>" if kind else ""
+
+
+def as_block(value: Any, wired: str = "") -> str:
+    """Return what to write in place of a linear system of python-control, "" of anything else.
+
+    Parameters
+    ----------
+    value : object
+        The system.
+    wired : str
+        What follows the block, such as ``"(u)"``.
+    """
+    if not (kind := kind_of_system(value)):
+        return ""
+    block = _BLOCKS[kind] if value.dt in (0, None) else f"Discrete{_BLOCKS[kind]}"
+    return f"A block is made of it by {block}.from_control(system){wired}"
