@@ -69,6 +69,7 @@ def run_commands(text, folder):
         assert done.returncode == 0, f"{program} {arguments}: {done.stdout}{done.stderr}"
 
 
+@pytest.mark.slow
 def test_a_script_of_the_readmes_code_shows_no_warnings(tmp_path):
     (tmp_path / "script.py").write_text("\n".join(blocks_of_code((ROOT / "README.md").read_text(encoding="utf-8"))))
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONWARNINGS"} | {"MPLBACKEND": "agg"}

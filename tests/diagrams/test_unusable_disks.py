@@ -97,7 +97,7 @@ def test_a_cache_that_can_not_be_used(use, code, file, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("code", FOUND, ids=errno.errorcode.get)
 @pytest.mark.parametrize("use", OUT)
-@pytest.mark.drawn
+@pytest.mark.drawn(4)
 def test_a_file_that_a_user_asks_for_and_that_can_not_be_written(use, code, file, tmp_path, monkeypatch):
     theirs = tmp_path / "theirs"
     theirs.mkdir()

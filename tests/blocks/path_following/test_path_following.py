@@ -556,6 +556,7 @@ def tracked(source, path, **options):
 
 @pytest.mark.parametrize("direction", [1.0, -1.0], ids=["forth", "back"])
 @pytest.mark.parametrize("kind", CLOSED)
+@pytest.mark.drawn(5)
 def test_laps_are_counted(kind, direction):
     # three laps and a half at half the reach, 0.7 s a lap: the arc length is lifted with the parameter
     path = PATHS[kind]

@@ -55,7 +55,7 @@ def public_blocks():
 # --- the library ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.drawn(18)
+@pytest.mark.drawn(9)
 @pytest.mark.parametrize(("block", "options", "frames"), CASES, ids=[named(case) for case in CASES])
 def test_the_library_keeps_the_contract(block, options, frames):
     report = check_block(block, **options)

@@ -48,6 +48,7 @@ def area(figure, renderer):
         ((2, 2, 4.0), {"span": 1e-7}),
     ],
 )
+@pytest.mark.drawn(3)
 def test_nothing_is_cut_off_or_overlaps_and_the_axes_fill_the_rest(shape, options):
     figure = drawn(*shape, **options)
     engine = figure.get_layout_engine()

@@ -135,6 +135,7 @@ with SecondProcess(Holds(Path(sys.argv[1])).make, "letters") as second:
 
 @ON_LINUX
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.drawn(1)
 def test_the_second_process_ends_with_its_host(tmp_path, number):
     with Host(HOST, str(tmp_path)) as host:
         assert wait_for(lambda: [int(path.name) in host.others() for path in tmp_path.iterdir()], [True], 60.0) == [

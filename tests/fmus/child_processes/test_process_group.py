@@ -46,7 +46,7 @@ python_fmu.build_python(MassSpringDamper(), {!r})
 @pytest.mark.parametrize(
     ("script", "when"), [(COMPILED, "version"), (COMPILED, "compile"), (PLANT, "compile"), (PYTHON, "pack")]
 )
-@pytest.mark.drawn
+@pytest.mark.drawn(2)
 def test_a_build_ends_with_its_host(tmp_path, number, script, when):
     """The compiler and the process that it has started, and all folders in which they work are removed."""
     (tmp_path / "sleep.py").write_text(COMPILER)

@@ -84,7 +84,7 @@ FAULTS = [
 
 @pytest.mark.parametrize("fmi", [2, 3])
 @pytest.mark.parametrize(("fault", "cause", "call", "text"), FAULTS, ids=[f[0].replace(" ", "_") for f in FAULTS])
-@pytest.mark.drawn
+@pytest.mark.drawn(5)
 def test_a_fault_ends_the_run_and_says_where_when_and_why(folder, fmi, fault, cause, call, text):
     with pytest.raises(FmuProcessError) as caught:
         simulate(zoo_fmu(folder, fmi, fault), SHORT if cause is FmuEnd.TIMEOUT else True)
