@@ -134,6 +134,9 @@ class Input(Port):
     tracks : str, optional
         Name of the block's own output whose true value comes back at this input, as for anti-windup by tracking. A loop
         that is cut between the two says so.
+    models_plant : bool
+        Whether a model of the plant in this block, such as an observer's, gets the plant's input here. Loops at the
+        wire are then cut ahead of the plant, and not here.
     """
 
     def __init__(
@@ -144,12 +147,13 @@ class Input(Port):
         *,
         default: Any = None,
         tracks: str | None = None,
+        models_plant: bool = False,
         name: str = "",
         **limits: Any,
     ):
-        limits = _known("Input", limits, "shape", "unit", "description", "default", "tracks")
+        limits = _known("Input", limits, "shape", "unit", "description", "default", "tracks", "models_plant")
         super().__init__(shape, unit, description, name, **limits)
-        self.tracks = tracks
+        self.tracks, self.models_plant = tracks, models_plant
         self.default = None if default is None else np.asarray(default, dtype=float)
 
     def __get__(self, instance: Any, owner: type | None = None) -> Any:

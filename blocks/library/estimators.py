@@ -169,7 +169,7 @@ class _Observer(Block):
     gain: Array = parameter(
         kw_only=False, description="gain L, n × p: a row for each state, a column for each output", kind=_GAIN
     )
-    u = Input(shape=None, description="input of the plant, as the model's")
+    u = Input(shape=None, description="input of the plant, as the model's", models_plant=True)
     y = Input(shape=None, description="measured output of the plant, as the model's")
 
     @property
@@ -202,7 +202,11 @@ class _Observer(Block):
         """Inputs of the shapes that the model has."""
         model: Any = self.model
         of = {"u": model.inputs["u"], "y": model.outputs["y"]}
-        return {name: Input(of[name].shape, None, getattr(type(self), name).description, name=name) for name in of}
+        own = {name: getattr(type(self), name) for name in of}
+        return {
+            name: Input(port.shape, None, own[name].description, models_plant=own[name].models_plant, name=name)
+            for name, port in of.items()
+        }
 
     def _error(self, estimate: Array, u: Any) -> Array:
         """Return the measured less the expected output."""

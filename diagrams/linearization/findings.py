@@ -224,18 +224,27 @@ class SharedCut(Finding):
         The cut wire.
     to : tuple of str
         Inputs of the plant: ``loop(wire, to=to)`` is the loop there.
+        Empty where no single cut separates them from the others.
     own : tuple of str
         The other consumers, from which the wire is reached again without the plant.
+    at : str
+        Wire that feeds the inputs of the plant, where it is not the cut wire but one behind it.
     """
 
     wire: str
     to: tuple[str, ...]
     own: tuple[str, ...]
+    at: str = ""
 
     def __str__(self) -> str:
+        step = (
+            f"For that take loop({self.at or self.wire!r}, to={_shown(self.to)})"
+            if self.to
+            else "For that take loop(…) of the wire into the plant"
+        )
         return (
             f"the cut at {self.wire!r} also takes {', '.join(self.own)}, the controller's own way back: L is not the "
-            f"loop at the plant's input. For that take loop({self.wire!r}, to={_shown(self.to)})"
+            f"loop at the plant's input. {step}"
         )
 
 
@@ -247,19 +256,24 @@ class ParallelWays(Finding):
     ----------
     wire : str
         The cut wire.
-    to : tuple of str
-        Its consumers that lead back to it.
+    cuts : tuple of (str, tuple of str)
+        Wires and inputs at which each way can be cut alone: the wire itself, or one behind blocks without states.
     """
 
     limits_numbers: ClassVar[bool] = False
     wire: str
-    to: tuple[str, ...]
+    cuts: tuple[tuple[str, tuple[str, ...]], ...]
+
+    @property
+    def to(self) -> tuple[str, ...]:
+        """The inputs that lead back to the wire."""
+        return tuple(dict.fromkeys(to for _, inputs in self.cuts for to in inputs))
 
     def __str__(self) -> str:
-        each = " or ".join(f"to={_shown((one,))}" for one in self.to)
+        each = " or ".join(f"loop({wire!r}, to={_shown(inputs)})" for wire, inputs in self.cuts)
         return (
-            f"{self.wire!r} is cut for {', '.join(self.to)}, which all lead back to it. If one of them is a model "
-            f"of the controller's own, the loop at the plant's input is loop({self.wire!r}, {each})"
+            f"{self.wire!r} is cut for {', '.join(self.to)}, which all lead back to it. If one of them is a model of "
+            f"the controller's own, the loop at the plant's input is {each}"
         )
 
 

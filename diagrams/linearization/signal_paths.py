@@ -79,6 +79,10 @@ class SignalPaths:
         """Return the inputs and outputs that follow a port as far as nothing is cut."""
         return _reach(self._forward, {PathNode(*port, True)})
 
+    def follow_input(self, block: str, port: str) -> set[PathNode]:
+        """Return the outputs of a block that follow one of its inputs."""
+        return self._forward.get(PathNode(block, port, False), set())
+
     def is_on_loop(self, *ports: tuple[str, str]) -> bool:
         """Return whether ports are on one loop: each follows what the consumers of each get."""
         return all(PathNode(*port, True) in self.after([other]) for port in ports for other in ports)

@@ -6,7 +6,9 @@ import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from ...blocks.core import LoopwrightError, UnknownNameError, close_names, near
+import numpy as np
+
+from ...blocks.core import LoopwrightError, UnknownNameError, close_names, near, print_unit
 from ..frequency import Number
 from ..linearization import find_signal
 from ..requirements import (
@@ -22,7 +24,8 @@ from ..requirements import (
     judge,
     judge_interval,
 )
-from ..studies import CaseState, StudyCase
+from ..studies import CaseState, StudyCase, is_zero, words_of
+from ..wiring import join
 from .case import Case
 from .points import STEP
 from .sections.contacts import ReportedContacts
@@ -36,6 +39,11 @@ from .variant import Cut, Variant
 STABLE = Limit(-math.inf, 0.0)
 MANY = 10.0
 """Times of its own uncertainty that a measurement has to be off by to refute a linear model."""
+
+LEAST_POLE = 1e-9
+"""Size of a pole, relative to the largest, below which it sets no frequency."""
+ALIKE = 1e-3
+"""Difference of two complementary sensitivities, relative to the largest, up to which their steps are alike."""
 
 HAS_NONE = (
     "the wire is renewed several times in the period of all clocks, so that S and T change frequencies there and have "
@@ -141,14 +149,16 @@ def _results(
                 reason, said = (Reason.PERIODIC, HAS_NONE) if is_periodic else (Reason.NO_NUMBER, "")
                 detail = (said or reason_of(absent, f"inner.{key}.{v.key}")) if found is None else ""
                 result = RequirementResult(name, key, v.key, limit, Verdict.UNDECIDED, reason, detail=detail)
-                yield _with(state, result, found, _refuted(numbers, key, v.key))
+                result = _with(state, result, found, _refuted(numbers, key, v.key))
+                yield _at_other_cuts(case, v, result) if key in wires else result
                 seen.add(name)
             step = asked.step_of(names, v.key)
             if step is not None and key in wires:
                 others = _wires_stepped(case, asked, numbers, v, step)
                 if step is not asked.step_named(names, v.key) and v.loops_elsewhere(wires[key], others):
                     continue  # a general limit, judged at other wires of the loop
-                yield from _step(case, v, state, key, step, numbers, absent)
+                for result in _step(case, v, state, key, step, numbers, absent):
+                    yield _stepped_elsewhere(case, v, key, result)
                 seen |= {f"step.{name}" for name in step.limits}
         if v.is_actual:
             yield from _nowhere(asked, v, state, seen, bool(loops))
@@ -284,6 +294,49 @@ def _with(
     if refuted and verdict is not Verdict.UNDECIDED:
         return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.REFUTED)
     return result
+
+
+def _at_other_cuts(case: Case, v: Variant, result: RequirementResult) -> RequirementResult:
+    """Return a result that is open where other cuts of its wire have other verdicts, and the plant may be there."""
+    place = case.loop_places[result.loop]
+    if not place.others or result.reason is not Reason.COMPARED or result.number is None:
+        return result
+    found = [(inputs, v.number_ahead(result.quantity, wire, inputs)) for wire, inputs in place.others]
+    there = [(inputs, number) for inputs, number in found if number is not None]
+    if all(judge(number, result.limit)[0] is result.verdict for _, number in there):
+        return result
+    unit = print_unit(result.unit) if result.unit else ""
+    every = [(tuple(join(*to) for to in place.to), result.number), *there]
+    said = ", ".join(f"{number.value:.4g}{unit} at {words_of(inputs)}" for inputs, number in every)
+    return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.SEVERAL_CUTS, detail=said)
+
+
+def _stepped_elsewhere(case: Case, v: Variant, key: str, result: RequirementResult) -> RequirementResult:
+    """Return a result on a step at a wire that is open where the step at other cuts of the wire has another answer."""
+    place = case.loop_places[key]
+    if not place.others or result.reason is not Reason.COMPARED:
+        return result
+    try:
+        loops = [(inputs, v.loop_ahead(wire, inputs)) for wire, inputs in place.others]
+        here = v.fullest_loop(place.name)[2]
+        s = v.model.poles
+        rates = np.abs(np.log(s[np.abs(s) > LEAST_POLE]) / here.dt if here.dt else s)
+        rates = rates[rates > LEAST_POLE * np.max(rates, initial=0.0)]
+        top = np.pi / here.dt if here.dt else 10.0 * np.max(rates, initial=1.0)
+        w = np.geomspace(min(0.1 * np.min(rates, initial=1.0), 0.1 * top), top, 200)
+        points = np.exp(1j * w * here.dt) if here.dt else 1j * w
+        own = here(points) / (1.0 + here(points))
+        apart = [
+            words_of(inputs)
+            for inputs, L in loops
+            if not is_zero(L) and np.max(np.abs(L(points) / (1.0 + L(points)) - own)) > ALIKE * np.max(np.abs(own))
+        ]
+    except LoopwrightError as error:
+        apart = [error.what_was_found]
+    if not apart:
+        return result
+    said = f"the answer to a step differs at {', '.join(apart)}"
+    return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.SEVERAL_CUTS, detail=said)
 
 
 def _worst(numbers: Mapping[str, Number], start: str, name: str, limit: Limit) -> tuple[str, Number] | None:

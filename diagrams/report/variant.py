@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -12,9 +13,11 @@ import numpy as np
 
 from ...blocks.core import BetweenTicksError, Finding, LoopwrightError, PeriodicLoopError
 from ..flat import FlatDiagram, WiredDiagram
+from ..frequency import Number, margins
 from ..linearization import FreeMotions, Linearization, find_signal, linearize
 from ..plotting import BLUE, DARK, GREEN, PURPLE, STONE, VERMILION
 from ..results import OperatingPoint
+from ..studies import is_zero
 from .points import point_of
 from .wires import ways_through
 
@@ -152,6 +155,32 @@ class Variant:
         if (wires, cut) not in self._loops:
             self._loops[wires, cut] = cut.loop(self.model, *wires)
         return self._loops[wires, cut]
+
+    def loop_ahead(self, wire: str, inputs: Iterable[str]) -> Any:
+        """Return the loop transfer function of a wire ahead of some consumers, computed once; of all without them.
+
+        Where the loops through slower subsystems make the loop periodic, they are open.
+        """
+        key = (wire, *inputs, "ahead")
+        if key not in self._loops:
+            try:
+                self._loops[key] = self.model.loop(wire, to=tuple(inputs))
+            except PeriodicLoopError:
+                self._loops[key] = self.model.loop(wire, to=tuple(inputs), slow="open")
+        return self._loops[key]
+
+    def number_ahead(self, name: str, wire: str, inputs: Iterable[str]) -> Number | None:
+        """Return a number of the loop at a wire ahead of some consumers; NaN where it has none.
+
+        None where nothing comes back from these consumers at the operating point.
+        """
+        try:
+            L = self.loop_ahead(wire, inputs)
+            if is_zero(L):
+                return None
+            return margins(L).numbers().get(name, Number(math.nan, "1", 0.0, ""))
+        except LoopwrightError:
+            return Number(math.nan, "1", 0.0, "")
 
     def fullest_loop(self, wire: str) -> tuple[Cut, str, Any]:
         """Return the cut that leaves the most closed at one rate, its title, and the loop transfer function.

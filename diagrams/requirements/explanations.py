@@ -66,6 +66,10 @@ def _find_reason(result: RequirementResult) -> tuple[str, str]:
             f"the linear model leaves something out (†){_finding_of(number)}",
             "limit a step response, which the run decides, or give the loop as measured",
         ),
+        Reason.SEVERAL_CUTS: (
+            f"several blocks on the wire may be the plant, and it depends on where it is cut: {detail}",
+            "name the plant's inputs as to=… in the requirements' loops, or to=[] for all blocks together",
+        ),
         Reason.REFUTED: (
             f"the {'nonlinear run' if by_run else 'injection check'} contradicts the linear model",
             "the run counts: look at it" if by_run else "limit a step response, which the run decides",

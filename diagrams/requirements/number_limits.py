@@ -44,6 +44,8 @@ class Reason(StrEnum):
     """No independent computation stands behind the number."""
     FINDINGS = "findings"
     """The linear model behind the number leaves something out at its operating point."""
+    SEVERAL_CUTS = "several cuts"
+    """The wire feeds several blocks that may be the plant, and the verdict depends on the one at which it is cut."""
     REFUTED = "refuted"
     """The running co-simulation was measured, and contradicts the linear model."""
     NOT_MEASURED = "not measured"

@@ -290,7 +290,7 @@ class Requirements(LoopLimits):
         made, loops = copy(self), dict[str, LoopLimits]()
         for name, limits in self.loops.items():
             loops[names.get(name, name)] = placed = copy(limits)
-            if name in names:
+            if name in names and placed.to:
                 placed.to = None
         made.loops = MappingProxyType(loops)
         return made

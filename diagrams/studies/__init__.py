@@ -3,7 +3,7 @@
 from .cases import CaseOrigin, CaseState, Goal, StudyCase
 from .confirmation import ConfirmationKind, RunConfirmation, confirm_parameter, confirm_sensitivity
 from .contact_task import ContactTask
-from .loop_places import LoopPlace, cut_places, find_places
+from .loop_places import LoopPlace, cut_places, find_places, is_zero, words_of
 from .sensitivity import Sensitivities, Sensitivity, find_sensitivities, sensitivities_of
 from .worst_case import WorstCase, find_worst_case
 from .worst_case_plot import plot_cases
@@ -28,6 +28,8 @@ __all__ = [
     "find_places",
     "find_sensitivities",
     "find_worst_case",
+    "is_zero",
     "plot_cases",
     "sensitivities_of",
+    "words_of",
 ]

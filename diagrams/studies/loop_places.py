@@ -4,13 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
 
 from ...blocks.core import LoopwrightError, OptionError
 from ..flat import FlatDiagram, WiredDiagram
-from ..linearization import find_inputs, find_signal, find_ways_back, name_of_cut, name_wire_to
+from ..frequency import Number
+from ..linearization import Linearization, find_inputs, find_signal, find_ways_back, name_of_cut, name_wire_to
 from ..requirements import Requirements
+from ..wiring import join
+from .numbers import numbers_of
 
+OtherCuts = tuple[tuple[str, tuple[str, ...]], ...]
+"""Wires and inputs of cuts, as of `Linearization.loop`."""
+NOTHING = 1e-12
+"""Size of a loop that is zero but for rounding."""
 STEP = 1e-3
 """Communication step in s with which signals of a diagram without a clock are looked up."""
 
@@ -27,16 +37,23 @@ class LoopPlace:
         Block and port of the inputs ahead of which it is cut; empty for all consumers.
     own : tuple of (str, str)
         Other consumers, by which the controller comes back to itself.
+    at : str
+        Wire that feeds these inputs, where it is one behind the wire; empty where it is the wire itself.
+    others : tuple of (str, tuple of str)
+        Wires and inputs of other cuts of it, as of `Linearization.loop`, where several blocks may be the plant; no
+        inputs for all consumers.
     """
 
     wire: str
     to: tuple[tuple[str, str], ...] = ()
     own: tuple[tuple[str, str], ...] = ()
+    at: str = ""
+    others: OtherCuts = ()
 
     @property
     def name(self) -> str:
         """Name of the wire that is cut, in diagrams of `cut_places`: "u → plant.u" ahead of some consumers."""
-        return name_of_cut(self.wire, self.to)
+        return name_of_cut(self.at or self.wire, self.to)
 
 
 def find_places(diagram: WiredDiagram, wires: Mapping[str, str], asked: Requirements | None) -> dict[str, LoopPlace]:
@@ -70,15 +87,23 @@ def _place_at_plant(diagram: WiredDiagram, wire: str, flat: FlatDiagram) -> Loop
     """Return the place ahead of the plant's inputs, where they can be told from others and all take the whole wire."""
     tap, wires = find_signal(flat, wire), diagram.structure.wires
     ways = find_ways_back(flat, tap.port)
-    is_whole = not tap.entry and all(wires[to].index is None for to in (*ways.plant, *ways.own) if to in wires)
-    if not ways.own or not is_whole:
-        return LoopPlace(wire)
-    place = LoopPlace(wire, ways.plant, ways.own)
+
+    def is_whole(inputs: Iterable[tuple[str, str]]) -> bool:
+        return not tap.entry and all(wires[to].index is None for to in inputs if to in wires)
+
+    def others(of: str) -> OtherCuts:
+        at = {tap.port: wire, ways.port: of}
+        cuts = [cut for cut in ways.others if is_whole(cut.to)]
+        return tuple((at.get(cut.port, join(*cut.port)), tuple(join(*to) for to in cut.to)) for cut in cuts)
+
+    if not ways.own or not ways.is_separable or not is_whole((*ways.plant, *ways.own)):
+        return LoopPlace(wire, others=others(wire))
+    place = LoopPlace(wire, ways.plant, ways.own, "" if ways.port == tap.port else join(*ways.port))
     try:
         cut_places(diagram, [place])
     except LoopwrightError:  # its inputs are in several subsystems
         return LoopPlace(wire)
-    return place
+    return replace(place, others=others(place.name))
 
 
 def place_loops(
@@ -86,8 +111,10 @@ def place_loops(
     loops: str | Iterable[str] | None,
     requirements: Requirements | None,
     to: str | Iterable[str] | None = None,
-) -> tuple[WiredDiagram, list[str], Requirements | None]:
+) -> tuple[WiredDiagram, list[str], Requirements | None, Mapping[str, OtherCuts]]:
     """Return a diagram with loops at wires, and requirements on them, in which the places of these loops have names.
+
+    The last entry has the other cuts of each loop by its name, where several blocks may be the plant.
 
     Places are those that requirements name, or ``to`` of a single wire: inputs of blocks, none for all consumers. Else
     a wire that also feeds a model of the controller's own is cut ahead of the plant, unless it is cut together with
@@ -110,7 +137,7 @@ def place_loops(
             port="to",
         )
     if requirements is None and len(wires) != 1:
-        return diagram, wires, None
+        return diagram, wires, None, {}
     if to is not None:
         inputs = (to,) if isinstance(to, str) else tuple(to)
         flat = diagram.flatten(None if diagram.has_clock else STEP)
@@ -127,7 +154,35 @@ def place_loops(
     names = {wire: place.name for wire, place in places.items()}
     diagram = cut_places(diagram, tuple(places.values()))
     renamed = None if requirements is None else requirements.with_loops(names)
-    return diagram, [names.get(wire, wire) for wire in wires], renamed
+    others = {place.name: place.others for place in places.values() if place.others}
+    return diagram, [names.get(wire, wire) for wire in wires], renamed, others
+
+
+def numbers_at_other_cuts(model: Linearization, others: OtherCuts, delay: int = 0) -> dict[str, dict[str, Number]]:
+    """Return the numbers of a loop at other cuts of its wire by their inputs; those from which nothing comes back none.
+
+    A loop that has no numbers there has none in its mapping.
+    """
+    found: dict[str, dict[str, Number]] = {}
+    for wire, inputs in others:
+        try:
+            L = model.loop(wire, to=inputs)
+            if not is_zero(L):
+                found[words_of(inputs)] = numbers_of(L, delay)
+        except LoopwrightError:
+            found[words_of(inputs)] = {}
+    return found
+
+
+def is_zero(L: Any) -> bool:
+    """Whether a loop is zero but for rounding."""
+    points = np.exp(1j * np.geomspace(1e-3, 3.0, 9)) if L.dt else 1j * np.geomspace(1e-3, 1e3, 9)
+    return bool(np.max(np.abs(L(points))) <= NOTHING)
+
+
+def words_of(inputs: Sequence[str]) -> str:
+    """Return the inputs ahead of which a wire is cut in words."""
+    return " and ".join(inputs) or "all of them"
 
 
 def cut_places(diagram: WiredDiagram, places: Sequence[LoopPlace]) -> WiredDiagram:

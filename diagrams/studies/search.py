@@ -24,6 +24,7 @@ from ..linearization import (
 from ..results import OperatingPoint
 from ..sweeps import Box
 from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe
+from .loop_places import OtherCuts, numbers_at_other_cuts
 from .measures import Measure
 from .numbers import numbers_of
 
@@ -146,6 +147,13 @@ class Study:
         except LoopwrightError as error:
             return replace(case, state=CaseState.FAILED, goodness=FAILED, loop=(), quantity="", reason=str(error))
         return self._judge(case, self._bases[case.point], diagram, at, loops)
+
+    def numbers_at_other_cuts(self, case: StudyCase, others: OtherCuts) -> dict[str, dict[str, Number]]:
+        """Return the numbers of a case's loop at other cuts of its wire, by their inputs."""
+        if not others or case.index not in self._asked or case.state not in (CaseState.STABLE, CaseState.MOVING):
+            return {}
+        diagram, at = self._asked[case.index]
+        return numbers_at_other_cuts(linearize(diagram, at, **self.options), others, self.delay)
 
     def _judge(
         self,

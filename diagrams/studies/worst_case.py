@@ -23,13 +23,13 @@ from ...blocks.core import (
     kinds,
 )
 from ..flat import WiredDiagram
-from ..frequency import order_key
+from ..frequency import Number, order_key
 from ..linearization import carry_point
 from ..requirements import REQUIREMENTS, Requirements
 from ..sweeps import Box, Samples, read_samples
 from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe, make_goal
 from .confirmation import RunConfirmation, confirm_case
-from .loop_places import place_loops
+from .loop_places import OtherCuts, place_loops
 from .measures import ContactMeasure, FunctionMeasure, Measure
 from .parameters import check_parameters
 from .search import Study
@@ -66,6 +66,9 @@ class WorstCase(ShownAsTable):
         Options of the linear models.
     measure : Measure, optional
         The number, where it is no loop's.
+    elsewhere : mapping of str to mapping
+        Numbers of the worst case's loop at other cuts of its wire by their inputs, where several blocks may be the
+        plant.
     """
 
     worst: StudyCase
@@ -77,6 +80,7 @@ class WorstCase(ShownAsTable):
     points: tuple[Any, ...] = field(repr=False)
     options: Mapping[str, Any] = field(default_factory=dict, repr=False)
     measure: Measure | None = field(default=None, repr=False)
+    elsewhere: Mapping[str, Mapping[str, Number]] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
         found = enumerate_some(f"{name} = {_short(value)}" for name, value in self.worst.parameters.items())
@@ -172,6 +176,7 @@ class WorstCase(ShownAsTable):
                 ("cases", ", ".join(f"{count} {state.value}" for state, count in counts.items() if count)),
                 ("operating point", f"{worst.point} of {len(self.points)}" if several else ""),
                 ("not looked at", ", ".join(self.goal.left_out)),
+                ("at other cuts", self._other_cuts()),
             ),
             (
                 Grid(
@@ -184,6 +189,11 @@ class WorstCase(ShownAsTable):
             if counts[CaseState.FAILED]
             else (),
         )
+
+    def _other_cuts(self) -> str:
+        quantity = self.worst.quantity
+        shown = [f"{n[quantity].value:.6g} at {at}" for at, n in self.elsewhere.items() if quantity in n]
+        return f"{', '.join(shown)}: give the plant's inputs as to=…" if shown else ""
 
     def _range(self, name: str) -> tuple[Any, Any]:
         box = self.boxes.get(name)
@@ -239,7 +249,7 @@ def find_worst_case(
     **options: Any,
 ) -> WorstCase:
     """Return the worst case of a loop's numbers over ranges of parameters; see `Diagram.worst_case`."""
-    measure = _make_measure(diagram, loop, quantity, requirements, contact, options)
+    measure, others = _make_measure(diagram, loop, quantity, requirements, contact, options), dict[str, OtherCuts]()
     if quantity is None and requirements is None and measure is None:
         quantity = "disk_margin"
     if points is not None and at is not None:
@@ -249,7 +259,7 @@ def find_worst_case(
     else:
         assert not callable(quantity)
         whole = diagram
-        diagram, loop, requirements = place_loops(diagram, loop, requirements, to)
+        diagram, loop, requirements, others = place_loops(diagram, loop, requirements, to)
         at = carry_point(whole, at, diagram)
         points = None if points is None else [carry_point(whole, point, diagram) for point in points]
         goal = make_goal(loop, quantity, requirements, diagram.name)
@@ -275,7 +285,10 @@ def find_worst_case(
     worst = study.with_findings(min(study.cases, key=lambda case: (order_key(case.goodness), case.index)))
     study.cases[worst.index] = worst
     cases = tuple(study.cases)
-    return WorstCase(worst, tuple(nominal), cases, boxes, goal, diagram, places, {**options, "delay": delay}, measure)
+    there = others.get(worst.loop[0], ()) if len(worst.loop) == 1 else ()
+    elsewhere = study.numbers_at_other_cuts(worst, there)
+    options |= {"delay": delay}
+    return WorstCase(worst, tuple(nominal), cases, boxes, goal, diagram, places, options, measure, elsewhere)
 
 
 def _make_measure(

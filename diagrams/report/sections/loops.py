@@ -28,8 +28,8 @@ from ...frequency import (
     periodic_margins,
     with_findings,
 )
-from ...linearization import MeanSlope, ParallelWays, linearize
-from ...studies import LoopPlace, cut_places
+from ...linearization import MeanSlope, linearize
+from ...studies import LoopPlace, cut_places, is_zero
 from ...wiring import join
 from .. import figures
 from ..case import Case
@@ -62,8 +62,6 @@ PEAKS = ("ms", "mt")
 """The numbers that say how much an error of L is amplified."""
 LINEAR = 1e-3
 """A difference between an FMU's step and its equations beyond which it is not the solver's: it moves as it steps."""
-NOTHING = 1e-12
-"""Size of a loop that is zero but for rounding."""
 RIGHT = 5
 """Column of the comparison with python-control that says whose number is right."""
 POINTS = 400
@@ -228,24 +226,21 @@ def _other_cuts(case: Case, place: LoopPlace) -> list[str]:
     v = case.actual
     if v is None or v.problem:
         return []
-    inputs = ", ".join(join(*to) for to in place.to)
+    inputs, notes = ", ".join(join(*to) for to in place.to), list[str]()
     if place.to:
         others = ", ".join(join(*to) for to in place.own)
-        return [TEXTS.line("at_inputs", wire=place.wire, inputs=inputs, own=others, whole=_margins_of(v, place.wire))]
-    try:
-        parallel = [f for f in v.loop(place.wire).findings if isinstance(f, ParallelWays)]
-    except LoopwrightError:
-        return []
-    return [
-        TEXTS.line("parallel", wire=f.wire, inputs=[(to, _margins_of(v, place.wire, to)) for to in f.to])
-        for f in parallel
-    ]
+        whole = _margins_of(v, place.wire)
+        notes.append(TEXTS.line("at_inputs", wire=place.wire, inputs=inputs, own=others, whole=whole))
+    if place.others:
+        cuts = [(" and ".join(to), _margins_of(v, wire, to)) for wire, to in place.others]
+        notes.append(TEXTS.line("parallel", wire=place.wire, at=inputs, inputs=cuts))
+    return notes
 
 
-def _margins_of(v: Variant, wire: str, to: str = "") -> str:
+def _margins_of(v: Variant, wire: str, inputs: Iterable[str] = ()) -> str:
     """Return the phase margin and M_s of a loop in words."""
     try:
-        m = margins(v.model.loop(wire, to=to or ()))
+        m = margins(v.loop_ahead(wire, inputs))
     except LoopwrightError:
         return TEXTS.line("no_numbers")
     if not m.stable:
@@ -321,7 +316,7 @@ def left_out(case: Case, wire: str, on_cycles: Collection[str]) -> list[str]:
     for v in case.usable():
         try:
             L = v.loop(wire)
-            if _is_zero(L):
+            if is_zero(L):
                 said |= dict.fromkeys([_zero(v, wire, on_cycles)])
             else:
                 margins(L)
@@ -340,11 +335,6 @@ def _no_margins(wire: str, v: Variant, error: LoopwrightError) -> str:
     if isinstance(error, BetweenTicksError):
         return TEXTS.line("between_ticks", wire=wire, variant=v.title, why=why)
     return TEXTS.line("not_shown", wire=wire, variant=v.title, why=why, step=error.next_step)
-
-
-def _is_zero(L: Any) -> bool:
-    points = np.exp(1j * np.geomspace(1e-3, 3.0, 9)) if L.dt else 1j * np.geomspace(1e-3, 1e3, 9)
-    return all(bool(np.max(np.abs(_model_response(L, p)), initial=0.0) <= NOTHING) for p in points)
 
 
 def _zero(v: Variant, wire: str, on_cycles: Collection[str]) -> str:

@@ -200,6 +200,11 @@ class ReportedWorstCase:
             return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.NO_VALUE)
         if verdict is Verdict.PASSED and any(one.state is CaseState.MOVING for one in found.cases):
             return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.MOVING)
+        if case is found.worst and loop == case.loop:
+            there = {at: numbers.get(quantity) for at, numbers in found.elsewhere.items()}
+            if any(n is None or judge(n, limit)[0] is not verdict for n in there.values()):
+                said = [f"{n.value:.4g} at {at}" for at, n in {"this cut": number, **there}.items() if n is not None]
+                return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.SEVERAL_CUTS, detail=", ".join(said))
         if case is found.worst and self.run is not None and not self.run.agrees:
             return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.REFUTED)
         return result
