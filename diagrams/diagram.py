@@ -956,9 +956,10 @@ class Diagram(ShownAsTable):
         """Write the diagram as an SSP (System Structure and Parameterization), and return the file.
 
         FMUs are components, subsystems with FMUs in them systems; gains, sums with constants and conversions of units
-        between them become the connections' transformations. Constants are inputs of the root system, named wires its
+        between them become the connections' transformations. Subsystems without FMUs, such as controllers, are built
+        as FMUs, and other blocks as one more, ``blocks``. Constants are inputs of the root system, named wires its
         outputs, start values parameter sets. It is SSP 1.0; 2.0 where an FMU has arrays or integers of more than 32
-        bits. See docs/howto/ssp.md.
+        bits. See docs/howto/ssp.md, also for the order in which other tools step a controller and its plant.
 
         Parameters
         ----------
@@ -976,6 +977,8 @@ class Diagram(ShownAsTable):
         ------
         SspFileError
             A block that has no place in an SSP: the message names it.
+        DefinitionError
+            A block that can't be exported.
         OptionError
             A path that does not end in ``.ssp``, or a folder that isn't there; a time that is not positive.
         """

@@ -90,10 +90,10 @@ class Dataflow:
                 "value comes to one that takes it. Correct a kind, or leave the connection out.",
                 block=".".join(names) or None,
             )
-        known = self.hops.setdefault(hop.end, hop)
-        if known is not hop:
-            if known.start == hop.start and known.connection == connection:
-                return
+        known = self.hops.get(hop.end)
+        if known is None:
+            self.hops[hop.end] = hop
+        elif (known.start, known.connection) != (hop.start, hop.connection):
             raise DoubleDriveError(
                 f"found two connections that drive it, {known.connection} and {connection}; expected one. Leave one "
                 "out.",

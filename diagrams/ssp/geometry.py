@@ -21,8 +21,10 @@ def lay_out(system: WrittenElement) -> None:
             [n for n, c in element.connectors.items() if (c.kind == "input") == side] for side in (True, False)
         )
         height = max(_LEAST, _ROW * (max(len(ins), len(outs)) + 1))
-        rows = [{Pin(n): height * (i + 1) / (len(names) + 1) for i, n in enumerate(names)} for names in (ins, outs)]
-        nodes.append(Node(element.name, _WIDTH, height, *rows))
+        left, right = (
+            {Pin(n): height * (i + 1) / (len(names) + 1) for i, n in enumerate(names)} for names in (ins, outs)
+        )
+        nodes.append(Node(element.name, _WIDTH, height, left, right))
         _place_connectors(element)
     nets: dict[tuple[str, str], Net] = {}
     for connection in system.connections:

@@ -88,7 +88,11 @@ class Terms:
     def _of_port(self, path: str, port: str, i: int | None) -> Term:
         if path in self.sources:
             return Term((path, port, i))
-        block = self.wired.scheduled.blocks[path]
+        table = self.wired.scheduled
+        block, subsystem = table.blocks[path], table.subsystem_of[path]
+        acts_at_ticks = table.is_sampled(subsystem) or bool(table.gates(subsystem))
+        if acts_at_ticks and not isinstance(block, Constant):
+            return Term(stopped=path)
         found = self._passed(path, block, port, i)
         if found is None or found.stopped:
             return found or Term(stopped=path)
@@ -99,7 +103,7 @@ class Terms:
         wire = self.wired.scheduled.wires.get((path, name))
         if wire is None:
             default = self.wired.scheduled.blocks[path].inputs[name].default
-            return Term(offset=float(np.ravel(default)[0]), factor=0.0)
+            return Term(offset=float(np.ravel(np.asarray(default, dtype=float))[0]), factor=0.0)
         return self.entry(wire, i if self.shape(wire) else None)
 
     def _passed(self, path: str, block: Block, port: str, i: int | None) -> Term | None:

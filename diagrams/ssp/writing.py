@@ -13,7 +13,7 @@ import numpy as np
 
 from ...blocks.core import Constant, OptionError, SspFileError, check_file, replace_file, same_unit
 from ...fmus import Fmu
-from ...fmus.archive import FmuDescription, FmuVariable
+from ...fmus.archive import FmuDescription, FmuVariable, read_description
 from ..flat import WiredDiagram
 from ..wiring import Wire
 from .documents import (
@@ -26,6 +26,7 @@ from .documents import (
     write_dictionary,
     write_values,
 )
+from .exports import Export, build_export, find_export, split_diagram
 from .geometry import lay_out
 from .package import DEFAULT
 from .terms import Term, Terms
@@ -34,7 +35,8 @@ _TIME = (2020, 1, 1, 0, 0, 0)
 """Time of all files in an archive, so that the same diagram gives the same bytes."""
 SET = "parameters"
 """Name of all parameter sets: tools that let a user choose one by its name apply those of all components."""
-_KINDS = {"input": "input", "output": "output", "parameter": "parameter"}
+_IMPLEMENTATIONS = {"co_simulation": "CoSimulation", "model_exchange": "ModelExchange"}
+_SIGNALS = ("input", "output")
 
 
 @dataclass
@@ -42,10 +44,11 @@ class Part:
     """Component that is written."""
 
     path: str
-    """Path of its block in the diagram."""
+    """Path of its block, or of the subsystem that becomes it, in the diagram."""
     system: str
     """Path of the system that it is in; empty for the root system."""
-    block: Fmu
+    wires: dict[str, Wire]
+    """Where its inputs come from, by their ports."""
     element: WrittenElement
     description: FmuDescription
     values: list[WrittenValue] = field(default_factory=list)
@@ -66,6 +69,7 @@ class Writer:
         self.systems: dict[str, WrittenElement] = {"": self.root}
         self.parts: dict[str, Part] = {}
         self.inputs: dict[str, WrittenValue] = {}
+        self.exports: dict[str, Export] = {}
         self.files: dict[str, Path] = {}
         self._digests: dict[str, str] = {}
         self._borders: dict[tuple[str, str, str, int | None], str] = {}
@@ -76,24 +80,23 @@ class Writer:
         Raises
         ------
         SspFileError
-            For a block that is no FMU, and no transformation between FMUs.
+            For a diagram without FMUs, and a block that has no place in an SSP.
         """
+        fmus = {path: block for path, block in self.table.blocks.items() if isinstance(block, Fmu)}
         for path, block in sorted(self.table.blocks.items()):
-            if isinstance(block, Fmu):
-                self._add_part(path, block)
-            elif block.stepped:
+            if block.stepped and path not in fmus:
                 raise SspFileError(
                     f"found {block.drawn_as}, which a run steps from outside and which is no FMU; expected FMUs. "
                     "Replace it by an FMU.",
                     block=path,
                 )
-        if not self.parts:
+        if not fmus:
             raise SspFileError(
-                "found no FMU in it; expected one at least, as an SSP is a system of FMUs. Build one of a block: "
-                "loopwright.build(…).",
+                "found no FMU in it; expected one at least, as an SSP is a system of FMUs. Build one of the whole: "
+                "loopwright.build(diagram).",
                 block=self.wired.name,
             )
-        constants = (
+        inputs = (
             set()
             if self.flat
             else {
@@ -102,31 +105,19 @@ class Writer:
                 if isinstance(block, Constant) and block.name and not self.table.subsystem_of[path]
             }
         )
-        self.terms = Terms(self.wired, {*self.parts, *constants})
+        self.wired, exported = split_diagram(self.wired, {*fmus}, inputs)
+        self.table = self.wired.scheduled
+        for path in exported:
+            self._add_export(path)
+        for path, block in sorted(fmus.items()):
+            self._add_fmu(path, block)
+        inside = {p for p in self.table.blocks if any(p.startswith(f"{path}.") for path in exported)}
+        self.terms = Terms(self.wired, {*fmus, *inputs, *inside})
         for part in self.parts.values():
-            for port in part.block.inputs:
-                wire = self.table.wires.get((part.path, port))
-                if wire is not None:
-                    self._wire_port(part, port, wire)
+            for port, wire in part.wires.items():
+                self._wire_port(part, port, wire)
         if not self.flat:
             self._name_outputs()
-        self._refuse_the_rest(constants)
-
-    def _refuse_the_rest(self, constants: set[str]) -> None:
-        """Refuse blocks that have no place in it."""
-        known = {*self.parts, *self.terms.through, *constants}
-        known |= {path for path, block in self.table.blocks.items() if isinstance(block, Constant)}
-        for path in sorted(self.table.blocks):
-            if path not in known:
-                raise self._no_place(path)
-
-    def _no_place(self, path: str) -> SspFileError:
-        block = self.table.blocks[path]
-        return SspFileError(
-            f"found {block.drawn_as}, which is neither an FMU nor a linear transformation of one signal; expected "
-            "these. Export it as an FMU, and put that in its place.",
-            block=path,
-        )
 
     # --- components --------------------------------------------------------------------------------------------------
 
@@ -146,29 +137,42 @@ class Writer:
             self.systems[path] = outer.elements[made.name] = made
         return self.systems[path]
 
-    def _add_part(self, path: str, block: Fmu) -> None:
-        system, name = self.table.subsystem_of[path], path.rpartition(".")[2]
+    def _add_export(self, path: str) -> None:
+        """Add the component of a subsystem that becomes an FMU."""
+        export = self.exports[path] = find_export(self.wired, path)
+        about = read_description(build_export(self.wired, path))
+        part = self._add_part(path, about, export.inputs)
+        for port in {*export.inputs, *(name for name, _ in export.outputs.values())}:
+            part.scalars[port] = _scalars(about, port)
+        for port, _ in export.outputs.values():
+            for scalar in part.scalars[port]:
+                self._connector(part, scalar)
+
+    def _add_fmu(self, path: str, block: Fmu) -> None:
+        """Add the component of an FMU."""
+        about = block.description
+        wires = {port: self.table.wires[path, port] for port in block.inputs if (path, port) in self.table.wires}
+        part = self._add_part(path, about, wires)
+        part.element.implementation = _IMPLEMENTATIONS.get(block.interface or "", "")
+        for port, variable in {**block.input_variables, **block.output_variables}.items():
+            part.scalars[port] = _scalars(about, variable.name)
+        for name, value in block.start.items():
+            scalars = _scalars(about, name)
+            numbers = np.ravel(value) if scalars != [name] else [value]
+            for scalar, number in zip(scalars, numbers, strict=True):
+                self._set_value(part, scalar, number)
+        for port in block.output_variables:
+            for scalar in part.scalars[port]:
+                self._connector(part, scalar)
+
+    def _add_part(self, path: str, about: FmuDescription, wires: dict[str, Wire]) -> Part:
+        system, _, name = path.rpartition(".")
         if self.flat:
             system, name = "", path.replace(".", "_")
-        about = block.description
-        implementation = {"co_simulation": "CoSimulation", "model_exchange": "ModelExchange"}.get(block.interface or "")
-        element = WrittenElement(name, self._add_file(Path(about.file), about.digest), implementation or "")
+        element = WrittenElement(name, self._add_file(Path(about.file), about.digest))
         self._system(system).elements[name] = element
-        part = self.parts[path] = Part(path, system, block, element, about)
-        arrays: dict[str, list[tuple[tuple[int, ...], str]]] = {}
-        for scalar, (array, index) in about.elements.items():
-            arrays.setdefault(array, []).append((index, scalar))
-        for port, variable in {**block.input_variables, **block.output_variables}.items():
-            gathered = variable.name in arrays and variable.shape
-            part.scalars[port] = [s for _, s in sorted(arrays[variable.name])] if gathered else [variable.name]
-        for variable_name, value in block.start.items():
-            members = [s for _, s in sorted(arrays.get(variable_name, []))]
-            numbers = np.ravel(value) if members else [value]
-            for scalar, number in zip(members or [variable_name], numbers, strict=True):
-                self._set_value(part, scalar, number)
-        for port in block.outputs:
-            for scalar in part.scalars.get(port, ()):
-                self._connector(part, scalar)
+        self.parts[path] = Part(path, system, wires, element, about)
+        return self.parts[path]
 
     def _add_file(self, file: Path, digest: str) -> str:
         """Return the place of an FMU in the archive; FMUs of one content share it."""
@@ -207,9 +211,6 @@ class Writer:
     def _wire_port(self, part: Part, port: str, wire: Wire) -> None:
         """Write the connections of an input, one for each of its variables; numbers become start values."""
         terms, scalars = self.terms.entries(wire), part.scalars[port]
-        for term in terms:
-            if term.stopped:
-                raise self._no_place(term.stopped)
         if len(scalars) < len(terms):  # an array of FMI 3.0
             terms = [self._whole(part, port, terms)]
         for name, term in zip(scalars, terms, strict=True):
@@ -227,7 +228,7 @@ class Writer:
             term == replace(first, source=(first.source[0], first.source[1], i)) for i, term in enumerate(terms)
         ):
             block, out, _ = first.source
-            if self.terms.shape(Wire(block, out)) == part.block.inputs[port].shape:
+            if self.terms.shape(Wire(block, out)) == self.terms.shape(part.wires[port]):
                 return replace(first, source=(block, out, None))
         raise SspFileError(
             "found an array of FMI 3.0 whose entries come from several signals; expected one array, as a connection of "
@@ -239,6 +240,10 @@ class Writer:
     def _start(self, source: tuple[str, str, int | None]) -> tuple[str, str, WrittenConnector]:
         """Return the system where a source is, the name of its element, and its connector."""
         path, port, i = source
+        outer = next((e for e in self.exports if path.startswith(f"{e}.")), None)
+        if outer is not None:
+            port, i = self.exports[outer].find(source)
+            path = outer
         if path in self.parts:
             part = self.parts[path]
             scalars = part.scalars[port]
@@ -289,7 +294,7 @@ class Writer:
         """Add a connector to a system, by the name that the diagram's subsystem has for this signal."""
         path, port, i = source
         wires = self.table.results if kind == "output" else self.table.arguments
-        label = f"{path.rpartition('.')[2]}_{port}" if path in self.parts else path
+        label = path if path in self.root.connectors else f"{path.rpartition('.')[2]}_{port}"
         for (at, known), wire in wires.items():
             if at == system and (wire.block, wire.port, wire.index) == (path, port, None):
                 label = known
@@ -304,12 +309,12 @@ class Writer:
 
     def _name_outputs(self) -> None:
         """Write the named wires as outputs of their systems, where they come from FMUs."""
-        for full, wire in sorted(self.wired.names.items()):
+        for full, wire in sorted(self.table.names.items()):
             system, _, name = full.rpartition(".")
             if system not in self.systems:
                 continue
             terms = self.terms.entries(wire)
-            if any(term.source is None or term.source[0] not in self.parts for term in terms):
+            if not all(self._is_readable(term) for term in terms):
                 continue
             unit = self.wired.checked.units.get((wire.block, wire.port))
             for i, term in enumerate(terms):
@@ -322,6 +327,13 @@ class Writer:
                 made = WrittenConnector(label, "output", type_ if type_ != "Enumeration" else "Int32", of)
                 self.systems[system].connectors[label] = made
                 self._connect(term, system, ("", label), made)
+
+    def _is_readable(self, term: Term) -> bool:
+        """Whether a term comes from an output of a component: an inner signal of an exported subsystem may not."""
+        if term.source is None or term.source[0] in self.root.connectors:
+            return False
+        outer = next((e for e in self.exports.values() if term.source[0].startswith(f"{e.path}.")), None)
+        return outer is None or term.source in outer.outputs
 
     # --- files -------------------------------------------------------------------------------------------------------
 
@@ -338,7 +350,7 @@ class Writer:
         if self.inputs:
             self.root.binding = _free("resources/inputs", ".ssv", taken)
             yield self.root.binding, write_values(version, SET, [*self.inputs.values()])
-        signals = [c for c in self.root.connectors.values() if c.kind in _KINDS]
+        signals = [c for c in self.root.connectors.values() if c.kind in _SIGNALS]
         if signals:
             self.root.dictionary = _free("resources/signals", ".ssb", taken)
             yield self.root.dictionary, write_dictionary(version, signals)
@@ -379,6 +391,12 @@ def write_ssp(
             item.external_attr = 0o644 << 16
             archive.writestr(item, content if isinstance(content, bytes) else content.read_bytes())
     return file
+
+
+def _scalars(about: FmuDescription, name: str) -> list[str]:
+    """Return the scalars that were gathered into a variable, in the order of its entries; else the variable itself."""
+    found = sorted((index, scalar) for scalar, (array, index) in about.elements.items() if array == name)
+    return [scalar for _, scalar in found] or [name]
 
 
 def _walk(element: WrittenElement) -> Iterator[WrittenElement]:

@@ -260,6 +260,35 @@ def test_entries_of_arrays_are_wired_one_by_one_or_as_a_whole(write):
     assert found["c.d"][-1].tolist() == [2.0 * H * (N - 1), 14.0]  # its input is held over the last step
 
 
+def test_entries_of_an_array_in_another_order_are_no_whole(write):
+    names = [f"{kind} {name}[{i}]" for kind, name in (("input", "s"), ("output", "d")) for i in (1, 2)]
+    root = system(
+        "root",
+        component("a", *names, bindings=inline("s[1]=Real 3;s[2]=Real 5")),
+        component("b", *names),
+        connections=(connection("a.d[1]", "b.s[2]"), connection("a.d[2]", "b.s[1]")),
+    )
+    assert run(write(root))["b.d"][-1].tolist() == [20.0, 12.0]
+
+
+def test_start_values_go_through_transformations_forwards_and_backwards(write):
+    """A parameter of the system: 4 · 3 + 0.5. An input without a value: the start value 3 of what 2 u + 1 drives."""
+    root = system(
+        "root",
+        component("a", "input u", "parameter b", "output y", bindings=inline("u=Real 3")),
+        given=("input u", "parameter rate"),
+        connections=(
+            connection("rate", "a.b", LINEAR.format(4, 0.5)),
+            connection("u", "a.u", LINEAR.format(2, 1)),
+        ),
+        bindings=inline("rate=Real 3"),
+    )
+    diagram = Diagram.from_ssp(write(root))
+    assert diagram["a"].start["b"] == 12.5
+    assert diagram["u"].value == 1.0
+    assert diagram.simulate(H, step=H, progress=False)["a.y"][-1] == H * (3.0 + 12.5)
+
+
 def test_whole_numbers_pass_through_a_table(write):
     """An integer of 100 becomes 3, then an item of an enumeration by its number; numbers without an entry stay."""
     table = (

@@ -8,8 +8,16 @@ from fmpy.ssp.simulation import simulate_ssp
 from fmpy.ssp.ssd import ParameterSet, read_ssd, read_ssv, validate_tree
 from lxml import etree
 
-from loopwright import Diagram, Fmu, subsystem
-from loopwright.blocks import Constant, Gain, Integrator, Sine, Stack, UnitConversion
+from loopwright import Coupling, Diagram, Fmu, LoopwrightError, subsystem
+from loopwright.blocks import (
+    Constant,
+    DiscreteIntegrator,
+    Gain,
+    Product,
+    PythonFunction,
+    Stack,
+    UnitConversion,
+)
 from loopwright.diagrams import OptionError, SspFileError, read_ssp
 from support.ecos import load_ecospy
 from support.ssp_files import adder
@@ -161,10 +169,88 @@ def test_arrays_of_fmi_3_make_it_ssp_2(tmp_path, cache):
     assert_same(one, two, "a.position", "b.velocity")
 
 
-@pytest.mark.parametrize("block", [Sine(frequency=1.0, name="wave"), Integrator(name="wave")(1.0)])
-def test_a_block_that_has_no_place_is_named(fmu, tmp_path, cache, block):
-    diagram = Diagram("d", Fmu(fmu, name="a", start=OTHERS)(u=block))
-    with pytest.raises(SspFileError, match=r"^wave: found (Sine|Integrator), .* expected"):
+@subsystem(sample_time=H)
+def controller(reference, y, d):
+    """A PI controller of the sum of two outputs, with two outputs of its own, one of them a vector."""
+    error = (reference - 0.5 * y).named("error")
+    total = DiscreteIntegrator(name="total")(error)
+    return (2.0 * error + 0.7 * total).named("command"), np.stack([error, 0.1 * d[1]]).named("both")
+
+
+def controlled(fmu, **options):
+    plant = Fmu(fmu, name="plant", start={**OTHERS, "b": 0.25})
+    reference = Constant(value=0.7, name="reference")
+    command, both = controller.replace(**options)(reference, plant.y, plant.d)
+    return Diagram("servo", plant(u=command, s=both), both.named("both"))
+
+
+@pytest.mark.slow
+def test_a_sampled_controller_becomes_an_fmu_that_is_stepped_before_its_plant(fmu, tmp_path, cache):
+    """The tick acts at the start of a step: a master that hands the new command on has the same bits as the diagram.
+
+    One that steps all at once has the command a step later: it is the diagram with one sample of delay, as the plant's
+    input is 0 over the first step in both.
+    """
+    diagram = controlled(fmu)
+    file = diagram.to_ssp(tmp_path / "servo.ssp")
+    check_schemas(file)
+    assert dict(read_ssp(file).components) == {
+        "controller": "resources/controller.fmu",
+        "plant": f"resources/{fmu.name}",
+    }
+    again = Diagram.from_ssp(file)
+    in_order = Coupling(scheme="gauss_seidel", order=("controller", "plant"))
+    ours = diagram.simulate(H * N, progress=False)
+    assert_same(ours, run(again, coupling=in_order), "plant.y", "plant.d", "plant.sum")
+    late = run(again)["plant.y"]
+    assert np.abs(late - ours["plant.y"]).max() > 0.01
+    shifted = controlled(fmu, delay=1).simulate(H * N, progress=False)
+    np.testing.assert_allclose(late, shifted["plant.y"], rtol=1e-13)
+
+
+@pytest.mark.slow
+def test_a_sampled_gain_is_no_transformation(fmu, tmp_path, cache):
+    """It holds its output for two steps of the plant, so it becomes an FMU; y grows by h (k u + b) with u held."""
+    sampled = subsystem(lambda level: Gain(gain=-0.5, name="p")(level), sample_time=2 * H, name="controller")
+    plant = Fmu(fmu, name="plant", start={**OTHERS, "b": 1.0})
+    diagram = Diagram("d", plant(u=sampled(plant.y)))
+    file = diagram.to_ssp(tmp_path / "d.ssp")
+    assert sorted(read_ssp(file).components) == ["controller", "plant"]
+    in_order = Coupling(scheme="gauss_seidel", order=("controller", "plant"))
+    found = run(Diagram.from_ssp(file), coupling=in_order)
+    y = np.zeros(N + 1)
+    for i in range(N):
+        u = -0.5 * y[i - i % 2]
+        y[i + 1] = y[i] + H * (u + 1.0)
+    np.testing.assert_array_equal(found["plant.y"], y)
+
+
+@pytest.mark.slow
+def test_blocks_between_fmus_become_one_component(fmu, tmp_path, cache):
+    """A product of two FMUs' outputs is no transformation of one; it is stepped with them and takes one step more."""
+    clock = subsystem(lambda: Constant(value=1.0)(), sample_time=H, name="clock")
+    a, b = (Fmu(fmu, name=name, start={**OTHERS, "k": k}) for name, k in (("a", 0.5), ("b", 0.2)))
+    mixed = Product(name="mixed")(a.y, b.y)
+    diagram = Diagram("two", a(u=Gain(gain=-0.5)(mixed)), b(u=clock()), mixed.named("mixed"))
+    file = diagram.to_ssp(tmp_path / "two.ssp")
+    check_schemas(file)
+    assert sorted(read_ssp(file).components) == ["a", "b", "blocks"]  # a constant of a clock is a value
+    found = run(Diagram.from_ssp(file))
+    y = np.zeros((N + 1, 2))
+    for i in range(N):  # the product is one step old: the blocks have stepped with the values of the step before
+        mixed = y[max(i - 1, 0)].prod() if i else 0.0
+        y[i + 1] = y[i] + H * (np.array([0.5 * -0.5 * mixed, 0.2]) + 1.0)
+    np.testing.assert_allclose(found["b.y"], y[:, 1], rtol=1e-13)
+    np.testing.assert_allclose(found["a.y"], y[:, 0], rtol=1e-13)
+
+
+def test_a_part_that_cant_be_exported_is_named(fmu, tmp_path, cache):
+    """A Python function has no C."""
+    own = PythonFunction(lambda u: 2.0 * u, name="own")
+    stepped = subsystem(lambda y: own(y), sample_time=H, name="python")
+    plant = Fmu(fmu, name="a", start=OTHERS)
+    diagram = Diagram("d", plant(u=stepped(plant.y)))
+    with pytest.raises(LoopwrightError, match="own"):
         diagram.to_ssp(tmp_path / "x.ssp")
     assert not (tmp_path / "x.ssp").exists()
 
