@@ -211,7 +211,7 @@ PUBLIC = {
     """,
     "loopwright.fmus": """
         ArchiveLimits CompilerError DefinitionError DiskError Fmu FmuError FmuFileError FmuProcessError FmuRuntimeError
-        Isolation ModelSpec ParameterError StepOptions StepTime UnitError UnknownNameError Variable bouncing_ball build
+        Isolation ModelSpec OptionError ParameterError StepOptions StepTime UnitError UnknownNameError Variable bouncing_ball build
         build_fmu build_python clear_cache dc_motor doctor gantry gantry_contact gantry_elastic gantry_stiction
         mass_spring_damper model_spec read_description scara tune
     """,
