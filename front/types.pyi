@@ -34,7 +34,7 @@ from .diagrams.measure import FrequencyResponse, StepResponse
 from .diagrams.paper import StabilityLimit, StabilityMap
 from .diagrams.report import Report
 from .diagrams.requirements import Review, Verdict
-from .diagrams.results import Occurrence, OperatingPoint, RunState, Snapshot, Stopped, TextSignal
+from .diagrams.results import Occurrence, OperatingPoint, RunState, Snapshot, StepInfo, Stopped, TextSignal
 from .diagrams.simulation import LiveRun, RunOptions, Simulation, SimulationView
 from .diagrams.ssp import SspDescription
 from .diagrams.studies import RunConfirmation, Sensitivities, Sensitivity, WorstCase
@@ -103,6 +103,7 @@ __all__ = [
     "SspDescription",
     "StabilityLimit",
     "StabilityMap",
+    "StepInfo",
     "StepResponse",
     "StepsOnly",
     "Stopped",

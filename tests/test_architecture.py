@@ -241,7 +241,7 @@ PUBLIC = {
         FreeMotions FrequencyResponse InexactDerivatives Kink Layout LinearDelays Linearization LiveRun MeanSlope Occurrence
         OperatingPoint Passivity PassivityReason PortPassivity RefutedDerivatives Report Review RunConfirmation
         RunOptions RunState Sensitivities Sensitivity Signal Simulation SimulationView Snapshot SspDescription StabilityLimit
-        StabilityMap StepResponse StepsOnly Stopped Subsystem SubsystemSettings TextSignal TrialMethod Unit Verdict Wire
+        StabilityMap StepInfo StepResponse StepsOnly Stopped Subsystem SubsystemSettings TextSignal TrialMethod Unit Verdict Wire
         WorstCase ZeroSlope
     """,
 }

@@ -14,7 +14,6 @@ from .quanta import (
     find_rest,
     remaining_oscillation,
 )
-from .step_measures import ExpectedStep, Measured, is_at_rest, measure_step
 from .step_response import DivergenceError, StepResponse, step_response
 
 __all__ = [
@@ -22,9 +21,7 @@ __all__ = [
     "LEAST_SINE",
     "Converter",
     "DivergenceError",
-    "ExpectedStep",
     "FrequencyResponse",
-    "Measured",
     "Quantum",
     "StepResponse",
     "columns_of",
@@ -34,8 +31,6 @@ __all__ = [
     "find_quantum",
     "find_rest",
     "frequency_response",
-    "is_at_rest",
-    "measure_step",
     "remaining_oscillation",
     "step_response",
 ]

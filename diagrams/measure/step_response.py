@@ -31,11 +31,11 @@ from ..linearization import (
     ticks_between_renewals,
     ticks_to_renewal,
 )
+from ..results import ExpectedStep
 from ..wiring import stepped_blocks
 from .beginning import can_start_at, with_ticks
 from .between_samples import BETWEEN, SMOOTH, Instants, WithinSamples, can_step_finer, choose_instants
 from .injection import InjectionRun, inject_signal
-from .step_measures import ExpectedStep
 
 SAMPLES = 1000
 """Samples of the response of a diagram that is not sampled."""

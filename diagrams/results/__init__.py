@@ -7,12 +7,16 @@ from .recording import Recording
 from .run import Run, Snapshot
 from .saved_state import RunState, check_fits, layout_of, not_open_error
 from .signal_names import BlockOutputs, Places, entries, outputs_of, resolve
+from .step_info import StepInfo
+from .step_measures import ExpectedStep, Measured, is_at_rest, measure_step
 from .stored import Occurrence, Stopped
 from .texts import TextSignal
 
 __all__ = [
     "BlockOutputs",
+    "ExpectedStep",
     "FreeDirection",
+    "Measured",
     "Occurrence",
     "OperatingPoint",
     "Places",
@@ -22,12 +26,15 @@ __all__ = [
     "Run",
     "RunState",
     "Snapshot",
+    "StepInfo",
     "Stopped",
     "TextSignal",
     "check_fits",
     "entries",
+    "is_at_rest",
     "layout_of",
     "machine_memory",
+    "measure_step",
     "not_open_error",
     "outputs_of",
     "resolve",

@@ -17,6 +17,7 @@ from ...blocks.core import (
     Sheet,
     ShownAsTable,
     UnknownNameError,
+    accepts,
     brief,
     check_argument,
     count_of,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
     from .plots import DrawnSignal
     from .saved_state import RunState
+    from .step_info import StepInfo
 
 
 _TIMES = kinds.row.where(lambda value: len(value) == 2 and value[0] < value[1]).worded(
@@ -52,7 +54,9 @@ WAYS = {
     **dict.fromkeys(("time", "times", "ts"), "run.t"),
     **dict.fromkeys(("get", "read", "value", "values", "signal"), 'run["wire"]'),
     **dict.fromkeys(("to_dataframe", "to_df", "dataframe", "df"), "run.to_pandas()"),
-    **dict.fromkeys(("step_info", "stepinfo"), 'diagram.report("loop.html"), which has overshoot and settling time'),
+    **dict.fromkeys(
+        ("stepinfo", "overshoot", "rise_time", "settling_time", "peak"), 'run.step_info("wire"), which has them'
+    ),
     **dict.fromkeys(("signals", "keys", "channels", "logs"), "run.names, which has all signals"),
 }
 """What to write for names that users of other tools look for in a run."""
@@ -452,6 +456,67 @@ class Run(ShownAsTable):
         panels = [[run.drawn(name, of) for of, run in runs.items() for name in group] for group in groups]
         return plot_signals(panels, self.events if len(runs) == 1 else (), axes, xlim)
 
+    @accepts(since=kinds.number, until=kinds.number, final=kinds.number)
+    def step_info(
+        self, name: str, *, since: float | None = None, until: float | None = None, final: float | None = None
+    ) -> StepInfo:
+        """Return rise time, settling time, overshoot and peak of a signal's response to a step.
+
+        The numbers are those of ``control.step_info``, measured as in a report: the settling time is that of a band of
+        2 % of the change, the rise time goes from 10 % to 90 %.
+
+        Parameters
+        ----------
+        name : str
+            The signal, or an entry of it, ``"q[1]"``.
+        since : float, optional
+            Time of the step in s. Without it that of the diagram's only `Step`, or the start of the run if there is
+            none.
+        until : float, optional
+            End of the response in s, such as the time of a load's step; the end of the run without it.
+        final : float, optional
+            Value that the signal should come to; without it the value at the end. A signal that rests elsewhere has
+            not settled.
+
+        Returns
+        -------
+        StepInfo
+            The numbers; ``print`` shows them as a table, and ``as_dict()`` has python-control's names.
+
+        Raises
+        ------
+        UnknownNameError
+            For a name that was not recorded.
+        OptionError
+            For a signal of several numbers, several steps without ``since``, and a response without samples.
+
+        Examples
+        --------
+        >>> from loopwright import Diagram
+        >>> from loopwright.blocks import PT1, Step
+        >>> lag = PT1(time_constant=0.5)(Step(times=1.0, values=2.0)).named("y")
+        >>> info = Diagram("lag", lag).simulate(6.0, progress=False).step_info("y")
+        >>> round(info.rise_time, 3), round(info.settling_time, 3), info.overshoot
+        (1.099, 1.956, 0.0)
+        """
+        from .signal_marks import is_held
+        from .step_info import find_step, measure_info
+
+        values = self[name]
+        if values.ndim != 1:
+            raise OptionError(
+                f"found a signal of {int(np.prod(values.shape[1:]))} numbers; expected one. Name an entry of it: "
+                f'run.step_info("{name}[1]").',
+                block=self.diagram_name,
+                port=str(name),
+            )
+        last = len(self.t) if until is None else int(np.searchsorted(self.t, until, side="right"))
+        t = self.t[:last]
+        start, end = (float(t[0]), float(t[-1])) if last else (0.0, 0.0)
+        since = find_step(self.diagram, end, start, self.diagram_name) if since is None else float(since)
+        held = is_held(self.diagram, self._port_of(name))
+        return measure_info(name, self._units(name)[0], t, values[:last], since, held=held, final=final)
+
     def plot_path(
         self,
         x: str,
@@ -509,10 +574,7 @@ class Run(ShownAsTable):
         from .plots import DrawnSignal
         from .signal_marks import is_held, is_set_point, limits_of
 
-        full, _ = split_entry(self._resolve(name), {*self.wires, *self.layout.slices})
-        wire = self.wires.get(full)
-        port = (wire.block, wire.port) if wire is not None else (full.rpartition(".")[0], full.rpartition(".")[2])
-        own = self.diagram
+        port, own = self._port_of(name), self.diagram
         return DrawnSignal(
             name,
             self.t,
@@ -523,6 +585,12 @@ class Run(ShownAsTable):
             is_held=is_held(own, port),
             limits=limits_of(own, port),
         )
+
+    def _port_of(self, name: str) -> tuple[str, str]:
+        """Return the block and the port that a signal is of."""
+        full, _ = split_entry(self._resolve(name), {*self.wires, *self.layout.slices})
+        wire = self.wires.get(full)
+        return (wire.block, wire.port) if wire is not None else (full.rpartition(".")[0], full.rpartition(".")[2])
 
     def _runs_to_draw(self, against: Run | Mapping[str, Run] | None, label: str) -> dict[str, Run]:
         """Return this run and others by their labels; "" alone where there are no others."""

@@ -24,13 +24,11 @@ from ...measure import (
     find_converters,
     find_least_step,
     find_rest,
-    is_at_rest,
-    measure_step,
     remaining_oscillation,
     step_response,
 )
 from ...requirements import STEP_UNITS, StepLimits
-from ...results import OperatingPoint
+from ...results import OperatingPoint, is_at_rest, measure_step
 from .. import figures
 from ..case import Case
 from ..pages import Plot, Section, Table, Texts

@@ -6,8 +6,9 @@ from scipy.linalg import expm
 
 from loopwright.blocks import PID, Constant, Gain, StateSpace, Step, Sum, TransferFunction
 from loopwright.diagrams import Diagram, Requirements, subsystem
-from loopwright.diagrams.measure import measure_step, step_response
+from loopwright.diagrams.measure import step_response
 from loopwright.diagrams.requirements import explain
+from loopwright.diagrams.results import measure_step
 from loopwright.fmus import Fmu, StepOptions, mass_spring_damper
 from loopwright.types import Verdict
 

@@ -18,7 +18,8 @@ from loopwright.blocks import (
     TransferFunction,
 )
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.measure import injection, measure_step, step_response
+from loopwright.diagrams.measure import injection, step_response
+from loopwright.diagrams.results import measure_step
 from support.tuned_loops import make_slide, slide_slope
 
 

@@ -69,7 +69,7 @@ def measure_step(
     Parameters
     ----------
     t : (N,) array
-        Time since the step in s, equally spaced.
+        Time since the step in s, ascending; two samples of one time are those before and after a jump.
     r : (N,) array
         Change of the signal.
     held : bool
@@ -100,7 +100,7 @@ def measure_step(
     >>> [round(found[name].value, 2) for name in ("final", "overshoot", "settling", "rise")]
     [1.0, 0.0, 3.91, 2.2]
     """
-    dt = float(t[1] - t[0])
+    dt = float(np.max(np.diff(t)))
     size = float(np.max(np.abs(r)))
     known = expected is not None and math.isfinite(expected.final)
     if expected is not None and known:
@@ -114,7 +114,7 @@ def measure_step(
     final = float(np.mean(tail))
     spread = float(np.max(np.abs(tail - final))) + _remainder(t, arrived, slowest)
     unknown = expected is None or math.isnan(expected.between)
-    bend = _bend(r) if expected is None or unknown else expected.between + _bend(r - expected.response)
+    bend = _bend(t, r) if expected is None or unknown else expected.between + _bend(t, r - expected.response)
     bend = 0.0 if held else bend
     later = 0.0  # size after the record; of one that does not rest, the peak is that of the record
     if is_at_rest(t, r, expected, slowest):
@@ -162,9 +162,18 @@ def is_at_rest(
     return left <= (BAND * abs(expected.final) if abs(expected.final) > NOTHING * size else FLAT * size)
 
 
-def _bend(r: np.ndarray) -> float:
+def _bend(t: np.ndarray, r: np.ndarray) -> float:
     """Return twice the height of a parabola through three samples, which bounds sines of up to 1.7 rad a sample."""
-    return 0.0 if len(r) < 3 else float(np.max(np.abs(np.diff(r, 2)))) / 4
+    return float(np.max(_bends(t, r), initial=0.0))
+
+
+def _bends(t: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Return that height around each sample but the first and the last; 0 next to a jump, which is no bend."""
+    h = np.diff(t)
+    before, after = h[:-1], h[1:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turn = np.diff(np.diff(r) / h) / (before + after)  # half the second derivative
+    return np.where((before > 0.0) & (after > 0.0), np.abs(turn) * np.maximum(before, after) ** 2 / 2, 0.0)
 
 
 def _remainder(t: np.ndarray, r: np.ndarray, slowest: float | None) -> float:
@@ -194,7 +203,7 @@ def _slack(t: np.ndarray, y: np.ndarray, off: float, settling: float, *, held: b
     away, off = np.abs(y - 1.0), off * (1.0 + BAND + off)  # at the band's edge
     bends = np.zeros(len(y))
     if not held and len(y) > 2:
-        bends[1:-1] = np.abs(np.diff(y, 2)) / 4
+        bends[1:-1] = _bends(t, y)
         bends = np.maximum(np.maximum(bends, np.append(bends[1:], 0.0)), np.append(0.0, bends[:-1]))
     late, early = np.flatnonzero(away + bends > BAND - off), np.flatnonzero(away > BAND + off)
     ends = [float(t[min(int(some[-1]) + 1, len(t) - 1)]) if len(some) else 0.0 for some in (late, early)]
