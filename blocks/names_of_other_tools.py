@@ -243,3 +243,29 @@ UNITS = {
     **dict.fromkeys(("tesla",), "T"),
 }
 """Symbols of units that are written out, in lower case."""
+
+STEP = ("dt", "h", "Ts", "sample_time", "step_size", "stepsize", "fixed_step", "time_step", "communication_step")
+"""Other words for the step of a run."""
+_END = (
+    *("t_end", "t_final", "t_stop", "t_max", "tf", "T", "Tf", "t", "time", "tmax"),
+    *("stop_time", "final_time", "until", "tspan", "t_span", "end", "stop"),
+)
+DURATION = dict.fromkeys(_END, "the duration in s, the first argument: simulate(2.0)")
+"""What to write for other words for the length of a run."""
+RUN_OPTIONS = {
+    **DURATION,
+    **dict.fromkeys(STEP, "step=… (seconds)"),
+    **dict.fromkeys(("method", "integrator", "Solver"), 'solver="RK45" or another one'),
+    **dict.fromkeys(("reltol", "rel_tol", "tol", "tolerance", "tolerance_lte_rel"), "rtol=…"),
+    **dict.fromkeys(("abstol", "abs_tol", "tolerance_lte_abs"), "atol=…"),
+    **dict.fromkeys(("dt_max", "maxstep", "hmax"), "max_step=…"),
+    **dict.fromkeys(("output_interval", "decimation"), "every=…, which keeps each such sample"),
+    **dict.fromkeys(("input", "inputs"), "a block that is wired to the input, such as Step or Recorded"),
+    **dict.fromkeys(("x0", "initial_state"), "start=…, a state or an operating point"),
+    "start_values": "Fmu(…, start={…}) or diagram.replace(…)",
+    "output": "record=[…], the signals to keep",
+    "outputs": "record=[…], the signals to keep",
+}
+"""What an error offers for words that other tools have for options of a run."""
+POINT = dict.fromkeys(("point", "operating_point", "t", "time", "x0", "op"), "at=…, a time in s, run.at(t) or a point")
+"""What to write for other words for the operating point of an analysis."""

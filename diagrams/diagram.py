@@ -22,8 +22,10 @@ from ..blocks.core import (
     explain_calls,
     kinds,
     missing_member,
+    offer_elsewhere,
     without_collection,
 )
+from ..blocks.names_of_other_tools import DURATION
 from .coupling import Coupling, CouplingReport, report_coupling, to_coupling
 from .flat import FlatDiagram, WiredDiagram
 from .results import OperatingPoint, Run
@@ -50,6 +52,8 @@ WAYS = {
     **dict.fromkeys(("scope", "plot", "show"), 'run = diagram.simulate(2.0), then run.plot("wire")'),
     **dict.fromkeys(("margin", "margins"), f"margins({_LOOP}), after from loopwright import margins"),
     **dict.fromkeys(("bode", "nyquist", "root_locus", "pzmap", "nichols"), f"{_LOOP}, which such plots take"),
+    "step": f"{_LOOP}.step(), which closes the loop, or a Step as the reference and diagram.simulate(2.0)",
+    **dict.fromkeys(("step_info", "stepinfo"), 'diagram.simulate(2.0).step_info("wire")'),
     **dict.fromkeys(("loop", "poles", "linmod"), f"diagram.linearize(), and {_LOOP} for the loop at a wire"),
     **dict.fromkeys(("add", "connect", "add_block", "add_connection"), "a call, which wires: plant(force=u)"),
     "sensitivity": 'diagram.sensitivities(…), by parameters, or S: diagram.linearize().sensitivity("wire")',
@@ -325,6 +329,7 @@ class Diagram(ShownAsTable):
         """
         return self.wired.flatten(step)
 
+    @offer_elsewhere(**DURATION)
     def simulate(self, duration: float, *, progress: ProgressOption = None, **options: Unpack[RunKeywords]) -> Run:
         """Run the diagram and return what it recorded: from t = 0, or from a saved state.
 
@@ -592,7 +597,7 @@ class Diagram(ShownAsTable):
 
     def linearize(
         self,
-        point: Any = None,
+        at: Any = None,
         *,
         inputs: str | Iterable[str] = (),
         outputs: str | Iterable[str] = (),
@@ -611,7 +616,7 @@ class Diagram(ShownAsTable):
 
         Parameters
         ----------
-        point : OperatingPoint, Snapshot or float, optional
+        at : OperatingPoint, Snapshot or float, optional
             Where: ``run.at(t)``, a time in s, `operating_point`, `trim`; the start without it.
         inputs : str or list of str
             Wires or ports at which a signal is injected: added to what the consumers get; over a period it is held. At
@@ -654,7 +659,7 @@ class Diagram(ShownAsTable):
         from .linearization import linearize
 
         options = {"plants": plants, "stairs": stairs, "delays": delays, "order": order, **options}
-        return linearize(self.wired, point, inputs=inputs, outputs=outputs, openings=openings, **options)
+        return linearize(self.wired, at, inputs=inputs, outputs=outputs, openings=openings, **options)
 
     def linearize_batch(
         self, points: Iterable[Any] = (None,), variants: Iterable[Mapping[str, Any]] = ({},), **options: Any

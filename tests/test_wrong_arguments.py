@@ -116,6 +116,7 @@ RESULTS = {
     "State",
     "StepResponse",
     "StepsOnly",
+    "StepInfo",
     "Stopped",
     "Subsystem",
     "SubsystemSettings",

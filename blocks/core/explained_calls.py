@@ -38,7 +38,7 @@ class UnknownArgumentError(OptionError, UnknownNameError):
     def _describe(self) -> str:
         exact = [self.argument] if self.argument in self.elsewhere else []
         close = exact or close_names(self.argument, self.known | self.elsewhere.keys())
-        offered = " or ".join(self.elsewhere.get(name, repr(name)) for name in close)
+        offered = " or ".join(dict.fromkeys(self.elsewhere.get(name, repr(name)) for name in close))
         return f"{self.found} {self.argument!r}. " + (
             f"Did you mean {offered}?" if close else near(self.argument, self.known)
         )
@@ -142,9 +142,10 @@ def misuse(
             )
     for parameter in [*placed[len(args) :], *(p for p in named.values() if p.kind is p.KEYWORD_ONLY)]:
         if parameter.default is parameter.empty and parameter.name not in kwargs:
+            ways = getattr(function, _ELSEWHERE, {})
             for name in kwargs:
-                if name not in named and parameter.name in close_names(name, shown):
-                    return UnknownArgumentError(name, shown, block=who)
+                if name not in named and (name in ways or parameter.name in close_names(name, shown)):
+                    return UnknownArgumentError(name, shown, block=who, elsewhere=ways)
             return OptionError(
                 f"it is required and was not given: {call.format(parameter.name + '=…')}.",
                 block=who,

@@ -41,6 +41,7 @@ from .ssp import add_ssp, ssp_command
 from .subjects import is_user_file
 from .text import fit as _fit
 from .text import say as _say
+from .unknown_options import explain_unknown
 
 SIGNALS = (
     "eta",
@@ -72,7 +73,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     parser = _make_parser()
     try:
-        arguments = parser.parse_args(argv)
+        arguments, unknown = parser.parse_known_args(argv)
+        if unknown:
+            explain_unknown(_find_command(parser, arguments.command), unknown)
     except SystemExit as stop:
         return int(stop.code or 0)
     if arguments.command is None:
@@ -157,6 +160,13 @@ def _make_parser() -> argparse.ArgumentParser:
     add_commands(commands)
     add_ssp(commands)
     return parser
+
+
+def _find_command(parser: argparse.ArgumentParser, name: str | None) -> argparse.ArgumentParser:
+    """Return the parser of a command, or that of the command line without one."""
+    groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    found: argparse.ArgumentParser = groups[0].choices[name] if name is not None else parser
+    return found
 
 
 def _version() -> str:

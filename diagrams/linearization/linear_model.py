@@ -482,6 +482,7 @@ def _sorted_poles(A: np.ndarray) -> np.ndarray:
 def linearize(
     diagram: WiredDiagram,
     point: PointLike = None,
+    /,
     *,
     inputs: str | Iterable[str] = (),
     outputs: str | Iterable[str] = (),

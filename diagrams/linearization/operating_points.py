@@ -11,6 +11,7 @@ import numpy as np
 
 from ...blocks import Constant, Reference
 from ...blocks.core import Layout, OptionError, Source, UnknownArgumentError, accepts, kinds
+from ...blocks.names_of_other_tools import POINT
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, PointOrigin, Snapshot, layout_of, units_of
 from ..solvers import FIXED
@@ -108,7 +109,8 @@ def check_options(diagram: WiredDiagram, options: Mapping[str, Any], caller: str
     """
     for name in options:
         if name not in RUN_OPTIONS:
-            raise UnknownArgumentError(name, (*RUN_OPTIONS, *MORE.get(caller, ())), block=caller)
+            words = POINT if caller == "linearize" else {}
+            raise UnknownArgumentError(name, (*RUN_OPTIONS, *MORE.get(caller, ())), block=caller, elsewhere=words)
 
 
 def operating_point(

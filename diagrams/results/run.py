@@ -47,6 +47,8 @@ if TYPE_CHECKING:
 _TIMES = kinds.row.where(lambda value: len(value) == 2 and value[0] < value[1]).worded(
     "two times in s, the first one below the other", "Give them: xlim=(0, 5)."
 )
+_FEW = 6
+"""Named wires up to which a run's table has outputs of plants, too, and rows that it then has at most."""
 _MESSAGES, _SHOWN_MESSAGES = 3, 10
 """Messages that the short text and the table of a run show; the others are counted."""
 WAYS = {
@@ -167,7 +169,9 @@ class Run(ShownAsTable):
     if not TYPE_CHECKING:  # a type checker knows all members
 
         def __getattr__(self, name):
-            raise missing_member(self, name, "a run", WAYS)
+            built = vars(self).keys() >= {"layout", "wires", "diagram", "outputs", "columns", "_places"}
+            is_signal = built and not name.startswith("_") and name in self
+            raise missing_member(self, name, "a run", WAYS | ({name: f'run["{name}"]'} if is_signal else {}))
 
     def __repr__(self) -> str:
         t = self.t
@@ -192,7 +196,8 @@ class Run(ShownAsTable):
 
         t, names, messages = self.t, self.names, self.messages
         named = [name for name in self.wires if name in names]
-        shown = named or [name for name in names if name not in self.wires]
+        plants = self._plant_outputs() if named and len(named) < _FEW else []
+        shown = [*named, *plants[: _FEW - len(named)]] or [name for name in names if name not in self.wires]
         signals = [ShownSignal(name, self._place(name)[0], self._units(name)) for name in shown]
         grid, why = signal_grid(t, self.data, signals, self.__getitem__)
         others = len(names) - len(shown)
@@ -209,6 +214,15 @@ class Run(ShownAsTable):
             (grid,),
             tuple(note for note in (why, more, *messages[:_SHOWN_MESSAGES], last) if note),
         )
+
+    def _plant_outputs(self) -> list[str]:
+        """Return the outputs of FMUs and of blocks with states in continuous time that no named wire covers."""
+        if self.diagram is None:
+            return []
+        from .signal_marks import is_of_a_plant
+
+        unnamed = (name for name in self._names_to_export(()) if name not in self.wires)
+        return [name for name in unnamed if is_of_a_plant(self.diagram, name.rpartition(".")[0])]
 
     @classmethod
     def open(cls, path: PathLike) -> Run:

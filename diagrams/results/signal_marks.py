@@ -43,6 +43,14 @@ def is_held(diagram: Any, port: tuple[str, str]) -> bool:
     return not block.stepped and structure.clock(structure.subsystem_of[port[0]]) is not None
 
 
+def is_of_a_plant(diagram: Any, path: str) -> bool:
+    """Whether a block is a plant, as far as a table knows: an FMU, or a block with states in continuous time."""
+    block, structure = diagram.blocks.get(path), diagram.structure
+    if block is None:
+        return False
+    return bool(block.stepped or (block.states and structure.clock(structure.subsystem_of[path]) is None))
+
+
 def limits_of(diagram: Any, port: tuple[str, str]) -> tuple[float, ...]:
     """Return the limits of a port: its block's, those that its port declares, and those of requirements on it."""
     block = None if diagram is None else diagram.blocks.get(port[0])

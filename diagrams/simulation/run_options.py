@@ -10,29 +10,13 @@ from fractions import Fraction
 from typing import Any, Self, TypedDict
 
 from ...blocks.core import OptionError, UnknownArgumentError, accepts, check_argument, explain_calls, kinds
+from ...blocks.names_of_other_tools import RUN_OPTIONS
 from ..coupling import Coupling
 from ..flat import FlatDiagram, WiredDiagram, takes_any_step
 from ..results import OperatingPoint, RunState
 from ..wiring import stepped_blocks
 
 START_EXCHANGES = ("agree", "once", "none")
-_STEP = ("dt", "h", "Ts", "sample_time", "step_size", "stepsize", "fixed_step", "time_step", "communication_step")
-_END = ("t_end", "tf", "T", "stop_time", "final_time", "until", "tspan", "t_span", "end", "t")
-OTHER_WORDS = {
-    **dict.fromkeys(_STEP, "step=… (seconds)"),
-    **dict.fromkeys(_END, "the duration in s, the first argument: simulate(2.0)"),
-    **dict.fromkeys(("method", "integrator", "Solver"), 'solver="RK45" or another one'),
-    **dict.fromkeys(("reltol", "rel_tol", "tol", "tolerance", "tolerance_lte_rel"), "rtol=…"),
-    **dict.fromkeys(("abstol", "abs_tol", "tolerance_lte_abs"), "atol=…"),
-    **dict.fromkeys(("dt_max", "maxstep", "hmax"), "max_step=…"),
-    **dict.fromkeys(("output_interval", "decimation"), "every=…, which keeps each such sample"),
-    **dict.fromkeys(("input", "inputs"), "a block that is wired to the input, such as Step or Recorded"),
-    **dict.fromkeys(("x0", "initial_state"), "start=…, a state or an operating point"),
-    "start_values": "Fmu(…, start={…}) or diagram.replace(…)",
-    "output": "record=[…], the signals to keep",
-    "outputs": "record=[…], the signals to keep",
-}
-"""What an error offers for words that other tools have for options of a run."""
 """Exchanges of values with FMUs while they initialize; the first one is the default."""
 
 
@@ -165,7 +149,7 @@ class RunOptions:
         known = [f.name for f in fields(cls)]
         for name in options:
             if name not in known:
-                raise UnknownArgumentError(name, known, block=block, elsewhere=OTHER_WORDS)
+                raise UnknownArgumentError(name, known, block=block, elsewhere=RUN_OPTIONS)
         if "start" in options and options["start"] is None:
             raise OptionError(
                 "found None; expected a state or an operating point. A run has no final_state if it was interrupted or "

@@ -163,7 +163,7 @@ def calls():
         ),
         "Diagram.linearize": lambda: (
             d().linearize,
-            {"point": 0.0, "inputs": ["u"], "outputs": ["y"], "openings": [], "plants": None, "stairs": None},
+            {"at": 0.0, "inputs": ["u"], "outputs": ["y"], "openings": [], "plants": None, "stairs": None},
         ),
         "Diagram.linearize_batch": lambda: (d().linearize_batch, {"points": [0.0], "variants": [{"kp.gain": 1.0}]}),
         "Diagram.continuous": lambda: (d().continuous, {}),

@@ -271,6 +271,12 @@ def test_interrupted(tmp_path, capsys, monkeypatch, undrawn):
         ),
         (["run", "--out"], "expected one argument"),
         (["ran"], "invalid choice: 'ran'"),
+        (
+            ["run", "loop.py:loop", "--stop-time", "2"],
+            "run: error: there is no option --stop-time. Did you mean '--dur",
+        ),
+        (["draw", "loop.py:loop", "--output=x.svg"], "draw: error: there is no option --output. Did you mean '--out'?"),
+        (["run", "A", "--otpion", "delay=1"], "there is no option --otpion. Did you mean '--option'"),
         ([], "usage: loopwright"),
     ],
 )

@@ -40,6 +40,14 @@ def test_a_run_shows_the_range_and_the_end_of_each_named_wire(run):
     assert run._repr_html_().count("<tr>") == 1 + 1 + 3  # the time, the head, the wires
 
 
+def test_a_run_with_few_named_wires_shows_the_plants_outputs_too():
+    plant = StateSpace(A=[[-1.0]], B=[1.0], C=[1.0], D=0.0, name="plant")
+    run = Diagram("few", plant((Step(times=0.2, values=3.0, name="r") - plant.y).named("e"))).simulate(1.0, step=0.1)
+    values = run["plant.y"]
+    assert row(str(run), "plant.y") == [f"{v:.6g}" for v in (values.min(), values.max(), values[-1])]
+    assert "r.y" not in str(run)
+
+
 def test_units_and_messages_of_a_run_are_shown():
     wave = Step(times=0.2, values=3.0, unit="rad/s", name="step")
     run = Diagram("speed", Gain(gain=1.0)(wave().named("speed"))).simulate(0.4, step=0.1, progress=False)
