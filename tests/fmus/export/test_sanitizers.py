@@ -14,6 +14,8 @@ from support import TESTS
 SCENARIO = """
 import ctypes, pathlib, sys
 import fmpy, fmpy.fmi2, fmpy.fmi3
+from loopwright import build
+from support.exported_diagrams import diagrams
 from support.exported import bouncing_ball, mass_spring_damper, pendulums, thermostat, van_der_pol
 from support.instances import open_instance
 from loopwright.fmus import build_fmu
@@ -79,6 +81,64 @@ for make, n, n_events in models:
             item = open_instance(path, where, model_exchange=me)
             exchange(item, n, n_events) if me else step(item, integrator)
             item.free()
+
+
+# Diagrams: every function in every state; what is refused there is an error, and the instance is reset.
+def in_every_state(path, where):
+    item = open_instance(path, where)
+    fmu, two = item.fmu, item.fmi == 2
+    get, put = (fmu.getReal, fmu.setReal) if two else (fmu.getFloat64, fmu.setFloat64)
+
+    def states():
+        state = fmu.getFMUState()
+        data = fmu.serializeFMUState(state)
+        fmu.setFMUState(state)
+        fmu.freeFMUState(state)
+        state = fmu.deserializeFMUState(data)
+        fmu.setFMUState(state)
+        fmu.freeFMUState(state)
+
+    def variables():
+        for name in item.references:
+
+            item[name]
+            refused_or_not(lambda: item.__setitem__(name, item[name]))
+
+    def step():
+        t = get([0], 1)[0] if not two else get([0])[0]
+        fmu.doStep(t, 0.013)
+        fmu.doStep(t + 0.013, 0.2)
+
+    def refused_or_not(call):
+        try:
+            call()
+        except fmpy.fmi1.FMICallException:
+            return False
+        return True
+
+    to_state = (
+        lambda: None,
+        lambda: fmu.enterInitializationMode(**({} if two else {"startTime": 0.0})),
+        lambda: fmu.exitInitializationMode(),
+        step,
+        fmu.terminate,
+    )
+    calls = (variables, states, step, fmu.terminate, fmu.reset, lambda: fmu.enterInitializationMode(),
+             lambda: fmu.exitInitializationMode(), lambda: get([9999]), lambda: put([9999], [0.0]))
+    done = 0
+    for depth in range(len(to_state) + 1):
+        for call in calls:
+            fmu.reset()
+            for go in to_state[:depth]:
+                go()
+            done += refused_or_not(call)
+    assert done > 20, done
+    item.free()
+
+
+for diagram in diagrams():
+    for fmi in (2, 3):
+        in_every_state(build(diagram, fmi=fmi), folder / f"{diagram.wired.name}-{fmi}")
 print("all done")
 """
 
