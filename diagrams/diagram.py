@@ -42,9 +42,10 @@ if TYPE_CHECKING:
     from .requirements import Requirements
     from .studies import Sensitivities, WorstCase
     from .sweeps import Sweep
+    from .web_page import WebPage
 
 LOOPS = ("error", "solve")
-PLUMBING = {"contact_port", "has_clock", "has_fmu", "is_continuous", "of_wired", "structure", "wired"}
+PLUMBING = {"contact_port", "drawn_facts", "has_clock", "has_fmu", "is_continuous", "of_wired", "structure", "wired"}
 """Public members of a diagram that only functions below it use: completion leaves them out."""
 _LOOP = 'diagram.linearize().loop("wire")'
 WAYS = {
@@ -1077,13 +1078,75 @@ class Diagram(ShownAsTable):
         """
         from .drawing import draw
 
-        facts = self._facts(run)
+        facts = self.drawn_facts(run)
         drawing = draw(self.structure, self.name, facts, subsystem=subsystem, closed=closed, width=width)
         if path is not None:
             drawing.save(path)
         return drawing
 
-    def _facts(self, run: Run | None = None) -> Facts:
+    def to_html(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        inputs: Mapping[str, tuple[float, float] | None] | Iterable[str] | None = None,
+        sliders: Mapping[str, tuple[float, float] | None] | Iterable[str] | None = None,
+        plots: Sequence[str | Sequence[str]] | None = None,
+        speed: float = 1.0,
+        span: float = 10.0,
+        title: str | None = None,
+    ) -> WebPage:
+        """Return the diagram as a page on which it runs in a browser: one file, no server, no network.
+
+        The diagram and the FMUs in it that Loopwright has built are compiled to WebAssembly. They run at the pace of
+        the clock, with plots that scroll, sliders, pause, single steps, reset, and the record as CSV. See
+        docs/howto/web_page.md.
+
+        Parameters
+        ----------
+        path : path, optional
+            File to write, ``.html``.
+        inputs, sliders : mapping of str to (float, float), or list of str, optional
+            What is moved by hand, by names as `replace` takes them, with the range of each, or None for one around its
+            value: first sources (the name of a `Constant`, or of the wire that comes out of it, is its value), then
+            parameters. Without ``inputs`` these are the constants of the diagram.
+        plots : list of str or of lists of str, optional
+            Signals, each in a plot; those of a list in one. Without it the named wires, by their units.
+        speed : float
+            Simulated seconds in a second of the clock, at first.
+        span : float
+            Seconds that plots show, at first.
+        title : str, optional
+            Title of the page; the diagram's name without one.
+
+        Returns
+        -------
+        WebPage
+            A notebook shows it; ``save`` writes it.
+
+        Raises
+        ------
+        DefinitionError
+            For an FMU of others, or a function that Python evaluates, by its path, before anything is compiled.
+        UnknownNameError, OptionError
+            A name that nothing has; a parameter that can't be moved while it runs; a range that doesn't fit.
+        CompilerError
+            If there is no compiler that builds WebAssembly (the extra ``build``), or it fails.
+        """
+        from .web_page import make_page
+
+        return make_page(
+            self.wired,
+            self.drawn_facts(),
+            path,
+            inputs=inputs,
+            sliders=sliders,
+            plots=plots,
+            speed=speed,
+            span=span,
+            title=title,
+        )
+
+    def drawn_facts(self, run: Run | None = None) -> Facts:
         """Return what a drawing says of signals: shapes, units, and the signals of a run."""
         from .drawing import Facts, RecordedSignal
 

@@ -30,6 +30,21 @@ _ZIG_FLAGS = ("-finline-hint-functions",)
 # Models use double and int alone: nothing of zig's own runtime, which takes seconds to build on a machine's first use.
 _ZIG_RUNTIME = ("-rtlib=none",)
 
+# No C library: what it would do is in headers of fmus/export/webassembly.
+WEBASSEMBLY = (
+    *(
+        "-target",
+        "wasm32-freestanding",
+        "-O2",
+        "-std=c11",
+        "-ffp-contract=off",
+        "-fno-math-errno",
+        "-fno-trapping-math",
+    ),
+    *("-mbulk-memory", "-g0", "-s", "-rtlib=none", "-nostdlib", "-Wl,--no-entry", "-Wl,--export-memory"),
+)
+"""Flags of WebAssembly modules."""
+
 DIAGRAM_FLAGS = ("-fno-math-errno", "-fno-trapping-math", "-fno-builtin-pow")
 """Further flags of diagrams: nobody reads errno, so that sine and cosine of one angle are one call; a power of two
 stays a power in every bit."""

@@ -38,6 +38,7 @@ from .diagrams.results import Occurrence, OperatingPoint, RunState, Snapshot, St
 from .diagrams.simulation import LiveRun, RunOptions, Simulation, SimulationView
 from .diagrams.ssp import SspDescription
 from .diagrams.studies import RunConfirmation, Sensitivities, Sensitivity, WorstCase
+from .diagrams.web_page import WebPage
 from .diagrams.wiring import Bus, Subsystem, SubsystemSettings, Wire
 from .fmus.archive import FmuDescription, FmuFault, FmuFinding, FmuSeverity, FmuVariable
 from .fmus.calls import FmuInstance, FmuState
@@ -113,6 +114,7 @@ __all__ = [
     "TrialMethod",
     "Unit",
     "Verdict",
+    "WebPage",
     "Wire",
     "WorstCase",
     "ZeroSlope",

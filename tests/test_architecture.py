@@ -241,8 +241,8 @@ PUBLIC = {
         FreeMotions FrequencyResponse InexactDerivatives Kink Layout LinearDelays Linearization LiveRun MeanSlope Occurrence
         OperatingPoint Passivity PassivityReason PortPassivity RefutedDerivatives Report Review RunConfirmation
         RunOptions RunState Sensitivities Sensitivity Signal Simulation SimulationView Snapshot SspDescription StabilityLimit
-        StabilityMap StepInfo StepResponse StepsOnly Stopped Subsystem SubsystemSettings TextSignal TrialMethod Unit Verdict Wire
-        WorstCase ZeroSlope
+        StabilityMap StepInfo StepResponse StepsOnly Stopped Subsystem SubsystemSettings TextSignal TrialMethod Unit Verdict WebPage
+        Wire WorstCase ZeroSlope
     """,
 }
 

@@ -38,6 +38,7 @@ WRONG = {
 }
 LONG = {
     ("Diagram.worst_case", "count", "None"),  # a hundred samples
+    ("Simulation.run_realtime", "duration", "None"),  # until it is stopped
     ("Diagram.sweep", "workers", "None"),  # every core
     ("analyse", "only", "None"),  # every section
     ("Diagram.frequency_response", "frequencies", "true"),  # 1 rad/s

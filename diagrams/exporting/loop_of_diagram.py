@@ -324,7 +324,7 @@ class _Variables:
             first = flat.parameters.slices[path].start
             for key, value in traced_parameters(block):
                 size = int(np.size(value))
-                if np.all(np.ravel(value) != 0):  # zeros are structure
+                if _is_number(flat, path, key):
                     variable = parameter_variable(block, key, value, join(self._opened.shown(path), key))
                     found.append(Placed(variable, "p", tuple(range(first, first + size))))
                 first += size
@@ -376,6 +376,11 @@ class _Variables:
                 if where is not None:
                     found.append((self._opened.shown(path), name, where.start, where.stop - where.start))
         return tuple(found)
+
+
+def _is_number(flat: FlatDiagram, path: str, key: str) -> bool:
+    """Whether a parameter is a symbol in the functions: zeros of the diagram that these were made of are structure."""
+    return bool(np.all(np.ravel(dict(traced_parameters(flat.origin.table.blocks[path]))[key]) != 0))
 
 
 def _unit(unit: object) -> str | None:

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path as File
@@ -36,10 +37,12 @@ from ..results import Run
 from ..simulation import ProgressOption, RunKeywords, RunOptions, simulate
 from .experiment_options import DEFAULTS, ELLIPSE, merge
 from .fig3_diagram import fig3
+from .hand_scene import pull_by_hand
 from .wires import IMPEDANCE_PAR, IMPEDANCE_PERP, Channel, Rig, check_plant
 
 if TYPE_CHECKING:
     from ..sweeps import Sweep
+    from ..web_page import WebPage
 
 __all__ = [
     "DEFAULTS",
@@ -48,7 +51,9 @@ __all__ = [
     "Experiment",
     "compliance",
     "force_tracking",
+    "guided_by_hand",
     "hand_guiding",
+    "hand_page",
     "path_following",
 ]
 
@@ -345,6 +350,69 @@ def hand_guiding(**options: Any) -> Experiment:
         return HandForce(path, name="hand")(position, f_par=f_par, f_perp=f_perp)
 
     return _build("C", "hand_guiding", 12.0, o, (0.2, 0.0), par, perp, hand, given=options)
+
+
+def guided_by_hand(**options: Any) -> Experiment:
+    """Return experiment C with a hand that is moved from outside, in place of its profile of forces. 12 s.
+
+    The hand pulls the tool by a spring, with at most 8 N, while ``hand_grip`` is 1. It is at ``hand_position``. Both
+    are constants, which `Simulation.run_realtime` and a page move.
+
+    Parameters
+    ----------
+    **options
+        See `DEFAULTS`.
+
+    Raises
+    ------
+    OptionError, PathDomainError
+        As in `path_following`.
+    """
+    o = merge("C", 12.0, options)
+    path = o["path"]
+    start = (0.2, 0.0)
+    par = Channel(
+        Reference(0.2, unit="m", name="eta_d"),
+        _admittance(o, 0, mass=0.5, stiffness=0.0, damping=_damping(IMPEDANCE_PAR)),
+    )
+    perp = Channel(Reference(0.0, unit="m", name="xi_d"), _admittance(o, 1, **IMPEDANCE_PERP))
+
+    def hand(position: Any) -> Any:
+        return pull_by_hand(position, path.to_plane(*start))
+
+    return _build("C", "guided_by_hand", 12.0, o, start, par, perp, hand, given=options)
+
+
+def hand_page(path: str | os.PathLike[str] | None = None, **options: Any) -> WebPage:
+    """Return experiment C as a page: the gantry, which the pointer pulls, and Table III as sliders.
+
+    Parameters
+    ----------
+    path : path, optional
+        File to write, ``.html``.
+    **options
+        See `DEFAULTS`.
+
+    Raises
+    ------
+    OptionError, PathDomainError, CompilerError
+        As in `path_following`; as in `Diagram.to_html`.
+    """
+    from ..web_page import PageText, make_page
+    from .hand_scene import ABOUT, LABELS, PLOTS, TABLE_III, gantry_scene
+
+    made = guided_by_hand(**options)
+    return make_page(
+        made.diagram.wired,
+        made.diagram.drawn_facts(),
+        path,
+        inputs=(),
+        sliders=TABLE_III,
+        plots=PLOTS,
+        text=PageText("A robot that is guided by hand", ABOUT),
+        labels=LABELS,
+        scene=gantry_scene(made.path),
+    )
 
 
 def force_tracking(*, cubic: bool = False, **options: Any) -> Experiment:

@@ -1,10 +1,11 @@
 """Export of a block as an FMU: equations, C code, model description, binaries."""
 
-from .compiler import compile_shared, describe_compiler
+from .compiler import compile_shared, compile_webassembly, describe_compiler
 from .from_block import build, model_spec, parameter_variable
 from .inlined import inline_model, own_functions
 from .loop_memory import Field, LoopMemory, c_number
 from .loop_spec import ROOM_FOR_EDGES, CFunction, ComputedNumbers, Guards, LoopSpec, Placed, write_unit
+from .merged import merge_model
 from .model import Integrator, ModelSpec, Variable
 from .package import build_fmu, clear_cache
 from .python_fmu import build_python
@@ -30,9 +31,11 @@ __all__ = [
     "c_number",
     "clear_cache",
     "compile_shared",
+    "compile_webassembly",
     "describe_compiler",
     "describe_processor",
     "inline_model",
+    "merge_model",
     "model_spec",
     "own_functions",
     "parameter_variable",

@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib import resources
 from pathlib import Path
 
 from ...blocks.core import (
@@ -30,7 +31,7 @@ from ...blocks.core import (
 from ..build_notes import announce_build
 from ..child_processes import find_python, folder_in, run_in_group
 from ..platform import OWN_CACHE, cache_folder, check_cache, native_platform
-from ..toolchain import TARGETS, find_command, flags
+from ..toolchain import TARGETS, WEBASSEMBLY, find_command, flags
 
 TIMEOUT = 600.0
 """Seconds after which a compilation is stopped. The first one on a machine takes seconds, on a slow one a minute."""
@@ -155,17 +156,60 @@ def compile_shared(
     platform = platform or native_platform()
     check_platform(compiler, platform)
     names = [name for name in sources if name.endswith(".c")] if compiled is None else list(compiled)
-    out = Path(out)
+    math = () if platform.endswith("windows") else ("-lm",)
+    includes = [f"-I{path}" for path in include]
+    given = [*flags(platform, zig=compiler.zig), *more_flags, "-I.", *includes]
+    _compile(compiler, sources, Path(out), [*given], [*names, *math], platform)
+
+
+def compile_webassembly(source: str, out: Path) -> None:
+    """Compile a C source into a WebAssembly module, which imports nothing but functions of JavaScript's Math.
+
+    Parameters
+    ----------
+    source : str
+        The C text; it finds the headers of ``webassembly/``, and no C library.
+    out : Path
+        The module to write; it appears complete or not at all.
+
+    Raises
+    ------
+    CompilerError
+        If the package's compiler isn't there, or it fails.
+    FmuError
+        If the cache can't be written.
+    """
+    check_cache()
+    compiler = find_compiler()
+    if not compiler.zig:
+        raise CompilerError(
+            f"found the compiler {compiler.command[0]!r}, which may not build WebAssembly; expected the package's. "
+            'Install it: pip install "loopwright[build]"'
+            + (", and unset LOOPWRIGHT_CC." if "LOOPWRIGHT_CC" in os.environ else ".")
+        )
+    folder = resources.files(__package__) / "webassembly"
+    headers = {part.name: part.read_text(encoding="utf-8") for part in folder.iterdir() if part.name.endswith(".h")}
+    _compile(
+        compiler, {"module.c": source, **headers}, Path(out), [*WEBASSEMBLY, "-isystem", "."], ["module.c"], "the web"
+    )
+
+
+def _compile(
+    compiler: Compiler,
+    sources: Mapping[str, str],
+    out: Path,
+    given: Sequence[str],
+    inputs: Sequence[str],
+    platform: str,
+) -> None:
+    """Compile sources into a file, which appears complete or not at all."""
     with explain_disk_errors("the C code can't be compiled", out, OWN_CACHE, CompilerError):
         out.parent.mkdir(parents=True, exist_ok=True)
         with folder_in(out.parent, ".building-") as folder:
             for name, text in sources.items():
                 (folder / name).write_text(text, encoding="utf-8", newline="\n")
             library = out.name  # a relative name, since some formats contain it
-            math = () if platform.endswith("windows") else ("-lm",)
-            includes = [f"-I{path}" for path in include]
-            given = [*flags(platform, zig=compiler.zig), *more_flags]
-            command = [*compiler.command, *given, "-I.", *includes, "-o", library, *names, *math]
+            command = [*compiler.command, *given, "-o", library, *inputs]
             with announce_build(_note(compiler)):
                 _run(command, folder, platform)
             if not (folder / library).is_file():

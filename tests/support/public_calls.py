@@ -12,7 +12,7 @@ import loopwright.fmus as fmus
 import loopwright.frequency as frequency
 import loopwright.sweeps as sweeps
 import loopwright.types as types
-from loopwright.blocks import Gain, Integrator, StateSpace, Step
+from loopwright.blocks import Constant, Gain, Integrator, StateSpace, Step
 from loopwright.diagrams import Diagram, Requirements, experiments, subsystem
 
 from .carts import cart_contact
@@ -91,6 +91,21 @@ def simulation():
     opened = drive().simulation(step=0.02).__enter__()
     opened.advance(0.1)
     return opened
+
+
+@cache
+def sampled():
+    """Return a diagram that has a clock alone."""
+
+    @subsystem(sample_time=0.02)
+    def control(u):
+        return Gain(gain=0.2, name="kp")(u).named("y")
+
+    return Diagram("sampled", control(Constant(value=0.5, name="u")))
+
+
+def web_page():
+    return types.WebPage("<!doctype html>", "sampled", 300)
 
 
 @cache
@@ -366,6 +381,19 @@ def calls():
         "Contact.confirm": lambda: (cart_contact().confirm, {"limit": limit(), "push": 1e-6, "method": "solver"}),
         "Simulation.time_of": lambda: (simulation().time_of, {"k": 1}),
         "Simulation.advance": lambda: (simulation().advance, {"duration": 0.02, "progress": None}),
+        "Diagram.to_html": lambda: (
+            sampled().to_html,
+            {
+                "path": "/nowhere/page.html",
+                "inputs": {"u": (-1.0, 1.0)},
+                "sliders": {"kp.gain": (0.0, 1.0)},
+                "plots": ["y"],
+                "speed": 1.0,
+                "span": 10.0,
+                "title": "drive",
+            },
+        ),
+        "WebPage.save": lambda: (web_page().save, {"path": "/nowhere/page.html"}),
         "Simulation.run_realtime": lambda: (
             simulation().run_realtime,
             {

@@ -1,0 +1,188 @@
+"""Diagrams as pages: their modules, run by wasmtime, have the samples of runs in Python."""
+
+import base64
+import hashlib
+import re
+from functools import cache
+
+import numpy as np
+import pytest
+
+from loopwright import Diagram, Fmu, subsystem
+from loopwright.blocks import Constant, DiscreteIntegrator, Gain, PythonFunction, Step, UnitDelay
+from loopwright.diagrams import DefinitionError, OptionError, UnknownNameError
+from loopwright.fmus import dc_motor
+from support.web_modules import Module
+
+T = 1e-3
+
+
+@subsystem(sample_time=T)
+def speed_loop(reference, speed):
+    error = reference - speed
+    total = DiscreteIntegrator(name="total")(error)
+    return (Gain(gain=0.05, name="kp")(error) + Gain(gain=0.8, name="ki")(total)).named("voltage")
+
+
+@subsystem(sample_time=4 * T)
+def slow_filter(voltage):
+    before = UnitDelay(initial_value=0.0, name="before")
+    return before(0.5 * before.y + 0.5 * voltage).named("smooth")
+
+
+def drive(target):
+    motor = Fmu(dc_motor.build(), name="motor")
+    voltage = speed_loop(target, motor.speed.named("speed"))
+    return Diagram("drive", motor(voltage=voltage, load_torque=Constant(value=0.0, name="load")), slow_filter(voltage))
+
+
+TARGET = Constant(value=0.0, unit="rad/s", name="target")
+
+
+@cache
+def page():
+    return drive(TARGET).to_html(
+        inputs={"target": (-200.0, 200.0), "load": (-0.2, 0.2)},
+        sliders={"kp.gain": (0.0, 1.0)},
+        plots=[["speed", "target"], "voltage", "motor.current"],
+    )
+
+
+def same(rows, module, run):
+    """Whether all columns are those of a run in Python, in every bit."""
+    assert rows.shape[0] == len(run.t)
+    assert np.array_equal(rows[:, 0], run.t)
+    return all(np.array_equal(rows[:, 1 + i], run[name]) for i, name in enumerate(module.names))
+
+
+def test_a_module_has_the_samples_of_a_run_in_every_bit():
+    """The loop at two rates, and the motor's FMU, whose equations are merged: moved by hand as by a step in Python."""
+    module = Module(page().html)
+    assert module.begin()
+    first = module.run(1)
+    module.set(module.slider("target")["place"], 100.0)  # acts at the tick at 1 ms
+    rows = np.concatenate([first, module.run(1999)])
+    stepped = drive(Step(times=T, values=100.0, unit="rad/s", name="target"))
+    assert same(rows, module, stepped.simulate(1999 * T, progress=False))
+    assert 99.0 < rows[-1, 1] < 101.0
+
+
+def test_a_parameter_is_moved_while_it_runs_and_a_reset_begins_again():
+    module, diagram = Module(page().html), drive(TARGET.replace(value=50.0))
+    for _ in range(2):  # the second time after a reset
+        module._call("fill")
+        module.set(module.slider("target")["place"], 50.0)
+        assert module.begin()
+        before = module.run(500)
+        module.set(module.slider("kp.gain")["place"], 0.3)
+        rows = np.concatenate([before, module.run(500)])
+        with diagram.simulation() as simulation:
+            simulation.advance(499 * T)
+            simulation.set_parameters("speed_loop.kp", diagram["kp"].replace(gain=0.3))
+            simulation.advance(500 * T)
+            assert same(rows, module, simulation.run())
+
+
+def test_a_page_is_one_file_that_asks_for_nothing():
+    html = page().html
+    assert page().size < 200_000
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', html)[1]
+    assert policy.startswith("default-src 'none'; script-src 'sha256-")
+    assert "unsafe-eval" not in policy.replace("wasm-unsafe-eval", "")
+    scripts = re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
+    assert len(scripts) == 2  # the page's own, and the drawing's
+    for script in scripts:
+        assert base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() in policy
+    assert not re.search(r"""(src|href)=["'](?!data:)""", html)
+    assert not re.search(r"\b(fetch|XMLHttpRequest|WebSocket|import)\s*\(", "".join(scripts))
+    assert Module(html).imports == [] or Module(html).imports == ["pow"]
+
+
+def test_plots_and_sliders_have_names_units_and_ranges():
+    _, data = Module(page().html), Module(page().html).data
+    names = [[data["columns"][i]["name"] for i in plot["curves"]] for plot in data["plots"]]
+    assert names == [["speed", "target"], ["voltage"], ["motor.current"]]
+    assert [plot["unit"] for plot in data["plots"]] == ["rad/s", "", "A"]
+    inputs, parameters = data["groups"]
+    assert [(s["label"], s["low"], s["high"], s["value"], s["unit"]) for s in inputs["sliders"]] == [
+        ("target", -200.0, 200.0, 0.0, "rad/s"),
+        ("load", -0.2, 0.2, 0.0, ""),
+    ]
+    assert [s["name"] for s in parameters["sliders"]] == ["kp.gain"]
+
+
+def test_without_choices_a_page_has_the_constants_and_the_named_wires():
+    diagram = Diagram(
+        "d", Gain(gain=[1.0, 2.0], name="two")(Constant(value=3.0, unit="m", name="u")).named("y"), step(0.5)
+    )
+    data = Module(diagram.to_html().html).data
+    assert [s["name"] for group in data["groups"] for s in group["sliders"]] == ["u", "level"]
+    assert [s["high"] for group in data["groups"] for s in group["sliders"]] == [6.0, 1.0]
+    assert [c["name"] for c in data["columns"]] == ["y[1]", "y[2]"]
+
+
+def step(value):
+    """Return a sampled part: a page needs a clock."""
+
+    @subsystem(sample_time=0.5)
+    def box(u):
+        return UnitDelay(name="delay")(u)
+
+    return box(Constant(value=value, name="level"))
+
+
+def test_a_page_is_shown_in_a_notebook_and_saved(tmp_path):
+    shown = page()._repr_html_()
+    assert shown.startswith('<iframe sandbox="allow-scripts allow-downloads"')
+    assert "<script" not in shown  # all of it is text of an attribute
+    assert page().save(tmp_path / "drive.html").read_text(encoding="utf-8") == page().html
+    with pytest.raises(OptionError, match=r"expected a page; name it drive\.html"):
+        page().save(tmp_path / "drive.txt")
+
+
+# --- what is refused, before anything is compiled -------------------------------------------------------------------------
+
+
+@pytest.fixture
+def uncompiled(monkeypatch):
+    def refuse(*arguments):
+        raise AssertionError("compiled")
+
+    monkeypatch.setattr("loopwright.diagrams.web_page.module.compile_webassembly", refuse)
+
+
+def test_a_function_of_python_is_refused_by_its_path(uncompiled):
+    @subsystem(sample_time=T)
+    def box(u):
+        return PythonFunction(lambda u: 2.0 * u, name="own")(u)
+
+    with pytest.raises(
+        DefinitionError, match="Python evaluates it.*Write its equations with NumPy functions"
+    ) as caught:
+        Diagram("d", box(Constant(value=1.0))).to_html()
+    assert caught.value.block == "box.own"
+
+
+def test_an_fmu_of_others_is_refused_by_its_path(uncompiled, monkeypatch):
+    monkeypatch.setattr("loopwright.fmus.export.merged.read_own_sources", lambda path: None)
+    with pytest.raises(DefinitionError, match=r"dc_motor\.fmu, an FMU that .*has not built.*Replace it by") as caught:
+        drive(TARGET).to_html()
+    assert caught.value.block == "motor"
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"inputs": ["targett"]}, UnknownNameError, "Did you mean"),
+        ({"inputs": {"target": (1.0, 2.0)}}, OptionError, "which is 0; expected one that has it"),
+        ({"inputs": {"target": (1.0, 1.0)}}, OptionError, "expected its smallest and its largest value"),
+        ({"sliders": ["motor.start.resistance"]}, OptionError, "of an FMU, of which parameters don't change"),
+        ({"sliders": ["target.unit"]}, OptionError, "expected a parameter that is a number"),
+        ({"plots": ["speeed"]}, UnknownNameError, "Did you mean 'speed'"),
+        ({"plots": [3]}, OptionError, "found 3 among the plots"),
+        ({"path": "drive.txt"}, OptionError, "name it drive.html"),
+    ],
+)
+def test_mistakes_are_refused(uncompiled, options, error, words):
+    with pytest.raises(error, match=words):
+        drive(TARGET).to_html(**options)
