@@ -1091,6 +1091,8 @@ class Diagram(ShownAsTable):
         inputs: Mapping[str, tuple[float, float] | None] | Iterable[str] | None = None,
         sliders: Mapping[str, tuple[float, float] | None] | Iterable[str] | None = None,
         plots: Sequence[str | Sequence[str]] | None = None,
+        step: float | None = None,
+        solver: str = "auto",
         speed: float = 1.0,
         span: float = 10.0,
         title: str | None = None,
@@ -1111,6 +1113,10 @@ class Diagram(ShownAsTable):
             parameters. Without ``inputs`` these are the constants of the diagram.
         plots : list of str or of lists of str, optional
             Signals, each in a plot; those of a list in one. Without it the named wires, by their units.
+        step : float, optional
+            Seconds between two samples, where no subsystem has a sample time.
+        solver : str
+            Method of continuous states: "RK45", which "auto" is, or "Radau" for stiff ones, or another one that C has.
         speed : float
             Simulated seconds in a second of the clock, at first.
         span : float
@@ -1141,6 +1147,8 @@ class Diagram(ShownAsTable):
             inputs=inputs,
             sliders=sliders,
             plots=plots,
+            step=step,
+            solver=solver,
             speed=speed,
             span=span,
             title=title,

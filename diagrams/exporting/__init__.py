@@ -2,11 +2,12 @@
 
 from .loop_of_diagram import loop_spec
 from .make_exported import make_exported, name_of
-from .open_diagram import OpenDiagram, choose_outputs, open_part, open_subsystem, open_whole
+from .open_diagram import OpenDiagram, choose_outputs, let_move, open_part, open_subsystem, open_whole
 
 __all__ = [
     "OpenDiagram",
     "choose_outputs",
+    "let_move",
     "loop_spec",
     "make_exported",
     "name_of",

@@ -52,6 +52,7 @@ def loop_spec(
     solver: str = "auto",
     rtol: float = 1e-6,
     atol: float = 1e-8,
+    between: bool = True,
     **options: Any,
 ) -> LoopSpec:
     """Return a diagram as it is exported.
@@ -64,6 +65,8 @@ def loop_spec(
         Method between ticks; "auto" is RK45.
     rtol, atol : float
         Relative and absolute tolerance of a method of variable step.
+    between : bool, default True
+        Whether outputs follow inputs between ticks, too, where nothing moves there.
     name, description, **options
         Fields of `LoopSpec`.
 
@@ -75,11 +78,11 @@ def loop_spec(
         If its start isn't found.
     """
     refuse(opened)
-    flat = _flatten(opened, name, options.get("step_size", 1e-3))
+    flat = _flatten(opened, name, options.get("step_size", 1e-3), between=between)
     workspace = _start(opened, flat)
     here = workspace.here
     acting = kinds_of(flat, every=False) if flat.distinct else []
-    hybrid = not _is_sampled(flat)
+    hybrid = flat.hybrid or (between and not _is_sampled(flat))
     acting = [NONE, *(clocks for clocks in acting if clocks)] if hybrid else acting
     _check_clocks(flat, len(acting), name)
     code = NamedCode(load_runtime())
@@ -137,14 +140,14 @@ def _is_sampled(flat: FlatDiagram) -> bool:
     return all(flat.table.is_sampled(flat.table.subsystem_of[path]) for path in flat.checked.traced)
 
 
-def _flatten(opened: OpenDiagram, name: str, step: float) -> FlatDiagram:
-    """Return the diagram with its ticks; without any, a step takes their place. Outputs are had between ticks."""
+def _flatten(opened: OpenDiagram, name: str, step: float, *, between: bool) -> FlatDiagram:
+    """Return the diagram with its ticks; without any, a step takes their place. Outputs may be had between ticks."""
     wired = opened.wired
     if not wired.has_base:
         base = exact_time(step, block=name)
         return flatten(wired.scheduled, wired.checked, wired.orders, base, name=name, asked=False, between=True)
     flat = wired.flatten()
-    if _is_sampled(flat):
+    if _is_sampled(flat) or not (between or flat.hybrid):
         return flat
     return flatten(wired.scheduled, wired.checked, wired.orders, name=name, between=True)
 
@@ -324,7 +327,7 @@ class _Variables:
             first = flat.parameters.slices[path].start
             for key, value in traced_parameters(block):
                 size = int(np.size(value))
-                if _is_number(flat, path, key):
+                if np.all(np.ravel(value) != 0) or join(path, key) in self._opened.moved:  # zeros are structure
                     variable = parameter_variable(block, key, value, join(self._opened.shown(path), key))
                     found.append(Placed(variable, "p", tuple(range(first, first + size))))
                 first += size
@@ -376,11 +379,6 @@ class _Variables:
                 if where is not None:
                     found.append((self._opened.shown(path), name, where.start, where.stop - where.start))
         return tuple(found)
-
-
-def _is_number(flat: FlatDiagram, path: str, key: str) -> bool:
-    """Whether a parameter is a symbol in the functions: zeros of the diagram that these were made of are structure."""
-    return bool(np.all(np.ravel(dict(traced_parameters(flat.origin.table.blocks[path]))[key]) != 0))
 
 
 def _unit(unit: object) -> str | None:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import UnknownNameError, near
-from ..flat import WiredDiagram
-from ..wiring import Collector, Structure, Subsystem, Wire, find_path, join
+from ..flat import Target, WiredDiagram, with_movable
+from ..wiring import Collector, Structure, Subsystem, Wire, find_path, join, split_entry
 from .outside import Outside
 from .start import DiagramStart, find_start
 
@@ -33,6 +33,8 @@ class OpenDiagram:
         Path of the subsystem that it is a part of; names are shown from there on.
     states : mapping of str to ndarray
         States of blocks at the start, flat, by path, as the diagram around it finds them.
+    moved : frozenset of str
+        Parameters, by path, of which zeros are numbers in the functions; see `let_move`.
     """
 
     wired: WiredDiagram
@@ -40,6 +42,7 @@ class OpenDiagram:
     outputs: Mapping[str, Wire]
     inside: str = ""
     states: Mapping[str, np.ndarray] = field(default_factory=dict)
+    moved: frozenset[str] = frozenset()
 
     def shown(self, path: str) -> str:
         """Return a path as it is shown."""
@@ -218,6 +221,18 @@ def open_whole(wired: WiredDiagram, outside: Sequence[str], name: str) -> OpenDi
     outputs = {key: scheduled.results["", key] for key in read} or dict(scheduled.names)
     outputs = {n: w for n, w in outputs.items() if w.block != _OUTSIDE}
     return OpenDiagram(opened, _OUTSIDE if ports else "", outputs, states=start.states)
+
+
+def let_move(opened: OpenDiagram, targets: Sequence[Target]) -> OpenDiagram:
+    """Return a diagram in which some parameters can be moved that are zero, and structure else.
+
+    Parameters
+    ----------
+    targets : sequence of (str, list of str)
+        Path of a block, and the names that lead to a parameter in it.
+    """
+    names = {join(path, ".".join([*keys[:-1], split_entry(keys[-1], ())[0]])) for path, keys in targets}
+    return replace(opened, wired=with_movable(opened.wired, targets), moved=opened.moved | names)
 
 
 def choose_outputs(opened: OpenDiagram, outputs: tuple[str, ...] | None) -> OpenDiagram:

@@ -95,7 +95,9 @@ def _sources(flat: FlatDiagram, ports: tuple[Port, ...], symbols: dict[str, Any]
 
 def _put(x: Any, where: slice, values: Any) -> Any:
     """Return a column with some entries replaced."""
-    return ca.vertcat(x[: where.start], ca.densify(values), x[where.stop :])
+    return ca.vertcat(
+        x[: where.start, 0], ca.densify(values), x[where.stop :, 0]
+    )  # a column, also where x has one entry
 
 
 def _count(shape: tuple[int, ...]) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,8 +14,8 @@ import numpy as np
 from ...blocks.core import DefinitionError
 from ...fmus import Fmu
 from ...fmus.export import LoopSpec, compile_webassembly, merge_model, write_unit
-from ..exporting import loop_spec, open_whole
-from ..flat import FlatDiagram, Target, WiredDiagram, with_movable
+from ..exporting import let_move, loop_spec, open_whole
+from ..flat import FlatDiagram, Target, WiredDiagram
 from ..wiring import Wire, stepped_blocks
 
 Place = tuple[str, int]
@@ -64,16 +64,25 @@ def find_plants(wired: WiredDiagram) -> dict[str, Fmu]:
 
 
 def make_module(
-    wired: WiredDiagram, columns: Sequence[tuple[Wire, int]], moved: Sequence[Target], name: str
+    wired: WiredDiagram,
+    flat: FlatDiagram,
+    columns: Sequence[tuple[Wire, int]],
+    moved: Sequence[Target],
+    *,
+    solver: str = "auto",
 ) -> WebModule:
     """Return a diagram as a module.
 
     Parameters
     ----------
+    flat : FlatDiagram
+        The diagram with the ticks at which it is sampled.
     columns : sequence of (Wire, int)
         What samples have: outputs of blocks, each with an entry, flat.
     moved : sequence of Target
         Parameters that the page changes.
+    solver : str
+        Method of the continuous states.
 
     Raises
     ------
@@ -82,11 +91,11 @@ def make_module(
     """
     plants = find_plants(wired)
     texts = {path: _merge(path, plant, wired, f"m{i}") for i, (path, plant) in enumerate(plants.items())}
-    opened = open_whole(wired, tuple(plants), name)
-    opened = replace(opened, wired=with_movable(opened.wired, moved))
-    spec = loop_spec(opened, name=name, description=f"Diagram {wired.name}.")
+    opened = let_move(open_whole(wired, tuple(plants), "diagram"), moved)
+    about = f"Diagram {wired.name}."
+    step = float(flat.base)
+    spec = loop_spec(opened, name="diagram", description=about, solver=solver, between=False, step_size=step)
     places = dict(_places(spec, plants))
-    flat = wired.flatten()
     page = files(__package__).joinpath("page", "module.c").read_text(encoding="utf-8")
     glue = _write_glue(spec, places, plants, flat, columns)
     source = "\n".join([*texts.values(), write_unit(spec, own_functions=True), *glue, page])

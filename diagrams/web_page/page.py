@@ -132,6 +132,8 @@ def make_page(
     inputs: Any = None,
     sliders: Any = None,
     plots: PlotNames | None = None,
+    step: float | None = None,
+    solver: str = "auto",
     speed: float = 1.0,
     span: float = 10.0,
     title: str | None = None,
@@ -155,15 +157,16 @@ def make_page(
     text = text or PageText(title or wired.name)
     moved = find_sliders(wired, inputs, "inputs") if inputs is not None else default_sources(wired)
     tuned = find_sliders(wired, sliders, "sliders") if sliders is not None else []
-    columns = Columns(wired.flatten(), wired.name)
+    flat = wired.flatten(step)
+    columns = Columns(flat, wired.name)
     shown = plots_of(columns, plots)
-    for name in (*(scene.signals if scene else ()), *wired.flatten().table.names):
+    for name in (*(scene.signals if scene else ()), *flat.table.names):
         columns.add(name)
     groups = [("Inputs" if tuned else "", moved), ("Parameters", tuned)]
     targets = [slider.target for _, group in groups for slider in group]
     targets += [target for target, _ in scene.moved.values()] if scene else []
     wires = [(Wire(column.block, column.port, None), column.entry) for column in columns.found]
-    module = make_module(wired, wires, targets, "diagram")
+    module = make_module(wired, flat, wires, targets, solver=solver)
     spec = module.spec
     hidden = {} if scene is None else {n: place_of(Slider.of_scene(n, t, i), spec) for n, (t, i) in scene.moved.items()}
     data = {

@@ -388,6 +388,8 @@ def calls():
                 "inputs": {"u": (-1.0, 1.0)},
                 "sliders": {"kp.gain": (0.0, 1.0)},
                 "plots": ["y"],
+                "step": None,
+                "solver": "auto",
                 "speed": 1.0,
                 "span": 10.0,
                 "title": "drive",

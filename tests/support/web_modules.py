@@ -55,16 +55,16 @@ class Module:
     def begin(self):
         """Begin at t = 0."""
         self._call("renew")
-        return bool(self._call("begin"))
+        self._call("begin")
+        return not self._call("failed")
 
     def run(self, ticks):
         """Go through ticks; return the samples, a row for each: time and columns."""
         rows, width = [], len(self.names) + 1
         while ticks:
-            wanted = min(CHUNK, ticks)
-            count = self._call("run", wanted)
+            count = self._call("run", min(CHUNK, ticks))
             rows.append(self._numbers(self._call("samples"), count * width).reshape(count, width).copy())
-            if count < wanted:
+            if self._call("failed"):
                 break
             ticks -= count
         return np.concatenate(rows)

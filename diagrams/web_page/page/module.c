@@ -22,7 +22,8 @@ typedef struct {
 static const lw_plant_of_page lw_plants[LW_N_PLANTS + 1] = {LW_PLANTS{0}};
 static double lw_page_rows[LW_N_ROWS][LW_N_COLUMNS + 1];
 static int64_t lw_page_reached[LW_N_PLANTS + 1]; /* the tick that each plant has come to */
-static int64_t lw_page_failed_plant;
+static int64_t lw_page_failed_plant, lw_page_tick;
+static bool lw_page_has_failed;
 
 static bool lw_page_is_due(const lw_plant_of_page *p, int64_t tick) {
     for (int i = 0; i < p->clocks; i++)
@@ -85,23 +86,38 @@ LW_SEEN(signals) const double *lw_page_signals(void) { return lw_page_memory.log
 LW_SEEN(plant) int lw_page_plant(void) { return (int)lw_page_failed_plant; }
 LW_SEEN(renew) void lw_page_renew(void) { lw_renew(&lw_page_memory); }
 
-/* Begin at t = 0, after `fill` and `renew`; 0: it can't, because of a plant or, if `plant` is -1, the diagram. */
-LW_SEEN(begin) int lw_page_begin(void) {
+/* Whether the last call has come to where it can't continue: because of a plant, or if `plant` is -1 of the diagram. */
+LW_SEEN(failed) int lw_page_failed(void) { return lw_page_has_failed; }
+
+/* Begin at t = 0, after `fill` and `renew`. */
+LW_SEEN(begin) void lw_page_begin(void) {
     lw_page_failed_plant = -1;
-    return lw_begin(&lw_page_memory, 0.0) && lw_page_start_plants();
+    lw_page_tick = 0;
+    lw_page_has_failed = !lw_begin(&lw_page_memory, 0.0) || !lw_page_start_plants();
+}
+
+/* Go through one tick into a row, and to the next one; false: it can't, and `wrote` says whether the row is whole. */
+static bool lw_page_take_tick(double *row, bool *wrote) {
+    lw_memory *m = &lw_page_memory;
+    const int64_t tick = lw_page_tick;
+    row[0] = lw_time_of(tick);
+    if (!lw_go(m, lw_time_of(tick + !LW_HYBRID))) return *wrote = false; /* the tick, and nothing after it */
+    lw_read_row(row + 1);
+    *wrote = true;
+    for (int j = 0; j < LW_N_PLANTS; j++)
+        if (lw_page_is_due(lw_plants + j, tick)) lw_page_take_inputs(lw_plants + j);
+    lw_page_tick = LW_N_CLOCKS ? m->tick : tick + 1;
+    return (!LW_HYBRID || lw_go(m, lw_time_of(lw_page_tick))) && lw_page_step_plants(lw_page_tick);
 }
 
 /* Go through so many ticks; returns the number of samples: fewer where it can't continue. */
 LW_SEEN(run) int lw_page_run(int count) {
+    int n = 0;
     lw_page_failed_plant = -1;
-    for (int n = 0; n < count && n < LW_N_ROWS; n++) {
-        const int64_t tick = lw_page_memory.tick;
-        lw_page_rows[n][0] = lw_time_of(tick);
-        if (!lw_go(&lw_page_memory, lw_time_of(tick + 1))) return n;
-        lw_read_row(lw_page_rows[n] + 1);
-        for (int j = 0; j < LW_N_PLANTS; j++)
-            if (lw_page_is_due(lw_plants + j, tick)) lw_page_take_inputs(lw_plants + j);
-        if (!lw_page_step_plants(lw_page_memory.tick)) return n + 1;
+    while (n < count && n < LW_N_ROWS && !lw_page_has_failed) {
+        bool wrote;
+        lw_page_has_failed = !lw_page_take_tick(lw_page_rows[n], &wrote);
+        n += wrote;
     }
-    return count < LW_N_ROWS ? count : LW_N_ROWS;
+    return n;
 }

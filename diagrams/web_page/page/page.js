@@ -25,8 +25,9 @@ class Model {
     const p = this.numbers(this.calls.parameters());
     for (const [place, value] of this.changed) p[place] = value;
     this.calls.renew();
-    this.failed = !this.calls.begin();
+    this.calls.begin();
   }
+  get failed() { return this.calls.failed() !== 0; }
   numbers(address, count) { return new Float64Array(this.calls.memory.buffer, address, count); }
   set(place, value) {
     this.changed.set(place, value);
@@ -37,10 +38,9 @@ class Model {
     if (this.isNew) { this.calls.renew(); this.isNew = false; }
     let done = 0;
     while (done < count && !this.failed) {
-      const wanted = Math.min(CHUNK, count - done), n = this.calls.run(wanted);
+      const n = this.calls.run(Math.min(CHUNK, count - done));
       record.add(this.numbers(this.calls.samples(), n * this.width), n);
       done += n;
-      if (n < wanted || this.calls.plant() >= 0) this.failed = true;
     }
     return done;
   }
