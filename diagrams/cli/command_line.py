@@ -36,6 +36,7 @@ from ..simulation import Interrupted
 from .diagrams import add_diagram_options, add_diagrams, draw_command, run_diagram, sweep_command
 from .fmu import COMMANDS, add_commands
 from .options import option_lines, parse_letters, parse_options, parse_renames, share
+from .page import add_page, page_command
 from .report import add_report, report_command
 from .ssp import add_ssp, ssp_command
 from .subjects import is_user_file
@@ -82,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.print_help(sys.stderr)
         return 2
     try:
-        own = {"report": report_command, "draw": draw_command, "sweep": sweep_command, "ssp": ssp_command}
+        own = {"report": report_command, "draw": draw_command, "sweep": sweep_command, "ssp": ssp_command, "page": page_command}
         return {**COMMANDS, **own}.get(arguments.command, _run)(arguments)
     except OptionError as error:
         _say(f"loopwright: error: {error}", sys.stderr)
@@ -157,6 +158,7 @@ def _make_parser() -> argparse.ArgumentParser:
     add_diagram_options(run)
     add_diagrams(commands)
     add_report(commands)
+    add_page(commands)
     add_commands(commands)
     add_ssp(commands)
     return parser

@@ -33,6 +33,13 @@ LABELS = {
     "admittance_perp.damping_ratio": "damping ratio ζ⊥",
     "admittance_perp.stiffness": "stiffness k⊥",
     "hand.stiffness": "the hand's spring",
+    "xi[1]": "ξ",
+    "xi_p[1]": "ξ of the admittance",
+    "eta[1]": "η",
+    "force_projection.f_par": "F∥",
+    "force_projection.f_perp": "F⊥",
+    "motor_force[1]": "motor y",
+    "motor_force[2]": "motor z",
 }
 PLOTS = (
     ("xi[1]", "xi_p[1]"),

@@ -150,7 +150,7 @@ def make_page(
     text : PageText, optional
         Its words; ``title`` is one of them.
     labels : mapping of str to str, optional
-        What the page calls sliders, by their names.
+        What the page calls sliders and signals, by their names.
     scene : Scene, optional
         A picture above the plots.
     """
@@ -174,7 +174,10 @@ def make_page(
         "step": float(spec.base),
         "speed": speed,
         "span": span,
-        "columns": [{"name": column.name, "unit": column.unit} for column in columns.found],
+        "columns": [
+            {"name": column.name, "unit": column.unit, "label": (labels or {}).get(column.name, column.name)}
+            for column in columns.found
+        ],
         "plots": shown,
         "groups": [
             {"title": head, "sliders": [_slider(one, place_of(one, spec), labels or {}) for one in group]}

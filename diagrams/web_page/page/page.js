@@ -122,7 +122,7 @@ function fit(canvas) {  // the drawing context in CSS pixels
 // ---- plots ----
 
 class Plot {
-  constructor(of, index) {
+  constructor(of) {
     this.of = of;
     const box = document.createElement('figure');
     box.className = 'plot';
@@ -132,14 +132,15 @@ class Plot {
       const key = document.createElement('span'), mark = document.createElement('i'), value = document.createElement('output');
       key.className = 'key';
       mark.style.background = `var(--c${i % 8})`;
-      key.append(mark, `${data.columns[curve].name} `, value);
+      key.append(mark, `${data.columns[curve].label} `, value);
+      key.title = data.columns[curve].name;
       legend.append(key);
       return value;
     });
     if (of.unit) legend.append(Object.assign(document.createElement('span'), { className: 'unit', textContent: `[${of.unit}]` }));
     this.canvas = document.createElement('canvas');
     this.canvas.setAttribute('role', 'img');
-    this.canvas.setAttribute('aria-label', of.curves.map(c => data.columns[c].name).join(', '));
+    this.canvas.setAttribute('aria-label', of.curves.map(c => data.columns[c].label).join(', '));
     this.canvas.onpointermove = event => { cursor = event.offsetX; this.at = this.timeAt(event.offsetX); redraw(); };
     this.canvas.onpointerleave = () => { cursor = null; redraw(); };
     box.append(legend, this.canvas);
@@ -258,7 +259,7 @@ class Slider {
 const model = new Model(Uint8Array.from(atob($('lw-module').textContent.trim()), c => c.charCodeAt(0)));
 const record = new Recording(model.width);
 let cursor = null, running = false, speed = data.speed, span = data.span, ticksDone = 0, origin = 0, base = 0, drawn = false, behind = 0, scene = null;
-const sliders = new Map(), plots = data.plots.map((of, i) => new Plot(of, i));
+const sliders = new Map(), plots = data.plots.map(of => new Plot(of));
 
 for (const group of data.groups) {
   const box = document.createElement('section');

@@ -1,0 +1,190 @@
+"""Pages in a real browser, opened from the disk: they run, answer, keep to themselves, and have a run's samples."""
+
+import csv
+import shutil
+from contextlib import contextmanager
+from functools import cache
+
+import numpy as np
+import pytest
+
+from loopwright import experiments
+
+pytestmark = pytest.mark.slow
+SIZES = [(1100, 900), (390, 844)]
+RELATIVE = 1e-9
+"""Of a signal's largest value: elementary functions differ by an ulp, and the loops damp that."""
+POINTER = """async ([moves, pause]) => {
+    const canvas = document.querySelector('.scene canvas'), box = canvas.getBoundingClientRect();
+    for (const [type, x, y] of moves) {
+        const at = {clientX: box.left + x * box.width, clientY: box.top + y * box.height, pointerId: 1, bubbles: true};
+        canvas.dispatchEvent(new PointerEvent(type, at));
+        await new Promise(done => setTimeout(done, pause));
+    }
+}"""
+
+
+@contextmanager
+def opened(file, size=SIZES[0], scheme="light"):
+    """Open a page from the disk; what it says in the console, and what it asks for, must be nothing."""
+    from playwright.sync_api import sync_playwright  # in the extra `test`
+
+    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    assert browser, "a browser is needed: install chromium (apt-get install chromium), then run this test again"
+    said, asked, url = [], [], file.as_uri()
+    with sync_playwright() as playwright:
+        program = playwright.chromium.launch(executable_path=browser, args=["--no-sandbox", "--disable-gpu"])
+        context = program.new_context(viewport=dict(zip(("width", "height"), size, strict=True)), color_scheme=scheme)
+        page = context.new_page()
+        page.on("console", lambda message: said.append(message.text))
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(url)
+        yield page
+        program.close()
+    assert said == []
+    assert [one for one in asked if one != url and not one.startswith(("data:", "blob:"))] == []
+
+
+@cache
+def hand_page(folder):
+    return experiments.hand_page(folder / "hand.html")
+
+
+@pytest.fixture
+def file(tmp_path_factory):
+    folder = tmp_path_factory.getbasetemp()
+    hand_page(folder)
+    return folder / "hand.html"
+
+
+def read_csv(path):
+    with open(path, encoding="utf-8", newline="") as stream:
+        names, *rows = csv.reader(stream)
+    return names, np.array(rows, dtype=float)
+
+
+def test_a_robot_that_is_pulled_moves_as_the_same_run_in_python(file, tmp_path):
+    circle = [("pointermove", 0.5 + 0.33 * np.cos(a), 0.5 - 0.42 * np.sin(a)) for a in np.linspace(0.3, 2.0, 60)]
+    with opened(file) as page:
+        page.evaluate(POINTER, [[("pointerdown", 0.75, 0.2), *circle, ("pointerup", 0.5, 0.5)], 20])  # in real time
+        page.evaluate("page.pause()")
+        changed_at = page.evaluate("page.ticks")
+        page.evaluate("page.set('admittance_perp.stiffness', 800)")
+        page.evaluate("page.advance(500)")
+        with page.expect_download() as download:
+            page.click("#save")
+        download.value.save_as(tmp_path / "hand.csv")
+    names, rows = read_csv(tmp_path / "hand.csv")
+    assert names[0] == "t"
+    assert len(rows) == changed_at + 500 > 800  # the pull took more than a second
+    column = {name: rows[:, i] for i, name in enumerate(names)}
+    assert column["eta[1]"][-1] - column["eta[1]"][0] > 0.05  # it was pulled along the path
+
+    hand = np.stack([column["hand_position[1]"], column["hand_position[2]"], column["hand_grip"]], axis=1)
+    run = run_again(hand, changed_at)
+    assert np.array_equal(run.t, rows[:, 0])
+    worst = {name: np.abs(column[name] - run[name]).max() / max(np.abs(run[name]).max(), 1e-12) for name in names[1:]}
+    assert max(worst.values()) < RELATIVE, {name: value for name, value in worst.items() if value >= RELATIVE}
+
+
+def run_again(hand, changed_at):
+    """Return the run in Python in which the hand moves as it did, and the stiffness changes at the same tick."""
+    last = len(hand) - 1
+
+    def following(t):  # what is read after a tick acts at the one that follows
+        return min(round(t / 1e-3) + 1, last)
+
+    inputs = {
+        "hand_position": lambda t: hand[following(t), :2],
+        "hand_grip": lambda t: hand[following(t), 2],
+        "admittance_perp.stiffness": lambda t: 800.0 if following(t) >= changed_at else 200.0,
+    }
+    now = [0.0]
+    found = (
+        experiments.guided_by_hand()
+        .diagram.simulation()
+        .run_realtime(
+            last * 1e-3,
+            inputs=inputs,
+            frame=1e-9,  # one tick
+            clock=lambda: now[0],
+            sleep=lambda seconds: now.__setitem__(0, now[0] + seconds),
+        )
+    )
+    return found.run
+
+
+def test_steps_resets_and_a_slider(file):
+    with opened(file) as page:
+        assert page.evaluate("[page.ticks, page.running]") == [1, False]
+        page.click("#step")
+        page.click("#step")
+        assert page.evaluate("page.ticks") == 3
+        page.click("#play")
+        page.wait_for_timeout(500)
+        page.click("#play")
+        assert page.inner_text("#play") == "Run"
+        ran = page.evaluate("page.ticks")
+        assert ran > 100
+        page.wait_for_timeout(200)
+        assert page.evaluate("page.ticks") == ran
+        page.get_by_label("stiffness k⊥", exact=True).fill("0.9")  # the way of the slider
+        assert page.get_by_label("stiffness k⊥, value").input_value() == "1820"
+        assert page.evaluate("page.sliders.get('admittance_perp.stiffness').value") == 1820.0
+        page.get_by_text("stiffness k⊥").dblclick()
+        assert page.evaluate("page.sliders.get('admittance_perp.stiffness').value") == 200.0
+        page.click("#reset")
+        assert page.evaluate("[page.ticks, page.time, page.record.count]") == [1, 0, 1]
+        page.keyboard.press("Tab")
+        page.evaluate("document.activeElement.blur()")
+        page.keyboard.press("ArrowRight")
+        assert page.evaluate("page.ticks") == 2
+
+
+def test_a_run_that_cannot_continue_says_why(file):
+    """Pulled out of the domain of the path's coordinates, the run stops and the page says so; a reset begins again."""
+    with opened(file) as page:
+        page.evaluate("page.set('admittance_perp.stiffness', 0)")  # beyond the slider's range
+        page.evaluate("for (const [n, v] of [['hand_y', 0.5], ['hand_z', 0.5], ['grip', 1]]) page.set(n, v)")
+        page.evaluate("page.advance(20000)")
+        text = page.inner_text("#note")
+        assert text.startswith("It has ended: ")
+        assert "Change what led there, and reset." in text
+        page.evaluate("page.set('admittance_perp.stiffness', 200)")
+        page.click("#reset")
+        assert page.evaluate("[page.ticks, page.model.failed]") == [1, False]
+        assert not page.is_visible("#note")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", SIZES)
+def test_it_fits_the_screen_in_both_schemes(file, size, scheme):
+    with opened(file, size, scheme) as page:
+        page.evaluate("page.advance(3000)")
+        page.wait_for_timeout(100)
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        assert page.is_visible(".scene canvas")
+        ground = page.evaluate("getComputedStyle(document.documentElement).backgroundColor")
+        assert ground == {"light": "rgb(255, 255, 255)", "dark": "rgb(20, 25, 31)"}[scheme]
+
+
+def test_it_keeps_pace(file, record_property):
+    """What is sustained is reported, and not asserted: 1000 ticks and 60 pictures in a second."""
+    with opened(file) as page:
+        measured = page.evaluate(
+            """async () => {
+                let pictures = 0, stop = false;
+                const count = () => { pictures++; if (!stop) requestAnimationFrame(count); };
+                page.play();
+                requestAnimationFrame(count);
+                const ticks = page.ticks, began = performance.now();
+                await new Promise(done => setTimeout(done, 3000));
+                const seconds = (performance.now() - began) / 1000;
+                stop = true; page.pause();
+                return [(page.ticks - ticks) / seconds, pictures / seconds, page.behind];
+            }"""
+        )
+        record_property("ticks, pictures per second, seconds behind", measured)
+        print("ticks and pictures per second, seconds behind:", measured)
+        assert measured[0] > 0.0
