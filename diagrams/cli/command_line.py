@@ -83,7 +83,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.print_help(sys.stderr)
         return 2
     try:
-        own = {"report": report_command, "draw": draw_command, "sweep": sweep_command, "ssp": ssp_command, "page": page_command}
+        own = {"report": report_command, "draw": draw_command, "sweep": sweep_command, "ssp": ssp_command}
+        own["page"] = page_command
         return {**COMMANDS, **own}.get(arguments.command, _run)(arguments)
     except OptionError as error:
         _say(f"loopwright: error: {error}", sys.stderr)
