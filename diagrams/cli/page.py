@@ -25,9 +25,9 @@ def add_page(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "page",
         help="write a diagram as a web page that runs",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="DIAGRAM is FILE.py:NAME: a diagram in a file of yours, or a function without arguments that returns\n"
-        "one; or hand: experiment C of the paper, guided by the pointer. One file, which opens from the disk: it\n"
-        "runs in the browser, with sliders and plots.",
+        description="DIAGRAM is FILE.py:NAME: a diagram in a file of yours, or a function without arguments that\n"
+        "returns one; or hand: experiment C of the paper, guided by the pointer. One file, which opens from the disk:\n"
+        "it runs in the browser, with sliders and plots.",
         epilog="examples:\n  loopwright page hand\n  loopwright page loop.py:loop --out loop.html\n"
         "  loopwright page loop.py:loop --input target=-100:100 --slider pid.kp=0:5 --plot speed,target --plot u\n"
         "\nexit status:\n  0    done\n  1    it can't be built: an FMU of others, a function of Python, no compiler\n"
