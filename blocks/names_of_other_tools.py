@@ -106,6 +106,7 @@ _PARTS = {
     "dump": 'an FMU is described by read_description("plant.fmu"), or the command loopwright inspect plant.fmu',
     "interconnect": "a call wires: plant(force=controller(plant.position))",
     "simulate_fmu": 'make Diagram("name", Fmu("plant.fmu")()), and run it by diagram.simulate(2.0)',
+    "simulate_ssp": 'make Diagram.from_ssp("system.ssp"), and run it by diagram.simulate(2.0, step=0.01)',
     "plot_result": 'a run is plotted by run.plot("wire")',
     "validate_fmu": 'an FMU is examined by doctor("plant.fmu"), or the command loopwright validate plant.fmu',
 }

@@ -26,10 +26,10 @@ from ...blocks.core import (
 from ...blocks.library import UnitConversion
 from ...fmus import ArchiveLimits, Fmu
 from ..wiring import Structure, SubsystemSettings, Wire, join
-from .dataflow import Dataflow, Hop, Node
+from .dataflow import ConnectorKey, Dataflow, Hop
 from .elements import OUTPUTS, Component, Names, System
 from .parameters import Given, apply_bindings, value_table
-from .parts import Part
+from .parts import FmuPart
 from .value_table import ValueTable
 
 Operation = tuple[Any, ...]
@@ -39,7 +39,7 @@ Operation = tuple[Any, ...]
 class Feed(NamedTuple):
     """What a connector gets: the connector where it comes from, and the steps on the way."""
 
-    origin: Node
+    origin: ConnectorKey
     operations: tuple[Operation, ...]
 
 
@@ -68,10 +68,10 @@ class Assembly:
     def __post_init__(self) -> None:
         walked = dict(self.root.walk())
         self.systems = {names: e for names, e in walked.items() if isinstance(e, System)}
-        self.parts = {names: Part(names, e, self.limits) for names, e in walked.items() if isinstance(e, Component)}
+        self.parts = {names: FmuPart(names, e, self.limits) for names, e in walked.items() if isinstance(e, Component)}
         self.paths = _make_paths(self.root)
         self._taken = set(self.paths.values())
-        self._sources: dict[Node, Wire] = {}
+        self._sources: dict[ConnectorKey, Wire] = {}
         self._made: dict[tuple[Any, ...], Wire] = {}
 
     def structure(self) -> Structure:
@@ -144,10 +144,10 @@ class Assembly:
 
     # --- values ------------------------------------------------------------------------------------------------------
 
-    def _unit(self, node: Node) -> str | None:
+    def _unit(self, node: ConnectorKey) -> str | None:
         return self.flow.connectors[node].unit if node in self.flow.connectors else None
 
-    def _feed(self, node: Node) -> Feed:
+    def _feed(self, node: ConnectorKey) -> Feed:
         """Return what a connector gets: conversions of units come ahead of the transformation (SSP 2.0, 4.5.3.1)."""
         origin, way = self.flow.trace(node)
         unit, operations = self._unit(origin), list[Operation]()
@@ -188,7 +188,7 @@ class Assembly:
         table = value_table(change, ends[0].items, ends[1].items, ".".join(hop.system) or self.root.name)
         return "table", tuple(sorted(table.items()))
 
-    def _set_start(self, node: Node, given: Given) -> None:
+    def _set_start(self, node: ConnectorKey, given: Given) -> None:
         """Set the start value of an FMU's variable."""
         part = self.parts[node.element]
         about = part.description
@@ -198,9 +198,9 @@ class Assembly:
             unit = about.find(node.connector).unit
         part.start[node.connector] = given.number(unit, items)
 
-    def _split_feeds(self, feeds: Mapping[Node, Feed]) -> dict[Node, Feed]:
+    def _split_feeds(self, feeds: Mapping[ConnectorKey, Feed]) -> dict[ConnectorKey, Feed]:
         """Return the feeds that become wires; the values of others become start values of the FMUs."""
-        wired: dict[Node, Feed] = {}
+        wired: dict[ConnectorKey, Feed] = {}
         for node, feed in feeds.items():
             part, origin = self.parts[node.element], feed.origin
             if origin.element in self.parts:
@@ -229,7 +229,7 @@ class Assembly:
                 self._start_from(node, feed)
         return wired
 
-    def _start_from(self, node: Node, feed: Feed) -> None:
+    def _start_from(self, node: ConnectorKey, feed: Feed) -> None:
         """Set a start value from the connector of a system that nothing drives, if it has a value."""
         given = self.given.get(feed.origin)
         if given is not None:
@@ -239,7 +239,7 @@ class Assembly:
         elif node in self.given:
             self._set_start(node, self.given[node])
 
-    def _make_inputs(self, wired: Mapping[Node, Feed]) -> None:
+    def _make_inputs(self, wired: Mapping[ConnectorKey, Feed]) -> None:
         """Make a block of each input of the root system: a constant, which `Diagram.replace` takes another source for.
 
         Raises
@@ -247,7 +247,7 @@ class Assembly:
         SspFileError
             For an input without a value, whose connections end at inputs with different start values.
         """
-        users: dict[Node, list[tuple[Node, Feed]]] = {}
+        users: dict[ConnectorKey, list[tuple[ConnectorKey, Feed]]] = {}
         for node, feed in wired.items():
             if feed.origin.element not in self.parts:
                 users.setdefault(feed.origin, []).append((node, feed))
@@ -275,8 +275,8 @@ class Assembly:
             )
             self._sources[origin] = Wire(path, "y")
 
-    def _common_start(self, origin: Node, used: Sequence[tuple[Node, Feed]]) -> Any:
-        found: list[tuple[Node, Any]] = []
+    def _common_start(self, origin: ConnectorKey, used: Sequence[tuple[ConnectorKey, Feed]]) -> Any:
+        found: list[tuple[ConnectorKey, Any]] = []
         for node, feed in used:
             if node in self.given:
                 self._set_start(node, self.given[node])
@@ -325,10 +325,10 @@ class Assembly:
                 raise error.blame(".".join(names)) from None
             self.table.subsystem_of[path] = self.paths[names[:-1]]
 
-    def _wire_parts(self, wired: Mapping[Node, Feed]) -> None:
+    def _wire_parts(self, wired: Mapping[ConnectorKey, Feed]) -> None:
         for names, part in self.parts.items():
             for port, scalars in part.members("input").items():
-                feeds = [wired.get(Node(names, name)) for name in scalars]
+                feeds = [wired.get(ConnectorKey(names, name)) for name in scalars]
                 if not any(feeds):
                     continue
                 subsystem, path = self.paths[names[:-1]], self.paths[names]
@@ -337,7 +337,7 @@ class Assembly:
                     wire = self._stack(names, scalars, feeds, subsystem, path)
                 self.table.wires[path, port] = wire
 
-    def _source(self, origin: Node) -> tuple[Wire, tuple[int, ...]]:
+    def _source(self, origin: ConnectorKey) -> tuple[Wire, tuple[int, ...]]:
         """Return the wire of an origin, and the shape of the port that it comes from."""
         if origin.element in self.parts:
             port, index, shape = self.parts[origin.element].port(origin.connector)
@@ -414,7 +414,7 @@ class Assembly:
         """Name the wires of systems' outputs by their connectors, and note where their inputs come from."""
         for names, system in self.systems.items():
             for name, connector in system.connectors.items():
-                node = Node(names, name)
+                node = ConnectorKey(names, name)
                 if node not in self.flow.hops:
                     continue
                 feed, path = self._feed(node), self.paths[names]

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 from ...blocks.core import DoubleDriveError, SspFileError, near
 from .elements import INPUTS, OUTPUTS, Component, Connection, Connector, DictionaryReference, Element, Names, System
-from .parts import Part
+from .parts import FmuPart
 
 
-class Node(NamedTuple):
+class ConnectorKey(NamedTuple):
     """Connector of an element by its names from the root system down, or entry of a signal dictionary."""
 
     element: Names
@@ -27,9 +27,9 @@ class Node(NamedTuple):
 class Hop(NamedTuple):
     """Connection on the way of a value."""
 
-    start: Node
+    start: ConnectorKey
     connection: Connection
-    end: Node
+    end: ConnectorKey
     system: Names
     """The system that has the connection."""
 
@@ -49,10 +49,10 @@ class Dataflow:
     """
 
     root: System
-    parts: Mapping[Names, Part]
+    parts: Mapping[Names, FmuPart]
     notes: list[str]
-    hops: dict[Node, Hop] = field(default_factory=dict)
-    connectors: dict[Node, Connector] = field(default_factory=dict)
+    hops: dict[ConnectorKey, Hop] = field(default_factory=dict)
+    connectors: dict[ConnectorKey, Connector] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._elements = dict(self.root.walk())
@@ -64,13 +64,13 @@ class Dataflow:
                         self.notes.append(f"the FMU of {part.path} has no variable {name!r}, which its connector names")
                         continue
                     found = part.connector(name)
-                    self.connectors[Node(names, found.name)] = found
+                    self.connectors[ConnectorKey(names, found.name)] = found
                 elif isinstance(element, System):
-                    self.connectors[Node(names, name)] = connector
+                    self.connectors[ConnectorKey(names, name)] = connector
             if isinstance(element, System):
                 for dictionary, entries in element.dictionaries.items():
                     for name, entry in entries.items():
-                        self.connectors[Node((*names, dictionary), name, True)] = entry
+                        self.connectors[ConnectorKey((*names, dictionary), name, True)] = entry
         for names, element in self._elements.items():
             if isinstance(element, System):
                 for connection in element.connections:
@@ -103,7 +103,7 @@ class Dataflow:
 
     def _find_end(
         self, names: Names, system: System, connection: Connection, end: tuple[str, str]
-    ) -> tuple[Node, str, bool, bool]:
+    ) -> tuple[ConnectorKey, str, bool, bool]:
         """Return an end of a connection, its kind, and whether a value comes from it or goes to it."""
         name, port = end
         where = ".".join(names) or None
@@ -116,7 +116,12 @@ class Dataflow:
                 )
             kind = system.connectors[port].kind
             open_ended = kind in ("inout", "unspecified")
-            return Node(names, port), f"system {kind}", open_ended or kind in INPUTS, open_ended or kind in OUTPUTS
+            return (
+                ConnectorKey(names, port),
+                f"system {kind}",
+                open_ended or kind in INPUTS,
+                open_ended or kind in OUTPUTS,
+            )
         element = system.elements.get(name)
         if element is None:
             raise SspFileError(
@@ -133,22 +138,22 @@ class Dataflow:
 
     def _find_connector(
         self, names: Names, element: Element, port: str, connection: Connection
-    ) -> tuple[Node, Connector]:
+    ) -> tuple[ConnectorKey, Connector]:
         if isinstance(element, Component):
             if port in element.connectors:
                 found = self.parts[names].connector(port)
-                return Node(names, found.name), found
+                return ConnectorKey(names, found.name), found
         elif port in element.connectors:
             if isinstance(element, DictionaryReference):
                 return self._find_entry(names, element, port), element.connectors[port]
-            return Node(names, port), element.connectors[port]
+            return ConnectorKey(names, port), element.connectors[port]
         raise SspFileError(
             f"found the connection {connection}; the element has no connector {port!r}; expected one of its own. "
             f"{near(port, element.connectors)}",
             block=".".join(names),
         )
 
-    def _find_entry(self, names: Names, reference: DictionaryReference, port: str) -> Node:
+    def _find_entry(self, names: Names, reference: DictionaryReference, port: str) -> ConnectorKey:
         """Return the entry of a dictionary, which is looked up in the systems around its reference."""
         for n in range(len(names) - 1, -1, -1):
             system = self._elements[names[:n]]
@@ -161,14 +166,14 @@ class Dataflow:
                         f"that name; expected one of its own. {near(port, entries)}",
                         block=".".join(names),
                     )
-                return Node((*names[:n], reference.dictionary), port, True)
+                return ConnectorKey((*names[:n], reference.dictionary), port, True)
         raise SspFileError(
             f"found a reference to the signal dictionary {reference.dictionary!r}, which no system around it has; "
             "expected its definition there. Add it.",
             block=".".join(names),
         )
 
-    def trace(self, node: Node) -> tuple[Node, list[Hop]]:
+    def trace(self, node: ConnectorKey) -> tuple[ConnectorKey, list[Hop]]:
         """Return where the value of a connector comes from, and the connections on the way, from there on."""
         way: list[Hop] = []
         seen = {node}

@@ -24,6 +24,7 @@ SPACES = {
 OSP = "http://opensimulationplatform.com/SSP/OSPAnnotations"
 _TYPES = {"Float64": "Real", "Float32": "Real", "Int32": "Integer", "Boolean": "Boolean", "String": "String"}
 _TYPES |= {"Enumeration": "Enumeration", "Binary": "Binary"}
+_FLOATS = ("Float64", "Float32")
 _SMALL = {f"{sign}Int{bits}": "Integer" for sign, bits in (("", 8), ("U", 8), ("", 16), ("U", 16))}
 
 
@@ -83,7 +84,7 @@ class WrittenValue:
     items: Mapping[str, int] = field(default_factory=dict)
 
 
-class Document:
+class XmlDocument:
     """One XML file: its units and enumerations are collected while it is made."""
 
     def __init__(self, version: str):
@@ -162,7 +163,7 @@ class Document:
         if connector.type == "Enumeration":
             self.add(parent, "ssc:Enumeration", name=self.enumeration(connector.items))
         else:
-            unit = self.unit(connector.unit) if connector.type.startswith("Float") else None
+            unit = self.unit(connector.unit) if connector.type in _FLOATS else None
             self.add(parent, f"ssc:{type_name(connector.type)}", unit=unit)
         for size in connector.shape:
             self.add(parent, "ssc:Dimension", size=size)
@@ -183,12 +184,12 @@ def needs_version_2(connectors: Iterable[WrittenConnector], values: Iterable[Wri
 
 def write_values(version: str, name: str, values: Sequence[WrittenValue]) -> bytes:
     """Return a parameter set."""
-    made = Document(version)
+    made = XmlDocument(version)
     root = made.root("ssv:ParameterSet", name=name)
     group = made.add(root, "ssv:Parameters")
     for value in values:
         element = made.add(group, "ssv:Parameter", name=value.name)
-        unit = made.unit(value.unit) if value.type.startswith("Float") else None
+        unit = made.unit(value.unit) if value.type in _FLOATS else None
         made.add(element, f"ssv:{type_name(value.type)}", value=_text(value), unit=unit)
         for size in np.shape(value.value) if not isinstance(value.value, str | bytes) else ():
             made.add(element, "ssc:Dimension", size=size)
@@ -209,12 +210,12 @@ def _number(number: float, value: WrittenValue) -> str:
         return next((name for name, item in value.items.items() if item == number), str(int(number)))
     if value.type == "Boolean":
         return "true" if number else "false"
-    return repr(number) if value.type.startswith("Float") else str(int(number))
+    return repr(number) if value.type in _FLOATS else str(int(number))
 
 
 def write_dictionary(version: str, entries: Sequence[WrittenConnector]) -> bytes:
     """Return a signal dictionary."""
-    made = Document(version)
+    made = XmlDocument(version)
     root = made.root("ssb:SignalDictionary")
     for entry in entries:
         made.type(made.add(root, "ssb:DictionaryEntry", name=entry.name), entry)
@@ -224,7 +225,7 @@ def write_dictionary(version: str, entries: Sequence[WrittenConnector]) -> bytes
 
 def write_description(version: str, name: str, system: WrittenElement, stop: float | None, step: float | None) -> bytes:
     """Return a system structure description."""
-    made = Document(version)
+    made = XmlDocument(version)
     root = made.root("ssd:SystemStructureDescription", "ssv", "ssb", name=name)
     _add_system(made, root, system)
     made.close(root, "ssd")
@@ -239,7 +240,7 @@ def write_description(version: str, name: str, system: WrittenElement, stop: flo
     return made.text(root)
 
 
-def _add_connectors(made: Document, parent: Any, element: WrittenElement) -> None:
+def _add_connectors(made: XmlDocument, parent: Any, element: WrittenElement) -> None:
     if element.connectors:
         group = made.add(parent, "ssd:Connectors")
         for connector in element.connectors.values():
@@ -256,7 +257,7 @@ def _add_connectors(made: Document, parent: Any, element: WrittenElement) -> Non
         made.add(group, "ssd:ParameterBinding", source=element.binding)
 
 
-def _add_system(made: Document, parent: Any, system: WrittenElement) -> None:
+def _add_system(made: XmlDocument, parent: Any, system: WrittenElement) -> None:
     root = made.add(parent, "ssd:System", name=system.name)
     _add_connectors(made, root, system)
     group = made.add(root, "ssd:Elements") if system.elements else None
@@ -264,9 +265,13 @@ def _add_system(made: Document, parent: Any, system: WrittenElement) -> None:
         if element.source:
             implementation = element.implementation or None
             added = made.add(
-                group, "ssd:Component", name=element.name, type="application/x-fmu-sharedlibrary",
-                source=element.source, implementation=implementation,
-            )  # fmt: skip
+                group,
+                "ssd:Component",
+                name=element.name,
+                type="application/x-fmu-sharedlibrary",
+                source=element.source,
+                implementation=implementation,
+            )
             _add_connectors(made, added, element)
         else:
             _add_system(made, group, element)
@@ -281,7 +286,7 @@ def _add_system(made: Document, parent: Any, system: WrittenElement) -> None:
         made.add(root, "ssd:SystemGeometry", x1="0", y1="0", x2=width, y2=height)
 
 
-def _add_connection(made: Document, group: Any, connection: WrittenConnection) -> None:
+def _add_connection(made: XmlDocument, group: Any, connection: WrittenConnection) -> None:
     (start, a), (end, b) = connection.start, connection.end
     added = made.add(
         group,

@@ -133,7 +133,7 @@ class System(Element):
 
 
 @dataclass(frozen=True)
-class Experiment:
+class ProposedExperiment:
     """Simulation that a file proposes: start and end in s, and the step that an annotation of a tool names."""
 
     start: float | None = None

@@ -116,14 +116,14 @@ class Package:
 
 
 @dataclass(frozen=True)
-class Place:
+class PackagedFile:
     """File in a package, against which the URIs in it are resolved."""
 
     package: Package
     name: str
     """Its path from the root of the package."""
 
-    def resolve(self, uri: str, subject: str) -> Place:
+    def resolve(self, uri: str, subject: str) -> PackagedFile:
         """Return the file that a relative URI names.
 
         Raises

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import SspFileError, convert_unit, same_dimension, same_unit
-from .dataflow import Node
+from .dataflow import ConnectorKey
 from .elements import INTEGERS, REALS, Component, Names, ParameterValue, System, Transformation
-from .parts import Part
+from .parts import FmuPart
 
 _BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
 
@@ -82,12 +82,12 @@ class Given:
         return known[text] if text in known else int(text)
 
 
-def apply_bindings(root: System, parts: Mapping[Names, Part]) -> tuple[dict[Node, Given], int]:
+def apply_bindings(root: System, parts: Mapping[Names, FmuPart]) -> tuple[dict[ConnectorKey, Given], int]:
     """Return the value that each connector and variable gets, and the number of values that belong to none.
 
     Bindings of an element are applied in their order; those of a system take precedence over those of what is in it.
     """
-    found: dict[Node, Given] = {}
+    found: dict[ConnectorKey, Given] = {}
     unused = 0
     for names, element in sorted(root.walk(), key=lambda item: -len(item[0])):
         for binding in element.bindings:
@@ -108,14 +108,14 @@ def apply_bindings(root: System, parts: Mapping[Names, Part]) -> tuple[dict[Node
     return found, unused
 
 
-def _find_targets(element: Any, names: Names, name: str, parts: Mapping[Names, Part]) -> list[Node]:
+def _find_targets(element: Any, names: Names, name: str, parts: Mapping[Names, FmuPart]) -> list[ConnectorKey]:
     """Return the connectors and variables of a hierarchical name, relative to an element: several, by punning."""
     if isinstance(element, Component):
         part = parts[names]
-        return [Node(names, part.canonical(name))] if part.has(name) else []
+        return [ConnectorKey(names, part.canonical(name))] if part.has(name) else []
     if not isinstance(element, System):
         return []
-    found = [Node(names, name)] if name in element.connectors else []
+    found = [ConnectorKey(names, name)] if name in element.connectors else []
     for inner, child in element.elements.items():
         if name.startswith(f"{inner}."):
             found += _find_targets(child, (*names, inner), name[len(inner) + 1 :], parts)

@@ -24,13 +24,13 @@ from .elements import (
     Connector,
     DictionaryReference,
     Element,
-    Experiment,
     MappingEntry,
     ParameterValue,
+    ProposedExperiment,
     System,
     Transformation,
 )
-from .package import DEFAULT, Package, Place, as_ssp_errors, open_package
+from .package import DEFAULT, Package, PackagedFile, as_ssp_errors, open_package
 
 _SPACE = "http://ssp-standard.org/SSP1/"
 _FULL = f"{_SPACE}SystemStructure"
@@ -77,7 +77,7 @@ class Parsed:
     name: str
     version: str
     system: System
-    experiment: Experiment
+    experiment: ProposedExperiment
     tool: str
     notes: tuple[str, ...]
 
@@ -97,10 +97,10 @@ def parse_package(package: Package, variant: str | None = None) -> Parsed:
     SspFileError
         If a file is missing or damaged, breaks the standard, or has something that is not supported here.
     """
-    return _Reader().parse_description(_choose(package, variant))
+    return _SspReader().parse_description(_choose(package, variant))
 
 
-def _choose(package: Package, variant: str | None) -> Place:
+def _choose(package: Package, variant: str | None) -> PackagedFile:
     """Return the description of a package that is asked for."""
     known, file = package.descriptions, str(package.file)
     if not known:
@@ -117,12 +117,12 @@ def _choose(package: Package, variant: str | None) -> Place:
                 f"{file!r} has no {DEFAULT}, only {', '.join(known)}; expected that one. Name one of them: variant=….",
                 fault=FmuFault.NO_DESCRIPTION,
             )
-        return Place(package, chosen)
+        return PackagedFile(package, chosen)
     if variant in known:
-        return Place(package, variant)
-    names = {str(Place(package, name).parse("the package").get("name")): name for name in known}
+        return PackagedFile(package, variant)
+    names = {str(PackagedFile(package, name).parse("the package").get("name")): name for name in known}
     if variant in names:
-        return Place(package, names[variant])
+        return PackagedFile(package, names[variant])
     raise SspFileError(
         f"{file!r} has no variant {variant!r}; expected one of {', '.join(map(repr, known))}. "
         f"{near(variant, [*known, *names])}",
@@ -132,14 +132,14 @@ def _choose(package: Package, variant: str | None) -> Place:
 
 
 @dataclass
-class _Reader:
+class _SspReader:
     """Reads files; those within one another share the stack of what is open, and the number of elements."""
 
     stack: list[tuple[Path, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     count: int = 0
 
-    def parse_description(self, place: Place) -> Parsed:
+    def parse_description(self, place: PackagedFile) -> Parsed:
         """Return a description, with all that it refers to."""
         self.enter(place.package.file, place.name, place)
         root = place.parse("the package")
@@ -163,7 +163,7 @@ class _Reader:
             tuple(dict.fromkeys(self.notes)),
         )
 
-    def enter(self, file: Path, name: str, place: Place) -> None:
+    def enter(self, file: Path, name: str, place: PackagedFile) -> None:
         if (file, name) in self.stack or len(self.stack) >= _DEEPEST:
             chain = " → ".join(name for _, name in self.stack)
             kind = "refers to itself" if (file, name) in self.stack else f"has more than {_DEEPEST} levels"
@@ -179,7 +179,7 @@ class _Reader:
 class _File:
     """One file: its place, its units and enumerations, and its elements."""
 
-    def __init__(self, reader: _Reader, place: Place, root: Any, kind: str):
+    def __init__(self, reader: _SspReader, place: PackagedFile, root: Any, kind: str):
         self.reader, self.place, self.root = reader, place, root
         space, _, tag = str(root.tag).rpartition("}")
         known = f"{{{_FULL}{kind}", f"{{{_SPACE}{kind}"  # some tools leave a part out
@@ -359,12 +359,12 @@ class _File:
 
     # --- parameters --------------------------------------------------------------------------------------------------
 
-    def bindings(self, element: Any, at: str, component: Place | None) -> tuple[Binding, ...]:
+    def bindings(self, element: Any, at: str, component: PackagedFile | None) -> tuple[Binding, ...]:
         """Return the parameter bindings of an element, in their order."""
         group = self.one("ParameterBindings", element)
         return () if group is None else tuple(self._binding(child, at, component) for child in self.children(group))
 
-    def _binding(self, element: Any, at: str, component: Place | None) -> Binding:
+    def _binding(self, element: Any, at: str, component: PackagedFile | None) -> Binding:
         self.expect(element, "ParameterBinding", at=at)
         for child in self.children(element):
             self.expect(child, "ParameterValues", "ParameterMapping", at=at)
@@ -392,7 +392,7 @@ class _File:
                 at,
             )
 
-    def _part(self, element: Any, kind: str, inline: Any, at: str, component: Place | None) -> _File | None:
+    def _part(self, element: Any, kind: str, inline: Any, at: str, component: PackagedFile | None) -> _File | None:
         """Return the file that an element refers to by its source, or that is inside of another element."""
         source = element.get("source")
         if source is None:
@@ -410,7 +410,7 @@ class _File:
         place = self.place.resolve(source, subject)
         return _File(self.reader, place, place.parse(subject), kind)
 
-    def _inside(self, component: Place, source: str, subject: str) -> Any:
+    def _inside(self, component: PackagedFile, source: str, subject: str) -> Any:
         """Return the XML of a file inside of an FMU, or inside of another package."""
         path, name = component.path(subject), unquote(source).removeprefix("./")
         with as_ssp_errors():
@@ -570,7 +570,7 @@ class _File:
         inner = open_package(place.path(at), limits)
         return reader.parse_description(_choose(inner, fragment or None)).system
 
-    def experiment(self, element: Any) -> Experiment:
+    def experiment(self, element: Any) -> ProposedExperiment:
         """Return the default experiment; its step is that of a tool's annotation."""
         steps = [
             float(text)
@@ -581,11 +581,11 @@ class _File:
         ]
         step = min(steps) if steps else None
         if element is None:
-            return Experiment(step=step)
+            return ProposedExperiment(step=step)
         start, stop = (
             None if element.get(name) is None else self._number(element, name) for name in ("startTime", "stopTime")
         )
-        return Experiment(start, stop, step)
+        return ProposedExperiment(start, stop, step)
 
 
 def _tag(element: Any) -> str:

@@ -17,7 +17,7 @@ _INTERFACES = {"any": None, "CoSimulation": "co_simulation", "ModelExchange": "m
 
 
 @dataclass
-class Part:
+class FmuPart:
     """FMU of a component.
 
     Parameters

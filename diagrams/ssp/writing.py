@@ -40,7 +40,7 @@ _SIGNALS = ("input", "output")
 
 
 @dataclass
-class Part:
+class WrittenPart:
     """Component that is written."""
 
     path: str
@@ -67,7 +67,7 @@ class Writer:
         self.table = self.wired.scheduled
         self.root = WrittenElement(self.wired.name)
         self.systems: dict[str, WrittenElement] = {"": self.root}
-        self.parts: dict[str, Part] = {}
+        self.parts: dict[str, WrittenPart] = {}
         self.inputs: dict[str, WrittenValue] = {}
         self.exports: dict[str, Export] = {}
         self.files: dict[str, Path] = {}
@@ -165,13 +165,13 @@ class Writer:
             for scalar in part.scalars[port]:
                 self._connector(part, scalar)
 
-    def _add_part(self, path: str, about: FmuDescription, wires: dict[str, Wire]) -> Part:
+    def _add_part(self, path: str, about: FmuDescription, wires: dict[str, Wire]) -> WrittenPart:
         system, _, name = path.rpartition(".")
         if self.flat:
             system, name = "", path.replace(".", "_")
         element = WrittenElement(name, self._add_file(Path(about.file), about.digest))
         self._system(system).elements[name] = element
-        self.parts[path] = Part(path, system, wires, element, about)
+        self.parts[path] = WrittenPart(path, system, wires, element, about)
         return self.parts[path]
 
     def _add_file(self, file: Path, digest: str) -> str:
@@ -185,7 +185,7 @@ class Writer:
         self._digests[digest] = name
         return name
 
-    def _set_value(self, part: Part, name: str, value: Any) -> None:
+    def _set_value(self, part: WrittenPart, name: str, value: Any) -> None:
         about = part.description
         if name in about.other:
             part.values.append(WrittenValue(name, about.other[name].type, value))
@@ -197,7 +197,7 @@ class Writer:
             return  # the FMU's own
         part.values.append(WrittenValue(name, variable.type, shown, variable.unit, variable.items))
 
-    def _connector(self, part: Part, name: str) -> WrittenConnector:
+    def _connector(self, part: WrittenPart, name: str) -> WrittenConnector:
         if name not in part.element.connectors:
             variable: FmuVariable = part.description.find(name)
             kind = "constant" if variable.variability == "constant" else variable.causality
@@ -208,7 +208,7 @@ class Writer:
 
     # --- connections -------------------------------------------------------------------------------------------------
 
-    def _wire_port(self, part: Part, port: str, wire: Wire) -> None:
+    def _wire_port(self, part: WrittenPart, port: str, wire: Wire) -> None:
         """Write the connections of an input, one for each of its variables; numbers become start values."""
         terms, scalars = self.terms.entries(wire), part.scalars[port]
         if len(scalars) < len(terms):  # an array of FMI 3.0
@@ -221,7 +221,7 @@ class Writer:
             end = self._connector(part, name)
             self._connect(term, part.system, (part.element.name, name), end)
 
-    def _whole(self, part: Part, port: str, terms: Sequence[Term]) -> Term:
+    def _whole(self, part: WrittenPart, port: str, terms: Sequence[Term]) -> Term:
         """Return the one term of an array, whose entries come from one array in order."""
         first = terms[0]
         if first.source is not None and all(
