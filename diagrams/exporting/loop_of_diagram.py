@@ -307,12 +307,13 @@ class _Variables:
         return tuple(self._signal(name, wire, "output") for name, wire in self._opened.outputs.items())
 
     def signals(self) -> tuple[Placed, ...]:
-        """Return the named wires that are no outputs."""
+        """Return the named wires that are no outputs; one with the name of an input is left out."""
         opened = self._opened
+        taken = {*opened.outputs, *(one.variable.name for one in self.inputs())}
         found = []
         for full, wire in sorted(opened.wired.scheduled.names.items()):
             name = opened.shown(full)
-            if name not in opened.outputs and wire.block != opened.outside:
+            if name not in taken and wire.block != opened.outside:
                 found.append(self._signal(name, wire, "local"))
         return tuple(found)
 

@@ -76,7 +76,7 @@ def open_subsystem(subsystem: Subsystem, facade_class: type[Any], name: str) -> 
     path = next(p for p in table.subsystems if p and "." not in p)
     wired = WiredDiagram(name, table, "error", facade_class)
     outputs = {output: wired.scheduled.results[p, output] for p, output in table.results if p == path}
-    return OpenDiagram(wired, _OUTSIDE if names else "", outputs, path)
+    return OpenDiagram(wired, _OUTSIDE if names else "", _apart(outputs, names, path), path)
 
 
 def _wire(subsystem: Subsystem, outside: Outside, names: list[str]) -> Structure:
@@ -160,7 +160,7 @@ def open_part(wired: WiredDiagram, path: str, name: str) -> OpenDiagram:
         part.subsystem_of[_OUTSIDE] = ""
     opened = WiredDiagram(name, part, wired.loops, wired.facade_class)
     outputs = {output: opened.scheduled.results[p, output] for p, output in part.results if p == found}
-    return OpenDiagram(opened, _OUTSIDE if ports else "", outputs, found, start.states)
+    return OpenDiagram(opened, _OUTSIDE if ports else "", _apart(outputs, taken, found), found, start.states)
 
 
 def open_whole(wired: WiredDiagram, outside: Sequence[str], name: str) -> OpenDiagram:
@@ -220,6 +220,7 @@ def open_whole(wired: WiredDiagram, outside: Sequence[str], name: str) -> OpenDi
     scheduled = opened.scheduled
     outputs = {key: scheduled.results["", key] for key in read} or dict(scheduled.names)
     outputs = {n: w for n, w in outputs.items() if w.block != _OUTSIDE}
+    outputs = _apart(outputs, [p[0] for p in ports], "")
     return OpenDiagram(opened, _OUTSIDE if ports else "", outputs, states=start.states)
 
 
@@ -233,6 +234,23 @@ def let_move(opened: OpenDiagram, targets: Sequence[Target]) -> OpenDiagram:
     """
     names = {join(path, ".".join([*keys[:-1], split_entry(keys[-1], ())[0]])) for path, keys in targets}
     return replace(opened, wired=with_movable(opened.wired, targets), moved=opened.moved | names)
+
+
+def _apart(outputs: Mapping[str, Wire], inputs: Collection[str], inside: str) -> dict[str, Wire]:
+    """Return outputs of which none has an input's name: such a one is called after its block, too."""
+    found: dict[str, Wire] = {}
+    taken = {*inputs, *outputs}
+    for name, wire in outputs.items():
+        label = name
+        if name in inputs:
+            block = wire.block.removeprefix(f"{inside}.") if inside else wire.block
+            base = label = f"{block}_{name}".replace(".", "_")
+            count = 2
+            while label in taken:
+                label, count = f"{base}_{count}", count + 1
+            taken.add(label)
+        found[label] = wire
+    return found
 
 
 def choose_outputs(opened: OpenDiagram, outputs: tuple[str, ...] | None) -> OpenDiagram:

@@ -55,4 +55,6 @@ def find_start(wired: WiredDiagram) -> DiagramStart:
     with Simulation(wired, RunOptions(step=None if wired.has_base else _STEP)) as simulation:
         flat, view = simulation.flat, simulation.view
         log, x = view.log.copy(), view.x.copy()
-    return DiagramStart(flat, log, {path: x[where] for path, where in flat.states.slices.items()})
+    # blocks that delays and units have become are other ones in a part, and start from their inputs
+    own = {path: x[where] for path, where in flat.states.slices.items() if path in wired.structure.blocks}
+    return DiagramStart(flat, log, own)

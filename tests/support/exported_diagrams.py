@@ -4,6 +4,12 @@ from loopwright.blocks import PID, Relay, Sine, Step, Sum, TransferFunction, Uni
 from loopwright.diagrams import Diagram, subsystem
 
 
+@subsystem(sample_time=0.01)
+def controller(wanted, level):
+    """PI."""
+    return PID(kp=2.0, ki=3.0)(wanted, level).named("effort")
+
+
 def sampled():
     """Two rates, a delay, limits; all of it sampled."""
 

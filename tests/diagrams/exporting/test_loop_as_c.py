@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import PID, Step, TransferFunction
+from loopwright.blocks import PID, Gain, Step, TransferFunction
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.exporting import loop_spec, open_part
+from loopwright.diagrams.exporting import loop_spec, open_part, open_subsystem
 from support.exported_loops import Loop
 
 
@@ -84,3 +84,29 @@ def test_a_value_that_is_not_finite_stops_it_before_the_tick(spec):
     loop["level"] = 0.0
     assert loop.advance(0.01)
     assert np.isfinite(loop["effort"])
+
+
+def test_delays_of_two_outputs_begin_with_their_own_values():
+    """The blocks that delays have become are other ones in a part of a diagram."""
+
+    @subsystem(sample_time=0.01, delay=1)
+    def late(u):
+        return Gain(gain=100.0)(u).named("large"), Gain(gain=1.0)(u).named("small")
+
+    large, small = late(Step(times=0.05, values=1.0, initial_value=-0.7, name="wanted"))
+    diagram = Diagram("two", large.named("a"), small.named("b"), Gain(gain=1.0)(large).named("c"))
+    loop = Loop(loop_spec(open_part(diagram.wired, "late", "late"), name="late"))
+    loop["u"] = 0.5
+    assert loop.start()
+    assert (loop["large"], loop["small"]) == (50.0, 0.5)
+    loop["u"] = 2.0
+    assert loop.advance(0.01)
+    assert (loop["large"], loop["small"]) == (50.0, 0.5)
+    assert loop.advance(0.02)
+    assert (loop["large"], loop["small"]) == (200.0, 2.0)
+
+
+def test_an_output_with_the_name_of_an_input_is_called_after_its_block():
+    half = subsystem(sample_time=0.01, name="half")(lambda y: Gain(gain=0.5)(y))
+    spec = loop_spec(open_subsystem(half, Diagram, "half"), name="half")
+    assert [one.variable.name for one in (*spec.inputs, *spec.outputs)] == ["y", "gain_y"]

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from loopwright import build
 from loopwright.fmus import bouncing_ball, gantry, mass_spring_damper
+from support import exported_diagrams
 from support.ecos import load_ecospy
 from support.exported import ball, bounces
 
@@ -151,3 +153,49 @@ def test_events_in_ecos(ecospy, fmi):
     t, y = ecos(ecospy, bouncing_ball.build(fmi=fmi), ADAPTIVE, ("height", "velocity", "bounces"), 200)
     np.testing.assert_allclose(y[:, :2], [ball(at) for at in t], rtol=0, atol=1e-12)
     assert np.array_equal(y[:, 2], np.searchsorted([at for at, _ in bounces(30)], t))
+
+
+# --- diagrams -------------------------------------------------------------------------------------------------------
+
+
+def warmth(t):
+    """Temperature and heat of the thermostat of `exported_diagrams`: T' = 0.3 P - 0.1 T, P = 10 until T = 2, 0 until 1."""
+    at, start, heats = 0.0, 0.0, True
+    while True:
+        rest, level = (30.0, 2.0) if heats else (0.0, 1.0)
+        end = at + 10.0 * np.log((start - rest) / (level - rest))
+        if t < end:
+            return rest + (start - rest) * np.exp(-0.1 * (t - at)), 10.0 * heats
+        at, start, heats = end, level, not heats
+
+
+@pytest.fixture(scope="module", params=FMI)
+def thermostat(request):
+    return build(exported_diagrams.continuous(), fmi=request.param, step_size=DT, tolerance=1e-10)
+
+
+@pytest.mark.slow
+def test_a_diagram_with_events_in_pathsim(thermostat):
+    t, y = pathsim("CoSimulationFMU", thermostat, 2, 20.0, dt=DT)
+    exact = np.array([warmth(at) for at in t + DT])
+    switched = np.abs(np.diff(exact[:, 1], prepend=exact[0, 1])) > 0
+    assert switched.sum() > 3
+    np.testing.assert_allclose(y[:, 0], exact[:, 0], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(y[:, 1], exact[:, 1], rtol=0, atol=0)
+
+
+@pytest.mark.slow
+def test_a_diagram_with_events_in_ecos(ecospy, thermostat):
+    t, y = ecos(ecospy, thermostat, {}, ("warmth", "heat"), 2000)
+    np.testing.assert_allclose(y, [warmth(at) for at in t], rtol=0, atol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fmi", FMI)
+def test_a_sampled_controller_in_both(ecospy, fmi):
+    """A PI controller at 100 Hz under a constant error e: u = kp e + ki e T k at tick k, which acts as a step begins."""
+    path = build(exported_diagrams.controller, fmi=fmi)
+    t, y = pathsim("CoSimulationFMU", path, 1, 1.0, inputs=[1.5, 0.5], dt=DT)
+    np.testing.assert_allclose(y[:, 0], 2.0 + 3.0 * 0.01 * np.round(t / DT), rtol=1e-12)
+    t, y = ecos(ecospy, path, {"wanted": 1.5, "level": 0.5}, ("effort",), 100)
+    np.testing.assert_allclose(y[:, 0], 2.0 + 3.0 * 0.01 * np.arange(100), rtol=1e-12)
