@@ -94,7 +94,7 @@ def test_delays_of_two_outputs_begin_with_their_own_values():
         return Gain(gain=100.0)(u).named("large"), Gain(gain=1.0)(u).named("small")
 
     large, small = late(Step(times=0.05, values=1.0, initial_value=-0.7, name="wanted"))
-    diagram = Diagram("two", large.named("a"), small.named("b"), Gain(gain=1.0)(large).named("c"))
+    diagram = Diagram("two", large.named("a"), Gain(gain=1.0)(small).named("c"))
     loop = Loop(loop_spec(open_part(diagram.wired, "late", "late"), name="late"))
     loop["u"] = 0.5
     assert loop.start()
