@@ -4,7 +4,6 @@ import gc
 import importlib.util
 import os
 import sys
-from collections import defaultdict
 from contextlib import ExitStack
 from functools import cache as keep
 from functools import lru_cache
@@ -92,13 +91,15 @@ def pytest_make_collect_report(collector):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_pycollect_makeitem(collector, name, obj):
+    """Take the quick cases of a function: those that its mark draws, or of a product of cases the diagonal."""
     items = yield
-    cases = defaultdict(list)
-    for item in items if isinstance(items, list) else ():
-        if isinstance(item, pytest.Function) and (mark := item.get_closest_marker("drawn")):
-            cases[item.originalname, mark.args].append(item)
-    for (_, args), group in cases.items():
-        quick = draw([identify(item) for item in group], *args)
+    group = [item for item in items if isinstance(item, pytest.Function)] if isinstance(items, list) else []
+    if len(group) < 2:
+        return items
+    mark, factors = group[0].get_closest_marker("drawn"), [*group[0].iter_markers("parametrize")]
+    chosen = any(item.get_closest_marker("slow") for item in group)
+    if mark is not None or (len(factors) > 1 and not chosen):
+        quick = draw([identify(item) for item in group], *(mark.args if mark is not None else ()))
         for i, item in enumerate(group):
             if i not in quick:
                 item.add_marker(pytest.mark.slow)

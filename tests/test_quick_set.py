@@ -30,6 +30,18 @@ def test_what_is_not_drawn_is_slow(first, second, request):
     assert (request.node.get_closest_marker("slow") is None) == (first + second == "ax")
 
 
+@pytest.mark.parametrize("second", "xyz")
+@pytest.mark.parametrize("first", "ab")
+def test_of_a_product_of_cases_the_diagonal_is_quick(first, second, request):
+    assert (request.node.get_closest_marker("slow") is None) == (first + second in ("ax", "by", "az"))
+
+
+@pytest.mark.parametrize("second", ["x", pytest.param("y", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("first", "ab")
+def test_who_says_which_cases_are_slow_has_the_others_quick(first, second, request):
+    assert (request.node.get_closest_marker("slow") is None) == (second == "x")
+
+
 def test_the_cases_of_a_function_have_one_budget():
     lines, budget = [], Budget(0.5)
     for name, taken in (("a[1]", 0.3), ("a[2]", 0.3), ("b", 0.4)):
