@@ -364,6 +364,6 @@ def _poles_of(system: DelayMatrices) -> list[complex]:
 
 def realize(loop: Any, *, delay: int = 0) -> Realization | DelayedRealization:
     """Return the realization of a loop, with delays or without."""
-    if hasattr(loop, "noutputs") and hasattr(loop, "delays"):  # a system of python-control, with delays
+    if "delays" in getattr(loop, "__dict__", ()) or hasattr(type(loop), "delays"):  # quick
         return DelayedRealization.of(loop, delay=delay)
     return Realization.of(loop, delay=delay)

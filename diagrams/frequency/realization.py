@@ -89,8 +89,7 @@ class Realization:
         if len(A):  # a feedthrough left by rounding would make crossings near infinity
             size = max(float(np.abs(M).max(initial=0.0)) for M in _scale(A, B, C))
             D = np.where(np.abs(D) <= STRUCTURE * size, 0.0, D)
-        for _ in range(int(delay)):
-            A, B, C, D = _delay_inputs(A, B, C, D)
+        A, B, C, D = _delay_inputs(A, B, C, D, int(delay))
         with explain_singular(name):
             made = cls(*_balance(A, B, C), D, float(dt), np.zeros(0), None, inexactness_of(loop)).reduce()
         # scaled once more, with input and output: rounding in A alone may have set the first scales
@@ -220,9 +219,7 @@ class Realization:
 
     def delay_by(self, samples: int) -> Realization:
         """Return this sampled system with samples of delay in series."""
-        A, B, C, D = self.A, self.B, self.C, self.D
-        for _ in range(samples):
-            A, B, C, D = _delay_inputs(A, B, C, D)
+        A, B, C, D = _delay_inputs(self.A, self.B, self.C, self.D, samples)
         return replace(self, A=A, B=B, C=C, D=D, coefficients=None)
 
     def reduce(self) -> Realization:
@@ -308,16 +305,18 @@ def _transpose(r: Realization) -> Realization:
     return replace(r, A=r.A.T, B=r.C.T, C=r.B.T, D=r.D.T, coefficients=None)
 
 
-def _delay_inputs(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Matrices:
-    """Put a delay of one sample behind the inputs: z d = u, so p d = u − d."""
+def _delay_inputs(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, samples: int) -> Matrices:
+    """Put a delay of some samples behind the inputs: z d = u, so p d = u − d, one sample after the other."""
+    if not samples:
+        return A, B, C, D
     n, m = len(A), B.shape[1]
-    bottom = np.hstack([np.zeros((m, n)), -np.eye(m)])
-    return (
-        np.vstack([np.hstack([A, B]), bottom]),
-        np.vstack([np.zeros((n, m)), np.eye(m)]),
-        np.hstack([C, D]),
-        np.zeros_like(D),
-    )
+    size = n + samples * m
+    late, entered, seen = np.zeros((size, size)), np.zeros((size, m)), np.zeros((len(C), size))
+    late[:n, :n], late[:n, n : n + m] = A, B
+    late[n:, n:] = np.eye(samples * m, k=m) - np.eye(samples * m)
+    entered[size - m :] = np.eye(m)
+    seen[:, :n], seen[:, n : n + m] = C, D
+    return late, entered, seen, np.zeros_like(D)
 
 
 def _balance(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -79,7 +79,8 @@ def _with_notes(function: F) -> F:
 
     @wraps(function)
     def noted(diagram: Any, **options: Any) -> Any:
-        with work_notes(getattr(diagram, "diagram", diagram).name, options.pop("progress", False)) as tell:
+        subject = diagram if _is_diagram(diagram) else diagram.diagram
+        with work_notes(subject.name, options.pop("progress", False)) as tell:
             return function(diagram, **options, progress=tell)
 
     return noted  # type: ignore[return-value]  # of the signature of the function that it wraps
@@ -203,7 +204,7 @@ def analyse(
     point = point if at is None else at
     if not _is_diagram(diagram):
         experiment, diagram = diagram, diagram.diagram
-    kind: ReportKind[Any] = getattr(diagram, "report_kind", ANY_DIAGRAM)
+    kind: ReportKind[Any] = diagram.report_kind if hasattr(type(diagram), "report_kind") else ANY_DIAGRAM
     wired: WiredDiagram = diagram.wired
     kind.check_keys(only or ())
     wires = None if loops is None else tuple([loops] if isinstance(loops, str) else loops)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -46,13 +47,15 @@ OPERATING_POINTS = TableForm(
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the libraries that computed the report."""
-    found = {"python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed as a package"
-    return found
+    return {"python": platform.python_version(), **{name: _version_of(name) for name in PACKAGES}}
+
+
+@cache  # to read the description of a package takes a tenth of a small report
+def _version_of(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed as a package"
 
 
 def subject(case: Case) -> Section:
