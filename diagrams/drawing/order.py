@@ -87,7 +87,8 @@ def cut_loops(
         Nodes behind which loops are closed.
     controllers : mapping of str to int
         Nodes ahead of which other loops are closed, so that a plant is on the right of them, with their ranks: the
-        lowest is taken. Without any it is the node at which the loop is entered.
+        lowest is taken, and of these one that the loop is entered at: in a cascade the outermost one, which has the
+        reference. Without any it is the node at which the loop is entered.
     """
     left = [pair for pair in dict.fromkeys(pairs) if pair[0] != pair[1]]
     place = {key: i for i, key in enumerate(keys)}
@@ -103,7 +104,10 @@ def cut_loops(
             else:
                 entered = {b for a, b in left if b in knot and a not in knot}
                 known = [key for key in (*entered, *knot) if key in controllers]
-                door = min(known or entered or knot, key=lambda key: (controllers.get(key, 0), place[key]))
+                door = min(
+                    known or entered or knot,
+                    key=lambda key: (controllers.get(key, 0), key not in entered, place[key]),
+                )
                 gone |= {(a, b) for a, b in left if b == door and a in knot}
         left = [pair for pair in left if pair not in gone]
 

@@ -186,6 +186,25 @@ def test_a_plant_is_right_of_its_controller_however_it_is_written(kind):
     assert at["wish"][0] < at["controller"][0] < at["feed"][0] < at["plant"][0]
 
 
+def test_a_cascade_is_drawn_from_its_reference_to_the_plant_whatever_is_written_first():
+    plant = TransferFunction(numerator=1.0, denominator=[1.0, 1.0, 0.0], name="plant")
+    speed = TransferFunction(numerator=1.0, denominator=[1.0, 1.0], name="speed")
+
+    @subsystem(sample_time=0.01)
+    def inner(wanted, w):
+        return Gain(gain=5.0, name="kp")(wanted - w)
+
+    @subsystem(sample_time=0.1)
+    def outer(r, y):
+        return Gain(gain=2.0, name="kp")(r - y)
+
+    wish, load = Sine(frequency=1.0, name="wish"), Sine(frequency=2.0, name="load")
+    force = inner(outer(wish, plant.y), speed.y)  # the inner loop's call comes first
+    drawing = Diagram("cascade", plant(Sum(name="feed")(speed(force), load))).draw(width=5000)
+    at = positions(drawing.svg)
+    assert at["wish"][0] < at["outer"][0] < at["inner"][0] < at["speed"][0] < at["plant"][0]
+
+
 def test_long_chains_of_blocks_need_no_recursion():
     keys = [f"k{i}" for i in range(3000)]
     wires = list(itertools.pairwise(keys))
