@@ -6,6 +6,7 @@ states, whose poles lie near 1, have lost most of their digits.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -60,9 +61,13 @@ def closed_loop_poles(loop: Any, gain: float) -> np.ndarray:
     return np.asarray(np.linalg.eigvals(A - B @ C * (gain / (1.0 + gain * d))), dtype=complex)
 
 
-def find_locus(loop: Any, gains: np.ndarray | None, view: View) -> Locus:
-    """Return the poles over gains, each branch in its column; gains that are not given lie dense where poles move."""
-    first = (0.0, *np.geomspace(*GAINS, 121), 1.0) if gains is None else map(float, gains)
+def find_locus(loop: Any, gains: np.ndarray | None, view: View, marked: Sequence[float] = ()) -> Locus:
+    """Return the poles over gains, each branch in its column; gains that are not given lie dense where poles move.
+
+    They reach beyond the gains that are marked in the figure, which are among them.
+    """
+    low, high = min([GAINS[0], *(0.5 * k for k in marked)]), max([GAINS[1], *(2.0 * k for k in marked)])
+    first = (0.0, *np.geomspace(low, high, 121), 1.0, *marked) if gains is None else map(float, gains)
     found = {k: closed_loop_poles(loop, k) for k in first}
     wide = sorted(found)[:-1] if gains is None else []
     while wide and len(found) < MOST:
@@ -111,7 +116,9 @@ def plot_root_locus(loop: Any, name: str, gains: np.ndarray | None, margins: Mar
     crossing = [] if margins is None else [c.frequency.value for c in margins.gain_crossovers]
     limits = _limits(margins, dt)
     view = _view([poles, zeros, now, np.array([pole for _, pole in limits])], dt, max(crossing, default=0.0))
-    locus = find_locus(loop, gains, view)
+    shown = [(factor, pole) for factor, pole in limits if _is_in(np.array([pole]), view)]
+    read = () if margins is None else (margins.gain_margin_low.value, margins.gain_margin_high.value)
+    locus = find_locus(loop, gains, view, [factor for factor, _ in shown])
     with shown_figure(*_size(view)) as figure:
         axes = figure.subplots()
         _draw_plane(axes, view, dt)
@@ -121,17 +128,25 @@ def plot_root_locus(loop: Any, name: str, gains: np.ndarray | None, margins: Mar
         _draw_points(axes, poles, zeros, color=DARK)
         square: dict[str, Any] = {"marker": "s", "color": VERMILION, "linestyle": "none", "markersize": 4.5}
         axes.plot(now.real, now.imag, label="k = 1", zorder=4, **square)
-        for factor, pole in limits:
-            if not _is_in(np.array([pole]), view):
-                continue
-            axes.plot([pole.real], [pole.imag], marker="d", color=GREEN, markersize=5.0, linestyle="none", zorder=4)
-            text = f"k = {factor:.4g} ({decibels(factor)})"
-            white = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
-            look: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "color": DARK, "bbox": white}
-            axes.annotate(text, (pole.real, pole.imag), (7, 4), zorder=3.5, **look)
+        if shown:
+            ends = np.array([pole for _, pole in shown])
+            diamond: dict[str, Any] = {"marker": "d", "color": GREEN, "markersize": 5.0, "linestyle": "none"}
+            axes.plot(ends.real, ends.imag, label="limit of stability", zorder=4, **diamond)
+        for factor, pole in shown:
+            if factor in read:
+                _name_limit(axes, factor, pole, view)
         axes.set_title(f"root locus of {name}", loc="right", fontsize="small")
         legend_above(figure, axes)
     return figure
+
+
+def _name_limit(axes: Axes, factor: float, pole: complex, view: View) -> None:
+    """Write the gain next to a limit of stability, on the side that has more room."""
+    white = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
+    look: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "color": DARK, "bbox": white}
+    is_left = pole.real < 0.5 * (view.left + view.right)
+    look |= {"ha": "left" if is_left else "right", "zorder": 3.5}
+    axes.annotate(f"k = {factor:.4g} ({decibels(factor)})", (pole.real, pole.imag), (7 if is_left else -7, 4), **look)
 
 
 def _limits(margins: Margins | None, dt: float) -> list[tuple[float, complex]]:

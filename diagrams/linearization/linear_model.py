@@ -416,11 +416,15 @@ class Linearization(ShownAsTable):
         ConfirmationError
             If the closed L does not have the diagram's poles.
         """
+        made: LoopTransfer
         if to:
             diagram, point, port = split_consumers(self.wired, self.point, wires, _as_list(to))
-            return replace(self, wired=diagram, point=point).loop(port, lifted=lifted, slow=slow)
+            made = replace(self, wired=diagram, point=point).loop(port, lifted=lifted, slow=slow)
+            name = f"L({', '.join(wires)} to {', '.join(_as_list(to))})"
+            made.name = name.replace(".", "_")  # python-control refuses dots in names
+            return made
         cut = self._make_at(wires, openings=wires, loop="lifted" if lifted else "one", slow=slow)
-        made: LoopTransfer = cut._state_space(-cut.C, -cut.D, f"L({', '.join(wires)})", loop_class(), sign=-1.0)
+        made = cut._state_space(-cut.C, -cut.D, f"L({', '.join(wires)})", loop_class(), sign=-1.0)
         made.linearization, made.wires = self, wires
         return made
 

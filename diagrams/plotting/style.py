@@ -107,6 +107,8 @@ def legend_above(figure: Figure, axes: Axes) -> None:
         return
     fitting = LETTERS * figure.get_figwidth() / WIDTH
     columns = max(1, min(len(labels), int(fitting) // (max(map(len, labels)) + 6)))
+    if sum(len(label) + 6 for label in labels) <= fitting:  # in one row each column is as wide as its own label
+        columns = len(labels)
     figure.legend(handles, labels, loc="outside upper left", ncols=columns)
 
 

@@ -6,6 +6,8 @@ import pytest
 
 from loopwright.blocks import Constant, Gain, Integrator, OptionError, TransferFunction, TransportDelay
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams.frequency.pole_maps import plot_root_locus
+from loopwright.frequency import margins
 
 T = 0.2
 
@@ -111,3 +113,26 @@ def test_a_loop_with_dead_time_has_no_locus_but_its_model_has_poles():
     s = points(axes, "x")
     assert np.allclose(s + np.exp(-0.5 * s), 0.0, atol=1e-8)  # the characteristic equation
     assert axes.get_title(loc="right") == "poles of d: the rightmost ones of infinitely many"
+
+
+def test_a_limit_at_a_large_gain_lies_on_the_locus_and_limits_that_decide_alone_are_named():
+    """L = c/(z⁶ (z − 1)) is at its first limit for k c = 2 sin(π/26), and at others for larger gains."""
+    late = control.ss(control.tf([1e-5], [1.0, -1.0, 0, 0, 0, 0, 0, 0], 0.1))
+    axes = plot_root_locus(late, "late", None, margins(late)).axes[0]
+    limits = points(axes, "d")
+    assert len(limits) > 2
+    assert max(np.abs(locus(axes).ravel() - limit).min() for limit in limits) < 1e-6
+    first = 2.0 * np.sin(np.pi / 26) / 1e-5
+    named = [t.get_text() for t in axes.texts if t.get_text().startswith("k =")]
+    assert named == [f"k = {first:.4g} ({20 * np.log10(first):.3g} dB)"]
+    assert "limit of stability" in [text.get_text() for text in axes.figure.legends[0].get_texts()]
+
+
+def test_a_loop_ahead_of_some_consumers_is_called_by_their_names():
+    plant = TransferFunction(numerator=[2.0], denominator=[1.0, 3.0, 2.0, 0.0], name="plant")
+    u = (Constant(value=0.0, name="r") - plant.y).named("u")
+    loop = (
+        Diagram("two", plant(u), Gain(gain=2.0, name="other")(u).named("monitor")).linearize().loop("u", to="plant.u")
+    )
+    assert loop.name == "L(u to plant_u)"
+    assert loop.root_locus().axes[0].get_title(loc="right") == "root locus of L(u to plant_u)"
