@@ -1,0 +1,158 @@
+"""What an FMU of a diagram does: its start, saved states, parameters that are tuned, steps that don't fit, errors."""
+
+import numpy as np
+import pytest
+from fmpy.fmi1 import FMICallException
+
+from loopwright import build, experiments
+from loopwright.blocks import PID, Constant, Gain, Power, Sum, UnitDelay
+from loopwright.diagrams import Diagram, subsystem
+from support import exported_diagrams
+from support.instances import open_instance
+
+pytestmark = pytest.mark.slow
+FMI = (2, 3)
+
+
+@subsystem(sample_time=0.01)
+def controller(reference, level):
+    """PI with a filtered derivative."""
+    return PID(kp=2.0, ki=3.0, kd=0.1, filter_time=0.02, name="pid")(reference, level).named("effort")
+
+
+@pytest.mark.parametrize("fmi", FMI)
+def test_the_start_is_computed_from_the_inputs_that_are_set(fmi, tmp_path):
+    """The derivative's filter begins with the level, so that D = 0: u = 2 · (1 − 0.3)."""
+    item = open_instance(build(controller, fmi=fmi), tmp_path).initialize(reference=1.0, level=0.3)
+    assert item["effort"] == pytest.approx(1.4, rel=1e-15)
+    assert item["pid.filtered"] == -0.3
+    item.step(0.0, 0.01)
+    assert item["effort"] == pytest.approx(1.4, rel=1e-15)
+    item.free()
+
+
+def test_held_outputs_begin_with_what_is_computed_from_the_inputs(tmp_path):
+    """A slow subsystem's output is held from the start on, though it acts later, by its offset."""
+
+    @subsystem(sample_time=0.01)
+    def both(u):
+        slow = subsystem(sample_time=0.02, offset=0.01, name="slow")(lambda v: Gain(gain=10.0)(v))
+        return Sum(signs="++")(slow(u), u).named("y")
+
+    item = open_instance(build(both), tmp_path).initialize(u=0.5)
+    assert item["y"] == 5.5
+    item.step(0.0, 0.01, u=1.0)
+    assert item["y"] == 6.0
+    item.step(0.01, 0.01, u=2.0)
+    assert item["y"] == 22.0
+    item.free()
+
+
+@pytest.mark.parametrize("fmi", FMI)
+@pytest.mark.parametrize("make", [exported_diagrams.sampled, exported_diagrams.continuous])
+def test_a_run_continues_from_a_saved_state_elsewhere_bit_for_bit(fmi, make, tmp_path):
+    file = build(make(), fmi=fmi)
+    name = "outer.inner_wanted" if make is exported_diagrams.sampled else "warmth"
+    one = open_instance(file, tmp_path / "one").initialize()
+    other = open_instance(file, tmp_path / "two").initialize()
+    for k in range(100):
+        one.step(0.013 * k, 0.013)
+    state = one.fmu.getFMUState()
+    assert one.fmu.serializeFMUState(state) == one.fmu.serializeFMUState(state)
+    one.fmu.freeFMUState(state)
+    one.copied_to(other)
+    seen = []
+    for k in range(100, 300):
+        for item in (one, other):
+            item.step(0.013 * k, 0.013)
+        assert one[name] == other[name]
+        seen.append(one[name])
+    assert np.ptp(seen) > 0.1
+    one.fmu.reset()
+    one.begin()
+    for k in range(300):
+        one.step(0.013 * k, 0.013)
+    assert one[name] == other[name]
+    one.free()
+    other.free()
+
+
+@pytest.mark.parametrize("fmi", FMI)
+def test_a_parameter_is_tuned_between_two_steps(fmi, tmp_path):
+    """u = kp e + ki T Σ e; ki changes after ten ticks, and what was integrated stays."""
+    item = open_instance(build(exported_diagrams.controller, fmi=fmi), tmp_path).initialize(wanted=1.0)
+    for k in range(10):
+        item.step(0.01 * k, 0.01)
+    item.step(0.1, 0.01, **{"pid.ki": 6.0})
+    assert item["effort"] == pytest.approx(2.0 + 3.0 * 0.01 * 10, rel=1e-14)
+    item.step(0.11, 0.01)
+    assert item["effort"] == pytest.approx(2.0 + 3.0 * 0.01 * 10 + 6.0 * 0.01, rel=1e-14)
+    item.free()
+
+
+def test_a_filter_is_computed_again_where_its_time_constant_is_tuned(tmp_path):
+    """The exact discretization of D = kd ẋ_f with T_f: after a step of the level by 1, x_f moves by 1 − exp(−T/T_f)."""
+    item = open_instance(build(controller), tmp_path).initialize(**{"pid.filter_time": 0.05})
+    item.step(0.0, 0.01, level=1.0)
+    item.step(0.01, 0.01)
+    assert item["pid.filtered"] == pytest.approx(-(1.0 - np.exp(-2 * 0.01 / 0.05)), rel=1e-13)
+    item.free()
+
+
+@pytest.mark.parametrize("fmi", FMI)
+def test_steps_from_tick_to_tick_are_asked_for(fmi, tmp_path):
+    item = open_instance(build(exported_diagrams.controller, fmi=fmi, communication="ticks"), tmp_path).initialize()
+    item.step(0.0, 0.03)
+    with pytest.raises(FMICallException):
+        item.step(0.03, 0.005)
+    assert "doesn't fit" in item.log[-1][2]
+    assert "every 0.01 s" in item.log[-1][2]
+    item.free()
+
+
+@pytest.mark.parametrize("fmi", FMI)
+def test_a_guard_that_fails_names_its_block(fmi, tmp_path):
+    diagram = experiments.compliance().diagram
+    item = open_instance(build(diagram, subsystem="controller", fmi=fmi), tmp_path).initialize()
+    item.step(0.0, 1e-3)
+    with pytest.raises(FMICallException):
+        item.step(1e-3, 1e-3, position=np.array([0.5, 0.5]))  # the ellipse's centre
+    assert "path_projection." in item.log[-1][2]
+    assert "this guard is not positive" in item.log[-1][2]
+    assert "path_projection.foot" in item.description.description
+    item.free()
+
+
+def test_the_first_block_with_a_value_that_is_no_number_is_named(tmp_path):
+    @subsystem(sample_time=0.01)
+    def root(u):
+        below = Power(exponent=-1.0, name="inverse")(u)
+        return Gain(gain=2.0)(below).named("y")
+
+    diagram = Diagram("whole", root(Constant(value=1.0)))
+    item = open_instance(build(diagram, subsystem="root"), tmp_path).initialize()
+    item.step(0.0, 0.01)
+    assert item["y"] == 2.0
+    with pytest.raises(FMICallException):
+        item.step(0.01, 0.01, u=0.0)
+    assert "inverse.y at t = 0.01 s: found inf" in item.log[-1][2]
+    item.free()
+
+
+def test_ticks_and_steps_of_any_length_agree(tmp_path):
+    """Ticks lie where they are on the clocks: long steps and short ones that don't fit give the same outputs."""
+
+    @subsystem(sample_time=0.01)
+    def count(u):
+        total, before = Sum(signs="++"), UnitDelay(initial_value=0.0)
+        made = total(u, before.y)
+        before(made)
+        return made.named("number")
+
+    item = open_instance(build(count), tmp_path).initialize(u=1.0)
+    t = 0.0
+    for h in (0.025, 0.0031, 0.0019, 0.07, 0.1):
+        item.step(t, h)
+        t += h
+        assert item["number"] == np.floor((t - 1e-9) / 0.01) + 1
+    item.free()
