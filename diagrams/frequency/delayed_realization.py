@@ -364,6 +364,7 @@ def _poles_of(system: DelayMatrices) -> list[complex]:
 
 def realize(loop: Any, *, delay: int = 0) -> Realization | DelayedRealization:
     """Return the realization of a loop, with delays or without."""
-    if "delays" in getattr(loop, "__dict__", ()) or hasattr(type(loop), "delays"):  # quick
+    # a loop itself is not asked, as it would look for near names
+    if "delays" in getattr(loop, "__dict__", ()) or hasattr(type(loop), "delays"):
         return DelayedRealization.of(loop, delay=delay)
     return Realization.of(loop, delay=delay)
