@@ -156,6 +156,26 @@ def _group(wired: WiredDiagram, members: set[str]) -> WiredDiagram:
     return WiredDiagram(wired.name, table, wired.loops, wired.facade_class)
 
 
+def order_sampled(table: Structure, paths: list[str]) -> list[str]:
+    """Return the sampled ones of some subsystems in the order in which signals go through them at one instant.
+
+    They are ahead of the plants in an SSP, and parts in continuous time behind: a tool that steps components in this
+    order and hands new values on has them when the diagram has.
+    """
+    left = [p for p in paths if any(table.is_sampled(s) for s in table.subsystems if f"{s}.".startswith(f"{p}."))]
+    before: dict[str, set[str]] = {path: set() for path in left}
+    for (reader, _), wire in table.wires.items():
+        ends = [next((p for p in left if at.startswith(f"{p}.")), "") for at in (reader, wire.block)]
+        if all(ends) and ends[0] != ends[1]:
+            before[ends[0]].add(ends[1])
+    found: list[str] = []
+    while left:
+        free = next((path for path in left if before[path] <= {*found}), left[0])
+        left.remove(free)
+        found.append(free)
+    return found
+
+
 def find_export(wired: WiredDiagram, path: str) -> Export:
     """Return a subsystem that becomes an FMU, with its inputs and outputs."""
     opened = open_part(wired, path, path.rpartition(".")[2])
@@ -174,11 +194,13 @@ def find_export(wired: WiredDiagram, path: str) -> Export:
         full = wired.checked.shapes[wire.block, wire.port]
         entries = np.arange(int(np.prod(full))).reshape(full)
         picked = entries if wire.index is None else entries[wire.index]
+        if wire.index is None:
+            outputs[wire.block, wire.port, None] = name, None
         for i, entry in enumerate(np.ravel(picked)):
             outputs[wire.block, wire.port, int(entry) if full else None] = name, i if np.shape(picked) else None
     return Export(path, inputs, outputs)
 
 
-def build_export(wired: WiredDiagram, path: str) -> Path:
-    """Return the FMU of a subsystem, of FMI 2.0, which most readers of SSPs take."""
-    return build(wired.facade, name=path.replace(".", "_"), subsystem=path, fmi=2, arrays=False)
+def build_export(wired: WiredDiagram, path: str, *, arrays: bool) -> Path:
+    """Return the FMU of a subsystem: of FMI 2.0, which most readers of SSPs take; of FMI 3.0 next to its arrays."""
+    return build(wired.facade, name=path.replace(".", "_"), subsystem=path, fmi=3 if arrays else 2, arrays=arrays)

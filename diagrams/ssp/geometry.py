@@ -21,10 +21,10 @@ def lay_out(system: WrittenElement) -> None:
             [n for n, c in element.connectors.items() if (c.kind == "input") == side] for side in (True, False)
         )
         height = max(_LEAST, _ROW * (max(len(ins), len(outs)) + 1))
-        left, right = (
+        on_left, on_right = (
             {Pin(n): height * (i + 1) / (len(names) + 1) for i, n in enumerate(names)} for names in (ins, outs)
         )
-        nodes.append(Node(element.name, _WIDTH, height, left, right))
+        nodes.append(Node(element.name, _WIDTH, height, on_left, on_right))
         _place_connectors(element)
     nets: dict[tuple[str, str], Net] = {}
     for connection in system.connections:

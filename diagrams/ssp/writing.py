@@ -26,7 +26,7 @@ from .documents import (
     write_dictionary,
     write_values,
 )
-from .exports import Export, build_export, find_export, split_diagram
+from .exports import Export, build_export, find_export, order_sampled, split_diagram
 from .geometry import lay_out
 from .package import DEFAULT
 from .terms import Term, Terms
@@ -37,6 +37,8 @@ SET = "parameters"
 """Name of all parameter sets: tools that let a user choose one by its name apply those of all components."""
 _IMPLEMENTATIONS = {"co_simulation": "CoSimulation", "model_exchange": "ModelExchange"}
 _SIGNALS = ("input", "output")
+_SCALARS = "Export the FMU with scalars: build(…, arrays=False), or fmi=2."
+"""Step where an array has no place in a connection."""
 
 
 @dataclass
@@ -107,10 +109,15 @@ class Writer:
         )
         self.wired, exported = split_diagram(self.wired, {*fmus}, inputs)
         self.table = self.wired.scheduled
-        for path in exported:
-            self._add_export(path)
+        arrays = any(v.shape for b in fmus.values() for v in b.description.scalars.values() if v.causality in _SIGNALS)
+        first = order_sampled(self.table, exported)
+        for path in first:
+            self._add_export(path, arrays=arrays)
         for path, block in sorted(fmus.items()):
             self._add_fmu(path, block)
+        for path in exported:
+            if path not in first:
+                self._add_export(path, arrays=arrays)
         inside = {p for p in self.table.blocks if any(p.startswith(f"{path}.") for path in exported)}
         self.terms = Terms(self.wired, {*fmus, *inputs, *inside})
         for part in self.parts.values():
@@ -137,10 +144,10 @@ class Writer:
             self.systems[path] = outer.elements[made.name] = made
         return self.systems[path]
 
-    def _add_export(self, path: str) -> None:
+    def _add_export(self, path: str, *, arrays: bool) -> None:
         """Add the component of a subsystem that becomes an FMU."""
         export = self.exports[path] = find_export(self.wired, path)
-        about = read_description(build_export(self.wired, path))
+        about = read_description(build_export(self.wired, path, arrays=arrays))
         part = self._add_part(path, about, export.inputs)
         for port in {*export.inputs, *(name for name, _ in export.outputs.values())}:
             part.scalars[port] = _scalars(about, port)
@@ -212,7 +219,18 @@ class Writer:
         """Write the connections of an input, one for each of its variables; numbers become start values."""
         terms, scalars = self.terms.entries(wire), part.scalars[port]
         if len(scalars) < len(terms):  # an array of FMI 3.0
-            terms = [self._whole(part, port, terms)]
+            joined = self._join(terms)
+            if joined is None and any(term.source is not None for term in terms):
+                raise SspFileError(
+                    "found an array of FMI 3.0 whose entries come from several signals; expected one array, as a "
+                    f"connection of an SSP is one of whole arrays. {_SCALARS}",
+                    block=part.path,
+                    port=port,
+                )
+            if joined is None:
+                self._set_value(part, scalars[0], np.reshape([t.offset for t in terms], self.terms.shape(wire)))
+                return
+            terms = [joined]
         for name, term in zip(scalars, terms, strict=True):
             if term.source is None:
                 variable = part.description.find(name)
@@ -221,34 +239,46 @@ class Writer:
             end = self._connector(part, name)
             self._connect(term, part.system, (part.element.name, name), end)
 
-    def _whole(self, part: WrittenPart, port: str, terms: Sequence[Term]) -> Term:
-        """Return the one term of an array, whose entries come from one array in order."""
+    def _join(self, terms: Sequence[Term]) -> Term | None:
+        """Return the one term of an array, whose entries come from one array in order; None for others."""
         first = terms[0]
-        if first.source is not None and all(
-            term == replace(first, source=(first.source[0], first.source[1], i)) for i, term in enumerate(terms)
-        ):
-            block, out, _ = first.source
-            if self.terms.shape(Wire(block, out)) == self.terms.shape(part.wires[port]):
-                return replace(first, source=(block, out, None))
-        raise SspFileError(
-            "found an array of FMI 3.0 whose entries come from several signals; expected one array, as a connection of "
-            "an SSP is one of whole arrays. Export its FMU with scalars: build(…, arrays=False).",
-            block=part.path,
-            port=port,
-        )
+        if first.source is None:
+            return None
+        block, port, _ = first.source
+        alike = all(term == replace(first, source=(block, port, i)) for i, term in enumerate(terms))
+        size = int(np.prod(self.terms.shape(Wire(block, port))))
+        return replace(first, source=(block, port, None)) if alike and size == len(terms) else None
 
-    def _start(self, source: tuple[str, str, int | None]) -> tuple[str, str, WrittenConnector]:
-        """Return the system where a source is, the name of its element, and its connector."""
+    def _find_output(self, source: tuple[str, str, int | None]) -> tuple[WrittenPart, str, int | None] | None:
+        """Return the component that makes a signal, its port, and the entry; None for an input of the root system."""
         path, port, i = source
         outer = next((e for e in self.exports if path.startswith(f"{e}.")), None)
         if outer is not None:
             port, i = self.exports[outer].find(source)
             path = outer
-        if path in self.parts:
-            part = self.parts[path]
+        return (self.parts[path], port, i) if path in self.parts else None
+
+    def _is_array(self, term: Term) -> bool:
+        """Whether a term comes from an array of FMI 3.0, which is one connector."""
+        found = None if term.source is None else self._find_output(term.source)
+        return found is not None and bool(found[0].description.find(found[0].scalars[found[1]][0]).shape)
+
+    def _start(self, source: tuple[str, str, int | None]) -> tuple[str, str, WrittenConnector]:
+        """Return the system where a source is, the name of its element, and its connector."""
+        found = self._find_output(source)
+        if found is not None:
+            part, port, i = found
             scalars = part.scalars[port]
-            name = scalars[i or 0] if len(scalars) > 1 else scalars[0]
-            return part.system, part.element.name, self._connector(part, name)
+            connector = self._connector(part, scalars[i or 0] if len(scalars) > 1 else scalars[0])
+            if connector.shape and i is not None:
+                raise SspFileError(
+                    "found an array of FMI 3.0 of which entries are read one by one; expected readers of the whole, as "
+                    f"a connection of an SSP is one of whole arrays. {_SCALARS}",
+                    block=part.path,
+                    port=port,
+                )
+            return part.system, part.element.name, connector
+        path, port, i = source
         block = self.wired.structure.blocks[path]
         assert isinstance(block, Constant)
         name = path if i is None else f"{path}[{i + 1}]"
@@ -317,14 +347,20 @@ class Writer:
             if not all(self._is_readable(term) for term in terms):
                 continue
             unit = self.wired.checked.units.get((wire.block, wire.port))
+            shape: tuple[int, ...] = ()
+            if any(self._is_array(term) for term in terms):
+                joined = self._join(terms)
+                if joined is None:  # entries of an array, which no connection reads one by one
+                    continue
+                terms, shape = [joined], self.terms.shape(wire)
             for i, term in enumerate(terms):
-                label = name if not self.terms.shape(wire) else f"{name}[{i + 1}]"
+                label = name if len(terms) == 1 and (shape or not self.terms.shape(wire)) else f"{name}[{i + 1}]"
                 if label in self.systems[system].connectors:
                     continue  # the border of this very signal
                 of = unit[i] if isinstance(unit, tuple) else unit
                 plain = term.is_plain and term.source is not None
                 type_ = self._start(term.source)[2].type if plain and term.source else "Float64"
-                made = WrittenConnector(label, "output", type_ if type_ != "Enumeration" else "Int32", of)
+                made = WrittenConnector(label, "output", type_ if type_ != "Enumeration" else "Int32", of, shape)
                 self.systems[system].connectors[label] = made
                 self._connect(term, system, ("", label), made)
 

@@ -15,6 +15,7 @@ from loopwright.blocks import (
     Gain,
     Product,
     PythonFunction,
+    Ramp,
     Stack,
     UnitConversion,
 )
@@ -120,6 +121,35 @@ def test_systems_within_systems_and_conversions_of_units(fmu, tmp_path, cache):
     assert_same(run(root), run(flat), ("inner.a.y", "inner_a.y"), ("inner.deepest.c.y", "inner_deepest_c.y"), "outer.d")
 
 
+def boxes(system):
+    """Return the places of a system's elements, and its canvas."""
+    numbers = [
+        [float(e.get(key)) for key in ("x1", "y1", "x2", "y2")]
+        for e in system.iterfind("{*}Elements/*/{*}ElementGeometry")
+    ]
+    canvas = system.find("{*}SystemGeometry")
+    return numbers, [float(canvas.get(key)) for key in ("x1", "y1", "x2", "y2")]
+
+
+def test_elements_have_places_that_do_not_overlap(fmu, tmp_path, cache):
+    """Each element is in the canvas, none on another; inputs are on the left of an element, outputs on the right."""
+    parts = [Fmu(fmu, name=name, start=OTHERS) for name in "abcd"]
+    a, b, c, d = parts
+    wires = Diagram("four", a(u=Gain(gain=1.0)(d.y)), b(s=a.d, u=0.0), c(s=b.d, u=0.0), d(s=a.d, u=Gain(gain=2.0)(c.y)))
+    with zipfile.ZipFile(wires.to_ssp(tmp_path / "four.ssp")) as archive:
+        root = etree.fromstring(archive.read("SystemStructure.ssd"))
+    found, (left, low, right, high) = boxes(root.find("{*}System"))
+    assert len(found) == 4
+    for i, (x1, y1, x2, y2) in enumerate(found):
+        assert left <= x1 < x2 <= right
+        assert low <= y1 < y2 <= high
+        assert not any(x1 < b[2] and b[0] < x2 and y1 < b[3] and b[1] < y2 for b in found[:i])
+    for connector in root.iterfind(".//{*}Component/{*}Connectors/{*}Connector"):
+        place = connector.find("{*}ConnectorGeometry")
+        assert float(place.get("x")) == (connector.get("kind") == "output")
+        assert 0.0 < float(place.get("y")) < 1.0
+
+
 def test_fmpy_runs_a_flat_one_with_the_same_bits(fmu, tmp_path, cache):
     """FMPy takes neither transformations nor bindings: a chain without them, and its parameter sets by hand."""
     b, c = (Fmu(fmu, name=name, start={"k": k, "b": 0.1, **OTHERS}) for name, k in (("b", 0.3), ("c", 0.7)))
@@ -199,13 +229,35 @@ def test_a_sampled_controller_becomes_an_fmu_that_is_stepped_before_its_plant(fm
         "plant": f"resources/{fmu.name}",
     }
     again = Diagram.from_ssp(file)
-    in_order = Coupling(scheme="gauss_seidel", order=("controller", "plant"))
+    in_order = Coupling(scheme="gauss_seidel", order=tuple(read_ssp(file).components))  # the controller is first
     ours = diagram.simulate(H * N, progress=False)
     assert_same(ours, run(again, coupling=in_order), "plant.y", "plant.d", "plant.sum")
     late = run(again)["plant.y"]
     assert np.abs(late - ours["plant.y"]).max() > 0.01
     shifted = controlled(fmu, delay=1).simulate(H * N, progress=False)
     np.testing.assert_allclose(late, shifted["plant.y"], rtol=1e-13)
+
+
+@pytest.mark.slow
+def test_components_are_in_the_order_in_which_a_tool_steps_them(fmu, tmp_path, cache):
+    """A sensor, then the controller that reads it, then the plant, then the reference, in continuous time.
+
+    The reference is a product with the plant's output: stepped behind the plant it is that of the next instant.
+    """
+    sensor = subsystem(lambda level: Gain(gain=0.5)(level), sample_time=H, name="sensor")
+    control = subsystem(lambda wish, seen: (wish - seen).named("command"), sample_time=H, name="control")
+    plant = Fmu(fmu, name="plant", start={**OTHERS, "b": 0.25})
+    wish = Product(name="wish")(Ramp(slope=0.4), plant.y)
+    diagram = Diagram("loop", plant(u=control(wish, sensor(plant.y))))
+    file = diagram.to_ssp(tmp_path / "loop.ssp")
+    order = tuple(read_ssp(file).components)
+    assert order == ("sensor", "control", "plant", "blocks")
+    found = run(Diagram.from_ssp(file), coupling=Coupling(scheme="gauss_seidel", order=order))["plant.y"]
+    y = np.zeros(N + 1)
+    for i in range(N):
+        y[i + 1] = y[i] + H * (0.4 * H * i * y[i] - 0.5 * y[i] + 0.25)
+    np.testing.assert_allclose(found, y, rtol=1e-13)
+    np.testing.assert_allclose(diagram.simulate(H * N, progress=False)["plant.y"], y, rtol=1e-13)
 
 
 @pytest.mark.slow
