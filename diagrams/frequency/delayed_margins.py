@@ -45,8 +45,9 @@ class ByArgument:
     def _scan(self) -> LoopScan:
         features = self.r.features()
         size = 1.0
-        if not any(a.omega == 0.0 for a in features.axis_poles):
-            size = float(min(1.0, max(abs(self.r.matrix(np.zeros(1))[0, 0, 0]), 1e-3)))
+        if not any(a.omega == 0.0 for a in features.axis_poles):  # L(0) may be 0: of a washout, of a cancelled delay
+            bends = np.append(0.0, np.abs(features.points()))
+            size = float(np.clip(np.max(np.abs(self.r.matrix(1j * bends)[:, 0, 0])), 1e-3, 1.0))
         for part in FLOORS:
             self.floor = part * size
             scan = LoopScan(self.r, features, floor=self.floor)

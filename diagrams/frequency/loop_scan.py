@@ -21,6 +21,8 @@ PER_DECADE = 40
 """Frequencies of a scan, besides those around poles and zeros."""
 TURNS_MATTER = 0.3
 """|L| below which the turns that a delay makes don't matter for the encirclements of −1."""
+HALVINGS = 24
+"""Halvings of the steps of a scan beside roots at which |L| may be too small to be looked for."""
 POLISHED = 20
 """Number of candidates of a peak that are refined."""
 
@@ -90,12 +92,78 @@ class Peak:
     omega: float
 
 
+@dataclass(frozen=True)
+class _Search:
+    """Roots of a function along a response that are looked for: those with |L| between two sizes, where L is wanted."""
+
+    function: Function
+    least: float = 0.0
+    most: float = np.inf
+    wanted: Callable[[np.ndarray], np.ndarray] | None = None
+
+    def show(self, omega: np.ndarray, L: np.ndarray, dL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the function's values at samples, and between which of them it may have a root that is looked for.
+
+        It changes its sign there, or turns and may reach 0. Its slopes bound how far it goes: one that grows evenly
+        takes it by half of the step times the larger slope; four times that is allowed. Where the function is constant
+        but for rounding, its slope has any sign at every sample, and no turn is searched.
+        """
+        with np.errstate(all="ignore"):
+            h, slope = self.function(L, dL)
+            left, right = h[:-1], h[1:]
+            reach = 2.0 * np.log(omega[1:] / omega[:-1]) * np.maximum(np.abs(slope[:-1]), np.abs(slope[1:]))
+            turns = (left * slope[:-1] < 0) & (right * slope[1:] > 0)
+            turns &= np.minimum(np.abs(left), np.abs(right)) <= reach
+            shown = (~(left * right > 0) | turns) & np.isfinite(left) & np.isfinite(right)
+        if self.wanted is not None:
+            wanted = self.wanted(L)
+            shown &= wanted[:-1] | wanted[1:]
+        if self.least or np.isfinite(self.most):
+            low, high = self._bound(omega, L, dL)
+            shown &= ~((high < self.least) | (low > self.most))
+        return h, np.asarray(shown)
+
+    def halve(
+        self,
+        respond: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+        omega: np.ndarray,
+        L: np.ndarray,
+        dL: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return samples of L and its slope, and more between those where |L| may fall below the least.
+
+        A response that passes 0 has a root beside it each time, and most of these turn out to be too small. All are
+        computed at once, which takes far less time than to refine one root after the other.
+        """
+        for _ in range(HALVINGS):
+            shown = self.show(omega, L, dL)[1] & (self._bound(omega, L, dL)[0] < self.least)
+            if not shown.any():
+                break
+            after = np.flatnonzero(shown) + 1
+            between = np.sqrt(omega[after - 1] * omega[after])
+            new = (between, *respond(between))
+            omega, L, dL = (np.insert(a, after, b) for a, b in zip((omega, L, dL), new, strict=True))
+        return omega, L, dL
+
+    @staticmethod
+    def _bound(omega: np.ndarray, L: np.ndarray, dL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return bounds of |L| between samples, from below and above.
+
+        From the nearer sample it changes by half a step times its slope, which may be twice as large in between.
+        """
+        with np.errstate(all="ignore"):
+            step, size, slope = np.log(omega[1:] / omega[:-1]), np.abs(L), np.abs(dL)
+            change = step * np.maximum(slope[:-1], slope[1:])
+            return np.minimum(size[:-1], size[1:]) - change, np.maximum(size[:-1], size[1:]) + change
+
+
 class LoopScan:
     """Frequency response of a loop with one channel, sampled once; crossings and peaks are refined from the samples."""
 
     def __init__(self, r: Response, features: Features | None = None, *, floor: float = 0.0):
         self.r = r
         self.features = features if features is not None else Features.of(cast("Realization", r))
+        self.floor = floor
         self.segments = make_grid(r, self.features, floor=floor)
         if floor:
             self.segments = _leave_small(r, self.segments, 0.5 * floor)
@@ -107,7 +175,8 @@ class LoopScan:
         def gain(L: np.ndarray, dL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             return np.log(np.abs(L)), np.real(dL / L)
 
-        inside = [self._make_crossing(omega, gain) for omega in self._find_roots(gain)]
+        search = _Search(gain, least=1.0, most=1.0) if self.floor else _Search(gain)
+        inside = [self._make_crossing(omega, gain) for omega in self._find_roots(search)]
         ends = [Crossing(omega, L, 0.0, 1e-13) for omega, L in self.ends() if abs(abs(L) - 1) < 1e-13]
         return sorted(inside + ends, key=lambda c: c.omega)
 
@@ -117,12 +186,16 @@ class LoopScan:
         return self.find_phase_crossovers()
 
     def find_phase_crossovers(self) -> list[Crossing]:
-        """Return the points with L real and negative by rising frequency; also at 0, at π/T and at infinity (D < 0)."""
+        """Return the points with L real and negative by rising frequency; also at 0, at π/T and at infinity (D < 0).
+
+        Those with |L| below the floor are left out, but for some near it.
+        """
 
         def sine(L: np.ndarray, dL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             return L.imag / np.abs(L), np.real(L) / np.abs(L) * np.imag(dL / L)
 
-        inside = [self._make_crossing(omega, sine) for omega in self._find_roots(sine, lambda L: L.real < 0)]
+        search = _Search(sine, least=self.floor, wanted=lambda L: L.real < 0)
+        inside = [self._make_crossing(omega, sine) for omega in self._find_roots(search)]
         found = [c for c in inside if c.L.real < 0 and c.slope != 0.0]
         zeros = {a.omega for a in self.features.axis_zeros}
         for omega, value in self.ends():
@@ -154,19 +227,19 @@ class LoopScan:
 
         ends = [Peak(value(L), omega) for omega, L in self.ends()]
         ends += [Peak(abs(b), pole.omega) for pole in self.features.axis_poles]
-        samples, spans = [], []
+        samples, spans = [(np.array([p.value for p in ends]), np.array([p.omega for p in ends]))], []
         for omega, (L, dL) in zip(self.segments, self.samples, strict=True):
             with np.errstate(all="ignore"):
                 values, rise = np.abs((a + b * L) / (1 + L)), slope(L, dL)[0]
-            samples += [Peak(float(v), float(w)) for v, w in zip(values, omega, strict=True)]
+            samples.append((values, omega))
             turns = np.flatnonzero((rise[:-1] > 0) & (rise[1:] <= 0))
             spans += [(float(values[k]), (float(omega[k]), float(omega[k + 1]))) for k in turns]
         spans = sorted(spans, reverse=True)[:POLISHED]  # rounding gives a flat response many of them
         roots = [self._polish(lambda w: self._evaluate(slope, w, 0), span) for _, span in spans]
-        polished = [Peak(value(self._value(omega)), omega) for omega in roots]
-        found = [*ends, *polished, *samples]
-        best = max(p.value for p in found)
-        return next(p for p in found if p.value >= best * (1 - 1e-12))
+        samples.insert(1, (np.array([value(self._value(omega)) for omega in roots]), np.array(roots)))
+        values, places = (np.concatenate(rows) for rows in zip(*samples, strict=True))
+        first = int(np.flatnonzero(values >= np.nanmax(values) * (1 - 1e-12))[0])
+        return Peak(float(values[first]), float(places[first]))
 
     def find_fall_below(self, level: float) -> float:
         """Return the lowest frequency at which |T| crosses ``level`` downwards; infinite if it never does."""
@@ -174,7 +247,7 @@ class LoopScan:
         def gain(L: np.ndarray, dL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             return np.log(np.abs(L / (1 + L)) / level), np.real(dL / (L * (1 + L)))
 
-        falls = (omega for omega in self._find_roots(gain) if gain(*self._response(omega))[1][0] < 0)
+        falls = (omega for omega in self._find_roots(_Search(gain)) if gain(*self._response(omega))[1][0] < 0)
         return next(falls, np.inf)
 
     def _response(self, omega: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
@@ -189,29 +262,19 @@ class LoopScan:
         L, dL = self._response(omega)
         return Crossing(omega, complex(L[0]), float(function(L, dL)[1][0]), self.r.error(omega))
 
-    def _find_roots(
-        self, function: Function, where: Callable[[np.ndarray], np.ndarray] | None = None
-    ) -> Iterator[float]:
-        """Yield the roots of a function by rising frequency; its slope shows two of them between two samples.
-
-        ``where`` says of values of L whether a root beside them is looked for.
-        """
-        last = -np.inf
+    def _find_roots(self, search: _Search) -> Iterator[float]:
+        """Yield the roots of a function by rising frequency; its slope shows two of them between two samples."""
+        function, last = search.function, -np.inf
         for omega, (L, dL) in zip(self.segments, self.samples, strict=True):
-            with np.errstate(all="ignore"):
-                h, slope = function(L, dL)
-            wanted = np.ones(len(L), dtype=bool) if where is None else where(L)
+            if 0.0 < search.least < search.most:
+                omega, L, dL = search.halve(self._response, omega, L, dL)
+            h, shown = search.show(omega, L, dL)
             searched = 0
-            for k in range(len(omega) - 1):
+            for k in np.flatnonzero(shown):
                 if k < searched:
                     continue
                 span = (float(omega[k]), float(omega[k + 1]))
                 left, right = h[k], h[k + 1]
-                if not (np.isfinite(left) and np.isfinite(right) and (wanted[k] or wanted[k + 1])):
-                    continue
-                turns = left * slope[k] < 0 and right * slope[k + 1] > 0 and self._may_reach_zero(omega, h, slope, k)
-                if left * right > 0 and not turns:
-                    continue
                 if max(abs(left), abs(right)) <= float(np.max(self._find_rounding(omega[k : k + 2], L[k : k + 2]))):
                     before, behind = self._leave_rounding(omega, L, h, k)
                     searched = len(omega) if behind is None else behind
@@ -224,23 +287,11 @@ class LoopScan:
                     yield (last := span[0])
                 elif left * right < 0:
                     yield (last := self._polish(lambda w: self._evaluate(function, w, 0), span))
-                elif turns:
+                elif right != 0.0:  # the function turns in between
                     turn = self._polish(lambda w: self._evaluate(function, w, 1), span)
                     if self._evaluate(function, turn, 0) * left < 0:
                         yield self._polish(lambda w: self._evaluate(function, w, 0), (span[0], turn))
                         yield (last := self._polish(lambda w: self._evaluate(function, w, 0), (turn, span[1])))
-
-    @staticmethod
-    def _may_reach_zero(omega: np.ndarray, h: np.ndarray, slope: np.ndarray, k: int) -> bool:
-        """Whether a function that turns between two samples may reach 0 there: its slopes bound how far it goes.
-
-        A slope that grows evenly takes it by half of the step times the larger one; four times that is allowed. Where
-        the function is constant but for rounding, its slope has any sign at every sample, and no turn is searched.
-        """
-        with np.errstate(divide="ignore"):
-            step = float(np.log(omega[k + 1] / omega[k]))
-        reach = 2.0 * step * max(abs(slope[k]), abs(slope[k + 1]))
-        return bool(min(abs(h[k]), abs(h[k + 1])) <= reach)
 
     def _find_rounding(self, omega: np.ndarray, L: np.ndarray) -> np.ndarray:
         """Return bounds of the relative rounding error of L at frequencies, at least that of a constant.

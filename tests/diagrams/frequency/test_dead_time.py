@@ -15,7 +15,9 @@ from scipy.special import lambertw
 from loopwright.blocks import PID, Constant, Gain, Integrator, OptionError, Sum, TransferFunction, TransportDelay
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.frequency.delay_matrices import DelayMatrices
+from loopwright.diagrams.frequency.delayed_realization import DelayedRealization, realize
 from loopwright.diagrams.frequency.delayed_system import DelayedSystem
+from loopwright.diagrams.frequency.loop_scan import LoopScan
 from loopwright.frequency import disk_margin, margins, nyquist_count
 
 
@@ -545,3 +547,53 @@ def test_an_integrator_behind_a_predictor_is_a_root_at_zero_whatever_the_gain(ki
     assert found.stable
     least = min(np.degrees(np.abs(np.angle(-at(x)))) for x in crossings)
     assert found.phase_margin_deg.value == pytest.approx(least, abs=1e-7)
+
+
+def predictor_of_a_lag(known):
+    """A PI controller that cancels the lag of its Smith predictor, whose model of the dead time of 8 s is ``known``."""
+    pipe, model = delay(8.0, "pipe"), rational([2.0], [10.0, 1.0], "model")
+    u = pi(model.y + (pipe.y - delay(known, "model_pipe")(model.y)), 1.5, 0.15)
+    lag = rational([2.0], [10.0, 1.0], "lag")
+    return Diagram("predictor", pipe(lag(u)), model(u)).linearize().loop("u", to="model.u")
+
+
+@pytest.mark.parametrize(("known", "crossings"), [(8.0, 1), (8.5, None)])
+def test_only_crossings_that_may_decide_are_refined_of_a_response_that_passes_zero_at_each_turn(
+    known, crossings, monkeypatch
+):
+    """Ahead of its model alone L = 0.3 (1 − e^(−s known))/(s + 0.3 e^(−8 s)), which is 0 at each 2πk/known."""
+    floor, calls = 3e-3, list[int]()
+    L = lambda w: 0.3 * (1 - np.exp(-1j * w * known)) / (1j * w + 0.3 * np.exp(-8j * w))  # noqa: E731
+    w = np.linspace(1e-3, 0.6 / floor, 400_001)
+    at = L(w)
+    k = np.flatnonzero((at.imag[1:] * at.imag[:-1] < 0) & (np.abs(at.real[1:]) >= 0.5 * floor) & (at.real[1:] < 0))
+    roots = [brentq(lambda w: L(w).imag, w[i], w[i + 1], xtol=1e-15) for i in k]
+    expected = [root for root in roots if L(root).real <= -floor]
+    r = realize(predictor_of_a_lag(known))
+    features, response = r.features(), DelayedRealization.response
+    monkeypatch.setattr(DelayedRealization, "response", lambda r, w: calls.append(np.size(w)) or response(r, w))
+    found = [c for c in LoopScan(r, features, floor=floor).phase_crossovers if abs(c.L) >= floor]
+    np.testing.assert_allclose([c.omega for c in found], expected, rtol=1e-9)
+    np.testing.assert_allclose([c.L.real for c in found], [L(root).real for root in expected], rtol=1e-8)
+    assert crossings is None or len(found) == crossings
+    assert len(calls) < 100 + 15 * len(found)  # one root after the other took 20 more for each turn
+
+
+@pytest.mark.slow
+def test_a_predictor_whose_model_is_exact_has_margins_ahead_of_its_model_in_no_time(monkeypatch):
+    """The floor of its scan falls to 1e-9, where tens of thousands of turns were refined (400 s)."""
+    calls, response = list[int](), DelayedRealization.response
+    monkeypatch.setattr(DelayedRealization, "response", lambda r, w: calls.append(np.size(w)) or response(r, w))
+    found = margins(predictor_of_a_lag(8.0))
+    L = lambda w: 0.3 * (1 - np.exp(-8j * w)) / (1j * w + 0.3 * np.exp(-8j * w))  # noqa: E731
+    low = brentq(lambda w: L(w).imag, 0.22, 0.24, xtol=1e-15)
+    w = np.linspace(1e-3, 1.0, 100_001)  # |L| < 1 beyond, as 0.6 < |s + 0.3 e^(−8 s)| there
+    turns = np.flatnonzero(np.diff(np.sign(np.abs(L(w)) - 1)))
+    ones = [brentq(lambda x: abs(L(x)) - 1, w[i], w[i + 1], xtol=1e-15) for i in turns]
+    assert found.gain_margin_low.value == pytest.approx(-1 / L(low).real, rel=1e-9)
+    assert np.isinf(found.gain_margin_high.value)
+    assert found.phase_margin_deg.value == pytest.approx(
+        min(np.degrees(np.abs(np.angle(-L(x)))) for x in ones), abs=1e-8
+    )
+    assert len(calls) < 5000
+    assert sum(calls) < 2_000_000

@@ -96,3 +96,28 @@ def test_a_neutral_loop_gets_a_verdict_in_seconds_that_names_the_way_without_a_s
     else:
         assert abs(numbers["inner.u.continuous.gain_margin_high"].value - 2.4035) < 1e-3  # test_dead_time of frequency
         assert numbers["poles.continuous.slowest"].value < 0.0
+
+
+@pytest.mark.slow
+def test_the_report_of_a_predictor_that_cancels_its_lag_is_ready_and_passes(monkeypatch):
+    """At the plant's input L = a e^(−8 s)/(s + a (1 − e^(−8 s))) with a = 2 ki = 0.3; cut elsewhere it passes 0 each turn.
+
+    Work is counted, as time is the machine's: 400 s and millions of responses before, some 23,000 now.
+    """
+    from loopwright.diagrams.frequency.delayed_realization import DelayedRealization
+
+    pipe, model_pipe = TransportDelay(delay=8.0, name="pipe"), TransportDelay(delay=8.0, name="model_pipe")
+    model = TransferFunction(numerator=2.0, denominator=[10.0, 1.0], name="model")
+    lag = TransferFunction(numerator=2.0, denominator=[10.0, 1.0], name="lag")
+    wish = Step(times=5.0, values=1.0, name="wanted")
+    u = PID(kp=1.5, ki=0.15, name="pi")(wish, model.y + (pipe.y - model_pipe.y)).named("heating")
+    smith = Diagram("smith", pipe(lag(u)).named("temperature"), model_pipe(model(u)))
+    calls, response = list[int](), DelayedRealization.response
+    monkeypatch.setattr(DelayedRealization, "response", lambda r, w: calls.append(np.size(w)) or response(r, w))
+    report = smith.report(requirements=Requirements(ms=2.0))
+    w = np.linspace(1e-3, 6.0, 600_001)
+    L = 0.3 * np.exp(-8j * w) / (1j * w + 0.3 * (1 - np.exp(-8j * w)))
+    assert report.review.verdict == "passed", report.review
+    ms = report.numbers()["inner.heating.continuous.ms"].value
+    assert ms == pytest.approx(np.max(np.abs(1 / (1 + L))), rel=1e-6)
+    assert len(calls) < 60_000
