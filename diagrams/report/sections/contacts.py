@@ -18,6 +18,7 @@ from ...requirements import ContactLimits, Reason, RequirementResult, Requiremen
 from ...studies import ContactTask
 from .. import figures
 from ..content_hash import content_hash
+from ..error_sentences import say
 from ..pages import Plot, Section, Table, TableForm, Texts
 
 TEXTS = Texts(__package__, "contact")
@@ -375,9 +376,9 @@ def _tried(contact: Contact, required: Sequence[ContactLimits]) -> tuple[list[Ta
     try:
         found = try_limit(contact, limit)
     except ConfirmationError as error:
-        return [], TEXTS.paragraphs("refuted", message=str(error)), [f"{LIMITS['stiffness']}.{place}"]
+        return [], TEXTS.paragraphs("refuted", message=say(error)), [f"{LIMITS['stiffness']}.{place}"]
     except LoopwrightError as error:
-        return [], TEXTS.paragraphs("not_tried", message=str(error)), []
+        return [], TEXTS.paragraphs("not_tried", message=say(error)), []
     rows = ({**row, "place": place} for row in trial_facts(found, f"the nonlinear run with {found.method.value}"))
     remarks = TEXTS.paragraphs("tried", method=found.method.value, tried=found.tried, limit=limit.value)
     return [IN_RUNS.fill(rows, environment=f" with {words}" if words else "")], remarks, []

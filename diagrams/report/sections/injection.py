@@ -13,6 +13,7 @@ from ...measure import LEAST_SINE, FrequencyResponse, find_least_sine, frequency
 from ...results import PointOrigin
 from .. import figures
 from ..case import Case, InjectionPlan
+from ..error_sentences import say
 from ..pages import Section, TableForm, Texts
 from ..stability import Stability
 from ..variant import Implementation, Variant
@@ -79,7 +80,7 @@ def injected(case: Case) -> Section | None:
                 continue
             except LoopwrightError as error:
                 refused = True
-                text.append(TEXTS.line("failed", variant=v.title, wire=wire, message=error.message))
+                text.append(TEXTS.line("failed", variant=v.title, wire=wire, message=say(error)))
                 continue
             worst, own = float(np.max(deviation)), float(np.max(found.uncertainty))
             if not np.isfinite(own):

@@ -33,6 +33,7 @@ from ...studies import LoopPlace, cut_places, is_zero
 from ...wiring import join
 from .. import figures
 from ..case import Case
+from ..error_sentences import say, say_found
 from ..pages import Plot, Section, Table, Texts
 from ..same_loops import find_same
 from ..variant import Cut, Variant, in_s
@@ -147,7 +148,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
             try:
                 p = periodic_margins(v.loop(wire, cut=Cut.PERIODIC))
             except LoopwrightError as error:
-                notes.append(f"{v.title}: {error.message}")
+                notes.append(f"{v.title}: {say(error)}")
             else:
                 periodic[v.title] = p
                 own[v, Cut.PERIODIC] = with_findings(_periodic_numbers(p), p.findings)
@@ -330,8 +331,7 @@ def _no_margins(wire: str, v: Variant, error: LoopwrightError) -> str:
 
     An error's text has what was found, what was expected, and one next step.
     """
-    found = error.what_was_found
-    why = f"{found[:1].upper()}{found[1:]}".rstrip(".")
+    why = say_found(error)
     if isinstance(error, BetweenTicksError):
         return TEXTS.line("between_ticks", wire=wire, variant=v.title, why=why)
     return TEXTS.line("not_shown", wire=wire, variant=v.title, why=why, step=error.next_step)
@@ -487,7 +487,7 @@ def several(case: Case, key: str, wire: str) -> LoopPart | None:
             cut, title, L = v.fullest_loop(wire)
             disk = mimo_disk_margin(L)
         except LoopwrightError as error:
-            notes.append(f"{v.title}: {error.message}")
+            notes.append(f"{v.title}: {say(error)}")
             continue
         own[v, cut] = disk_numbers(disk)
         rows.append((title, disk.alpha, disk.frequency, disk_range(disk)))

@@ -23,6 +23,7 @@ from ...frequency import (
 from ...linearization import find_signal
 from .. import figures
 from ..case import Case
+from ..error_sentences import say
 from ..pages import Plot, Section, Table, Texts
 from ..points import STEP
 from ..variant import Variant
@@ -157,7 +158,7 @@ def _model(variant: Variant, wire: str, text: list[str]) -> tuple[Any, Any]:
         L = variant.loop(wire)
         return L, margins(L)
     except LoopwrightError as error:
-        text.append(TEXTS.line("no_model", wire=wire, message=error.message))
+        text.append(TEXTS.line("no_model", wire=wire, message=say(error)))
         return None, None
 
 

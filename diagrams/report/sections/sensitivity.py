@@ -10,6 +10,7 @@ from ...frequency import Number
 from ...studies import Sensitivities, Sensitivity, confirm_parameter, sensitivities_of
 from .. import figures
 from ..case import Case
+from ..error_sentences import say
 from ..pages import Section, Table, Texts
 from ..same_loops import find_same, is_same
 from .loops import ROWS
@@ -38,7 +39,7 @@ def sensitivity(case: Case) -> Section | None:
             text.append(TEXTS.line("no_loop", wire=wire, between=isinstance(error, BetweenTicksError)))
             continue
         except LoopwrightError as error:
-            text.append(TEXTS.line("left_out", wire=wire, message=error.message))
+            text.append(TEXTS.line("left_out", wire=wire, message=say(error)))
             continue
         if not found.stable:
             text.append(TEXTS.line("unstable", wire=wire))
@@ -73,7 +74,7 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities, confirmed: list
                 made = confirm_parameter(found, name, shown)
                 confirmed += made
         except LoopwrightError as error:
-            text.append(TEXTS.line("left_out", wire=wire, message=error.message))
+            text.append(TEXTS.line("left_out", wire=wire, message=say(error)))
             rough = [found[name, quantity] for quantity in shown]
             made = [replace(row, slope=replace(row.slope, confirmed_by="")) for row in rough]
         bars[name] = next(row for row in made if row.quantity == first).per_percent.value

@@ -31,6 +31,7 @@ from ...requirements import STEP_UNITS, StepLimits
 from ...results import OperatingPoint, is_at_rest, measure_step
 from .. import figures
 from ..case import Case
+from ..error_sentences import say
 from ..pages import Plot, Section, Table, Texts
 from ..stability import Stability
 from ..variant import Variant, in_s
@@ -139,8 +140,8 @@ def steps(case: Case) -> Section | None:
             try:
                 ran = _run(case, v, test)
             except LoopwrightError as error:
-                text.append(TEXTS.line("failed", variant=v.title, wire=test.wire, message=str(error)))
-                absent[f"{test.key}.{v.key}"] = str(error)
+                text.append(TEXTS.line("failed", variant=v.title, wire=test.wire, message=say(error)))
+                absent[f"{test.key}.{v.key}"] = say(error)
                 continue
             if ran is None:
                 absent[f"{test.key}.{v.key}"] = TEXTS.line("no_single", wire=test.wire)

@@ -26,6 +26,7 @@ from ...studies import (
     plot_cases,
 )
 from ..content_hash import content_hash
+from ..error_sentences import say
 from ..pages import Plot, Section, Table, Texts
 from .loops import ROWS
 
@@ -94,12 +95,12 @@ def find_reported(
         try:
             given = task.find(diagram, asked, at=at, progress=lambda line: tell(f"{KEY}: {line}"), **options)
         except LoopwrightError as error:
-            return MissingWorstCase(task.find_limits(diagram, asked), error.message)
+            return MissingWorstCase(task.find_limits(diagram, asked), say(error))
     tell("confirming the worst case by a run")
     try:
         return ReportedWorstCase(given, given.confirm())
     except LoopwrightError as error:
-        return ReportedWorstCase(given, problem=error.message)
+        return ReportedWorstCase(given, problem=say(error))
 
 
 def _name_wires(
