@@ -816,6 +816,7 @@ class Diagram(ShownAsTable):
         loop: str | Iterable[str],
         parameters: str | Iterable[str] | None = None,
         *,
+        to: str | Iterable[str] | None = None,
         at: Any = None,
         delay: int = 0,
         skew: float = 0.0,
@@ -835,6 +836,9 @@ class Diagram(ShownAsTable):
         parameters : list of str, optional
             Paths, ``"controller.pid.kp"`` or ``"plant.mass"`` of an FMU. Without it, all numbers in the traced
             equations that are not 0, and the parameters that the blocks of FMUs set.
+        to : str or list of str, optional
+            Inputs ahead of which the wire is cut, as of `Linearization.loop`; an empty list cuts it for all consumers.
+            Without it, a wire that also feeds a model of the controller's own is cut ahead of the plant.
         at : OperatingPoint, Snapshot, float or callable, optional
             Point, as in `linearize`. An equilibrium follows the parameter; a point that is not at rest keeps its
             states. A function from a diagram to a point, ``lambda d: d.trim(…)``, is asked again for changed
@@ -854,7 +858,7 @@ class Diagram(ShownAsTable):
         """
         from .studies import find_sensitivities
 
-        return find_sensitivities(self.wired, loop, parameters, at=at, delay=delay, skew=skew, **options)
+        return find_sensitivities(self.wired, loop, parameters, to=to, at=at, delay=delay, skew=skew, **options)
 
     def worst_case(
         self,

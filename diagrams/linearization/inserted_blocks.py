@@ -266,11 +266,12 @@ def find_inputs(diagram: WiredDiagram, flat: FlatDiagram, wire: str, to: Iterabl
 
 
 def _find_input(diagram: WiredDiagram, name: str, fed: Sequence[Port]) -> Port:
-    """Return the input of a name, or the only one of the block of that name that a wire feeds."""
+    """Return the input of a name; of a block's name the only one that a wire feeds, or the only one that it has."""
     known = {join(*port): port for port in diagram.structure.wires}
     found = [name] if name in known else [n for n in known if n.endswith("." + name)]
     if not found:
-        found = [join(*port) for port in fed if port[0] == name or port[0].endswith("." + name)]
+        own = [port for port in known.values() if port[0] == name or port[0].endswith("." + name)]
+        found = [join(*port) for port in own if port in fed] or [join(*port) for port in own]
     if len(found) != 1:
         several = f"several inputs end with {name!r}: {', '.join(found)}" if found else f"there is no input {name!r}"
         raise UnknownNameError(f"{several}. {near(name, known)}", block=diagram.name, port="to")

@@ -25,9 +25,18 @@ from ...blocks.core import (
 )
 from ..flat import WiredDiagram
 from ..frequency import MarginSlope, Number, margin_slopes, margins, order_key
-from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize, rational_loop
+from ..linearization import (
+    Linearization,
+    LoopSlope,
+    PointFinder,
+    carry_point,
+    differentiate_loop,
+    linearize,
+    rational_loop,
+)
 from ..plotting import BLUE, DARK, VERMILION, shown_figure
 from ..results import OperatingPoint
+from .loop_places import place_loops
 from .parameters import check_parameters, list_parameters, unit_of
 
 if TYPE_CHECKING:
@@ -236,12 +245,13 @@ def _row(row: Sensitivity) -> tuple[Any, ...]:
     return row.parameter, row.value, row.unit, change, row.slope.value, known, marks
 
 
-@accepts("sensitivity", loop=kinds.names, parameters=kinds.names, delay=kinds.whole, skew=kinds.number)
+@accepts("sensitivity", loop=kinds.names, to=kinds.names, parameters=kinds.names, delay=kinds.whole, skew=kinds.number)
 def find_sensitivities(
     diagram: WiredDiagram,
     loop: str | Iterable[str],
     parameters: str | Iterable[str] | None = None,
     *,
+    to: str | Iterable[str] | None = None,
     at: Any = None,
     delay: int = 0,
     skew: float = 0.0,
@@ -250,7 +260,8 @@ def find_sensitivities(
     **options: Any,
 ) -> Sensitivities:
     """Return the derivatives of a loop's margins by parameters; see `Diagram.sensitivities`."""
-    wires = (loop,) if isinstance(loop, str) else tuple(loop)
+    whole = diagram
+    diagram, wires, _ = place_loops(diagram, loop, None, to)
     find: PointFinder | None = None
     if callable(at) and not isinstance(at, OperatingPoint):
 
@@ -258,9 +269,9 @@ def find_sensitivities(
             found: OperatingPoint = at(variant.facade)
             return found
 
-    point = find(diagram) if find is not None else at
+    point = find(diagram) if find is not None else carry_point(whole, at, diagram)
     model = linearize(diagram, point, plants=plants, stairs=stairs, **options)
-    return sensitivities_of(model, wires, parameters, find=find, delay=delay, skew=skew)
+    return sensitivities_of(model, tuple(wires), parameters, find=find, delay=delay, skew=skew)
 
 
 def sensitivities_of(

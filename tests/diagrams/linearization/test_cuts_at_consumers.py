@@ -138,7 +138,7 @@ def test_mistakes_name_what_was_found_and_a_next_step():
     with pytest.raises(
         WiringError, match=r"^x\.u: found sum\.y wired to it; expected 'wire'.*its consumers: a\.u, b\.u"
     ):
-        model.loop("wire", to="x.u")
+        model.loop("wire", to="x")  # its only input
     with pytest.raises(OptionError, match="found 2 wires with to=…; expected one"):
         model.loop("wire", "sum.y", to="a.u")
     with pytest.raises(DefinitionError, match="found tracks='v'; expected an output of this block"):

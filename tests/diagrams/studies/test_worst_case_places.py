@@ -1,4 +1,4 @@
-"""The place at which a worst case cuts a loop: at the plant's input, where the wire also feeds the controller's model."""
+"""The place at which a worst case and sensitivities cut a loop: at the plant's input, where the wire also feeds the controller's model."""
 
 import numpy as np
 import pytest
@@ -42,6 +42,16 @@ def test_an_operating_point_serves_the_diagram_with_the_cut():
     found = diagram.worst_case({"controller.pi.kp": (1.999, 2.0)}, "u", quantity="ms", at=at, **FEW)
     assert found.nominal[0].value == pytest.approx(peak(smith_by_hand()[0](Z)), rel=1e-3)
     assert found.confirm().agrees
+
+
+def test_sensitivities_are_those_at_the_plants_input_too():
+    """The slope by the plant's gain is that of differences by hand."""
+    ms = [[peak(system(Z)) for system in smith_by_hand(gain)] for gain in (1.299, 1.3, 1.301)]
+    at_plant, everywhere = zip(*ms, strict=True)
+    for to, (low, here, high) in ((None, at_plant), ("plant", at_plant), ([], everywhere)):
+        row = smith().sensitivities("u", ["plant.numerator[1]"], to=to)["plant.numerator[1]", "ms"]
+        assert row.number.value == pytest.approx(here, rel=1e-6)
+        assert row.slope.value == pytest.approx((high - low) / 0.002, rel=1e-3)
 
 
 def test_what_can_not_be_cut_is_refused_by_name():
