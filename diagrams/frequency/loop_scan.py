@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol, cast
 
@@ -23,6 +23,10 @@ TURNS_MATTER = 0.3
 """|L| below which the turns that a delay makes don't matter for the encirclements of −1."""
 HALVINGS = 24
 """Halvings of the steps of a scan beside roots at which |L| may be too small to be looked for."""
+MANY = 100
+"""Roots between samples above which those that can't have the largest |L| below 1 are left out."""
+NARROWINGS = 12
+"""Halvings of the steps in which they lie."""
 POLISHED = 20
 """Number of candidates of a peak that are refined."""
 
@@ -139,11 +143,51 @@ class _Search:
             shown = self.show(omega, L, dL)[1] & (self._bound(omega, L, dL)[0] < self.least)
             if not shown.any():
                 break
-            after = np.flatnonzero(shown) + 1
-            between = np.sqrt(omega[after - 1] * omega[after])
-            new = (between, *respond(between))
-            omega, L, dL = (np.insert(a, after, b) for a, b in zip((omega, L, dL), new, strict=True))
+            omega, L, dL = self._insert(respond, shown, omega, L, dL)
         return omega, L, dL
+
+    def leave_smaller(
+        self,
+        respond: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+        omega: np.ndarray,
+        L: np.ndarray,
+        dL: np.ndarray,
+    ) -> tuple[_Search, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the search for fewer of many roots with |L| < 1, and samples: the largest |L| of them decides.
+
+        A root that is certain, between samples of both signs, has an |L| above the lower bound there. Those with an
+        upper bound below it are left out.
+        """
+        search = self
+        for _ in range(NARROWINGS):
+            h, shown = search.show(omega, L, dL)
+            low, high = self._bound(omega, L, dL)
+            shown &= high < 1.0
+            if np.count_nonzero(shown) <= MANY:
+                break
+            certain = shown & (h[:-1] * h[1:] < 0)
+            if self.wanted is not None:
+                wanted = self.wanted(L)
+                certain &= wanted[:-1] & wanted[1:]
+            least = float(np.max(low[certain], initial=0.0)) * (1.0 - 1e-6)  # nearly equal ones are a kink
+            search = replace(search, least=max(search.least, least))
+            omega, L, dL = self._insert(respond, shown, omega, L, dL)
+        return search, omega, L, dL
+
+    @staticmethod
+    def _insert(
+        respond: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+        where: np.ndarray,
+        omega: np.ndarray,
+        L: np.ndarray,
+        dL: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return samples with one more in the middle of some steps."""
+        after = np.flatnonzero(where) + 1
+        between = np.sqrt(omega[after - 1] * omega[after])
+        new = (between, *respond(between))
+        one, two, three = (np.insert(a, after, b) for a, b in zip((omega, L, dL), new, strict=True))
+        return one, two, three
 
     @staticmethod
     def _bound(omega: np.ndarray, L: np.ndarray, dL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -262,12 +306,15 @@ class LoopScan:
         L, dL = self._response(omega)
         return Crossing(omega, complex(L[0]), float(function(L, dL)[1][0]), self.r.error(omega))
 
-    def _find_roots(self, search: _Search) -> Iterator[float]:
+    def _find_roots(self, looked_for: _Search) -> Iterator[float]:
         """Yield the roots of a function by rising frequency; its slope shows two of them between two samples."""
-        function, last = search.function, -np.inf
+        function, last = looked_for.function, -np.inf
         for omega, (L, dL) in zip(self.segments, self.samples, strict=True):
+            search = looked_for
             if 0.0 < search.least < search.most:
                 omega, L, dL = search.halve(self._response, omega, L, dL)
+                if np.isinf(self.r.settled):  # else the first ones are shown
+                    search, omega, L, dL = search.leave_smaller(self._response, omega, L, dL)
             h, shown = search.show(omega, L, dL)
             searched = 0
             for k in np.flatnonzero(shown):

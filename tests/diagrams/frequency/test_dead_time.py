@@ -17,6 +17,7 @@ from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.frequency.delay_matrices import DelayMatrices
 from loopwright.diagrams.frequency.delayed_realization import DelayedRealization, realize
 from loopwright.diagrams.frequency.delayed_system import DelayedSystem
+from loopwright.diagrams.frequency.loop_margins import scan_margins
 from loopwright.diagrams.frequency.loop_scan import LoopScan
 from loopwright.frequency import disk_margin, margins, nyquist_count
 
@@ -577,6 +578,23 @@ def test_only_crossings_that_may_decide_are_refined_of_a_response_that_passes_ze
     np.testing.assert_allclose([c.L.real for c in found], [L(root).real for root in expected], rtol=1e-8)
     assert crossings is None or len(found) == crossings
     assert len(calls) < 100 + 15 * len(found)  # one root after the other took 20 more for each turn
+
+
+def test_of_many_crossings_those_that_can_not_decide_are_left_out(monkeypatch):
+    """A model of the dead time that is 0.5 % too long: L = 0.3 (1 + e^(−8 s) − e^(−8.04 s))/s crosses at each turn."""
+    calls, response = list[int](), DelayedRealization.response
+    monkeypatch.setattr(DelayedRealization, "response", lambda r, w: calls.append(np.size(w)) or response(r, w))
+    pipe, model = delay(8.0, "pipe"), rational([2.0], [10.0, 1.0], "model")
+    u = pi(model.y + (pipe.y - delay(8.04, "model_pipe")(model.y)), 1.5, 0.15)
+    loop = Diagram("late", pipe(rational([2.0], [10.0, 1.0], "lag")(u)), model(u)).linearize().loop("u")
+    L = lambda w: 0.3 * (1 + np.exp(-8j * w) - np.exp(-8.04j * w)) / (1j * w)  # noqa: E731
+    w = np.linspace(1e-3, 300.0, 600_001)
+    at = L(w)
+    k = np.flatnonzero((at.imag[1:] * at.imag[:-1] < 0) & (at.real[1:] < 0))
+    largest = max(-L(brentq(lambda w: L(w).imag, w[i], w[i + 1], xtol=1e-15)).real for i in k)
+    assert scan_margins(loop)["gain_margin_high"].value == pytest.approx(1 / largest, rel=1e-9)
+    assert len(k) > 200
+    assert len(calls) < 2000
 
 
 @pytest.mark.slow
