@@ -261,7 +261,7 @@ def find_sensitivities(
 ) -> Sensitivities:
     """Return the derivatives of a loop's margins by parameters; see `Diagram.sensitivities`."""
     whole = diagram
-    diagram, wires, _ = place_loops(diagram, loop, None, to)
+    diagram, wires, _, _ = place_loops(diagram, loop, None, to)
     find: PointFinder | None = None
     if callable(at) and not isinstance(at, OperatingPoint):
 
