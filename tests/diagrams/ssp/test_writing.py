@@ -19,7 +19,7 @@ from loopwright.blocks import (
     Stack,
     UnitConversion,
 )
-from loopwright.diagrams import OptionError, SspFileError, read_ssp
+from loopwright.diagrams import OptionError, SspFileError, experiments, read_ssp
 from support.ecos import load_ecospy
 from support.ssp_files import adder
 
@@ -258,6 +258,20 @@ def test_components_are_in_the_order_in_which_a_tool_steps_them(fmu, tmp_path, c
         y[i + 1] = y[i] + H * (0.4 * H * i * y[i] - 0.5 * y[i] + 0.25)
     np.testing.assert_allclose(found, y, rtol=1e-13)
     np.testing.assert_allclose(diagram.simulate(H * N, progress=False)["plant.y"], y, rtol=1e-13)
+
+
+@pytest.mark.slow
+def test_fig_3_goes_out_and_comes_back(tmp_path, cache):
+    """Experiment C: sensors, controller, gantry and sources as four FMUs; sources add up their time differently."""
+    diagram = experiments.EXPERIMENTS["C"]().diagram
+    file = diagram.to_ssp(tmp_path / "fig3.ssp", step=1e-3)
+    about = read_ssp(file)
+    assert tuple(about.components) == ("sensors", "controller", "plant", "blocks")
+    in_order = Coupling(scheme="gauss_seidel", order=tuple(about.components))
+    ours = diagram.simulate(1.0, progress=False)
+    found = Diagram.from_ssp(file).simulate(1.0, step=about.step, coupling=in_order, progress=False)
+    np.testing.assert_allclose(found["plant.position"], ours["plant.position"], rtol=0.0, atol=1e-14)
+    assert np.ptp(ours["plant.position"][:, 0]) > 0.01  # it moves
 
 
 @pytest.mark.slow
