@@ -88,7 +88,7 @@ window.makeScene = (page, box) => {
 
     const record = page.record, first = record.from(page.time - trailSeconds), count = record.count - first;
     const [iy, iz] = axes.map(name => page.data.columns.findIndex(column => column.name === name));
-    ctx.strokeStyle = c.c0; ctx.lineWidth = 2.2; ctx.lineCap = 'round';
+    ctx.strokeStyle = c.c0; ctx.lineWidth = 2.2; ctx.lineCap = 'butt';
     const pieces = 30, step = Math.max(1, Math.floor(count / 240));
     for (let k = 0; k < pieces; k++) {
       const from = first + Math.floor(count * k / pieces), to = Math.min(record.count - 1, first + Math.floor(count * (k + 1) / pieces));

@@ -160,8 +160,11 @@ class Plot {
       for (let i = first; i < n; i += step) { const v = record.value(i, curve); if (v < low) low = v; if (v > high) high = v; }
     if (!(low <= high)) { low = 0; high = 1; }
     const least = Math.max(Math.abs(low), Math.abs(high)) * 1e-6 || 1e-9;
-    if (high - low < least) { const middle = (low + high) / 2; low = middle - Math.max(least, 0.5 * Math.abs(middle) || 0.5); high = middle + Math.max(least, 0.5 * Math.abs(middle) || 0.5); }
-    // the scale grows at once, and shrinks slowly
+    const flat = high - low < least;
+    if (flat) { const middle = (low + high) / 2; low = middle - Math.max(least, 0.5 * Math.abs(middle) || 0.5); high = middle + Math.max(least, 0.5 * Math.abs(middle) || 0.5); }
+    // the scale grows at once, and shrinks slowly; that of a constant is not kept
+    if (this.flat || flat) this.low = this.high = null;
+    this.flat = flat;
     this.low = this.low === null || low < this.low ? low : this.low + (low - this.low) * 0.05;
     this.high = this.high === null || high > this.high ? high : this.high + (high - this.high) * 0.05;
     const pad = 0.06 * (this.high - this.low), y0 = this.low - pad, y1 = this.high + pad;
