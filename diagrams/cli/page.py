@@ -59,8 +59,7 @@ def add_page(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 def page_command(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright page``."""
     try:
-        page, out = _make(arguments)
-        file = page.save(out)
+        page, file = _make(arguments)
     except OptionError:
         raise
     except LoopwrightError as error:
@@ -72,7 +71,8 @@ def page_command(arguments: argparse.Namespace) -> int:
 
 def _make(arguments: argparse.Namespace) -> tuple[WebPage, Path]:
     if arguments.diagram == _HAND:
-        return experiments.hand_page(), Path(arguments.out or f"{_HAND}.html")
+        out = Path(arguments.out or f"{_HAND}.html")
+        return experiments.hand_page(out), out
     with open_user_diagram(arguments.diagram) as (diagram, _):
         options: dict[str, Any] = {"step": arguments.step, "speed": arguments.speed}
         if arguments.inputs:
@@ -81,7 +81,8 @@ def _make(arguments: argparse.Namespace) -> tuple[WebPage, Path]:
             options["sliders"] = _ranges(arguments.sliders, "--slider")
         if arguments.plots:
             options["plots"] = [plot.split(",") for plot in arguments.plots]
-        return diagram.to_html(**options), Path(arguments.out or f"{diagram.name}.html")
+        out = Path(arguments.out or f"{diagram.name}.html")
+        return diagram.to_html(out, **options), out
 
 
 def _ranges(given: list[str], option: str) -> dict[str, tuple[float, float] | None]:

@@ -62,7 +62,7 @@ class Module:
         """Go through ticks; return the samples, a row for each: time and columns."""
         rows, width = [], len(self.names) + 1
         while ticks:
-            count = self._call("run", min(CHUNK, ticks))
+            count = self._call("run", min(CHUNK, ticks), math.inf)
             rows.append(self._numbers(self._call("samples"), count * width).reshape(count, width).copy())
             if self._call("failed"):
                 break

@@ -110,11 +110,11 @@ static bool lw_page_take_tick(double *row, bool *wrote) {
     return (!LW_HYBRID || lw_go(m, lw_time_of(lw_page_tick))) && lw_page_step_plants(lw_page_tick);
 }
 
-/* Go through so many ticks; returns the number of samples: fewer where it can't continue. */
-LW_SEEN(run) int lw_page_run(int count) {
+/* Go through so many ticks, up to a time; returns the number of samples. */
+LW_SEEN(run) int lw_page_run(int count, double until) {
     int n = 0;
     lw_page_failed_plant = -1;
-    while (n < count && n < LW_N_ROWS && !lw_page_has_failed) {
+    while (n < count && n < LW_N_ROWS && !lw_page_has_failed && lw_time_of(lw_page_tick) <= until) {
         bool wrote;
         lw_page_has_failed = !lw_page_take_tick(lw_page_rows[n], &wrote);
         n += wrote;

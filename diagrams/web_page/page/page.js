@@ -34,11 +34,11 @@ class Model {
     this.numbers(this.calls.parameters())[place] = value;
     this.isNew = true;
   }
-  run(count, record) {  // returns the number of ticks that were gone through
+  run(count, until, record) {  // returns the number of ticks that were gone through, up to a time
     if (this.isNew) { this.calls.renew(); this.isNew = false; }
     let done = 0;
-    while (done < count && !this.failed) {
-      const n = this.calls.run(Math.min(CHUNK, count - done));
+    for (let n = 1; n > 0 && done < count && !this.failed;) {
+      n = this.calls.run(Math.min(CHUNK, count - done), until);
       record.add(this.numbers(this.calls.samples(), n * this.width), n);
       done += n;
     }
@@ -275,8 +275,8 @@ for (const group of data.groups) {
 function say(text) { $('note').textContent = text; $('note').hidden = !text; }
 function time() { return record.count ? record.time(record.count - 1) : 0; }
 
-function advance(count) {  // so many ticks, at once
-  const done = model.run(count, record);
+function advance(count, until = Infinity) {  // so many ticks, up to a time, at once
+  const done = model.run(count, until, record);
   ticksDone += done;
   if (model.failed) {
     pause();
@@ -288,17 +288,16 @@ function advance(count) {  // so many ticks, at once
 function frame(now) {
   if (running) {
     now /= 1000;
-    let wanted = Math.floor((now - origin) * speed / data.step) + base - ticksDone;
-    const started = performance.now() / 1000;
-    while (wanted > 0 && running && performance.now() / 1000 - started < BUDGET) {
-      const n = Math.min(wanted, 64);
-      advance(n);
-      wanted -= n;
+    const until = base + (now - origin) * speed, started = performance.now() / 1000;
+    let done = 64, spent = 0;
+    while (done === 64 && running && spent < BUDGET) {
+      done = advance(64, until);
+      spent = performance.now() / 1000 - started;
     }
-    const late = wanted * data.step / speed;
+    const late = done === 64 ? (until - time()) / speed : 0;
     if (late > LONGEST) {
       behind += late;
-      if (performance.now() / 1000 - started >= BUDGET)
+      if (spent >= BUDGET)
         say(`${short(behind, 2)} s behind the clock: this machine is too slow for ${short(speed)} times real time. Choose a lower speed.`);
       start(now);
     }
@@ -307,7 +306,7 @@ function frame(now) {
   if (!drawn) draw();
   requestAnimationFrame(frame);
 }
-function start(now = performance.now() / 1000) { origin = now; base = ticksDone; }
+function start(now = performance.now() / 1000) { origin = now; base = time(); }
 function play() {
   if (model.failed) return;
   running = true; start();

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from loopwright import experiments
+from support.web_modules import Module
 
 pytestmark = pytest.mark.slow
 SIZES = [(1100, 900), (390, 844)]
@@ -113,6 +114,12 @@ def run_again(hand, changed_at):
         )
     )
     return found.run
+
+
+def test_elementary_functions_are_the_packages_own(file):
+    """The browser's functions are asked for step sizes alone (pow); else samples would hang on the browser."""
+    module = Module(file.read_text(encoding="utf-8"))
+    assert set(module.imports) <= {"pow", "atan2"}
 
 
 def test_steps_resets_and_a_slider(file):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from loopwright import Diagram, Fmu, subsystem
-from loopwright.blocks import Constant, DiscreteIntegrator, Gain, PythonFunction, Step, UnitDelay
+from loopwright.blocks import Constant, DiscreteIntegrator, Gain, PythonFunction, Step, TransferFunction, UnitDelay
 from loopwright.diagrams import DefinitionError, OptionError, UnknownNameError
-from loopwright.fmus import dc_motor
+from loopwright.fmus import bouncing_ball, dc_motor, mass_spring_damper
 from support.web_modules import Module
 
 T = 1e-3
@@ -186,3 +186,69 @@ def test_an_fmu_of_others_is_refused_by_its_path(uncompiled, monkeypatch):
 def test_mistakes_are_refused(uncompiled, options, error, words):
     with pytest.raises(error, match=words):
         drive(TARGET).to_html(**options)
+
+
+# --- diagrams of other kinds ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_continuous_diagram_is_sampled_at_a_step():
+    """ÿ + ẏ/2 + y = 1, from rest: the closed form, to the tolerance of the method."""
+    lag = TransferFunction(numerator=[1.0], denominator=[1.0, 0.5, 1.0])
+    page = Diagram("lag", lag(Constant(value=1.0, name="u")).named("y")).to_html(step=0.05, plots=["y"])
+    module = Module(page.html)
+    assert module.begin()
+    t, y = module.run(200).T[:2]
+    w = np.sqrt(1.0 - 0.25**2)
+    assert np.array_equal(t, np.arange(200) / 20)
+    assert np.abs(y - (1.0 - np.exp(-0.25 * t) * (np.cos(w * t) + 0.25 / w * np.sin(w * t)))).max() < 1e-6
+
+
+@pytest.mark.slow
+def test_plants_step_at_the_ticks_of_all_rates_around_them():
+    """At 2 and 3 ticks: the plant steps at 2, 3, 4, 6, and each subsystem holds its outputs."""
+
+    @subsystem(sample_time=2 * T)
+    def twos(y):
+        return Gain(gain=-0.5)(y).named("force")
+
+    @subsystem(sample_time=3 * T)
+    def threes(v):
+        return Gain(gain=0.5)(v).named("v")
+
+    plant = Fmu(mass_spring_damper.build(fmi=2), name="plant")
+    diagram = Diagram("rates", plant(force=twos(plant.position) + 1.0), threes(plant.velocity))
+    module = Module(diagram.to_html(inputs=[], plots=["force", "v", "plant.position"]).html)
+    assert module.begin()
+    run = diagram.simulate(0.6, progress=False)
+    assert same(module.run(len(run.t)), module, run)
+    assert module.run(1)[0, 0] == 0.602
+
+
+@pytest.mark.slow
+def test_an_fmu_with_events_between_ticks():
+    """A ball that bounces: the FMU finds its contacts within its steps."""
+
+    @subsystem(sample_time=0.01)
+    def look(height):
+        return Gain(gain=2.0)(height).named("twice")
+
+    ball = Fmu(bouncing_ball.build(), name="ball")
+    diagram = Diagram("ball", look(ball.height))
+    module = Module(diagram.to_html(inputs=[], plots=["twice", "ball.height"]).html)
+    assert module.begin()
+    assert same(module.run(301), module, diagram.simulate(3.0, progress=False))
+
+
+def test_a_module_stops_where_a_value_is_not_finite():
+    @subsystem(sample_time=1.0)
+    def box(u):
+        total = DiscreteIntegrator(initial_value=-3.0, name="total")(u)
+        return np.sqrt(0.0 - total).named("root")  # the total is -3, -2, -1, 0, 1: the root of -1 is none
+
+    module = Module(Diagram("d", box(Constant(value=1.0, name="u"))).to_html(plots=["root"]).html)
+    assert module.begin()
+    rows = module.run(10)
+    assert rows[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert module._call("failed") == 1
+    assert module._call("plant") == -1
