@@ -21,8 +21,9 @@ def refuse(opened: OpenDiagram) -> None:
         shown = opened.shown(path)
         if block.evaluated_outside or (block.stepped and not block.transport):
             raise DefinitionError(
-                "it is an FMU, which is not exported with the diagram. Export the subsystem around it, and couple the "
-                "two where the exported one is used.",
+                "it is an FMU, which is not exported with the diagram. Leave it outside, "
+                f"build(diagram, outside=[{shown!r}]), and couple the two FMUs where they are used; "
+                "diagram.to_ssp(…) writes both, and how they are coupled, into one file.",
                 block=shown,
             )
         if block.transport and not table.is_sampled(table.subsystem_of[path]):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from loopwright import build, experiments
+from loopwright.blocks import DefinitionError
 from support.instances import open_instance
 
 MAKERS = (
@@ -65,3 +66,12 @@ def test_a_parameter_of_table_iii_is_tuned_with_what_is_computed_from_it(tmp_pat
     hard = diagram.simulate(2.0, progress=False)
     assert np.abs(hard["motor_force"][1999] - run["motor_force"][1999]).max() > 1e-3
     item.free()
+
+
+@pytest.mark.slow
+def test_an_fmu_inside_is_named_with_the_ways_out():
+    with pytest.raises(DefinitionError) as caught:
+        build(experiments.path_following().diagram)
+    assert caught.value.block == "plant"
+    assert "outside=['plant']" in str(caught.value)
+    assert "to_ssp" in str(caught.value)
