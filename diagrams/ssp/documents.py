@@ -21,7 +21,7 @@ SPACES = {
         ("ssb", "SignalDictionary"),
     )
 }
-OSP = "http://opensimulationplatform.com/SSP/OSPAnnotations"
+SPACES["osp"] = "http://opensimulationplatform.com/SSP/OSPAnnotations"
 _TYPES = {"Float64": "Real", "Float32": "Real", "Int32": "Integer", "Boolean": "Boolean", "String": "String"}
 _TYPES |= {"Enumeration": "Enumeration", "Binary": "Binary"}
 _FLOATS = ("Float64", "Float32")
@@ -226,7 +226,8 @@ def write_dictionary(version: str, entries: Sequence[WrittenConnector]) -> bytes
 def write_description(version: str, name: str, system: WrittenElement, stop: float | None, step: float | None) -> bytes:
     """Return a system structure description."""
     made = XmlDocument(version)
-    root = made.root("ssd:SystemStructureDescription", "ssv", "ssb", name=name)
+    prefixes = ("ssv", "ssb") if step is None else ("ssv", "ssb", "osp")
+    root = made.root("ssd:SystemStructureDescription", *prefixes, name=name)
     _add_system(made, root, system)
     made.close(root, "ssd")
     if stop is not None or step is not None:
@@ -235,8 +236,8 @@ def write_description(version: str, name: str, system: WrittenElement, stop: flo
         if step is not None:
             group = made.add(experiment, "ssd:Annotations")
             note = made.add(group, "ssc:Annotation", type="com.opensimulationplatform")
-            algorithm = made.etree.SubElement(note, f"{{{OSP}}}Algorithm", nsmap={"osp": OSP})
-            made.etree.SubElement(algorithm, f"{{{OSP}}}FixedStepAlgorithm", {"baseStepSize": repr(float(step))})
+            algorithm = made.add(note, "osp:Algorithm")  # its namespace is declared at the root: libcosim's parser asks
+            made.add(algorithm, "osp:FixedStepAlgorithm", baseStepSize=repr(float(step)))
     return made.text(root)
 
 

@@ -78,6 +78,7 @@ def test_a_diagram_goes_out_and_comes_in_with_the_same_bits(fmu, tmp_path, cache
     assert diagram.to_ssp(tmp_path / "again.ssp", stop=2.0, step=H).read_bytes() == file.read_bytes()
     with zipfile.ZipFile(file) as archive:
         assert sum(name.endswith(".fmu") for name in archive.namelist()) == 1  # both components are of one file
+        assert b"<osp:Algorithm>" in archive.read("SystemStructure.ssd")  # libcosim takes no declaration in it
 
 
 def test_the_second_way_out_is_the_first(fmu, tmp_path, cache):
