@@ -106,13 +106,14 @@ def interpret_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]])
 
 
 def write_ticks(
-    flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, straight: bool = False
+    flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, straight: bool = False, whole: bool = False
 ) -> Sources[TickCode]:
     """Return the ticks at which these sets of clocks act, to be written as C code; see `compile_ticks`.
 
-    ``straight`` leaves functions that are no scalar operations as they are.
+    ``straight`` leaves functions that are no scalar operations as they are; ``whole`` makes one function of each tick
+    of a large diagram, too, which calls those of its blocks.
     """
-    ticks = None if flat.by_block else _write_straight(flat, acting, always=straight)
+    ticks = _write_straight(flat, acting, always=straight) if whole or not flat.by_block else None
     ticks = ticks or _write_grouped(flat, acting)
     loops = loop_functions(flat, acting)
     if not loops:

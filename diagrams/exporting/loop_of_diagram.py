@@ -101,7 +101,7 @@ def loop_spec(
         facts["left"] = None if left is None else CFunction.of(left)
         functions += [] if left is None else [left]
     else:
-        sources = write_ticks(flat, acting, straight=True)
+        sources = write_ticks(flat, acting, straight=True, whole=True)
         loop = _bind_ticks(workspace, sources.make([code] * len(sources.writers)))
         memory = read_memory({"loop": loop.structure}, vectors, loop.kept, code)
     guards = [trace_guards(flat, clocks, i, opened) for i, clocks in enumerate(acting)]

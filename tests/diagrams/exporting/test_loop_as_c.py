@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import PID, Gain, Step, TransferFunction
+from loopwright.blocks import PID, PT1, Gain, Step, TransferFunction
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.exporting import loop_spec, open_part, open_subsystem
 from support.exported_loops import Loop
@@ -110,3 +110,27 @@ def test_an_output_with_the_name_of_an_input_is_called_after_its_block():
     half = subsystem(sample_time=0.01, name="half")(lambda y: Gain(gain=0.5)(y))
     spec = loop_spec(open_subsystem(half, Diagram, "half"), name="half")
     assert [one.variable.name for one in (*spec.inputs, *spec.outputs)] == ["y", "gain_y"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sample_time", [1e-2, None])
+def test_a_diagram_of_many_blocks_is_exported(sample_time):
+    """It runs in groups of equal blocks, and leaves as one function that calls theirs."""
+
+    @subsystem(sample_time=sample_time)
+    def chain(u):
+        y = u
+        for i in range(500):
+            y = PT1(time_constant=1e-2 + 1e-5 * i, name=f"lag{i}")(y).y
+        return y.named("y")
+
+    diagram = Diagram("chain", chain(Step(times=0.0, values=1.0, name="step")))
+    spec = loop_spec(open_part(diagram.wired, "chain", "chain"), name="chain", description="", rtol=1e-9, atol=1e-9)
+    options = {} if sample_time else {"step": 1e-2, "rtol": 1e-9, "atol": 1e-9}
+    run = diagram.simulate(12.0, progress=False, **options)
+    if sample_time:
+        np.testing.assert_array_equal(replay(Loop(spec), run, 1200, {"u": "step.y"}, "y"), run["y"][:1200])
+    else:
+        found = replay(Loop(spec), run, 1200, {"u": "step.y"}, "y")
+        np.testing.assert_allclose(found, run["y"][1:], rtol=0.0, atol=1e-6)
+    assert run["y"][-1] > 0.9
