@@ -82,6 +82,12 @@ class StepLimits:
         if not found:
             raise OptionError(f"found no limit; expected some of {', '.join(STEP_SENSES)}. Give one.", port="step")
 
+    def __repr__(self) -> str:
+        ends = " → ".join(name for name in (self.input, self.output) if name)
+        size = "" if self.size is None else f" of {self.size:g}"
+        told = ", ".join(f"{name} {limit}" for name, limit in self.limits.items())
+        return f"step{size}{f' {ends}' if ends else ''}: {told}"
+
     @classmethod
     def of(cls, given: Any) -> StepLimits:
         """Return the limits that a mapping has, or `StepLimits` themselves."""
@@ -126,7 +132,8 @@ class LoopLimits:
             self.to = _read_inputs(to)
         for name in limits:
             if name not in SENSES:
-                raise OptionError(f"there is no requirement {name!r}. {near(name, self._names())}", port=name)
+                hint = _instead_of(name, limits[name]) or near(name, self._names())
+                raise OptionError(f"there is no requirement {name!r}. {hint}", port=name)
         found = {name: make_limit(name, given, SENSES[name]) for name, given in limits.items() if given is not None}
         self.limits: Mapping[str, Limit] = MappingProxyType(found)
         self.step = None if step is None else StepLimits.of(step)
@@ -142,8 +149,14 @@ class LoopLimits:
 
     def __repr__(self) -> str:
         told = [f"{name} {limit}" for name, limit in self.limits.items()]
-        more = "limits of steps" if self.step else "", f"{len(self.variants)} variants" if self.variants else ""
-        return brief(self._kind, *told, *more, then=".limits, .step, .variants")
+        steps = [repr(step) for step in self._all_steps()]
+        loops = [f"{wire}: {limits!r}" for wire, limits in getattr(self, "loops", {}).items()]
+        more = f"variants {', '.join(self.variants)}" if self.variants else ""
+        return brief(self._kind, *told, *steps, *loops, more, then=".limits, .step, .variants")
+
+    def _all_steps(self) -> list[StepLimits]:
+        """Return the limits of responses to steps: of that at a loop's own wire, and of others."""
+        return [*([] if self.step is None else [self.step]), *getattr(self, "steps", ())]
 
     _kind: ClassVar[str] = "limits of a loop"
 
@@ -340,6 +353,28 @@ class Requirements(LoopLimits):
             yield limits
             if variant in limits.variants:
                 yield limits.variants[variant]
+
+
+_DECIBELS = ("gain_margin_db", "gm_db", "gain_margin_high_db")
+_FACTORS = ("gain_margin", "gm", "amplitude_margin")
+_OF_STEPS = {name: name for name in STEP_SENSES} | {
+    **dict.fromkeys(("settling_time", "ts"), "settling"),
+    **dict.fromkeys(("rise_time", "tr"), "rise"),
+}
+
+
+def _instead_of(name: str, given: Any) -> str:
+    """Return what to write for words of textbooks and other tools that are no limits of a loop; "" for others."""
+    if name in _OF_STEPS:
+        return f"It is one of a step response: step={{{_OF_STEPS[name]!r}: {shorten(given)}}}."
+    if name in _DECIBELS and kinds.is_real(given):
+        return f"Gain margins are factors: write gain_margin_high={10.0 ** (given / 20.0):.4g}, which is {given:g} dB."
+    if name in _DECIBELS + _FACTORS:
+        return (
+            "Gain margins are factors: write gain_margin_high=2.0, which is 6 dB, and gain_margin_low=0.5 for the one "
+            "to lower gains."
+        )
+    return ""
 
 
 def _read_inputs(given: Any) -> tuple[str, ...]:

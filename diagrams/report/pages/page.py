@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -252,6 +253,8 @@ def _about(meta: Mapping[str, Any]) -> Any:
     for key, value in meta.items():
         if key in ELSEWHERE or value in (None, "", {}, ()):
             continue
+        if key == "revision" and re.fullmatch(r"[0-9a-f]{64}", str(value)):  # the JSON has all digits
+            value = f"{value[:12]}… (digest of the diagram: its blocks, wires, parameters and FMUs)"
         if isinstance(value, Mapping):
             pairs = {str(k): cell(v) for k, v in value.items()}
             plainly = all(len(text.split()) == 1 for text in pairs.values())

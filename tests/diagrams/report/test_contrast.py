@@ -73,3 +73,21 @@ def test_curves_stand_out_from_their_ground_and_have_lines_of_their_own():
     colors = {look_of("", 0)["color"], *COLORS, *(color for color, _ in looks)}
     assert all(contrast(color, "#ffffff") >= GRAPHIC for color in colors)
     assert len(set(map(str, looks))) == len(looks)  # told apart without color, too
+
+
+def test_figures_are_drawn_light_on_dark_in_the_colors_of_the_page():
+    """Turned round in lightness, the grounds of figures are those of the page, and their texts can be read."""
+    ground = re.search(r'\[style\*="fill: #ffffff"\] \{ fill: (#\w{6})', DARK_SCREEN)[1]
+    assert "filter: invert(1) hue-rotate(180deg)" in DARK_SCREEN
+
+    def turned(color):
+        """hue-rotate(180deg) of Filter Effects, on the inverted color."""
+        r, g, b = (255 - int(color[i : i + 2], 16) for i in (1, 3, 5))
+        rows = ((-0.574, 1.430, 0.144), (0.426, 0.430, 0.144), (0.426, 1.430, -0.856))
+        return "#" + "".join(f"{round(min(max(x * r + y * g + z * b, 0), 255)):02x}" for x, y, z in rows)
+
+    (page,) = re.findall(r"html \{ background: (#\w+)", DARK_SCREEN)
+    pairs = zip(*([int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in (turned(ground), page)), strict=True)
+    assert max(abs(a - b) for a, b in pairs) <= 8
+    assert all(contrast(turned(color), page) >= TEXT for color in (DARK, STONE, STYLE["xtick.color"]))
+    assert all(contrast(turned(color), page) >= GRAPHIC for color in COLORS)

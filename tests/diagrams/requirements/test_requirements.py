@@ -120,6 +120,10 @@ def test_the_step_of_a_loop_replaces_the_general_one_and_steps_between_wires_sta
     ("wrong", "said"),
     [
         ({"phase_margin": 45}, "there is no requirement 'phase_margin'. Did you mean 'phase_margin_deg'"),
+        ({"gain_margin_db": 6.0}, "Gain margins are factors: write gain_margin_high=1.995, which is 6 dB"),
+        ({"gain_margin": 2.0}, "write gain_margin_high=2.0, which is 6 dB, and gain_margin_low=0.5"),
+        ({"overshoot": 0.1}, "It is one of a step response: step={'overshoot': 0.1}"),
+        ({"settling_time": 0.5}, "It is one of a step response: step={'settling': 0.5}"),
         ({"ms": "1.6"}, "ms: found '1.6'; expected a number (at most), or two: low and high"),
         ({"ms": True}, "ms: found True; expected a number"),
         ({"ms": math.nan}, "ms: found nan; expected a number"),
@@ -304,3 +308,13 @@ def test_the_distance_of_a_gain_margin_is_no_gain():
     )
     *_, found, distance = row_of(kept)
     assert (str(found), str(distance)) == ("8.7 (18.8 dB)", "6.7")
+
+
+def test_requirements_show_those_of_steps_and_of_single_loops():
+    asked = Requirements(
+        ms=1.6, step={"input": "r", "output": "y", "settling": 0.8, "size": 2.0}, loops={"u": {"phase_margin_deg": 40}}
+    )
+    assert repr(asked).startswith(
+        "<requirements: ms ≤ 1.6, step of 2 r → y: settling ≤ 0.8, u: <limits of a loop: phase"
+    )
+    assert "step: overshoot ≤ 0.3" in repr(Requirements(step={"overshoot": 0.3}))
