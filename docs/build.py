@@ -12,6 +12,7 @@ import re
 import shutil
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -75,10 +76,20 @@ def build(folder: Path) -> int:
 
     with tempfile.TemporaryDirectory() as temporary:
         sources, trees = Path(temporary) / "pages", Path(temporary) / "trees"
+        started = time.monotonic()
+
+        def say(doing: str) -> None:
+            print(f"{time.monotonic() - started:6.1f} s  {doing}", file=sys.stderr, flush=True)
+
+        say("pages and notebooks")
         stage(sources)
+        say("gallery, facts and responses of blocks")
         write_made_pages(sources)
+        say("Sphinx: about a minute of processor time; warnings follow")
         options = ["-W", "--keep-going", "-q", "-j", "auto", "-d", str(trees), "-c", str(HERE / "site")]
-        return sphinx([*options, str(sources), str(folder)])
+        status = sphinx([*options, str(sources), str(folder)])
+        say("done" if status == 0 else "there were warnings")
+        return status
 
 
 def main() -> int:

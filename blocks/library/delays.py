@@ -154,7 +154,9 @@ class TransportDelay(Block):
 
     transport: ClassVar[bool] = True
     """True: a solver gives the input of the time ``delay`` ago."""
-    delay: float = parameter(unit="s", above=0.0, description="delay τ")
+    delay: float = parameter(
+        unit="s", above=0.0, description="delay τ; without one leave the block out, and begin a sweep at a small one"
+    )
     initial_value: Array | None = parameter(default=0.0, description="output while t < τ; None: the input at t = 0")
     u = Input(shape=None, description="signal to delay, of any shape")
     y = Output(like="u", description="the input τ ago")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -28,6 +28,8 @@ class PID(Block):
 
     With ki = 0, a P or PD controller, there is no state ``integral``: it would stay 0. It is kept where something else
     moves it or sets it: back-calculation with a ``tracking_time``, or ``initial_output``.
+
+    Of an error alone, as textbooks write it, the controller is ``pid(e, 0.0)``, with ``c=1.0`` if it has a D part.
 
     The integral gain is under the integral, so a change of it makes no bump. In a sampled subsystem P, D and the limits
     are those of the tick, and I[k + 1] = I[k] + T ki (r − y) + (1 − α)(u − v). The subsystem's method gives the filter
@@ -82,6 +84,13 @@ class PID(Block):
     filter_decay: ClassVar[Array]  # computed by constants
     filter_gain: ClassVar[Array]
     tracking_share: ClassVar[Array]
+
+    def advise_unwired(self, ports: Collection[str]) -> str:
+        """Return how a controller of an error alone is written."""
+        if "y" not in ports:
+            return ""
+        weight = ", in a PID with c=1.0, so that D acts on it" if self.kd and self.c != 1.0 else ""
+        return f" Of an error e alone, without a set-point and a measured value, it is {self.label}(e, 0.0){weight}."
 
     @classmethod
     def from_ideal_form(

@@ -26,7 +26,7 @@ from .event_rules import check_events, check_smooth, find_instants
 from .exercise import Bench, Exercise, kind_text, points
 from .runs import check_run
 from .traces import check_derivatives, check_feedthrough, check_guards, check_shapes, check_trace, find_swallowed
-from .value_rules import check_after_start, check_ports, check_purity, check_values
+from .value_rules import check_after_start, check_ports, check_purity, check_values, describe_units
 
 
 @explain_calls
@@ -99,7 +99,8 @@ def check_block(
     """Check that a block keeps the contract of blocks, the library's or one of your own.
 
     - Values: pickling and ``replace`` give an equal block, a changed parameter another one.
-    - Ports: units can be read, and there are as many as entries; ``like`` names an input.
+    - Ports: units can be read, and there are as many as entries; ``like`` names an input. Where some variables have
+      units, the report names those without, which `build` refuses.
     - Purity: the same arguments give the same results and stay unchanged; equations leave the block unchanged.
     - Shapes and traced results are NumPy's at random points; derivatives of the trace are those of differences.
     - Feedthrough: no output changes with an input that the trace doesn't show.
@@ -161,6 +162,8 @@ def check_block(
     checks = {"values": check_values(block)}
     exercise = Exercise.of(block, inputs or {}, shapes or {}, sample_time, ticks, seed)
     checks["ports"] = check_ports(block)
+    if lacking := describe_units(block):
+        checks["units"] = lacking
     span = exercise.duration if duration is None else float(duration)
     announced = find_instants(block, span)
     checks["next_instant"] = f"{len(announced)} within {span:g} s"

@@ -150,6 +150,23 @@ def check_ports(block: Block) -> str:
     return f"{count}"
 
 
+def describe_units(block: Block) -> str:
+    """Return what an FMU of a block's equations lacks, "" if nothing: units for all of its variables, or for none."""
+    if not (hasattr(block, "derivative") or block.events):  # it has no FMU
+        return ""
+    units = {name: port.unit for ports in (block.inputs, block.outputs, block.states) for name, port in ports.items()}
+    numeric = (name for name, value in block.parameters.items() if _is_numeric(value))
+    units |= {name: type(block).parameter_specs[name].unit for name in numeric}
+    without = [name for name, unit in units.items() if unit is None]
+    if not 0 < len(without) < len(units):
+        return ""
+    return f"as an FMU it needs one for {', '.join(without)}, too: unit='1' for no dimension"
+
+
+def _is_numeric(value: Any) -> bool:
+    return isinstance(value, int | float | np.ndarray) and not isinstance(value, bool)
+
+
 # --- purity -----------------------------------------------------------------------------------------------------------
 
 

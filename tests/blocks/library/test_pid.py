@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import PID, ParameterError
+from loopwright.blocks import PID, Constant, ParameterError, TransferFunction, UnwiredInputError
 from loopwright.blocks.tracing.traced import trace
+from loopwright.diagrams import Diagram
 from support.stepped import Alone, response
 
 RNG = np.random.default_rng(21)
@@ -277,3 +278,17 @@ def test_what_can_not_work_is_refused(parameters, port, text):
 def test_a_nan_passes_the_limits(T):
     alone = Alone(PID(kp=1.0, ki=1.0, lower=-1.0, upper=1.0), T=T)
     assert np.isnan(alone.call(0.0, np.zeros(1), {"r": np.nan})[0]["u"])
+
+
+def test_of_an_error_alone_it_is_the_textbooks_controller():
+    """With y = 0 and c = 1 it is kp + ki/s + kd s/(T_f s + 1) on the error."""
+    pid = PID(kp=2.0, ki=3.0, kd=0.4, filter_time=0.05, c=1.0, name="pid")
+    plant = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="plant")
+    loop = Diagram("loop", plant(pid(Constant(value=1.0) - plant.y, 0.0).named("u"))).linearize().loop("u")
+    s = 0.7j
+    wanted = (2.0 + 3.0 / s + 0.4 * s / (0.05 * s + 1.0)) / (s + 1.0)
+    assert complex(loop(s)) == pytest.approx(wanted, rel=1e-9)
+    with pytest.raises(UnwiredInputError, match=r"Of an error e alone, .* it is pid\(e, 0\.0\)\.$"):
+        pid(plant.y)
+    with pytest.raises(UnwiredInputError, match=r"pid\(e, 0\.0\), in a PID with c=1\.0, so that D acts on it\.$"):
+        pid.replace(c=0.0)(plant.y)

@@ -586,3 +586,22 @@ def test_a_dependency_that_the_trace_does_not_show_is_found(monkeypatch):
         DefinitionError, match=r"amplifier\.y: feedthrough: .* the output 'y' changes with the input 'u'"
     ):
         check_block(Amplifier())
+
+
+class Gear(Block):
+    """J ω̇ = N M."""
+
+    N: float = parameter(default=30.0)
+    J: float = parameter(default=1.0, unit="kg.m2")
+    M = Input(unit="N.m", shape=())
+    w = State(unit="rad/s", output=True)
+
+    def derivative(self, t, x, u):
+        return self.N * u.M / self.J
+
+
+def test_the_report_names_variables_without_a_unit_that_an_export_refuses():
+    with pytest.raises(DefinitionError, match="N without a unit, where others have one"):
+        loopwright.fmus.build(Gear(name="gear"))
+    assert check_block(Gear()).checks["units"] == "as an FMU it needs one for N, too: unit='1' for no dimension"
+    assert "units" not in check_block(Saturation(limit=1.0)).checks
