@@ -184,6 +184,20 @@ def test_ecos_runs_a_flat_one_with_the_same_bits(fmu, tmp_path, cache):
         simulation.terminate()
 
 
+@pytest.mark.slow
+def test_ecos_runs_a_controller_and_its_plant_with_the_same_bits(fmu, tmp_path, cache):
+    """Ecos steps all at once: so does the SSP, read again, by default."""
+    ecospy = load_ecospy()
+    file = controlled(fmu).to_ssp(tmp_path / "servo.ssp", flat=True, step=H)
+    ours = run(Diagram.from_ssp(file))["plant.y"]
+    with ecospy.EcosSimulation(H, ssp_path=str(file)) as simulation:
+        assert simulation.init(parameter_set="parameters"), ecospy.EcosLib.get_last_error()
+        for value in ours[1:]:
+            simulation.step()
+            assert simulation.get_real("plant::y") == value
+        simulation.terminate()
+
+
 def test_arrays_of_fmi_3_make_it_ssp_2(tmp_path, cache):
     """An array of FMI 3.0 is one connector with a dimension, and one value of a parameter set."""
     from loopwright.fmus import gantry
