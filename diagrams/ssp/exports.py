@@ -188,8 +188,8 @@ def find_export(wired: WiredDiagram, path: str) -> Export:
             whole = inner.index == outer.index
             inputs[inner.port] = replace(outer, index=None) if whole else outer
     outputs: dict[tuple[str, str, int | None], tuple[str, int | None]] = {}
-    for (at, name), wire in wired.scheduled.results.items():
-        if at != path or name not in opened.outputs:
+    for name, wire in opened.outputs.items():
+        if wire.block == opened.outside:  # a signal that only passes through: its readers have its source
             continue
         full = wired.checked.shapes[wire.block, wire.port]
         entries = np.arange(int(np.prod(full))).reshape(full)

@@ -291,8 +291,11 @@ def test_fig_3_goes_out_and_comes_back(tmp_path, cache):
 
 @pytest.mark.slow
 def test_a_sampled_gain_is_no_transformation(fmu, tmp_path, cache):
-    """It holds its output for two steps of the plant, so it becomes an FMU; y grows by h (k u + b) with u held."""
-    sampled = subsystem(lambda level: Gain(gain=-0.5, name="p")(level), sample_time=2 * H, name="controller")
+    """It holds its output for two steps of the plant, so it becomes an FMU; y grows by h (k u + b) with u held.
+
+    Its input and its output are both called y, and become two variables.
+    """
+    sampled = subsystem(lambda y: Gain(gain=-0.5, name="p")(y), sample_time=2 * H, name="controller")
     plant = Fmu(fmu, name="plant", start={**OTHERS, "b": 1.0})
     diagram = Diagram("d", plant(u=sampled(plant.y)))
     file = diagram.to_ssp(tmp_path / "d.ssp")
