@@ -53,6 +53,8 @@ class ByArgument:
             scan = LoopScan(self.r, features, floor=self.floor)
             if np.isfinite(self.r.settled) or any(self.floor <= abs(c.L) < 1.0 for c in scan.phase_crossovers):
                 break  # one that turns up to infinite frequency is scanned as far as it changes
+            if all(np.all(np.abs(L) > self.floor) for L, _ in scan.samples):
+                break  # a lower floor leads to the same samples
         return scan
 
     def count_encirclements(self) -> int:
