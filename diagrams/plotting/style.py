@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -105,11 +105,16 @@ def legend_above(figure: Figure, axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if len(labels) < 2:
         return
-    fitting = LETTERS * figure.get_figwidth() / WIDTH
-    columns = max(1, min(len(labels), int(fitting) // (max(map(len, labels)) + 6)))
-    if sum(len(label) + 6 for label in labels) <= fitting:  # in one row each column is as wide as its own label
-        columns = len(labels)
+    columns = legend_columns(labels, figure.get_figwidth())
     figure.legend(handles, labels, loc="outside upper left", ncols=columns)
+
+
+def legend_columns(labels: Sequence[str], width: float) -> int:
+    """Return how many of some labels fit side by side in a width in inches."""
+    fitting = LETTERS * width / WIDTH
+    if sum(len(label) + 6 for label in labels) <= fitting:  # in one row each column is as wide as its own label
+        return len(labels)
+    return max(1, min(len(labels), int(fitting) // (max(map(len, labels)) + 6)))
 
 
 def marker_of(t: np.ndarray) -> str:

@@ -10,7 +10,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core import OptionError, print_unit
-from ..plotting import COLORS, DARK, LINES, STONE, WIDTH, legend_above, limit_time, marker_of, shown_figure, style
+from ..plotting import (
+    COLORS,
+    DARK,
+    LINES,
+    STONE,
+    WIDTH,
+    legend_above,
+    legend_columns,
+    limit_time,
+    marker_of,
+    shown_figure,
+    style,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,7 +115,7 @@ def _draw_panels(
     for ax, panel in zip(rows, panels, strict=True):
         _draw_panel(ax, panel, shown)
         if _has_legend(panel) and not (shared and _has_legend_of_runs(panel)):
-            ax.legend(loc="best", ncols=min(len(ax.get_legend_handles_labels()[1]), 3))
+            _legend_over(ax)
         if xlim is not None:
             _fit(ax, panel, xlim)
         limit_time(ax, shown)
@@ -115,6 +127,14 @@ def _draw_panels(
     result: Figure = top
     result.align_ylabels()
     return result
+
+
+def _legend_over(ax: Axes) -> None:
+    """Put a legend over the upper edge of axes, at the right, where it hides no curve."""
+    look: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0}
+    figure: Any = ax.figure  # a figure, or a part of one
+    width = figure.get_figwidth() if hasattr(figure, "get_figwidth") else WIDTH
+    ax.legend(ncols=legend_columns(ax.get_legend_handles_labels()[1], width), frameon=False, **look)
 
 
 def _draw_panel(ax: Axes, panel: Panel, shown: np.ndarray) -> None:
@@ -212,7 +232,7 @@ def _mark_events(rows: Sequence[Axes], events: Sequence[Occurrence], shown: np.n
         ax.vlines(times, 0.0, 0.05, transform=ax.get_xaxis_transform(), color=DARK, linewidth=0.8, gid="events")
     blocks = list(dict.fromkeys(event.block for event in mine))
     named = ", ".join(blocks[:3]) + ("" if len(blocks) <= 3 else f" and {len(blocks) - 3} more")
-    rows[0].set_title(f"ticks: events of {named}", loc="right", fontsize="small", color=STONE)
+    rows[0].set_title(f"ticks: events of {named}", loc="left", fontsize="small", color=STONE)
 
 
 def plot_curve(

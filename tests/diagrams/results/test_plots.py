@@ -71,12 +71,16 @@ def test_a_list_is_one_axis_with_the_set_point_dashed_and_limits_and_events_mark
     assert lines(both)["angle"].get_drawstyle() == "default"
     assert np.array_equal(lines(both)["angle"].get_ydata(), run["motor.y"])
     assert [text.get_text() for text in both.get_legend().get_texts()] == ["wish", "angle"]
+    figure.draw(figure.canvas.get_renderer())
+    edge = both.get_window_extent()
+    assert both.get_legend().get_window_extent().y0 >= edge.y1 - 1.0  # it hides no curve
+    assert u.get_window_extent().y0 >= both.get_legend().get_window_extent().y1  # nor the axis above
     limits = [{line.get_ydata()[0] for line in ax.lines if line.get_label().startswith("_")} for ax in (u, both)]
     assert limits == [{-1.2, 1.2}, {1.3}]
     (event,) = run.events
     marks = [c for ax in figure.axes for c in ax.collections if c.get_gid() == "events"]
     assert [c.get_segments()[0][0][0] for c in marks] == [event.t, event.t]
-    assert u.get_title(loc="right") == "ticks: events of low"
+    assert u.get_title(loc="left") == "ticks: events of low"
     assert both.get_xlabel() == "t [s]"
 
 
