@@ -25,6 +25,7 @@ from ..blocks.core import (
 from .contract import check_block
 from .coupling import Coupling
 from .diagram import Diagram
+from .exporting import to_c
 from .paper import (
     AdmittanceLoop,
     Channel,
@@ -108,4 +109,5 @@ __all__ = [
     "stiffness_limits",
     "subsystem",
     "target_admittance",
+    "to_c",
 ]

@@ -34,6 +34,7 @@ from .wiring import Collector, Structure, SubsystemSettings, Wire, sheet_of_stru
 
 if TYPE_CHECKING:
     from ..fmus import ArchiveLimits
+    from ..fmus.export import Number, TargetCode
     from .contact import Contact
     from .drawing import Drawing, Facts
     from .linearization import Linearization
@@ -1039,6 +1040,49 @@ class Diagram(ShownAsTable):
             tell("writing the files")
             write_report(made, path, pdf=pdf, json=json, paper=paper)
         return made
+
+    def to_c(
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        name: str | None = None,
+        subsystem: str | None = None,
+        outside: Iterable[str] = (),
+        outputs: Iterable[str] | None = None,
+        number: Number = "double",
+        own_functions: bool = False,
+    ) -> TargetCode:
+        """Write the diagram, a subsystem of it, or all but some blocks, as C for a target; see `loopwright.to_c`.
+
+        Parameters
+        ----------
+        folder, name, subsystem, outside, outputs, number, own_functions
+            As of `loopwright.to_c`.
+
+        Returns
+        -------
+        TargetCode
+            The files; its ``measure`` compiles them for Cortex-M and counts instructions.
+
+        Raises
+        ------
+        DefinitionError
+            For what can't be on a target, by its path; then nothing is written.
+        OptionError, UnknownNameError, SimulationError, DiskError
+            As `loopwright.to_c`.
+        """
+        from .exporting import to_c
+
+        return to_c(
+            self,
+            folder,
+            name=name,
+            subsystem=subsystem,
+            outside=outside,
+            outputs=outputs,
+            number=number,
+            own_functions=own_functions,
+        )
 
     def draw(
         self,

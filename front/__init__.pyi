@@ -12,6 +12,7 @@ from .diagrams import (
     experiments,
     fig3,
     subsystem,
+    to_c,
 )
 from .fmus import Fmu, StepOptions, build, doctor, read_description
 from .frequency import disk_margin, margins, place
@@ -49,5 +50,6 @@ __all__ = [
     "read_description",
     "subsystem",
     "sweeps",
+    "to_c",
     "types",
 ]

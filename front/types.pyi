@@ -43,6 +43,7 @@ from .diagrams.wiring import Bus, Subsystem, SubsystemSettings, Wire
 from .fmus.archive import FmuDescription, FmuFault, FmuFinding, FmuSeverity, FmuVariable
 from .fmus.calls import FmuInstance, FmuState
 from .fmus.checks import FmuDiagnosis, FmuTrial, FmuVerdict
+from .fmus.export import ProcessorMeasurement, TargetCode, TargetMeasurement, TickFacts
 from .fmus.running import FmuLinearization
 
 __all__ = [
@@ -89,6 +90,7 @@ __all__ = [
     "Passivity",
     "PassivityReason",
     "PortPassivity",
+    "ProcessorMeasurement",
     "RefutedDerivatives",
     "Report",
     "Review",
@@ -110,7 +112,10 @@ __all__ = [
     "Stopped",
     "Subsystem",
     "SubsystemSettings",
+    "TargetCode",
+    "TargetMeasurement",
     "TextSignal",
+    "TickFacts",
     "TrialMethod",
     "Unit",
     "Verdict",

@@ -33,6 +33,7 @@ from ...fmus.models import gantry
 from ..paper import DEFINITIONS, EXPERIMENTS, Experiment, Theory, key_numbers, theory_numbers
 from ..results import Run
 from ..simulation import Interrupted
+from .c_code import add_c, c_command
 from .diagrams import add_diagram_options, add_diagrams, draw_command, run_diagram, sweep_command
 from .fmu import COMMANDS, add_commands
 from .options import option_lines, parse_letters, parse_options, parse_renames, share
@@ -83,8 +84,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.print_help(sys.stderr)
         return 2
     try:
-        own = {"report": report_command, "draw": draw_command, "sweep": sweep_command, "ssp": ssp_command}
-        own["page"] = page_command
+        own = {
+            "report": report_command,
+            "draw": draw_command,
+            "sweep": sweep_command,
+            "ssp": ssp_command,
+            "page": page_command,
+            "c": c_command,
+        }
         return {**COMMANDS, **own}.get(arguments.command, _run)(arguments)
     except OptionError as error:
         _say(f"loopwright: error: {error}", sys.stderr)
@@ -160,6 +167,7 @@ def _make_parser() -> argparse.ArgumentParser:
     add_diagrams(commands)
     add_report(commands)
     add_page(commands)
+    add_c(commands)
     add_commands(commands)
     add_ssp(commands)
     return parser

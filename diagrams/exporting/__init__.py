@@ -3,6 +3,7 @@
 from .loop_of_diagram import loop_spec
 from .make_exported import make_exported, name_of
 from .open_diagram import OpenDiagram, choose_outputs, let_move, open_part, open_subsystem, open_whole
+from .target import target_spec, to_c
 
 __all__ = [
     "OpenDiagram",
@@ -14,4 +15,6 @@ __all__ = [
     "open_part",
     "open_subsystem",
     "open_whole",
+    "target_spec",
+    "to_c",
 ]

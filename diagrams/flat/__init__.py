@@ -7,7 +7,7 @@ from .clocks import EVERY, NONE, ClockSets, TickPattern, ticks_after
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, just_after, no_evaluator, sort_names
 from .fast_functions import share_terms, speed_up
 from .flat_diagram import EXACT_LOOP, FlatDiagram
-from .flat_functions import indicators_of
+from .flat_functions import GuardedTick, indicators_of, trace_guarded_tick
 from .flat_layout import FlatEvent, StateLayout, sample_time_of
 from .flatten import flatten, renumber, write_numbers
 from .logic import TRUE, is_true
@@ -42,6 +42,7 @@ __all__ = [
     "Evaluators",
     "FlatDiagram",
     "FlatEvent",
+    "GuardedTick",
     "Ids",
     "Instant",
     "Layout",
@@ -83,6 +84,7 @@ __all__ = [
     "takes_any_step",
     "ticks_after",
     "times_of",
+    "trace_guarded_tick",
     "trace_schedule",
     "with_movable",
     "write_numbers",

@@ -12,6 +12,7 @@ positive. The vectors are those of `FlatLayout`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import reduce
 from typing import Any
 
@@ -19,6 +20,7 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core import without_collection
+from ...blocks.tracing import GUARDS
 from .block_functions import BlockFunctions
 from .clocks import NONE, TickPattern
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, rows
@@ -84,6 +86,44 @@ def trace_tick(
         return {**found, "ok": ok}
 
     return trace_schedule("tick", symbols, results, by_block=by_block)
+
+
+@dataclass(frozen=True, eq=False)
+class GuardedTick:
+    """A tick with each of its guards, for C that is read.
+
+    Attributes
+    ----------
+    function : casadi.Function
+        ``(t, x, w, p) -> (x_next, log, guards)``.
+    evaluated : frozenset of str
+        The blocks that act.
+    guards : tuple of (str, str)
+        Block and name of each guard.
+    """
+
+    function: Any
+    evaluated: frozenset[str]
+    guards: tuple[tuple[str, str], ...]
+
+
+@without_collection
+def trace_guarded_tick(layout: FlatLayout, functions: BlockFunctions, acting: frozenset[TickPattern]) -> GuardedTick:
+    """Return a tick at which the given clocks act with its guards one by one; see `trace_tick`."""
+    symbols = make_symbols(layout)
+    evaluated: set[str] = set()
+    guards: list[tuple[str, str]] = []
+
+    def visit(instant: Instant, path: str, inputs: dict[str, Any], made: dict[str, Any]) -> None:
+        evaluated.add(path)
+        if GUARDS in made:
+            guards.extend((path, name) for name in functions.traced[path].guards)
+
+    instant = evaluate(layout, functions, acting, **symbols, visit=visit)
+    results = {"x_next": next_x(instant), "log": log(instant), "guards": join_columns(instant.guards)}
+    made = [ca.densify(ca.MX(column)) for column in results.values()]
+    function = ca.Function("tick", [*symbols.values()], made, [*symbols], [*results])
+    return GuardedTick(function, frozenset(evaluated), tuple(guards))
 
 
 def _without(column: Any, entries: np.ndarray) -> Any:

@@ -9,20 +9,38 @@ from .merged import merge_model
 from .model import Integrator, ModelSpec, Variable
 from .package import build_fmu, clear_cache
 from .python_fmu import build_python
+from .scalar_code import Lookup, split_lookups
+from .target_code import Number, TargetText, TickFacts, identifier, write_target
+from .target_files import TargetCode, TargetMeasurement, write_c
+from .target_measure import PROCESSORS, ProcessorMeasurement, measure, run_here
+from .target_spec import CLOCK_LIMIT, BlockOutput, Kept, TargetSpec, TargetTick
 from .tuning import describe_processor, processor_flags, tune
 from .written_equations import WrittenEquations, read_equations
 
 __all__ = [
+    "CLOCK_LIMIT",
+    "PROCESSORS",
     "ROOM_FOR_EDGES",
+    "BlockOutput",
     "CFunction",
     "ComputedNumbers",
     "Field",
     "Guards",
     "Integrator",
+    "Kept",
+    "Lookup",
     "LoopMemory",
     "LoopSpec",
     "ModelSpec",
+    "Number",
     "Placed",
+    "ProcessorMeasurement",
+    "TargetCode",
+    "TargetMeasurement",
+    "TargetSpec",
+    "TargetText",
+    "TargetTick",
+    "TickFacts",
     "Variable",
     "WrittenEquations",
     "build",
@@ -34,13 +52,19 @@ __all__ = [
     "compile_webassembly",
     "describe_compiler",
     "describe_processor",
+    "identifier",
     "inline_model",
+    "measure",
     "merge_model",
     "model_spec",
     "own_functions",
     "parameter_variable",
     "processor_flags",
     "read_equations",
+    "run_here",
+    "split_lookups",
     "tune",
+    "write_c",
+    "write_target",
     "write_unit",
 ]

@@ -217,6 +217,44 @@ def _compile(
             os.replace(folder / library, out)
 
 
+def run_compiler(
+    sources: Mapping[str, str], commands: Sequence[Sequence[str]], results: Sequence[str], platform: str
+) -> dict[str, bytes]:
+    """Run a compiler's commands in a fresh folder with sources, and return the content of files that they write.
+
+    Parameters
+    ----------
+    sources : mapping of str to str
+        Text of each file, by name, with its folder.
+    commands : sequence of sequence of str
+        Commands, one after the other.
+    results : sequence of str
+        Names of files that they write.
+    platform : str
+        Name of the platform in messages.
+
+    Raises
+    ------
+    CompilerError
+        If a command can't be run, does not end, or fails; then its message is quoted.
+    FmuError
+        If the cache can't be written.
+    """
+    check_cache()
+    place = cache_folder()
+    with (
+        explain_disk_errors("the C code can't be compiled", place, OWN_CACHE, CompilerError),
+        folder_in(place, ".building-") as folder,
+        announce_build(_note(find_compiler())),
+    ):
+        for name, text in sources.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(text, encoding="utf-8", newline="\n")
+        for command in commands:
+            _run(command, folder, platform)
+        return {name: (folder / name).read_bytes() for name in results}
+
+
 def _zig_caches() -> dict[str, str]:
     """Return the folders of zig's own caches, by the environment variable that names each."""
     own = str(cache_folder() / "zig")

@@ -1,0 +1,123 @@
+"""The command that writes a sampled diagram as C for a target: ``loopwright c``."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import LoopwrightError, OptionError, explain_disk_errors
+from ..exporting import to_c
+from ..wiring import Subsystem
+from .subjects import open_user_diagram
+from .text import say
+from .user_models import load_user_file
+
+
+def add_c(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``c`` to the parser of `main`."""
+    parser = commands.add_parser(
+        "c",
+        help="write a sampled diagram or subsystem as C for a target",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Write a sampled diagram or subsystem as C for a target: a header, a source of standard C99 without\n"
+        "allocation, an example, and a report of what each tick touches. No compiler is needed.\n\n"
+        "MODEL is FILE.py:NAME: a diagram in a file of yours, a function that returns one, or a function with\n"
+        "@subsystem, whose arguments become inputs.",
+        epilog="examples:\n  loopwright c loop.py:controller --out target\n"
+        "  loopwright c loop.py:loop --subsystem controller --number float --out target\n"
+        "  loopwright c loop.py:loop --outside plant --measure --test signal.csv\n\n"
+        "exit status:\n  0    done\n  1    it can't be C for a target, or the measurement failed\n"
+        "  2    wrong usage; nothing is written\n  130  interrupted (Ctrl-C)",
+    )
+    parser.add_argument("model", metavar="MODEL", help="FILE.py:NAME")
+    parser.add_argument("--out", metavar="DIR", default=".", help="folder for the files (default: the current folder)")
+    parser.add_argument("--name", help="begin of all names in the C code (default: the subsystem's or diagram's)")
+    parser.add_argument("--subsystem", metavar="PATH", help="write this subsystem of the diagram alone")
+    parser.add_argument(
+        "--outside",
+        metavar="PATH",
+        nargs="+",
+        action="extend",
+        default=[],
+        help="blocks of the diagram that are not written, such as the plant",
+    )
+    parser.add_argument("--outputs", metavar="NAME", nargs="+", action="extend", help="signals that are outputs")
+    parser.add_argument("--number", choices=("double", "float"), default="double", help="type of numbers")
+    parser.add_argument(
+        "--own-functions", action="store_true", help="elementary functions of Loopwright in place of math.h's"
+    )
+    parser.add_argument(
+        "--measure", action="store_true", help="compile it for Cortex-M4 and M0, and count the instructions of ticks"
+    )
+    parser.add_argument(
+        "--test",
+        metavar="FILE.csv",
+        help="test signal for --measure: a column for each input, such as force or force[1]; a row for each tick",
+    )
+
+
+def c_command(arguments: argparse.Namespace) -> int:
+    """Carry out ``loopwright c``."""
+    if arguments.test and not arguments.measure:
+        raise OptionError("it is for --measure. Give both, or none.", port="--test")
+    inputs = _read_signal(Path(arguments.test)) if arguments.test else {}
+    try:
+        code = _write(arguments)
+        for file in code.files:
+            say(str(file))
+        if arguments.measure:
+            code.measure(inputs)
+    except OptionError:
+        raise
+    except LoopwrightError as error:
+        say(f"loopwright: error: {error}", sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        say("loopwright: interrupted", sys.stderr)
+        return 130
+    say("")
+    say(code.report.rstrip())
+    return 0
+
+
+def _write(arguments: argparse.Namespace) -> Any:
+    options = {
+        "name": arguments.name,
+        "subsystem": arguments.subsystem,
+        "outside": arguments.outside,
+        "outputs": arguments.outputs,
+        "number": arguments.number,
+        "own_functions": arguments.own_functions,
+    }
+    with load_user_file(arguments.model, port="MODEL") as (module, _, name):
+        found = vars(module).get(name)
+        if isinstance(found, Subsystem):
+            return to_c(found, arguments.out, **options)
+    with open_user_diagram(arguments.model) as (diagram, _):
+        return to_c(diagram, arguments.out, **options)
+
+
+def _read_signal(path: Path) -> dict[str, np.ndarray]:
+    """Return the columns of a file by input; ``force[0]``, ``force[1]`` together are those of ``force``."""
+    step = "Check the path."
+    with explain_disk_errors(f"{str(path)!r} can't be read", path, step, OptionError, port="--test"):
+        rows = [*csv.reader(path.read_text(encoding="utf-8").splitlines())]
+    if len(rows) < 2:
+        raise OptionError(f"found no row of numbers in {str(path)!r}; expected names, then numbers.", port="--test")
+    try:
+        table = np.array(rows[1:], dtype=float)
+    except ValueError:
+        raise OptionError(
+            f"found something else than numbers below the names in {str(path)!r}; expected a number in each place.",
+            port="--test",
+        ) from None
+    columns: dict[str, list[int]] = {}
+    for i, name in enumerate(rows[0]):
+        columns.setdefault(name.strip().partition("[")[0], []).append(i)
+    vectors = {name.strip().partition("[")[0] for name in rows[0] if "[" in name}
+    return {n: table[:, at] if n in vectors else table[:, at[0]] for n, at in columns.items()}

@@ -1,0 +1,290 @@
+"""A sampled diagram as C for a target: its ticks, traced with the names of blocks; what can't be on a target."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import DefinitionError, OptionError, accepts, kinds
+from ...fmus.export import (
+    CLOCK_LIMIT,
+    BlockOutput,
+    Kept,
+    Number,
+    TargetCode,
+    TargetSpec,
+    TargetTick,
+    Variable,
+    identifier,
+    split_lookups,
+    write_c,
+)
+from ..flat import FlatDiagram, TickPattern, WiredDiagram, kinds_of, share_terms, speed_up, trace_guarded_tick
+from ..wiring import Subsystem, join
+from .loop_of_diagram import loop_spec
+from .obstacles import refuse
+from .open_diagram import OpenDiagram, choose_outputs, open_part, open_subsystem, open_whole
+
+_LARGEST = 20_000
+"""Operations of a tick that are written as text; a compiler takes long for more."""
+
+
+@accepts(number=kinds.choice("double", "float"))
+def to_c(
+    model: object,
+    folder: str | os.PathLike[str],
+    *,
+    name: str | None = None,
+    subsystem: str | None = None,
+    outside: Iterable[str] = (),
+    outputs: Iterable[str] | None = None,
+    number: Number = "double",
+    own_functions: bool = False,
+) -> TargetCode:
+    """Write a sampled diagram, or a subsystem, as C for a target: one header and one source, an example, a report.
+
+    Standard C99 without allocation: an instance is one struct that the caller owns. In double precision its numbers are
+    those of a run, bit by bit. No compiler is needed.
+
+    Parameters
+    ----------
+    model : Diagram or subsystem
+        A diagram, or a function with ``@subsystem``, whose arguments become inputs.
+    folder : path
+        Folder of the files ``NAME.h``, ``NAME.c``, ``NAME_example.c`` and ``NAME_report.txt``.
+    name : str, optional
+        Begin of the names of files, functions and types: a C identifier. Without it, that of the subsystem or diagram.
+    subsystem : str, optional
+        Path of a subsystem of the diagram that is written alone: what it reads are inputs.
+    outside : iterable of str
+        Paths of blocks of the diagram that are not written, such as the plant: what they put out are inputs, what they
+        read are outputs.
+    outputs : iterable of str, optional
+        Named wires, or outputs of blocks by their paths, that are the outputs.
+    number : {"double", "float"}
+        Type of all numbers.
+    own_functions : bool
+        Take sine, cosine, tangent hyperbolic, exponential, exp(x) - 1, logarithm and power from Loopwright, with the
+        same bits on every platform, and not from ``math.h``.
+
+    Returns
+    -------
+    TargetCode
+        The files; its ``measure`` compiles them for Cortex-M and counts instructions.
+
+    Raises
+    ------
+    DefinitionError
+        For what can't be on a target, by its path; then nothing is written.
+    OptionError
+        For options that don't fit together.
+    UnknownNameError
+        If there is no such subsystem, block or signal.
+    SimulationError
+        If the diagram's start isn't found.
+    DiskError
+        If the files can't be written.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> from loopwright import subsystem, to_c
+    >>> from loopwright.blocks import PID
+    >>> @subsystem(sample_time=0.01)
+    ... def controller(reference, level):
+    ...     return PID(kp=2.0, ki=3.0)(reference, level).named("effort")
+    >>> code = to_c(controller, mkdtemp())
+    >>> [file.name for file in code.files]
+    ['controller.h', 'controller.c', 'controller_example.c', 'controller_report.txt']
+    >>> code.bytes_of["struct"]
+    56
+    """
+    opened, about = _open(model, name, subsystem, outside, outputs)
+    spec = target_spec(opened, name=opened.wired.name, description=about)
+    return write_c(spec, Path(folder).expanduser(), number=number, own_functions=own_functions)
+
+
+def _open(
+    model: object,
+    name: str | None,
+    subsystem: str | None,
+    outside: Iterable[str],
+    outputs: Iterable[str] | None,
+) -> tuple[OpenDiagram, str]:
+    """Return what is written of a diagram or a subsystem, and a line about it."""
+    if name is not None and name != identifier(name):
+        raise OptionError(
+            f"found {name!r}; expected a C identifier, such as {identifier(name)!r}.", block="to_c", port="name"
+        )
+    if isinstance(called := getattr(model, "subsystem", None), Subsystem):
+        model = called  # a call of it
+    names = (outside,) if isinstance(outside, str) else tuple(outside)
+    about = ""
+    if isinstance(model, Subsystem):
+        if subsystem is not None or names:
+            raise OptionError(
+                "subsystem= and outside= choose a part of a diagram; this is a subsystem by itself. Leave them out.",
+                block=model.name,
+            )
+        about = inspect.cleandoc(model.__doc__ or "").partition("\n")[0]
+        opened = open_subsystem(model, object, name or identifier(model.name))
+    else:
+        wired = getattr(model, "wired", None)
+        if not isinstance(wired, WiredDiagram):
+            raise OptionError(f"found {model!r}; expected a diagram, or a function with @subsystem.", block="to_c")
+        if subsystem is not None and names:
+            raise OptionError(
+                "found subsystem= and outside=; expected one of them. Give one.", block=wired.name, port="outside"
+            )
+        label = name or identifier(wired.name if subsystem is None else subsystem.rpartition(".")[2])
+        opened = open_whole(wired, names, label) if subsystem is None else open_part(wired, subsystem, label)
+    return choose_outputs(opened, None if outputs is None else tuple(outputs)), about
+
+
+def target_spec(opened: OpenDiagram, *, name: str, description: str) -> TargetSpec:
+    """Return a diagram as C for a target is made of it.
+
+    Raises
+    ------
+    DefinitionError
+        For what can't be on a target, by its path.
+    SimulationError
+        If its start isn't found.
+    """
+    refuse(opened)
+    flat = opened.wired.flatten()
+    _refuse_between_ticks(opened, flat)
+    loop = loop_spec(opened, name=name, description=description)
+    acting = kinds_of(flat, every=False)
+    start = {f.name: np.asarray(f.start) for f in loop.memory.fields if f.name in ("x", "w", "p", "log")}
+    return TargetSpec(
+        loop=loop,
+        ticks=tuple(_trace_tick(opened, flat, clocks, name) for clocks in acting),
+        kept=tuple(_kept(opened, flat, start["x"])),
+        start=start,
+        acting=tuple(_acting(opened, flat, clock) for clock in flat.distinct),
+    )
+
+
+def _refuse_between_ticks(opened: OpenDiagram, flat: FlatDiagram) -> None:
+    """Refuse what happens between ticks, and algebraic loops: nothing but ticks is on a target."""
+    table = flat.table
+    for path, block in table.blocks.items():
+        if path == opened.outside:
+            continue
+        sampled = table.is_sampled(table.subsystem_of[path])
+        if block.transport:
+            raise DefinitionError(
+                "it is a transport delay, whose memory grows with the time between ticks; on a target only ticks are. "
+                "Write UnitDelay(…) or Delay(…), which count ticks, in a sampled subsystem.",
+                block=opened.shown(path),
+            )
+        if not sampled and path in flat.checked.traced and flat.checked.traced[path].advance == "derivative":
+            if flat.states.slices.get(path, slice(0, 0)) != slice(0, 0) and flat.states.shapes[path] != (0,):
+                raise DefinitionError(
+                    "it is in continuous time, and on a target only ticks are. Put it into a sampled subsystem, "
+                    "sample_time=…, or leave it outside.",
+                    block=opened.shown(path),
+                )
+    for event in flat.events:
+        raise DefinitionError(
+            f"its event {event.name!r} is between ticks, and on a target only ticks are. Put it into a sampled "
+            "subsystem, sample_time=…, or leave it outside.",
+            block=opened.shown(event.path),
+        )
+    for full in flat.loops.slices:
+        path, port = flat.ports[full]
+        raise DefinitionError(
+            "an algebraic loop is solved here by iterations, whose number nobody knows before. Put a UnitDelay() "
+            "into the loop for the target.",
+            block=opened.shown(path),
+            port=port,
+        )
+    if not flat.distinct:
+        raise DefinitionError(
+            "found no sample time, and a target has ticks alone. Give one: @subsystem(sample_time=1e-3), or "
+            "diagram.sampled(1e-3).",
+            block=opened.wired.name,
+        )
+    if len(flat.distinct) > CLOCK_LIMIT:
+        raise DefinitionError(
+            f"found {len(flat.distinct)} sample times with their offsets; at most {CLOCK_LIMIT} are on a target. "
+            "Choose fewer.",
+            block=opened.wired.name,
+        )
+
+
+def _trace_tick(opened: OpenDiagram, flat: FlatDiagram, clocks: frozenset[TickPattern], name: str) -> TargetTick:
+    made = trace_guarded_tick(flat, flat.blocks, clocks)
+    try:
+        function, lookups = split_lookups(made.function, _expand)
+    except DefinitionError as error:
+        raise error.at(block=name) from None
+    if (count := function.n_instructions()) > _LARGEST:
+        raise DefinitionError(
+            f"a tick of it has {count} operations; at most {_LARGEST} are written for a target. Split it into parts.",
+            block=name,
+        )
+    table = flat.table
+    outputs = []
+    for path, names in flat.order.steps:
+        if path == opened.outside or path not in made.evaluated:
+            continue
+        for port in names:
+            where = flat.log.slices.get(join(path, port))
+            if where is not None:
+                kind = type(table.blocks[path]).__name__
+                outputs.append(BlockOutput(opened.shown(path), port, kind, where.start, where.stop - where.start))
+    guards = tuple((opened.shown(path), guard) for path, guard in made.guards)
+    return TargetTick(share_terms(function), lookups, tuple(outputs), guards)
+
+
+def _expand(function: Any) -> Any:
+    """Return a function as scalar operations where it has no others: simplified as a run's is."""
+    found = speed_up(function)
+    if found.is_a("SXFunction"):
+        return found
+    try:
+        return function.expand()  # with large products of matrices, which runs leave as they are
+    except RuntimeError:
+        return function
+
+
+def _kept(opened: OpenDiagram, flat: FlatDiagram, x: np.ndarray) -> list[Kept]:
+    found = []
+    for path, own in flat.states.of_block.items():
+        block = flat.table.blocks[path]
+        for state, where in own.slices.items():
+            port, shape = block.states[state], own.shapes[state]
+            unit = port.unit if isinstance(port.unit, str) else None
+            label = join(opened.shown(path), state)
+            about: Any = {"unit": unit, "description": port.description}
+            found.append((where.start, label, shape, about))
+    for layout, kind in ((flat.held, "held"), (flat.gates, "gate"), (flat.starts, "start")):
+        for full, where in layout.slices.items():
+            about = {"description": _DESCRIPTIONS[kind]}
+            found.append((where.start, f"{kind}.{opened.shown(full)}", layout.shapes[full], about))
+    kept = []
+    for first, label, shape, about in sorted(found, key=lambda one: one[0]):
+        count = int(np.prod(shape)) if shape else 1
+        values = x[first : first + count].reshape(shape)
+        variable = Variable("state", "local", "discrete", shape, start=values, state=True, **about)
+        object.__setattr__(variable, "name", label)
+        kept.append(Kept(variable, first))
+    return kept
+
+
+_DESCRIPTIONS = {
+    "held": "output that is held until the subsystem acts again",
+    "gate": "value of the control that the subsystem remembers",
+    "start": "start value of a state that is reset",
+}
+
+
+def _acting(opened: OpenDiagram, flat: FlatDiagram, clock: TickPattern) -> tuple[str, ...]:
+    return tuple(opened.shown(path) for path, own in flat.clocks.items() if own == clock)

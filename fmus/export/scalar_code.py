@@ -1,0 +1,443 @@
+"""Scalar operations of CasADi's functions as C that people read: named values, short expressions, few temporaries.
+
+CasADi writes one operation a line in variables without names. Here an operation that one other needs is written inside
+it, and a value has the name of the signal that it is. Every operation is the one that CasADi has, in the same grouping,
+so that all bits are the same as long as the compiler contracts nothing.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ...blocks.core import DefinitionError
+
+_WIDEST = 84
+"""Characters of an expression up to which it is written inside another one."""
+_ATOM, _UNARY, _PRODUCT, _SUM, _RELATION, _LOGIC = 6, 5, 4, 3, 2, 1
+_BINARY = {
+    ca.OP_ADD: ("+", _SUM),
+    ca.OP_SUB: ("-", _SUM),
+    ca.OP_MUL: ("*", _PRODUCT),
+    ca.OP_DIV: ("/", _PRODUCT),
+    ca.OP_LT: ("<", _RELATION),
+    ca.OP_LE: ("<=", _RELATION),
+    ca.OP_EQ: ("==", _RELATION),
+    ca.OP_NE: ("!=", _RELATION),
+    ca.OP_AND: ("&&", _LOGIC),
+    ca.OP_OR: ("||", _LOGIC),
+}
+_BOOLEAN = {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_AND, ca.OP_OR, ca.OP_NOT}
+_OF_MATH = {
+    ca.OP_EXP: "exp",
+    ca.OP_LOG: "log",
+    ca.OP_POW: "pow",
+    ca.OP_CONSTPOW: "pow",
+    ca.OP_SQRT: "sqrt",
+    ca.OP_SIN: "sin",
+    ca.OP_COS: "cos",
+    ca.OP_TAN: "tan",
+    ca.OP_ASIN: "asin",
+    ca.OP_ACOS: "acos",
+    ca.OP_ATAN: "atan",
+    ca.OP_FLOOR: "floor",
+    ca.OP_CEIL: "ceil",
+    ca.OP_FMOD: "fmod",
+    ca.OP_REMAINDER: "remainder",
+    ca.OP_FABS: "fabs",
+    ca.OP_COPYSIGN: "copysign",
+    ca.OP_FMIN: "fmin",
+    ca.OP_FMAX: "fmax",
+    ca.OP_SINH: "sinh",
+    ca.OP_COSH: "cosh",
+    ca.OP_TANH: "tanh",
+    ca.OP_ASINH: "asinh",
+    ca.OP_ACOSH: "acosh",
+    ca.OP_ATANH: "atanh",
+    ca.OP_ATAN2: "atan2",
+    ca.OP_LOG1P: "log1p",
+    ca.OP_EXPM1: "expm1",
+    ca.OP_HYPOT: "hypot",
+    ca.OP_ERF: "erf",
+}
+EXACT = frozenset({"sqrt", "floor", "ceil", "fmod", "remainder", "fabs", "copysign", "fmin", "fmax"})
+"""Functions of math.h whose results are the same bits everywhere."""
+FIND, TAKE = -1, -2
+"""Operations of tables: the place of a value between breakpoints, and an entry of a table."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """A value.
+
+    Attributes
+    ----------
+    operation : int
+        CasADi's number of it, `FIND`, or `TAKE`.
+    arguments : tuple of int
+        Nodes that it is computed from.
+    constant : float
+        Its value, of a constant.
+    place : tuple of int
+        Argument and entry, of an input; the table, of `FIND`; table and offset of `TAKE`.
+    """
+
+    operation: int
+    arguments: tuple[int, ...] = ()
+    constant: float = 0.0
+    place: tuple[int, int] = (0, 0)
+
+    @property
+    def is_boolean(self) -> bool:
+        """Whether it is true or false."""
+        return self.operation in _BOOLEAN
+
+
+@dataclass(frozen=True, eq=False)
+class Lookup:
+    """A lookup that is no scalar operation; its results are arguments of a function behind the ordinary ones.
+
+    Attributes
+    ----------
+    kind : int
+        `FIND` or `TAKE`.
+    table : ndarray
+        Breakpoints, or entries.
+    count : int
+        Number of results.
+    """
+
+    kind: int
+    table: np.ndarray
+    count: int
+
+
+def split_lookups(function: Any, expand: Callable[[Any], Any]) -> tuple[Any, tuple[Lookup, ...]]:
+    """Return a function as scalar operations, and its lookups in tables.
+
+    Their results are further arguments of the function, and what they look up further results, in this order.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        The function.
+    expand : callable
+        Returns a function as scalar operations where that is possible, else the function.
+
+    Raises
+    ------
+    DefinitionError
+        If it has other operations that are not scalar.
+    """
+    made = expand(function)
+    if made.is_a("SXFunction"):
+        return made, ()
+    symbols = function.mx_in()
+    results = function.call(symbols, True, False)
+    flat = ca.Function(function.name(), symbols, results)
+    kinds = {ca.OP_LOW: FIND, ca.OP_GETNONZEROS_PARAM: TAKE}
+    nodes, lookups, fresh, arguments = [], [], [], []
+    for k in range(flat.n_instructions()):
+        if (kind := kinds.get(flat.instruction_id(k))) is None:
+            continue
+        node = flat.instruction_MX(k)
+        table, sought = (node.dep(0), node.dep(1))
+        if not table.is_constant():
+            continue  # expand says so
+        nodes.append(node)
+        fresh.append(ca.MX.sym(f"lookup{len(nodes)}", node.numel()))
+        arguments.append(sought)
+        lookups.append(Lookup(kind, np.ravel(np.array(table.to_DM())), node.numel()))
+    shaped = [ca.reshape(one, node.shape) for one, node in zip(fresh, nodes, strict=True)]
+    replaced = ca.graph_substitute([*results, *arguments], nodes, shaped)
+    replaced = [ca.densify(ca.vec(one)) for one in replaced]
+    made = expand(ca.Function(function.name(), [*symbols, *fresh], replaced))
+    if not made.is_a("SXFunction"):
+        raise DefinitionError(
+            "found equations that are no scalar operations, such as a solver's or an external function's; expected sums, "
+            "products, elementary functions, comparisons and tables. Write them with these."
+        )
+    return made, tuple(lookups)
+
+
+@dataclass
+class Scalars:
+    """The operations of a function of scalar operations.
+
+    Attributes
+    ----------
+    nodes : list of Node
+        All values.
+    results : list of list of int
+        By result of the function: the nodes of its entries.
+    """
+
+    nodes: list[Node] = field(default_factory=list)
+    results: list[list[int]] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, function: Any, lookups: Sequence[Lookup], tables: Tables) -> Scalars:
+        """Read the operations of a function; its last arguments and results are those of lookups."""
+        found = cls(results=[[-1] * function.numel_out(i) for i in range(function.n_out())])
+        ordinary = function.n_in() - len(lookups)
+        known: dict[Node, int] = {}
+        waiting: list[tuple[int, int, int]] = []  # node, lookup, entry
+
+        def add(node: Node) -> int:
+            if node.operation >= 0 and node in known:
+                return known[node]
+            found.nodes.append(node)
+            known[node] = len(found.nodes) - 1
+            return known[node]
+
+        work: dict[int, int] = {}
+        inputs: dict[tuple[int, int], int] = {}
+        for k in range(function.n_instructions()):
+            operation = function.instruction_id(k)
+            read, written = function.instruction_input(k), function.instruction_output(k)
+            if operation == ca.OP_OUTPUT:
+                found.results[written[0]][written[1]] = work[read[0]]
+            elif operation == ca.OP_INPUT and read[0] >= ordinary:
+                place = (read[0], read[1])
+                if place not in inputs:
+                    found.nodes.append(Node(lookups[read[0] - ordinary].kind))
+                    inputs[place] = len(found.nodes) - 1
+                    waiting.append((inputs[place], read[0] - ordinary, read[1]))
+                work[written[0]] = inputs[place]
+            elif operation == ca.OP_INPUT:
+                work[written[0]] = add(Node(operation, place=(read[0], read[1])))
+            elif operation == ca.OP_CONST:
+                value = float(function.instruction_constant(k))
+                work[written[0]] = add(Node(operation, constant=value, place=(0, int(np.signbit(value)))))
+            else:
+                work[written[0]] = add(Node(operation, tuple(work[i] for i in read)))
+        for i, row in enumerate(found.results):  # zeros of the sparsity are no instructions
+            found.results[i] = [add(Node(ca.OP_CONST)) if node < 0 else node for node in row]
+        first = function.n_out() - len(lookups)
+        for node, which, entry in waiting:
+            sought = found.results[first + which]
+            number = tables.add(lookups[which])
+            argument = sought[entry] if len(sought) > 1 else sought[0]
+            found.nodes[node] = Node(lookups[which].kind, (argument,), place=(number, 0))
+        del found.results[first:]
+        return found
+
+    def needed(self, roots: Iterable[int]) -> Counter[int]:
+        """Return how often each value is used that some values are computed from, and the values themselves."""
+        uses: Counter[int] = Counter()
+        stack = [*roots]
+        uses.update(stack)
+        seen = set()
+        while stack:
+            node = stack.pop()
+            if node in seen:
+                continue
+            seen.add(node)
+            for argument in self.nodes[node].arguments:
+                uses[argument] += 2 if self.nodes[node].operation == ca.OP_SQ else 1  # it is written twice
+                stack.append(argument)
+        return uses
+
+    def before(self, root: int, done: set[int]) -> Iterator[int]:
+        """Yield the values that one is computed from, and it, each behind those that it needs, but for some."""
+        stack = [(root, False)]
+        while stack:
+            node, ready = stack.pop()
+            if node in done:
+                continue
+            if ready:
+                done.add(node)
+                yield node
+                continue
+            stack.append((node, True))
+            stack += [(argument, False) for argument in reversed(self.nodes[node].arguments)]
+
+
+class Tables:
+    """Tables of numbers, each once."""
+
+    def __init__(self) -> None:
+        self.values: list[np.ndarray] = []
+        self._known: dict[bytes, int] = {}
+
+    def add(self, lookup: Lookup) -> int:
+        """Return the number of a lookup's table."""
+        key = lookup.table.tobytes()
+        if key not in self._known:
+            self._known[key] = len(self.values)
+            self.values.append(lookup.table)
+        return self._known[key]
+
+
+class Expressions:
+    """C text of values: written inside others, or assigned to variables.
+
+    Parameters
+    ----------
+    scalars : Scalars
+        The operations.
+    uses : Counter
+        How often each value is used.
+    read : callable
+        Returns the C text of an input, by argument and entry.
+    tables : Tables
+        The tables of its lookups.
+    call : callable
+        Returns the C name of a function of math.h.
+    real : str
+        The C type of numbers.
+    single : bool
+        Whether numbers are of single precision.
+    """
+
+    def __init__(
+        self,
+        scalars: Scalars,
+        uses: Mapping[int, int],
+        read: Callable[[int, int], str],
+        *,
+        tables: Tables,
+        call: Callable[[str], str],
+        real: str,
+        single: bool,
+    ):
+        self._scalars, self._uses, self._read = scalars, uses, read
+        self._tables, self._call, self._real, self._single = tables, call, real, single
+        self._texts: dict[int, tuple[str, int]] = {}
+        self._done: set[int] = set()
+        self._temporaries = 0
+        self.functions: set[str] = set()
+        self.operations: Counter[str] = Counter()
+
+    def compute(self, node: int, name: str | None = None) -> list[str]:
+        """Return the statements that compute a value, into a constant of this name where one is given."""
+        lines: list[str] = []
+        for one in self._scalars.before(node, self._done):
+            text, level = self._write(one)
+            plain = self._scalars.nodes[one].operation in (ca.OP_INPUT, ca.OP_CONST)
+            wanted = name if one == node and not plain else None
+            if wanted is None and (plain or (self._uses.get(one, 0) < 2 and len(text) <= _WIDEST and one != node)):
+                self._texts[one] = text, level
+                continue
+            if wanted is None:
+                self._temporaries += 1
+                wanted = f"t{self._temporaries}"
+            kind = "bool" if self._scalars.nodes[one].is_boolean else self._real
+            lines.append(f"const {kind} {wanted} = {text};")
+            self._texts[one] = wanted, _ATOM
+        return lines
+
+    def text(self, node: int) -> str:
+        """Return the C text of a value that has been computed, as a number."""
+        return self._number(node, _LOGIC)
+
+    def _number(self, node: int, level: int) -> str:
+        text, own = self._texts[node]
+        if self._scalars.nodes[node].is_boolean:
+            inner = text if own >= _ATOM else f"({text})"
+            return f"({inner} ? {self.constant(1.0)} : {self.constant(0.0)})"
+        return text if own >= level else f"({text})"
+
+    def _truth(self, node: int, level: int) -> str:
+        text, own = self._texts[node]
+        if not self._scalars.nodes[node].is_boolean:
+            text, own = f"{text if own > _RELATION else f'({text})'} != {self.constant(0.0)}", _RELATION
+        return text if own >= level else f"({text})"
+
+    def constant(self, value: float) -> str:
+        """Return a number as C text."""
+        return c_constant(value, single=self._single)
+
+    def _write(self, one: int) -> tuple[str, int]:
+        node = self._scalars.nodes[one]
+        operation, arguments = node.operation, node.arguments
+        if operation == ca.OP_INPUT:
+            return self._read(*node.place), _ATOM
+        if operation == ca.OP_CONST:
+            text = self.constant(node.constant)
+            return text, _UNARY if text.startswith("-") else _ATOM
+        self.operations[_kind(operation)] += 1
+        if operation in _BINARY:
+            return self._binary(operation, arguments)
+        if operation == FIND:
+            self.functions.add("find")
+            table = f"table_{node.place[0]}"
+            count = self._tables.values[node.place[0]].size
+            return f"find_piece({table}, {count}u, {self._number(arguments[0], _LOGIC)})", _ATOM
+        if operation == TAKE:
+            self.functions.add("take")
+            return f"table_{node.place[0]}[(size_t)({self._number(arguments[0], _LOGIC)})]", _ATOM
+        if operation == ca.OP_NOT:
+            return f"!{self._truth(arguments[0], _ATOM)}", _UNARY
+        if operation == ca.OP_NEG:
+            inner = self._number(arguments[0], _ATOM)
+            return f"-{inner}", _UNARY
+        if operation == ca.OP_SQ:
+            inner = self._number(arguments[0], _ATOM)
+            return f"{inner} * {inner}", _PRODUCT
+        if operation == ca.OP_TWICE:
+            return f"{self.constant(2.0)} * {self._number(arguments[0], _UNARY)}", _PRODUCT
+        if operation == ca.OP_INV:
+            return f"{self.constant(1.0)} / {self._number(arguments[0], _UNARY)}", _PRODUCT
+        if operation == ca.OP_IF_ELSE_ZERO:
+            condition = self._truth(arguments[0], _ATOM)
+            return f"({condition} ? {self._number(arguments[1], _SUM)} : {self.constant(0.0)})", _ATOM
+        if operation == ca.OP_SIGN:
+            self.functions.add("sign")
+            return f"sign_of({self._number(arguments[0], _LOGIC)})", _ATOM
+        if operation in (ca.OP_ASSIGN, ca.OP_LIFT):
+            return self._number(arguments[0], _ATOM), _ATOM
+        if operation not in _OF_MATH:
+            raise DefinitionError(
+                f"found CasADi's operation {operation}, which is not written as C. Write the equation with sums, "
+                "products, elementary functions and comparisons."
+            )
+        called = _OF_MATH[operation]
+        self.functions.add(called)
+        listed = ", ".join(self._number(argument, _LOGIC) for argument in arguments)
+        return f"{self._call(called)}({listed})", _ATOM
+
+    def _binary(self, operation: int, arguments: tuple[int, ...]) -> tuple[str, int]:
+        sign, level = _BINARY[operation]
+        if operation in (ca.OP_AND, ca.OP_OR):
+            left, right = (self._truth(argument, _RELATION) for argument in arguments)
+            return f"{left} {sign} {right}", level
+        above = level + 1
+        left = self._number(arguments[0], above if level == _RELATION else level)
+        right = self._number(arguments[1], above)
+        return f"{left} {sign} {right}", level
+
+
+def _kind(operation: int) -> str:
+    """Return what an operation counts as in a report."""
+    if operation in (ca.OP_ADD, ca.OP_SUB, ca.OP_NEG):
+        return "+ -"
+    if operation in (ca.OP_MUL, ca.OP_SQ, ca.OP_TWICE):
+        return "*"
+    if operation in (ca.OP_DIV, ca.OP_INV):
+        return "/"
+    if operation in (FIND, TAKE):
+        return "tables"
+    if operation in _OF_MATH:
+        return _OF_MATH[operation]
+    return "comparisons"
+
+
+def c_constant(value: float, *, single: bool = False) -> str:
+    """Return a number as C text of double or single precision, exactly, or rounded to the nearest."""
+    with np.errstate(over="ignore", under="ignore"):
+        number: Any = np.float32(value) if single else np.float64(value)
+    if np.isnan(number):
+        return "NAN" if single else "(double)NAN"
+    if np.isinf(number):
+        sign = "" if number > 0 else "-"
+        return f"{sign}INFINITY" if single else f"{sign}(double)INFINITY"
+    usual = not number or 1e-5 < abs(number) < 1e7
+    write = np.format_float_positional if usual else np.format_float_scientific
+    text = write(number, unique=True, trim="0")
+    return f"{text}f" if single else text

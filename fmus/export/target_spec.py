@@ -1,0 +1,102 @@
+"""A sampled diagram as C for a target: what happens at each kind of tick, as scalar operations with names.
+
+It is plain data, which knows no diagram. `LoopSpec` has the variables and the clocks; here are the functions, each with
+the blocks whose outputs it has, so that the C text can have names, and leave out what nobody reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .loop_spec import LoopSpec
+from .model import Variable
+from .scalar_code import Lookup
+
+CLOCK_LIMIT = 32
+"""Clocks of a target: their bits are in one word."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlockOutput:
+    """An output of a block.
+
+    Attributes
+    ----------
+    block, port, kind : str
+        The block's path, the port, and the block's class.
+    first, count : int
+        Its entries in the log.
+    """
+
+    block: str
+    port: str
+    kind: str
+    first: int
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class TargetTick:
+    """A kind of tick: the clocks of a set act.
+
+    Attributes
+    ----------
+    function : casadi.Function
+        Scalar operations ``(t, x, w, p, …) -> (x_next, log, guards, …)``; behind them what `lookups` find, and seek.
+    lookups : tuple of Lookup
+        Its lookups in tables.
+    outputs : tuple of BlockOutput
+        Outputs of the blocks that act, in the order of evaluation.
+    guards : tuple of (str, str)
+        Block and name of each guard.
+    """
+
+    function: Any
+    lookups: tuple[Lookup, ...]
+    outputs: tuple[BlockOutput, ...]
+    guards: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """Entries of x that are kept from one tick to the next.
+
+    Attributes
+    ----------
+    variable : Variable
+        Name, shape, unit, description and start values.
+    first : int
+        The first entry.
+    """
+
+    variable: Variable
+    first: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TargetSpec:
+    """A sampled diagram as C for a target.
+
+    Attributes
+    ----------
+    loop : LoopSpec
+        Its variables and clocks.
+    ticks : tuple of TargetTick
+        By set of clocks, in the order of ``loop.sets``.
+    kept : tuple of Kept
+        All of x.
+    start : mapping of str to ndarray
+        Start values of x, w, p and log.
+    acting : tuple of tuple of str
+        By clock: the subsystems that act with it.
+    """
+
+    loop: LoopSpec
+    ticks: tuple[TargetTick, ...]
+    kept: tuple[Kept, ...]
+    start: Mapping[str, np.ndarray]
+    acting: tuple[tuple[str, ...], ...]
