@@ -24,8 +24,8 @@ def add_c(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None
         "c",
         help="write a sampled diagram or subsystem as C for a target",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Write a sampled diagram or subsystem as C for a target: a header, a source of standard C99 without\n"
-        "allocation, an example, and a report of what each tick touches. No compiler is needed.\n\n"
+        description="Write a sampled diagram or subsystem as C for a target: a header, a source of standard C99\n"
+        "without allocation, an example, and a report of what each tick touches. No compiler is needed.\n\n"
         "MODEL is FILE.py:NAME: a diagram in a file of yours, a function that returns one, or a function with\n"
         "@subsystem, whose arguments become inputs.",
         epilog="examples:\n  loopwright c loop.py:controller --out target\n"

@@ -17,6 +17,7 @@ from ...fmus.export import (
     Kept,
     Number,
     TargetCode,
+    TargetNumbers,
     TargetSpec,
     TargetTick,
     Variable,
@@ -27,6 +28,7 @@ from ...fmus.export import (
 from ..flat import FlatDiagram, TickPattern, WiredDiagram, kinds_of, share_terms, speed_up, trace_guarded_tick
 from ..wiring import Subsystem, join
 from .loop_of_diagram import loop_spec
+from .more_functions import trace_computed_numbers
 from .obstacles import refuse
 from .open_diagram import OpenDiagram, choose_outputs, open_part, open_subsystem, open_whole
 
@@ -157,10 +159,18 @@ def target_spec(opened: OpenDiagram, *, name: str, description: str) -> TargetSp
         If its start isn't found.
     """
     refuse(opened)
+    if not opened.wired.has_clock:
+        _refuse_states(opened)
+        raise DefinitionError(
+            "found no sample time, and a target has ticks alone. Give one: @subsystem(sample_time=1e-3), or "
+            "diagram.sampled(1e-3).",
+            block=opened.wired.name,
+        )
     flat = opened.wired.flatten()
     _refuse_between_ticks(opened, flat)
     loop = loop_spec(opened, name=name, description=description)
     acting = kinds_of(flat, every=False)
+    numbers, fixed = _trace_numbers(opened, flat)
     start = {f.name: np.asarray(f.start) for f in loop.memory.fields if f.name in ("x", "w", "p", "log")}
     return TargetSpec(
         loop=loop,
@@ -168,29 +178,42 @@ def target_spec(opened: OpenDiagram, *, name: str, description: str) -> TargetSp
         kept=tuple(_kept(opened, flat, start["x"])),
         start=start,
         acting=tuple(_acting(opened, flat, clock) for clock in flat.distinct),
+        numbers=numbers,
+        fixed=fixed,
     )
+
+
+def _trace_numbers(
+    opened: OpenDiagram, flat: FlatDiagram
+) -> tuple[tuple[TargetNumbers, ...], tuple[tuple[int, int], ...]]:
+    """Return the numbers that are computed from parameters, and the parameters of which none can be on a target."""
+    found, fixed = [], []
+    for path, (one, function) in trace_computed_numbers(flat).items():
+        expanded = None if function is None else _expand(function)
+        if expanded is None or not expanded.is_a("SXFunction") or expanded.n_instructions() > _LARGEST:
+            fixed.append((one.first, one.first + one.parameters))
+        else:
+            numbers = share_terms(expanded)
+            found.append(TargetNumbers(opened.shown(path), one.first, one.parameters, one.count, numbers))
+    return tuple(found), tuple(fixed)
+
+
+def _refuse_states(opened: OpenDiagram) -> None:
+    """Refuse blocks with states in continuous time."""
+    table = opened.wired.scheduled
+    for path, trace in opened.wired.checked.traced.items():
+        sampled = table.is_sampled(table.subsystem_of[path])
+        if not sampled and trace.advance == "derivative" and trace.states:
+            raise DefinitionError(
+                "it is in continuous time, and on a target only ticks are. Put it into a sampled subsystem, "
+                "@subsystem(sample_time=…), or leave it outside.",
+                block=opened.shown(path),
+            )
 
 
 def _refuse_between_ticks(opened: OpenDiagram, flat: FlatDiagram) -> None:
     """Refuse what happens between ticks, and algebraic loops: nothing but ticks is on a target."""
-    table = flat.table
-    for path, block in table.blocks.items():
-        if path == opened.outside:
-            continue
-        sampled = table.is_sampled(table.subsystem_of[path])
-        if block.transport:
-            raise DefinitionError(
-                "it is a transport delay, whose memory grows with the time between ticks; on a target only ticks are. "
-                "Write UnitDelay(…) or Delay(…), which count ticks, in a sampled subsystem.",
-                block=opened.shown(path),
-            )
-        if not sampled and path in flat.checked.traced and flat.checked.traced[path].advance == "derivative":
-            if flat.states.slices.get(path, slice(0, 0)) != slice(0, 0) and flat.states.shapes[path] != (0,):
-                raise DefinitionError(
-                    "it is in continuous time, and on a target only ticks are. Put it into a sampled subsystem, "
-                    "sample_time=…, or leave it outside.",
-                    block=opened.shown(path),
-                )
+    _refuse_states(opened)
     for event in flat.events:
         raise DefinitionError(
             f"its event {event.name!r} is between ticks, and on a target only ticks are. Put it into a sampled "
@@ -204,12 +227,6 @@ def _refuse_between_ticks(opened: OpenDiagram, flat: FlatDiagram) -> None:
             "into the loop for the target.",
             block=opened.shown(path),
             port=port,
-        )
-    if not flat.distinct:
-        raise DefinitionError(
-            "found no sample time, and a target has ticks alone. Give one: @subsystem(sample_time=1e-3), or "
-            "diagram.sampled(1e-3).",
-            block=opened.wired.name,
         )
     if len(flat.distinct) > CLOCK_LIMIT:
         raise DefinitionError(

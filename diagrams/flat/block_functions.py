@@ -20,10 +20,12 @@ class BlockFunctions:
     ----------
     traced : mapping
         The traced equations of every block, by path. Blocks of equal structure share theirs.
+    inlined : bool
+        Write functions that are no scalar operations out in place of calls, so that lookups in them are found.
     """
 
-    def __init__(self, traced: Mapping[str, Traced]):
-        self.traced = traced
+    def __init__(self, traced: Mapping[str, Traced], *, inlined: bool = False):
+        self.traced, self.inlined = traced, inlined
         self._parts: dict[tuple[int, tuple[str, ...]], Any] = {}
 
     def of(self, path: str, names: tuple[str, ...]) -> Any:
@@ -65,13 +67,16 @@ class BlockFunctions:
         return self._parts[key]
 
 
-def call_block(function: Any, arguments: Sequence[Any]) -> list[Any]:
+def call_block(function: Any, arguments: Sequence[Any], *, inlined: bool = False) -> list[Any]:
     """Call a block's function; one with a product with a large matrix is written out in place of the call.
+
+    ``inlined`` writes out all that are no scalar operations.
 
     The derivative of a call has a direction for every parameter, thus for every entry of the matrix.
     """
     if isinstance(arguments[0], Cells):
         return [*arguments[0].program.call(function, arguments)]
+    written_out = has_large_product(function) or (inlined and not function.is_a("SXFunction"))
     symbolic = any(isinstance(argument, ca.MX) for argument in arguments)
-    made: list[Any] = function.call([*arguments], symbolic and has_large_product(function), False)
+    made: list[Any] = function.call([*arguments], symbolic and written_out, False)
     return made

@@ -119,7 +119,7 @@ def trace_guarded_tick(layout: FlatLayout, functions: BlockFunctions, acting: fr
         if GUARDS in made:
             guards.extend((path, name) for name in functions.traced[path].guards)
 
-    instant = evaluate(layout, functions, acting, **symbols, visit=visit)
+    instant = evaluate(layout, BlockFunctions(functions.traced, inlined=True), acting, **symbols, visit=visit)
     results = {"x_next": next_x(instant), "log": log(instant), "guards": join_columns(instant.guards)}
     made = [ca.densify(ca.MX(column)) for column in results.values()]
     function = ca.Function("tick", [*symbols.values()], made, [*symbols], [*results])

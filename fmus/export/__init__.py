@@ -13,7 +13,7 @@ from .scalar_code import Lookup, split_lookups
 from .target_code import Number, TargetText, TickFacts, identifier, write_target
 from .target_files import TargetCode, TargetMeasurement, write_c
 from .target_measure import PROCESSORS, ProcessorMeasurement, measure, run_here
-from .target_spec import CLOCK_LIMIT, BlockOutput, Kept, TargetSpec, TargetTick
+from .target_spec import CLOCK_LIMIT, BlockOutput, Kept, TargetNumbers, TargetSpec, TargetTick
 from .tuning import describe_processor, processor_flags, tune
 from .written_equations import WrittenEquations, read_equations
 
@@ -37,6 +37,7 @@ __all__ = [
     "ProcessorMeasurement",
     "TargetCode",
     "TargetMeasurement",
+    "TargetNumbers",
     "TargetSpec",
     "TargetText",
     "TargetTick",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi as ca
@@ -65,10 +65,12 @@ _OF_MATH = {
     ca.OP_HYPOT: "hypot",
     ca.OP_ERF: "erf",
 }
-EXACT = frozenset({"sqrt", "floor", "ceil", "fmod", "remainder", "fabs", "copysign", "fmin", "fmax"})
-"""Functions of math.h whose results are the same bits everywhere."""
+OF_MATH = frozenset(_OF_MATH.values())
+"""Functions of math.h that are written."""
 FIND, TAKE = -1, -2
 """Operations of tables: the place of a value between breakpoints, and an entry of a table."""
+CHOOSE = -3
+"""One of two values by a condition: the sum of both, of which one is zero."""
 
 
 @dataclass(frozen=True)
@@ -159,8 +161,8 @@ def split_lookups(function: Any, expand: Callable[[Any], Any]) -> tuple[Any, tup
     made = expand(ca.Function(function.name(), [*symbols, *fresh], replaced))
     if not made.is_a("SXFunction"):
         raise DefinitionError(
-            "found equations that are no scalar operations, such as a solver's or an external function's; expected sums, "
-            "products, elementary functions, comparisons and tables. Write them with these."
+            "found equations that are no scalar operations, such as a solver's or an external function's; expected "
+            "sums, products, elementary functions, comparisons and tables. Write them with these."
         )
     return made, tuple(lookups)
 
@@ -227,6 +229,43 @@ class Scalars:
         del found.results[first:]
         return found
 
+    def folded(self, known: Callable[[int, int], float | None]) -> Scalars:
+        """Return the same values with what is constant computed, to the same bits.
+
+        Parameters
+        ----------
+        known : callable
+            Returns the value of an input that is constant, by argument and entry; else None.
+        """
+        found = Scalars()
+        new: dict[int, int] = {}
+        nodes: dict[Node, int] = {}
+
+        def add(node: Node) -> int:
+            if node not in nodes:
+                found.nodes.append(node)
+                nodes[node] = len(found.nodes) - 1
+            return nodes[node]
+
+        def constant(value: float) -> int:
+            return add(Node(ca.OP_CONST, constant=value, place=(0, int(np.signbit(value)))))
+
+        done: set[int] = set()
+        for root in (node for row in self.results for node in row):
+            for old in self.before(root, done):
+                node = self.nodes[old]
+                arguments = tuple(new[argument] for argument in node.arguments)
+                value = known(*node.place) if node.operation == ca.OP_INPUT else _fold(found, node.operation, arguments)
+                choice = _find_choice(found, node.operation, arguments)
+                if isinstance(value, int):
+                    new[old] = value
+                elif choice is not None:
+                    new[old] = add(Node(CHOOSE, choice))
+                else:
+                    new[old] = add(replace(node, arguments=arguments)) if value is None else constant(value)
+        found.results = [[new[node] for node in row] for row in self.results]
+        return found
+
     def needed(self, roots: Iterable[int]) -> Counter[int]:
         """Return how often each value is used that some values are computed from, and the values themselves."""
         uses: Counter[int] = Counter()
@@ -256,6 +295,71 @@ class Scalars:
                 continue
             stack.append((node, True))
             stack += [(argument, False) for argument in reversed(self.nodes[node].arguments)]
+
+
+_EXACTLY: dict[int, Callable[..., Any]] = {
+    ca.OP_ADD: np.add,
+    ca.OP_SUB: np.subtract,
+    ca.OP_MUL: np.multiply,
+    ca.OP_DIV: np.divide,
+    ca.OP_NEG: np.negative,
+    ca.OP_SQ: np.square,
+    ca.OP_TWICE: lambda x: 2.0 * x,
+    ca.OP_INV: lambda x: 1.0 / x,
+    ca.OP_FABS: np.abs,
+    ca.OP_SQRT: np.sqrt,
+    ca.OP_FLOOR: np.floor,
+    ca.OP_CEIL: np.ceil,
+    ca.OP_LT: np.less,
+    ca.OP_LE: np.less_equal,
+    ca.OP_EQ: np.equal,
+    ca.OP_NE: np.not_equal,
+    ca.OP_NOT: np.logical_not,
+    ca.OP_AND: np.logical_and,
+    ca.OP_OR: np.logical_or,
+}
+"""Operations whose results are the same bits everywhere."""
+
+
+def _fold(scalars: Scalars, operation: int, arguments: tuple[int, ...]) -> float | int | None:
+    """Return the value of an operation on constants, or the node that it is equal to in every bit; None otherwise."""
+    nodes = [scalars.nodes[argument] for argument in arguments]
+    values = [node.constant if node.operation == ca.OP_CONST else None for node in nodes]
+    if operation in _EXACTLY and None not in values and values:
+        with np.errstate(all="ignore"):
+            return float(_EXACTLY[operation](*map(np.float64, values)))  # type: ignore[arg-type]
+    if operation == ca.OP_MUL and 1.0 in values:
+        return arguments[1 - values.index(1.0)]
+    if operation == ca.OP_DIV and values[1] == 1.0:
+        return arguments[0]
+    if operation == ca.OP_SUB and values[1] == 0.0 and not np.signbit(values[1]):
+        return arguments[0]
+    if operation in (ca.OP_AND, ca.OP_OR):
+        for value, other in zip(values, (1, 0), strict=True):
+            if value is not None and bool(value) == (operation == ca.OP_AND) and nodes[other].is_boolean:
+                return arguments[other]
+            if value is not None and bool(value) != (operation == ca.OP_AND):
+                return float(bool(value))
+    if operation == ca.OP_IF_ELSE_ZERO:
+        if values[0] is not None:
+            return arguments[1] if values[0] else 0.0
+        if nodes[1].operation == operation and nodes[1].arguments[0] == arguments[0]:
+            return arguments[1]
+    return None
+
+
+def _find_choice(scalars: Scalars, operation: int, arguments: tuple[int, ...]) -> tuple[int, int, int] | None:
+    """Return condition and values where a sum of two values is a choice of one."""
+    if operation != ca.OP_ADD:
+        return None
+    nodes = [scalars.nodes[argument] for argument in arguments]
+    if any(node.operation != ca.OP_IF_ELSE_ZERO for node in nodes):
+        return None
+    for one, other in (nodes, nodes[::-1]):
+        condition = scalars.nodes[other.arguments[0]]
+        if condition.operation == ca.OP_NOT and condition.arguments[0] == one.arguments[0]:
+            return one.arguments[0], one.arguments[1], other.arguments[1]
+    return None
 
 
 class Tables:
@@ -320,8 +424,11 @@ class Expressions:
         for one in self._scalars.before(node, self._done):
             text, level = self._write(one)
             plain = self._scalars.nodes[one].operation in (ca.OP_INPUT, ca.OP_CONST)
+            chosen = "?" in text  # nested choices are hard to read
             wanted = name if one == node and not plain else None
-            if wanted is None and (plain or (self._uses.get(one, 0) < 2 and len(text) <= _WIDEST and one != node)):
+            if wanted is None and (
+                plain or (self._uses.get(one, 0) < 2 and len(text) <= _WIDEST and one != node and not chosen)
+            ):
                 self._texts[one] = text, level
                 continue
             if wanted is None:
@@ -348,6 +455,11 @@ class Expressions:
         if not self._scalars.nodes[node].is_boolean:
             text, own = f"{text if own > _RELATION else f'({text})'} != {self.constant(0.0)}", _RELATION
         return text if own >= level else f"({text})"
+
+    def is_positive(self, node: int) -> bool:
+        """Whether a value is a positive constant."""
+        one = self._scalars.nodes[node]
+        return one.operation == ca.OP_CONST and one.constant > 0.0
 
     def constant(self, value: float) -> str:
         """Return a number as C text."""
@@ -387,6 +499,13 @@ class Expressions:
         if operation == ca.OP_IF_ELSE_ZERO:
             condition = self._truth(arguments[0], _ATOM)
             return f"({condition} ? {self._number(arguments[1], _SUM)} : {self.constant(0.0)})", _ATOM
+        if operation == CHOOSE:
+            self.functions.add("choose")
+            condition = self._truth(arguments[0], _LOGIC)
+            return (
+                f"choose({condition}, {self._number(arguments[1], _LOGIC)}, {self._number(arguments[2], _LOGIC)})",
+                _ATOM,
+            )
         if operation == ca.OP_SIGN:
             self.functions.add("sign")
             return f"sign_of({self._number(arguments[0], _LOGIC)})", _ATOM

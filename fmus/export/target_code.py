@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
-from math import lcm
-from typing import Any, Literal
+from typing import Literal
 
 import casadi as ca
 import numpy as np
@@ -16,21 +15,20 @@ import numpy as np
 from .elementary_tables import FUNCTIONS, prepare_functions
 from .loop_spec import Placed
 from .model import Variable
-from .scalar_code import EXACT, Expressions, Scalars, Tables, c_constant
+from .scalar_code import OF_MATH, Expressions, Scalars, Tables, c_constant
 from .target_spec import TargetSpec, TargetTick
 
 Number = Literal["double", "float"]
 _WIDTH = 110
-_KEYWORDS = frozenset(
-    """auto break case char const continue default do double else enum extern float for goto if inline int long register
-    restrict return short signed sizeof static struct switch typedef union unsigned void volatile while bool true false
-    complex imaginary I NULL errno signgam main t c""".split()
-)
-_RESULT = {"tick": "taken over", "finite": "a number isn't finite"}
-_GROUPS = ("parameters", "inputs", "outputs", "signals", "states")
+_WORDS = """auto break case char const continue default do double else enum extern float for goto if inline int long
+register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while bool true
+false complex imaginary I NULL errno signgam main t c"""
+_KEYWORDS = frozenset(_WORDS.split())
+_GROUPS = ("parameters", "numbers", "inputs", "outputs", "signals", "states")
 _KIND = {"inputs": "input", "outputs": "output", "signals": "signal", "parameters": "parameter"}
 _ABOUT = {
     "parameters": "Parameters: to be set at any time between two ticks.",
+    "numbers": "Numbers that are computed from parameters, by block: not to be written.",
     "inputs": "Inputs: to be set before each tick; they are held until they are set again.",
     "outputs": "Outputs: valid after a tick, until the next one.",
     "signals": "Named signals inside, to be watched: valid after a tick.",
@@ -190,6 +188,8 @@ class _Writer:
         self.real = f"{self.name}_real"
         self.tables = Tables()
         self.scalars = [Scalars.of(tick.function, tick.lookups, self.tables) for tick in spec.ticks]
+        self.numbers = [(one, Scalars.of(one.function, (), self.tables)) for one in spec.numbers]
+        self._fold()
         self.called: set[str] = set()
         self.uses_time = False
         self.clocks = spec.loop.clocks
@@ -199,23 +199,50 @@ class _Writer:
 
     # --- what there is ------------------------------------------------------------------------------------------------
 
+    def _fold(self) -> None:
+        """Compute what is constant: of parameters that can't be set, and of states that never change."""
+        loop, start = self.spec.loop, self.spec.start
+        fixed = {i for first, end in self.spec.fixed for i in range(first, end)}
+        self.tunable = [one for one in loop.parameters if not fixed.intersection(one.places)]
+        offered = {place for one in self.tunable for place in one.places}
+        free = set(offered)
+        for one, scalars in self.numbers:
+            for i, root in enumerate(scalars.results[0]):
+                nodes = (scalars.nodes[node] for node in scalars.needed([root]))
+                if any(n.operation == ca.OP_INPUT and one.first + n.place[1] in offered for n in nodes):
+                    free.add(one.first + one.parameters + i)
+        self.changes = {
+            i
+            for scalars in self.scalars
+            for i, node in enumerate(scalars.results[0])
+            if not self._is_entry(scalars, node, 1, i)
+        }
+
+        def known(argument: int, entry: int) -> float | None:
+            if argument == 1 and entry not in self.changes:
+                return float(start["x"][entry])
+            return float(start["p"][entry]) if argument == 3 and entry not in free else None
+
+        self.scalars = [scalars.folded(known) for scalars in self.scalars]
+        self.numbers = [
+            (one, scalars.folded(lambda _, entry, first=one.first: known(3, first + entry)))
+            for one, scalars in self.numbers
+        ]
+
     def _choose_members(self) -> None:
         """Keep what is read or written: states that change, parameters that are used, all inputs and outputs."""
         loop, start = self.spec.loop, self.spec.start
-        changes, reads = set[int](), {"p": set[int](), "x": set[int]()}
+        changes, read = self.changes, set[int]()
         for scalars in self.scalars:
-            new = scalars.results[0]
-            changed = [i for i, node in enumerate(new) if not self._is_entry(scalars, node, 1, i)]
-            changes.update(changed)
-            roots = [*(new[i] for i in changed), *scalars.results[1], *scalars.results[2]]
-            for node in scalars.needed(roots):
+            for node in scalars.needed([n for row in scalars.results for n in row]):
                 one = scalars.nodes[node]
-                if one.operation == ca.OP_INPUT and one.place[0] in (1, 3):
-                    reads["x" if one.place[0] == 1 else "p"].add(one.place[1])
-        self.changes = changes
-        tunable = [p for p in loop.parameters if reads["p"].intersection(p.places)]
+                if one.operation == ca.OP_INPUT and one.place[0] == 3:
+                    read.add(one.place[1])
+        computed = self._choose_numbers(read)
+        tunable = [one for one in self.tunable if read.intersection(one.places)]
         groups: dict[str, list[tuple[Variable, tuple[int, ...], np.ndarray]]] = {
             "parameters": [(p.variable, p.places, start["p"][list(p.places)]) for p in tunable],
+            "numbers": computed,
             "inputs": [(p.variable, p.places, start["w"][list(p.places)]) for p in loop.inputs],
             "outputs": [(p.variable, p.places, self._output_start(p)) for p in loop.outputs],
             "signals": [(p.variable, p.places, self._output_start(p)) for p in loop.signals],
@@ -233,13 +260,34 @@ class _Writer:
             for variable, places, values in found:
                 name = _distinct(identifier(variable.name), taken)
                 self.members[group].append(Member(group, name, variable, places, values))
-        vectors = {"parameters": 3, "inputs": 2, "states": 1}
+        vectors = {"parameters": 3, "numbers": 3, "inputs": 2, "states": 1}
         self.places = {
             (vectors[group], place): (member, entry)
             for group in vectors
             for member in self.members[group]
             for entry, place in enumerate(member.places)
         }
+
+    def _choose_numbers(self, read: set[int]) -> list[tuple[Variable, tuple[int, ...], np.ndarray]]:
+        """Return the computed numbers that ticks read and that depend on parameters; note the parameters as read."""
+        found = []
+        self.renewed: list[tuple[int, int, int]] = []  # numbers, result, entry of p
+        for which, (one, scalars) in enumerate(self.numbers):
+            places, wanted = [], set[int]()
+            for i in range(one.count):
+                place = one.first + one.parameters + i
+                needed = scalars.needed([scalars.results[0][i]]) if place in read else {}
+                inputs = {scalars.nodes[n].place[1] for n in needed if scalars.nodes[n].operation == ca.OP_INPUT}
+                if inputs:
+                    places.append(place)
+                    wanted |= inputs
+                    self.renewed.append((which, i, place))
+            read |= {one.first + i for i in wanted}
+            if places:
+                variable = Variable("numbers", shape=(len(places),), description=f"of {one.block}")
+                object.__setattr__(variable, "name", one.block)
+                found.append((variable, tuple(places), self.spec.start["p"][places]))
+        return found
 
     def _output_start(self, placed: Placed) -> np.ndarray:
         values = self.spec.start.get("log", np.zeros(0))
@@ -265,12 +313,12 @@ class _Writer:
 
     def write(self) -> TargetText:
         ticks = [self._tick(i) for i in range(len(self.spec.ticks))]
+        self.update = self._update_lines()
         source = self._source(ticks)
         files = {f"{self.name}.h": self._header(), f"{self.name}.c": source, f"{self.name}_example.c": self._example()}
         members = tuple(member for group in _GROUPS for member in self.members[group])
-        platform = tuple(
-            sorted(f for f in self.called if not (self.own and f in FUNCTIONS)) + ["fabs"] * ("fabs" not in self.called)
-        )
+        own = FUNCTIONS if self.own else ()
+        platform = {"fabs"} | {f for f in self.called if f in OF_MATH and f not in own}
         return TargetText(
             self.name,
             self.number,
@@ -348,6 +396,47 @@ class _Writer:
         self.called |= expressions.functions
         return tick
 
+    def _update_lines(self) -> list[str]:
+        """Return the function that computes the numbers again."""
+        if not self.renewed:
+            return []
+        lines = [
+            "/* ---- numbers that are computed from parameters ---- */",
+            "",
+            f"void {self.name}_update({self.name} *c) {{",
+        ]
+        ready = []
+        for which, (one, scalars) in enumerate(self.numbers):
+            entries = [(i, place) for w, i, place in self.renewed if w == which]
+            if not entries:
+                continue
+            roots = [scalars.results[0][i] for i, _ in entries]
+
+            def read(argument: int, entry: int, first: int = one.first) -> str:
+                found = self.places.get((3, first + entry))
+                return (
+                    self._constant(self.spec.start["p"][first + entry]) if found is None else found[0].access(found[1])
+                )
+
+            expressions = Expressions(
+                scalars,
+                scalars.needed(roots),
+                read,
+                tables=self.tables,
+                call=self._call,
+                real=self.real,
+                single=self.single,
+            )
+            lines += ["    {", f"        /* {one.block} */"]
+            for (_, place), root in zip(entries, roots, strict=True):
+                lines += [f"        {line}" for line in _wrap(expressions.compute(root, None))]
+                member, entry = self.places[3, place]
+                ready.append(f"        {member.access(entry)} = {expressions.text(root)};")
+            lines += [*ready, "    }"]
+            ready = []
+            self.called |= expressions.functions
+        return [*lines, "}", ""]
+
     def _read(self, tick: _Tick, argument: int, entry: int) -> str:
         if argument == 0:
             self.uses_time = True
@@ -357,7 +446,7 @@ class _Writer:
         if found is None:
             return self._constant(self.spec.start["p" if argument == 3 else "x"][entry])
         member, which = found
-        tick.touch(member.group, member.variable.name)
+        tick.touch("parameters" if member.group == "numbers" else member.group, member.variable.name)
         return member.access(which)
 
     def _call(self, function: str) -> str:
@@ -390,9 +479,11 @@ class _Writer:
                 tick.add(*_wrap(lines))
 
     def _guards(self, tick: _Tick, expressions: Expressions, guards: Sequence[int]) -> None:
-        if guards:
+        if not all(map(expressions.is_positive, guards)):
             tick.add("", "/* Guards: what must be positive. */")
         for guard, node in zip(tick.tick.guards, guards, strict=True):
+            if expressions.is_positive(node):
+                continue
             tick.add(*_wrap(expressions.compute(node, None)))
             text = expressions.text(node)
             tick.add(f"if (!({text} > {self._constant(0.0)})) {{ /* {guard[0]}: {guard[1]} */")
@@ -417,10 +508,10 @@ class _Writer:
             label = _distinct(f"next_{member.name}" + (f"_{entry}" if member.variable.shape else ""), taken)
             tick.add(*_wrap(expressions.compute(node, label)))
             text, one = expressions.text(node), scalars.nodes[node]
-            if one.operation == ca.OP_INPUT or one.is_boolean or not re.fullmatch(r"\w+", text):
-                if one.operation != ca.OP_CONST:
-                    tick.add(*_wrap([f"const {self.real} {label} = {text};"]))
-                    text = label
+            named = one.operation != ca.OP_INPUT and not one.is_boolean and re.fullmatch(r"\w+", text)
+            if not named and one.operation != ca.OP_CONST:
+                tick.add(*_wrap([f"const {self.real} {label} = {text};"]))
+                text = label
             ready.append((member.access(entry), text))
             if one.operation != ca.OP_CONST:
                 checked.append(text)
@@ -458,9 +549,9 @@ class _Writer:
             " * Generated by Loopwright. Standard C99; no memory is allocated, nothing is global but constant tables.",
             " *",
             f" * Use: let the caller own one struct {name} for each instance;",
-            f" * {name}_init() once; then {name}_tick() every {base:g} s, with the inputs of this instant set before it, and",
-            " * the outputs read after it. The struct may be copied: a copy is an instance, or a saved state.",
-            f" * It is not to be ticked and written by two threads or interrupts at the same time.",
+            f" * {name}_init() once; then {name}_tick() every {base:g} s, with the inputs of this instant set before",
+            " * it, and the outputs read after it. The struct may be copied: a copy is an instance, or a saved state.",
+            " * It is not to be ticked and written by two threads or interrupts at the same time.",
             " *",
             " * Sample times:",
             *(
@@ -501,9 +592,19 @@ class _Writer:
             lines += [f"    uint32_t wait[{len(self.clocks)}]; /**< ticks until each sample time is due */"]
         lines += [f"}} {name};", "", *self._named_header()]
         lines += [
-            f"/** Put an instance to its start: start values of parameters, inputs and states, time 0. */",
+            "/** Put an instance to its start: start values of parameters, inputs and states, time 0. */",
             f"void {name}_init({name} *c);",
             "",
+            *(
+                [
+                    "/** Compute the numbers that depend on parameters, for the next tick. To be called when members of",
+                    f" * c->parameters have been written; {name}_set() does it. */",
+                    f"void {name}_update({name} *c);",
+                    "",
+                ]
+                if self.renewed
+                else []
+            ),
             f"/** Act at one instant, and let the time go on by {upper}_PERIOD; call it at this period.",
             f" * @return {upper}_OK, or why nothing of the tick was taken over; then the time stays, too. */",
             f"{name}_status {name}_tick({name} *c);",
@@ -538,7 +639,7 @@ class _Writer:
             f"    {upper}_VARIABLES /**< their number */",
             f"}} {name}_id;",
             "",
-            "/** A variable: name, unit, place in the struct, number of entries, whether it may be set, and its range. */",
+            "/** A variable: name, unit, place in the struct, number of entries, whether it may be set, range. */",
             "typedef struct {",
             "    const char *name;",
             "    const char *unit;",
@@ -553,7 +654,7 @@ class _Writer:
             f"extern const {name}_variable {name}_variables[{upper}_VARIABLES];",
             "",
             "/** Set an entry of a parameter or an input; index 0 of a scalar.",
-            " * @return false, and nothing is set, if there is no such entry, it isn't to be set, or it is out of range. */",
+            " * @return false, and nothing is set, if there is no such entry, it isn't to be set, or out of range. */",
             f"bool {name}_set({name} *c, {name}_id id, uint32_t index, {self.real} value);",
             "",
             "/** Get an entry of any variable.",
@@ -563,12 +664,12 @@ class _Writer:
         ]
 
     def _source(self, ticks: Sequence[_Tick]) -> str:
-        name, upper = self.name, self.upper
+        name = self.name
         lines = [
             f"/* {name}: see {name}.h. Generated by Loopwright.",
             "",
-            "   Its numbers are those of the diagram's run, bit by bit, in double precision, where nothing is contracted to",
-            "   fused operations: gcc needs -std=c99 or -ffp-contract=off; clang is told below. No -ffast-math.",
+            "   In double precision its numbers are those of the diagram's run, bit by bit, where nothing is contracted",
+            "   to fused operations: gcc needs -std=c99 or -ffp-contract=off; clang is told below. No -ffast-math.",
             "   A block's code is below its path. */",
             f'#include "{name}.h"',
             "#include <float.h>",
@@ -601,6 +702,7 @@ class _Writer:
                 lines += [f"    const {self.real} t = {whole}; /* s */"]
             lines += [*tick.lines, "}", ""]
         lines += self._tick_lines(ticks)
+        lines += self.update
         lines += self._named_source()
         lines += [
             f"const char *{name}_status_text({name}_status status) {{",
@@ -642,6 +744,14 @@ class _Writer:
             "",
         ]
         one, zero = self._constant(1.0), self._constant(0.0)
+        if "choose" in self.called:
+            found += [
+                "/* a where the condition holds, else b; in a run it is a sum of both, so that -0 becomes 0. */",
+                f"static inline {real} choose(bool condition, {real} a, {real} b) {{",
+                f"    return condition ? a + {zero} : b + {zero};",
+                "}",
+                "",
+            ]
         if "sign" in self.called:
             found += [
                 f"static inline {real} sign_of({real} x) {{",
@@ -766,6 +876,15 @@ class _Writer:
             "        return false;",
             "    }",
             "    memcpy((unsigned char *)c + v->offset + index * sizeof value, &value, sizeof value);",
+            *(
+                [
+                    f"    if ((uint32_t)id < {len(self.members['parameters'])}u) {{",
+                    f"        {name}_update(c);",
+                    "    }",
+                ]
+                if self.renewed
+                else []
+            ),
             "    return true;",
             "}",
             "",
@@ -773,7 +892,8 @@ class _Writer:
             f"    if (((uint32_t)id >= (uint32_t){upper}_VARIABLES) || (index >= {name}_variables[id].count)) {{",
             "        return false;",
             "    }",
-            f"    memcpy(value, (const unsigned char *)c + {name}_variables[id].offset + index * sizeof *value, sizeof *value);",
+            f"    const size_t place = {name}_variables[id].offset + index * sizeof *value;",
+            "    memcpy(value, (const unsigned char *)c + place, sizeof *value);",
             "    return true;",
             "}",
             "",
@@ -798,8 +918,7 @@ class _Writer:
             "",
             f"   cc -std=c99 -O2 {name}.c {name}_example.c -lm && ./a.out",
             "",
-            f"   On a target {name}_tick() is called by a timer every {float(self.spec.loop.base):g} s, with inputs from "
-            "converters. */",
+            f"   On a target a timer calls {name}_tick() every {float(self.spec.loop.base):g} s. */",
             f'#include "{name}.h"',
             "#include <stdio.h>",
             "",
@@ -811,9 +930,8 @@ class _Writer:
         ]
         for m in inputs:
             for i, value in enumerate(m.start.tolist()):
-                lines.append(
-                    f"        {m.access(i).replace('c->', 'c.')} = {c_constant(value, single=self.single)}; /* measured */"
-                )
+                member = m.access(i).replace("c->", "c.")
+                lines.append(f"        {member} = {c_constant(value, single=self.single)}; /* measured */")
         lines += [
             f"        const {name}_status status = {name}_tick(&c);",
             f"        if (status != {upper}_OK) {{",

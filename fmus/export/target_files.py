@@ -161,7 +161,7 @@ def _report(code: TargetCode) -> Iterator[str]:
     yield "No memory is allocated; no loop of a tick depends on data, but the search in a table, of log2(length) steps."
     yield ""
     yield "Memory in bytes"
-    for group in ("parameters", "inputs", "outputs", "signals", "states"):
+    for group in ("parameters", "numbers", "inputs", "outputs", "signals", "states"):
         yield f"  {group:<12}{size[group]:>7}"
     yield f"  {'an instance':<12}{size['struct']:>7}   all of it, with the count of ticks"
     yield f"  {'tables':<12}{size['tables']:>7}   constant, once for all instances"
@@ -206,7 +206,8 @@ def _measured(measured: TargetMeasurement | None) -> Iterator[str]:
         return
     yield f"Measured with a test signal of {measured.ticks} ticks"
     for one in measured.processors:
-        yield f"  {one.processor}, -O2: {one.code} bytes of instructions, {one.constants} of constants (without libraries)"
+        memory = f"{one.code} bytes of instructions, {one.constants} of constants (without libraries)"
+        yield f"  {one.processor}, -O2: {memory}"
         if one.instructions:
             yield (
                 f"    instructions of a tick: {one.largest} at most, {min(one.instructions)} at least; "

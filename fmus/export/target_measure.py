@@ -44,11 +44,13 @@ void _start(void) {{
     lw_kept[2] = (void (*)(void))lw_size;
 }}
 """
-_STRING = "#include <stddef.h>\nvoid *memcpy(void *to, const void *from, size_t count);\nvoid *memset(void *to, int value, size_t count);\n"
-_UNARY = (
-    "sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp expm1 log log1p sqrt floor ceil fabs erf".split()
-)
-_OTHERS = "pow fmod remainder copysign fmin fmax atan2 hypot".split()
+_STRING = """#include <stddef.h>
+void *memcpy(void *to, const void *from, size_t count);
+void *memset(void *to, int value, size_t count);
+"""
+_UNARY = """sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp expm1 log log1p sqrt floor ceil fabs
+erf"""
+_OTHERS = "pow fmod remainder copysign fmin fmax atan2 hypot"
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,8 +171,8 @@ def input_rows(text: TargetText, inputs: Mapping[str, Any], ticks: int) -> dict[
             values = np.broadcast_to(values, (ticks, *member.variable.shape))
         if values.shape[1:] != member.variable.shape or len(values) < ticks:
             raise OptionError(
-                f"found values of shape {values.shape} for the input {name!r}; expected {(ticks, *member.variable.shape)}, "
-                "a value for each tick.",
+                f"found values of shape {values.shape} for the input {name!r}; expected a value for each tick, "
+                f"{(ticks, *member.variable.shape)}.",
                 block=text.name,
             )
         found[name] = values[:ticks].reshape(ticks, -1)
@@ -190,8 +192,8 @@ def _headers() -> dict[str, str]:
     """Return headers of a C library for a compiler without one: declarations alone."""
     lines = ['#define NAN __builtin_nanf("")', "#define INFINITY __builtin_inff()"]
     for kind, end in (("double", ""), ("float", "f")):
-        lines += [f"{kind} {f}{end}({kind} x);" for f in _UNARY]
-        lines += [f"{kind} {f}{end}({kind} x, {kind} y);" for f in _OTHERS]
+        lines += [f"{kind} {f}{end}({kind} x);" for f in _UNARY.split()]
+        lines += [f"{kind} {f}{end}({kind} x, {kind} y);" for f in _OTHERS.split()]
         lines += [f"#define {f}{end} __builtin_{f}{end}" for f in ("fabs", "sqrt", "copysign", "fmin", "fmax")]
     return {"include/math.h": "\n".join(lines) + "\n", "include/string.h": _STRING}
 
@@ -232,14 +234,14 @@ def _symbols(elf: bytes) -> dict[str, int]:
     return found
 
 
-# --- a bound ------------------------------------------------------------------------------------------------------------
+# --- a bound ------------------------------------------------------------------------------------------------
 
 _LABEL = re.compile(r"^([\w.$]+):")
 _BRANCH = re.compile(r"^(b\w*(?:\.[nw])?|cbn?z)\s+(?:\w+,\s*)?([\w.$]+)$")
 
 
 def find_bound(assembly: str, function: str) -> tuple[int | None, str]:
-    """Return how many instructions a function executes at most, with those it calls; or None, and why there is no bound.
+    """Return how many instructions a function executes at most, with those it calls; or None, and the reason.
 
     Without a jump backwards every instruction is executed once at most. So the number of instructions is a bound.
     """
@@ -300,7 +302,7 @@ def _functions(assembly: str) -> dict[str, list[str]]:
     return found
 
 
-# --- the emulator -------------------------------------------------------------------------------------------------------
+# --- the emulator -------------------------------------------------------------------------------------------
 
 
 class _Emulator:
@@ -381,7 +383,7 @@ class _Emulator:
         return used, tuple(counts), {name: np.array(found) for name, found in outputs.items()}
 
 
-# --- this machine ---------------------------------------------------------------------------------------------------------
+# --- this machine -------------------------------------------------------------------------------------------
 
 _HOST = """#include "{name}.h"
 
@@ -433,8 +435,8 @@ def run_here(text: TargetText, inputs: Mapping[str, Any], ticks: int) -> dict[st
     run.argtypes = [pointer, pointer, ctypes.c_long]
     if status := run(table.ctypes.data_as(pointer), values.ctypes.data_as(pointer), ticks):
         raise CompilerError(
-            f"a tick of the test signal ended with the status {status}: {text.statuses[status]}. Give a test signal that "
-            "the diagram runs with."
+            f"a tick of the test signal ended with the status {status}: {text.statuses[status]}. Give a test signal "
+            "that the diagram runs with."
         )
     made, first = {}, 0
     for m in outs:

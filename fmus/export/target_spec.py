@@ -77,6 +77,27 @@ class Kept:
     first: int
 
 
+@dataclass(frozen=True, eq=False)
+class TargetNumbers:
+    """Numbers that are computed from the parameters of a block, behind these.
+
+    Attributes
+    ----------
+    block : str
+        The block's path.
+    first, parameters, count : int
+        Entry of p with which the block's parameters begin, their number, and that of the computed numbers.
+    function : casadi.Function
+        Scalar operations from one to the other.
+    """
+
+    block: str
+    first: int
+    parameters: int
+    count: int
+    function: Any
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TargetSpec:
     """A sampled diagram as C for a target.
@@ -93,6 +114,10 @@ class TargetSpec:
         Start values of x, w, p and log.
     acting : tuple of tuple of str
         By clock: the subsystems that act with it.
+    numbers : tuple of TargetNumbers
+        Numbers that are computed from parameters.
+    fixed : tuple of (int, int)
+        Entries of p, from one on and up to another, from which numbers are computed here alone: they are constants.
     """
 
     loop: LoopSpec
@@ -100,3 +125,5 @@ class TargetSpec:
     kept: tuple[Kept, ...]
     start: Mapping[str, np.ndarray]
     acting: tuple[tuple[str, ...], ...]
+    numbers: tuple[TargetNumbers, ...] = ()
+    fixed: tuple[tuple[int, int], ...] = ()

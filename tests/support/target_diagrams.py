@@ -1,6 +1,7 @@
 """Sampled subsystems of several kinds in closed loops, for C that leaves: each diagram, the subsystem, its inputs."""
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -62,8 +63,8 @@ def cascade():
     def controller(wanted, position, speed, current):
         return current_loop(speed_loop(position_loop(wanted, position), speed), current)
 
-    A = [[-200.0, -20.0, 0.0], [40.0, -1.0, 0.0], [0.0, 1.0, 0.0]]
-    drive = StateSpace(A=A, B=[[400.0], [0.0], [0.0]], C=np.eye(3), D=np.zeros((3, 1)), name="drive")
+    A: Any = [[-200.0, -20.0, 0.0], [40.0, -1.0, 0.0], [0.0, 1.0, 0.0]]
+    drive = StateSpace(A=A, B=[400.0, 0.0, 0.0], C=np.eye(3), D=np.zeros(3), name="drive")
     wanted = Step(times=0.0105, values=3.0, name="wanted")
     return Diagram("cascade", drive(controller(wanted, drive.y[2], drive.y[1], drive.y[0])))
 
@@ -74,14 +75,14 @@ def observer():
 
     @subsystem(sample_time=0.02)
     def controller(wanted, y):
-        A, B, C = [[1.0, 0.02], [0.0, 1.0]], [[0.0002], [0.02]], [[1.0, 0.0]]
-        model = DiscreteStateSpace(A=A, B=B, C=C, D=[[0.0]], dt=0.02)
-        estimate = DiscreteObserver(model, [[0.4], [2.2]], name="observer")
+        A, B, C = [[1.0, 0.02], [0.0, 1.0]], [0.0002, 0.02], [1.0, 0.0]
+        model = DiscreteStateSpace(A=A, B=B, C=C, D=0.0, dt=0.02)
+        estimate = DiscreteObserver(model, [0.4, 2.2], name="observer")
         u = (9.0 * (wanted - estimate.x_hat[0]) - 5.0 * estimate.x_hat[1]).named("u")
-        estimate(stack(u), stack(y))
+        estimate(u, y)
         return u
 
-    plant = StateSpace(A=[[0.0, 1.0], [0.0, -0.1]], B=[[0.0], [1.0]], C=[[1.0, 0.0]], D=[[0.0]], name="plant")
+    plant = StateSpace(A=[[0.0, 1.0], [0.0, -0.1]], B=[0.0, 1.0], C=[1.0, 0.0], D=0.0, name="plant")
     wanted = Step(times=0.1, values=1.0, name="wanted")
     return Diagram("observed", plant(controller(wanted, plant.y)))
 
@@ -104,8 +105,8 @@ def machine():
         return flow, laps
 
     tank = TransferFunction(numerator=[1.0], denominator=[1.0, 0.05], name="tank")
-    control = controller(tank.y, Step(times=0.3, values=1.0, name="permit"))
-    return Diagram("tank", tank(control[0]), control[1])
+    flow, laps = controller(tank.y, Step(times=0.3, values=1.0, name="permit"))
+    return Diagram("tank", tank(flow), laps)
 
 
 @cache

@@ -1,0 +1,225 @@
+"""C for a target: the numbers of the run in every bit, on this machine and on a Cortex-M, without a warning."""
+
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from loopwright import Diagram, subsystem, to_c
+from loopwright.blocks import PID, Gain, Step, TransferFunction
+from loopwright.diagrams import DefinitionError, OptionError
+from loopwright.diagrams.exporting import open_subsystem, target_spec
+from loopwright.fmus.export import measure, run_here, write_target
+from loopwright.fmus.export.target_measure import find_bound
+from support.target_diagrams import DIAGRAMS, run_of, spec_of
+
+TICKS = 300
+EPS = float(np.finfo(np.float32).eps)
+
+
+@subsystem(sample_time=0.1)
+def pi(reference, level):
+    """PI controller of a level."""
+    return PID(kp=2.0, ki=3.0, name="pi")(reference, level).named("effort")
+
+
+@pytest.fixture(scope="module")
+def pi_spec():
+    return target_spec(open_subsystem(pi, Diagram, "pi"), name="pi", description="PI controller of a level")
+
+
+def test_a_pi_controller_has_the_numbers_of_the_closed_form(pi_spec):
+    """After k ticks with the error 1 the integral has k steps of 0.1 s: u = kp + ki 0.1 k."""
+    found = run_here(write_target(pi_spec), {"reference": 1.0}, 20)["effort"]
+    np.testing.assert_allclose(found, 2.0 + 0.3 * np.arange(20), rtol=1e-14)
+    single = run_here(write_target(pi_spec, number="float"), {"reference": 1.0}, 20)["effort"]
+    np.testing.assert_allclose(single, 2.0 + 0.3 * np.arange(20), rtol=20 * EPS)
+    assert np.any(single != found)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cascade",
+        "tables",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in DIAGRAMS if n not in ("cascade", "tables")),
+    ],
+)
+def test_the_numbers_are_those_of_the_run_in_every_bit(name):
+    run, inputs = run_of(name, TICKS)
+    found = run_here(write_target(spec_of(name)), inputs, TICKS)
+    for signal, values in found.items():
+        np.testing.assert_array_equal(values, run[signal][:TICKS])
+    assert max(np.ptp(values) for values in found.values()) > 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*DIAGRAMS])
+def test_single_precision_is_within_its_rounding_of_double(name):
+    """Errors are some roundings of the largest number; a feedback over the run is in the test signal already."""
+    _, inputs = run_of(name, TICKS)
+    fine, coarse = (run_here(write_target(spec_of(name), number=n), inputs, TICKS) for n in ("double", "float"))
+    for signal, values in fine.items():
+        size = max(1.0, float(np.max(np.abs(values))))
+        # Fig. 3 has gains of 64,000 on errors of a position of size 1
+        assert np.max(np.abs(values - coarse[signal])) < (1e5 if name == "path_following" else 2e3) * EPS * size
+    assert any(np.any(fine[signal] != coarse[signal]) for signal in fine)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*DIAGRAMS])
+@pytest.mark.parametrize("processor", ["cortex-m4", "cortex-m0"])
+def test_a_cortex_m_computes_the_bits_of_this_machine(name, processor):
+    """With our own functions, in double precision; it is compiled with warnings as errors."""
+    _, inputs = run_of(name, TICKS)
+    text = write_target(spec_of(name), own_functions=True)
+    here, there = run_here(text, inputs, 40), measure(text, processor, inputs, 40)
+    assert not there.missing
+    for signal, values in here.items():
+        np.testing.assert_array_equal(values, there.outputs[signal])
+    assert len(there.instructions) == 40
+    assert there.stack > 0
+
+
+@pytest.mark.slow
+def test_a_tick_without_branches_takes_the_instructions_of_its_bound(pi_spec):
+    """On a Cortex-M4 with its unit for single precision nothing of a library is called: each tick is the bound."""
+    found = measure(write_target(pi_spec, number="float"), "cortex-m4", {"reference": 1.0}, 10)
+    assert {*found.instructions} == {found.bound}
+    soft = measure(write_target(pi_spec, number="float"), "cortex-m0", {"reference": 1.0}, 10)
+    assert soft.bound is None
+    assert "library" in soft.unbounded
+    assert soft.largest > 5 * found.largest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*DIAGRAMS])
+@pytest.mark.parametrize("number", ["double", "float"])
+def test_compilers_and_cppcheck_have_nothing_to_say(name, number, tmp_path):
+    for own in (False, True):
+        text = write_target(spec_of(name), number=number, own_functions=own)
+        for file, content in text.files.items():
+            (tmp_path / file).write_text(content, encoding="utf-8")
+        compiler = shutil.which("gcc")
+        assert compiler, "no gcc was found. Install it: apt-get install gcc"
+        warnings = ["-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic", "-Werror"]
+        sources = [f"{name}.c", f"{name}_example.c"]
+        command = [compiler, "-std=c99", "-O2", *warnings, "-o", "example", *sources, "-lm"]
+        subprocess.run(command, cwd=tmp_path, check=True)
+        subprocess.run(["./example"], cwd=tmp_path, check=True, stdout=subprocess.DEVNULL)
+        checker = shutil.which("cppcheck")
+        assert checker, "no cppcheck was found. Install it: apt-get install cppcheck"
+        command = [checker, "-q", "--std=c99", "--enable=warning,style,performance,portability", "--error-exitcode=1"]
+        subprocess.run([*command, "--suppress=missingIncludeSystem", *sources], cwd=tmp_path, check=True)
+
+
+_SET = """#include "pi.h"
+#include <stdio.h>
+int main(void) {
+    pi one, other;
+    pi_init(&one);
+    pi_init(&other);
+    const bool set = pi_set(&one, PI_PARAMETER_PI_KP, 0u, 5.0);
+    const bool in = pi_set(&one, PI_INPUT_REFERENCE, 0u, 2.0);
+    const bool far = pi_set(&one, PI_INPUT_REFERENCE, 1u, 2.0);
+    const bool out = pi_set(&one, PI_OUTPUT_EFFORT, 0u, 2.0);
+    other.inputs.reference = 2.0;
+    const pi_status a = pi_tick(&one), b = pi_tick(&other);
+    pi saved = one;
+    one.inputs.level = 1.0 / 0.0;
+    const pi_status c = pi_tick(&one);
+    double effort = 0.0;
+    const bool got = pi_get(&one, PI_OUTPUT_EFFORT, 0u, &effort);
+    pi_tick(&saved);
+    printf("%d%d%d%d %d%d%d%d %g %g %g\\n", set, in, far, out, a, b, c, got, effort, other.outputs.effort,
+           saved.outputs.effort);
+    return 0;
+}
+"""
+
+
+@pytest.mark.slow
+def test_variables_by_name_instances_and_a_tick_that_fails(pi_spec, tmp_path):
+    """kp = 5 and error 2: 10, in the other instance 4; a number that isn't finite changes nothing; a copy goes on."""
+    for file, content in write_target(pi_spec).files.items():
+        (tmp_path / file).write_text(content, encoding="utf-8")
+    (tmp_path / "main.c").write_text(_SET)
+    subprocess.run(["gcc", "-std=c99", "-o", "main", "pi.c", "main.c", "-lm"], cwd=tmp_path, check=True)
+    said = subprocess.run(["./main"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+    assert said.split() == ["1100", "0011", "10", "4", "10.6"]
+
+
+def test_the_files_name_what_an_engineer_looks_for(tmp_path):
+    code = to_c(pi, tmp_path, number="float")
+    header, source, _, report = (file.read_text(encoding="utf-8") for file in code.files)
+    assert "PI controller of a level." in header
+    assert "#define PI_PERIOD 0.1f" in header
+    assert "pi_real reference;" in header
+    assert "pi_real pi_kp;" in header
+    assert "/* pi (PID) */" in source
+    for forbidden in ("malloc", "double ", "while (", "for ("):
+        assert forbidden not in source.partition("#include")[2]
+    assert "Tick 0: every 0.1 s" in report
+    assert "Not measured" in report
+    assert code.bytes_of["states"] == 4
+    assert code.ticks[0].inputs == ("reference", "level")
+
+
+REFUSED = {
+    "continuous": (
+        lambda: Diagram(
+            "loop", TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="lag")(Step(times=0.1, values=1.0))
+        ),
+        "lag",
+    ),
+    "no ticks": (lambda: Diagram("loop", Gain(gain=2.0, name="twice")(Step(times=0.1, values=1.0))), "loop"),
+}
+
+
+@pytest.mark.parametrize("reason", [*REFUSED])
+def test_what_cannot_be_on_a_target_is_named_before_anything_is_written(reason, tmp_path):
+    make, path = REFUSED[reason]
+    with pytest.raises(DefinitionError, match=rf"^{path}.*sample") as refused:
+        make().to_c(tmp_path / "out")
+    assert "sample_time=" in str(refused.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_options_that_do_not_fit_are_named(tmp_path):
+    with pytest.raises(OptionError, match="expected a C identifier, such as 'my_pi'"):
+        to_c(pi, tmp_path, name="my pi")
+    with pytest.raises(OptionError, match="Leave them out"):
+        to_c(pi, tmp_path, subsystem="pi")
+    code = to_c(pi, tmp_path)
+    with pytest.raises(OptionError, match="there is no input 'levle'. Did you mean 'level'"):
+        code.measure({"levle": 1.0})
+
+
+def test_a_bound_counts_each_instruction_and_each_call_once():
+    assembly = """
+\t.type\tinner,%function
+inner:
+\tadds\tr0, #1
+\tbx\tlr
+\t.size\tinner, .-inner
+\t.type\touter,%function
+outer:
+\tpush\t{r4, lr}
+\tbl\tinner
+\tbne\t.LBB1_2
+\tbl\tinner
+.LBB1_2:
+\tpop\t{r4, pc}
+\t.size\touter, .-outer
+\t.type\tlooping,%function
+looping:
+.LBB2_1:
+\tsubs\tr0, #1
+\tbne\t.LBB2_1
+\tbx\tlr
+\t.size\tlooping, .-looping
+"""
+    assert find_bound(assembly, "outer") == (5 + 2 * 2, "")
+    assert find_bound(assembly, "looping") == (None, "looping has a loop")
+    assert find_bound("\t.type\ta,%function\na:\n\tb\tsinf\n\t.size\ta, .-a\n", "a")[0] is None
