@@ -193,7 +193,7 @@ PUBLIC = {
     "loopwright": """
         Block Coupling Diagram Event Fmu Input LoopwrightError Output Requirements Run SimulationError State StepOptions
         __version__ analyse blocks build check_block diagrams disk_margin doctor experiments fig3 fmus frequency hold
-        margins parameter place read_description subsystem sweeps types
+        margins parameter place read_description subsystem sweeps to_c types
     """,
     "loopwright.blocks": """
         AdmittanceFilter And Backlash BandLimitedNoise Block Butterworth Chirp Circle Clock Compare Constant Counter
@@ -222,7 +222,7 @@ PUBLIC = {
         SampleTimeError Section ShapeError SimulationError SspFileError Table UnitError UnknownNameError
         UnwiredInputError WiringError analyse check_block confirm_sensitivity crossing_frequency experiments fig3 first_order_hold growth_rate passivity
         poles read_ssp rendered_admittance rendered_response rendered_system rule_of_thumb stability_limit stability_map
-        stiffness_limits subsystem target_admittance
+        stiffness_limits subsystem target_admittance to_c
     """,
     "loopwright.frequency": """
         Comparison ConfirmationError DiskMargin GainCrossover GangOfFour Margins MeasuredMargins Number NyquistCount
@@ -239,9 +239,9 @@ PUBLIC = {
         ContactMap ContactTrial CouplingReport Drawing FlatDiagram FmuDescription FmuDiagnosis FmuEnd FmuFault
         FmuFinding FmuInstance FmuLinearization FmuSeverity FmuState FmuTrial FmuVariable FmuVerdict Frame FreeMotion
         FreeMotions FrequencyResponse InexactDerivatives Kink Layout LinearDelays Linearization LiveRun MeanSlope Occurrence
-        OperatingPoint Passivity PassivityReason PortPassivity RefutedDerivatives Report Review RunConfirmation
+        OperatingPoint Passivity PassivityReason PortPassivity ProcessorMeasurement RefutedDerivatives Report Review RunConfirmation
         RunOptions RunState Sensitivities Sensitivity Signal Simulation SimulationView Snapshot SspDescription StabilityLimit
-        StabilityMap StepInfo StepResponse StepsOnly Stopped Subsystem SubsystemSettings TextSignal TrialMethod Unit Verdict WebPage
+        StabilityMap StepInfo StepResponse StepsOnly Stopped Subsystem SubsystemSettings TargetCode TargetMeasurement TextSignal TickFacts TrialMethod Unit Verdict WebPage
         Wire WorstCase ZeroSlope
     """,
 }

@@ -246,9 +246,7 @@ class Instant:
         t, state, columns, p = self._arguments(path, inputs)
         if path in self.layout.apart:
             return self._call_apart(path, names, state, columns)
-        made = call_block(
-            self.functions.of(path, names), [t, state, *columns, p], inlined=self.functions.inlined
-        )
+        made = call_block(self.functions.of(path, names), [t, state, *columns, p], inlined=self.functions.inlined)
         return [m if isinstance(m, Cells) or m.is_dense() else ca.densify(m) for m in made]
 
     def _arguments(self, path: str, inputs: dict[str, Any]) -> tuple[Any, Any, list[Any], Any]:
