@@ -12,6 +12,7 @@ from typing import Literal
 import casadi as ca
 import numpy as np
 
+from ...blocks.core import explain_calls
 from .elementary_tables import FUNCTIONS, prepare_functions
 from .loop_spec import Placed
 from .model import Variable
@@ -23,6 +24,7 @@ _WIDTH = 110
 _WORDS = """auto break case char const continue default do double else enum extern float for goto if inline int long
 register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while bool true
 false complex imaginary I NULL errno signgam main t c"""
+_FUNCTION = re.compile(r"^static [^\n;=]*\b(lw_\w+)\([^\n]*\) \{(?:[^\n]*\}|\n.*?^\})\n", re.MULTILINE | re.DOTALL)
 _KEYWORDS = frozenset(_WORDS.split())
 _GROUPS = ("parameters", "numbers", "inputs", "outputs", "signals", "states")
 _KIND = {"inputs": "input", "outputs": "output", "signals": "signal", "parameters": "parameter"}
@@ -75,6 +77,7 @@ class Member:
         return f"{self.name}[{self.count}]" if self.variable.shape else self.name
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class TickFacts:
     """What a kind of tick touches.
@@ -726,6 +729,7 @@ class _Writer:
             r"\b0x[0-9a-f.]+p[+-]?\d+\b", lambda found: repr(float.fromhex(found[0])), text
         )  # the same number
         text = re.sub(r"\b(INFINITY|NAN)\b", r"(double)\1", text)  # they are of single precision in C
+        text = _leave_out_unused(text, [f"lw_{f}" for f in called])
         found = ["/* ---- elementary functions, with the same bits on every platform ---- */", "", text]
         for function in called if self.single else ():
             names = ("x", "y") if function == "pow" else ("x",)
@@ -950,6 +954,18 @@ class _Writer:
             "",
         ]
         return "\n".join(lines)
+
+
+def _leave_out_unused(text: str, wanted: Sequence[str]) -> str:
+    """Return C text without functions that neither the wanted ones nor others call."""
+    while True:
+        for found in _FUNCTION.finditer(text):
+            name = found[1]
+            if name not in wanted and len(re.findall(rf"\b{name}\b", text)) == 1:
+                text = text[: found.start()] + text[found.end() :]
+                break
+        else:
+            return text
 
 
 def _distinct(name: str, taken: set[str]) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import explain_disk_errors, write_text
+from ...blocks.core import explain_calls, explain_disk_errors, write_text
 from .target_code import Number, TargetText, TickFacts, write_target
 from .target_measure import PROCESSORS, ProcessorMeasurement, measure, run_here
 from .target_spec import TargetSpec
@@ -18,6 +18,7 @@ _HELD = 200
 """Ticks that are counted where no test signal is given: the start values of the inputs are held."""
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class TargetMeasurement:
     """C for a target, measured with a test signal.
@@ -40,6 +41,7 @@ class TargetMeasurement:
     missing: tuple[str, ...]
 
 
+@explain_calls
 class TargetCode:
     """C for a target: one header and one source, an example, and a report.
 

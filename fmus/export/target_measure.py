@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import CompilerError, OptionError, near
+from ...blocks.core import CompilerError, OptionError, explain_calls, near
 from ..platform import cache_folder, native_platform
 from ..toolchain import SUFFIXES
 from .compiler import compile_shared, describe_compiler, find_compiler, run_compiler
@@ -53,6 +53,7 @@ erf"""
 _OTHERS = "pow fmod remainder copysign fmin fmax atan2 hypot"
 
 
+@explain_calls
 @dataclass(frozen=True, eq=False)
 class ProcessorMeasurement:
     """Numbers of C for a target on one processor.

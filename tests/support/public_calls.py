@@ -395,6 +395,18 @@ def calls():
                 "title": "drive",
             },
         ),
+        "Diagram.to_c": lambda: (
+            sampled().to_c,
+            {
+                "folder": "/nowhere/c",
+                "name": "own",
+                "subsystem": None,
+                "outside": (),
+                "outputs": None,
+                "number": "double",
+                "own_functions": False,
+            },
+        ),
         "WebPage.save": lambda: (web_page().save, {"path": "/nowhere/page.html"}),
         "Simulation.run_realtime": lambda: (
             simulation().run_realtime,
