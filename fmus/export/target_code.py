@@ -978,6 +978,7 @@ def _distinct(name: str, taken: set[str]) -> str:
 
 
 def _sentence(text: str) -> str:
+    text = text.replace("*/", "* /")
     return text if not text or text.endswith(".") else f"{text}."
 
 

@@ -30,11 +30,12 @@ def pi_spec():
 
 
 def test_a_pi_controller_has_the_numbers_of_the_closed_form(pi_spec):
-    """After k ticks with the error 1 the integral has k steps of 0.1 s: u = kp + ki 0.1 k."""
-    found = run_here(write_target(pi_spec), {"reference": 1.0}, 20)["effort"]
-    np.testing.assert_allclose(found, 2.0 + 0.3 * np.arange(20), rtol=1e-14)
-    single = run_here(write_target(pi_spec, number="float"), {"reference": 1.0}, 20)["effort"]
-    np.testing.assert_allclose(single, 2.0 + 0.3 * np.arange(20), rtol=20 * EPS)
+    """After k ticks with the error e the integral has k steps of 0.1 s: u = (kp + ki 0.1 k) e."""
+    signal, expected = {"reference": 1.0, "level": 0.25}, 0.75 * (2.0 + 0.3 * np.arange(20))
+    found = run_here(write_target(pi_spec), signal, 20)["effort"]
+    np.testing.assert_allclose(found, expected, rtol=1e-14)
+    single = run_here(write_target(pi_spec, number="float"), signal, 20)["effort"]
+    np.testing.assert_allclose(single, expected, rtol=20 * EPS)
     assert np.any(single != found)
 
 
