@@ -327,7 +327,7 @@ def _fold(scalars: Scalars, operation: int, arguments: tuple[int, ...]) -> float
     values = [node.constant if node.operation == ca.OP_CONST else None for node in nodes]
     if operation in _EXACTLY and None not in values and values:
         with np.errstate(all="ignore"):
-            return float(_EXACTLY[operation](*map(np.float64, values)))  # type: ignore[arg-type]
+            return float(_EXACTLY[operation](*map(np.float64, values)))
     if operation == ca.OP_MUL and 1.0 in values:
         return arguments[1 - values.index(1.0)]
     if operation == ca.OP_DIV and values[1] == 1.0:

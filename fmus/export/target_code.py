@@ -227,10 +227,14 @@ class _Writer:
             return float(start["p"][entry]) if argument == 3 and entry not in free else None
 
         self.scalars = [scalars.folded(known) for scalars in self.scalars]
-        self.numbers = [
-            (one, scalars.folded(lambda _, entry, first=one.first: known(3, first + entry)))
-            for one, scalars in self.numbers
-        ]
+        numbers = []
+        for one, scalars in self.numbers:
+
+            def given(_: int, entry: int, first: int = one.first) -> float | None:
+                return known(3, first + entry)
+
+            numbers.append((one, scalars.folded(given)))
+        self.numbers = numbers
 
     def _choose_members(self) -> None:
         """Keep what is read or written: states that change, parameters that are used, all inputs and outputs."""
@@ -349,8 +353,12 @@ class _Writer:
             self._when(bits),
             tuple(subsystems),
             tuple(dict.fromkeys(tick.blocks)),
-            *(names.get(k, ()) for k in ("inputs", "parameters", "states", "next", "written")),
-            tick.operations,
+            inputs=names.get("inputs", ()),
+            parameters=names.get("parameters", ()),
+            read=names.get("states", ()),
+            states=names.get("next", ()),
+            outputs=names.get("written", ()),
+            operations=tick.operations,
         )
 
     def _when(self, bits: int) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import importlib
 import importlib.util
 import re
 import struct
@@ -308,9 +309,8 @@ def _functions(assembly: str) -> dict[str, list[str]]:
 
 class _Emulator:
     def __init__(self, elf: bytes, text: TargetText):
-        import unicorn
-        from unicorn import arm_const
-
+        unicorn: Any = importlib.import_module("unicorn")
+        arm_const: Any = importlib.import_module("unicorn.arm_const")
         self._arm = arm_const
         uc = unicorn.Uc(unicorn.UC_ARCH_ARM, unicorn.UC_MODE_THUMB)
         access = uc.reg_read(arm_const.UC_ARM_REG_C1_C0_2)
