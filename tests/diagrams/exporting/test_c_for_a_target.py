@@ -109,6 +109,8 @@ def test_compilers_and_cppcheck_have_nothing_to_say(name, number, tmp_path):
         command = [compiler, "-std=c99", "-O2", *warnings, "-o", "example", *sources, "-lm"]
         subprocess.run(command, cwd=tmp_path, check=True)
         subprocess.run(["./example"], cwd=tmp_path, check=True, stdout=subprocess.DEVNULL)
+        if own and name == "path_following":
+            continue  # half a minute, for functions that other diagrams call, too
         checker = shutil.which("cppcheck")
         assert checker, "no cppcheck was found. Install it: apt-get install cppcheck"
         command = [checker, "-q", "--std=c99", "--enable=warning,style,performance,portability", "--error-exitcode=1"]
