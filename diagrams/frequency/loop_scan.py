@@ -317,7 +317,7 @@ class LoopScan:
                     search, omega, L, dL = search.leave_smaller(self._response, omega, L, dL)
             h, shown = search.show(omega, L, dL)
             searched = 0
-            for k in np.flatnonzero(shown):
+            for k in np.flatnonzero(shown).tolist():
                 if k < searched:
                     continue
                 span = (float(omega[k]), float(omega[k + 1]))
