@@ -91,7 +91,7 @@ class TickFacts:
     inputs, parameters, read, states, outputs : tuple of str
         Names that it reads, and that it writes: states, outputs and signals.
     operations : Counter
-        Operations, each once: no loop of a tick depends on data.
+        Operations, each at most once, whatever the data.
     """
 
     when: str
@@ -457,7 +457,10 @@ class _Writer:
         if found is None:
             return self._constant(self.spec.start["p" if argument == 3 else "x"][entry])
         member, which = found
-        tick.touch("parameters" if member.group == "numbers" else member.group, member.variable.name)
+        if member.group == "numbers":
+            tick.touch("parameters", f"numbers of {member.variable.name}")
+        else:
+            tick.touch(member.group, member.variable.name)
         return member.access(which)
 
     def _call(self, function: str) -> str:

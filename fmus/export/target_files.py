@@ -160,7 +160,8 @@ def _report(code: TargetCode) -> Iterator[str]:
     yield f"Call {text.name}_tick() every {float(spec.base):g} s."
     functions = ", ".join(text.platform_functions)
     yield f"Functions of math.h: {functions or 'none'}."
-    yield "No memory is allocated; no loop of a tick depends on data, but the search in a table, of log2(length) steps."
+    yield "No memory is allocated. Nothing in a tick loops but the search in a table, of log2(length) steps, and what"
+    yield "elementary functions do inside, such as sine for angles above a million."
     yield ""
     yield "Memory in bytes"
     for group in ("parameters", "numbers", "inputs", "outputs", "signals", "states"):
