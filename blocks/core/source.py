@@ -50,6 +50,20 @@ class Source(Block):
         times = np.ravel(self.instants())
         return float(np.min(times[move_earlier(times) > t], initial=math.inf))
 
+    def changes(self) -> tuple[Array, Array]:
+        """Return the times at which the output, or its first entry, begins to change its level, and by how much.
+
+        They are none by default.
+        """
+        return np.zeros(0), np.zeros(0)
+
+    def own_step(self, t: float) -> float:
+        """Return the first change of level after t, or else the last one before; 0 without any."""
+        times, heights = (np.ravel(np.asarray(values, dtype=float)) for values in self.changes())
+        times, heights = times[heights != 0.0], heights[heights != 0.0]
+        after = np.flatnonzero(move_earlier(times) > t)
+        return float(heights[after[0] if after.size else -1]) if heights.size else 0.0
+
 
 class Constant(Source):
     """Constant number or array."""

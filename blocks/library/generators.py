@@ -162,6 +162,10 @@ class PulseTrain(Source):
         period, delay, duty = (read_time(v) or Fraction(repr(v)) for v in (self.period, self.delay, self.duty))
         return next_edge(t, self.period, self.delay, float(delay + duty * period))
 
+    def changes(self) -> tuple[Array, Array]:
+        """Return the first edge with the height."""
+        return np.array([self.delay]), np.array([self.amplitude])
+
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the pulses."""
         number, part, tolerance = period_of(t, self.period, self.delay)

@@ -78,6 +78,10 @@ class SmoothStep(Source):
         starts = np.atleast_1d(self.start_times)
         return np.concatenate([starts, starts + self.durations])
 
+    def changes(self) -> tuple[Array, Array]:
+        """Return the start of each step with its height."""
+        return np.atleast_1d(self.start_times), np.diff(self.levels)
+
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the sum of all steps."""
         levels, starts, durations = self.levels, np.atleast_1d(self.start_times), np.atleast_1d(self.durations)
@@ -115,6 +119,10 @@ class Step(Source):
         """Return the times of the steps."""
         return np.atleast_1d(self.times)
 
+    def changes(self) -> tuple[Array, Array]:
+        """Return the times of the steps with their heights."""
+        return np.atleast_1d(self.times), np.diff(np.atleast_1d(self.values), prepend=self.initial_value)
+
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the value at t."""
         y = self.initial_value + 0.0 * t
@@ -150,6 +158,10 @@ class Pulse(Source):
         """Return the times at which the flanks start and end."""
         first, last, rise = self.start_time, self.end_time, self.rise_time
         return np.array([first, first + rise, last - rise, last])
+
+    def changes(self) -> tuple[Array, Array]:
+        """Return the start of the rise with the height."""
+        return np.array([self.start_time]), np.array([self.amplitude])
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the pulse."""

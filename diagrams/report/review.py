@@ -31,7 +31,7 @@ from .points import STEP
 from .sections.contacts import ReportedContacts
 from .sections.injection import REFUTED
 from .sections.measured_loops import MEASURED, MeasuredLoop
-from .sections.step_responses import APART, key_of_step, unit_at
+from .sections.step_responses import APART, StepSize, key_of_step, unit_at
 from .sections.worst_case import MissingWorstCase, ReportedWorstCase
 from .stability import Stability, free_motions, why_unstable
 from .variant import Cut, Variant
@@ -399,6 +399,7 @@ def _step(
         if number is None:
             result = replace(result, detail=reason_of(absent, f"steps.{key}.{v.key}"))
         result = _with(state, result, None if number is None else (path, number))
+        result = replace(result, size=numbers.get(f"steps.{key}.{v.key}.size"))
         if (since := numbers.get(f"steps.{key}.{v.key}.diverges")) is not None:
             detail = f"from t = {since.value:.4g} s after the step, where it leaves the linear model's response"
             result = replace(result, verdict=Verdict.FAILED, reason=Reason.DIVERGES, detail=detail)
@@ -410,7 +411,8 @@ def _step(
                 size = f"± {cycle.value:.3g}{unit}"
                 detail = f"by {size} with a period of {period.value:.3g} s, in a record of {result.detail}"
                 result = replace(result, reason=Reason.OSCILLATES, detail=detail)
-        yield result if step.size is not None else _at_no_size(result, numbers, f"steps.{key}.{v.key}", name)
+        is_chosen = step.size is None and (result.size is None or result.size.confirmed_by == StepSize.CHOSEN)
+        yield _at_no_size(result, numbers, f"steps.{key}.{v.key}", name) if is_chosen else result
 
 
 def _at_no_size(result: RequirementResult, numbers: Mapping[str, Number], start: str, name: str) -> RequirementResult:

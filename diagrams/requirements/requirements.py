@@ -39,7 +39,8 @@ class StepLimits:
         Wire that responds to a step at ``input``; without it the loop's own answer at the wire, as the complementary
         sensitivity T.
     size : float, optional
-        Height of the step in the wire's unit; small without it, 1e-2 of 1 + the signal's size.
+        Height of the step in the wire's unit. Without it, that of the source's own step at an input that a `Step` or
+        another source that steps gives; else small, 1e-2 of 1 + the signal's size.
     length : float, optional
         Length of the run in s; without it some time constants of the slowest pole, and at least thrice the limits.
     **limits : float or (float, float)

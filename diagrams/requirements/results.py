@@ -41,6 +41,9 @@ class RequirementResult:
         Wires of a step from one to another, such as "wish → y"; empty of all other numbers.
     unit : str
         Unit of the limit: the number's, or where there is none that of the quantity; empty if neither says it.
+    size : Number, optional
+        Height of the step that the number belongs to; it says in its ``confirmed_by`` where that comes from. None of
+        all other numbers.
     words, where, title : str
         The quantity, the place and the variant in words, as a report names them; empty where no report does.
     """
@@ -57,6 +60,7 @@ class RequirementResult:
     detail: str = ""
     place: str = ""
     unit: str = ""
+    size: Number | None = None
     words: str = field(default="", repr=False, compare=False)
     where: str = field(default="", repr=False, compare=False)
     title: str = field(default="", repr=False, compare=False)
@@ -70,6 +74,15 @@ class RequirementResult:
         """The limit with its unit, such as "≥ 45°"."""
         unit = print_unit(self.unit) if self.unit else ""
         return f"{self.limit}{'' if unit in ('', '°') else ' '}{unit}"
+
+    @property
+    def step(self) -> str:
+        """The height of the step in words, such as "a step of 2 rad/s"; empty of all other numbers."""
+        if self.size is None:
+            return ""
+        unit = "" if self.size.unit == "1" else f" {print_unit(self.size.unit)}"
+        why = "" if self.size.confirmed_by == "given" else f", {self.size.confirmed_by}"
+        return f"a step of {self.size.value:.4g}{unit}{why}"
 
     @property
     def is_step(self) -> bool:
@@ -97,4 +110,6 @@ class RequirementResult:
             "value": math.nan if self.number is None else self.number.value,
             "detail": self.detail,
             "place": self.place,
+            "size": math.nan if self.size is None else self.size.value,
+            "size_from": "" if self.size is None else self.size.confirmed_by,
         }

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
 
 from ....blocks import Saturation
-from ....blocks.core import LoopwrightError, NonFiniteError, PeriodicLoopError
+from ....blocks.core import LoopwrightError, NonFiniteError, PeriodicLoopError, Source
 from ...flat import WiredDiagram
 from ...frequency import Confirmation, Number, realize
 from ...linearization import find_signal
@@ -149,6 +150,9 @@ def steps(case: Case) -> Section | None:
             got, slowest, quantized, diverges = ran
             where = f"{test.key}.{v.key}"
             own = _numbers(got, test, v, slowest) | _diverging(got, test, v, diverges)
+            if test.limits is not None:
+                port = ".".join(find_signal(v.diagram.flatten_like(v.point), test.wire).port)
+                own["size"] = Number(got.size, unit_at(v.diagram, port), 0.0, quantized.size.value, given=True)
             if not own["settled"].value and diverges is None:
                 own |= _oscillation(got, test, v)
             numbers |= {f"{where}.{name}": number for name, number in own.items()}
@@ -212,6 +216,17 @@ def steps(case: Case) -> Section | None:
     return Section("steps", TITLE, whole, tuple(tables), tuple(plots), numbers, overview=overview, absent=absent)
 
 
+class StepSize(StrEnum):
+    """Origin of a step's height; its value is in the JSON."""
+
+    GIVEN = "given"
+    """The requirement says it."""
+    SOURCE = "its source's own step"
+    """The wire comes from a source that steps, such as `Step`: the height of its step."""
+    CHOSEN = "chosen small"
+    """Nothing says it: it is small beside the signal, and large beside quanta."""
+
+
 @dataclass(frozen=True)
 class Quantized:
     """What the converters and encoders of a diagram have to do with a step.
@@ -226,12 +241,15 @@ class Quantized:
         Height that the step would have without converters; None where its height was given.
     oscillations : mapping of str to Number
         By converter, what is left of its input's motion at the end of the record, in quanta.
+    size : StepSize
+        Where the height comes from.
     """
 
     least: float = 0.0
     quantum: Quantum | None = None
     usual: float | None = None
     oscillations: Mapping[str, Number] = field(default_factory=dict)
+    size: StepSize = StepSize.CHOSEN
 
 
 def _said_of_quanta(
@@ -322,7 +340,7 @@ def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | 
     if limits is not None and limits.length is not None:
         length = limits.length
     diagram, point, usual = plan.variant.diagram, plan.variant.point, SIZE * plan.amplitude
-    given = None if limits is None else limits.size
+    given, chosen = _find_size(v, test)
     height, quantum = _least_step(diagram, point, test, length)
     size = max(usual, height) if given is None else given
     if limits is None or limits.length is None:
@@ -357,7 +375,19 @@ def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | 
         got = _small_response(got, respond, height)
     kept = sum(len(find_signal(diagram.flatten_like(point), name).labels) for name in outputs)
     got, left = _without_converters(got, converters, plan.variant, kept)
-    return got, slowest, Quantized(height, quantum, usual if given is None else None, left), diverges
+    return got, slowest, Quantized(height, quantum, usual if given is None else None, left, chosen), diverges
+
+
+def _find_size(v: Variant, test: StepTest) -> tuple[float | None, StepSize]:
+    """Return the height of a required step with its origin; None where it is to be chosen."""
+    if test.limits is None:
+        return None, StepSize.CHOSEN
+    if test.limits.size is not None:
+        return test.limits.size, StepSize.GIVEN
+    signal = find_signal(v.diagram.flatten_like(v.point), test.wire)
+    source = v.diagram.blocks[signal.port[0]]
+    own = source.own_step(v.point.t) if isinstance(source, Source) and signal.entries == (0,) else 0.0
+    return (own, StepSize.SOURCE) if own else (None, StepSize.CHOSEN)
 
 
 def _grows_on(
