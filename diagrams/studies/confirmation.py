@@ -46,6 +46,10 @@ GROWTH_AGREEMENT = 0.1
 MARGIN_AGREEMENT = 1e-2
 """Relative difference of a measured number that confirms a margin."""
 
+LARGER = (2.0, 4.0, 8.0)
+"""Factors on a sine of the least size beside quanta, where its measurement is uncertain."""
+SAME_MARGIN = 1e-3
+"""Relative difference up to which a crossing has the margin that is confirmed; a measurement is judged by more."""
 MOST_UNCERTAIN = 1e-2
 """Relative uncertainty of a measurement above which it confirms nothing."""
 
@@ -99,7 +103,9 @@ class RunConfirmation:
     def trial(self) -> str:
         """The trial in words: its kind, place and values."""
         at = "" if math.isnan(self.omega) else f" at {self.omega:.6g} rad/s"
-        return f"{self.kind.value} at {self.wire!r}{at}: predicted {self.predicted:.6g}, measured {self.measured:.6g}"
+        off = f", uncertain by {100.0 * self.uncertainty:.2g} %" if self.uncertainty >= MOST_UNCERTAIN else ""
+        said = f"predicted {self.predicted:.6g}, measured {self.measured:.6g}{off}"
+        return f"{self.kind.value} at {self.wire!r}{at}: {said}"
 
     def __str__(self) -> str:
         return f"{'confirmed' if self.agrees else 'NOT confirmed'} by {self.trial}"
@@ -154,10 +160,19 @@ def _measure_margin(
     """
     L, wire = model.loop(*case.loop), case.loop[0]
     omega = _deciding_frequency(L, case.quantity, case.value, diagram.name)
+    larger: tuple[float, ...] = ()
     if amplitude is None:
         least = find_least_sine(diagram, model.point, wire, L, np.array([omega]))
         amplitude = max(_size_at(model, wire), 0.0 if least is None else least[0])
+        larger = () if least is None else LARGER
     response = frequency_response(diagram, wire, [omega], amplitude=amplitude, at=model.point)
+    for factor in larger:  # quanta of several converters add up
+        if float(response.uncertainty[0]) < MOST_UNCERTAIN:
+            break
+        try:
+            response = frequency_response(diagram, wire, [omega], amplitude=factor * amplitude, at=model.point)
+        except LoopwrightError:  # beyond the diagram's range
+            break
     measured = np.asarray(response.L.frdata)[:, :, 0]
     here = float(response.omega[0])
     predicted = np.asarray(L(np.exp(1j * here * L.dt) if L.dt else 1j * here)).reshape(measured.shape)
@@ -185,9 +200,9 @@ def _deciding_frequency(L: Any, quantity: str, value: float, name: str) -> float
     if quantity == "bandwidth":
         return _inside(found.bandwidth.value, L, name)
     if quantity in ("gain_margin_low", "gain_margin_high"):
-        near = [c.frequency.value for c in found.phase_crossovers if c.gain_margin.value == value]
+        near = _nearest(((c.frequency.value, c.gain_margin.value) for c in found.phase_crossovers), value)
     elif quantity == "phase_margin_deg":
-        near = [c.frequency.value for c in found.gain_crossovers if abs(c.phase_margin_deg.value) == value]
+        near = _nearest(((c.frequency.value, abs(c.phase_margin_deg.value)) for c in found.gain_crossovers), value)
     else:
         lag = found.delay_margin_s.value
         near = [
@@ -196,6 +211,15 @@ def _deciding_frequency(L: Any, quantity: str, value: float, name: str) -> float
             if abs(np.radians(c.phase_margin_deg.value) % (2 * np.pi) / c.frequency.value - lag) <= 1e-9 * lag
         ]
     return _inside(near[0] if near else math.nan, L, name)
+
+
+def _nearest(crossings: Iterable[tuple[float, float]], value: float) -> list[float]:
+    """Return the frequency of the crossing whose margin is nearest to a value; none where they all are another margin.
+
+    The value comes from another model of the same diagram: its sources moved, or its loop came from matrices alone.
+    """
+    found = sorted((abs(margin - value), omega) for omega, margin in crossings)
+    return [omega for off, omega in found[:1] if off <= SAME_MARGIN * abs(value)]
 
 
 def _inside(omega: float, L: Any, name: str) -> float:
