@@ -90,9 +90,8 @@ def _rate(state: Variable) -> Variable:
 
 def _settings(spec: ModelSpec) -> list[tuple[Kind, Variable, str]]:
     """Return the parameters of the FMU's own integrator."""
-    step = Variable(
-        "v", "parameter", "tunable", description=_STEP_DESCRIPTION, start=spec.internal_step, unit="s", minimum=0.0
-    )
+    described = _STEP_DESCRIPTION + spec.step_note
+    step = Variable("v", "parameter", "tunable", description=described, start=spec.internal_step, unit="s", minimum=0.0)
     integrator = Variable(
         *("v", "parameter", "fixed"),
         description=_INTEGRATOR_DESCRIPTION,

@@ -24,6 +24,7 @@ from ...blocks.core import (
 from ...blocks.tracing import GUARDS, NEXT, Traced, constants_of, trace, traced_parameters
 from ..exported_models import make_exported
 from .html_page import block_text
+from .internal_step import choose_internal_step, compare_internal_step
 from .model import EventSpec, Integrator, ModelSpec, Variable
 from .package import build_fmu
 
@@ -196,8 +197,12 @@ def build(
     name : str, optional
         Name of the model; without it, the class name in lower case, or the name of the diagram or subsystem.
     internal_step : float, optional
-        Of a block: start value, in s, of the FMU's parameter ``internal_step``, 1e-3 without it: the longest step of
-        its Runge-Kutta integrator of order 4. The adaptive integrators choose their steps.
+        Of a block: start value, in s, of the FMU's parameter ``internal_step``: the longest step of its Runge-Kutta
+        integrator of order 4. The adaptive integrators choose their steps. Without it and ``integrator``, it is at
+        most 1e-3 and a tenth of the time constant of the fastest mode at the start values, which leaves an error of
+        8e-7 of that mode in each of its time constants. A model that needs steps below 1e-5 gets the integrator
+        "rodas". A step that is given and longer than half that time constant is a warning, and the FMU says so, too,
+        when it is initialized with such parameters.
     integrator : {"rk4", "dopri5", "rodas"}, optional
         Of a block: start value of the FMU's parameter ``integrator``, for co-simulation: explicit with a fixed step,
         explicit with an adaptive one, or implicit for stiff models.
@@ -280,6 +285,8 @@ def build(
         integrator=integrator or "rk4",
         tolerance=1e-8 if tolerance is None else tolerance,
     )
+    is_chosen = internal_step is None and integrator is None
+    spec = choose_internal_step(spec) if is_chosen else compare_internal_step(spec)
     text = block_text(block) if documentation is None else documentation
     return build_fmu(spec, out, fmi=fmi, arrays=arrays, platform=platform, documentation=text, notify=notify)
 

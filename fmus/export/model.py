@@ -230,6 +230,8 @@ class ModelSpec:
         explicit, adaptive, order 5(4); implicit, adaptive, order 4(3), for stiff models.
     tolerance : float
         Start value of the parameter ``tolerance`` of the adaptive integrators: relative; times ``nominal``, absolute.
+    step_note : str
+        End of the description of the parameter ``internal_step``.
     """
 
     name: str
@@ -248,6 +250,7 @@ class ModelSpec:
     jump: ca.Function | None = None
     integrator: Integrator = "rk4"
     tolerance: float = 1e-8
+    step_note: str = ""
 
     def __repr__(self) -> str:
         facts = f"{len(self.states)} states", f"{len(self.inputs)} inputs", f"{len(self.outputs)} outputs"

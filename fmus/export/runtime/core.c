@@ -489,11 +489,49 @@ static inline void lw_suggest_tolerance(lw_instance *self, double tolerance) {
 static bool lw_start_domains(lw_instance *self);
 #endif
 
+#if LW_HAS_DERIVATIVES && LW_N_X
+#define LW_COARSE 0.5      /* steps of rk4 in time constants of the fastest mode: above, it is off by 5e-4 of that mode in each */
+#define LW_ITERATIONS 64   /* of the power method, whose growth in the second half is the size of the largest eigenvalue */
+
+/* Warn if rk4's step is coarse beside the fastest mode at the values of the instance. */
+static void lw_compare_step(lw_instance *self) {
+    const double *v = self->s.values;
+    LW_SCRATCH(x);
+    LW_SCRATCH(stage);
+    double growth = 0.0;
+    if (self->s.model_exchange || v[LW_INTEGRATOR] != LW_RK4) return;
+    self->arg[0] = v;
+    self->arg[1] = v + LW_X;
+    self->arg[2] = v + LW_U;
+    self->arg[3] = v + LW_P;
+    self->res[0] = self->jacobian;
+    self->res[1] = self->slope;
+    if (lw_jacobian(self->arg, self->res, self->iw, self->w, 0) || !lw_are_finite(self->jacobian, LW_N_J)) return;
+    for (int i = 0; i < LW_N_X; i++) x[i] = 1.0 + 0.37 * ((i * 7) % 11);
+    for (int k = 0; k < LW_ITERATIONS; k++) {
+        double size = 0.0;
+        for (int i = 0; i < LW_N_X; i++) stage[i] = 0.0;
+        for (int j = 0; j < LW_N_J; j++) stage[lw_jacobian_rows[j]] += self->jacobian[j] * x[lw_jacobian_columns[j]];
+        for (int i = 0; i < LW_N_X; i++) size = fmax(size, fabs(stage[i]));
+        if (!(size > 0.0) || !isfinite(size)) return;
+        for (int i = 0; i < LW_N_X; i++) x[i] = stage[i] / size;
+        if (k >= LW_ITERATIONS / 2) growth += log(size);
+    }
+    const double fastest = exp(growth / (LW_ITERATIONS / 2));
+    if (fastest * v[LW_STEP] > LW_COARSE)
+        lw_warn(self, "internal_step = %.3g s is coarse beside the fastest mode at t = %.9g s, about %.2g 1/s: set it to %.1g s, or "
+                "integrator = 3.", v[LW_STEP], v[0], fastest, 0.1 / fastest);
+}
+#endif
+
 /* Enter `next`: Step Mode, or Event Mode if it is used. */
 static inline bool lw_start(lw_instance *self, const char *function, lw_mode next) {
     if (!lw_in_mode(self, function, LW_INITIALIZING) || !lw_update_outputs(self)) return false;
 #if LW_N_Z
     if (!lw_start_domains(self)) return false;
+#endif
+#if LW_HAS_DERIVATIVES && LW_N_X
+    lw_compare_step(self);
 #endif
     self->s.mode = next;
     return true;

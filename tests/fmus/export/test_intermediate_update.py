@@ -287,8 +287,9 @@ def test_what_is_refused_ends_the_step(msd, instance, act, message):
     importer.act = lambda item, t: act(item, t) if t > 1.25 else item.__setitem__("force", 9.0)
     with pytest.raises(fmpy.fmi1.FMICallException):
         item.step(1.0, 1.0)
-    assert [text for _, _, text in item.log if message in text], item.log
-    assert len(item.log) == 1
+    told = [text for _, _, text in item.log if "is coarse beside the fastest mode" not in text]
+    assert [text for text in told if message in text], item.log
+    assert len(told) == 1
     assert importer.times[-1] == 1.5
     assert [item[name] for name in item.references] == before
     fails(item, lambda: item.step(1.0, 1.0), "called in state Terminated")
