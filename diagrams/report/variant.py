@@ -178,9 +178,10 @@ class Variant:
             L = self.loop_ahead(wire, inputs)
             if is_zero(L):
                 return None
-            return margins(L).numbers().get(name, Number(math.nan, "1", 0.0, ""))
+            numbers: Mapping[str, Number] = margins(L).numbers()
         except LoopwrightError:
             return Number(math.nan, "1", 0.0, "")
+        return numbers.get(name, Number(math.nan, "1", 0.0, ""))
 
     def fullest_loop(self, wire: str) -> tuple[Cut, str, Any]:
         """Return the cut that leaves the most closed at one rate, its title, and the loop transfer function.

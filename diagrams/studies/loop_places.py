@@ -111,7 +111,7 @@ def place_loops(
     loops: str | Iterable[str] | None,
     requirements: Requirements | None,
     to: str | Iterable[str] | None = None,
-) -> tuple[WiredDiagram, list[str], Requirements | None, Mapping[str, OtherCuts]]:
+) -> tuple[WiredDiagram, list[str], Requirements | None, dict[str, OtherCuts]]:
     """Return a diagram with loops at wires, and requirements on them, in which the places of these loops have names.
 
     The last entry has the other cuts of each loop by its name, where several blocks may be the plant.
