@@ -160,8 +160,9 @@ def make_page(
     flat = wired.flatten(step)
     columns = Columns(flat, wired.name)
     shown = plots_of(columns, plots)
-    for name in (*(scene.signals if scene else ()), *flat.table.names):
+    for name in scene.signals if scene else ():
         columns.add(name)
+    columns.add_wires()
     groups = [("Inputs" if tuned else "", moved), ("Parameters", tuned)]
     targets = [slider.target for _, group in groups for slider in group]
     targets += [target for target, _ in scene.moved.values()] if scene else []

@@ -61,6 +61,18 @@ class Columns:
         names = [name] if not places.ndim else [f"{name}[{_number(i)}]" for i in np.ndindex(places.shape)]
         return [self._add(each, int(place)) for each, place in zip(names, places.ravel(), strict=True)]
 
+    def add_wires(self) -> None:
+        """Append the named wires that no column has yet, under whatever name."""
+        known = {(column.block, column.port, column.entry) for column in self.found}
+        for name in self.flat.table.names:
+            columns = len(self.found)
+            for i in self.add(name):
+                one = self.found[i]
+                if i >= columns and (one.block, one.port, one.entry) in known:
+                    del self.found[columns:]
+                    break
+            known |= {(column.block, column.port, column.entry) for column in self.found[columns:]}
+
     def _add(self, name: str, place: int) -> int:
         port = next(p for p, where in self.flat.log.slices.items() if where.start <= place < where.stop)
         block, output = self.flat.ports[port]

@@ -103,6 +103,8 @@ def test_plots_and_sliders_have_names_units_and_ranges():
     names = [[data["columns"][i]["name"] for i in plot["curves"]] for plot in data["plots"]]
     assert names == [["speed", "target"], ["voltage"], ["motor.current"]]
     assert [plot["unit"] for plot in data["plots"]] == ["rad/s", "", "A"]
+    columns = ["speed", "target", "voltage", "motor.current", "slow_filter.smooth"]  # each signal once
+    assert [column["name"] for column in data["columns"]] == columns
     inputs, parameters = data["groups"]
     assert [(s["label"], s["low"], s["high"], s["value"], s["unit"]) for s in inputs["sliders"]] == [
         ("target", -200.0, 200.0, 0.0, "rad/s"),
