@@ -22,14 +22,16 @@ def shape_of(value: Array) -> Shape:
     return tuple(getattr(value, "shape", ()))
 
 
-def describe_shape(shape: tuple[int, ...]) -> str:
-    """Return a shape in words, for messages.
+def describe_shape(shape: tuple[int, ...] | None) -> str:
+    """Return a shape in words, for messages; None is any one.
 
     Examples
     --------
     >>> describe_shape(()), describe_shape((2,))
     ('a scalar', '(2,)')
     """
+    if shape is None:
+        return "any shape"
     return str(shape) if shape else "a scalar"
 
 
