@@ -370,6 +370,8 @@ def run_validate(arguments: argparse.Namespace) -> int:
         say(f"checked: {'; '.join(report.done)}")
     for line in report.left:
         say(f"not checked: {line}")
+    if report.problems:
+        say(f"These are departures from the standard. Whether it runs here all the same: loopwright doctor {path}")
     return 1 if report.problems else 0
 
 

@@ -603,6 +603,7 @@ def problems(file, capsys, *options):
     assert len([line for line in lines if line.startswith("     Next: ")]) == len(found)
     count = {0: "clean", 1: "1 problem"}.get(len(found), f"{len(found)} problems")
     assert lines[0] == f"{file}: {count}"
+    assert lines[-1].endswith(f"all the same: loopwright doctor {file}") == bool(found)
     return found
 
 
