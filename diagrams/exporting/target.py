@@ -104,7 +104,7 @@ def to_c(
     >>> [file.name for file in code.files]
     ['controller.h', 'controller.c', 'controller_example.c', 'controller_report.txt']
     >>> code.bytes_of["struct"]
-    56
+    64
     """
     opened, about = _open(model, name, subsystem, outside, outputs)
     spec = target_spec(opened, name=opened.wired.name, description=about)
