@@ -74,7 +74,7 @@ class WaysBack:
 
 def find_ways_back(flat: FlatDiagram, port: Port) -> WaysBack:
     """Return the consumers of a port that lead back to it, those of the controller itself apart."""
-    search = _Search(flat, port)
+    search = _WaysFrom(flat, port)
     every = search.consumers(port)
     entries = search.entries(port)
     declared = [to for to in entries if _is_declared(flat, to)]
@@ -109,7 +109,7 @@ def find_ways_back(flat: FlatDiagram, port: Port) -> WaysBack:
     return WaysBack(cut.to, left, cut.port, tuple(one for one in found if one != cut))
 
 
-class _Search:
+class _WaysFrom:
     """The ways from a port back to it."""
 
     def __init__(self, flat: FlatDiagram, port: Port):

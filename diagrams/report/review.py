@@ -19,6 +19,7 @@ from ..requirements import (
     Requirements,
     Review,
     StepLimits,
+    StepSize,
     Verdict,
     is_doubtful,
     judge,
@@ -31,7 +32,7 @@ from .points import STEP
 from .sections.contacts import ReportedContacts
 from .sections.injection import REFUTED
 from .sections.measured_loops import MEASURED, MeasuredLoop
-from .sections.step_responses import APART, StepSize, key_of_step, unit_at
+from .sections.step_responses import APART, key_of_step, unit_at
 from .sections.worst_case import MissingWorstCase, ReportedWorstCase
 from .stability import Stability, free_motions, why_unstable
 from .variant import Cut, Variant

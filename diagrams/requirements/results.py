@@ -4,11 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Any
 
 from ...blocks.core import print_unit
 from ..frequency import Number
 from .number_limits import Limit, Reason, Verdict, unit_of
+
+
+class StepSize(StrEnum):
+    """Origin of a step's height; its value is in the JSON."""
+
+    GIVEN = "given"
+    """The requirement says it."""
+    SOURCE = "its source's own step"
+    """The wire comes from a source that steps, such as `Step`: the height of its step."""
+    CHOSEN = "chosen small"
+    """Nothing says it: it is small beside the signal, and large beside quanta."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +93,7 @@ class RequirementResult:
         if self.size is None:
             return ""
         unit = "" if self.size.unit == "1" else f" {print_unit(self.size.unit)}"
-        why = "" if self.size.confirmed_by == "given" else f", {self.size.confirmed_by}"
+        why = "" if self.size.confirmed_by == StepSize.GIVEN else f", {self.size.confirmed_by}"
         return f"a step of {self.size.value:.4g}{unit}{why}"
 
     @property

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from ...measure import (
     remaining_oscillation,
     step_response,
 )
-from ...requirements import STEP_UNITS, StepLimits
+from ...requirements import STEP_UNITS, StepLimits, StepSize
 from ...results import OperatingPoint, is_at_rest, measure_step
 from .. import figures
 from ..case import Case
@@ -214,17 +213,6 @@ def steps(case: Case) -> Section | None:
     overview = tuple(plot for test, curves in found.items() for plot in _overview(case, test, curves))
     whole = (*TEXTS.paragraphs("responses"), *dict.fromkeys(text))
     return Section("steps", TITLE, whole, tuple(tables), tuple(plots), numbers, overview=overview, absent=absent)
-
-
-class StepSize(StrEnum):
-    """Origin of a step's height; its value is in the JSON."""
-
-    GIVEN = "given"
-    """The requirement says it."""
-    SOURCE = "its source's own step"
-    """The wire comes from a source that steps, such as `Step`: the height of its step."""
-    CHOSEN = "chosen small"
-    """Nothing says it: it is small beside the signal, and large beside quanta."""
 
 
 @dataclass(frozen=True)
