@@ -40,7 +40,9 @@ ALLOWED = {
     "fmus/export/c_code.py": {"int "},  # in the C code that CasADi writes
     "fmus/export/compiler.py": {"windows"},  # the end of a platform's name
     "fmus/toolchain.py": {"windows"},  # the end of a platform's name
-    "fmus/export/inlined.py": {'^#include "(.*)"$', "#define LW_N_Z 0\n"},  # C code of our own
+    "fmus/export/inlined.py": {"#define LW_N_Z 0\n"},  # C code of our own
+    "fmus/export/own_sources.py": {'^#include "(.*)"$'},  # C code of our own
+    "fmus/export/target_measure.py": {r"undefined symbol: (\w+)", "bkpt"},  # a linker's output; an instruction
     "fmus/export/python_slave.py": {"linux"},  # sys.platform
 }
 """Literals that may be searched for, by file: the texts are not for people, or foreign code gives nothing else."""

@@ -124,6 +124,8 @@ HANDED_ON = {
     "experiments.path_following": (lambda: (experiments.path_following, {}), "delay"),
     "experiments.compliance": (lambda: (experiments.compliance, {}), "delay"),
     "experiments.hand_guiding": (lambda: (experiments.hand_guiding, {}), "delay"),
+    "experiments.hand_page": (lambda: (experiments.hand_page, {}), "delay"),
+    "experiments.guided_by_hand": (lambda: (experiments.guided_by_hand, {}), "delay"),
     "experiments.force_tracking": (lambda: (experiments.force_tracking, {}), "cubic delay"),
     "crossing_frequency": (GOOD["crossing_frequency"], "stiffness damping"),
     "growth_rate": (GOOD["growth_rate"], "stiffness damping"),

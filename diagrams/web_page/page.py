@@ -20,7 +20,7 @@ from ..drawing import Facts, draw
 from ..flat import Target, WiredDiagram
 from ..wiring import Wire
 from .module import make_module
-from .shown_signals import Columns, PlotNames, plots_of
+from .shown_signals import PlotNames, ShownColumns, plots_of
 from .sliders import Slider, default_sources, find_sliders, place_of
 
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
@@ -158,7 +158,7 @@ def make_page(
     moved = find_sliders(wired, inputs, "inputs") if inputs is not None else default_sources(wired)
     tuned = find_sliders(wired, sliders, "sliders") if sliders is not None else []
     flat = wired.flatten(step)
-    columns = Columns(flat, wired.name)
+    columns = ShownColumns(flat, wired.name)
     shown = plots_of(columns, plots)
     for name in scene.signals if scene else ():
         columns.add(name)

@@ -19,7 +19,7 @@ _MOST_CURVES, _MOST_PLOTS = 4, 6
 
 
 @dataclass(frozen=True)
-class Column:
+class ShownColumn:
     """An entry of a signal, which every sample has.
 
     Attributes
@@ -40,12 +40,12 @@ class Column:
 
 
 @dataclass
-class Columns:
+class ShownColumns:
     """The columns of a page's samples, in the order in which they were asked for."""
 
     flat: FlatDiagram
     name: str
-    found: list[Column] = field(default_factory=list)
+    found: list[ShownColumn] = field(default_factory=list)
 
     def add(self, name: str) -> list[int]:
         """Return the numbers of the columns of a signal; new ones are appended.
@@ -83,7 +83,7 @@ class Columns:
         unit: Any = self.flat.checked.units.get((block, output))
         if isinstance(unit, tuple):
             unit = unit[entry] if entry < len(unit) else None
-        self.found.append(Column(name, "" if unit in (None, "1") else str(unit), block, output, entry))
+        self.found.append(ShownColumn(name, "" if unit in (None, "1") else str(unit), block, output, entry))
         return len(self.found) - 1
 
 
@@ -91,7 +91,7 @@ def _number(index: tuple[int, ...]) -> str:
     return ",".join(str(i + 1) for i in index)
 
 
-def plots_of(columns: Columns, plots: PlotNames | None) -> list[dict[str, Any]]:
+def plots_of(columns: ShownColumns, plots: PlotNames | None) -> list[dict[str, Any]]:
     """Return the plots of a page: the unit and the columns of each.
 
     Without a choice the named wires are drawn, those of one unit together; where there are none, outputs of blocks.
@@ -119,7 +119,7 @@ def plots_of(columns: Columns, plots: PlotNames | None) -> list[dict[str, Any]]:
     return made
 
 
-def _default_plots(columns: Columns) -> list[dict[str, Any]]:
+def _default_plots(columns: ShownColumns) -> list[dict[str, Any]]:
     table = columns.flat.table
     names = list(table.names)
     if not names:

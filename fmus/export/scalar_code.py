@@ -74,7 +74,7 @@ CHOOSE = -3
 
 
 @dataclass(frozen=True)
-class Node:
+class ScalarNode:
     """A value.
 
     Attributes
@@ -173,13 +173,13 @@ class Scalars:
 
     Attributes
     ----------
-    nodes : list of Node
+    nodes : list of ScalarNode
         All values.
     results : list of list of int
         By result of the function: the nodes of its entries.
     """
 
-    nodes: list[Node] = field(default_factory=list)
+    nodes: list[ScalarNode] = field(default_factory=list)
     results: list[list[int]] = field(default_factory=list)
 
     @classmethod
@@ -187,10 +187,10 @@ class Scalars:
         """Read the operations of a function; its last arguments and results are those of lookups."""
         found = cls(results=[[-1] * function.numel_out(i) for i in range(function.n_out())])
         ordinary = function.n_in() - len(lookups)
-        known: dict[Node, int] = {}
+        known: dict[ScalarNode, int] = {}
         waiting: list[tuple[int, int, int]] = []  # node, lookup, entry
 
-        def add(node: Node) -> int:
+        def add(node: ScalarNode) -> int:
             if node.operation >= 0 and node in known:
                 return known[node]
             found.nodes.append(node)
@@ -207,25 +207,25 @@ class Scalars:
             elif operation == ca.OP_INPUT and read[0] >= ordinary:
                 place = (read[0], read[1])
                 if place not in inputs:
-                    found.nodes.append(Node(lookups[read[0] - ordinary].kind))
+                    found.nodes.append(ScalarNode(lookups[read[0] - ordinary].kind))
                     inputs[place] = len(found.nodes) - 1
                     waiting.append((inputs[place], read[0] - ordinary, read[1]))
                 work[written[0]] = inputs[place]
             elif operation == ca.OP_INPUT:
-                work[written[0]] = add(Node(operation, place=(read[0], read[1])))
+                work[written[0]] = add(ScalarNode(operation, place=(read[0], read[1])))
             elif operation == ca.OP_CONST:
                 value = float(function.instruction_constant(k))
-                work[written[0]] = add(Node(operation, constant=value, place=(0, int(np.signbit(value)))))
+                work[written[0]] = add(ScalarNode(operation, constant=value, place=(0, int(np.signbit(value)))))
             else:
-                work[written[0]] = add(Node(operation, tuple(work[i] for i in read)))
+                work[written[0]] = add(ScalarNode(operation, tuple(work[i] for i in read)))
         for i, row in enumerate(found.results):  # zeros of the sparsity are no instructions
-            found.results[i] = [add(Node(ca.OP_CONST)) if node < 0 else node for node in row]
+            found.results[i] = [add(ScalarNode(ca.OP_CONST)) if node < 0 else node for node in row]
         first = function.n_out() - len(lookups)
         for node, which, entry in waiting:
             sought = found.results[first + which]
             number = tables.add(lookups[which])
             argument = sought[entry] if len(sought) > 1 else sought[0]
-            found.nodes[node] = Node(lookups[which].kind, (argument,), place=(number, 0))
+            found.nodes[node] = ScalarNode(lookups[which].kind, (argument,), place=(number, 0))
         del found.results[first:]
         return found
 
@@ -239,16 +239,16 @@ class Scalars:
         """
         found = Scalars()
         new: dict[int, int] = {}
-        nodes: dict[Node, int] = {}
+        nodes: dict[ScalarNode, int] = {}
 
-        def add(node: Node) -> int:
+        def add(node: ScalarNode) -> int:
             if node not in nodes:
                 found.nodes.append(node)
                 nodes[node] = len(found.nodes) - 1
             return nodes[node]
 
         def constant(value: float) -> int:
-            return add(Node(ca.OP_CONST, constant=value, place=(0, int(np.signbit(value)))))
+            return add(ScalarNode(ca.OP_CONST, constant=value, place=(0, int(np.signbit(value)))))
 
         done: set[int] = set()
         for root in (node for row in self.results for node in row):
@@ -260,7 +260,7 @@ class Scalars:
                 if isinstance(value, int):
                     new[old] = value
                 elif choice is not None:
-                    new[old] = add(Node(CHOOSE, choice))
+                    new[old] = add(ScalarNode(CHOOSE, choice))
                 else:
                     new[old] = add(replace(node, arguments=arguments)) if value is None else constant(value)
         found.results = [[new[node] for node in row] for row in self.results]
