@@ -138,6 +138,11 @@ RESULTS = {
     "FmuTrial",
     "FmuVariable",
     "ModelSpec",
+    "ProcessorMeasurement",
+    "SspDescription",
+    "TargetCode",
+    "TargetMeasurement",
+    "TickFacts",
     "Variable",
     "AdmittanceLoop",
 }

@@ -21,9 +21,9 @@ from .target_spec import TargetSpec, TargetTick
 
 Number = Literal["double", "float"]
 _WIDTH = 110
-_C_KEYWORDS = """auto break case char const continue default do double else enum extern float for goto if inline int long
-register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while bool true
-false complex imaginary I NULL errno signgam main t c"""
+_C_KEYWORDS = """auto break case char const continue default do double else enum extern float for goto if inline int
+long register restrict return short signed sizeof static struct switch typedef union unsigned void
+volatile while bool true false complex imaginary I NULL errno signgam main t c"""
 _FUNCTION = re.compile(r"^static [^\n;=]*\b(lw_\w+)\([^\n]*\) \{(?:[^\n]*\}|\n.*?^\})\n", re.MULTILINE | re.DOTALL)
 _KEYWORDS = frozenset(_C_KEYWORDS.split())
 _GROUPS = ("parameters", "numbers", "inputs", "outputs", "signals", "states")

@@ -407,6 +407,20 @@ def calls():
                 "own_functions": False,
             },
         ),
+        "to_c": lambda: (
+            diagrams.to_c,
+            {
+                "model": sampled(),
+                "folder": "/nowhere/c",
+                "name": "own",
+                "subsystem": None,
+                "outside": (),
+                "outputs": None,
+                "number": "double",
+                "own_functions": False,
+            },
+        ),
+        "read_ssp": lambda: (diagrams.read_ssp, {"file": "/nowhere/x.ssp", "variant": None}),
         "WebPage.save": lambda: (web_page().save, {"path": "/nowhere/page.html"}),
         "Simulation.run_realtime": lambda: (
             simulation().run_realtime,
