@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, accepts, kinds
 from ...fmus.export import LoopSpec
 from ..flat import WiredDiagram
 from ..wiring import Subsystem, SubsystemCall
@@ -39,6 +39,31 @@ def make_exported(
     **options
         Fields of `LoopSpec`.
     """
+    found = open_model(model, name=name, subsystem=subsystem, outside=outside, outputs=outputs)
+    if found is None:
+        return None
+    label, opened, about = found
+    base = {"step_size": float(opened.wired.flatten().base)} if opened.wired.has_base else {}
+    chosen = {**base, **{key: value for key, value in options.items() if value is not None}}
+    return loop_spec(opened, name=label, description=about, **chosen)
+
+
+@accepts("build", subsystem=kinds.text.or_none(), outside=kinds.names, outputs=kinds.names.or_none())
+def open_model(
+    model: object,
+    *,
+    name: str | None,
+    subsystem: str | None,
+    outside: Iterable[str],
+    outputs: Iterable[str] | None,
+) -> tuple[str, OpenDiagram, str] | None:
+    """Return the name of what is exported, with its inputs and outputs, and a line about it; None for anything else.
+
+    Raises
+    ------
+    OptionError
+        For arguments that don't fit together.
+    """
     if isinstance(model, SubsystemCall):
         model = model.subsystem
     names = (outside,) if isinstance(outside, str) else tuple(outside)
@@ -63,10 +88,8 @@ def make_exported(
             )
         label = name or name_of(model, subsystem)
         opened = open_whole(wired, names, label) if subsystem is None else open_part(wired, subsystem, label)
-    opened = choose_outputs(opened, None if outputs is None else tuple(outputs))
-    base = {"step_size": float(opened.wired.flatten().base)} if opened.wired.has_base else {}
-    chosen = {**base, **{key: value for key, value in options.items() if value is not None}}
-    return loop_spec(opened, name=label, description=about, **chosen)
+    chosen = (outputs,) if isinstance(outputs, str) else outputs
+    return label, choose_outputs(opened, None if chosen is None else tuple(chosen)), about
 
 
 def name_of(model: Any, subsystem: str | None = None) -> str:

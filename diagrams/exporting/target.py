@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -25,12 +24,13 @@ from ...fmus.export import (
     split_lookups,
     write_c,
 )
-from ..flat import FlatDiagram, TickPattern, WiredDiagram, kinds_of, share_terms, speed_up, trace_guarded_tick
-from ..wiring import Subsystem, join
+from ..flat import FlatDiagram, TickPattern, kinds_of, share_terms, speed_up, trace_guarded_tick
+from ..wiring import join
 from .loop_of_diagram import loop_spec
+from .make_exported import open_model
 from .more_functions import trace_computed_numbers
 from .obstacles import refuse
-from .open_diagram import OpenDiagram, choose_outputs, open_part, open_subsystem, open_whole
+from .open_diagram import OpenDiagram
 
 _LARGEST = 20_000
 """Operations of a tick that are written as text; a compiler takes long for more."""
@@ -106,46 +106,16 @@ def to_c(
     >>> code.bytes_of["struct"]
     64
     """
-    opened, about = _open(model, name, subsystem, outside, outputs)
-    spec = target_spec(opened, name=opened.wired.name, description=about)
-    return write_c(spec, Path(folder).expanduser(), number=number, own_functions=own_functions)
-
-
-def _open(
-    model: object,
-    name: str | None,
-    subsystem: str | None,
-    outside: Iterable[str],
-    outputs: Iterable[str] | None,
-) -> tuple[OpenDiagram, str]:
-    """Return what is written of a diagram or a subsystem, and a line about it."""
     if name is not None and name != identifier(name):
         raise OptionError(
             f"found {name!r}; expected a C identifier, such as {identifier(name)!r}.", block="to_c", port="name"
         )
-    if isinstance(called := getattr(model, "subsystem", None), Subsystem):
-        model = called  # a call of it
-    names = (outside,) if isinstance(outside, str) else tuple(outside)
-    about = ""
-    if isinstance(model, Subsystem):
-        if subsystem is not None or names:
-            raise OptionError(
-                "subsystem= and outside= choose a part of a diagram; this is a subsystem by itself. Leave them out.",
-                block=model.name,
-            )
-        about = inspect.cleandoc(model.__doc__ or "").partition("\n")[0]
-        opened = open_subsystem(model, object, name or identifier(model.name))
-    else:
-        wired = getattr(model, "wired", None)
-        if not isinstance(wired, WiredDiagram):
-            raise OptionError(f"found {model!r}; expected a diagram, or a function with @subsystem.", block="to_c")
-        if subsystem is not None and names:
-            raise OptionError(
-                "found subsystem= and outside=; expected one of them. Give one.", block=wired.name, port="outside"
-            )
-        label = name or identifier(wired.name if subsystem is None else subsystem.rpartition(".")[2])
-        opened = open_whole(wired, names, label) if subsystem is None else open_part(wired, subsystem, label)
-    return choose_outputs(opened, None if outputs is None else tuple(outputs)), about
+    found = open_model(model, name=name, subsystem=subsystem, outside=outside, outputs=outputs)
+    if found is None:
+        raise OptionError(f"found {model!r}; expected a diagram, or a function with @subsystem.", block="to_c")
+    label, opened, about = found
+    spec = target_spec(opened, name=identifier(label), description=about)
+    return write_c(spec, Path(folder).expanduser(), number=number, own_functions=own_functions)
 
 
 def target_spec(opened: OpenDiagram, *, name: str, description: str) -> TargetSpec:

@@ -509,7 +509,7 @@ class Run(ShownAsTable):
         >>> from loopwright import Diagram
         >>> from loopwright.blocks import PT1, Step
         >>> lag = PT1(time_constant=0.5)(Step(times=1.0, values=2.0)).named("y")
-        >>> info = Diagram("lag", lag).simulate(6.0, progress=False).step_info("y")
+        >>> info = Diagram("lag", lag).simulate(11.0, progress=False).step_info("y")
         >>> round(info.rise_time, 3), round(info.settling_time, 3), info.overshoot
         (1.099, 1.956, 0.0)
         """
