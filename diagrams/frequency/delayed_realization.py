@@ -364,7 +364,8 @@ def _poles_of(system: DelayMatrices) -> list[complex]:
 
 def realize(loop: Any, *, delay: int = 0) -> Realization | DelayedRealization:
     """Return the realization of a loop, with delays or without."""
-    # a loop itself is not asked, as it would look for near names
-    if "delays" in getattr(loop, "__dict__", ()) or hasattr(type(loop), "delays"):
+    # a loop itself is not asked, as it would look for near names; a linear model of a diagram has delays, and no inputs
+    own = {*getattr(loop, "__dict__", ()), *dir(type(loop))}
+    if {"delays", "ninputs"} <= own:
         return DelayedRealization.of(loop, delay=delay)
     return Realization.of(loop, delay=delay)

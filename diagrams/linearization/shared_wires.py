@@ -11,6 +11,9 @@ inputs are its entries. The controller's own are, by what blocks and the structu
   sampled wire also acts on blocks in continuous time, through sampled blocks alone;
 - those that an FMU leads to, which the wire drives as well, if the way from them back to the wire avoids all FMUs.
 
+A wire that enters a sampled subsystem, and acts nowhere else, is one signal for all that is in it, as an error is for
+the parts of a PI law: no cut is made ahead of one of them.
+
 Where this leaves several entries, nothing tells the parallel parts of a plant from a plant and a model of it, as their
 graphs are the same: the cuts ahead of each are then as possible as that for all of them.
 """
@@ -98,7 +101,10 @@ def find_ways_back(flat: FlatDiagram, port: Port) -> WaysBack:
     for to in plant:
         if to not in inner:
             possible.setdefault(to[0], []).append(to)
-    alone = [search.cut(port, inputs) for inputs in possible.values()] if 1 < len(possible) <= MOST else []
+    is_parted = 1 < len(possible) <= MOST and not _enters_as_one(
+        flat, parting := search.parting(port), search.consumers(parting)
+    )
+    alone = [search.cut(port, inputs) for inputs in possible.values()] if is_parted else []
     found = tuple(sorted((cut for cut in alone if cut is not None), key=lambda cut: cut.to))
     if not own:
         return WaysBack(every, (), port, found)
@@ -144,6 +150,15 @@ class _WaysFrom:
     def leads_back(self, to: Port, avoiding: Callable[[str], bool]) -> bool:
         """Return whether the port is reached from an input through blocks that are not to be avoided."""
         return PathNode(*self.port, True) in self.paths.reach(PathNode(*to, False), avoiding)
+
+    def parting(self, port: Port) -> Port:
+        """Return the port at which the ways from one part: itself, or one behind blocks without states."""
+        consumers = self.consumers(port)
+        if len(consumers) == 1 and not self._ends_at(consumers[0][0]):
+            following = self._outputs(*consumers[0])
+            if len(following) == 1:
+                return self.parting(following[0])
+        return port
 
     def behind_fmus(self, entries: Sequence[Port]) -> list[Port]:
         """Return the entries that an FMU among them leads to, if they lead back without an FMU, as an observer does."""
@@ -220,6 +235,18 @@ def _is_declared(flat: FlatDiagram, to: Port) -> bool:
 def _is_fmu(flat: FlatDiagram, path: str) -> bool:
     block = flat.table.blocks[path]
     return bool(block.stepped or block.evaluated_outside)
+
+
+def _enters_as_one(flat: FlatDiagram, port: Port, consumers: Sequence[Port]) -> bool:
+    """Return whether all consumers are in one sampled subsystem that the port is not in."""
+    table = flat.table
+
+    def around(block: str) -> list[str]:
+        subsystem = table.subsystem_of[block]
+        return [f for f in table.subsystems if f"{subsystem}.".startswith(f"{f}.") and table.clock(f) is not None]
+
+    common = set.intersection(*(set(around(block)) for block, _ in consumers)) if consumers else set()
+    return bool(common.difference(around(port[0])))
 
 
 def _borders(flat: FlatDiagram, source: str) -> Iterator[Callable[[str], bool]]:

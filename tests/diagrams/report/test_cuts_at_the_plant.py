@@ -25,6 +25,7 @@ from loopwright.diagrams.requirements import Reason, Verdict
 from loopwright.diagrams.studies import find_places
 from loopwright.fmus import mass_spring_damper
 from support.predictors import T, observed, smith
+from support.public_calls import drive
 
 A, B, C = np.array([[0.0, 1.0], [20.0, 0.0]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
 UPRIGHT = control.ss(A, B, C, 0.0)
@@ -184,6 +185,20 @@ def test_a_pi_law_of_single_blocks_is_decided():
     diagram = Diagram("pi", plant(2.0 * error + 2.0 * Integrator(name="integral")(error)))
     report = diagram.report(only=("inner",), requirements=Requirements(phase_margin_deg=60, ms=1.3))
     assert {verdict for verdict, _ in verdicts(report).values()} == {Verdict.PASSED}
+
+
+@pytest.mark.parametrize("wire", ["e", "y"])
+@pytest.mark.parametrize(("ms", "verdict"), [(2.6, Verdict.PASSED), (2.3, Verdict.FAILED)])
+def test_an_error_that_enters_a_sampled_pi_law_is_one_wire(wire, ms, verdict):
+    """M_s 2.462 where the error is cut; 1.769 and 2.078 ahead of either part of the law, which nobody means."""
+    report = drive().report(only=("inner",), requirements=Requirements(loops={wire: {"ms": ms}}))
+    assert set(verdicts(report).values()) == {(verdict, Reason.COMPARED)}
+    plant = control.sample_system(control.ss([[0.0, 1.0], [-9.0, -0.6]], [[0.0], [9.0]], [[1.0, 0.0]], 0.0), 0.02)
+    law = control.ss([[1.0]], [[0.02]], [[0.3]], [[0.2]], 0.02)
+    omega = np.linspace(1.0, 10.0, 20001)
+    (number,) = (r.number for r in report.review.results if r.quantity == "ms")
+    peak = np.max(1.0 / np.abs(1.0 + (plant * law)(np.exp(0.02j * omega))))
+    assert number.value == pytest.approx(peak, rel=1e-6)
 
 
 class Disturbance(Block):

@@ -61,7 +61,7 @@ def test_a_response_that_was_not_measured_says_why():
     verdict, _, at = row_of(report, "settling")
     assert at == "y → plant.y"
     assert verdict.startswith("not decided: no response was measured: ")
-    assert "found 2 entries; expected one" in verdict
+    assert "Found 2 entries. To change it: Name one of them" in verdict
 
 
 def limited(limit):

@@ -99,7 +99,7 @@ def test_a_worst_case_that_no_run_confirms_is_told_on_the_first_page(monkeypatch
 
     monkeypatch.setattr(type(found), "confirm", refuse)
     text = "\n".join(map(str, page().sections[0].text))
-    assert "The worst case over the parameters: no run confirms it: found a loop cut at 2 wires." in text
+    assert "The worst case over the parameters: no run confirms it: Found a loop cut at 2 wires." in text
 
 
 def test_a_worst_case_of_another_diagram_is_refused():
