@@ -216,7 +216,10 @@ class Plot {
 
 function ticks(low, high, count) {
   const rough = (high - low) / count, power = 10 ** Math.floor(Math.log10(rough));
-  const size = [1, 2, 5, 10].map(m => m * power).find(s => s >= rough) ?? 10 * power, found = [];
+  const sizes = [0.2, 0.5, 1, 2, 5, 10].map(m => m * power), multiples = size => Math.floor(high / size) - Math.ceil(low / size) + 1;
+  let i = sizes.findIndex(size => size >= rough);
+  while (i > 0 && multiples(sizes[i]) < 2) i--;  // an axis has two numbers at least
+  const size = sizes[i], found = [];
   for (let k = Math.ceil(low / size); k * size <= high; k++) found.push(k * size);
   return found;
 }
