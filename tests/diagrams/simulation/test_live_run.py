@@ -164,6 +164,15 @@ def test_it_is_stopped_from_outside():
     assert (found.ended_by, found.t, found.run.t[-1]) == ("stop", 0.5, 0.5)
 
 
+@pytest.fixture
+def ctrl_c():
+    """Let Ctrl-C interrupt: a background job begins with it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_ends_it_after_a_frame_and_nothing_is_lost():
     def interrupt(view):
         if view.t == 0.5:
@@ -177,6 +186,7 @@ def test_ctrl_c_ends_it_after_a_frame_and_nothing_is_lost():
     assert "it was stopped by Ctrl-C" in str(found)
 
 
+@pytest.mark.usefixtures("ctrl_c")
 def test_a_second_ctrl_c_interrupts_at_once():
     def interrupt(view):
         signal.raise_signal(signal.SIGINT)
