@@ -448,13 +448,20 @@ class _LoopMarginFinder(MarginFinder[Margins]):
     def _find_bandwidth(self) -> Number:
         L = self.scan.ends()[0][1]
         low = 1.0 if np.isinf(L) else abs(L / (1 + L))
+        with np.errstate(all="ignore"):
+            largest = max((float(np.nanmax(np.abs(L / (1 + L)))) for L, _ in self.scan.samples), default=0.0)
         level = low / np.sqrt(2)
-        omega = self.scan.find_fall_below(level) if level > 0 else np.nan
+        vanishes = level == 0 or low <= _VANISHES * largest  # rounding leaves something of a 0
+        omega = np.nan if vanishes else self.scan.find_fall_below(level)
         if np.isnan(omega):
             return Number(omega, "rad/s", np.nan, "T vanishes at low frequency")
         if np.isinf(omega):
             return Number(omega, "rad/s", 0.0, "the response: |T| never falls below 1/√2 of its low-frequency value")
         return Number(omega, "rad/s", 1e-10 * omega, self.by.confirm_bandwidth(omega, level))
+
+
+_VANISHES = 1e-9
+"""|T| at low frequency, of its largest value, below which there is no bandwidth."""
 
 
 class _Unconfirmed:

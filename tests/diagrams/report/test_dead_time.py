@@ -92,7 +92,8 @@ def test_a_neutral_loop_gets_a_verdict_in_seconds_that_names_the_way_without_a_s
             assert result.reason is Reason.UNSTABLE
             assert "gain of" in explain(result)
             assert "through controller, pipe, plant, " in explain(result)
-        assert numbers["poles.continuous.slowest"].value >= np.log(abs(k)) / 0.5 - 1e-9
+        if abs(k) > 1.0:  # at 1 the chain of poles has no end, and no number
+            assert numbers["poles.continuous.slowest"].value >= np.log(abs(k)) / 0.5 - 1e-9
     else:
         assert abs(numbers["inner.u.continuous.gain_margin_high"].value - 2.4035) < 1e-3  # test_dead_time of frequency
         assert numbers["poles.continuous.slowest"].value < 0.0
