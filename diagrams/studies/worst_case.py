@@ -69,6 +69,8 @@ class WorstCase(ShownAsTable):
     elsewhere : mapping of str to mapping
         Numbers of the worst case's loop at other cuts of its wire by their inputs, where several blocks may be the
         plant.
+    given : WiredDiagram, optional
+        The diagram as it was given; ``base`` has names for wires that are cut ahead of some consumers.
     """
 
     worst: StudyCase
@@ -81,6 +83,7 @@ class WorstCase(ShownAsTable):
     options: Mapping[str, Any] = field(default_factory=dict, repr=False)
     measure: Measure | None = field(default=None, repr=False)
     elsewhere: Mapping[str, Mapping[str, Number]] = field(default_factory=dict, repr=False)
+    given: WiredDiagram | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         found = enumerate_some(f"{name} = {_short(value)}" for name, value in self.worst.parameters.items())
@@ -249,7 +252,8 @@ def find_worst_case(
     **options: Any,
 ) -> WorstCase:
     """Return the worst case of a loop's numbers over ranges of parameters; see `Diagram.worst_case`."""
-    measure, others = _make_measure(diagram, loop, quantity, requirements, contact, options), dict[str, OtherCuts]()
+    whole, others = diagram, dict[str, OtherCuts]()
+    measure = _make_measure(diagram, loop, quantity, requirements, contact, options)
     if quantity is None and requirements is None and measure is None:
         quantity = "disk_margin"
     if points is not None and at is not None:
@@ -258,7 +262,6 @@ def find_worst_case(
         goal = Goal({(measure.place,): {measure.name: None}})
     else:
         assert not callable(quantity)
-        whole = diagram
         diagram, loop, requirements, others = place_loops(diagram, loop, requirements, to)
         at = carry_point(whole, at, diagram)
         points = None if points is None else [carry_point(whole, point, diagram) for point in points]
@@ -288,7 +291,7 @@ def find_worst_case(
     there = others.get(worst.loop[0], ()) if len(worst.loop) == 1 else ()
     elsewhere = study.numbers_at_other_cuts(worst, there)
     options |= {"delay": delay}
-    return WorstCase(worst, tuple(nominal), cases, boxes, goal, diagram, places, options, measure, elsewhere)
+    return WorstCase(worst, tuple(nominal), cases, boxes, goal, diagram, places, options, measure, elsewhere, whole)
 
 
 def _make_measure(

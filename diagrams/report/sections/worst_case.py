@@ -42,7 +42,8 @@ def check_worst_case(diagram: WiredDiagram, found: Any) -> None:
         raise OptionError(
             f"found {found!r}; expected a worst case. Give diagram.worst_case(…), or a TOML file.", port="worst_case"
         )
-    if content_hash(found.wired) != content_hash(diagram):
+    of = found.wired if found.given is None else found.given
+    if content_hash(of) != content_hash(diagram):
         raise OptionError(
             f"found a worst case of another diagram; expected one of {diagram.name!r} with its present parameters. "
             "Make it by diagram.worst_case(…).",

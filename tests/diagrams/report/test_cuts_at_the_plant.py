@@ -125,6 +125,15 @@ def test_a_worst_case_says_what_other_cuts_have():
     assert f"{expected:.6g} at plant.u" in str(found)
 
 
+def test_a_worst_case_at_the_plants_input_is_one_of_the_diagram_that_was_given():
+    diagram = with_observer(library)
+    found = diagram.worst_case(
+        {"law.gain": [K, 1.1 * K]}, "force", quantity="phase_margin_deg", samples="grid", starts=0
+    )
+    report = diagram.report(only=("inner",), requirements=Requirements(phase_margin_deg=45), worst_case=found)
+    assert verdicts(report)["phase_margin_deg"] == (Verdict.FAILED, Reason.COMPARED)
+
+
 def predictor():
     """A Smith predictor in continuous time, its blocks side by side."""
     plant = TransferFunction(numerator=[1.3], denominator=[5.0, 1.0], name="plant")
