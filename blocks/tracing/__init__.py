@@ -6,6 +6,7 @@ from .discretization import check_method, find_hold, hold
 from .equations import initial_state, start_shapes, start_values, state_after_start
 from .numpy_check import GUARDS, NEXT, evaluate
 from .opaque_equations import raise_failure
+from .operations import MATH_FUNCTIONS
 from .outside import describe_outside
 from .structure import has_structure, is_traced_by, structure, traced_parameters
 from .switching_times import Line, switching_times
@@ -15,6 +16,7 @@ from .traced_array import as_traced
 
 __all__ = [
     "GUARDS",
+    "MATH_FUNCTIONS",
     "NEXT",
     "Line",
     "Traced",

@@ -9,44 +9,12 @@ from typing import Any
 
 import casadi as ca
 
-from ...blocks.tracing import count_uses
+from ...blocks.tracing import MATH_FUNCTIONS, count_uses
 from .no_lanes import NoLanesError
 
 _INFIX = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
 _COMPARED = {ca.OP_LT: "<", ca.OP_LE: "<=", ca.OP_EQ: "==", ca.OP_NE: "!="}
-_CALLS = {
-    ca.OP_EXP: "exp",
-    ca.OP_LOG: "log",
-    ca.OP_SQRT: "sqrt",
-    ca.OP_SIN: "sin",
-    ca.OP_COS: "cos",
-    ca.OP_TAN: "tan",
-    ca.OP_ASIN: "asin",
-    ca.OP_ACOS: "acos",
-    ca.OP_ATAN: "atan",
-    ca.OP_FLOOR: "floor",
-    ca.OP_CEIL: "ceil",
-    ca.OP_FMOD: "fmod",
-    ca.OP_FABS: "fabs",
-    ca.OP_SIGN: "sign",
-    ca.OP_COPYSIGN: "copysign",
-    ca.OP_ERF: "erf",
-    ca.OP_FMIN: "fmin",
-    ca.OP_FMAX: "fmax",
-    ca.OP_SINH: "sinh",
-    ca.OP_COSH: "cosh",
-    ca.OP_TANH: "tanh",
-    ca.OP_ASINH: "asinh",
-    ca.OP_ACOSH: "acosh",
-    ca.OP_ATANH: "atanh",
-    ca.OP_ATAN2: "atan2",
-    ca.OP_LOG1P: "log1p",
-    ca.OP_EXPM1: "expm1",
-    ca.OP_HYPOT: "hypot",
-    ca.OP_REMAINDER: "remainder",
-    ca.OP_POW: "pow",
-    ca.OP_CONSTPOW: "pow",
-}
+_CALLS = {**MATH_FUNCTIONS, ca.OP_SIGN: "sign"}
 _LOGIC = (ca.OP_NOT, ca.OP_AND, ca.OP_OR)
 
 

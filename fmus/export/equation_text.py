@@ -6,40 +6,16 @@ from collections.abc import Sequence
 
 import casadi as ca
 
-from ...blocks.tracing import count_uses
+from ...blocks.tracing import MATH_FUNCTIONS, count_uses
 
 _SUM, _PRODUCT, _POWER, _ATOM = 1, 2, 3, 4
 _FUNCTIONS = {
-    ca.OP_EXP: "exp",
-    ca.OP_LOG: "log",
-    ca.OP_SQRT: "sqrt",
-    ca.OP_SIN: "sin",
-    ca.OP_COS: "cos",
-    ca.OP_TAN: "tan",
-    ca.OP_ASIN: "asin",
-    ca.OP_ACOS: "acos",
-    ca.OP_ATAN: "atan",
+    **MATH_FUNCTIONS,
     ca.OP_NOT: "not",
-    ca.OP_FLOOR: "floor",
-    ca.OP_CEIL: "ceil",
-    ca.OP_FMOD: "fmod",
     ca.OP_FABS: "abs",
     ca.OP_SIGN: "sign",
-    ca.OP_COPYSIGN: "copysign",
-    ca.OP_ERF: "erf",
     ca.OP_FMIN: "min",
     ca.OP_FMAX: "max",
-    ca.OP_SINH: "sinh",
-    ca.OP_COSH: "cosh",
-    ca.OP_TANH: "tanh",
-    ca.OP_ASINH: "asinh",
-    ca.OP_ACOSH: "acosh",
-    ca.OP_ATANH: "atanh",
-    ca.OP_ATAN2: "atan2",
-    ca.OP_LOG1P: "log1p",
-    ca.OP_EXPM1: "expm1",
-    ca.OP_HYPOT: "hypot",
-    ca.OP_REMAINDER: "remainder",
     ca.OP_IF_ELSE_ZERO: "where",
 }
 # Operator, its precedence, and the least precedences at which its left and right operands need no parentheses.

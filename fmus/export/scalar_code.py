@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core import DefinitionError
+from ...blocks.tracing import MATH_FUNCTIONS
 
 _WIDEST = 84
 """Characters of an expression up to which it is written inside another one."""
@@ -33,39 +34,7 @@ _BINARY = {
     ca.OP_OR: ("||", _LOGIC),
 }
 _BOOLEAN = {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_AND, ca.OP_OR, ca.OP_NOT}
-_OF_MATH = {
-    ca.OP_EXP: "exp",
-    ca.OP_LOG: "log",
-    ca.OP_POW: "pow",
-    ca.OP_CONSTPOW: "pow",
-    ca.OP_SQRT: "sqrt",
-    ca.OP_SIN: "sin",
-    ca.OP_COS: "cos",
-    ca.OP_TAN: "tan",
-    ca.OP_ASIN: "asin",
-    ca.OP_ACOS: "acos",
-    ca.OP_ATAN: "atan",
-    ca.OP_FLOOR: "floor",
-    ca.OP_CEIL: "ceil",
-    ca.OP_FMOD: "fmod",
-    ca.OP_REMAINDER: "remainder",
-    ca.OP_FABS: "fabs",
-    ca.OP_COPYSIGN: "copysign",
-    ca.OP_FMIN: "fmin",
-    ca.OP_FMAX: "fmax",
-    ca.OP_SINH: "sinh",
-    ca.OP_COSH: "cosh",
-    ca.OP_TANH: "tanh",
-    ca.OP_ASINH: "asinh",
-    ca.OP_ACOSH: "acosh",
-    ca.OP_ATANH: "atanh",
-    ca.OP_ATAN2: "atan2",
-    ca.OP_LOG1P: "log1p",
-    ca.OP_EXPM1: "expm1",
-    ca.OP_HYPOT: "hypot",
-    ca.OP_ERF: "erf",
-}
-OF_MATH = frozenset(_OF_MATH.values())
+OF_MATH = frozenset(MATH_FUNCTIONS.values())
 """Functions of math.h that are written."""
 FIND, TAKE = -1, -2
 """Operations of tables: the place of a value between breakpoints, and an entry of a table."""
@@ -511,12 +480,12 @@ class Expressions:
             return f"sign_of({self._number(arguments[0], _LOGIC)})", _ATOM
         if operation in (ca.OP_ASSIGN, ca.OP_LIFT):
             return self._number(arguments[0], _ATOM), _ATOM
-        if operation not in _OF_MATH:
+        if operation not in MATH_FUNCTIONS:
             raise DefinitionError(
                 f"found CasADi's operation {operation}, which is not written as C. Write the equation with sums, "
                 "products, elementary functions and comparisons."
             )
-        called = _OF_MATH[operation]
+        called = MATH_FUNCTIONS[operation]
         self.functions.add(called)
         listed = ", ".join(self._number(argument, _LOGIC) for argument in arguments)
         return f"{self._call(called)}({listed})", _ATOM
@@ -542,8 +511,8 @@ def _kind(operation: int) -> str:
         return "/"
     if operation in (FIND, TAKE):
         return "tables"
-    if operation in _OF_MATH:
-        return _OF_MATH[operation]
+    if operation in MATH_FUNCTIONS:
+        return MATH_FUNCTIONS[operation]
     return "comparisons"
 
 
