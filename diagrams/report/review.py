@@ -276,7 +276,10 @@ def _stable(v: Variant, state: _State, numbers: Mapping[str, Number]) -> Require
         return replace(result, reason=Reason.FINDINGS)
     if state.verdict is not None:
         return replace(result, verdict=state.verdict, reason=state.reason, detail=state.detail)
-    return result if number is None else replace(result, verdict=Verdict.PASSED, reason=Reason.COMPARED)
+    if number is not None:
+        return replace(result, verdict=Verdict.PASSED, reason=Reason.COMPARED)
+    is_left_out = len(v.model.poles) > 0 and "poles" not in {name.split(".")[0] for name in numbers}
+    return replace(result, detail="Its chapter was left out: add 'poles' to only=") if is_left_out else result
 
 
 def _with(

@@ -183,3 +183,10 @@ def test_a_required_margin_that_a_loop_of_several_entries_has_not_is_open():
     assert review.verdict is not Verdict.PASSED
     asked = Requirements(disk_margin=0.05)
     assert diagram.report(only=("inner", "poles"), requirements=asked).review.verdict is Verdict.PASSED
+
+
+def test_stability_without_the_chapter_on_poles_says_that_it_was_left_out():
+    plant = StateSpace(A=[[-1.0]], B=[1.0], C=[1.0], D=0.0, name="plant")
+    diagram = Diagram("one", plant(Gain(gain=-1.0, name="minus")(plant.y.named("y"))))
+    report = diagram.report(only=("inner",), requirements=Requirements(phase_margin_deg=30.0))
+    assert "Its chapter was left out: add 'poles' to only=" in str(report.review)
