@@ -1,8 +1,8 @@
-"""The compiled loop: C code of a diagram's ticks and of what happens between them, and the masters that run it."""
+"""The compiled loop: C code of a diagram's ticks and of what happens between them, and the loops that run it."""
 
 from .background import BackgroundCode
-from .code import LARGEST, TickCode, compile_ticks, find_obstacle, interpret_ticks, write_ticks
 from .compiled_libraries import load_compiled
+from .event_domains import Domains
 from .exported_memory import NamedCode, function_text, read_memory
 from .function_code import Code, Sources
 from .fused import FusedPlant, compile_fused, fuse
@@ -33,6 +33,7 @@ from .native_tick import bind_call
 from .remote import REFUSED, TAKEN_BY_PYTHON, UNDER_WAY, PythonStep, compile_other_side
 from .runtime import load_runtime
 from .staged import NativeModelExchange, OwnEvent
+from .tick_code import LARGEST, TickCode, compile_ticks, find_obstacle, interpret_ticks, write_ticks
 from .transport_delays import Delays, delays_of
 from .watch import Fired, Pile
 
@@ -47,6 +48,7 @@ __all__ = [
     "CompiledHybrid",
     "CompiledLoop",
     "Delays",
+    "Domains",
     "Fired",
     "FusedPlant",
     "HandedOver",

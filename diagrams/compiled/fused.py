@@ -13,17 +13,17 @@ from ...fmus.export import describe_processor, inline_model, own_functions, proc
 from ...fmus.platform import is_built_here
 from ..flat import FlatDiagram, TickPattern, WiredDiagram, share_terms
 from .bound_functions import GeneratedCode
-from .code import (
-    MASTER,
-    TickCode,
-    compile_loops,
-    compile_ticks,
-    master_source,
-)
 from .compiled_libraries import load_compiled
 from .generated_text import write_functions
 from .hybrid_code import FUSING
 from .reordered import reorder
+from .tick_code import (
+    LOOP_OVER_TICKS,
+    TickCode,
+    compile_loops,
+    compile_ticks,
+    loop_source,
+)
 
 _LIMIT = "0x1p20"  # LW_FAST_LIMIT
 _MANY = 16  # kinds of ticks that are written twice
@@ -106,18 +106,18 @@ def _compile(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], plants
     found = {} if flat.by_block else {clocks: flat.at_tick(clocks).last.fast for clocks in acting}
     straight = bool(found) and all(function.is_a("SXFunction") for function in found.values())
     functions = {clocks: share_terms(f, f"tick{i}") for i, (clocks, f) in enumerate(found.items())} if straight else {}
-    text = "\n".join([_SYSTEM, _write_ticks([*functions.values()]), models, steps, master_source()])
+    text = "\n".join([_SYSTEM, _write_ticks([*functions.values()]), models, steps, loop_source()])
     library = load_compiled(text, (*processor_flags(), *FUSING), describe_processor())
-    master = library[MASTER]
-    master.restype = None
+    run_ticks = library[LOOP_OVER_TICKS]
+    run_ticks.restype = None
     notes = tuple(f"Fused: the equations of {path} are in the loop, compiled with the ticks." for path in inside)
     if not functions:
-        return replace(compile_ticks(flat, acting), master=master, notes=notes)
+        return replace(compile_ticks(flat, acting), run_ticks=run_ticks, notes=notes)
     bound = {clocks: GeneratedCode(library).find(f) for clocks, f in functions.items()}
     notes += (
         "Fused: the ticks are compiled for this processor; values differ by rounding, which some motions magnify.",
     )
-    return TickCode(bound, True, library, compile_loops(flat, acting), master, notes)
+    return TickCode(bound, True, library, compile_loops(flat, acting), run_ticks, notes)
 
 
 def _write_models(plants: Mapping[str, FusedPlant]) -> tuple[str, str, list[str]]:

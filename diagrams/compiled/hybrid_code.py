@@ -14,14 +14,6 @@ import casadi as ca
 from ...fmus.export import describe_processor, processor_flags
 from ..flat import NONE, FlatDiagram, OpaqueStage, PartProgram, Schedule, TickPattern, share_terms
 from .bound_functions import CodeOfFunctions, CompiledFunction, GeneratedCode, MachineFunction, address_of
-from .code import (
-    GroupedTicks,
-    TickCode,
-    check_size,
-    find_loops,
-    loop_functions,
-    write_loops,
-)
 from .function_code import Sources
 from .generated_text import write_functions
 from .grouped_functions import GroupedFunction, GroupedPart
@@ -32,6 +24,14 @@ from .runtime import load_runtime
 from .small_steps import STEPS, write_steps
 from .staged_functions import Staged, StagedEquations, StagedSlopes
 from .step_outputs import may_fail_at_steps
+from .tick_code import (
+    GroupedTicks,
+    TickCode,
+    check_size,
+    find_loops,
+    loop_functions,
+    write_loops,
+)
 
 FUSING = ("-finline-functions", "-freciprocal-math", "-fno-tree-vectorize", "-fno-tree-slp-vectorize")
 """Flags of fused code: a parameter's inverse is computed once; vectors of few values cost more than they save."""

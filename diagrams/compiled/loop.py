@@ -19,11 +19,11 @@ from ...fmus.calls import NEAR, FmuInstance, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
 from ..flat import TRUE, StepTable, TickPattern
 from .bound_functions import CALL, TICK, TickStructure, at
-from .code import CompiledTick, TickCode
 from .grouped_functions import GroupedTick
 from .remote import PythonStep, RemotePlants
 from .runtime import load_runtime
 from .staged_functions import Staged, StagedEquations
+from .tick_code import CompiledTick, TickCode
 
 _SEEN = 1e-6  # least singular value, relative to 1 + the loop's gain, that differences surely tell from 0
 
@@ -262,7 +262,7 @@ class CompiledLoop:
             solvers += [NewtonStructure()] * (len(ticks) - len(solvers))
             self.structure.loops = self._address(solvers, NewtonStructure)
         self._outcome = OutcomeStructure()
-        self._run = code.master or load_runtime()["loopwright_run"]
+        self._run = code.run_ticks or load_runtime()["loopwright_run"]
         self._run.restype = None
         self._run.argtypes = [ctypes.c_void_p, ctypes.c_int64, *[ctypes.c_void_p] * 5]
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from ...blocks.interrupts import INTERRUPTS
 from .bound_functions import TICK
-from .code import CompiledTick
 from .staged_functions import Staged
+from .tick_code import CompiledTick
 
 
 def bind_call(tick: CompiledTick, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Callable[[], None]:

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..events import Domains
 from ..flat import FlatDiagram
 from .bound_functions import TickStructure, at
+from .event_domains import Domains
 from .hybrid_code import Between
 from .rate_differences import RateDifferences
 from .staged import NativeModelExchange

@@ -2,11 +2,11 @@
 
 from .contact_limits import ContactLimits, read_contact_limits
 from .explanations import explain
-from .number_limits import SENSES, STEP_UNITS, Limit, Reason, Sense, Verdict, is_doubtful, judge, judge_interval
 from .requirements import REQUIREMENTS, LoopLimits, Requirements, StepLimits, write_requirements
 from .results import RequirementResult, StepSize
 from .review import COLUMNS, DIGITS, MOST_REQUIREMENTS, NOTHING, Review, by_loop, rank, reason_in_table, row_of
 from .toml_file import REQUIRED, STUDIES, TomlFile, read_requirements
+from .verdicts import SENSES, STEP_UNITS, Limit, Reason, Sense, Verdict, is_doubtful, judge, judge_interval
 
 __all__ = [
     "COLUMNS",

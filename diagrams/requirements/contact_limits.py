@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ...blocks.core import OptionError, near
-from .number_limits import Limit, Sense, make_limit
+from .verdicts import Limit, Sense, make_limit
 
 CONTACT_SENSES: Mapping[str, Sense] = MappingProxyType(
     {"stiffness": Sense.LEAST, "damping": Sense.LEAST, "mass": Sense.LEAST, "tool_mass": Sense.LEAST}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from ..frequency import Number, is_at_steps_only
-from .number_limits import Reason, Verdict
 from .results import RequirementResult
+from .verdicts import Reason, Verdict
 
 MEASURED, WORST_CASE, CONTACT = "measured", "worst_case", "contact"
 """Keys of results that belong to no variant of the diagram: of measured loops, searches and contacts."""

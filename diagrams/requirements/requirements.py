@@ -20,7 +20,7 @@ from ...blocks.core import (
     shorten,
 )
 from .contact_limits import ContactLimits, read_contacts
-from .number_limits import SENSES, STEP_SENSES, Limit, make_limit
+from .verdicts import SENSES, STEP_SENSES, Limit, make_limit
 
 EVERY_STATE = "every state"
 """Value of ``stable`` by which free motions count, too: the strict rule."""

@@ -9,7 +9,7 @@ from typing import Any
 
 from ...blocks.core import print_unit
 from ..frequency import Number
-from .number_limits import Limit, Reason, Verdict, unit_of
+from .verdicts import Limit, Reason, Verdict, unit_of
 
 
 class StepSize(StrEnum):

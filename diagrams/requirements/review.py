@@ -10,8 +10,8 @@ from typing import Any
 from ...blocks.core import Grid, Sheet, ShownAsTable, brief, explain_calls
 from ..frequency import Number
 from .explanations import CONTACT, explain
-from .number_limits import Verdict
 from .results import RequirementResult
+from .verdicts import Verdict
 
 COLUMNS = ("verdict", "requirement", "at", "variant", "required", "found", "distance")
 MOST_REQUIREMENTS = 20

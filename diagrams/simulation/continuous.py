@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Block, FmuRuntimeError, OptionError, ParameterError, SimulationError
-from ..compiled import delays_of
-from ..events import Domains
+from ..compiled import Domains, delays_of
 from ..flat import FlatDiagram, announcers, renumber
 from ..model_exchange import BlocksInModelExchange, OutsideEvents
 from ..results import Occurrence

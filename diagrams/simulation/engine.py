@@ -1,4 +1,7 @@
-"""The engine of a run: everything that advances in time, without the record."""
+"""The engine of a run: everything that advances in time, without the record.
+
+Time itself advances in C: `fmus/runtime/loop_over_ticks.c`, and `loop_over_time.c` where states are continuous.
+"""
 
 from __future__ import annotations
 

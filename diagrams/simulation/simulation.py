@@ -1,6 +1,6 @@
 """A run in the making: it continues, is saved, restored and read.
 
-The page docs/explanation/time.md says what happens in which order.
+The page docs/explanation/time.md says what happens in which order. The loop over time is in C, `fmus/runtime`.
 """
 
 from __future__ import annotations

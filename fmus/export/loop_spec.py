@@ -20,8 +20,8 @@ from .model import Variable
 
 ROOM_FOR_EDGES = 64
 """Discontinuities of sources in a stretch of a loop with continuous states."""
-_TICKS = ("newton.c", "alone.c", "master.c")
-_BETWEEN = ("problem.c", "delays.c", "methods.c", "radau.c", "events.c", "instants.c", "hybrid.c")
+_TICKS = ("newton.c", "alone.c", "loop_over_ticks.c")
+_BETWEEN = ("problem.c", "delays.c", "methods.c", "radau.c", "event_search.c", "instants.c", "loop_over_time.c")
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@
    complete, or lets an event act: of its indicators, or of inputs that have jumped. Python lets those of time and of steps
    act, and does whatever C can't: it transfers values that don't fit, and evaluates blocks that are no FMU of C's.
    An FMU in its own process is asked for all calls between two copies at once: its buffers are in the memory that
-   both share. It comes after `remote.c` and `master.c`. */
+   both share. It comes after `remote.c` and `loop_over_ticks.c`. */
 
 enum { TAKE, GIVE, SET_TIME, CALL, ASK };
 enum { OK, WARNING, DISCARD, LOST_PROCESS };
@@ -49,7 +49,7 @@ typedef struct {
     double end;
     int64_t other_nominals, acted, event;
     int64_t by_python;          /* whether Python does all that C asks it for */
-    bool *changed;              /* see `plant` in master.c */
+    bool *changed;              /* see `plant` in loop_over_ticks.c */
     remote *far;                /* its process; NULL: this one */
 } exchanged;
 

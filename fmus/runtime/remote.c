@@ -1,7 +1,7 @@
 /* FMUs in their own processes: requests and replies are words in the memory that both sides share.
 
    A request is posted, then its reply is watched for a while, then slept for. Whatever is out of the ordinary is left to
-   Python with the request as it is: under way, or answered. It comes after `newton.c` and before `master.c`. */
+   Python with the request as it is: under way, or answered. It comes after `newton.c` and before `loop_over_ticks.c`. */
 
 #ifndef _WIN32
 #include <errno.h>

@@ -6,7 +6,7 @@
  * Zero itself is the border. An indicator that is exactly 0 at the start is in neither domain, and so is one that the jump
  * of its own event leaves in contact: an impact, which changes continuous states and with them the motion of the indicator,
  * and leaves it on 0, or where the event found it, moving on beyond. The direction in which it leaves decides: down is falling, up is rising. A jump whose motion leads back beyond contact at once, again and
- * again, rests there; that is an error. Diagrams have this rule, too (diagrams/events/domains.py). */
+ * again, rests there; that is an error. Diagrams have this rule, too (diagrams/compiled/event_domains.py). */
 #if LW_N_Z
 #define LW_MAX_ITERATIONS 100
 #define LW_MAX_EVENTS 10000

@@ -25,7 +25,7 @@ from .staged_functions import Staged, StagedEquations
 
 LARGEST = 6_000
 """Operations of a function up to which it is compiled as a whole: the compiler's time grows faster than they do."""
-MASTER = "loopwright_run"
+LOOP_OVER_TICKS = "loopwright_run"
 
 
 CompiledTick = CompiledFunction | GroupedTick | Staged
@@ -48,7 +48,7 @@ class TickCode:
         The library, which is loaded as long as this lives.
     loops : mapping
         Equations of the algebraic loops, by the clocks that act, where there are some.
-    master : function or None
+    run_ticks : function or None
         The C function that goes over ticks; None for the one that all diagrams share.
     notes : tuple of str
         What a run reports of its code.
@@ -58,7 +58,7 @@ class TickCode:
     exact: bool
     library: ctypes.CDLL
     loops: Mapping[frozenset[TickPattern], CompiledFunction | StagedEquations] = field(default_factory=dict)
-    master: Any = None
+    run_ticks: Any = None
     notes: tuple[str, ...] = ()
 
 
@@ -231,6 +231,6 @@ class GroupedTicks:
         return {clocks: GroupedTick(tables, kernels, address) for clocks, tables in self._tables[kernels].items()}
 
 
-def master_source() -> str:
+def loop_source() -> str:
     """Return the C text of the loop over ticks, for code that is in one unit with it."""
-    return read_sources("newton.c", "remote.c", "master.c")
+    return read_sources("newton.c", "remote.c", "loop_over_ticks.c")

@@ -1,8 +1,8 @@
 /* Events between ticks: the domains of indicators, and the search for their changes within a step.
 
-   The rules are those of diagrams/events, which says why: an indicator leaves its domain beyond its hysteresis; one that
-   has just crossed zero has some slack for rounding errors; one that comes close to zero between two instants is followed
-   to where it is closest. At an indicator that is not finite the run ends. */
+   The rules are those of diagrams/compiled/event_domains.py, which says why: an indicator leaves its domain beyond its
+   hysteresis; one that has just crossed zero has some slack for rounding errors; one that comes close to zero between two
+   instants is followed to where it is closest. At an indicator that is not finite the run ends. */
 
 enum { QUIET, EVENT, LOST, PILED }; /* PILED: events pile up, and the run can't continue: */
 enum { IN_CONTACT, ZENO, CHATTERS, ENDLESS, ENDLESS_OUTSIDE }; /* the last one: of FMUs in model exchange */

@@ -17,8 +17,9 @@ names the event: its block needs a state of rest.
 **Sliding.** With a fixed step, events that follow each other without end, as those of an ideal relay, wait for the end
 of the step from there on, until none fires at the end of one.
 
-The loop in C finds events, lets them fire and keeps the domains: `fmus/runtime/events.c` has the search, `instants.c`
-what happens at an instant. Here are the domains with which a run begins, what is kept of them, and the errors.
+The loop in C finds events, lets them fire and keeps the domains: `fmus/runtime/event_search.c` has the search,
+`instants.c` what happens at an instant. Here are the domains with which a run begins, what is kept of them, and the
+errors.
 """
 
 from __future__ import annotations
