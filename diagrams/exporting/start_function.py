@@ -77,7 +77,7 @@ def trace_left(workspace: Workspace) -> Any:
     symbols = flat.symbols()
     columns = _sources(flat, tuple(left), symbols)
     taps = {port: (lambda _, column=column: column) for port, column in zip(left, columns, strict=True)}
-    found = [evaluate(flat, flat.blocks, NONE, **symbols, taps=one) for one in (taps, {})]
+    found = [evaluate(flat, flat.blocks, NONE, **symbols, opened=True, taps=one) for one in (taps, {})]
     g = [ca.densify(ca.MX(one)) for instant in found for one in indicators_of(instant)[0]]
     return speed_up(ca.Function("lw_indicators_at_start", [*symbols.values()], [ca.vertcat(*g)]))
 

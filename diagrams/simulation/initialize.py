@@ -384,6 +384,8 @@ def _jumps_at_start(block: Block) -> bool:
 def domains_from_left(workspace: Workspace, domains: np.ndarray) -> np.ndarray:
     """Return the domains of the indicators of all events just before t = 0: 1 above 0, −1 below, 0 on the border.
 
+    Subsystems are evaluated as if they acted: what a sampled one puts out before its first tick jumps with its sources.
+
     Parameters
     ----------
     domains : ndarray of int
@@ -395,7 +397,7 @@ def domains_from_left(workspace: Workspace, domains: np.ndarray) -> np.ndarray:
     flat, here, apart = workspace.flat, workspace.here, evaluate_apart(workspace.evaluators)
 
     def at(taps: Taps) -> np.ndarray:
-        instant = evaluate(flat, flat.blocks, NONE, 0.0, here.x, here.w, here.p, apart=apart, taps=taps)
+        instant = evaluate(flat, flat.blocks, NONE, 0.0, here.x, here.w, here.p, opened=True, apart=apart, taps=taps)
         return np.array([float(np.ravel(np.array(g))[0]) for g in indicators_of(instant)[0]])
 
     left, right = at(taps), at({})

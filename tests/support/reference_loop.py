@@ -124,6 +124,8 @@ class ReferenceLoop:
         self.x = {part.name: tuple(part.x) for part in parts}
         self.integrated = [part for part in parts if part.x and not part.clocks]
         self.held, self.guess, self.plans, self.passed = {}, {}, {}, {}
+        self.fresh = set()  # parts that have jumped since their indicators were looked at last
+        self.resting = np.zeros(len(self.watched), dtype=bool)  # indicators that their own part's jump has left at a border
         self.record = Record()
 
     # --- signals at an instant -----------------------------------------------------------------------------------------
@@ -233,14 +235,28 @@ class ReferenceLoop:
                     self.x[p.name], self.z[p.name] = p.start(tuple(signals[s] for s in p.inputs))
         if before != (self.x, self.z):
             raise DelicateError("initial states depend on themselves")
+        if any(zero in p.breaks for p in self.parts) and any(p.start and self.reads_itself(p) for p in self.parts):
+            raise DelicateError("an initial state depends on itself, and a source jumps: there are several solutions")
         self.enter(zero)
         first = self.evaluate(0.0, self.x, everything)
-        self.held.update({s: (signals if p.breaks else first)[s] for p in self.parts if p.clock for s in p.signals})
+        self.held.update({s: signals[s] for p in self.parts if p.clock for s in p.signals})
         self.enter(zero, right=False)
         values = self.indicate(0.0, self.x)
         self.domains = np.where(values > 0.0, 1, np.where(values == 0.0, 0, -1))
         self.held.update({s: first[s] for p in self.parts if p.clock for s in p.signals})
         self.inputs = {}
+
+    def reads_itself(self, part):
+        """Whether a part's initial state depends on its own outputs, through those that follow their inputs at once."""
+        maker, found, waiting = {s: p for p in self.parts for s in p.signals}, set(), [part]
+        while waiting:
+            for p in (maker[s] for s in waiting.pop().inputs):
+                if p is part:
+                    return True
+                if p.name not in found and (p.direct or p.start) and not p.plant:
+                    found.add(p.name)
+                    waiting.append(p)
+        return False
 
     def land(self, exact):
         """Do what happens at an exact instant: events, the tick, events, a sample, the inputs of plants."""
@@ -332,7 +348,11 @@ class ReferenceLoop:
         distances = self.distances(self.values)
         left = self.has_left(distances)
         own = np.array([p.name in self.moved for p, _ in self.watched])
-        left &= ~((np.abs(distances) < ZONE) & own)
+        jumped = np.array([p.name in self.fresh for p, _ in self.watched])
+        near = np.abs(distances) < ZONE
+        self.resting = np.where(jumped, near, self.resting & near)
+        self.fresh = set()
+        left &= ~(self.resting & own)
         unsure = left & (np.abs(distances) < ZONE) & (distances != 0.0)
         if ahead:
             soon, later = self.gone(t, EQUAL), self.gone(t, self.apart)
@@ -357,6 +377,7 @@ class ReferenceLoop:
             if not any(own):
                 continue
             self.moved.add(p.name)
+            self.fresh.add(p.name)
             self.record.events += [(t, p.name, p.events[i][0]) for i, f in enumerate(own) if f]
             if p.jump is not None:
                 after[p.name] = p.jump(*self.arguments(p, t, self.x, signals), own)

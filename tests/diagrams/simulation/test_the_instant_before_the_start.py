@@ -11,10 +11,12 @@ from loopwright.blocks import (
     Counter,
     EdgeDetector,
     FilteredDerivative,
+    Gain,
     Integrator,
     Latch,
     Output,
     PulseTrain,
+    Quantizer,
     RateLimiter,
     Recorded,
     Sine,
@@ -115,6 +117,21 @@ def test_a_trigger_that_rises_at_zero_triggers(sample_time, first, hits):
     rises = Step(times=[first, 0.1, 0.2], values=[1.0, 0.0, 1.0])
     run = Diagram("d", around(rises)).simulate(0.3, step=0.1, progress=False)
     assert run["unit_delay.y"].tolist() == [0, 0, hits, hits]
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.05])
+def test_a_quantizer_behind_a_sampled_block_sees_the_jump_of_its_source_at_zero(offset):
+    """It began from 0.5 · 0.73 = 0.365, and stayed at 0.4 for ever, with −0.33 at its input."""
+
+    @subsystem(sample_time=0.1, offset=offset)
+    def controller():
+        return Gain(gain=-0.5, name="held")(Step(times=0.0, values=0.66, initial_value=-0.73))
+
+    diagram = Diagram("d", Quantizer(quantum=0.2)(controller()))
+    run = diagram.simulate(0.2, step=0.05, progress=False)
+    assert run["held.y"] == pytest.approx([-0.33] * 5)
+    assert run["quantizer.y"] == pytest.approx([-0.4] * 5)
+    assert [(e.t, e.event) for e in run.events] == [(0.0, "down")]
 
 
 def test_rate_limiters_and_edge_detectors_begin_from_the_left():
