@@ -125,7 +125,8 @@ class ReferenceLoop:
         self.integrated = [part for part in parts if part.x and not part.clocks]
         self.held, self.guess, self.plans, self.passed = {}, {}, {}, {}
         self.fresh = set()  # parts that have jumped since their indicators were looked at last
-        self.resting = np.zeros(len(self.watched), dtype=bool)  # indicators that their own part's jump has left at a border
+        # indicators that their own part's jump has left at a border
+        self.resting = np.zeros(len(self.watched), dtype=bool)
         self.record = Record()
 
     # --- signals at an instant -----------------------------------------------------------------------------------------
