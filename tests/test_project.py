@@ -222,7 +222,7 @@ import loopwright
 assert "loopwright.blocks.core" not in sys.modules  # a name is loaded when it is used
 wave = loopwright.blocks.Sine(frequency=1.0)()
 loopwright.Diagram("wave", wave).simulate(1.0, step=0.5, progress=False)
-needed = {"compiled", "coupling", "diagram", "events", "flat", "model_exchange", "results", "simulation", "solvers", "wiring"}  # a run pays for nothing else
+needed = {"compiled", "coupling", "diagram", "flat", "model_exchange", "results", "simulation", "solvers", "wiring"}  # a run pays for nothing else
 assert {m.split(".")[2] for m in sys.modules if m.startswith("loopwright.diagrams.")} == needed
 loopwright.experiments.path_following().diagram.simulate(0.01, progress=False)
 late = [m for m in ("control", "matplotlib.pyplot", "scipy.integrate") if m in sys.modules]
