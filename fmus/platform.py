@@ -44,7 +44,7 @@ def cache_folder() -> Path:
         return folder.absolute()
 
 
-_USER = "HOME", "XDG_CACHE_HOME", "LOCALAPPDATA"
+_USER = ("LOCALAPPDATA", "USERPROFILE", "HOME") if os.name == "nt" else ("HOME", "XDG_CACHE_HOME")
 """Environment variables by which a user's cache folder is found."""
 
 

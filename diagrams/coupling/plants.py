@@ -126,7 +126,7 @@ def load_plants(flat: FlatDiagram, stack: ExitStack, start_time: float = 0.0) ->
         made: Any = block
         stepped: Stepped = made
         try:
-            wired = [port for port in block.inputs if (path, port) in flat.table.wires]
+            wired = [port for of, port in map(flat.ports.__getitem__, flat.plant_inputs.slices) if of == path]
             yield path, stack.enter_context(stepped.instantiate(wired, None, start_time=start_time))
         except SimulationError as error:
             error.at(block=path, t=0.0)

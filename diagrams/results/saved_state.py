@@ -71,6 +71,10 @@ def layout_of(flat: FlatDiagram) -> StateLayout:
 
     A block's states count by their names, since its parameters may leave some out.
     """
+    return flat.keep("layout of a saved state", lambda: _lay_out(flat))
+
+
+def _lay_out(flat: FlatDiagram) -> StateLayout:
     layouts = (flat.states.each, flat.held, flat.gates, flat.starts, flat.loops, flat.log, flat.plant_inputs)
     names = tuple(tuple((n, layout.shapes[n]) for n in layout.slices) for layout in layouts)
     return (*names, tuple((e.path, e.name) for e in flat.events))

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
+from functools import lru_cache
 from typing import Any, Self, TypedDict
 
 from ...blocks.core import OptionError, UnknownArgumentError, accepts, check_argument, explain_calls, kinds
@@ -146,10 +147,10 @@ class RunOptions:
             A name that is no option of a run; None for ``start``, which a run without a ``final_state`` has.
         """
         check_argument(options, kinds.mapping, "options", block)
-        known = [f.name for f in fields(cls)]
-        for name in options:
-            if name not in known:
-                raise UnknownArgumentError(name, known, block=block, elsewhere=RUN_OPTIONS)
+        if not options.keys() <= cls.__dataclass_fields__.keys():
+            known = [f.name for f in fields(cls)]
+            name = next(name for name in options if name not in known)
+            raise UnknownArgumentError(name, known, block=block, elsewhere=RUN_OPTIONS)
         if "start" in options and options["start"] is None:
             raise OptionError(
                 "found None; expected a state or an operating point. A run has no final_state if it was interrupted or "
@@ -185,7 +186,7 @@ class RunOptions:
 
     def with_step(self, step: float | Fraction | None) -> Self:
         """Return the options with another step."""
-        return replace(self, step=step)
+        return self if step is self.step else replace(self, step=step)
 
     @property
     def recipe(self) -> dict[str, Any]:
@@ -211,6 +212,11 @@ def ticks_in(duration: Any, base: Fraction, name: str) -> tuple[int, Fraction]:
         span = math.nan
     if not 0 < span < math.inf or isinstance(duration, str | bool):
         raise OptionError(f"found a duration of {duration!r}; expected seconds, positive.", block=name, port="duration")
+    return _divide(span, base)
+
+
+@lru_cache(maxsize=64)
+def _divide(span: float, base: Fraction) -> tuple[int, Fraction]:
     exact = Fraction(span)
     n = round(exact / base)
     if n and abs(exact - n * base) <= exact * Fraction(1, 10**12):

@@ -8,7 +8,7 @@ import stat
 import weakref
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -252,12 +252,12 @@ class FmuDescription(ShownAsTable):
             nominal=at(v.nominal),
         )
 
-    @property
+    @cached_property
     def structural(self) -> dict[str, FmuVariable]:
         """Structural parameters, on which the sizes of arrays depend, by name."""
         return self.of("structuralParameter")
 
-    @property
+    @cached_property
     def texts(self) -> dict[str, OtherVariable]:
         """Variables that are texts or binary data, by name."""
         return {name: v for name, v in self.other.items() if v.is_text}
@@ -314,7 +314,7 @@ def find_description(
     path = os.fspath(file)  # pathlib would take most of the time
     if path.startswith("~"):
         path = os.path.expanduser(path)
-    if not os.path.isabs(path):
+    if not _is_absolute(path):
         with FOLDER:  # another thread may load a library, which takes place in its folder
             try:
                 path = os.path.abspath(path)
@@ -331,7 +331,10 @@ def find_description(
         found = f"{shown!r} is a folder" if os.path.isdir(path) else f"there is no file {shown!r}"
         raise FmuFileError(f"{found}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
     identity = (status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size)
-    return _read(path, identity, limits or _USUAL, _key_of(sizes))
+    return _read(path, identity, limits or _USUAL, _key_of(sizes) if sizes else ())
+
+
+_is_absolute = lru_cache(maxsize=256)(os.path.isabs)
 
 
 def _unreadable(path: str, error: OSError) -> FmuFileError:

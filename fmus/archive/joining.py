@@ -39,7 +39,7 @@ def join_scalars(description: FmuDescription, rename: Mapping[str, str], label: 
         If elements are missing or there twice, don't begin at 0 or 1, or are of different types, causalities,
         variabilities or units; or if an array is to be an element.
     """
-    if not any("[" in new for new in rename.values()):
+    if not rename or not any("[" in new for new in rename.values()):
         return description
     return _join(description, tuple(rename.items()), label)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 
 from ...blocks.core import FmuFileError
@@ -31,11 +32,11 @@ def unpack(description: FmuDescription) -> Path:
         If the archive can't be unpacked or is not the file that was described, or if the library for this platform
         can't be loaded safely.
     """
-    folder = cache_folder() / "unpacked" / description.digest[:32]
-    if os.path.exists(folder / RESOURCES):
+    folder, resources = _place_of(cache_folder(), description.digest)
+    if os.path.exists(resources):
         return folder
     with explain_cache_errors():
-        if (folder / RESOURCES).exists():  # whoever may not look is told so
+        if resources.exists():  # whoever may not look is told so
             return folder
     archive = FmuArchive.open(description.file, description.limits)
     if archive.digest != description.digest:
@@ -47,6 +48,13 @@ def unpack(description: FmuDescription) -> Path:
     check_binary(archive, description.binary, description.fmi, model_exchange=not description.co_simulation)
     unpack_archive(archive, folder)
     return folder
+
+
+@lru_cache(maxsize=64)
+def _place_of(cache: Path, digest: str) -> tuple[Path, Path]:
+    """Return the folder of an unpacked FMU, and its resources."""
+    folder = cache / "unpacked" / digest[:32]
+    return folder, folder / RESOURCES
 
 
 def unpack_archive(archive: FmuArchive, folder: Path) -> None:

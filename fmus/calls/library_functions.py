@@ -98,11 +98,11 @@ class LibraryFunctions(dict[str, Any]):
             change(name, function)
 
     def __missing__(self, name: str) -> Any:
-        prototype = self._prototypes[name]
-        if name not in self._needed and self.lack(name):
-            function: Any = ctypes.CFUNCTYPE(ctypes.c_int)(lambda: ERROR)
-        else:
-            function = getattr(self._library, self._exported(name))
+        prototype, exported = self._prototypes[name], self._exported(name)
+        if name in self._needed:
+            function: Any = getattr(self._library, exported)
+        elif (function := getattr(self._library, exported, None)) is None:
+            function = ctypes.CFUNCTYPE(ctypes.c_int)(lambda: ERROR)
         function.argnames, function.argtypes = list(prototype.arguments), list(prototype.types)
         function.restype = prototype.result
         for change in self._changes:

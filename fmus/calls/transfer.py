@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -53,11 +54,6 @@ class Transfer:
         Values of all ports, one after the other.
     chosen : collection of str, optional
         Those of the ports whose values are transferred; None for all.
-
-    Attributes
-    ----------
-    limits : tuple of ndarray
-        Least and greatest value of each entry of the vector; infinite without one.
     """
 
     def __init__(
@@ -77,13 +73,24 @@ class Transfer:
             self.groups.append(TypeGroup(fmi, verb, type_, alike, {p: places[p] for p in alike}, vector))
         self.is_plain = all(group.direct for group in self.groups)
         self._ports, self._places = mine, {port: places[port] for port in mine}
-        low, high = np.full(vector.size, -np.inf), np.full(vector.size, np.inf)
-        for port, v in mine.items():
-            low[places[port]], high[places[port]] = (np.ravel(side) for side in v.limits)
-        self._bounded = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
+        self.has_limits = any(v.minimum is not None or v.maximum is not None for v in mine.values())
+        """Whether a port has a smallest or largest value."""
+
+    @cached_property
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest value of each entry of the vector; infinite without one."""
+        low, high = np.full(self.vector.size, -np.inf), np.full(self.vector.size, np.inf)
+        for port, v in self._ports.items() if self.has_limits else ():
+            low[self._places[port]], high[self._places[port]] = (np.ravel(side) for side in v.limits)
         # A signal at its bound that was converted from another unit may be off by a rounding.
-        self.limits = low - _ROUNDED * np.abs(low), high + _ROUNDED * np.abs(high)
-        self._low, self._high = (limit[self._bounded] for limit in self.limits)
+        return low - _ROUNDED * np.abs(low), high + _ROUNDED * np.abs(high)
+
+    @cached_property
+    def _bounded(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Places of the entries with a limit, and their least and greatest values."""
+        low, high = self.limits
+        places = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
+        return places, low[places], high[places]
 
     @property
     def plain_call(self) -> tuple[Callable[..., int], tuple[Any, ...]] | None:
@@ -105,11 +112,6 @@ class Transfer:
         """The calls, one for each type."""
         return [(group.function, group.arguments) for group in self.groups]
 
-    @property
-    def has_limits(self) -> bool:
-        """Whether a port has a smallest or largest value."""
-        return self._bounded.size > 0
-
     def check_limits(self) -> None:
         """Refuse values out of the ranges that the FMU's description states.
 
@@ -118,10 +120,11 @@ class Transfer:
         OutOfRangeError
             If a value is out of its port's range.
         """
-        found = self.vector[self._bounded]
-        wrong = (found < self._low) | (found > self._high)
+        places, low, high = self._bounded
+        found = self.vector[places]
+        wrong = (found < low) | (found > high)
         if wrong.any():
-            place = int(self._bounded[wrong][0])
+            place = int(places[wrong][0])
             port = next(port for port, where in self._places.items() if where.start <= place < where.stop)
             value = float(self.vector[place])
             raise OutOfRangeError(port, f"found {value:.9g}; expected {self._ports[port].range_text}")

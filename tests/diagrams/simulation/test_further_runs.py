@@ -1,10 +1,13 @@
 """Runs of a diagram after its first one have its numbers; their start values come from traced functions."""
 
+import sys
+
 import numpy as np
 import pytest
 
 from loopwright.blocks import Clock, Constant, DiscreteIntegrator, Function, Gain, Step, Sum, UnitDelay
 from loopwright.diagrams import Diagram, NonFiniteError, experiments, subsystem
+from loopwright.fmus import Fmu, mass_spring_damper
 
 
 @pytest.mark.parametrize("enabled", [0.0, 1.0])
@@ -79,3 +82,28 @@ def test_experiment_c_has_the_bits_of_its_first_run():
     runs = [diagram.simulate(0.02, progress=False) for _ in range(3)]
     for run in runs[1:]:
         assert {n: run[n].tobytes() for n in run.names} == {n: runs[0][n].tobytes() for n in run.names}
+
+
+def test_a_further_run_calls_few_functions_of_python():
+    diagram, seen = experiments.hand_guiding().diagram, []
+    for _ in range(3):
+        diagram.simulate(0.002, progress=False)
+    sys.setprofile(lambda frame, event, argument: seen.append(1) if event == "call" else None)
+    try:
+        diagram.simulate(0.002, progress=False)
+    finally:
+        sys.setprofile(None)
+    assert len(seen) < 1800  # 2100, where descriptions, layouts and durations are looked up again and again
+
+
+def test_a_run_has_the_start_the_duration_and_the_cache_of_its_own_call(tmp_path, monkeypatch):
+    """An undamped mass on a spring, held at no force, is at x₀ cos(ω t): ω = 20 rad/s of 800 N/m and 2 kg."""
+    given = {"damping": 0.0, "stiffness": 800.0, "mass": 2.0, "position": 0.0}
+    plant = Fmu(mass_spring_damper.build(out=tmp_path / "mass.fmu"), start=given, isolate=False, name="plant")
+    diagram = Diagram("swing", plant(force=Constant(value=0.0)).position.named("x"))
+    for k, (start, duration) in enumerate([(0.1, 0.05), (-0.3, 0.2), (0.1, 0.05)]):
+        monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / f"cache {k}"))
+        run = diagram.replace({"plant.start.position": start}).simulate(duration, step=0.01, progress=False)
+        np.testing.assert_allclose(run["x"], start * np.cos(20.0 * np.arange(run.t.size) * 0.01), atol=1e-6)
+        assert run.t.size == round(duration / 0.01) + 1
+        assert any((tmp_path / f"cache {k}" / "unpacked").iterdir())
