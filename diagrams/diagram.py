@@ -1158,7 +1158,7 @@ class Diagram(ShownAsTable):
         inputs, sliders : mapping of str to (float, float), or list of str, optional
             What is moved by hand, by names as `replace` takes them, with the range of each, or None for one around its
             value: first sources (the name of a `Constant`, or of the wire that comes out of it, is its value), then
-            parameters. Without ``inputs`` these are the constants of the diagram.
+            parameters, those of FMUs that are tunable, too. Without ``inputs`` these are the constants of the diagram.
         plots : list of str or of lists of str, optional
             Signals, each in a plot; those of a list in one. Without it the named wires, by their units.
         step : float, optional

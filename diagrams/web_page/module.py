@@ -18,6 +18,8 @@ from ..exporting import let_move, loop_spec, open_whole
 from ..flat import FlatDiagram, Target, WiredDiagram
 from ..wiring import Wire, stepped_blocks
 
+Tuned = tuple[str, int, int]
+"""A parameter of an FMU: the FMU's path, the value reference, and the element of it."""
 Place = tuple[str, int]
 """An entry of a vector of the loop's memory: "log", "w" or "p", and its number."""
 
@@ -68,6 +70,7 @@ def make_module(
     flat: FlatDiagram,
     columns: Sequence[tuple[Wire, int]],
     moved: Sequence[Target],
+    tuned: Sequence[Tuned] = (),
     *,
     solver: str = "auto",
 ) -> WebModule:
@@ -80,7 +83,9 @@ def make_module(
     columns : sequence of (Wire, int)
         What samples have: outputs of blocks, each with an entry, flat.
     moved : sequence of Target
-        Parameters that the page changes.
+        Parameters of blocks that the page changes.
+    tuned : sequence of Tuned
+        Those of FMUs.
     solver : str
         Method of the continuous states.
 
@@ -97,7 +102,7 @@ def make_module(
     spec = loop_spec(opened, name="diagram", description=about, solver=solver, between=False, step_size=step)
     places = dict(_places(spec, plants))
     page = files(__package__).joinpath("page", "module.c").read_text(encoding="utf-8")
-    glue = _write_glue(spec, places, plants, flat, columns)
+    glue = _write_glue(spec, places, plants, flat, columns, tuned)
     source = "\n".join([*texts.values(), write_unit(spec, own_functions=True), *glue, page])
     return WebModule(spec, source, places, tuple(plants))
 
@@ -160,6 +165,7 @@ def _write_glue(
     plants: Mapping[str, Fmu],
     flat: FlatDiagram,
     columns: Sequence[tuple[Wire, int]],
+    tuned: Sequence[Tuned],
 ) -> Iterator[str]:
     """Yield the C text of what `page/module.c` needs before it."""
     yield f"#define LW_N_COLUMNS {len(columns)}"
@@ -179,11 +185,15 @@ def _write_glue(
         yield f"static const int64_t lw_due{j}[][2] = {{{ticks}}};"
         own = f"m{j}lw_plant_"
         entries.append(
-            f"{{{own}enter, {own}exchange, {own}start, {own}step, {len(taken)}, {len(given)}, lw_from{j}, "
+            f"{{{own}enter, {own}exchange, {own}start, {own}step, {own}tune, {len(taken)}, {len(given)}, lw_from{j}, "
             f"{given[0] if given else 0}, lw_held{j}, {len(flat.plant_ticks[path])}, lw_due{j}}}, "
         )
     yield f"#define LW_N_PLANTS {len(plants)}"
     yield f"#define LW_PLANTS {''.join(entries)}"
+    numbers = {path: j for j, path in enumerate(plants)}
+    rows = [f"{{{numbers[path]}, {reference}, {element}, 0.0, false}}, " for path, reference, element in tuned]
+    yield f"#define LW_N_TUNED {len(tuned)}"
+    yield f"#define LW_TUNED {''.join(rows)}"
     most = max((sum(v.size for v in plant.output_variables.values()) for plant in plants.values()), default=1)
     yield f"#define LW_MOST_OUTPUTS {most}"
 

@@ -19,12 +19,13 @@ from ...blocks.core import OptionError, accepts, brief, check_file, explain_call
 from ..drawing import Facts, draw
 from ..flat import Target, WiredDiagram
 from ..wiring import Wire
-from .module import make_module
+from .module import Tuned, make_module
 from .shown_signals import PlotNames, ShownColumns, plots_of
 from .sliders import Slider, default_sources, find_sliders, place_of
 
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
 SPANS = (2.0, 5.0, 10.0, 30.0, 60.0)
+_SCRIPTS = ("shared", "model", "record", "plots", "sliders", "page")
 _LARGEST_DRAWING = 400_000
 _HINT = (
     "Double-click a name to set it back. Keys: space runs and pauses, → is one step, r resets. Point at a plot to read "
@@ -164,11 +165,17 @@ def make_page(
         columns.add(name)
     columns.add_wires()
     groups = [("Inputs" if tuned else "", moved), ("Parameters", tuned)]
-    targets = [slider.target for _, group in groups for slider in group]
+    every = [slider for _, group in groups for slider in group]
+    targets = [slider.target for slider in every if slider.reference is None]
+    tuned_plants = [_tuned(one) for one in every if one.reference is not None]
     targets += [target for target, _ in scene.moved.values()] if scene else []
     wires = [(Wire(column.block, column.port, None), column.entry) for column in columns.found]
-    module = make_module(wired, flat, wires, targets, solver=solver)
+    module = make_module(wired, flat, wires, targets, tuned_plants, solver=solver)
     spec = module.spec
+
+    def place(one: Slider) -> int:  # those of FMUs from -1 downwards
+        return place_of(one, spec) if one.reference is None else -1 - tuned_plants.index(_tuned(one))
+
     hidden = {} if scene is None else {n: place_of(Slider.of_scene(n, t, i), spec) for n, (t, i) in scene.moved.items()}
     data = {
         "name": wired.name,
@@ -181,15 +188,16 @@ def make_page(
         ],
         "plots": shown,
         "groups": [
-            {"title": head, "sliders": [_slider(one, place_of(one, spec), labels or {}) for one in group]}
+            {"title": head, "sliders": [_slider(one, place(one), labels or {}) for one in group]}
             for head, group in groups
             if group
         ],
         "hidden": hidden,
         "labels": [list(label) for label in spec.labels],
         "plants": list(module.plants),
+        "guards": [list(guard) for guards in spec.guards for guard in guards.names],
+        "events": [[block, name] for block, name, _ in spec.events],
         "scene": None if scene is None else dict(scene.data),
-        "autoplay": False,
     }
     if path is not None:
         _check_page(path)
@@ -199,6 +207,11 @@ def make_page(
     if path is not None:
         page.save(path)
     return page
+
+
+def _tuned(one: Slider) -> Tuned:
+    assert one.reference is not None
+    return one.path, one.reference, one.entry
 
 
 def _slider(one: Slider, place: int, labels: Mapping[str, str]) -> dict[str, Any]:
@@ -231,7 +244,7 @@ def _fill(
     span: float,
 ) -> str:
     """Return the page's HTML."""
-    own = ["" if scene is None else scene.script, _file("page.js")]
+    own = ["" if scene is None else scene.script, "\n".join(_file(f"{name}.js") for name in _SCRIPTS)]
     scripts = "".join(f"<script>{script}</script>\n" for script in own if script)
     hashes = [_hash(script) for script in re.findall(r"<script>(.*?)</script>", drawing + scripts, re.DOTALL)]
     policy = (

@@ -21,6 +21,21 @@ _MOST = 12
 
 
 @dataclass(frozen=True)
+class _Bounds:
+    """Least and greatest value of a parameter of an FMU, as a block's parameter declares them."""
+
+    minimum: float | None
+    above: float | None
+    maximum: float | None
+
+    @classmethod
+    def of(cls, least: float | None, most: float | None) -> _Bounds:
+        """Return the bounds of a variable; the least number above 0 is how an FMU says "above 0"."""
+        is_open = least is not None and 0.0 < least <= np.finfo(float).tiny
+        return cls(None if is_open else least, 0.0 if is_open else None, most)
+
+
+@dataclass(frozen=True)
 class Slider:
     """A slider: one number that a page moves.
 
@@ -38,6 +53,8 @@ class Slider:
         Its unit; empty without one.
     label : str
         What the page calls it.
+    reference : int or None
+        Of a parameter of an FMU the value reference, in which ``entry`` counts; None for one of a block.
     """
 
     name: str
@@ -49,6 +66,7 @@ class Slider:
     high: float
     unit: str = ""
     label: str = ""
+    reference: int | None = None
 
     @classmethod
     def of_scene(cls, name: str, target: Target, entry: int) -> Slider:
@@ -111,12 +129,7 @@ def _sliders_of(wired: WiredDiagram, name: str, limits: Any, option: str) -> lis
     path, keys = find_control(table, name, wired.name)
     block = table.blocks[path]
     if isinstance(block, Fmu):
-        raise OptionError(
-            f"{name!r} is of an FMU, of which parameters don't change while it runs. Make the page of "
-            "diagram.replace(…), or wire a Constant to an input of it.",
-            block=path,
-            port=option,
-        )
+        return _sliders_of_plant(block, path, keys, name, limits, option)
     whole, entry, unit, spec = _value_of(block, keys)
     values = np.asarray(whole)
     if values.dtype.kind not in "if" or not values.size:
@@ -132,6 +145,49 @@ def _sliders_of(wired: WiredDiagram, name: str, limits: Any, option: str) -> lis
         value = float(values.ravel()[i])
         low, high = _range(value, spec, limits, path, name, option)
         sliders.append(Slider(label, path, tuple(keys), int(i), value, low, high, unit, label))
+    return sliders
+
+
+def _tunable(plant: Fmu) -> list[str]:
+    """Return the names of an FMU's parameters that may change between steps."""
+    found = plant.description.variables.items()
+    return [
+        name
+        for name, v in found
+        if v.causality == "parameter" and v.variability == "tunable" and v.type == "Float64" and not v.is_integer
+    ]
+
+
+def _sliders_of_plant(plant: Fmu, path: str, keys: list[str], name: str, limits: Any, option: str) -> list[Slider]:
+    """Return sliders of a parameter of an FMU that may change between steps."""
+    names = _tunable(plant)
+    one, chosen = split_entry(keys[-1], names)
+    if keys[0] != "start" or one not in names:
+        raise OptionError(
+            f"{name!r} is of an FMU; expected one of its parameters that may change between steps: "
+            f"{enumerate_some([f'{path}.{each}' for each in names], 8) or 'it has none'}. Make the page of "
+            "diagram.replace(…) for another value of what is fixed.",
+            block=path,
+            port=option,
+        )
+    variable = plant.description.variables[one]
+    values = np.asarray(plant.start.get(one, variable.start), dtype=float)
+    if values.shape != variable.shape:  # one number for all entries
+        values = np.broadcast_to(values, variable.shape)
+    bounds = _Bounds.of(variable.minimum, variable.maximum)
+    unit = "" if variable.unit in (None, "1") else str(variable.unit)
+    size = variable.size // len(variable.references)
+    if chosen:
+        entries: Iterable[int] = [int(np.ravel_multi_index(index_of(chosen, values.shape, one), values.shape))]
+    else:
+        entries = range(values.size)
+    sliders = []
+    for i in entries:
+        value = float(values.flat[i])
+        low, high = _range(value, bounds, limits, path, name, option)
+        label = name if chosen or not values.ndim else f"{name}[{_number(i, values.shape)}]"
+        reference = variable.references[i // size]
+        sliders.append(Slider(label, path, tuple(keys), i % size, value, low, high, unit, label, reference))
     return sliders
 
 

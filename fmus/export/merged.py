@@ -36,6 +36,15 @@ static bool lw_plant_step(const double *u, double t, double h, double *y) {
     return lw_set(&lw_plant, "", lw_plant_inputs, %(n_inputs)d, u, %(n_u)d) && lw_step(&lw_plant, t, h)
            && lw_get(&lw_plant, "", lw_plant_outputs, %(n_outputs)d, y, %(n_y)d);
 }
+
+/* Set an element of a tunable parameter: before the start, or between two steps. */
+static inline bool lw_plant_tune(uint32_t reference, size_t element, double value) {
+    const lw_variable *variable = lw_variables + reference;
+    double values[LW_AT_LEAST_1(LW_N_P)];
+    memcpy(values, lw_plant.s.values + variable->first, variable->size * sizeof(double));
+    values[element] = value;
+    return lw_set(&lw_plant, "", &reference, 1, values, variable->size);
+}
 """
 
 Sized = Sequence[tuple[int, int]]
@@ -52,7 +61,7 @@ def merge_model(
 ) -> str | None:
     """Return an FMU of ours as C text with one instance, for a unit with other code.
 
-    The text defines ``<prefix>lw_plant_enter``, ``…exchange``, ``…start`` and ``…step``.
+    The text defines ``<prefix>lw_plant_enter``, ``…exchange``, ``…start``, ``…step`` and ``…tune``.
 
     Parameters
     ----------

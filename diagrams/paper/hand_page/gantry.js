@@ -93,7 +93,8 @@ window.makeScene = (page, box) => {
     for (let k = 0; k < pieces; k++) {
       const from = first + Math.floor(count * k / pieces), to = Math.min(record.count - 1, first + Math.floor(count * (k + 1) / pieces));
       ctx.globalAlpha = 0.05 + 0.75 * k / pieces; ctx.beginPath();
-      for (let i = from; i <= to; i += step) ctx.lineTo(...toScreen([record.value(i, iy), record.value(i, iz)]));
+      for (let i = from; i < to; i += step) ctx.lineTo(...toScreen([record.value(i, iy), record.value(i, iz)]));
+      if (to >= from) ctx.lineTo(...toScreen([record.value(to, iy), record.value(to, iz)]));
       ctx.stroke();
     }
     ctx.globalAlpha = 1;

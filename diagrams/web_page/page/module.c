@@ -1,7 +1,8 @@
 /* A diagram with its FMUs as a WebAssembly module: the page writes parameters, and takes rows of samples.
 
    It comes after the exported diagram and its FMUs. Generated before it: LW_N_COLUMNS and `lw_read_row`, which reads a sample;
-   LW_N_PLANTS, LW_PLANTS, what is in their table, and LW_MOST_OUTPUTS, the largest number of outputs of one. A plant steps at its own ticks, before the diagram's tick there, as in a run. */
+   LW_N_PLANTS, LW_PLANTS, what is in their table, and LW_MOST_OUTPUTS, the largest number of outputs of one; LW_N_TUNED
+   and LW_TUNED, the parameters of plants that the page moves. A plant steps at its own ticks, before the diagram's tick there, as in a run. */
 
 #define LW_SEEN(name) __attribute__((export_name(#name)))
 #define LW_N_ROWS 1024 /* of a call, at most */
@@ -11,6 +12,7 @@
 typedef struct {
     bool (*enter)(double start), (*exchange)(const double *u, double *y), (*start)(void);
     bool (*step)(const double *u, double t, double h, double *y);
+    bool (*tune)(uint32_t reference, size_t element, double value);
     int inputs, outputs; /* numbers of elements */
     const int *from;     /* entries of the log that the inputs are */
     int to;              /* first entry of w that the outputs are */
@@ -19,7 +21,16 @@ typedef struct {
     const int64_t (*due)[2]; /* ticks at which it steps: every so many, from an offset on */
 } lw_plant_of_page;
 
+typedef struct {
+    int plant;
+    uint32_t reference;
+    size_t element;
+    double value;
+    bool is_set;
+} lw_tuned_of_page;
+
 static const lw_plant_of_page lw_plants[LW_N_PLANTS + 1] = {LW_PLANTS{0}};
+static lw_tuned_of_page lw_tuned[LW_N_TUNED + 1] = {LW_TUNED{0}};
 static double lw_page_rows[LW_N_ROWS][LW_N_COLUMNS + 1];
 static int64_t lw_page_reached[LW_N_PLANTS + 1]; /* the tick that each plant has come to */
 static int64_t lw_page_failed_plant, lw_page_tick;
@@ -35,10 +46,16 @@ static void lw_page_take_inputs(const lw_plant_of_page *p) {
     for (int i = 0; i < p->inputs; i++) p->held[i] = lw_page_memory.log[p->from[i]];
 }
 
+static bool lw_page_put(const lw_tuned_of_page *one) {
+    return lw_plants[one->plant].tune(one->reference, one->element, one->value) || (lw_page_failed_plant = one->plant, false);
+}
+
 /* Outputs of the plants at the start depend on their inputs, and these on outputs: both until they agree. */
 static bool lw_page_start_plants(void) {
     for (int j = 0; j < LW_N_PLANTS; j++)
         if (!lw_plants[j].enter(0.0)) return lw_page_failed_plant = j, false;
+    for (int k = 0; k < LW_N_TUNED; k++)
+        if (lw_tuned[k].is_set && !lw_page_put(lw_tuned + k)) return false;
     bool settled = false;
     for (int n = 0; n < LW_MOST_PASSES && !settled; n++) {
         settled = true;
@@ -78,6 +95,7 @@ static bool lw_page_step_plants(int64_t tick) {
 LW_SEEN(fill) void lw_page_fill(void) {
     lw_fill(&lw_page_memory);
     lw_bind(&lw_page_memory);
+    for (int k = 0; k < LW_N_TUNED; k++) lw_tuned[k].is_set = false;
 }
 
 LW_SEEN(parameters) double *lw_page_parameters(void) { return lw_page_memory.p; }
@@ -88,6 +106,25 @@ LW_SEEN(renew) void lw_page_renew(void) { lw_renew(&lw_page_memory); }
 
 /* Whether the last call has come to where it can't continue: because of a plant, or if `plant` is -1 of the diagram. */
 LW_SEEN(failed) int lw_page_failed(void) { return lw_page_has_failed; }
+
+/* Set a parameter of a plant: from the next step on, or after `fill` from the start on. */
+LW_SEEN(tune) void lw_page_tune(int number, double value, int begun) {
+    lw_tuned[number].value = value;
+    lw_tuned[number].is_set = true;
+    if (begun && !lw_page_has_failed) lw_page_has_failed = !lw_page_put(lw_tuned + number);
+}
+
+/* Why the diagram can't continue: the number of the guard that is not positive, or -1: there is none. */
+LW_SEEN(guard) int lw_page_guard(void) { return lw_find_guard(&lw_page_memory); }
+
+/* The number of the event that fires without end, LW_N_EVENTS where the solver finds no step, or -1: neither. */
+LW_SEEN(event) int lw_page_event(void) {
+#if LW_HYBRID
+    if (lw_page_memory.reason == PILED_UP && LW_N_EVENTS) return (int)lw_page_memory.hybrid.w.culprit;
+    if (lw_page_memory.reason == BROKEN_OFF && lw_page_memory.hybrid.p.lost != AT_INSTANT) return LW_N_EVENTS;
+#endif
+    return -1;
+}
 
 /* Begin at t = 0, after `fill` and `renew`. */
 LW_SEEN(begin) void lw_page_begin(void) {

@@ -43,7 +43,7 @@ TARGET = Constant(value=0.0, unit="rad/s", name="target")
 def page():
     return drive(TARGET).to_html(
         inputs={"target": (-200.0, 200.0), "load": (-0.2, 0.2)},
-        sliders={"kp.gain": (0.0, 1.0)},
+        sliders={"kp.gain": (0.0, 1.0), "motor.resistance": None},
         plots=[["speed", "target"], "voltage", "motor.current"],
     )
 
@@ -83,6 +83,33 @@ def test_a_parameter_is_moved_while_it_runs_and_a_reset_begins_again():
             assert same(rows, module, simulation.run())
 
 
+def test_a_parameter_of_an_fmu_is_moved_from_the_start_on_as_its_start_value_is():
+    module, diagram = Module(page().html), drive(TARGET.replace(value=50.0)).replace({"motor.resistance": 3.0})
+    for _ in range(2):  # the second time after a reset
+        module._call("fill")
+        module.set(module.slider("motor.resistance")["place"], 3.0, begun=False)
+        module.set(module.slider("target")["place"], 50.0)
+        assert module.begin()
+        assert same(module.run(500), module, diagram.simulate(0.499, progress=False))
+
+
+def test_a_parameter_of_an_fmu_is_moved_between_steps():
+    """At rest at ω the current is b ω / K, and the voltage R b ω / K + K ω: with another R after the move."""
+    module = Module(page().html)
+    module.set(module.slider("target")["place"], 100.0)
+    assert module.begin()
+    column = {name: 1 + i for i, name in enumerate(module.names)}
+    rest = [module.run(4000)[-1]]
+    module.set(module.slider("motor.resistance")["place"], 6.0)
+    rest.append(module.run(4000)[-1])
+    motor_constant, friction, w = 0.05, 1e-5, 100.0
+    for row, resistance in zip(rest, (1.2, 6.0), strict=True):
+        assert row[column["speed"]] == pytest.approx(w, rel=1e-9)
+        assert row[column["motor.current"]] == pytest.approx(friction * w / motor_constant, rel=1e-9)
+        voltage = resistance * friction * w / motor_constant + motor_constant * w
+        assert row[column["voltage"]] == pytest.approx(voltage, rel=1e-9)
+
+
 def test_a_page_is_one_file_that_asks_for_nothing():
     html = page().html
     assert page().size < 200_000
@@ -110,7 +137,10 @@ def test_plots_and_sliders_have_names_units_and_ranges():
         ("target", -200.0, 200.0, 0.0, "rad/s"),
         ("load", -0.2, 0.2, 0.0, ""),
     ]
-    assert [s["name"] for s in parameters["sliders"]] == ["kp.gain"]
+    assert [(s["name"], s["low"], s["high"], s["value"], s["unit"], s["log"]) for s in parameters["sliders"]] == [
+        ("kp.gain", 0.0, 1.0, 0.05, "", False),
+        ("motor.resistance", 0.24, 6.0, 1.2, "Ohm", True),
+    ]
 
 
 def test_without_choices_a_page_has_the_constants_and_the_named_wires():
@@ -178,7 +208,9 @@ def test_an_fmu_of_others_is_refused_by_its_path(uncompiled, monkeypatch):
         ({"inputs": ["targett"]}, UnknownNameError, "Did you mean"),
         ({"inputs": {"target": (1.0, 2.0)}}, OptionError, "which is 0; expected one that has it"),
         ({"inputs": {"target": (1.0, 1.0)}}, OptionError, "expected its smallest and its largest value"),
-        ({"sliders": ["motor.start.resistance"]}, OptionError, "of an FMU, of which parameters don't change"),
+        ({"sliders": ["motor.integrator"]}, OptionError, r"of an FMU; expected one .* motor\.resistance, motor\.induc"),
+        ({"sliders": ["motor.start"]}, OptionError, "of an FMU; expected one of its parameters that may change"),
+        ({"sliders": {"motor.resistance": (0.0, 2.0)}}, OptionError, "expected values above 0"),
         ({"sliders": ["target.unit"]}, OptionError, "expected a parameter that is a number"),
         ({"plots": ["speeed"]}, UnknownNameError, "Did you mean 'speed'"),
         ({"plots": [3]}, OptionError, "found 3 among the plots"),
