@@ -16,6 +16,10 @@ from .derivation import Derivation
 from .start_values import check_state, check_value
 
 
+_KEPT, _ROUNDING = 1e-9, 1e-12
+"""A state counts as set within these: relative to its value, and to its nominal value."""
+
+
 @explain_calls
 @dataclass(frozen=True, eq=False)
 class FmuLinearization:
@@ -108,17 +112,31 @@ class FmuPoint:
             )
         return Layout.of({v.name: v.shape for v in variables}).split(vector)
 
-    def check(self, found: np.ndarray) -> None:
-        """Refuse an operating point that the FMU does not accept."""
-        for name, part in self.about.layout(self.states).split(found).items():
-            if name in self.given and not is_kept(part, np.ravel(self.given[name]).astype(float), tolerance=1e-9):
-                raise FmuError(
-                    f"its state was set to {self.given[name].tolist()}, but is {np.ravel(part).tolist()} when the FMU "
-                    f"has initialized at t = {self.t:.9g} s: an event there changes it, or its start value is only a "
-                    "guess. Choose a point that is not on an event.",
-                    block=self.block.label,
-                    port=name,
-                )
+    def lost(self, found: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the states that were set, and are others now by more than rounding, with their values."""
+        parts = self.about.layout(self.states).split(found).items()
+        return {n: part for n, part in parts if n in self.given and not self._is_kept(n, part)}
+
+    def _is_kept(self, name: str, part: np.ndarray) -> bool:
+        given, nominals = np.ravel(self.given[name]).astype(float), np.abs(np.ravel(self.about.find(name).nominals))
+        rounded = np.abs(np.ravel(part) - given) <= _ROUNDING * nominals
+        return is_kept(part, given, tolerance=_KEPT) or bool(np.all(rounded))
+
+    def check(self, found: np.ndarray, *, exchange: bool) -> None:
+        """Refuse an operating point that the FMU does not accept; ``exchange``: it was asked in model exchange."""
+        for name, part in self.lost(found).items():
+            raise FmuError(
+                f"its state was set to {self.given[name].tolist()}, but is {np.ravel(part).tolist()} when the FMU "
+                f"has initialized at t = {self.t:.9g} s: an event there changes it, or its start value is only a "
+                f"guess. {self._next_step(exchange)}",
+                block=self.block.label,
+                port=name,
+            )
+
+    def _next_step(self, exchange: bool) -> str:
+        if exchange or self.about.model_exchange is None:
+            return "Choose a point that is not on an event."
+        return "Choose a point that is not on an event, or take Fmu(…, interface='model_exchange'), which sets states."
 
     def elements(self, names: list[str], *, ports: bool = False) -> tuple[str, ...]:
         """Return the names of all elements of variables."""

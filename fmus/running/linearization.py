@@ -79,8 +79,13 @@ def _interface_name(exchange: bool) -> str:
 
 
 def _enter_continuous_time(point: FmuPoint, instance: LoadedFmu) -> None:
-    """Settle the events at the start, then set the states without an exact start value (FMI 3.0, 3.2)."""
+    """Settle the events at the start, then set the states that initialization computes (FMI 3.0, 3.2).
+
+    They are those without an exact start value, and those that have lost theirs before any event: initial equations
+    of a model may override what its description calls exact, as in FMUs of OpenModelica.
+    """
     instance.begin()
+    computed = point.lost(instance.values(point.states))
     for _ in range(100):
         found = instance.call("the events at the start", instance.fmi.update_events)
         if found.terminate:
@@ -93,7 +98,9 @@ def _enter_continuous_time(point: FmuPoint, instance: LoadedFmu) -> None:
             block=point.block.label,
         )
     instance.call("entering Continuous-Time Mode", instance.fmi.enter_continuous_time_mode)
-    guessed = [n for n in point.states if n in point.given and point.about.find(n).initial != "exact"]
+    guessed = [
+        n for n in point.states if n in point.given and (n in computed or point.about.find(n).initial != "exact")
+    ]
     if guessed:
         x = instance.values(point.states)
         where = point.about.layout(point.states).slices
@@ -130,7 +137,7 @@ def _linearize_by_directions(point: FmuPoint, instance: LoadedFmu) -> FmuLineari
         instance.begin()
     about = point.about
     x, u = instance.values(point.states), instance.values(point.inputs)
-    point.check(x)
+    point.check(x, exchange=instance.model_exchange)
     values = _values(point, instance)
     unknowns = [*(about.states[n] for n in point.states), *point.outputs]
     variables = [about.find(n) for n in unknowns]
@@ -232,7 +239,7 @@ def _linearize_by_differences(point: FmuPoint, instance: LoadedFmu) -> FmuLinear
     if instance.model_exchange:
         _enter_continuous_time(point, instance)
     x, u = instance.values(point.states), instance.values(point.inputs)
-    point.check(x)
+    point.check(x, exchange=instance.model_exchange)
     values = _values(point, instance)
     made = _differences(point, instance, values)
     J, uncertainty = point.widen(made.J), point.widen(made.error)
@@ -364,7 +371,7 @@ def _linearize_step(point: FmuPoint, instance: LoadedFmu, h: float, relative_ste
     about, known = point.about, [*point.states, *point.inputs]
     instance.begin()
     x, u = instance.values(point.states), instance.values(point.inputs)
-    point.check(x)
+    point.check(x, exchange=instance.model_exchange)
     at = about.layout(known).split(np.concatenate([x, u]))
 
     def start_again(set_before: Mapping[str, Any]) -> None:

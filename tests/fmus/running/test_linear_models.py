@@ -2,6 +2,7 @@
 
 import re
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import casadi as ca
@@ -25,8 +26,8 @@ from loopwright.fmus import (
     gantry_stiction,
     mass_spring_damper,
 )
-from loopwright.fmus.calls.loaded_library import LoadedFmu
 from loopwright.types import FmuLinearization
+from support.closed_form import closed_form_fmu
 from support.exported import pendulums, thermostat
 
 WAYS = [("model_exchange", True), ("co_simulation", True), ("model_exchange", False), ("co_simulation", False)]
@@ -249,17 +250,24 @@ def test_an_fmu_that_hides_its_states_has_no_linear_model_but_a_step(motor, tmp_
     assert np.abs(step.D[:3] - E[:3, 3:]).max() < 1e-6 * np.abs(E).max()
 
 
-def test_an_operating_point_that_the_fmu_does_not_take_is_refused(motor, monkeypatch):
-    go = LoadedFmu.initialize
-
-    def deaf(self, stop_time, *, start_time=0.0, values=None):
-        go(self, stop_time, start_time=start_time, values={**values, "current": 1.25})
-
-    monkeypatch.setattr(LoadedFmu, "initialize", deaf)
-    plant = Fmu(motor, name="m")
-    for linearize in (plant.linear_model, lambda state: plant.step_difference(1e-3, state=state)):
-        with pytest.raises(FmuError, match=r"^m\.current: its state was set to 1\.0, but is \[1\.25\] when the FMU"):
-            linearize(state={"current": 1.0})
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_states_that_initialization_computes_again_are_set_in_model_exchange_or_refused(fmi, tmp_path):
+    """As in an FMU of OpenModelica, whose description calls them exact; of dx/dt = u − x³, A = −3 x²."""
+    deaf = ("else (r[i] < 10 ? c->x", "else if (r[i] >= 10) (r[i] < 10 ? c->x")
+    plant = Fmu(closed_form_fmu(tmp_path, fmi, "dx[0] = u[0] - x[0]*x[0]*x[0]; y[0] = x[0];", changes=[deaf]), name="m")
+    model = plant.linear_model(state={"x1": 2.0})
+    assert (model.x0.tolist(), model.f.tolist()) == ([2.0], [-8.0])
+    assert pytest.approx(np.array([[-12.0]]), rel=1e-7) == model.A
+    ways = [
+        (partial(plant.linear_model, interface="co_simulation"), "interface='model_exchange'"),
+        (partial(plant.step_difference, 1e-3), "interface='model_exchange'"),
+    ]
+    for linearize, text in ways:
+        with pytest.raises(
+            FmuError, match=rf"^m\.x1: its state was set to 2\.0, but is \[0\.0\] when the FMU .*{text}"
+        ):
+            linearize(state={"x1": 2.0})
+        assert linearize(state={"x1": 1e-17}).x0.tolist() == [0.0]
 
 
 def test_wrong_points_are_refused(motor):
