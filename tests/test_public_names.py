@@ -196,6 +196,12 @@ def test_completion_of_a_plant_and_a_diagram_shows_what_a_person_types():
     assert all(hasattr(diagram, name) for name in PLUMBING)
 
 
+def test_completion_of_the_experiments_and_of_a_plants_module_shows_what_they_define_and_no_import():
+    assert {"path_following", "compliance", "DEFAULTS"} <= set(dir(loopwright.experiments))
+    assert not {"np", "Any", "fig3", "Diagram"} & set(dir(loopwright.experiments))
+    assert dir(loopwright.fmus.dc_motor) == ["DcMotor", "build", "nominal"]
+
+
 @pytest.mark.parametrize("cls", [Gain, PID, loopwright.Block, loopwright.Fmu])
 def test_help_shows_no_special_methods(cls):
     text = pydoc.render_doc(cls, renderer=pydoc.plaintext)

@@ -8,7 +8,7 @@ from .numpy_check import GUARDS, NEXT, evaluate
 from .opaque_equations import raise_failure
 from .operations import MATH_FUNCTIONS
 from .outside import describe_outside
-from .structure import has_structure, is_traced_by, structure, traced_parameters
+from .structure import has_structure, is_traced_by, traced_parameters
 from .switching_times import Line, switching_times
 from .symbols import bundle, count_uses, flat_column, has_large_product, is_nonzero, size, with_values, wrap
 from .traced import Traced, constants_of, trace
@@ -42,7 +42,6 @@ __all__ = [
     "start_shapes",
     "start_values",
     "state_after_start",
-    "structure",
     "switching_times",
     "trace",
     "trace_initial",

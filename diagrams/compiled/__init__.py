@@ -4,7 +4,7 @@ from .background import BackgroundCode
 from .compiled_libraries import load_compiled
 from .event_domains import Domains
 from .exported_memory import NamedCode, function_text, read_memory
-from .function_code import Code, Sources
+from .function_code import Code
 from .fused import FusedPlant, compile_fused, fuse
 from .grouping import make_tables
 from .handed_over import HandedOver
@@ -28,8 +28,9 @@ from .hybrid_code import (
 )
 from .kernels import Kernel
 from .library_method import StepFailure
-from .loop import CompiledLoop, NewtonOptions, Outcome, ReturnReason
+from .loop import CompiledLoop, Outcome, ReturnReason
 from .native_tick import bind_call
+from .newton import NewtonOptions
 from .remote import REFUSED, TAKEN_BY_PYTHON, UNDER_WAY, PythonStep, compile_other_side
 from .runtime import load_runtime
 from .staged import NativeModelExchange, OwnEvent
@@ -67,7 +68,6 @@ __all__ = [
     "PythonStep",
     "ReturnReason",
     "Sign",
-    "Sources",
     "Span",
     "StepFailure",
     "TickCode",

@@ -17,7 +17,8 @@ from ...fmus.export import Field, LoopMemory, c_number
 from ..flat import share_terms
 from .bound_functions import BoundFunction, CodeOfFunctions, CompiledFunction, TickStructure
 from .hybrid_structures import DelaysStructure, HybridStructure, MethodStructure, ProblemStructure
-from .loop import LoopStructure, NewtonStructure
+from .loop import LoopStructure
+from .newton import NewtonStructure
 from .watch import WatchStructure
 
 _STRUCTS: dict[type[ctypes.Structure], str] = {

@@ -3,49 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from ...blocks.core import EvaluationVectors, FmuRuntimeError, SimulationError
+from ...fmus.calls import ModelExchangeInstance
 from ..flat import JUMP, FlatDiagram, OpaqueStage
 from ..model_exchange import OWN_EVENTS, ModelExchangeEvaluator
 from .runtime import load_runtime
-from .staged import NativeBlock, NativeModelExchange, OwnEvent
+from .staged import NativeModelExchange, OwnEvent
 
 _DONE, _NOT_COMPUTED = range(2)
 _FIRED = -1
-
-
-class HandedBlock(NativeBlock, Protocol):
-    """A block that C can evaluate; see `loopwright.fmus.calls.ModelExchangeInstance`."""
-
-    next_time: float
-    ends_run: bool
-    nominals: np.ndarray
-
-    def find_native_obstacle(self) -> str | None:
-        """Return why a loop in C can't evaluate it by itself; None if it can."""
-
-    @property
-    def reached_inputs(self) -> np.ndarray:
-        """Values of all inputs at the last instant that was reached."""
-
-    @property
-    def is_final(self) -> bool:
-        """Whether no earlier state will be restored."""
-
-    def take_back(self, u: np.ndarray, next_time: float, *, read_nominals: bool) -> None:
-        """Continue from where a loop in C has come to."""
-
-    def take_end(self, t: float, *, in_event: bool) -> None:
-        """Note that the block has asked a loop in C to end the run."""
-
-    def take_warning(self, action: str, t: float) -> None:
-        """Note a warning that a loop in C has got."""
-
-    def judge_native(self, action: str, status: int, t: float) -> None:
-        """Raise the error of a call of C that has failed."""
 
 
 class HandedOver:
@@ -55,8 +25,8 @@ class HandedOver:
     ----------
     flat : FlatDiagram
         The diagram.
-    blocks : mapping of str to HandedBlock
-        The blocks by path, loaded.
+    blocks : mapping of str to ModelExchangeInstance
+        The blocks by path, loaded; one that a user has written has the members that Python needs alone.
     evaluators : mapping of str to ModelExchangeEvaluator
         Their evaluators, by which Python does what C can't.
     report : callable
@@ -74,7 +44,7 @@ class HandedOver:
         count: Callable[[float, str, str], None],
     ):
         self._evaluators, self._report, self._count = evaluators, report, count
-        self._blocks: dict[str, HandedBlock] = {path: blocks[path] for path in flat.outside}
+        self._blocks: dict[str, ModelExchangeInstance] = {path: blocks[path] for path in flat.outside}
         first = {path: flat.states.slices[path].start for path in flat.outside}
         self.native = NativeModelExchange(self._blocks, first, flat.width, load_runtime(), self._by_python)
         """The blocks as C knows them."""

@@ -17,7 +17,8 @@ from .event_domains import Domains
 from .hybrid_code import Between, HybridCode
 from .hybrid_structures import HybridStructure, MethodStructure, ProblemStructure, SpanStructure
 from .library_method import LibraryMethod, StepFailure
-from .loop import CompiledLoop, NewtonOptions, NewtonStructure, OutcomeStructure
+from .loop import CompiledLoop, OutcomeStructure
+from .newton import NewtonOptions, NewtonStructure
 from .radau import radau_numbers
 from .rate_differences import RateDifferences
 from .runtime import load_runtime

@@ -5,10 +5,9 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,8 +19,10 @@ from ...fmus.host_state import HostState
 from ..flat import TRUE, StepTable, TickPattern
 from .bound_functions import CALL, TICK, TickStructure, at
 from .grouped_functions import GroupedTick
+from .newton import NewtonOptions, NewtonStructure
 from .remote import PythonStep, RemotePlants
 from .runtime import load_runtime
+from .staged import NativeModelExchange
 from .staged_functions import Staged, StagedEquations
 from .tick_code import CompiledTick, TickCode
 
@@ -84,48 +85,6 @@ class _OwnSteps(ctypes.Structure):
     _fields_ = [(name, ctypes.c_void_p) for name in ("begins", "widths", "holds", "inputs")]
 
 
-class NewtonStructure(ctypes.Structure):
-    """The algebraic loops of a tick, as C knows them."""
-
-    _fields_ = [
-        ("n", ctypes.c_int64),
-        ("equations", TickStructure),
-        *((name, ctypes.c_void_p) for name in ("where", "r", "J", "v", "before", "direction", "column", "lu", "rows")),
-        *((name, ctypes.c_double) for name in ("tolerance", "rounding", "singular")),
-        *((name, ctypes.c_int64) for name in ("iterations", "halvings")),
-        ("help", ctypes.c_void_p),
-    ]
-
-
-@dataclass(frozen=True)
-class NewtonOptions:
-    """Newton's method for the algebraic loops of a tick.
-
-    Attributes
-    ----------
-    where : sequence of int
-        Entries of x that hold the values of the loops.
-    tolerance, rounding : float
-        Residuals, relative to 1 + the size of the values: up to the one a loop counts as solved, up to the other it is
-        solved no further.
-    singular : float
-        Least singular value of the derivative that surely determines the values, relative to 1 + the loop's gain.
-    iterations, halvings : int
-        Steps, and halvings of a step, at most.
-    solver : callable
-        ``solver(t, x, call, r, J)`` returns Python's function that solves the loops where C can't: with the vectors t
-        and x, and ``call``, which evaluates the mismatch r and its derivative J.
-    """
-
-    where: Sequence[int]
-    tolerance: float
-    rounding: float
-    singular: float
-    iterations: int
-    halvings: int
-    solver: Callable[..., Callable[[], None]]
-
-
 class Outcome(NamedTuple):
     """Where and why the loop has returned.
 
@@ -151,23 +110,6 @@ class Outcome(NamedTuple):
     status: int
 
 
-class StagedBinding(Protocol):
-    """Binds functions in stages to vectors; see `NativeModelExchange`."""
-
-    watched: list[tuple[HostState, ctypes.c_bool]]
-    """States of this process that FMUs may change, and whether C has seen that."""
-    remote: RemotePlants
-    """Processes that are asked for calls."""
-
-    def bind(self, staged: Staged, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> ctypes.Structure:
-        """Return a function bound to vectors, as C knows it."""
-
-    def bind_equations(
-        self, equations: StagedEquations, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
-    ) -> ctypes.Structure:
-        """Return the equations of algebraic loops bound to vectors, as C knows them."""
-
-
 class CompiledLoop:
     """The loop over ticks, bound to the numbers of a run.
 
@@ -189,7 +131,7 @@ class CompiledLoop:
         Entries of the log that end the run where they are true.
     loops : mapping, optional
         How the algebraic loops of each tick are solved, where there are some.
-    exchange : StagedBinding, optional
+    exchange : NativeModelExchange, optional
         Binds ticks in stages.
     held : pair of ndarray, optional
         Inputs of the plants as they are now, and as they are held between ticks; one array where that is the same.
@@ -212,7 +154,7 @@ class CompiledLoop:
         every: int,
         stops: Sequence[int],
         loops: Mapping[frozenset[TickPattern], NewtonOptions] | None = None,
-        exchange: StagedBinding | None = None,
+        exchange: NativeModelExchange | None = None,
         held: tuple[np.ndarray, np.ndarray] | None = None,
         inputs: Sequence[slice] = (),
         rest: Callable[[], int] | None = None,

@@ -5,18 +5,18 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...blocks.called_back import CalledBack
-from ...blocks.core import EvaluationVectors, Wanted
-from ...fmus.calls import BoundCalls, NativeAction, NativeLook
+from ...blocks.core import EvaluationVectors
+from ...fmus.calls import BoundCalls, ModelExchangeInstance, NativeAction, NativeLook
 from ...fmus.host_state import HostState
 from ..flat import JUMP, OpaqueStage
 from ..model_exchange import OWN_EVENTS
 from .bound_functions import CALL, TickStructure, address_of, at, list_vectors
-from .loop import NewtonStructure
+from .newton import NewtonStructure
 from .rate_differences import color_columns
 from .remote import LateReplies, RemotePlants
 from .staged_functions import Staged, StagedEquations, StagedSlopes
@@ -102,20 +102,6 @@ class _SlopesInC(ctypes.Structure):
     ]
 
 
-class NativeBlock(Protocol):
-    """A block that a loop in C evaluates; see `loopwright.fmus.calls.ModelExchangeInstance`."""
-
-    @property
-    def native_host(self) -> HostState | None:
-        """The state of this process, which a library that Loopwright has not built may change."""
-
-    def native_evaluation(self, wanted: Wanted, vectors: EvaluationVectors, *, again: bool) -> list[NativeAction]:
-        """Return an evaluation as actions of C."""
-
-    def native_look(self, vectors: EvaluationVectors) -> NativeLook:
-        """Return all that a look at an instant that is reached may do."""
-
-
 class OwnEvent(NamedTuple):
     """An event of a block's own: its time in s, block and name, and the states before and after it."""
 
@@ -159,7 +145,7 @@ class NativeModelExchange:
 
     def __init__(
         self,
-        blocks: Mapping[str, NativeBlock],
+        blocks: Mapping[str, ModelExchangeInstance],
         first: Mapping[str, int],
         width: int,
         library: ctypes.CDLL,

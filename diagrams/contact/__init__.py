@@ -5,7 +5,7 @@ from .confirmation import ContactConfirmation, ContactTrial, TrialMethod, try_li
 from .contact import SIDES, Contact, find_sign, make_contact
 from .contact_ports import PortNames
 from .coupled_parts import restrict
-from .environment import UNITS, check_properties, check_property
+from .environment import check_properties, check_property
 from .loop import close_loop, controller_rows, join_environment
 from .measured_force import Tool
 from .passivity import LOWEST, Passivity, PassivityReason, PortPassivity
@@ -23,7 +23,6 @@ __all__ = [
     "LOWEST",
     "PER_DECADE",
     "SIDES",
-    "UNITS",
     "Contact",
     "ContactAdmittance",
     "ContactConfirmation",

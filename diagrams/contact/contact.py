@@ -316,7 +316,7 @@ def make_contact(
     force = names.force
     taken = {name: options[name] for name in ("stairs", "step") if name in options}
     options = {name: value for name, value in options.items() if name != "stairs"}
-    check_options(diagram, options, "contact")
+    check_options(options, "contact")
     point = operating_point(diagram, at, options)
     diagram = diagram.replace(point.parameters) if point.parameters else diagram  # parameters that a trim has found
     ports = Ports.find(diagram, diagram.flatten_like(point), names)

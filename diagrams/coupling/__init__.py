@@ -1,7 +1,7 @@
 """Plants of a run: loaded, stepped between their communication points, and coupled with one another."""
 
-from .connection_delays import CoupledConnection, CouplingReport, HeldFrom, LinkKind, report_coupling
-from .coupled_steps import CoupledSteps, Effort, passes_slopes
+from .connection_delays import CouplingReport, HeldFrom, LinkKind, report_coupling
+from .coupled_steps import CoupledSteps, passes_slopes
 from .coupling_options import Coupling, Scheme, refuse_model_exchange, to_coupling
 from .fixed_points import find_fixed_point
 from .links import Links
@@ -9,21 +9,17 @@ from .loops import note_loops
 from .plant_steps import PlantSteps, end_all, runs_apart, step_all
 from .plants import Plant, load_plants, note_steps
 from .rollback import accept_steps, try_steps
-from .search import Search
 
 __all__ = [
-    "CoupledConnection",
     "CoupledSteps",
     "Coupling",
     "CouplingReport",
-    "Effort",
     "HeldFrom",
     "LinkKind",
     "Links",
     "Plant",
     "PlantSteps",
     "Scheme",
-    "Search",
     "accept_steps",
     "end_all",
     "find_fixed_point",

@@ -126,7 +126,7 @@ def _stack(nodes: Sequence[Node], nets: Sequence[Net], row_of: dict[str, int]) -
             crossing.append((net, None if source.side else rows[home], [rows[home]] * bool(source.side)))
             crossing[-1][2].extend(rows[row] for row in across)
     left = (len(crossing) - 1) * TRACK + 2 * LANE if crossing else 0.0
-    _place(rows, crossing, left)
+    _place(rows, crossing)
     for line in rows:
         for node in (*line.nodes, *line.entries.values(), *line.exits.values()):
             node.x, node.y = node.x + left, node.y + line.y
@@ -165,7 +165,7 @@ def _strip(row: _Row, crossing: Sequence[_Crossing]) -> float:
     return LANE + count * TRACK if count else 0.0
 
 
-def _place(rows: Sequence[_Row], crossing: Sequence[_Crossing], left: float) -> None:
+def _place(rows: Sequence[_Row], crossing: Sequence[_Crossing]) -> None:
     """Lay out each row by itself, one below the other."""
     y = 0.0
     for row in rows:

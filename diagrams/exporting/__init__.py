@@ -2,12 +2,10 @@
 
 from .loop_of_diagram import loop_spec
 from .make_exported import make_exported, name_of
-from .open_diagram import OpenDiagram, choose_outputs, let_move, open_part, open_subsystem, open_whole
+from .open_diagram import let_move, open_part, open_subsystem, open_whole
 from .target import target_spec, to_c
 
 __all__ = [
-    "OpenDiagram",
-    "choose_outputs",
     "let_move",
     "loop_spec",
     "make_exported",

@@ -4,10 +4,10 @@ from ...blocks.core import Layout
 from .announced import Announcer, Times, announcers
 from .clock_sets import kinds_of, times_of
 from .clocks import EVERY, NONE, ClockSets, TickPattern, ticks_after
-from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, just_after, no_evaluator, sort_names
+from .evaluation import JUMP, Apart, Instant, evaluate, just_after, no_evaluator, sort_names
 from .fast_functions import share_terms, speed_up
 from .flat_diagram import EXACT_LOOP, FlatDiagram
-from .flat_functions import GuardedTick, indicators_of, trace_guarded_tick
+from .flat_functions import indicators_of, trace_guarded_tick
 from .flat_layout import FlatEvent, StateLayout, sample_time_of
 from .flatten import flatten, renumber, write_numbers
 from .logic import TRUE, is_true
@@ -26,7 +26,6 @@ __all__ = [
     "COPY",
     "EVERY",
     "EXACT_LOOP",
-    "INDICATORS",
     "JUMP",
     "LESS",
     "NONE",
@@ -42,7 +41,6 @@ __all__ = [
     "Evaluators",
     "FlatDiagram",
     "FlatEvent",
-    "GuardedTick",
     "Ids",
     "Instant",
     "Layout",

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from .delay_matrices import NEUTRAL, DelayMatrices, find_pade_limit, replace_delays
 from .delayed_hold import delayed_hold, delayed_hold_margin
-from .delayed_realization import DelayedRealization, realize
+from .delayed_realization import realize
 from .disk_margins import DiskMargin, disk_margin, loop_at, mimo_disk_margin
 from .loop_drawing import DrawnLoop, draw_bode_axes, draw_nyquist_axes, phase_of
 from .loop_margins import GainCrossover, Margins, PhaseCrossover, find_disk_frequency, margins, scan_margins
@@ -24,7 +24,7 @@ from .realization import Realization
 from .sampled_design import SampledDesign, sampled_gains, sampled_poles
 from .scan_refine_confirm import first_largest, order_key, refine_sign_change
 from .sensitivities import GangOfFour, complementary, gang_of_four, sensitivity
-from .state_space import FourMatrices, advance_held, hold_inputs, read_matrices
+from .state_space import FourMatrices, advance_held, hold_inputs
 from .structured_value import mu_bound
 
 if TYPE_CHECKING:
@@ -61,7 +61,6 @@ __all__ = [
     "Comparison",
     "Confirmation",
     "DelayMatrices",
-    "DelayedRealization",
     "DiskMargin",
     "DrawnLoop",
     "FourMatrices",
@@ -110,7 +109,6 @@ __all__ = [
     "place",
     "plot_poles",
     "read_frequency_data",
-    "read_matrices",
     "realize",
     "refine_sign_change",
     "relative_difference",

@@ -1,6 +1,6 @@
 """Runs of one diagram side by side in the lanes of vectors: code of its ticks and of its FMUs' equations."""
 
-from .lane_code import LaneCode, LaneStarts, compile_lanes
+from .lane_code import LaneCode, compile_lanes
 from .lane_runs import LaneEnd, LaneRuns, LaneStart, LaneVectors, make_room
 from .no_lanes import NoLanesError
 from .start_code import StartSource
@@ -10,7 +10,6 @@ __all__ = [
     "LaneEnd",
     "LaneRuns",
     "LaneStart",
-    "LaneStarts",
     "LaneVectors",
     "NoLanesError",
     "StartSource",

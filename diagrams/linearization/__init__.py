@@ -9,7 +9,6 @@ from .findings import (
     CoarseValues,
     CutFromTracking,
     EntryTaken,
-    EventWithinPeriod,
     InertConsumer,
     InexactDerivatives,
     Kink,
@@ -22,7 +21,7 @@ from .findings import (
     ZeroSlope,
 )
 from .flow_model import LinearDelays
-from .free_motions import FreeMotion, FreeMotions, deflate
+from .free_motions import FreeMotion, FreeMotions
 from .inserted_blocks import find_inputs, name_wire_to, with_passed_values
 from .kinks import find_kinks_between
 from .linear_model import (
@@ -46,7 +45,7 @@ from .operating_points import (
 from .over_a_period import TickModel, model_ticks, ticks_between_renewals, ticks_to_renewal
 from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop, loop_of_variant, rational_loop
 from .plant_models import EQUILIBRIUM, PlantEquations, linearize_plant
-from .shared_wires import WaysBack, find_ways_back
+from .shared_wires import find_ways_back
 from .signal_paths import SignalPaths
 from .trim_search import point_from_states, trim
 
@@ -58,7 +57,6 @@ __all__ = [
     "CoarseValues",
     "CutFromTracking",
     "EntryTaken",
-    "EventWithinPeriod",
     "FreeMotion",
     "FreeMotions",
     "InertConsumer",
@@ -79,14 +77,12 @@ __all__ = [
     "Tap",
     "TickModel",
     "UnusualStart",
-    "WaysBack",
     "ZeroSlope",
     "capture",
     "carry_point",
     "check_options",
     "copy_point",
     "cut_to",
-    "deflate",
     "differentiate_loop",
     "find_flow_poles",
     "find_inputs",

@@ -500,7 +500,7 @@ def linearize(
     """Linearize a diagram; see `Diagram.linearize`."""
     check_argument(delays, kinds.choice("exact", "pade"), "delays", "linearize")
     check_argument(order, kinds.integer(1), "order", "linearize")
-    check_options(diagram, options, "linearize")
+    check_options(options, "linearize")
     at = operating_point(diagram, point, options)
     if delays == "pade" and _is_discrete(diagram, options.get("step")):
         raise OptionError(

@@ -99,7 +99,7 @@ def with_residual(flat: FlatDiagram, point: OperatingPoint, x_next: np.ndarray) 
     return pass_on(point, replace(point, residual=found, largest=who, unjudged=unjudged))
 
 
-def check_options(diagram: WiredDiagram, options: Mapping[str, Any], caller: str) -> None:
+def check_options(options: Mapping[str, Any], caller: str) -> None:
     """Refuse options that a run to an operating point does not have; ``caller`` is the name of the method.
 
     Raises
@@ -182,7 +182,7 @@ def run_to(diagram: WiredDiagram, t: float, options: Mapping[str, Any], *, begun
     """Run a diagram to a time in s, and return the operating point there; see `operating_point`."""
     from ..simulation import RunOptions, Simulation
 
-    check_options(diagram, options, "operating_point")
+    check_options(options, "operating_point")
     options = dict(options)
     start = options.get("start")
     first = 0.0 if start is None else float(start.t)

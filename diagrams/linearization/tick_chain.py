@@ -223,7 +223,7 @@ class Chain:
         if not self.steps:
             self.n_p, self._first_tick = n_p, tick
         self.steps.append((M, N, *eliminate_w("y")))
-        self._move(following, h, x1, tick["z"])
+        self._move(following, x1, tick["z"])
 
     def _check_delays(self) -> None:
         """Refuse transport delays next to FMUs that are coupled within a step."""
@@ -309,7 +309,7 @@ class Chain:
     def _end_time(self, k: int) -> float:
         return self.first.t + float((k - self.first.tick) * self.flat.base)
 
-    def _move(self, k: int, h: float, x: np.ndarray, z: np.ndarray) -> None:
+    def _move(self, k: int, x: np.ndarray, z: np.ndarray) -> None:
         """Move the operating point to tick k."""
         kind = np.result_type(self.here.w, *(m.y_next for m in self.models))
         w, plants = self.here.w.astype(kind), dict(self.here.plants)

@@ -2,7 +2,7 @@
 
 from .contact_limits import ContactLimits, read_contact_limits
 from .explanations import explain
-from .requirements import REQUIREMENTS, LoopLimits, Requirements, StepLimits, write_requirements
+from .requirements import REQUIREMENTS, Requirements, StepLimits, write_requirements
 from .results import RequirementResult, StepSize
 from .review import COLUMNS, DIGITS, MOST_REQUIREMENTS, NOTHING, Review, by_loop, rank, reason_in_table, row_of
 from .toml_file import REQUIRED, STUDIES, TomlFile, read_requirements
@@ -20,7 +20,6 @@ __all__ = [
     "STUDIES",
     "ContactLimits",
     "Limit",
-    "LoopLimits",
     "Reason",
     "RequirementResult",
     "Requirements",

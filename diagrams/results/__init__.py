@@ -6,17 +6,15 @@ from .recorder import Recorder, select
 from .recording import Recording
 from .run import Run, Snapshot
 from .saved_state import RunState, check_fits, layout_of, not_open_error
-from .signal_names import BlockOutputs, Places, entries, outputs_of, resolve
+from .signal_names import Places, entries, outputs_of, resolve
 from .step_info import StepInfo
-from .step_measures import ExpectedStep, Measured, is_at_rest, measure_step
+from .step_measures import ExpectedStep, is_at_rest, measure_step
 from .stored import Occurrence, Stopped
 from .texts import TextSignal
 
 __all__ = [
-    "BlockOutputs",
     "ExpectedStep",
     "FreeDirection",
-    "Measured",
     "Occurrence",
     "OperatingPoint",
     "Places",

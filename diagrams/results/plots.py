@@ -113,7 +113,7 @@ def _draw_panels(
     shown = np.array(ends if xlim is None else xlim)
     shared = all(_has_legend_of_runs(panel) for panel in panels)
     for ax, panel in zip(rows, panels, strict=True):
-        _draw_panel(ax, panel, shown)
+        _draw_panel(ax, panel)
         if _has_legend(panel) and not (shared and _has_legend_of_runs(panel)):
             _legend_over(ax)
         if xlim is not None:
@@ -137,7 +137,7 @@ def _legend_over(ax: Axes) -> None:
     ax.legend(ncols=legend_columns(ax.get_legend_handles_labels()[1], width), frameon=False, **look)
 
 
-def _draw_panel(ax: Axes, panel: Panel, shown: np.ndarray) -> None:
+def _draw_panel(ax: Axes, panel: Panel) -> None:
     """Draw the signals of one axis, with their limits where these are near."""
     single, is_long, common = _only_name(panel), _is_long(panel), _common(panel)
     runs = list(dict.fromkeys(one.run for one in panel))

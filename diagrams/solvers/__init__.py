@@ -1,6 +1,6 @@
 """The methods by name, the method of a run, and the multistep methods of libraries behind one interface."""
 
-from .base import FIXED, METHODS, SOLVERS, AcceptedStep, MethodKind, Polynomial, Problem, Solver, solver_name
+from .base import FIXED, METHODS, SOLVERS, AcceptedStep, MethodKind, Problem, Solver, solver_name
 from .choose import Method, make_solver
 
 __all__ = [
@@ -10,7 +10,6 @@ __all__ = [
     "AcceptedStep",
     "Method",
     "MethodKind",
-    "Polynomial",
     "Problem",
     "Solver",
     "make_solver",

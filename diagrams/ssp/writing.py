@@ -297,13 +297,13 @@ class Writer:
         around = _around(system)
         while at not in around:  # out of the systems that hold the source alone
             outer = at.rpartition(".")[0]
-            name = self._border(at, term.source, connector, "output")
+            name = self._border(at, term.source, "output")
             if name is None:
                 name = self._add_border(at, term.source, connector, "output")
                 self.systems[at].connections.append(WrittenConnection(start, ("", name)))
             start, at = (at.rpartition(".")[2], name), outer
         for inner in around[around.index(at) + 1 :]:
-            name = self._border(inner, term.source, connector, "input")
+            name = self._border(inner, term.source, "input")
             if name is None:
                 name = self._add_border(inner, term.source, connector, "input")
                 self.systems[at].connections.append(WrittenConnection(start, (inner.rpartition(".")[2], name)))
@@ -313,9 +313,7 @@ class Writer:
         plain = replace(term, source=None)
         self.systems[system].connections.append(WrittenConnection(start, end, plain, differ))
 
-    def _border(
-        self, system: str, source: tuple[str, str, int | None], connector: WrittenConnector, kind: str
-    ) -> str | None:
+    def _border(self, system: str, source: tuple[str, str, int | None], kind: str) -> str | None:
         return self._borders.get((system, kind, f"{source[0]}.{source[1]}", source[2]))
 
     def _add_border(

@@ -1,6 +1,6 @@
 """Studies of a design's margins over its parameters: sensitivities, worst cases."""
 
-from .cases import CaseOrigin, CaseState, Goal, StudyCase
+from .cases import CaseOrigin, CaseState, StudyCase
 from .confirmation import ConfirmationKind, RunConfirmation, confirm_parameter, confirm_sensitivity
 from .contact_task import ContactTask
 from .loop_places import LoopPlace, cut_places, find_places, is_zero, words_of
@@ -14,7 +14,6 @@ __all__ = [
     "CaseState",
     "ConfirmationKind",
     "ContactTask",
-    "Goal",
     "LoopPlace",
     "RunConfirmation",
     "Sensitivities",

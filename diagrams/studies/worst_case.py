@@ -270,7 +270,7 @@ def find_worst_case(
         count = 100
     drawn = read_samples(diagram, parameters, samples, count=count, seed=seed)
     check_parameters(diagram, drawn.names, "a worst case", blocks=True)
-    boxes = _read_boxes(diagram, parameters, drawn)
+    boxes = _read_boxes(drawn)
     places = tuple(points) if points is not None else (at,)
     study = Study(diagram, goal, boxes, places, delay, options, progress or (lambda text: None), measure)
     nominal = study.run({}, CaseOrigin.NOMINAL)
@@ -320,7 +320,7 @@ def _make_measure(
     return FunctionMeasure(quantity, diagram.name)
 
 
-def _read_boxes(diagram: WiredDiagram, parameters: Mapping[str, Any] | None, drawn: Samples) -> dict[str, Box]:
+def _read_boxes(drawn: Samples) -> dict[str, Box]:
     """Return the ranges of a search: those of a Latin hypercube, or from the least to the largest value of a grid."""
     if drawn.boxes:
         return dict(drawn.boxes)

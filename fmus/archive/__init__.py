@@ -1,7 +1,7 @@
 """FMU files: their archive and description, read, checked and unpacked; the archives of SSPs, too."""
 
 from .archive_limits import ArchiveLimits
-from .binaries import check_binary, find_binary, missing_functions
+from .binaries import check_binary, missing_functions
 from .description import FmuDescription, find_description, kept_description, read_description
 from .faults import FmuFault, FmuFinding, FmuSeverity
 from .gathering import read_index
@@ -31,7 +31,6 @@ __all__ = [
     "OtherVariable",
     "SharedLibrary",
     "check_binary",
-    "find_binary",
     "find_description",
     "inexact",
     "join_scalars",

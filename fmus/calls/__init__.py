@@ -5,7 +5,7 @@ from .fmi_calls import ERROR, WARNING, FmiCalls, Log
 from .fmu_block import FmuBlock
 from .instance import FmuInstance
 from .library_functions import LibraryFunctions, exported_name, list_prototypes
-from .loaded_library import CALLS, LoadedFmu, MakeCalls
+from .loaded_library import CALLS, LoadedFmu
 from .model_exchange_instance import ModelExchangeInstance
 from .model_structure import is_smooth
 from .native_actions import NativeAction, NativeLook
@@ -31,7 +31,6 @@ __all__ = [
     "LibraryFunctions",
     "LoadedFmu",
     "Log",
-    "MakeCalls",
     "ModelExchangeInstance",
     "NativeAction",
     "NativeLook",

@@ -15,6 +15,8 @@ import numpy as np
 from ...blocks.core import Array, Block, Event, State, parameter
 from ..export import build as _build
 
+__all__ = ["BouncingBall", "build", "nominal"]
+
 
 class BouncingBall(Block):
     """Ball that bounces on the floor and comes to rest."""

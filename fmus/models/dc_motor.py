@@ -15,6 +15,8 @@ from typing import Any
 from ...blocks.core import Array, Block, Input, Output, State, parameter
 from ..export import build as _build
 
+__all__ = ["DcMotor", "build", "nominal"]
+
 
 class DcMotor(Block):
     """Direct-current motor with permanent magnets, driven by a voltage against a load."""

@@ -22,6 +22,8 @@ from ...blocks.core import Array, Input, Output, State, parameter
 from ...blocks.path_following import PlanarModel
 from ..export import build as _build
 
+__all__ = ["INTERNAL_STEP", "Gantry", "build", "nominal"]
+
 INTERNAL_STEP = 1.0 / 5000.0
 """Start value of the FMU's internal Runge-Kutta step in s, for the friction width of 0.01 m/s: five per millisecond."""
 

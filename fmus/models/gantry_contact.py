@@ -29,6 +29,8 @@ from ...blocks.core import Array, Event, Output, State, parameter
 from ..export import build as _build
 from .gantry import INTERNAL_STEP, Gantry
 
+__all__ = ["GantryContact", "build", "nominal"]
+
 
 class GantryContact(Gantry):
     """Biaxial gantry robot with a wall in its workspace.

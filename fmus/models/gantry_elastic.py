@@ -27,6 +27,8 @@ from ...blocks.core import Array, Output, State, parameter
 from ..export import build as _build
 from .gantry import Gantry
 
+__all__ = ["INTERNAL_STEP", "GantryElastic", "build", "nominal"]
+
 INTERNAL_STEP = 1.0 / 10000.0
 """Start value of the FMU's internal Runge-Kutta step in s: a hundred per period of the resonance."""
 

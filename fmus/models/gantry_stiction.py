@@ -27,6 +27,8 @@ from ...blocks.core import Array, Block, Input, Output, ParameterError, State, p
 from ..export import Integrator
 from ..export import build as _build
 
+__all__ = ["INTERNAL_STEP", "GantryStiction", "build", "nominal"]
+
 INTERNAL_STEP = 1e-3
 """Start value of the FMU's longest internal step in s; Runge-Kutta 4 needs 5e-5 s to be stable up to 1.7 m/s."""
 

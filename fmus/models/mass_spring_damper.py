@@ -8,6 +8,8 @@ from typing import Any
 from ...blocks.core import Array, Block, Input, Output, State, parameter
 from ..export import build as _build
 
+__all__ = ["MassSpringDamper", "build", "nominal"]
+
 
 class MassSpringDamper(Block):
     """Mass on a spring and a damper, driven by a force."""

@@ -32,6 +32,8 @@ from ...blocks.core import Array, Input, Output, ParameterError, State, paramete
 from ...blocks.path_following import PlanarModel
 from ..export import build as _build
 
+__all__ = ["INTERNAL_STEP", "Scara", "build", "nominal"]
+
 INTERNAL_STEP = 1.0 / 5000.0
 """Start value of the FMU's internal Runge-Kutta step in s; the joints' friction has a rate of 200 1/s at rest."""
 
