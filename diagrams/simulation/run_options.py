@@ -69,9 +69,9 @@ class RunOptions:
         one it is the greatest common divisor of all sample times, of which those are visited at which a subsystem
         acts; for a diagram without any, a thousandth of the duration.
     solver : str
-        Solver of the continuous states: "auto", of fixed step "euler", "heun", "rk4", of variable step "RK23",
-        "RK45", "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "CVODE_Adams". The default changes from an explicit
-        to an implicit method where the diagram turns out to be stiff.
+        Solver of the continuous states: of fixed step such as "rk4", of variable step such as "RK45", "Radau" or
+        "CVODE_BDF"; an unknown name raises an error that lists all. The default, "auto", changes from an explicit to
+        an implicit method where the diagram turns out to be stiff.
     rtol, atol : float
         Relative and absolute tolerance of a step of a solver of variable step; the absolute one is multiplied with
         the nominal value of a state that declares one.

@@ -22,6 +22,17 @@ LW_INLINE int lw_heun(LW_EQUATION *e, int64_t n, double h, double to, const LW_N
     return failed;
 }
 
+/* The method of order 3 of Bogacki and Shampine's pair, Appl. Math. Lett. 2 (1989): no stage is at the end of the step. */
+LW_INLINE int lw_rk3(LW_EQUATION *e, int64_t n, double t, double h, const LW_NUMBER *x, const LW_NUMBER *k1, LW_NUMBER *k2,
+                     LW_NUMBER *k3, LW_NUMBER *y, LW_NUMBER *out) {
+    for (int64_t i = 0; i < n; i++) y[i] = x[i] + (0.5 * h) * k1[i];
+    int failed = LW_RATE(e, t + 0.5 * h, y, k2);
+    for (int64_t i = 0; i < n; i++) y[i] = x[i] + (0.75 * h) * k2[i];
+    failed |= LW_RATE(e, t + 0.75 * h, y, k3);
+    for (int64_t i = 0; i < n; i++) out[i] = x[i] + (h / 9.0) * (2.0 * k1[i] + 3.0 * k2[i] + 4.0 * k3[i]);
+    return failed;
+}
+
 LW_INLINE int lw_rk4(LW_EQUATION *e, int64_t n, double t, double h, double to, const LW_NUMBER *x, const LW_NUMBER *k1,
                      LW_NUMBER *k2, LW_NUMBER *k3, LW_NUMBER *k4, LW_NUMBER *y, LW_NUMBER *out) {
     const double middle = t + 0.5 * h;
@@ -40,5 +51,6 @@ LW_INLINE int lw_fixed(LW_EQUATION *e, int64_t n, int stages, double t, double h
                        const LW_NUMBER *k1, LW_NUMBER *K, LW_NUMBER *y, LW_NUMBER *out) {
     if (stages == 1) return lw_euler(n, h, x, k1, out);
     if (stages == 2) return lw_heun(e, n, h, to, x, k1, K, y, out);
+    if (stages == 3) return lw_rk3(e, n, t, h, x, k1, K, K + n, y, out);
     return lw_rk4(e, n, t, h, to, x, k1, K, K + n, K + 2 * n, y, out);
 }

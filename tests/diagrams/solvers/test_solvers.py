@@ -29,7 +29,7 @@ from loopwright.diagrams.solvers.choose import make_solver
 from support.hybrid_blocks import Crossings
 from support.work_in_c import simulate_counted
 
-FIXED = {"euler": 1, "heun": 2, "rk4": 4}
+FIXED = {"euler": 1, "heun": 2, "rk3": 3, "rk4": 4}
 VARIABLE = [name for name in SOLVERS if name not in FIXED]
 STIFF = ["auto", "Radau", "BDF", "LSODA", "CVODE_BDF"]
 ONE_STEP = {"RK23": 3, "RK45": 4, "DOP853": 7, "Radau": 3}  # order of the dense output
@@ -442,7 +442,7 @@ def test_an_error_in_the_rates_passes_through(name):
 # --- counts ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "rates"), [("euler", 1), ("heun", 2), ("rk4", 4)])
+@pytest.mark.parametrize(("name", "rates"), FIXED.items())
 def test_steps_and_rates_of_a_fixed_step_are_counted(name, rates):
     _, work = simulate_counted(system(lambda t, x: [-x[0]], [1.0]), 2.5, step=0.05, solver=name)
     assert work == (50, 0, 50 * rates, 0)

@@ -25,6 +25,7 @@ LANES, NEAR = 4, 1e-12
 GROWTH = {
     "euler": lambda z: 1 + z,
     "heun": lambda z: 1 + z + z**2 / 2,
+    "rk3": lambda z: 1 + z + z**2 / 2 + z**3 / 6,
     "rk4": lambda z: 1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24,
 }
 
