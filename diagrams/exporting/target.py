@@ -20,8 +20,8 @@ from ...fmus.export import (
     TargetSpec,
     TargetTick,
     Variable,
-    identifier,
     split_lookups,
+    unit_name,
     write_c,
 )
 from ..flat import FlatDiagram, TickPattern, kinds_of, share_terms, speed_up, trace_guarded_tick
@@ -106,15 +106,17 @@ def to_c(
     >>> code.bytes_of["struct"]
     64
     """
-    if name is not None and name != identifier(name):
+    if name is not None and name != unit_name(name):
         raise OptionError(
-            f"found {name!r}; expected a C identifier, such as {identifier(name)!r}.", block="to_c", port="name"
+            f"found {name!r}; expected a C identifier, such as {unit_name(name)!r}. C's own headers have names, too.",
+            block="to_c",
+            port="name",
         )
     found = open_model(model, name=name, subsystem=subsystem, outside=outside, outputs=outputs)
     if found is None:
         raise OptionError(f"found {model!r}; expected a diagram, or a function with @subsystem.", block="to_c")
     label, opened, about = found
-    spec = target_spec(opened, name=identifier(label), description=about)
+    spec = target_spec(opened, name=unit_name(label), description=about)
     return write_c(spec, Path(folder).expanduser(), number=number, own_functions=own_functions)
 
 

@@ -10,7 +10,7 @@ from .model import Integrator, ModelSpec, Variable
 from .package import build_fmu, clear_cache
 from .python_fmu import build_python
 from .scalar_code import Lookup, split_lookups
-from .target_code import Number, TargetText, TickFacts, identifier, write_target
+from .target_code import Number, TargetText, TickFacts, unit_name, write_target
 from .target_files import TargetCode, TargetMeasurement, write_c
 from .target_measure import PROCESSORS, ProcessorMeasurement, measure, run_here
 from .target_spec import CLOCK_LIMIT, BlockOutput, Kept, TargetNumbers, TargetSpec, TargetTick
@@ -53,7 +53,6 @@ __all__ = [
     "compile_webassembly",
     "describe_compiler",
     "describe_processor",
-    "identifier",
     "inline_model",
     "measure",
     "merge_model",
@@ -65,6 +64,7 @@ __all__ = [
     "run_here",
     "split_lookups",
     "tune",
+    "unit_name",
     "write_c",
     "write_target",
     "write_unit",

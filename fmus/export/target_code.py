@@ -24,8 +24,27 @@ _WIDTH = 110
 _C_KEYWORDS = """auto break case char const continue default do double else enum extern float for goto if inline int
 long register restrict return short signed sizeof static struct switch typedef union unsigned void
 volatile while bool true false complex imaginary I NULL errno signgam main t c"""
+_MACRO = re.compile(
+    r"NAN|INFINITY|HUGE_VAL[FL]?|EOF|BUFSIZ|stdin|stdout|stderr|linux|unix|L_tmpnam|(FILENAME|FOPEN|TMP|RAND)_MAX"
+    r"|(DBL|FLT|LDBL|FP|DECIMAL|MATH|SEEK|M)_\w+|U?INT\w*_(MAX|MIN)|(SIZE|PTRDIFF|WCHAR|WINT|SIG_ATOMIC)_(MAX|MIN)"
+)
+"""Macros of the headers that the source, or a program with it, includes: they are no names of members."""
+_HELPERS = "is_finite choose sign_of find_piece start_values"
+_OF_FILES = f"""{_HELPERS}
+math string float stddef stdint stdbool stdio stdlib errno assert time signal ctype limits locale
+abs labs div ldiv exit abort atexit system getenv malloc calloc realloc free rand srand qsort bsearch atoi atof atol
+strtod strtol strtoul clock difftime mktime raise setjmp longjmp
+printf scanf sprintf snprintf fprintf puts putchar getchar gets remove rename tmpfile perror rewind offsetof va_list
+memcpy memmove memset memcmp memchr strcpy strcat strcmp strlen strchr strncpy strncat strncmp strstr strtok strerror
+sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp log sqrt fabs floor ceil cbrt erf erfc expm1 exp2 log1p
+log2 log10 logb ilogb lgamma tgamma rint lrint llrint round lround llround trunc nearbyint fdim fmax fmin fma fmod pow
+hypot atan2 remainder remquo copysign nextafter nexttoward ldexp frexp modf scalbn scalbln nan gamma
+j0 j1 jn y0 y1 yn index rindex isnan isinf isfinite isnormal signbit fpclassify isgreater isless"""
 _FUNCTION = re.compile(r"^static [^\n;=]*\b(lw_\w+)\([^\n]*\) \{(?:[^\n]*\}|\n.*?^\})\n", re.MULTILINE | re.DOTALL)
 _KEYWORDS = frozenset(_C_KEYWORDS.split())
+_FILE_NAMES = frozenset(_OF_FILES.split())
+_FILE_NAME = re.compile(r"(t|table_|tick_)\d+|(lw|own)_\w+|u?int\w*_t|.*_t")
+_INPUTS = 2  # argument w of a tick: the inputs
 _GROUPS = ("parameters", "numbers", "inputs", "outputs", "signals", "states")
 _KIND = {"inputs": "input", "outputs": "output", "signals": "signal", "parameters": "parameter"}
 _ABOUT = {
@@ -156,10 +175,22 @@ def write_target(spec: TargetSpec, *, number: Number = "double", own_functions: 
 
 
 def identifier(name: str) -> str:
-    """Return a C identifier that is like a name."""
+    """Return a C identifier that is like a name, and no macro of a header of the standard."""
     found = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or "x"
     found = f"n{found}" if found[0].isdigit() else found
-    return f"{found}_" if found in _KEYWORDS else found
+    return f"{found}_" if found in _KEYWORDS or _MACRO.fullmatch(found) else found
+
+
+def unit_name(name: str) -> str:
+    """Return a C identifier that is like a name and may name a type and its files: nothing else there is called so."""
+    found = identifier(name)
+    single = found[:-1] if found[-1] in "fl" else found  # sinf, sinl
+    taken = found in _FILE_NAMES or single in _FILE_NAMES or _FILE_NAME.fullmatch(found)
+    return f"{found}_" if taken else found
+
+
+def _elementary_source() -> str:
+    return (resources.files(__package__) / "runtime" / "elementary.c").read_text(encoding="utf-8")
 
 
 @dataclass
@@ -172,6 +203,11 @@ class _WrittenTick:
     touched: dict[str, list[str]] = field(default_factory=dict)
     operations: Counter[str] = field(default_factory=Counter)
     blocks: list[str] = field(default_factory=list)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether it does nothing."""
+        return not any("c->" in line or "if (" in line for line in self.lines)
 
     def touch(self, kind: str, name: str) -> None:
         names = self.touched.setdefault(kind, [])
@@ -197,6 +233,7 @@ class _SourceWriter:
         self.uses_time = False
         self.clocks = spec.loop.clocks
         self.counted = self.clocks != ((1, 0),)  # which clocks act has to be counted
+        self._labels: dict[tuple[str, str], str] = {}
         self._choose_members()
         self._name_statuses()
 
@@ -306,6 +343,11 @@ class _SourceWriter:
         one = scalars.nodes[node]
         return one.operation == ca.OP_INPUT and one.place == (argument, entry)
 
+    @staticmethod
+    def _is_input(scalars: Scalars, node: int) -> bool:
+        one = scalars.nodes[node]
+        return one.operation == ca.OP_INPUT and one.place[0] == _INPUTS
+
     def _name_statuses(self) -> None:
         guards = list(dict.fromkeys(guard for tick in self.spec.ticks for guard in tick.guards))
         taken = set[str]()
@@ -382,6 +424,7 @@ class _SourceWriter:
             if not self._is_entry(scalars, new[p], 1, p)
         ]
         fresh = {i for out in tick.tick.outputs for i in range(out.first, out.first + out.count)}
+        fresh |= {i for i, node in enumerate(log) if self._is_input(scalars, node)}  # inputs that are outputs
         written = [
             (m, e, log[p])
             for g in ("outputs", "signals")
@@ -399,7 +442,8 @@ class _SourceWriter:
             real=self.real,
             single=self.single,
         )
-        taken = {*_KEYWORDS, *(f"t{i}" for i in range(10_000))}
+        taken = {*_KEYWORDS, *_HELPERS.split(), self.name, self.real, f"{self.name}_status"}
+        taken |= {f"t{i}" for i in range(10_000)}
         self._blocks(tick, expressions, log, uses, taken)
         self._guards(tick, expressions, guards)
         self._take_over(tick, expressions, states, written, scalars, taken)
@@ -640,7 +684,13 @@ class _SourceWriter:
         return [m for group in ("parameters", "inputs", "outputs", "signals") for m in self.members[group]]
 
     def _label(self, member: Member) -> str:
-        return f"{self.upper}_{_KIND[member.group].upper()}_{member.name.upper()}"
+        """Return the enumerator of a member: names that differ in case alone are numbered."""
+        if not self._labels:
+            taken: dict[str, set[str]] = {group: set() for group in _GROUPS}
+            for one in self._named:
+                name = _distinct(one.name.upper(), taken[one.group])
+                self._labels[one.group, one.name] = f"{self.upper}_{_KIND[one.group].upper()}_{name}"
+        return self._labels[member.group, member.name]
 
     def _named_header(self) -> list[str]:
         name, upper = self.name, self.upper
@@ -702,11 +752,14 @@ class _SourceWriter:
         ]
         for tick in ticks:
             bits = self.spec.loop.sets[tick.number]
+            if self.counted and not bits and tick.is_empty:
+                continue
             when = self._when(bits)
             lines += [
                 f"/* ---- {when[0].upper()}{when[1:]} ---- */",
                 "",
                 f"static {name}_status tick_{tick.number}({name} *c) {{",
+                *(["    (void)c; /* nothing is read or written */"] if tick.is_empty else []),
             ]
             if "time" in tick.touched:
                 base = self.spec.loop.base
@@ -733,8 +786,9 @@ class _SourceWriter:
         called = [f for f in FUNCTIONS if f in self.called] if self.own else []
         if not called:
             return []
-        elementary = (resources.files(__package__) / "runtime" / "elementary.c").read_text(encoding="utf-8")
-        text = prepare_functions(" ".join(f"{f}(" for f in called)).replace('#include "elementary.c"\n', elementary)
+        text = prepare_functions(" ".join(f"{f}(" for f in called)).replace(
+            '#include "elementary.c"\n', _elementary_source()
+        )
         text = re.sub(r"^#define (\w+) lw_\1\n", "", text, flags=re.MULTILINE)
         text = re.sub(
             r"\b0x[0-9a-f.]+p[+-]?\d+\b", lambda found: repr(float.fromhex(found[0])), text
@@ -843,7 +897,7 @@ class _SourceWriter:
                     f"        status = tick_{tick.number}(c);",
                     "        break;",
                 ]
-        idle = next((t for t in ticks if not sets[t.number]), None)
+        idle = next((t for t in ticks if not sets[t.number] and not t.is_empty), None)
         lines += [
             "    default:" if idle else "    default: /* nothing is due */",
             *([f"        status = tick_{idle.number}(c);"] if idle else []),

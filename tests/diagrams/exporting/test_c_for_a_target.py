@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from loopwright import Diagram, subsystem, to_c
-from loopwright.blocks import PID, Gain, Step, TransferFunction
+from loopwright.blocks import PID, Compare, Gain, Step, Switch, TransferFunction
 from loopwright.diagrams import DefinitionError, OptionError
 from loopwright.diagrams.exporting import open_subsystem, target_spec
-from loopwright.fmus.export import measure, run_here, write_target
+from loopwright.fmus.export import measure, run_here, unit_name, write_target
 from loopwright.fmus.export.target_measure import find_bound
 from support.target_diagrams import DIAGRAMS, run_of, spec_of
 
@@ -197,6 +197,38 @@ def test_options_that_do_not_fit_are_named(tmp_path):
     code = to_c(pi, tmp_path)
     with pytest.raises(OptionError, match="there is no input 'levle'. Did you mean 'level'"):
         code.measure({"levle": 1.0})
+
+
+def spec_of_function(function, name="ctl", **options):
+    sub = subsystem(sample_time=0.1, name=name, **options)(function)
+    return target_spec(open_subsystem(sub, Diagram, name), name=unit_name(name), description="")
+
+
+def test_an_input_that_is_an_output_is_passed_on_at_each_tick():
+    """With an offset, there are ticks of 0.05 s at which nothing else happens."""
+    values = np.arange(1.0, 7.0)
+    for options in ({}, {"offset": 0.05}):
+        spec = spec_of_function(lambda u: (u.named("same"), (3.0 * u).named("triple")), **options)
+        found = run_here(write_target(spec), {"u": values}, 6)
+        np.testing.assert_array_equal(found["same"], values)
+        held = values if not options else [3.0, 2.0, 2.0, 4.0, 4.0, 6.0]
+        np.testing.assert_array_equal(found["triple"][1:], 3.0 * np.array(held[1:]))
+
+
+def test_names_of_c_and_names_that_differ_in_case_alone_compile():
+    """All of it in one source: a subsystem called choose, inputs NAN and EOF, outputs p and P."""
+
+    def choose(NAN, EOF):
+        chosen = Switch(name="is")(Compare(">", name="above")(NAN, 0.0), NAN, EOF)
+        return (2.0 * chosen).named("p"), (3.0 * chosen).named("P"), np.sin(EOF).named("sin")
+
+    text = write_target(spec_of_function(choose, "choose"))
+    assert text.name == "choose_"
+    found = run_here(text, {"NAN": 0.5, "EOF": 0.25}, 1)
+    assert (found["p"][0], found["P"][0], found["sin"][0]) == (1.0, 1.5, np.sin(0.25))
+    assert [unit_name(n) for n in ("exp", "expf", "uint8_t", "math", "table_0", "my name", "1")] == [
+        "exp_", "expf_", "uint8_t_", "math_", "table_0_", "my_name", "n1",
+    ]  # fmt: skip
 
 
 def test_a_bound_counts_each_instruction_and_each_call_once():
