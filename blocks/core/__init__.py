@@ -47,6 +47,7 @@ from .errors import (
     close_names,
     near,
 )
+from .evaluation_vectors import EvaluationVectors, Wanted
 from .explained_calls import UnknownArgumentError, explain_calls, offer_elsewhere
 from .files import check_file, replace_file, write_text
 from .findings import Finding
@@ -55,7 +56,6 @@ from .instants import FINEST, is_before, left_of, move_earlier, next_edge, perio
 from .layout import Layout, elements, lay_out
 from .numpy_functions import Units, result_unit
 from .one_thread import on_one_thread, one_thread
-from .outside import EvaluationVectors, Wanted
 from .parameters import ParameterSpec
 from .ports import Event, Input, Output, Port, PortUnit, Shape, State, number_inputs
 from .shown import missing_member

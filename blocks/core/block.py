@@ -146,9 +146,10 @@ class Block(ShownAsTable, Value, Wireable, metaclass=ShownMembers):
     inputs that the run sets, times are in s. It yields a plant, with the methods of the simulation's ``Plant``.
     """
 
-    evaluated_outside: ClassVar[bool] = False
-    """True where a run evaluates the equations from outside of its traced functions, as those of an FMU in model
-    exchange: continuous states that a solver integrates, and events.
+    in_model_exchange: ClassVar[bool] = False
+    """True where a run evaluates the equations by calls of the block, as those of an FMU in model exchange.
+
+    It has continuous states that a solver integrates, and events.
 
     Instead of equations it has ``dependence`` and ``exchange(wired, start_time)``, a context manager: ``wired`` names
     the inputs that the run sets, times are in s. It yields the simulation's ``ModelExchangeBlock``.
@@ -264,7 +265,7 @@ class Block(ShownAsTable, Value, Wireable, metaclass=ShownMembers):
         return math.inf
 
     def dependence(self, equation: str) -> Mapping[str, Array]:
-        """Return what depends on what in a block that is evaluated from outside.
+        """Return what depends on what in a block in model exchange.
 
         Parameters
         ----------

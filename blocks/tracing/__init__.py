@@ -4,10 +4,10 @@ from .computed import trace_initial, trace_numbers
 from .differences import differentiate, extrapolate
 from .discretization import check_method, find_hold, hold
 from .equations import initial_state, start_shapes, start_values, state_after_start
+from .model_exchange import describe_model_exchange
 from .numpy_check import GUARDS, NEXT, evaluate
 from .opaque_equations import raise_failure
 from .operations import MATH_FUNCTIONS
-from .outside import describe_outside
 from .structure import has_structure, is_traced_by, traced_parameters
 from .switching_times import Line, switching_times
 from .symbols import bundle, count_uses, flat_column, has_large_product, is_nonzero, size, with_values, wrap
@@ -25,7 +25,7 @@ __all__ = [
     "check_method",
     "constants_of",
     "count_uses",
-    "describe_outside",
+    "describe_model_exchange",
     "differentiate",
     "evaluate",
     "extrapolate",

@@ -1,4 +1,4 @@
-"""Blocks that are evaluated from outside, handed over to a loop in C and taken back."""
+"""Blocks in model exchange, handed over to a loop in C and taken back."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FIRED = -1
 
 
 class HandedOver:
-    """Blocks that are evaluated from outside, in a run that continues in C.
+    """Blocks in model exchange, in a run that continues in C.
 
     Parameters
     ----------
@@ -44,8 +44,8 @@ class HandedOver:
         count: Callable[[float, str, str], None],
     ):
         self._evaluators, self._report, self._count = evaluators, report, count
-        self._blocks: dict[str, ModelExchangeInstance] = {path: blocks[path] for path in flat.outside}
-        first = {path: flat.states.slices[path].start for path in flat.outside}
+        self._blocks: dict[str, ModelExchangeInstance] = {path: blocks[path] for path in flat.in_model_exchange}
+        first = {path: flat.states.slices[path].start for path in flat.in_model_exchange}
         self.native = NativeModelExchange(self._blocks, first, flat.width, load_runtime(), self._by_python)
         """The blocks as C knows them."""
         self._with_c = False

@@ -87,9 +87,11 @@ def _hand_over(function: Any, to: Any) -> None:
 def find_code_obstacle(flat: FlatDiagram) -> str | None:
     """Return why there can't be generated code of a diagram with continuous states; None if there can."""
     blocks = flat.table.blocks
-    opaque = sorted(path for path in flat.checked.traced if blocks[path].opaque and path not in flat.outside)
-    if opaque and flat.outside:
-        return f"Python evaluates the block {opaque[0]!r} next to the FMU {flat.outside[0]!r} in model exchange"
+    opaque = sorted(path for path in flat.checked.traced if blocks[path].opaque and path not in flat.in_model_exchange)
+    if opaque and flat.in_model_exchange:
+        return (
+            f"Python evaluates the block {opaque[0]!r} next to the FMU {flat.in_model_exchange[0]!r} in model exchange"
+        )
     if opaque and flat.loops.slices:
         return f"it has an algebraic loop next to the block {opaque[0]!r}, which Python evaluates"
     return None
@@ -166,9 +168,9 @@ def write_hybrid(
     """
     kinds = (NONE, *(clocks for clocks in acting if clocks))
     grouped = flat.by_block and not flat.active_loops(NONE) and not straight
-    write = _write_staged if flat.outside else _write_grouped if grouped else _write_straight
+    write = _write_staged if flat.in_model_exchange else _write_grouped if grouped else _write_straight
     written = write(flat, kinds, stiff=stiff)
-    loops, judged = loop_functions(flat, kinds), bool(flat.outside) or may_fail_at_steps(flat)
+    loops, judged = loop_functions(flat, kinds), bool(flat.in_model_exchange) or may_fail_at_steps(flat)
 
     def make(libraries: Sequence[CodeOfFunctions]) -> HybridCode:
         code = replace(written.make(libraries), judged=judged)

@@ -62,7 +62,7 @@ class _Exchanged(ctypes.Structure):
     ]
 
 
-class _Outside(ctypes.Structure):
+class _ModelExchange(ctypes.Structure):
     _fields_ = [
         ("count", _INT),
         ("each", _AT),
@@ -127,7 +127,7 @@ def find_obstacle(block: Any) -> str | None:
 
 
 class NativeModelExchange:
-    """Blocks that are evaluated from outside, as C knows them in a run.
+    """Blocks in model exchange, as C knows them in a run.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ class NativeModelExchange:
         self.watched: list[tuple[HostState, ctypes.c_bool]] = []
         """States of this process that libraries may change, and whether C has seen that."""
         self._log = np.zeros((max(4 * len(blocks), _LOGGED // (16 * (1 + width))), 2 + 2 * width))
-        self.structure = _Outside(
+        self.structure = _ModelExchange(
             count=len(blocks),
             each=ctypes.addressof(self._each),
             log=at(self._log),

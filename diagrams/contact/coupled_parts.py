@@ -471,7 +471,7 @@ def _check_held(
         return
     moving = "" if diagram.blocks[path].stepped else moves_between_ticks(diagram, at, outputs, sources)
     if moving:
-        exchanged = diagram.blocks[path].evaluated_outside
+        exchanged = diagram.blocks[path].in_model_exchange
         advice = "Take co-simulation for it, interface='co_simulation'" if exchanged else "Give it as an FMU"
         raise OptionError(
             f"found {moving!r}, which acts on continuous blocks between the ticks; expected a plant whose inputs are "

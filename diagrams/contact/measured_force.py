@@ -155,7 +155,7 @@ def _refuse_states(flat: FlatDiagram, ports: Ports, signal: Tap) -> None:
     """Refuse a measured force with states ahead of it: the environment's force would act behind them."""
     for path in sorted(find_upstream(flat, signal.port[0], ports.plant, to_sensors=True)):
         block = flat.table.blocks[path]
-        if block.stepped or block.evaluated_outside or (block.states and not block.memory):
+        if block.stepped or block.in_model_exchange or (block.states and not block.memory):
             raise OptionError(
                 f"found {signal.name!r} behind the states of {path!r} ({type(block).__name__}), to which no wire of "
                 f"{ports.plant}.{ports.force} leads: the environment's force would act behind them. Expected the wire "

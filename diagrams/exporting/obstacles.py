@@ -19,7 +19,7 @@ def refuse(opened: OpenDiagram) -> None:
         if path == opened.outside:
             continue
         shown = opened.shown(path)
-        if block.evaluated_outside or (block.stepped and not block.transport):
+        if block.in_model_exchange or (block.stepped and not block.transport):
             raise DefinitionError(
                 "it is an FMU, which is not exported with the diagram. Leave it outside, "
                 f"build(diagram, outside=[{shown!r}]), and couple the two FMUs where they are used; "

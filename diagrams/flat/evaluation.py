@@ -29,8 +29,8 @@ SMALLEST = float(np.finfo(float).tiny)
 """Time in s that is above 0, and that no other time of a run is changed by."""
 
 Apart = Callable[["Instant", str, tuple[str, ...], Any, Sequence[Any]], list[Any]]
-"""Evaluates a block from outside: called with the instant, the block's path, the names of the equations that are
-wanted, its states and its inputs as columns, it returns a column for each name."""
+"""Evaluates a block apart from the others: called with the instant, the block's path, the names of the equations
+that are wanted, its states and its inputs as columns, it returns a column for each name."""
 
 
 def evaluate(
@@ -204,7 +204,7 @@ class Instant:
     # --- one block ---------------------------------------------------------------------------------------------------
 
     def source(self, path: str, port: str) -> Any:
-        """Return the flat column at an input of a block, or of what is stepped from outside."""
+        """Return the flat column at an input of a block, or of what is stepped between ticks."""
         wire = self.layout.table.wires.get((path, port))
         if wire is None:
             default = self.layout.table.blocks[path].inputs[port].default
@@ -378,13 +378,13 @@ def just_after(t: Any, block: Block) -> Any:
 
 
 def sort_names(names: Sequence[str]) -> Wanted:
-    """Return the equations of an evaluation from outside by kind; there are no guards, and no `JUMP`."""
+    """Return the equations of an evaluator by kind; there are no guards, and no `JUMP`."""
     outputs = tuple(name for name in names if name not in (NEXT, GUARDS, INDICATORS))
     return Wanted(outputs, NEXT in names, INDICATORS in names)
 
 
 def no_evaluator(path: str) -> SimulationError:
-    """Return the error of a block that is evaluated from outside where nothing was given that does it."""
+    """Return the error of a block without its evaluator."""
     return SimulationError(
         "it is evaluated from outside, and nothing was given that does so. Give what evaluates it by its path.",
         block=path,

@@ -80,8 +80,8 @@ class FlatDiagram(FlatLayout):
         return FlatLayout(**{f.name: getattr(self, f.name) for f in fields(FlatLayout)})
 
     def with_apart(self, *paths: str) -> FlatDiagram:
-        """Return the same diagram with some blocks evaluated from outside, in their own stages."""
-        return replace(self, apart=frozenset(paths) | frozenset(self.outside))
+        """Return the same diagram with some blocks evaluated by an `Evaluator`, in their own stages."""
+        return replace(self, apart=frozenset(paths) | frozenset(self.in_model_exchange))
 
     def with_numbers(self, table: Structure, p: np.ndarray, x0: np.ndarray) -> FlatDiagram:
         """Return a diagram with other blocks, parameters and start values, which shares the functions of this one."""

@@ -153,7 +153,7 @@ def trace_tick_program(layout: FlatLayout, functions: BlockFunctions, acting: fr
 
 
 def trace_driven(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
-    """Return ``(t, x, w, p) -> z`` between ticks: the inputs of what is stepped from outside."""
+    """Return ``(t, x, w, p) -> z`` between ticks: the inputs of what is stepped between ticks."""
     symbols = make_symbols(layout)
     return trace_schedule(
         "driven",
@@ -189,7 +189,7 @@ def trace_flow(layout: FlatLayout, functions: BlockFunctions, made: TracedRates 
     Parameters
     ----------
     made : TracedRates, optional
-        The rates, where a tick at which no clock acts has been traced, and nothing is evaluated from outside.
+        The rates, where a tick at which no clock acts has been traced, and no block has an evaluator.
     """
     if made is not None:
         return trace_schedule("flow", made[0], lambda apart: {"dx": made[1]})
@@ -235,7 +235,7 @@ def indicators_of(instant: Instant) -> tuple[list[Any], list[Any]]:
 def trace_jump(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
     """Return ``(t, x, w, p, fired) -> x_next``: x after the events that fire; each sees the instant before them all.
 
-    A block that is evaluated from outside is asked whatever fires: it has its own events.
+    A block in model exchange is asked whatever fires: it has its own events.
     """
     symbols = make_symbols(layout)
     fired = ca.MX.sym("fired", len(layout.events))
@@ -252,7 +252,7 @@ def _let_fire(instant: Instant) -> None:
     """Put the states of an instant to those after the events that fire there."""
     layout, x, fired = instant.layout, instant.x, instant.fired
     states, starts = layout.states.slices, layout.starts.slices
-    own: dict[str, list[int]] = {path: [] for path in layout.outside}
+    own: dict[str, list[int]] = {path: [] for path in layout.in_model_exchange}
     for i, event in enumerate(layout.events):
         own.setdefault(event.path, []).append(i)
     for path, indices in own.items():
@@ -261,7 +261,7 @@ def _let_fire(instant: Instant) -> None:
         each = [fired[i : i + 1] for i in indices]
         after = instant.events_of(path, JUMP, join_columns(each))
         acts = instant.gate_of(path)
-        if path not in layout.outside:  # those look at every event themselves
+        if path not in layout.in_model_exchange:  # those look at every event themselves
             acts = logic_and(acts, reduce(logic_or, map(is_true, each)))
         instant.new[path] = choose(acts, densify(after), rows(x, states[path]))
     for i, event in enumerate(layout.events):

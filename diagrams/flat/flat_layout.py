@@ -1,7 +1,7 @@
 """The layout of a flattened diagram: the place of everything in its vectors, and when it acts. Pure data.
 
 A flattened diagram has five vectors: ``x``, the states of all blocks and whatever else is kept from one instant to the
-next; ``w``, the outputs of what is stepped from outside (FMUs, transport delays); ``z``, its inputs; ``p``, the
+next; ``w``, the outputs of what is stepped between ticks (FMUs, transport delays); ``z``, its inputs; ``p``, the
 parameters; and ``log``, all outputs. A `FlatLayout` says where each thing is in them, holds their start values, and
 lists the clocks, the events and the order of evaluation. It knows no CasADi and can be pickled: what runs the diagram
 in another process, or in compiled code, needs this and the functions.
@@ -101,7 +101,7 @@ class FlatLayout:
     ports : dict
         Block and port behind every dotted path; an FMU's port may have its own dots.
     apart : frozenset of str
-        Blocks that are evaluated from outside, in their own stages; see `loopwright.diagrams.flat.stages`.
+        Blocks that an evaluator evaluates, in their own stages; see `loopwright.diagrams.flat.stages`.
     asked : bool
         Whether ``base`` was asked for, as a ``step``: then something happens at every tick.
     """
@@ -143,7 +143,7 @@ class FlatLayout:
         foreign = {
             path
             for path, block in self.table.blocks.items()
-            if (block.stepped and not block.transport) or block.evaluated_outside
+            if (block.stepped and not block.transport) or block.in_model_exchange
         }
         return {
             name: where
@@ -186,12 +186,12 @@ class FlatLayout:
     def hybrid(self) -> bool:
         """Whether something happens between ticks: continuous states, events, or a transport delay."""
         delayed = any(self.table.blocks[self.ports[name][0]].transport for name in self.plant_inputs.slices)
-        return bool(self.continuous.size or self.events or delayed or self.outside)
+        return bool(self.continuous.size or self.events or delayed or self.in_model_exchange)
 
     @cached_property
-    def outside(self) -> tuple[str, ...]:
-        """Paths of the blocks whose equations a run evaluates from outside, with their own events."""
-        return tuple(path for path in sorted(self.apart) if self.table.blocks[path].evaluated_outside)
+    def in_model_exchange(self) -> tuple[str, ...]:
+        """Paths of the blocks in model exchange: a run evaluates their equations, and they have events of their own."""
+        return tuple(path for path in sorted(self.apart) if self.table.blocks[path].in_model_exchange)
 
     @cached_property
     def plant_ticks(self) -> dict[str, tuple[TickPattern, ...]]:
@@ -206,7 +206,7 @@ class FlatLayout:
 
     @cached_property
     def even_plants(self) -> tuple[str, ...]:
-        """Paths of what is stepped from outside in steps of one length only."""
+        """Paths of what is stepped between ticks in steps of one length only."""
         return tuple(path for path, plant in stepped_blocks(self.table).items() if not takes_any_step(plant))
 
     def steps_at(self, path: str, k: int) -> bool:

@@ -122,7 +122,7 @@ def flatten(
         start_order=start_order,
         ports=ports,
         asked=step is not None if asked is None else asked,
-        apart=frozenset(path for path in paths if blocks[path].evaluated_outside),
+        apart=frozenset(path for path in paths if blocks[path].in_model_exchange),
     )
 
 

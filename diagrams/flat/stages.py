@@ -1,10 +1,10 @@
 """Staged schedules: a function of the whole diagram as a sequence of stages.
 
-At an instant a diagram is one function of ``(t, x, w, p)``. Some blocks can't be part of a traced function: they are
-evaluated from outside, by a library in C or by Python. Such a block splits the function into *stages*:
+At an instant a diagram is one function of ``(t, x, w, p)``. Some blocks can't be part of a traced function: an
+`Evaluator` evaluates them, by a library in C or by Python. Such a block splits the function into *stages*:
 
-    traced stage       one CasADi function of (t, x, w, p, c): everything between two blocks that are evaluated from
-                       outside. It writes a part of c, the last one the results.
+    traced stage       one CasADi function of (t, x, w, p, c): everything between two blocks that have an
+                       evaluator. It writes a part of c, the last one the results.
     opaque stage       one block, called with its states and inputs, which are in c; it writes its outputs, or the
                        rates of its states, into c.
 
@@ -45,7 +45,7 @@ from .fast_functions import share_terms, speed_up
 
 
 class Evaluator(Protocol):
-    """Evaluates a block from outside of the traced functions; its parameters are its own.
+    """Evaluates a block that the traced functions leave out; its parameters are its own.
 
     A protocol: evaluators in runs and in linear models belong to sub-packages above this one.
     """
@@ -90,7 +90,7 @@ Evaluators = Mapping[str, Evaluator]
 
 @dataclass(frozen=True, eq=False)
 class TracedStage:
-    """One CasADi function over the blocks between two that are evaluated from outside.
+    """One CasADi function over the blocks between two that have an evaluator.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ class TracedStage:
 
 @dataclass(frozen=True, eq=False)
 class OpaqueStage:
-    """A block that is evaluated from outside.
+    """A block that an `Evaluator` evaluates.
 
     Attributes
     ----------

@@ -43,7 +43,7 @@ class Derivative:
     Raises
     ------
     ParameterError
-        A derivative by the parameters, where a block that is evaluated from outside has some.
+        A derivative by the parameters, where a block with an evaluator has some.
     """
 
     def __init__(self, schedule: Schedule, by: Sequence[By], *, values: bool = True):
@@ -77,7 +77,7 @@ class Derivative:
     def is_constant(self, result: str, argument: str, entries: Sequence[int] | None = None) -> bool:
         """Whether no derivative of a result depends on an argument, or on some of its entries.
 
-        False where a stage is evaluated from outside, or has tables: its operations can't be looked at.
+        False where a stage has an evaluator, or tables: its operations can't be looked at.
         """
         last, names = self.schedule.last, self.schedule.arguments
         if self.schedule.opaque:

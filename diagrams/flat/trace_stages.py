@@ -1,4 +1,4 @@
-"""Tracing a schedule: the evaluation of all blocks is cut at every block that is evaluated from outside."""
+"""Tracing a schedule: the evaluation of all blocks is cut at every block that has an evaluator."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def trace_schedule(
         The symbols that it is a function of, by name; the time ``t`` comes first.
     results : callable
         Evaluates the diagram with these symbols and returns the results by name, as expressions. It is called with
-        what `evaluate` takes as ``apart``: this cuts the evaluation at the blocks that are evaluated from outside.
+        what `evaluate` takes as ``apart``: this cuts the evaluation at the blocks that have an evaluator.
     by_block : bool
         Do the operations of each block as they are; else those of all blocks are simplified together.
     """
@@ -52,7 +52,7 @@ def trace_schedule(
 
 @dataclass
 class _StageCut:
-    """Where a block is evaluated from outside, and what was made between that and the cut before.
+    """Where an evaluator evaluates a block, and what was made between that and the cut before.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class _StageCut:
 
 
 class _Cuts:
-    """Cuts an evaluation with symbols: called for each block that is evaluated from outside."""
+    """Cuts an evaluation with symbols: called for each block that has an evaluator."""
 
     def __init__(self) -> None:
         self.made: list[_StageCut] = []
@@ -109,16 +109,16 @@ class _Cuts:
                 [*carried.values()],
                 outputs,
                 _varies(instant, path, names),
-                names != (JUMP,) and path in instant.layout.outside,
+                names != (JUMP,) and path in instant.layout.in_model_exchange,
             )
         )
         return outputs
 
 
 def _varies(instant: Instant, path: str, names: tuple[str, ...]) -> bool:
-    """Whether equations of a block that is evaluated from outside may depend on time, as far as the block says."""
+    """Whether equations of a block that has an evaluator may depend on time, as far as the block says."""
     depends = instant.functions.traced[path].depends
-    return path not in instant.layout.outside or any("t" in depends.get(name, "t") for name in names)
+    return path not in instant.layout.in_model_exchange or any("t" in depends.get(name, "t") for name in names)
 
 
 def _in_stages(
@@ -151,12 +151,12 @@ def _in_stages(
 
     stages: list[TracedStage | OpaqueStage] = []
     arguments, names_in = (*symbols, c), [*names, "carried"]
-    for i, (expressions, makes, outside) in enumerate(parts):
+    for i, (expressions, makes, opaque) in enumerate(parts):
         if makes.stop > makes.start:
             made = of_c([ca.vertcat(*expressions)])
             function = ca.Function(f"{name}_{i}", [*arguments], [*made], names_in, ["made"])
             stages.append(TracedStage(f"{name}_{i}", arguments, made, function, makes))
-        stages.append(outside)
+        stages.append(opaque)
     made = of_c(results.values())
     function = ca.Function(name, [*arguments], [*made], names_in, [*results])
     stages.append(TracedStage(name, arguments, made, function, slice(0, 0)))

@@ -68,7 +68,7 @@ def rates(instant: Instant) -> Any:
 
 
 def plant_inputs(instant: Instant) -> Any:
-    """Return z: the inputs of what is stepped from outside."""
+    """Return z: the inputs of what is stepped between ticks."""
     layout = instant.layout
     sources = [instant.source(*layout.ports[name]) for name in layout.plant_inputs.slices]
     if isinstance(instant.t, Cells):

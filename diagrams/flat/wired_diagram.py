@@ -288,7 +288,7 @@ def _find_other_numbers(diagram: WiredDiagram, other: WiredDiagram) -> dict[str,
 def _has_same_functions(table: Structure, path: str, block: Block) -> bool:
     """Return whether a diagram has the same functions with another block at a path, whose trace is the same one."""
     old = table.blocks[path]
-    if type(block) is not type(old) or block.transport or block.evaluated_outside:
+    if type(block) is not type(old) or block.transport or block.in_model_exchange:
         return False
     if block.stepped:
         names = type(old).parameter_specs.keys() - OF_A_RUN

@@ -258,7 +258,7 @@ def _compile(
     if between := _between_ticks(flat, method):
         raise NoLanesError(between)
     if flat.apart:
-        raise NoLanesError(f"{min(flat.apart)} is evaluated from outside")
+        raise NoLanesError(f"{min(flat.apart)} is in model exchange")
     scalars = ScalarFunctions()
     ticks = TickSources(flat, [*acting, *(() if start is None else (start.clocks,))], scalars)
     loops = dict[int, LoopSource]()
@@ -329,8 +329,8 @@ def _between_ticks(flat: FlatDiagram, method: str) -> str:
         )
     if flat.continuous.size and flat.active_loops(NONE):
         return f"it has algebraic loops between ticks, such as through {min(flat.loops.slices)}"
-    if flat.outside:
-        return f"{flat.outside[0]} is evaluated from outside"
+    if flat.in_model_exchange:
+        return f"{flat.in_model_exchange[0]} is in model exchange"
     if flat.events:
         event = flat.events[0]
         kind = "a subsystem that is enabled or triggered" if event.subsystem else "a block that has events"

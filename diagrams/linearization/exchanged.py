@@ -125,7 +125,7 @@ def evaluators_at(flat: FlatDiagram, at: OperatingPoint) -> Evaluators | None:
     FmuError
         If an FMU can't be loaded, or doesn't accept the states of the point.
     """
-    if not flat.outside:
+    if not flat.in_model_exchange:
         return None
     known = _KNOWN.get(at)
     if known is None or known[0] is not flat:
@@ -174,7 +174,7 @@ def load_evaluators(flat: FlatDiagram, at: OperatingPoint) -> Mapping[str, Point
     """Return new evaluators of the FMUs in model exchange at an operating point, as `evaluators_at` does."""
     held, stack = _Held(), ExitStack()
     weakref.finalize(held, stack.close)
-    for path in flat.outside:
+    for path in flat.in_model_exchange:
         block = cast("Fmu", flat.table.blocks[path])
         evaluator = held[path] = PointEvaluator(flat, path)
         try:

@@ -95,7 +95,7 @@ def differentiate_flow(
 
     def stays() -> bool:
         """Return whether rates and derivatives at rest are the same over the whole time."""
-        if not flat.outside or len([*_split_at_discontinuities(flat, t, end)]) > 1:
+        if not flat.in_model_exchange or len([*_split_at_discontinuities(flat, t, end)]) > 1:
             return False
         asked = (differentiate(min(t + part * h, left_of(end)), start) for part in STAGES)
         return all(np.array_equal(J, F) and np.array_equal(f, f0) for J, f in asked)

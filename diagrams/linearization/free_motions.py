@@ -624,7 +624,7 @@ class _Look:
 
 def _has_foreign(flat: FlatDiagram) -> bool:
     """Whether an FMU of another tool is evaluated in the diagram's functions."""
-    blocks: list[Any] = [flat.table.blocks[path] for path in flat.outside]
+    blocks: list[Any] = [flat.table.blocks[path] for path in flat.in_model_exchange]
     return not all(is_built_here(block.description.digest) for block in blocks if hasattr(block, "description"))
 
 

@@ -331,7 +331,7 @@ def _find_inert(flat: FlatDiagram, at: OperatingPoint, cut: Sequence[Port], on_l
         for path, port in consumers:
             if len(consumers) < 2 or (path, port) not in on_loop or path not in flat.checked.traced:
                 continue
-            if path in flat.outside:
+            if path in flat.in_model_exchange:
                 continue
             slopes = slopes_of(flat.checked.traced[path])
             if not slopes.rows.total:

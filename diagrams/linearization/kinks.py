@@ -58,7 +58,7 @@ def find_kinks(flat: FlatDiagram, at: OperatingPoint) -> tuple[Finding, ...]:
     """Return the findings about all blocks at an operating point, by path."""
     found: list[Finding] = []
     log: np.ndarray | None = None
-    for path in sorted(set(flat.checked.traced).difference(flat.outside)):
+    for path in sorted(set(flat.checked.traced).difference(flat.in_model_exchange)):
         slopes = slopes_of(flat.checked.traced[path])
         wired = {f"u {port}" for port in slopes.inputs if (path, port) in flat.table.wires}
         if slopes.is_simple or not slopes.columns.total or not slopes.rows.total:
@@ -71,7 +71,7 @@ def find_kinks(flat: FlatDiagram, at: OperatingPoint) -> tuple[Finding, ...]:
 
 def _find_steps_of_plants(flat: FlatDiagram) -> Iterator[StepsOnly]:
     """Yield the ways through FMUs from or to a port of integers, which has no derivatives, and from discrete inputs."""
-    for path in (*plant_paths(flat), *flat.outside):
+    for path in (*plant_paths(flat), *flat.in_model_exchange):
         block = flat.table.blocks[path]
         if not isinstance(block, Fmu):
             continue
@@ -80,7 +80,7 @@ def _find_steps_of_plants(flat: FlatDiagram) -> Iterator[StepsOnly]:
                 continue
             if block.output_variables[port].is_integer or block.input_variables[source].is_integer:
                 yield StepsOnly(path, port, source)
-            elif path in flat.outside and not is_smooth(block.input_variables[source]):
+            elif path in flat.in_model_exchange and not is_smooth(block.input_variables[source]):
                 yield EventsOnly(path, port, source)
 
 

@@ -70,7 +70,7 @@ class Stairs:
     def of(cls, flat: FlatDiagram, at: OperatingPoint, *, every: bool) -> Stairs:
         """Return the stairs with their mean slopes at an operating point: of all blocks, or of those that name them."""
         found = []
-        for path in sorted(set(flat.checked.traced).difference(flat.outside)):
+        for path in sorted(set(flat.checked.traced).difference(flat.in_model_exchange)):
             named = flat.table.blocks[path].quanta
             if not every and not named:
                 continue

@@ -481,7 +481,7 @@ def linearize_plant(diagram: WiredDiagram, at: OperatingPoint, path: str) -> Pla
     """
     flat, block = diagram.flatten_like(at), diagram.blocks[path]
     trace = flat.checked.traced.get(path)
-    if block.evaluated_outside:
+    if block.in_model_exchange:
         m = linearize_exchanged(flat, at, path)
     elif block.stepped:
         m = linearize_equations(flat, at, path, at.z)

@@ -234,7 +234,7 @@ def _is_declared(flat: FlatDiagram, to: Port) -> bool:
 
 def _is_fmu(flat: FlatDiagram, path: str) -> bool:
     block = flat.table.blocks[path]
-    return bool(block.stepped or block.evaluated_outside)
+    return bool(block.stepped or block.in_model_exchange)
 
 
 def _enters_as_one(flat: FlatDiagram, port: Port, consumers: Sequence[Port]) -> bool:

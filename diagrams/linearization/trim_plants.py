@@ -177,7 +177,7 @@ class ExchangedPlants:
 
     def __init__(self, diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, free: list[Free]):
         self.diagram, self.at_start, self.free = diagram, at, free
-        self.mine = [i for i, f in enumerate(free) if f.block.evaluated_outside]
+        self.mine = [i for i, f in enumerate(free) if f.block.in_model_exchange]
         self.as_they_are = evaluators_at(flat, at)
 
     def evaluators(self, q: Sequence[np.ndarray]) -> Evaluators | None:

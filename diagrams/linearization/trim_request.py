@@ -285,7 +285,7 @@ def free_parameters(diagram: WiredDiagram, asked: Mapping[str, Any]) -> tuple[li
         low, high = _limit_bounds(block, keys, low, high)
         start = np.clip(np.ravel(np.asarray(value, dtype=float)), low, high)
         free = Free(f"{path}.{'.'.join(keys)}", path, keys, block, start, low, high, np.shape(value))
-        if not (block.stepped or block.evaluated_outside):
+        if not (block.stepped or block.in_model_exchange):
             start = np.where(start == 0.0, _move_off_zero(low, high), start)
             free.start = start
             moved[free.name] = free.shape_value(start)
@@ -293,7 +293,7 @@ def free_parameters(diagram: WiredDiagram, asked: Mapping[str, Any]) -> tuple[li
     diagram = diagram.replace(moved) if moved else diagram
     flat = diagram.flatten(None if diagram.has_clock else 1)
     for free in found:
-        if free.path in flat.checked.traced and not free.block.evaluated_outside:
+        if free.path in flat.checked.traced and not free.block.in_model_exchange:
             locate(free, diagram, flat)
     return found, diagram
 
@@ -372,7 +372,7 @@ def _limit_bounds(block: Block, keys: list[str], low: np.ndarray, high: np.ndarr
 
 def _is_start_value(block: Block, keys: Sequence[str]) -> bool:
     """Return whether a parameter is a start value of an FMU."""
-    return len(keys) > 1 and keys[0] == "start" and (block.stepped or block.evaluated_outside)
+    return len(keys) > 1 and keys[0] == "start" and (block.stepped or block.in_model_exchange)
 
 
 def _move_off_zero(low: np.ndarray, high: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""All blocks of a run that are evaluated from outside: loading, and the start."""
+"""All blocks of a run in model exchange: loading, and the start."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SETTLED = 1e-13  # relative change of a state between two passes at the start, 
 
 
 class BlocksInModelExchange:
-    """All blocks of a run that are evaluated from outside, with their events.
+    """All blocks of a run in model exchange, with their events.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class BlocksInModelExchange:
 
     def __init__(self, flat: FlatDiagram):
         self.flat = flat
-        self.evaluators = {path: ModelExchangeEvaluator(flat, path) for path in flat.outside}
+        self.evaluators = {path: ModelExchangeEvaluator(flat, path) for path in flat.in_model_exchange}
         self.blocks: dict[str, ModelExchangeBlock] = {}
         """The blocks that are loaded, by path."""
 

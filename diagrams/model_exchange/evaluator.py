@@ -1,4 +1,4 @@
-"""A block that is evaluated from outside in a run, such as an FMU in model exchange, and its evaluator.
+"""A block that is in model exchange in a run, such as an FMU, and its evaluator.
 
 An `ModelExchangeBlock` is loaded for a run, as a plant is. An `ModelExchangeEvaluator` lets the stages of the diagram's
 functions call it; it is there before the block is loaded, as the functions are bound first.
@@ -109,7 +109,7 @@ class ModelExchangeBlock(Protocol):
 
 
 class HasModelExchange(Protocol):
-    """A block whose class says ``evaluated_outside``: an `Fmu`, or one that a user has written."""
+    """A block whose class says ``in_model_exchange``: an `Fmu`, or one that a user has written."""
 
     def exchange(self, wired: Sequence[str], *, start_time: float) -> AbstractContextManager[ModelExchangeBlock]:
         """Load it for a run; see `loopwright.Block`."""

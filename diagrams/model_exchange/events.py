@@ -1,4 +1,4 @@
-"""Events of blocks that are evaluated from outside which pile up: those of time, of steps, of inputs."""
+"""Events of blocks in model exchange that pile up: those of time, of steps, of inputs."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ _PART = 1e-2  # and within so much of the time between two ticks: a run in picos
 _SLOW = 0.5  # part of the time between two ticks within which so many instants make a run slow
 
 
-class OutsideEvents:
-    """Counts of the events of blocks from outside, and the errors where they pile up.
+class OwnEvents:
+    """Counts of the events of blocks in model exchange, and the errors where they pile up.
 
     Parameters
     ----------

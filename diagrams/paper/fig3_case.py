@@ -24,7 +24,7 @@ from ...blocks.core import LoopwrightError, OptionError
 from ...fmus.models import Gantry
 from ...fmus.running import Fmu
 from ..flat import WiredDiagram
-from ..report import OUTSIDE, Basis, Case, Implementation, InjectionPlan, Texts, Variant, point_of
+from ..report import IN_MODEL_EXCHANGE, Basis, Case, Implementation, InjectionPlan, Texts, Variant, point_of
 from ..results import OperatingPoint
 from .compliance_loop import control_rate
 from .reduced_loops import FRICTION, NO_FRICTION, ReducedLoops
@@ -227,8 +227,8 @@ class Fig3Case(Case):
         if variant not in self._held:
             self._held[variant] = self._hold_references(variant)
         plan = InjectionPlan(self._held[variant], FREQUENCIES, AMPLITUDE)
-        asked_outside = bool(variant.diagram.flatten_like(variant.point).outside)
-        return plan.shortened(OUTSIDE) if asked_outside else plan
+        asks_plants = bool(variant.diagram.flatten_like(variant.point).in_model_exchange)
+        return plan.shortened(IN_MODEL_EXCHANGE) if asks_plants else plan
 
     @cached_property
     def _held(self) -> WeakKeyDictionary[Variant, Variant]:

@@ -133,7 +133,7 @@ def _refuse(path: str, port: str, found: str, expected: str, then: str) -> NoRet
 def is_discrete(diagram: WiredDiagram, path: str) -> bool:
     """Whether a plant has discrete states, which do not follow from its position."""
     block = diagram.blocks[path]
-    if block.stepped or block.evaluated_outside:
+    if block.stepped or block.in_model_exchange:
         variables = cast("Fmu", block).description.variables.values()
         return any(v.variability == "discrete" and v.initial == "exact" for v in variables)
     return any(state.discrete for state in block.states.values())
@@ -141,7 +141,7 @@ def is_discrete(diagram: WiredDiagram, path: str) -> bool:
 
 def _make_linearizer(diagram: WiredDiagram, path: str, point: OperatingPoint | None) -> Linearizer:
     """Return a function from states and inputs, None for those of the point, to the plant's linear model."""
-    if not (diagram.blocks[path].stepped or diagram.blocks[path].evaluated_outside):
+    if not (diagram.blocks[path].stepped or diagram.blocks[path].in_model_exchange):
         return _make_traced_linearizer(diagram, path, point)
     block = cast("Fmu", diagram.blocks[path])
     here: Mapping[str, Any] = {} if point is None else {**point.plants, **point.exchanged}[path]

@@ -14,7 +14,7 @@ from .analysis import (
     SUBJECT,
     analyse,
 )
-from .case import OUTSIDE, Basis, Case, InjectionPlan
+from .case import IN_MODEL_EXCHANGE, Basis, Case, InjectionPlan
 from .figures import DOTTED, draw_admittances, fill_growth, with_drawing
 from .pages import (
     DEFINITIONS,
@@ -46,11 +46,11 @@ __all__ = [
     "DOTTED",
     "INJECTION",
     "INNER_LOOPS",
+    "IN_MODEL_EXCHANGE",
     "LIMITS",
     "LIMITS_TITLE",
     "MEMORY",
     "OPERATING_POINTS",
-    "OUTSIDE",
     "POLES_TITLE",
     "REMARKS",
     "SENSITIVITY",

@@ -27,9 +27,9 @@ AMPLITUDE = 1e-4
 """Size of the test signal of the injection check, relative to 1 + the size of the signal."""
 
 
-SAMPLES, SOLVED, OUTSIDE = 20_000, 1_000, 400
+SAMPLES, SOLVED, IN_MODEL_EXCHANGE = 20_000, 1_000, 400
 """Samples at most in a period of the injection check, those where a solver goes from one to the next, and those where
-the solver asks a block that is evaluated from outside, as an FMU in model exchange."""
+the solver asks a block in model exchange."""
 
 
 class ReportedExperiment(Protocol):
@@ -86,7 +86,7 @@ class InjectionPlan(NamedTuple):
 def most_samples(variant: Variant) -> int:
     """Return the samples at most in a period of the injection check of a sampled variant, by the price of a tick."""
     flat = variant.diagram.flatten_like(variant.point)
-    return OUTSIDE if flat.outside else SOLVED if flat.hybrid else SAMPLES
+    return IN_MODEL_EXCHANGE if flat.in_model_exchange else SOLVED if flat.hybrid else SAMPLES
 
 
 class Case:

@@ -114,7 +114,7 @@ class ReportKind(Generic[C]):
         wanted = set(self.keys if only is None else only)
         keys = tuple(key for key in self.keys if key in wanted)
         task = SectionTask(self, diagram, point, wires, stairs, requirements, axes, tuple(measured), keys, drawn)
-        foreign = any(block.stepped or block.evaluated_outside for block in diagram.blocks.values())
+        foreign = any(block.stepped or block.in_model_exchange for block in diagram.blocks.values())
         long = foreign and len(keys) >= LONG and not isinstance(point, Snapshot)
         with contextlib.ExitStack() as stack:
             second: SecondProcess[tuple[Section | None, tuple[str, ...]]] | None = None

@@ -107,8 +107,8 @@ def pile_up(continuous: Continuous, loop: CompiledHybrid, t: float) -> Simulatio
     """Return the error of events that pile up at t in s, where C has come to; the domains have been taken back."""
     pile, event, times = loop.pile
     if pile is Pile.ENDLESS_OUTSIDE:
-        assert continuous.outside is not None
-        return continuous.outside.endless(t, event, loop.own_event(event))
+        assert continuous.own_events is not None
+        return continuous.own_events.endless(t, event, loop.own_event(event))
     assert continuous.domains is not None
     assert loop.watch is not None
     limits = continuous.domains.limits

@@ -72,7 +72,7 @@ def bind_hybrid(
     rest: Callable[[], int],
     drain: Callable[[], None],
 ) -> tuple[CompiledHybrid, HandedOver | None]:
-    """Return the loop in C, bound to the numbers of a run, and its blocks that are evaluated from outside.
+    """Return the loop in C, bound to the numbers of a run, and its blocks in model exchange.
 
     Parameters
     ----------
@@ -84,9 +84,9 @@ def bind_hybrid(
     flat, here, domains, blocks = workspace.flat, workspace.here, continuous.domains, continuous.exchanged
     handed = (
         None
-        if blocks is None or continuous.outside is None
+        if blocks is None or continuous.own_events is None
         else HandedOver(
-            flat, blocks.blocks, blocks.evaluators, partial(_report_own_event, continuous), continuous.outside.count
+            flat, blocks.blocks, blocks.evaluators, partial(_report_own_event, continuous), continuous.own_events.count
         )
     )
     native = None if handed is None else handed.native

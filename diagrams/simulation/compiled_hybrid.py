@@ -368,7 +368,7 @@ class HybridTicks:
             loop.take_back_domains(continuous.domains)
 
     def _report(self) -> None:
-        """Report what has happened in C: events that have fired, and those of blocks from outside."""
+        """Report what has happened in C: events that have fired, and those of blocks in model exchange."""
         loop, continuous = self._loop, self._continuous
         assert loop is not None
         report_fired(continuous, loop.take_fired())

@@ -280,7 +280,7 @@ def bind_evaluations(
         Returns the code of ticks.
     """
     flat, here = workspace.flat, workspace.here
-    if flat.loops.slices or flat.outside:
+    if flat.loops.slices or flat.in_model_exchange:
         return {}
     try:
         code = find_code()

@@ -12,7 +12,7 @@ import numpy as np
 from ...blocks.core import Block, FmuRuntimeError, OptionError, ParameterError, SimulationError
 from ..compiled import Domains, delays_of
 from ..flat import FlatDiagram, announcers, renumber
-from ..model_exchange import BlocksInModelExchange, OutsideEvents
+from ..model_exchange import BlocksInModelExchange, OwnEvents
 from ..results import Occurrence
 from ..solvers import METHODS, Method, MethodKind, Problem
 from .diagnosis import state_values
@@ -41,7 +41,7 @@ class Continuous:
     on_event : callable
         Called with every event that fires.
     exchanged : BlocksInModelExchange, optional
-        Blocks that are evaluated from outside.
+        Blocks in model exchange.
 
     Attributes
     ----------
@@ -51,8 +51,8 @@ class Continuous:
         The domains of the indicators; None without events.
     delays : Delays or None
         Transport delays; None without any.
-    outside : OutsideEvents or None
-        Events of blocks that are evaluated from outside; None without such blocks.
+    own_events : OwnEvents or None
+        Events of blocks in model exchange; None without such blocks.
     beyond : tuple of float and ndarray, or None
         Time in s and states of the last trial of the method at which a rate was not finite.
     """
@@ -102,8 +102,8 @@ class Continuous:
             )
         self.domains = Domains(flat, time_scale) if flat.events else None
         self.exchanged = exchanged if exchanged else None
-        """Blocks that are evaluated from outside; None without any."""
-        self.outside = OutsideEvents(exchanged) if exchanged else None
+        """Blocks in model exchange; None without any."""
+        self.own_events = OwnEvents(exchanged) if exchanged else None
         self._nominals = np.zeros(0)
         self.sources = announcers(flat)
         self.late = find_late(self.sources)
@@ -140,11 +140,11 @@ class Continuous:
     # --- events ------------------------------------------------------------------------------------------------------
 
     def report_own_event(self, t: float, path: str, name: str, before: np.ndarray, after: np.ndarray) -> None:
-        """Report an event of a block from outside, with all states before and after it."""
+        """Report an event of a block in model exchange, with all states before and after it."""
         self.on_event(Occurrence(t, path, name, *(state_values(self.flat, path, x) for x in (before, after))))
 
     def follow(self) -> None:
-        """Take over nominal values of states, which an event of a block from outside may have changed."""
+        """Take over nominal values of states, which an event of a block in model exchange may have changed."""
         if self.where.size and not self.fixed and self.exchanged is not None:
             nominals = self.exchanged.nominals()
             if not np.array_equal(nominals, self._nominals):
@@ -159,7 +159,7 @@ class Continuous:
         """
         event = self.flat.events[i]
         states = [{} if event.subsystem else state_values(self.flat, event.path, x) for x in (before, after)]
-        if event.path in self.flat.outside and self.domains is not None:
+        if event.path in self.flat.in_model_exchange and self.domains is not None:
             last, self._crossed[i] = self._crossed.get(i, -math.inf), t
             same = all(np.array_equal(value, states[1][name]) for name, value in states[0].items())
             if same and 0.0 <= t - last <= _AT_ONCE * self.domains.spacing:

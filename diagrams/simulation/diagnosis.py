@@ -38,7 +38,7 @@ def failure(
     acting : frozenset of TickPattern
         The clocks that act there.
     evaluators : mapping, optional
-        Evaluators of blocks that are evaluated from outside, by path.
+        Evaluators of blocks in model exchange, by path.
     """
     forget_trials(flat)
     for name, where in flat.plant_outputs.slices.items():
@@ -100,7 +100,7 @@ def _wrong(
             what = {NEXT: "the rate of its states" if trace.advance == "derivative" else "the next state"}.get(
                 name, name
             )
-            outside = block.evaluated_outside and name in block.outputs
+            outside = block.in_model_exchange and name in block.outputs
             hint = f"{_out_of_an_fmu(flat, path, name)} " if outside else ""
             return _non_finite(path, what, made[name], f"{hint}{inputs_text(shaped)}")
     return None

@@ -116,7 +116,7 @@ class Engine:
         self._change_over = ChangeOver(self.position)
         self._part = ContinuousPart(self.workspace, self.continuous, self.exchanged) if is_coupled else None
         if self._part is not None:
-            refuse_model_exchange(self.coupling, {path: flat.table.blocks[path] for path in flat.outside})
+            refuse_model_exchange(self.coupling, {path: flat.table.blocks[path] for path in flat.in_model_exchange})
             self.coupled = CoupledSteps(
                 flat,
                 name,

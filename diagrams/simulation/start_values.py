@@ -41,7 +41,7 @@ class StartValues:
 
     @staticmethod
     def fits(flat: FlatDiagram) -> bool:
-        """Whether a diagram's start can be traced: no block of it is evaluated from outside, or in a loop."""
+        """Whether a diagram's start can be traced: no block of it is in model exchange, or in a loop."""
         opaque = any(flat.table.blocks[path].opaque for path in flat.checked.traced)
         return not (opaque or flat.apart or flat.loops.slices)
 

@@ -75,7 +75,7 @@ class SimulationView:
     plants : mapping of str to Plant
         The plants that are loaded, by path.
     exchanged : mapping of str to ModelExchangeBlock
-        The blocks that are evaluated from outside, by path, in a run that has begun.
+        The blocks in model exchange, by path, in a run that has begun.
     """
 
     x: np.ndarray

@@ -306,7 +306,7 @@ def _measure_departure(diagram: WiredDiagram, model: Linearization, wire: str, s
     doubles in the second half of eight time constants, where a mode's grows fiftyfold.
     """
     blocks = diagram.blocks
-    moving = (path for path, b in blocks.items() if b.states or b.stepped or b.evaluated_outside)
+    moving = (path for path, b in blocks.items() if b.states or b.stepped or b.in_model_exchange)
     names = [f"{path}.{port}" for path in moving for port in blocks[path].outputs]
 
     def respond(length: float) -> StepResponse:

@@ -20,7 +20,7 @@ def list_parameters(diagram: WiredDiagram) -> tuple[list[str], dict[str, str]]:
     """
     found, left_out = list[str](), dict[str, str]()
     for path, block in sorted(diagram.blocks.items()):
-        if block.stepped or block.evaluated_outside:
+        if block.stepped or block.in_model_exchange:
             about: Any = block
             known = len(found)
             for name in getattr(block, "start", {}):
@@ -29,7 +29,7 @@ def list_parameters(diagram: WiredDiagram) -> tuple[list[str], dict[str, str]]:
                     found.append(f"{path}.start.{name}")
             if block.stepped or len(found) > known:
                 continue
-        if block.opaque or block.evaluated_outside:
+        if block.opaque or block.in_model_exchange:
             left_out[path] = "its equations are evaluated from outside; name its parameters to difference them"
             continue
         for name, value in traced_parameters(block):
@@ -97,7 +97,7 @@ def _find_structure(diagram: WiredDiagram, name: str) -> str:
         return f"{article} {last.replace('_', ' ')} of a subsystem"
     path, keys = split_path(diagram.structure, name, diagram.name)
     block: Any = diagram.structure.blocks[path]
-    if (block.stepped or block.evaluated_outside) and keys[0] == "start":
+    if (block.stepped or block.in_model_exchange) and keys[0] == "start":
         variable = block.description.find(".".join(keys[1:]))
         kind = "b" if variable.type == "Boolean" else "i" if variable.is_integer else "f"
     else:
@@ -110,7 +110,7 @@ def unit_of(diagram: WiredDiagram, parameter: str) -> str:
     """Return the declared unit of a parameter; "" where there is none."""
     path, keys = split_path(diagram.structure, parameter.partition("[")[0], diagram.name)
     block: Block = diagram.structure.blocks[path]
-    if (block.stepped or block.evaluated_outside) and keys[0] == "start":
+    if (block.stepped or block.in_model_exchange) and keys[0] == "start":
         about: Any = block
         variable = about.description.variables.get(".".join(keys[1:]))
         return str(getattr(variable, "unit", None) or "")
@@ -153,7 +153,7 @@ def read_parameter(diagram: WiredDiagram, name: str) -> Any:
     """Return the value of a parameter, or of an FMU's start value, by its full path; or of an entry of an array."""
     path, keys = split_path(diagram.structure, name, diagram.name)
     owner: Any = diagram.structure.blocks[path]
-    if (owner.stepped or owner.evaluated_outside) and keys[0] == "start":
+    if (owner.stepped or owner.in_model_exchange) and keys[0] == "start":
         key = ".".join(keys[1:])
         known = owner.start.get(key)
         return owner.description.find(key).start if known is None else known

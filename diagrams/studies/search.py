@@ -358,5 +358,5 @@ def _is_start_value(diagram: WiredDiagram, name: str) -> bool:
     return any(
         name.startswith(f"{path}.start.")
         for path, block in diagram.blocks.items()
-        if block.stepped or block.evaluated_outside
+        if block.stepped or block.in_model_exchange
     )

@@ -21,7 +21,7 @@ from ...blocks.core import (
     near,
 )
 from ...blocks.library import FixedSampleTime
-from ...blocks.tracing import Traced, describe_outside, start_shapes, trace, traced_parameters
+from ...blocks.tracing import Traced, describe_model_exchange, start_shapes, trace, traced_parameters
 from .structure import Structure, Wire
 from .wire_units import Unit, check_units
 
@@ -223,7 +223,7 @@ def _check_subsystems(table: Structure, traced: dict[str, Traced], shapes: dict[
     for path in sorted(table.blocks):
         gates = table.gates(table.subsystem_of[path])
         # Time can't wait in an FMU or a transport delay, while the subsystem around it does.
-        if gates and (path not in traced or table.blocks[path].evaluated_outside):
+        if gates and (path not in traced or table.blocks[path].in_model_exchange):
             kind = "a transport delay" if table.blocks[path].transport else "a block that is stepped, such as an FMU,"
             kind = "an FMU in model exchange" if path in traced else kind
             raise WiringError(
@@ -285,8 +285,8 @@ def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, 
     try:
         if rate is not None and isinstance(block, FixedSampleTime):
             block.check_rate(float(rate))
-        if block.evaluated_outside:
-            return describe_outside(block, shapes, sampled=sampled)
+        if block.in_model_exchange:
+            return describe_model_exchange(block, shapes, sampled=sampled)
         return trace(block, shapes, sampled=sampled, method=method, cache=shared)
     except LoopwrightError as error:
         error.blame(path)

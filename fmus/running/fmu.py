@@ -245,13 +245,13 @@ class Fmu(ModelExchangeMembers):
     @property
     def can_save(self) -> bool:
         """Whether the state of a run can be saved and restored (canGetAndSetFMUState)."""
-        exchange = self.description.exchange if self.evaluated_outside else None
+        exchange = self.description.exchange if self.in_model_exchange else None
         return self.description.can_save if exchange is None else exchange.can_save
 
     @property
     def can_serialize(self) -> bool:
         """Whether a saved state can go to another process (canSerializeFMUState)."""
-        exchange = self.description.exchange if self.evaluated_outside else None
+        exchange = self.description.exchange if self.in_model_exchange else None
         return self.description.can_serialize if exchange is None else exchange.can_serialize
 
     @property

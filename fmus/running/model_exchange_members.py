@@ -78,7 +78,7 @@ class ModelExchangeMembers(PortMembers):
         return self.used_interface == INTERFACES[0]
 
     @property
-    def evaluated_outside(self) -> bool:  # type: ignore[override]
+    def in_model_exchange(self) -> bool:  # type: ignore[override]
         """Whether a run's solver integrates its states (model exchange)."""
         return self.used_interface == INTERFACES[1]
 
@@ -113,12 +113,12 @@ class ModelExchangeMembers(PortMembers):
     @property
     def states(self) -> Mapping[str, State]:  # type: ignore[override]
         """The continuous states in model exchange; in co-simulation they are the FMU's own."""
-        return states_of(self) if self.evaluated_outside else {}
+        return states_of(self) if self.in_model_exchange else {}
 
     @property
     def events(self) -> Mapping[str, Event]:  # type: ignore[override]
         """The events of the indicators in model exchange."""
-        return events_of(self) if self.evaluated_outside else {}
+        return events_of(self) if self.in_model_exchange else {}
 
     def dependence(self, equation: str) -> Mapping[str, Array]:
         """Return what depends on what in model exchange, by the model structure; see `loopwright.Block`."""

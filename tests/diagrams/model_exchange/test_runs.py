@@ -73,7 +73,7 @@ def test_states_are_those_of_the_diagram(files, fmi):
     assert not diagram.has_fmu
     flat = diagram.flatten(1)
     assert flat.continuous_labels == ["plant.position", "plant.velocity"]
-    assert flat.outside == ("plant",)
+    assert flat.in_model_exchange == ("plant",)
 
 
 def test_feedthrough_by_the_model_structure_orders_a_loop_around_the_fmu(files, fmi):

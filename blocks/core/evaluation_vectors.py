@@ -1,4 +1,4 @@
-"""One evaluation of a block from outside its equations in Python: the quantities that are wanted, and the vectors."""
+"""One evaluation of a block in model exchange: the quantities that are wanted, and the vectors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Blocks that a run evaluates from outside, in the place of a trace: their ports, and what depends on what."""
+"""Blocks in model exchange, in the place of a trace: their ports, and what depends on what."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from .symbols import size
 from .traced import Traced
 
 
-def describe_outside(block: Block, shapes: Mapping[str, Shape], *, sampled: bool) -> Traced:
-    """Return the description of a block whose class says ``evaluated_outside``.
+def describe_model_exchange(block: Block, shapes: Mapping[str, Shape], *, sampled: bool) -> Traced:
+    """Return the description of a block whose class says ``in_model_exchange``.
 
     Its functions have the ports and the structure of dependencies; their values are NaN, since an evaluator gives them.
 
@@ -55,7 +55,7 @@ def describe_outside(block: Block, shapes: Mapping[str, Shape], *, sampled: bool
                 column += ca.MX(ca.DM(_sparse(pattern))) @ symbol
         results.append(column)
         depends[name] = frozenset(of for of, pattern in patterns.items() if np.any(pattern))
-    function = ca.Function("outside", [t, x, *u, p], results)
+    function = ca.Function("model_exchange", [t, x, *u, p], results)
     n = len(block.events)
     fired = ca.MX.sym("fired", n)
     indicators = ca.Function("indicators", [t, x, *u, p], [ca.MX.ones(n) * np.nan])
