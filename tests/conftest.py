@@ -13,7 +13,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, an
 import pytest
 
 from support.disturbed import IN_QUICK
-from support.drawn import draw, identify
+from support.drawn import QuickAlone, find_quick
 
 WORKER = os.environ.get("PYTEST_XDIST_WORKER", "")
 
@@ -36,6 +36,8 @@ def pytest_configure(config):
         from support.cpu_budget import Budget
 
         config.pluginmanager.register(Budget(budget))
+    if config.option.markexpr == "not slow" and not any("::" in arg for arg in config.args):
+        config.pluginmanager.register(QuickAlone(), "quick alone")
 
 
 def pytest_terminal_summary(terminalreporter, config):
@@ -91,18 +93,16 @@ def pytest_make_collect_report(collector):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_pycollect_makeitem(collector, name, obj):
-    """Take the quick cases of a function: those that its mark draws, or of a product of cases the diagonal."""
+    """Mark the cases of a function that aren't quick as slow, see `support.drawn.find_quick`."""
     items = yield
     group = [item for item in items if isinstance(item, pytest.Function)] if isinstance(items, list) else []
-    if len(group) < 2:
+    if len(group) < 2 or collector.config.pluginmanager.has_plugin("quick alone"):
         return items
-    mark, factors = group[0].get_closest_marker("drawn"), [*group[0].iter_markers("parametrize")]
     chosen = any(item.get_closest_marker("slow") for item in group)
-    if mark is not None or (len(factors) > 1 and not chosen):
-        quick = draw([identify(item) for item in group], *(mark.args if mark is not None else ()))
-        for i, item in enumerate(group):
-            if i not in quick:
-                item.add_marker(pytest.mark.slow)
+    quick = {*find_quick(group[0], [item.callspec.params for item in group], chosen=chosen)}
+    for i, item in enumerate(group):
+        if i not in quick:
+            item.add_marker(pytest.mark.slow)
     return items
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from support.cpu_budget import Budget
-from support.drawn import draw
+from support.drawn import QuickAlone, draw
 from support.kept import kept_folder, kept_tree
 
 
@@ -40,6 +40,28 @@ def test_of_a_product_of_cases_the_diagonal_is_quick(first, second, request):
 @pytest.mark.parametrize("first", "ab")
 def test_who_says_which_cases_are_slow_has_the_others_quick(first, second, request):
     assert (request.node.get_closest_marker("slow") is None) == (second == "x")
+
+
+@pytest.mark.parametrize(
+    ("drawn", "slow", "made"),
+    [((), "", "ax by az"), ((2,), "", "ax az"), ((), "az bz", "ax ay bx by"), ((), "ax ay az bx by bz", "ax")],
+)
+def test_slow_cases_are_not_made_where_the_quick_ones_alone_are_asked_for(drawn, slow, made):
+    """Where all are slow one is made, as pytest makes a case without parameters of none."""
+    values = {name: name for name in "abxyz"}
+    calls = [
+        SimpleNamespace(
+            params={"first": values[a], "second": values[b]}, marks=[pytest.mark.slow] * (a + b in slow.split())
+        )
+        for a, b in product("ab", "xyz")
+    ]
+    factors = [pytest.mark.parametrize("second", "xyz").mark, pytest.mark.parametrize("first", "ab").mark]
+    mark = pytest.mark.drawn(*drawn).mark if drawn else None
+    definition = SimpleNamespace(iter_markers=lambda name: factors, get_closest_marker=lambda name: mark)
+    metafunc, hook = SimpleNamespace(definition=definition, _calls=calls), QuickAlone()
+    for _ in hook.pytest_generate_tests(metafunc):
+        pass
+    assert " ".join("".join(call.params.values()) for call in metafunc._calls) == made
 
 
 def test_the_cases_of_a_function_have_one_budget():
