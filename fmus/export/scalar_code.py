@@ -18,6 +18,8 @@ import numpy as np
 from ...blocks.core import DefinitionError
 from ...blocks.tracing import MATH_FUNCTIONS
 
+OF_TIME = "_of_time"
+"""End of names in double precision, where numbers are of single precision."""
 _WIDEST = 84
 """Characters of an expression up to which it is written inside another one."""
 _ATOM, _UNARY, _PRODUCT, _SUM, _RELATION, _LOGIC = 6, 5, 4, 3, 2, 1
@@ -251,6 +253,30 @@ class Scalars:
                 stack.append(argument)
         return uses
 
+    def of_time(self, values: Iterable[int]) -> frozenset[int]:
+        """Return those of some values that follow from time and parameters alone, with what they are computed from.
+
+        Inputs other than the time, and constants, are not in it.
+        """
+        kinds: dict[int, tuple[bool, bool]] = {}  # with the time; with inputs or states
+        done: set[int] = set()
+        for root in values:
+            for node in self.before(root, done):
+                one = self.nodes[node]
+                if one.operation == ca.OP_INPUT:
+                    kinds[node] = one.place[0] == 0, one.place[0] in (1, 2)
+                else:
+                    found = [kinds[argument] for argument in one.arguments]
+                    kinds[node] = any(t for t, _ in found), any(other for _, other in found)
+        found = {node for node, (timed, other) in kinds.items() if timed and not other}
+        waiting = [*found]
+        while waiting:  # with what they are computed from, such as 2π times a frequency
+            for node in self.nodes[waiting.pop()].arguments:
+                if node not in found and self.nodes[node].arguments:
+                    found.add(node)
+                    waiting.append(node)
+        return frozenset(found)
+
     def before(self, root: int, done: set[int]) -> Iterator[int]:
         """Yield the values that one is computed from, and it, each behind those that it needs, but for some."""
         stack = [(root, False)]
@@ -336,7 +362,13 @@ class Tables:
 
     def __init__(self) -> None:
         self.values: list[np.ndarray] = []
+        self.read: set[tuple[int, bool]] = set()
         self._known: dict[bytes, int] = {}
+
+    def name(self, number: int, fine: bool) -> str:
+        """Return the C name of a table, as numbers or in double precision, and note that it is read."""
+        self.read.add((number, fine))
+        return f"table_{number}{OF_TIME * fine}"
 
     def add(self, lookup: Lookup) -> int:
         """Return the number of a lookup's table."""
@@ -357,27 +389,31 @@ class Expressions:
     uses : Counter
         How often each value is used.
     read : callable
-        Returns the C text of an input, by argument and entry.
+        Returns the C text of an input, by argument, entry, and whether it is wanted in double precision.
     tables : Tables
         The tables of its lookups.
     call : callable
-        Returns the C name of a function of math.h.
+        Returns the C name of a function of math.h, by its name and whether it is that of double precision.
     real : str
         The C type of numbers.
     single : bool
-        Whether numbers are of single precision.
+        Whether numbers are of single precision. Values that follow from the time and parameters alone are of double
+        precision nevertheless: a float of the time is as coarse as a tick after some hours.
+    timed : bool
+        Whether argument 0 is the time, 1 states, 2 inputs and 3 parameters.
     """
 
     def __init__(
         self,
         scalars: Scalars,
         uses: Mapping[int, int],
-        read: Callable[[int, int], str],
+        read: Callable[[int, int, bool], str],
         *,
         tables: Tables,
-        call: Callable[[str], str],
+        call: Callable[[str, bool], str],
         real: str,
         single: bool,
+        timed: bool = True,
     ):
         self._scalars, self._uses, self._read = scalars, uses, read
         self._tables, self._call, self._real, self._single = tables, call, real, single
@@ -385,6 +421,8 @@ class Expressions:
         self._done: set[int] = set()
         self._temporaries = 0
         self.functions: set[str] = set()
+        self.fine_functions: set[str] = set()
+        self._fine = scalars.of_time(uses) if single and timed else frozenset()
         self.operations: Counter[str] = Counter()
 
     def compute(self, node: int, name: str | None = None) -> list[str]:
@@ -403,7 +441,7 @@ class Expressions:
             if wanted is None:
                 self._temporaries += 1
                 wanted = f"t{self._temporaries}"
-            kind = "bool" if self._scalars.nodes[one].is_boolean else self._real
+            kind = "bool" if self._scalars.nodes[one].is_boolean else "double" if one in self._fine else self._real
             lines.append(f"const {kind} {wanted} = {text};")
             self._texts[one] = wanted, _ATOM
         return lines
@@ -412,17 +450,30 @@ class Expressions:
         """Return the C text of a value that has been computed, as a number."""
         return self._number(node, _LOGIC)
 
-    def _number(self, node: int, level: int) -> str:
+    def _number(self, node: int, level: int, fine: bool = False) -> str:
+        """Return the C text of a value as a number, for an operation of some level, in double precision or not."""
         text, own = self._texts[node]
-        if self._scalars.nodes[node].is_boolean:
+        one = self._scalars.nodes[node]
+        if one.is_boolean:
             inner = text if own >= _ATOM else f"({text})"
-            return f"({inner} ? {self.constant(1.0)} : {self.constant(0.0)})"
+            return f"({inner} ? {self.constant(1.0, fine)} : {self.constant(0.0, fine)})"
+        if fine and node not in self._fine:  # a constant or a parameter
+            text, own = self._leaf(one, fine)
+        if node in self._fine and not fine:
+            text, own = f"({self._real}){text if own >= _UNARY else f'({text})'}", _UNARY
         return text if own >= level else f"({text})"
+
+    def _leaf(self, one: ScalarNode, fine: bool) -> tuple[str, int]:
+        if one.operation == ca.OP_INPUT:
+            return self._read(*one.place, fine), _UNARY if fine and one.place[0] else _ATOM
+        text = self.constant(one.constant, fine)
+        return text, _UNARY if text.startswith("-") else _ATOM
 
     def _truth(self, node: int, level: int) -> str:
         text, own = self._texts[node]
         if not self._scalars.nodes[node].is_boolean:
-            text, own = f"{text if own > _RELATION else f'({text})'} != {self.constant(0.0)}", _RELATION
+            zero = self.constant(0.0, node in self._fine)
+            text, own = f"{text if own > _RELATION else f'({text})'} != {zero}", _RELATION
         return text if own >= level else f"({text})"
 
     def is_positive(self, node: int) -> bool:
@@ -430,74 +481,75 @@ class Expressions:
         one = self._scalars.nodes[node]
         return one.operation == ca.OP_CONST and one.constant > 0.0
 
-    def constant(self, value: float) -> str:
-        """Return a number as C text."""
-        return c_constant(value, single=self._single)
+    def constant(self, value: float, fine: bool = False) -> str:
+        """Return a number as C text, in double precision or not."""
+        return c_constant(value, single=self._single and not fine)
 
-    def _write(self, one: int) -> tuple[str, int]:
-        node = self._scalars.nodes[one]
+    def _write(self, number: int) -> tuple[str, int]:
+        node = self._scalars.nodes[number]
         operation, arguments = node.operation, node.arguments
-        if operation == ca.OP_INPUT:
-            return self._read(*node.place), _ATOM
-        if operation == ca.OP_CONST:
-            text = self.constant(node.constant)
-            return text, _UNARY if text.startswith("-") else _ATOM
+        fine = number in self._fine
+        if operation in (ca.OP_INPUT, ca.OP_CONST):
+            return self._leaf(node, fine)
         self.operations[_kind(operation)] += 1
         if operation in _BINARY:
-            return self._binary(operation, arguments)
+            return self._binary(operation, arguments, fine)
         if operation == FIND:
-            self.functions.add("find")
-            table = f"table_{node.place[0]}"
+            self._note("find", fine)
+            table = self._tables.name(node.place[0], fine)
             count = self._tables.values[node.place[0]].size
-            return f"find_piece({table}, {count}u, {self._number(arguments[0], _LOGIC)})", _ATOM
+            sought = self._number(arguments[0], _LOGIC, fine)
+            return f"find_piece{OF_TIME * fine}({table}, {count}u, {sought})", _ATOM
         if operation == TAKE:
-            self.functions.add("take")
-            return f"table_{node.place[0]}[(size_t)({self._number(arguments[0], _LOGIC)})]", _ATOM
+            self._note("take", fine)
+            table = self._tables.name(node.place[0], fine)
+            return f"{table}[(size_t)({self._number(arguments[0], _LOGIC, fine)})]", _ATOM
         if operation == ca.OP_NOT:
             return f"!{self._truth(arguments[0], _ATOM)}", _UNARY
         if operation == ca.OP_NEG:
-            inner = self._number(arguments[0], _ATOM)
+            inner = self._number(arguments[0], _ATOM, fine)
             return f"-{inner}", _UNARY
         if operation == ca.OP_SQ:
-            inner = self._number(arguments[0], _ATOM)
+            inner = self._number(arguments[0], _ATOM, fine)
             return f"{inner} * {inner}", _PRODUCT
         if operation == ca.OP_TWICE:
-            return f"{self.constant(2.0)} * {self._number(arguments[0], _UNARY)}", _PRODUCT
+            return f"{self.constant(2.0, fine)} * {self._number(arguments[0], _UNARY, fine)}", _PRODUCT
         if operation == ca.OP_INV:
-            return f"{self.constant(1.0)} / {self._number(arguments[0], _UNARY)}", _PRODUCT
+            return f"{self.constant(1.0, fine)} / {self._number(arguments[0], _UNARY, fine)}", _PRODUCT
         if operation == ca.OP_IF_ELSE_ZERO:
             condition = self._truth(arguments[0], _ATOM)
-            return f"({condition} ? {self._number(arguments[1], _SUM)} : {self.constant(0.0)})", _ATOM
+            return f"({condition} ? {self._number(arguments[1], _SUM, fine)} : {self.constant(0.0, fine)})", _ATOM
         if operation == CHOOSE:
-            self.functions.add("choose")
+            self._note("choose", fine)
             condition = self._truth(arguments[0], _LOGIC)
-            return (
-                f"choose({condition}, {self._number(arguments[1], _LOGIC)}, {self._number(arguments[2], _LOGIC)})",
-                _ATOM,
-            )
+            one, other = (self._number(argument, _LOGIC, fine) for argument in arguments[1:])
+            return f"choose{OF_TIME * fine}({condition}, {one}, {other})", _ATOM
         if operation == ca.OP_SIGN:
-            self.functions.add("sign")
-            return f"sign_of({self._number(arguments[0], _LOGIC)})", _ATOM
+            self._note("sign", fine)
+            return f"sign_of{OF_TIME * fine}({self._number(arguments[0], _LOGIC, fine)})", _ATOM
         if operation in (ca.OP_ASSIGN, ca.OP_LIFT):
-            return self._number(arguments[0], _ATOM), _ATOM
+            return self._number(arguments[0], _ATOM, fine), _ATOM
         if operation not in MATH_FUNCTIONS:
             raise DefinitionError(
                 f"found CasADi's operation {operation}, which is not written as C. Write the equation with sums, "
                 "products, elementary functions and comparisons."
             )
         called = MATH_FUNCTIONS[operation]
-        self.functions.add(called)
-        listed = ", ".join(self._number(argument, _LOGIC) for argument in arguments)
-        return f"{self._call(called)}({listed})", _ATOM
+        self._note(called, fine)
+        listed = ", ".join(self._number(argument, _LOGIC, fine) for argument in arguments)
+        return f"{self._call(called, fine)}({listed})", _ATOM
 
-    def _binary(self, operation: int, arguments: tuple[int, ...]) -> tuple[str, int]:
+    def _note(self, function: str, fine: bool) -> None:
+        (self.fine_functions if fine else self.functions).add(function)
+
+    def _binary(self, operation: int, arguments: tuple[int, ...], fine: bool) -> tuple[str, int]:
         sign, level = _BINARY[operation]
         if operation in (ca.OP_AND, ca.OP_OR):
             left, right = (self._truth(argument, _RELATION) for argument in arguments)
             return f"{left} {sign} {right}", level
         above = level + 1
-        left = self._number(arguments[0], above if level == _RELATION else level)
-        right = self._number(arguments[1], above)
+        left = self._number(arguments[0], above if level == _RELATION else level, fine)
+        right = self._number(arguments[1], above, fine)
         return f"{left} {sign} {right}", level
 
 

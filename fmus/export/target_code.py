@@ -16,7 +16,7 @@ from ...blocks.core import explain_calls
 from .elementary_tables import FUNCTIONS, prepare_functions
 from .loop_spec import Placed
 from .model import Variable
-from .scalar_code import OF_MATH, Expressions, Scalars, Tables, c_constant
+from .scalar_code import OF_MATH, OF_TIME, Expressions, Scalars, Tables, c_constant
 from .target_spec import TargetSpec, TargetTick
 
 Number = Literal["double", "float"]
@@ -29,7 +29,8 @@ _MACRO = re.compile(
     r"|(DBL|FLT|LDBL|FP|DECIMAL|MATH|SEEK|M)_\w+|U?INT\w*_(MAX|MIN)|(SIZE|PTRDIFF|WCHAR|WINT|SIG_ATOMIC)_(MAX|MIN)"
 )
 """Macros of the headers that the source, or a program with it, includes: they are no names of members."""
-_HELPERS = "is_finite choose sign_of find_piece start_values"
+_IN_TWO = ("choose", "sign_of", "find_piece")
+_HELPERS = f"is_finite exact choose sign_of find_piece start_values {' '.join(f'{one}{OF_TIME}' for one in _IN_TWO)}"
 _OF_FILES = f"""{_HELPERS}
 math string float stddef stdint stdbool stdio stdlib errno assert time signal ctype limits locale
 abs labs div ldiv exit abort atexit system getenv malloc calloc realloc free rand srand qsort bsearch atoi atof atol
@@ -230,7 +231,7 @@ class _SourceWriter:
         self.numbers = [(one, Scalars.of(one.function, (), self.tables)) for one in spec.numbers]
         self._fold()
         self.called: set[str] = set()
-        self.uses_time = False
+        self.called_fine: set[str] = set()  # of double precision, in a source of single precision
         self.clocks = spec.loop.clocks
         self.counted = self.clocks != ((1, 0),)  # which clocks act has to be counted
         self._labels: dict[tuple[str, str], str] = {}
@@ -367,7 +368,7 @@ class _SourceWriter:
         files = {f"{self.name}.h": self._header(), f"{self.name}.c": source, f"{self.name}_example.c": self._example()}
         members = tuple(member for group in _GROUPS for member in self.members[group])
         own = FUNCTIONS if self.own else ()
-        platform = {"fabs"} | {f for f in self.called if f in OF_MATH and f not in own}
+        platform = {"fabs"} | {f for f in self.called | self.called_fine if f in OF_MATH and f not in own}
         return TargetText(
             self.name,
             self.number,
@@ -384,7 +385,8 @@ class _SourceWriter:
         found = {group: size * sum(m.count for m in self.members[group]) for group in _GROUPS}
         end = -(-sum(found.values()) // 8) * 8 + 8 + (4 * len(self.clocks) if self.counted else 0)
         found["struct"] = -(-end // 8) * 8
-        found["tables"] = size * sum(table.size for table in self.tables.values)
+        sizes = [(self.tables.values[i].size, 8 if fine else size) for i, fine in self.tables.read]
+        found["tables"] = sum(count * each for count, each in sizes)
         return found
 
     def _facts(self, tick: _WrittenTick) -> TickFacts:
@@ -436,7 +438,7 @@ class _SourceWriter:
         expressions = Expressions(
             scalars,
             uses,
-            lambda argument, entry: self._read(tick, argument, entry),
+            lambda argument, entry, fine: self._read(tick, argument, entry, fine),
             tables=self.tables,
             call=self._call,
             real=self.real,
@@ -449,6 +451,7 @@ class _SourceWriter:
         self._take_over(tick, expressions, states, written, scalars, taken)
         tick.operations = expressions.operations
         self.called |= expressions.functions
+        self.called_fine |= expressions.fine_functions
         return tick
 
     def _update_lines(self) -> list[str]:
@@ -467,7 +470,7 @@ class _SourceWriter:
                 continue
             roots = [scalars.results[0][i] for i, _ in entries]
 
-            def read(argument: int, entry: int, first: int = one.first) -> str:
+            def read(argument: int, entry: int, fine: bool, first: int = one.first) -> str:
                 found = self.places.get((3, first + entry))
                 return (
                     self._constant(self.spec.start["p"][first + entry]) if found is None else found[0].access(found[1])
@@ -481,6 +484,7 @@ class _SourceWriter:
                 call=self._call,
                 real=self.real,
                 single=self.single,
+                timed=False,
             )
             lines += ["    {", f"        /* {one.block} */"]
             for (_, place), root in zip(entries, roots, strict=True):
@@ -492,28 +496,34 @@ class _SourceWriter:
             self.called |= expressions.functions
         return [*lines, "}", ""]
 
-    def _read(self, tick: _WrittenTick, argument: int, entry: int) -> str:
+    def _read(self, tick: _WrittenTick, argument: int, entry: int, fine: bool) -> str:
         if argument == 0:
-            self.uses_time = True
             tick.touch("time", "time")
             return "t"
         found = self.places.get((argument, entry))
         if found is None:
-            return self._constant(self.spec.start["p" if argument == 3 else "x"][entry])
+            return self._constant(self.spec.start["p" if argument == 3 else "x"][entry], fine)
         member, which = found
         if member.group == "numbers":
             tick.touch("parameters", f"numbers of {member.variable.name}")
         else:
             tick.touch(member.group, member.variable.name)
-        return member.access(which)
+        if not fine:
+            return member.access(which)
+        start = float(member.start[which])
+        if member.group != "parameters" or float(np.float32(start)) == start:
+            return f"(double){member.access(which)}"
+        self.called_fine.add("exact")
+        return f"exact({member.access(which)}, {c_constant(start, single=True)}, {c_constant(start)})"
 
-    def _call(self, function: str) -> str:
+    def _call(self, function: str, fine: bool = False) -> str:
+        single = self.single and not fine
         if self.own and function in FUNCTIONS:
-            return f"own_{function}f" if self.single else f"lw_{function}"
-        return f"{function}f" if self.single else function
+            return f"own_{function}f" if single else f"lw_{function}"
+        return f"{function}f" if single else function
 
-    def _constant(self, value: float) -> str:
-        text = c_constant(float(value), single=self.single)
+    def _constant(self, value: float, fine: bool = False) -> str:
+        text = c_constant(float(value), single=self.single and not fine)
         return f"({text})" if text.startswith("-") else text
 
     def _blocks(
@@ -763,10 +773,8 @@ class _SourceWriter:
             ]
             if "time" in tick.touched:
                 base = self.spec.loop.base
-                whole = (
-                    f"({self.real})(c->tick * INT64_C({base.numerator})) / {self._constant(float(base.denominator))}"
-                )
-                lines += [f"    const {self.real} t = {whole}; /* s */"]
+                whole = f"(double)(c->tick * INT64_C({base.numerator})) / {c_constant(float(base.denominator))}"
+                lines += [f"    const double t = {whole}; /* s */"]
             lines += [*tick.lines, "}", ""]
         lines += self._tick_lines(ticks)
         lines += self.update
@@ -783,7 +791,7 @@ class _SourceWriter:
         return "\n".join(lines)
 
     def _own_functions(self) -> list[str]:
-        called = [f for f in FUNCTIONS if f in self.called] if self.own else []
+        called = [f for f in FUNCTIONS if f in self.called | self.called_fine] if self.own else []
         if not called:
             return []
         text = prepare_functions(" ".join(f"{f}(" for f in called)).replace(
@@ -796,7 +804,7 @@ class _SourceWriter:
         text = re.sub(r"\b(INFINITY|NAN)\b", r"(double)\1", text)  # they are of single precision in C
         text = _leave_out_unused(text, [f"lw_{f}" for f in called])
         found = ["/* ---- elementary functions, with the same bits on every platform ---- */", "", text]
-        for function in called if self.single else ():
+        for function in [f for f in called if f in self.called] if self.single else ():
             names = ("x", "y") if function == "pow" else ("x",)
             found += [
                 f"static inline float own_{function}f({', '.join(f'float {n}' for n in names)}) {{",
@@ -812,47 +820,57 @@ class _SourceWriter:
             f"static inline bool is_finite({real} x) {{ return {self._call('fabs')}(x) <= {largest}; }}",
             "",
         ]
-        one, zero = self._constant(1.0), self._constant(0.0)
-        if "choose" in self.called:
+        if "exact" in self.called_fine:
             found += [
-                "/* a where the condition holds, else b; in a run it is a sum of both, so that -0 becomes 0. */",
-                f"static inline {real} choose(bool condition, {real} a, {real} b) {{",
-                f"    return condition ? a + {zero} : b + {zero};",
+                "/* A parameter in double precision: the exact start value until it is set. */",
+                "static inline double exact(float value, float start, double exactly) {",
+                "    return ((value < start) || (value > start)) ? (double)value : exactly;",
                 "}",
                 "",
             ]
-        if "sign" in self.called:
-            found += [
-                f"static inline {real} sign_of({real} x) {{",
-                f"    return (x < {zero}) ? -{one} : ((x > {zero}) ? {one} : x);",
-                "}",
-                "",
-            ]
-        if "find" in self.called:
-            found += [
-                "/* The piece of a table that x is in: the last breakpoint up to x, or an end piece. */",
-                f"static inline {real} find_piece(const {real} *breakpoints, uint32_t count, {real} x) {{",
-                "    uint32_t low = 0u, high = count - 1u;",
-                "    while (high - low > 1u) {",
-                "        const uint32_t middle = low + (high - low) / 2u;",
-                "        if (x < breakpoints[middle]) {",
-                "            high = middle;",
-                "        } else {",
-                "            low = middle;",
-                "        }",
-                "    }",
-                f"    return ({real})low;",
-                "}",
-                "",
-            ]
+        for called, type_, end in ((self.called, real, ""), (self.called_fine, "double", OF_TIME)):
+            one, zero = (self._constant(value, bool(end)) for value in (1.0, 0.0))
+            if "choose" in called:
+                found += [
+                    "/* a where the condition holds, else b; in a run it is a sum of both, so that -0 becomes 0. */",
+                    f"static inline {type_} choose{end}(bool condition, {type_} a, {type_} b) {{",
+                    f"    return condition ? a + {zero} : b + {zero};",
+                    "}",
+                    "",
+                ]
+            if "sign" in called:
+                found += [
+                    f"static inline {type_} sign_of{end}({type_} x) {{",
+                    f"    return (x < {zero}) ? -{one} : ((x > {zero}) ? {one} : x);",
+                    "}",
+                    "",
+                ]
+            if "find" in called:
+                found += [
+                    "/* The piece of a table that x is in: the last breakpoint up to x, or an end piece. */",
+                    f"static inline {type_} find_piece{end}(const {type_} *breakpoints, uint32_t count, {type_} x) {{",
+                    "    uint32_t low = 0u, high = count - 1u;",
+                    "    while (high - low > 1u) {",
+                    "        const uint32_t middle = low + (high - low) / 2u;",
+                    "        if (x < breakpoints[middle]) {",
+                    "            high = middle;",
+                    "        } else {",
+                    "            low = middle;",
+                    "        }",
+                    "    }",
+                    f"    return ({type_})low;",
+                    "}",
+                    "",
+                ]
         return found
 
     def _table_lines(self) -> list[str]:
-        found = ["/* ---- tables ---- */", ""] if self.tables.values else []
-        for i, table in enumerate(self.tables.values):
-            texts = [c_constant(v, single=self.single) for v in table.tolist()]
+        found = ["/* ---- tables ---- */", ""] if self.tables.read else []
+        for i, fine in sorted(self.tables.read):
+            table, type_ = self.tables.values[i], "double" if fine else self.real
+            texts = [c_constant(v, single=self.single and not fine) for v in table.tolist()]
             found += [
-                f"static const {self.real} table_{i}[{table.size}] = {{",
+                f"static const {type_} {self.tables.name(i, fine)}[{table.size}] = {{",
                 *_fill("    ", texts, ", ", ""),
                 "};",
                 "",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from loopwright import Diagram, subsystem, to_c
-from loopwright.blocks import PID, Compare, Gain, Step, Switch, TransferFunction
+from loopwright.blocks import PID, BandLimitedNoise, Compare, Gain, PulseTrain, Sine, Step, Switch, TransferFunction
 from loopwright.diagrams import DefinitionError, OptionError
 from loopwright.diagrams.exporting import open_subsystem, target_spec
 from loopwright.fmus.export import measure, run_here, unit_name, write_target
@@ -229,6 +229,23 @@ def test_names_of_c_and_names_that_differ_in_case_alone_compile():
     assert [unit_name(n) for n in ("exp", "expf", "uint8_t", "math", "table_0", "my name", "1")] == [
         "exp_", "expf_", "uint8_t_", "math_", "table_0_", "my_name", "n1",
     ]  # fmt: skip
+
+
+def test_sources_of_time_are_exact_in_single_precision():
+    """Noise is made of integers of 48 bits, and pulses have edges at ticks: a float of the time has neither."""
+
+    def waves(u):
+        noise = BandLimitedNoise(sample_time=0.3, variance=2.0, seed=5, name="noise").y.named("noisy")
+        pulses = PulseTrain(amplitude=1.0, period=0.7, duty=3 / 7, delay=0.1, name="pulses")
+        return noise, pulses.y.named("pulsed"), Sine(frequency=0.3, name="wave").y.named("wavy"), (u * 2.0).named("v")
+
+    found = run_here(write_target(spec_of_function(waves), number="float"), {}, 400)
+    k = np.arange(400)
+    np.testing.assert_array_equal(found["pulsed"], (k >= 1) & ((k - 1) % 7 < 3))
+    np.testing.assert_allclose(found["wavy"], np.sin(0.06 * np.pi * k), atol=2 * EPS)
+    exact = BandLimitedNoise(sample_time=0.3, variance=2.0, seed=5, name="noise")
+    run = Diagram("noise", exact.y.named("noisy")).simulate(40.0, step=0.1, progress=False)
+    np.testing.assert_allclose(found["noisy"], run["noisy"][:400], rtol=EPS)
 
 
 def test_a_bound_counts_each_instruction_and_each_call_once():
