@@ -933,7 +933,7 @@ class Diagram(ShownAsTable):
         from .simulation import work_notes
         from .studies import find_worst_case
 
-        with work_notes(self.name, progress) as tell:
+        with work_notes(self.name, progress) as notify:
             return find_worst_case(
                 self.wired,
                 parameters,
@@ -950,7 +950,7 @@ class Diagram(ShownAsTable):
                 at=at,
                 points=points,
                 delay=delay,
-                progress=tell,
+                progress=notify,
                 **options,
             )
 
@@ -1034,10 +1034,10 @@ class Diagram(ShownAsTable):
         from .simulation import work_notes
 
         check_files(path, pdf=pdf, json=json, paper=paper)
-        with work_notes(self.name, options.pop("progress", None)) as tell:
-            analysed = analyse(self, _written=path is not None, progress=tell, **options)
+        with work_notes(self.name, options.pop("progress", None)) as notify:
+            analysed = analyse(self, _written=path is not None, progress=notify, **options)
             made = with_drawing(analysed, self.wired)
-            tell("writing the files")
+            notify("writing the files")
             write_report(made, path, pdf=pdf, json=json, paper=paper)
         return made
 

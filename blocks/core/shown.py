@@ -16,7 +16,7 @@ from .errors import close_names, near
 from .ports import Port
 from .signals import UnknownAttributeError
 
-_MOST = 20
+_MOST_LISTED = 20
 """Members that an error lists where none is near the name that was asked for."""
 _PACKAGE = __name__.partition(".")[0]
 _SECTION = re.compile(r"^(?:Attributes|Methods)\n-+\n((?:.+\n|\n(?!\S.*\n-+\n))*)", re.MULTILINE)
@@ -72,6 +72,6 @@ def missing_member(owner: object, name: str, kind: str, ways: Mapping[str, str])
         return AttributeError(f"{type(owner).__name__!r} object has no attribute {name!r}")
     known = [member for member in dir(owner) if not member.startswith("_")]
     step = f"Write {ways[name]}." if name in ways else near(name, known)
-    if name not in ways and len(known) > _MOST and not close_names(name, known):
+    if name not in ways and len(known) > _MOST_LISTED and not close_names(name, known):
         step = f"Completion lists its {len(known)} members, as dir(…) does."
     return UnknownAttributeError(f"{kind} has no {name!r}. {step}")

@@ -222,7 +222,7 @@ class Backlash(Block):
         """Return the resting y, and the direction in which y is driven after an event."""
         ends = fired.push - fired.pull  # the end that y has reached: 1, −1 or none
         drive = np.where(np.abs(ends) > 0.5, ends, x.drive)
-        drive = np.where(drive * u.rate > 0.0, drive, 0.0)  # u must go on towards that end
+        drive = np.where(drive * u.rate > 0.0, drive, 0.0)  # u must continue towards that end
         stays = np.where(np.abs(ends) > 0.5, u.u - 0.5 * ends * self.width, self.output(t, x, u))
         return np.where(np.abs(drive) > 0.5, x.rest, stays), drive  # while driven, rest keeps its last value
 

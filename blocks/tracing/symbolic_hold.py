@@ -12,7 +12,7 @@ from casadi import ArrayInterface
 from .symbols import flat_column, wrap
 
 _TERMS = 14  # of the exponential's series: at a norm of 1/2 the rest is 2e-17
-_MOST = 16  # squarings: up to a norm of 3e4; beyond, the result is no number
+_MOST_SQUARINGS = 16  # squarings: up to a norm of 3e4; beyond, the result is no number
 
 
 def holds_symbols(rows: Any) -> bool:
@@ -58,9 +58,9 @@ def exponential(A: Any) -> Any:
     found = eye
     for i in range(_TERMS, 0, -1):
         found = eye + (scaled @ found) / i
-    for i in range(_MOST):
+    for i in range(_MOST_SQUARINGS):
         found = ca.if_else(i < k, found @ found, found)
-    return ca.if_else(k > _MOST, np.nan, found)
+    return ca.if_else(k > _MOST_SQUARINGS, np.nan, found)
 
 
 def _matrix(rows: Any) -> Any:

@@ -26,7 +26,7 @@ from .tick_code import (
 )
 
 _LIMIT = "0x1p20"  # LW_FAST_LIMIT
-_MANY = 16  # kinds of ticks that are written twice
+_KINDS_WRITTEN_TWICE = 16  # kinds of ticks that are written twice
 _SYSTEM = "#define _POSIX_C_SOURCE 200809L"  # as `newton.c` asks for it, before anything is included
 _CASADI = re.compile(r"\b(_?(?:casadi|CASADI)_)")
 
@@ -147,7 +147,7 @@ def _write_ticks(functions: Sequence[Any]) -> str:
     for i, function in enumerate(functions):
         text = write_functions(function.name(), [function])
         texts.append(_CASADI.sub(rf"t{i}\1", text))
-        if i < _MANY and (other := reorder(text, f"fast{i}", _LIMIT)) is not None:
+        if i < _KINDS_WRITTEN_TWICE and (other := reorder(text, f"fast{i}", _LIMIT)) is not None:
             others.append(_CASADI.sub(rf"t{i}\1", other))
             one = f"(l)->ticks[{i}]"
             cases.append(f"(kind) == {i} ? fast{i}({one}.arguments, {one}.results) && call(&{one}) : ")

@@ -181,7 +181,7 @@ class LimitTrials:
         return float(min(found, key=lambda omega: abs(omega - near)))
 
     def _fold(self, omega: float) -> float:
-        """Return the alias of a frequency of which a pole over the period tells, rad/s."""
+        """Return the alias of a frequency that a pole over the period shows, rad/s."""
         T = self.contact.sample_time
         return min(omega % (2.0 * np.pi / T), -omega % (2.0 * np.pi / T)) if T else omega
 

@@ -302,9 +302,9 @@ def _grows(A: np.ndarray, pole: complex, rounding: float, sampled: bool) -> bool
 
 
 def _not_reached(A: np.ndarray, B: np.ndarray, lengths: np.ndarray, size: float) -> tuple[np.ndarray, float]:
-    """Return an orthonormal basis of what B does not reach through A, and the least part told as reached.
+    """Return an orthonormal basis of what B does not reach through A, and the least part that counts as reached.
 
-    ``lengths`` are the sizes of the columns of B, ``size`` that of A, against which rounding is told.
+    ``lengths`` are the sizes of the columns of B, ``size`` that of A, to which rounding is relative.
     """
     n = len(A)
     V, new, reference, least = np.zeros((n, 0)), B, lengths, 1.0

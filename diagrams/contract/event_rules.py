@@ -20,7 +20,8 @@ N = TypeVar("N", float, np.ndarray)
 _INSTANTS = 200  # looked at, at most
 _SAME_INSTANT = 100  # jumps that may follow each other at one instant
 _FINENESS = 13  # refinements of an interval, by 8 each
-_MANY, _FEW = 20_000, 2_001  # points in time at which equations are looked at, and those of foreign code
+_INSTANTS, _FOREIGN_INSTANTS = 20_000, 2_001
+"""Points in time at which equations are looked at, and those of foreign code."""
 _TIME = np.zeros(1), np.ones(1)  # the time as a straight line
 
 
@@ -72,7 +73,7 @@ def check_smooth(bench: Bench, announced: list[float], duration: float) -> int:
     hidden = {} if bench.block.opaque else switching_times(bench.traced, bench.p, dict.fromkeys(clocks, _TIME))
     hidden = {t: late for t, late in hidden.items() if 0.0 < t < duration and not _is_known(t, announced)}
     edges = np.unique([0.0, *announced[:24], *sorted(hidden)[:24], duration])
-    points = _FEW if bench.block.opaque else _MANY // (len(edges) - 1) + 65
+    points = _FOREIGN_INSTANTS if bench.block.opaque else _INSTANTS // (len(edges) - 1) + 65
     function = bench.traced.function
     symbols = function.mx_in()
     *outputs, rates, _ = function.call(symbols)

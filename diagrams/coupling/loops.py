@@ -1,4 +1,4 @@
-"""Loops of direct feedthrough across FMUs, told where a coupling does not solve them."""
+"""Loops of direct feedthrough across FMUs, reported where a coupling does not solve them."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from .flat_diagram import FlatDiagram
 from .flat_layout import FlatEvent, StateLayout, sample_time_of
 from .plant_ticks import own_step
 
-_MANY = 300
+_BLOCKS_FOR_ONE_THREAD = 300
 """Blocks from which on it pays to limit BLAS to one thread, which takes some 20 ms."""
 
 
@@ -91,7 +91,7 @@ def flatten(
             if (p, q) in table.wires
         }
     )
-    with one_thread() if len(paths) > _MANY else nullcontext():  # matrices of a few states each
+    with one_thread() if len(paths) > _BLOCKS_FOR_ONE_THREAD else nullcontext():  # matrices of a few states each
         packed = {path: traced[path].pack(blocks[path], sample_time_of(table, path)) for path in paths}
     log_shapes = dict(plant_outputs.shapes) | {join(p, q): s for p in paths for q, s in traced[p].outputs.items()}
     start_values = [

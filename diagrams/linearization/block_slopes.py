@@ -213,8 +213,8 @@ class BlockSlopes:
         A state is named only if no output of the block follows the input in steps.
         """
         found = [*self.steps_of_equations, *self.steps_of_events]
-        told = {column for row, column in found if row in self.rows.ports}
-        return tuple(dict.fromkeys((r, c) for r, c in found if r in self.rows.ports or c not in told))
+        named = {column for row, column in found if row in self.rows.ports}
+        return tuple(dict.fromkeys((r, c) for r, c in found if r in self.rows.ports or c not in named))
 
     @cached_property
     def steps_of_equations(self) -> tuple[tuple[str, str], ...]:

@@ -323,7 +323,7 @@ class LocalDerivatives:
         acting, t, x, w
             As of `differentiate`.
         beside : tuple of ndarray, optional
-            Inputs v and own values s of the stairs at another instant, from which they go on by their mean slope.
+            Inputs v and own values s of the stairs at another instant, from which they continue by their mean slope.
             Without it they have their own values.
         """
         names, zeros = (*_RESULTS, "s"), np.zeros(self.n_inputs)

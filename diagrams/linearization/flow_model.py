@@ -113,12 +113,12 @@ def differentiate_flow(
         error, noise = noise_of(local.evaluators)
         rtol, atol = np.full(s.size, 1e-12), np.full(s.size, 1e-14)
         rtol[nc:], atol[nc:] = max(1e-12, noise), 1e-14 + error * h  # a derivative's own error can't be stepped away
-        with late_progress(f"linear model from t = {t:.6g} s", t, end) as tell:
+        with late_progress(f"linear model from t = {t:.6g} s", t, end) as notify:
             for begin, edge in _split_at_discontinuities(flat, t, end):
                 left = left_of(edge) if edge < end else edge
 
                 def rates(time: float, s: np.ndarray, left: float = left) -> np.ndarray:
-                    tell(time)
+                    notify(time)
                     J, dx = differentiate(min(time, left), s[:nc])
                     V = s[nc:].reshape(nc, nc + many)
                     forced = J[:, :nc] @ V

@@ -246,7 +246,7 @@ class _Runner:
         self._k = self._steps
 
     def check_restoring(self, y0: np.ndarray) -> None:
-        """Begin every response anew if the FMU goes on otherwise behind a restored state than from its start.
+        """Begin every response at the start if the FMU continues otherwise from a restored state than from its start.
 
         Steps behind a state that is restored later may not be final (noSetFMUStatePriorToCurrentPoint). There are FMUs
         that take such a step back when the next one begins.

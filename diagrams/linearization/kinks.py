@@ -46,7 +46,7 @@ HALVINGS = 16
 NO_SLOPE = 1e-9
 """Share of a change over the nominal range up to which a slope that explains no more counts as zero."""
 BESIDE = 1e-2
-"""Distance to both sides, relative to the nominal value, at which an extremum is told from a flat place."""
+"""Distance to both sides, relative to the nominal value, at which an extremum is distinguished from a flat place."""
 JUMP = 1e-9
 """Smallest jump and change that count, relative to 1 + the size of the value."""
 
@@ -174,8 +174,8 @@ class _BlockAtPoint:
                         zeros[key] = zero
         made: dict[tuple[str, str], Finding] = {**zeros, **kinks}
         outputs = self.slopes.rows.ports - self._unused
-        told = {source for row, source in (*made, *steps) if row in outputs}  # a state is named if no output is
-        yield from (f for (row, source), f in made.items() if row in outputs or _is_own(row, source, told))
+        named = {source for row, source in (*made, *steps) if row in outputs}  # a state is named if no output is
+        yield from (f for (row, source), f in made.items() if row in outputs or _is_own(row, source, named))
 
     def _steps_count(self, row: str, column: str) -> bool:
         """Whether a row follows an input in stairs, or in steps of which some lie within its nominal range."""
@@ -309,9 +309,9 @@ def _survives(curved: Curved, row: int, h: float, which: int) -> bool:
     return True
 
 
-def _is_own(row: str, source: str, told: set[str]) -> bool:
+def _is_own(row: str, source: str, named: set[str]) -> bool:
     """Whether a row is a state that follows a source which no output follows in such a way."""
-    return row.startswith("x ") and source not in told
+    return row.startswith("x ") and source not in named
 
 
 def _is_secondary(port: Output | State) -> bool:

@@ -97,7 +97,7 @@ def differentiate_loop(
         Paths, as `Diagram.trim` frees them: of numbers in traced equations, or start values of FMUs; or of one entry of
         an array, ``"motor.denominator[1]"``.
     find : callable, optional
-        How the operating point is found: a changed diagram's point is found anew, and the derivatives count its change.
+        How the operating point is found: a changed diagram's point is found again, and the derivatives count that.
         Without it, an equilibrium follows the parameter, and any other point keeps its states.
     slow : {"closed", "open"}
         As of `Linearization.loop`.

@@ -246,7 +246,7 @@ def _read_bounds(given: Any, shape: tuple[int, ...], name: str) -> tuple[np.ndar
 
 
 def set_states(flat: FlatDiagram, at: OperatingPoint, states: Mapping[str, Any]) -> OperatingPoint:
-    """Return the operating point with other states, given by name; its signals are not computed anew."""
+    """Return the operating point with other states, given by name; its signals are not computed again."""
     known, x = index_states(flat, at), at.x.copy()
     plants = {path: {**point, "state": dict(point["state"])} for path, point in at.plants.items()}
     for name, value in states.items():

@@ -86,7 +86,7 @@ def refine_tolerances(flat: FlatDiagram, chosen: Mapping[str, Any]) -> dict[str,
 
 
 def _check_size(run: InjectionRun, part: Part, v: np.ndarray, largest: float) -> None:
-    """Refuse to go on where a signal grows without end.
+    """Refuse to continue where a signal grows without end.
 
     Raises
     ------

@@ -10,9 +10,12 @@ from ..flat import FlatDiagram
 from .blocks_in_a_run import BlocksInModelExchange
 
 _ROUNDS = 100  # of events at one instant
-_MANY, _SPAN = 500, 1e-8  # so many instants within so many seconds (relative to 1 + |t|), as for those of indicators
-_PART = 1e-2  # and within so much of the time between two ticks: a run in picoseconds continues
-_SLOW = 0.5  # part of the time between two ticks within which so many instants make a run slow
+_PILED, _PILE_SPAN = (
+    500,
+    1e-8,
+)  # so many instants within so many seconds (relative to 1 + |t|), as for those of indicators
+_PILE_PART = 1e-2  # and within so much of the time between two ticks: a run in picoseconds continues
+_SLOW_PART = 0.5  # part of the time between two ticks within which so many instants make a run slow
 
 
 class OwnEvents:
@@ -27,7 +30,7 @@ class OwnEvents:
     def __init__(self, blocks: BlocksInModelExchange):
         self.flat: FlatDiagram = blocks.flat
         self._evaluators = blocks.evaluators
-        self._recent = {path: deque[float](maxlen=_MANY) for path in self._evaluators}
+        self._recent = {path: deque[float](maxlen=_PILED) for path in self._evaluators}
         """The last instants at which a block had an event of time or of a step."""
         self._reported = set[str]()
 
@@ -40,14 +43,14 @@ class OwnEvents:
             recent.clear()  # the run has gone back to a saved state
         recent.append(t)
         span, base = t - recent[0], float(self.flat.base)
-        if len(recent) < _MANY or span >= min(_SPAN * (1.0 + abs(t)), _SLOW * base):
+        if len(recent) < _PILED or span >= min(_PILE_SPAN * (1.0 + abs(t)), _SLOW_PART * base):
             return
-        if span >= _PART * base:
+        if span >= _PILE_PART * base:
             if path not in self._reported:
                 self._reported.add(path)
                 self._evaluators[path].block.add_note(
-                    f"t = {t:.9g} s: its events ({name}) come every {span / (_MANY - 1):.2g} s, about "
-                    f"{base / span * (_MANY - 1):.2g} times between two ticks of {base:g} s, so the run continues "
+                    f"t = {t:.9g} s: its events ({name}) come every {span / (_PILED - 1):.2g} s, about "
+                    f"{base / span * (_PILED - 1):.2g} times between two ticks of {base:g} s, so the run continues "
                     "slowly. Look up in its documentation which input or parameter sets the time between its events"
                 )
             return
@@ -56,7 +59,7 @@ class OwnEvents:
             f"the next time event is at t + {time - t:.2g} s" if math.isfinite(time) else "it has no time event ahead"
         )
         raise SimulationError(
-            f"its events pile up ({name}): they came at {_MANY} instants within {span:.2g} s, while two ticks are "
+            f"its events pile up ({name}): they came at {_PILED} instants within {span:.2g} s, while two ticks are "
             f"{base:g} s apart, so the run would not advance; {counted}. Look up in its documentation which "
             "input or parameter sets the time between its events, or report it to its makers.",
             block=path,

@@ -80,8 +80,8 @@ def _with_notes(function: F) -> F:
     @wraps(function)
     def noted(diagram: Any, **options: Any) -> Any:
         subject = diagram if _is_diagram(diagram) else diagram.diagram
-        with work_notes(subject.name, options.pop("progress", False)) as tell:
-            return function(diagram, **options, progress=tell)
+        with work_notes(subject.name, options.pop("progress", False)) as notify:
+            return function(diagram, **options, progress=notify)
 
     return noted  # type: ignore[return-value]  # of the signature of the function that it wraps
 
@@ -210,7 +210,7 @@ def analyse(
     wires = None if loops is None else tuple([loops] if isinstance(loops, str) else loops)
     for wire in (*(wires or ()), *(measured or ())):
         find_signal(wired.flatten(None if wired.has_clock else STEP), wire)
-    tell: Any = progress  # a function: see `_with_notes`
+    notify: Any = progress  # a function: see `_with_notes`
     file = None if isinstance(requirements, Requirements | None) else TomlFile.read(requirements, "requirements")
     asked = requirements if isinstance(requirements, Requirements | None) else read_requirements(file or requirements)
     touched = read_contacts(wired, contacts, file, asked)
@@ -219,15 +219,15 @@ def analyse(
     task = read_task(wired, worst_case, file, asked)
     axes, names = AxisUnits(decibels, hertz), tuple(measured or ())
     how: dict[str, Any] = {"workers": check_workers(workers, _written), "drawn": _written and not summary}
-    case, sections = kind.sections(wired, point, experiment, wires, only, tell, stairs, asked, axes, names, **how)
+    case, sections = kind.sections(wired, point, experiment, wires, only, notify, stairs, asked, axes, names, **how)
     loops_measured = read_measured(case, measured) if measured else ()
     if loops_measured:
         sections = (*sections, measured_loops(case, loops_measured))
-    searched = None if task is None else find_reported(wired, task, asked, point, stairs, tell, case.loop_places)
+    searched = None if task is None else find_reported(wired, task, asked, point, stairs, notify, case.loop_places)
     if searched is not None:
         sections = (*sections, worst_case_of(searched))
     if touched is not None and touched.contacts:
-        tell("contact")
+        notify("contact")
         sections = (*sections, contact_sections(touched))
     whole = Report("", sections)
     made, absent = whole.numbers(), whole.absent()

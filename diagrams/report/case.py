@@ -120,7 +120,7 @@ class Case:
         Keys of the sections that the report is to have.
     axes : AxisUnits
         Units of the axes of frequency responses.
-    tell : callable
+    notify : callable
         Told what is being done, where a section takes long.
     """
 
@@ -143,7 +143,7 @@ class Case:
         self.notes: list[str] = []
         self.keys: tuple[str, ...] = ()
         self.axes = AxisUnits()
-        self.tell: Callable[[str], None] = lambda doing: None
+        self.notify: Callable[[str], None] = lambda doing: None
         self.variants: dict[str, Variant] = {}
         own = self.own_delay()
         for basis in self.bases():
@@ -184,7 +184,7 @@ class Case:
         return {key: tuple(dict.fromkeys((key, place.wire, place.name))) for key, place in self.loop_places.items()}
 
     def sensitivity_wires(self) -> dict[str, str]:
-        """Return the wires whose loops' sensitivities to parameters are told, by their keys."""
+        """Return the wires whose loops' sensitivities to parameters are reported, by their keys."""
         return dict(self.loop_wires())
 
     def extra_loops(self) -> tuple[str, ...]:

@@ -96,7 +96,7 @@ class ReportKind(Generic[C]):
         experiment: ReportedExperiment | None,
         wires: tuple[str, ...] | None,
         only: Iterable[str] | None,
-        tell: Callable[[str], None],
+        notify: Callable[[str], None],
         stairs: str | None = None,
         requirements: Requirements | None = None,
         axes: AxisUnits = RADIANS,
@@ -107,10 +107,10 @@ class ReportKind(Generic[C]):
     ) -> tuple[Case, tuple[Section, ...]]:
         """Return the case of a diagram, and its sections.
 
-        ``tell`` gets the key of each section before it is made. With two workers, a second process makes sections of a
-        diagram with FMUs, from the last one on; where they are ``drawn``, it draws their figures, too.
+        ``notify`` gets the key of each section before it is made. With two workers, a second process makes sections of
+        a diagram with FMUs, from the last one on; where they are ``drawn``, it draws their figures, too.
         """
-        tell("variants")
+        notify("variants")
         wanted = set(self.keys if only is None else only)
         keys = tuple(key for key in self.keys if key in wanted)
         task = SectionTask(self, diagram, point, wires, stairs, requirements, axes, tuple(measured), keys, drawn)
@@ -123,24 +123,24 @@ class ReportKind(Generic[C]):
             case = task.make_case(experiment)
 
             def make(key: str) -> tuple[Section | None, tuple[str, ...]]:
-                return self.make_section(case, key, tell), ()
+                return self.make_section(case, key, notify), ()
 
-            case.tell = tell
+            case.notify = notify
             if requirements is not None:
                 check_names(case, requirements, measured)
-            made = list(map(make, keys)) if second is None else second.share(keys, make, tell)
+            made = list(map(make, keys)) if second is None else second.share(keys, make, notify)
         for section, pictures in made:
             if section is not None and pictures:
                 keep_drawings(section, pictures)
         return case, tuple(section for section, _ in made if section is not None)
 
-    def make_section(self, case: Case, key: str, tell: Callable[[str], None]) -> Section | None:
+    def make_section(self, case: Case, key: str, notify: Callable[[str], None]) -> Section | None:
         """Return the section of a key; None where nothing is to be said."""
         own = cast("C", case)
         parts = [part for part in self.parts if part.key == key and part.applies(own)]
         if not parts:
             return None
-        tell(key)
+        notify(key)
         made = [section for part in parts if (section := part.make(own)) is not None]
         if not made:
             return None
@@ -173,10 +173,10 @@ class SectionTask:
     def _case(self) -> Case:
         return self.make_case()
 
-    def make(self, key: str, tell: Callable[[str], None]) -> tuple[Section | None, tuple[str, ...]]:
+    def make(self, key: str, notify: Callable[[str], None]) -> tuple[Section | None, tuple[str, ...]]:
         """Return the section of a key, and its figures as SVG where they are to be drawn."""
-        self._case.tell = tell
-        made = self.kind.make_section(self._case, key, tell)
+        self._case.notify = notify
+        made = self.kind.make_section(self._case, key, notify)
         return made, draw_section(made) if self.drawn and made is not None else ()
 
 

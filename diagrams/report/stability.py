@@ -20,7 +20,7 @@ ON_THE_LIMIT = 1e-9
 
 
 class Stability(StrEnum):
-    """Answer to the question whether a diagram is stable; its value stands in tables."""
+    """Answer to the question whether a diagram is stable; its value is in tables."""
 
     STABLE = "yes"
     UNSTABLE = "no"

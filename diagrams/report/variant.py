@@ -26,7 +26,7 @@ AT_REST = 1e-6
 
 
 class Implementation(StrEnum):
-    """A way in which a diagram is implemented; its value stands in dotted paths."""
+    """A way in which a diagram is implemented; its value is in dotted paths."""
 
     CONTINUOUS = "continuous"
     """Everything that is sampled is taken as ideal."""
@@ -60,7 +60,7 @@ def look_of(key: str, i: int) -> dict[str, Any]:
 
 
 class Cut(StrEnum):
-    """A way in which a loop is cut; the value of all but the plain one stands in dotted paths."""
+    """A way in which a loop is cut; the value of all but the plain one is in dotted paths."""
 
     PLAIN = ""
     """All other loops closed, L at one rate."""

@@ -86,8 +86,8 @@ class StepLimits:
     def __repr__(self) -> str:
         ends = " → ".join(name for name in (self.input, self.output) if name)
         size = "" if self.size is None else f" of {self.size:g}"
-        told = ", ".join(f"{name} {limit}" for name, limit in self.limits.items())
-        return f"step{size}{f' {ends}' if ends else ''}: {told}"
+        texts = ", ".join(f"{name} {limit}" for name, limit in self.limits.items())
+        return f"step{size}{f' {ends}' if ends else ''}: {texts}"
 
     @classmethod
     def of(cls, given: Any) -> StepLimits:
@@ -149,11 +149,11 @@ class LoopLimits:
         self.variants: Mapping[str, LoopLimits] = MappingProxyType(_variants(variants))
 
     def __repr__(self) -> str:
-        told = [f"{name} {limit}" for name, limit in self.limits.items()]
+        texts = [f"{name} {limit}" for name, limit in self.limits.items()]
         steps = [repr(step) for step in self._all_steps()]
         loops = [f"{wire}: {limits!r}" for wire, limits in getattr(self, "loops", {}).items()]
         more = f"variants {', '.join(self.variants)}" if self.variants else ""
-        return brief(self._kind, *told, *steps, *loops, more, then=".limits, .step, .variants")
+        return brief(self._kind, *texts, *steps, *loops, more, then=".limits, .step, .variants")
 
     def _all_steps(self) -> list[StepLimits]:
         """Return the limits of responses to steps: of that at a loop's own wire, and of others."""

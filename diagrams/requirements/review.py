@@ -80,8 +80,8 @@ class Review(ShownAsTable):
     free: tuple[Any, ...] = ()
 
     def __repr__(self) -> str:
-        told = [f"{len(self.of(verdict))} {verdict.value}" for verdict in Verdict if self.of(verdict)]
-        return brief(f"review of {len(self.results)} requirements", *told, then=".results, .of(Verdict.FAILED)")
+        counts = [f"{len(self.of(verdict))} {verdict.value}" for verdict in Verdict if self.of(verdict)]
+        return brief(f"review of {len(self.results)} requirements", *counts, then=".results, .of(Verdict.FAILED)")
 
     def _sheet(self) -> Sheet:
         ranked = rank(self.results)

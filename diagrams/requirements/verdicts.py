@@ -13,7 +13,7 @@ from ..frequency import MARGIN_UNITS, Number
 
 
 class Verdict(StrEnum):
-    """Answer to the question whether a requirement is met; its value stands in the report and in its JSON."""
+    """Answer to the question whether a requirement is met; its value is in the report and in its JSON."""
 
     PASSED = "passed"
     """The number is within its limits, with its tolerance."""
@@ -24,7 +24,7 @@ class Verdict(StrEnum):
 
 
 class Reason(StrEnum):
-    """Cause of a verdict; its value stands in the JSON."""
+    """Cause of a verdict; its value is in the JSON."""
 
     COMPARED = "compared"
     """The number was compared with its limits."""
@@ -41,7 +41,7 @@ class Reason(StrEnum):
     NO_UNCERTAINTY = "no uncertainty"
     """The number was measured, and the data don't say how well."""
     NOT_CONFIRMED = "not confirmed"
-    """No independent computation stands behind the number."""
+    """No independent computation confirms the number."""
     FINDINGS = "findings"
     """The linear model behind the number leaves something out at its operating point."""
     SEVERAL_CUTS = "several cuts"

@@ -10,15 +10,15 @@ from ...blocks.core import on_one_thread
 from ...fmus.child_processes import Host
 
 Make = Callable[[str, Callable[[str], None]], object]
-"""``make(key, tell)``: return the part of a key, the same in any process; ``tell`` gets what is being done, as text."""
+"""``make(key, notify)``: return the part of a key, the same in any process; ``notify`` gets texts on progress."""
 
 
 @on_one_thread
 def main() -> None:
-    """Answer keys with parts until the host ends: ``("told", text)``, then ``("made", bytes)``.
+    """Answer keys with parts until the host ends: ``("progress", text)``, then ``("made", bytes)``.
 
     A part that fails, or can't be sent, is answered with ``("failed", None)``: the first process makes it itself, and
-    tells its error.
+    raises its error.
     """
     with contextlib.suppress(EOFError, BrokenPipeError):
         host = Host()
@@ -28,7 +28,7 @@ def main() -> None:
             key = host.receive()
             try:
                 make = pickle.loads(data) if make is None else make
-                made = pickle.dumps(make(key, lambda text: host.send(("told", text))), protocol=5)
+                made = pickle.dumps(make(key, lambda text: host.send(("progress", text))), protocol=5)
             except BrokenPipeError:
                 return
             except Exception:

@@ -17,7 +17,7 @@ from .child import Make
 
 T = TypeVar("T")
 PAUSE = 0.1
-"""Seconds between two looks at what the second process tells, while this one waits for it."""
+"""Seconds between two looks at what the second process reports, while this one waits for it."""
 
 
 class SecondProcess(Generic[T]):
@@ -79,7 +79,7 @@ class SecondProcess(Generic[T]):
         make : callable
             Makes a part here.
         report : callable
-            Called with what the second process tells, by this thread.
+            Called with what the second process reports, by this thread.
         """
         self._left = deque(keys[1:])
         if self._child is not None:
@@ -117,7 +117,7 @@ class SecondProcess(Generic[T]):
             while (key := self._take(first=False)) is not None:
                 child.send(key)
                 kind, answer = child.receive()
-                while kind == "told":
+                while kind == "progress":
                     self._texts.put(answer)
                     kind, answer = child.receive()
                 if kind == "made":

@@ -63,7 +63,7 @@ _MAPPED = {"BooleanMappingTransformation": "boolean", "IntegerMappingTransformat
 _MAPPED["EnumerationMappingTransformation"] = "enumeration"
 _DEEPEST = 16
 """Packages and systems within one another that are opened."""
-_MOST = 10_000
+_MOST_ELEMENTS = 10_000
 """Elements of a diagram, of all nested files together."""
 
 
@@ -478,8 +478,8 @@ class _File:
             if name in elements:
                 raise self.error(f"found two elements {name!r}; expected one. Rename one.", at)
             self.reader.count += 1
-            if self.reader.count > _MOST:
-                raise self.error(f"found more than {_MOST} elements; expected fewer. Take a part of it.", path)
+            if self.reader.count > _MOST_ELEMENTS:
+                raise self.error(f"found more than {_MOST_ELEMENTS} elements; expected fewer. Take a part of it.", path)
             if tag == "Component":
                 elements[name] = self.component(child, path)
             elif tag == "System":

@@ -342,7 +342,7 @@ _SENSITIVITY = Kind(
 def confirm_sensitivity(found: Sensitivities, row: Sensitivity, *, delay: int = 0, skew: float = 0.0) -> Sensitivity:
     """Return a sensitivity that a second computation has confirmed: differences of the margin itself.
 
-    The diagram is changed by ±0.1 % of the parameter, linearized at the point as anew, and its margin is computed.
+    The diagram is changed by ±0.1 % of the parameter, linearized at the point again, and its margin is computed.
 
     Raises
     ------

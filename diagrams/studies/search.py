@@ -58,11 +58,11 @@ class Study:
         points: tuple[Any, ...],
         delay: int,
         options: Mapping[str, Any],
-        tell: Callable[[str], None],
+        notify: Callable[[str], None],
         measure: Measure | None = None,
     ):
         self.diagram, self.goal, self.boxes, self.points = diagram, goal, boxes, points
-        self.delay, self.options, self.tell, self.measure = delay, options, tell, measure
+        self.delay, self.options, self.notify, self.measure = delay, options, notify, measure
         self.cases: list[StudyCase] = []
         self.names = [(name, i) for name, box in boxes.items() for i in range(box.size)]
         self.smooth = {name for name in boxes if not _is_start_value(diagram, name)}
@@ -89,7 +89,7 @@ class Study:
         if where is not None:
             self._places.append((where, made))
         worst = min(made, key=lambda case: case.goodness)
-        self.tell(f"{origin.value} {len(self.cases)}: {describe(worst)}")
+        self.notify(f"{origin.value} {len(self.cases)}: {describe(worst)}")
         return made
 
     def _analyse(self, parameters: Mapping[str, Any], place: int, origin: CaseOrigin) -> StudyCase:
@@ -134,7 +134,7 @@ class Study:
         )
 
     def with_findings(self, case: StudyCase) -> StudyCase:
-        """Return a stable case with its numbers made anew by the whole linear model, which tells what it leaves out.
+        """Return a stable case with the numbers of the whole linear model, which reports what it leaves out.
 
         The numbers of many cases come from their loops' matrices alone, without the model's checks and findings.
         """

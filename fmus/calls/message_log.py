@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from ...blocks.core import FmuEnd, FmuProcessError
 from .fmi_calls import STATUS
 
-_MOST = 1000
+_MOST_MESSAGES = 1000
 """Most different messages of an FMU that are kept."""
 _LONGEST = 2000
 """Most characters of a message that are kept."""
@@ -30,7 +30,7 @@ _ADVICE = {
 
 
 class MessageLog:
-    """Messages of an FMU, each told once with its count, after notes on the FMU; ``label`` names the block."""
+    """Messages of an FMU, each reported once with its count, after notes on the FMU; ``label`` names the block."""
 
     def __init__(self, label: str, notes: Iterable[str] = ()):
         self._label, self._notes = label, list(notes)
@@ -45,7 +45,7 @@ class MessageLog:
         self._notes.append(f"{self._label}: {text}")
 
     def begin_again(self) -> None:
-        """Forget all but the notes that were there at the first call: another run begins, and tells its own."""
+        """Forget all but the notes that were there at the first call: another run begins, and reports its own."""
         if self._lasting is None:
             self._lasting = len(self._notes)
         del self._notes[self._lasting :]
@@ -67,7 +67,7 @@ class MessageLog:
         message = f"{self._label}: {kind}: {clean_text(text)}"
         if message not in self._last:
             self._last.append(message)
-        if message in self._said or len(self._said) < _MOST:
+        if message in self._said or len(self._said) < _MOST_MESSAGES:
             self._said[message] = self._said.get(message, 0) + 1
         else:
             self._left_out += 1

@@ -29,11 +29,11 @@ from .transfer import Transfer, UnfitError, WatchedInputs
 
 _BY_PYTHON = StepParts.EVENTS | StepParts.EARLY_RETURN | StepParts.SLOPES | StepParts.ROLLBACK
 """Parts with which a loop in C takes those steps alone that turn out to be nothing but calls."""
-_MANY, _SPAN = 500, 1e-8
+_PILED_PARTS, _PILE_SPAN = 500, 1e-8
 """So many parts of a step within so many seconds (relative to 1 + |t|) are events that pile up."""
-_MOST = 50_000
+_REFUSED_PARTS = 50_000
 """Parts in one step, at the rate of the last ones, above which they are an error."""
-_SLOW = 1000
+_SLOW_PARTS = 1000
 """Parts in one step, at the rate of the last ones, above which the run warns of them."""
 
 
@@ -227,7 +227,7 @@ class InstanceStep:
         if not self.parts & (StepParts.EVENTS | StepParts.EARLY_RETURN):
             self._judge_part(status, t, h)
             return
-        still, instants = 0, deque[float](maxlen=_MANY)
+        still, instants = 0, deque[float](maxlen=_PILED_PARTS)
         while True:
             reached, asks = self._judge_part(status, now, part)
             still = still + 1 if reached - now <= ROUNDED * h else 0
@@ -237,7 +237,7 @@ class InstanceStep:
             if self._is_ended(t, h, now):
                 return
             instants.append(now)
-            if len(instants) == _MANY:
+            if len(instants) == _PILED_PARTS:
                 self._look_for_pile(instants)
             if self.events is not None and self.events.act_within(now, end, h, asked=asks):
                 self._is_read = False
@@ -427,8 +427,8 @@ class InstanceStep:
     def _look_for_pile(self, instants: Sequence[float], *, ends: bool = False) -> None:
         """Warn of events that come so often that the step takes long; refuse those with which it would not end."""
         now, each, h = instants[-1], (instants[-1] - instants[0]) / (len(instants) - 1), self._h
-        refused = ends or (h > _MOST * each and instants[-1] - instants[0] < _SPAN * (1.0 + abs(now)))
-        if not refused and (h < _SLOW * each or self._has_warned):
+        refused = ends or (h > _REFUSED_PARTS * each and instants[-1] - instants[0] < _PILE_SPAN * (1.0 + abs(now)))
+        if not refused and (h < _SLOW_PARTS * each or self._has_warned):
             return
         clocks, next_event = ([], math.inf) if self.events is None else (self.events.clocks, self.events.next_event)
         ticking = [f"its clock {c.variable.name}" for c in clocks if c.next <= now + 2.0 * each]

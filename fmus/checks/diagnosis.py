@@ -20,7 +20,7 @@ _CAUSALITIES = {
     "structuralParameter": "structural parameter",
     "calculatedParameter": "calculated parameter",
 }
-_MOST = 5
+_MOST_OF_A_FAULT = 5
 """Findings of one kind that the text shows."""
 
 
@@ -141,11 +141,11 @@ class FmuDiagnosis:
         shown = Counter[FmuFault]()
         for i, finding in enumerate(self.findings, 1):
             shown[finding.fault] += 1
-            if shown[finding.fault] > _MOST:
+            if shown[finding.fault] > _MOST_OF_A_FAULT:
                 continue
             yield f"  {i}. {finding.severity}: {_indent(finding.found)}"
             yield f"     Next: {_indent(finding.step)}"
-        hidden = sum(n - _MOST for n in shown.values() if n > _MOST)
+        hidden = sum(n - _MOST_OF_A_FAULT for n in shown.values() if n > _MOST_OF_A_FAULT)
         if hidden:
             yield f"  {hidden} more of these kinds are not shown; --json has them."
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from .process import ChildProcess
 
-_MOST, _IDLE = 4, 20.0
+_MOST_IDLE, _IDLE_TIME = 4, 20.0
 """Number of idle processes, and seconds after which an idle one is ended."""
 _COLLECTED_AT = 8
 """Number of processes in use at which garbage is collected, as circles of references may hold FMUs."""
@@ -68,7 +68,7 @@ def give_back(process: ChildProcess, clean: bool) -> None:
         keeps = clean and key is not None and key[3] and process.alive and not process.used
         if keeps and key is not None:
             _IDLE_ONES.append((key, process, time.monotonic()))
-            surplus = [_IDLE_ONES.pop(0)[1] for _ in range(len(_IDLE_ONES) - _MOST)]
+            surplus = [_IDLE_ONES.pop(0)[1] for _ in range(len(_IDLE_ONES) - _MOST_IDLE)]
             _set_timer()
         else:
             surplus = [process]
@@ -85,7 +85,7 @@ def _drop(process: ChildProcess) -> None:
 def _set_timer() -> None:
     """Look at the idle ones after a while; a daemon, so that the end of Python doesn't wait for it."""
     if not _TIMER and _IDLE_ONES:
-        timer = threading.Timer(_IDLE / 2, end_idle, kwargs={"seconds": _IDLE})
+        timer = threading.Timer(_IDLE_TIME / 2, end_idle, kwargs={"seconds": _IDLE_TIME})
         timer.daemon = True
         _TIMER.append(timer)
         timer.start()

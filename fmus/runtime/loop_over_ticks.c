@@ -1,8 +1,8 @@
 /* The loop over ticks: FMUs step, the diagram's tick is evaluated, its states are taken over, a sample is recorded.
 
    It knows no diagram: a tick is a function pointer with the addresses of its arguments and results. On anything out of
-   the ordinary it returns at that tick; Python, which has the same numbers before it, says what has happened. It stands
-   behind `newton.c` and `remote.c`. */
+   the ordinary it returns at that tick; Python, which has the same numbers before it, says what has happened. It comes
+   after `newton.c` and `remote.c`. */
 
 typedef int (*set_or_get2)(void *instance, const uint32_t *references, size_t count, double *values);
 typedef int (*set_or_get3)(void *instance, const uint32_t *references, size_t count, double *values, size_t size);

@@ -19,7 +19,7 @@ SUMMARY = "summary"
 class Table(ShownAsTable, Grid):
     """A table: a title, column headings, and rows of texts or numbers.
 
-    One of ``details`` stands in the appendix. Numbers have ``digits`` significant digits at most, fewer where their
+    One of ``details`` is in the appendix. Numbers have ``digits`` significant digits at most, fewer where their
     tolerance bears no more. Columns without a single entry are not shown. ``terms`` names the definitions of numbers
     that have no dotted path, by their columns; ``numbers`` has those with a path within the section. A ``brief`` table
     repeats numbers of other tables: of their confirmations it has only those that say less than "confirmed".
@@ -74,7 +74,7 @@ class TableForm:
 class Judged(str):
     """A text that is shown in the color of its verdict: a cell of a table, or a paragraph.
 
-    Its ``reason`` is a part of the text, after a colon; that of a cell stands below the table, by a letter.
+    Its ``reason`` is a part of the text, after a colon; that of a cell is below the table, by a letter.
     """
 
     verdict: Verdict
@@ -110,7 +110,7 @@ class Plot:
     """A figure: a key for its file, a caption, the matplotlib figure or the `Drawing`; ``ahead`` of the tables or not.
 
     In place of the figure it can have a function without arguments that draws it: who reads the numbers alone waits for
-    no figure. One of ``details`` stands in the appendix. Figures with the same ``group`` are small and stand side by
+    no figure. One of ``details`` is in the appendix. Figures with the same ``group`` are small and stand side by
     side.
     """
 

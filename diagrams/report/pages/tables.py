@@ -33,7 +33,7 @@ class Heading:
 class CellView:
     """A cell; ``kind`` is "right" for numbers, "again" where it repeats what stands above it.
 
-    Of a number ``about`` tells the path, the tolerance and the confirmation; ``anchor`` is where it stands in the
+    Of a number ``about`` has the path, the tolerance and the confirmation; ``anchor`` is where it is in the
     appendix, empty where it doesn't.
     """
 

@@ -62,7 +62,7 @@ def injected(case: Case) -> Section | None:
                 text.append(TEXTS.line("moving", variant=v.title, wire=wire, **_moving(v)))
                 continue
             try:
-                case.tell(f"injection at {wire}, {v.title}")
+                case.notify(f"injection at {wire}, {v.title}")
                 L = v.loop(wire)  # a wire without a loop at one rate needs no measurement
                 plan = case.excitation(v, wire)
                 least = find_least_sine(plan.variant.diagram, plan.variant.point, wire, L, plan.frequencies)

@@ -123,7 +123,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
     beside: list[tuple[Any, ...]] = []
     absent: dict[str, str] = {}
     for v in case.usable():
-        case.tell(f"margins at {wire}, {v.title}")
+        case.notify(f"margins at {wire}, {v.title}")
         try:
             cut, title, L = v.fullest_loop(wire)
             if L.ninputs > 1:
@@ -162,7 +162,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
         elif v.is_design and isinstance(L, delayed_system_class()):
             notes.append(TEXTS.line("no_rational_model", variant=title))
         elif v.is_design:
-            case.tell(f"confirming the margins at {wire}, {v.title}")
+            case.notify(f"confirming the margins at {wire}, {v.title}")
             try:
                 with np.errstate(all="ignore"):
                     r = Realization.of(L)

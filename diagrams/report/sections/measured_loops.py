@@ -153,7 +153,7 @@ def _numbers(key: str, name: str, interval: Interval) -> dict[str, Number]:
 
 
 def _model(variant: Variant, wire: str, text: list[str]) -> tuple[Any, Any]:
-    """Return the model's loop at a wire and its margins; None where it has none, which is told in the text."""
+    """Return the model's loop at a wire and its margins; None where it has none, which the text says."""
     try:
         L = variant.loop(wire)
         return L, margins(L)

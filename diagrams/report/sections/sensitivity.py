@@ -32,7 +32,7 @@ def sensitivity(case: Case) -> Section | None:
     text, parts = [*TEXTS.paragraphs("about", title=variant.title)], []
     confirmed: list[Sensitivity] = []
     for key, wire in case.sensitivity_wires().items():
-        case.tell(f"sensitivity at {wire}")
+        case.notify(f"sensitivity at {wire}")
         try:
             found = sensitivities_of(variant.model, (wire,))
         except (PeriodicLoopError, BetweenTicksError) as error:
@@ -70,7 +70,7 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities, confirmed: list
         try:
             made = _take_confirmed([found[name, quantity] for quantity in shown], confirmed)
             if not made:
-                case.tell(f"confirming the sensitivity at {wire} to {name}")
+                case.notify(f"confirming the sensitivity at {wire} to {name}")
                 made = confirm_parameter(found, name, shown)
                 confirmed += made
         except LoopwrightError as error:

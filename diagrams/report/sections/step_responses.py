@@ -136,7 +136,7 @@ def steps(case: Case) -> Section | None:
             text.append(TEXTS.line("unstable", variant=v.title))
             continue
         for test in step_tests(case, v):
-            case.tell(f"step at {test!s}, {v.title}")
+            case.notify(f"step at {test!s}, {v.title}")
             try:
                 ran = _run(case, v, test)
             except LoopwrightError as error:
@@ -356,8 +356,8 @@ def _run(case: Case, v: Variant, test: StepTest) -> tuple[StepResponse, float | 
             raise
         got = respond(usual)  # the diagram's range is smaller than the quanta ask for
     if diverges is None and given is not None:
-        case_tells = f"step at {test!s}, {v.title}, for longer: it has left the linear model's"
-        if _grows_on(got, test, lambda length: respond(size, length), length, lambda: case.tell(case_tells)):
+        what_is_done = f"step at {test!s}, {v.title}, for longer: it has left the linear model's"
+        if _grows_on(got, test, lambda length: respond(size, length), length, lambda: case.notify(what_is_done)):
             got, diverges = _follow_diverging(lambda length: respond(size, length), test, length)
     if given is None and diverges is None:
         got = _small_response(got, respond, height)
@@ -383,7 +383,7 @@ def _grows_on(
     test: StepTest,
     respond: Callable[[float], StepResponse],
     length: float,
-    tell: Callable[[], None],
+    notify: Callable[[], None],
 ) -> bool:
     """Return whether an answer that ends away from the linear model's grows without end.
 
@@ -400,7 +400,7 @@ def _grows_on(
     for times in FURTHER:
         if size > BEYOND_ALL * linear:
             return True
-        tell()
+        notify()
         try:
             further = _size_at_end(respond(times * length), test)
         except (DivergenceError, NonFiniteError):

@@ -79,7 +79,7 @@ def find_reported(
     requirements: Requirements | None,
     at: Any,
     stairs: str | None,
-    tell: Callable[[str], None],
+    notify: Callable[[str], None],
     places: Mapping[str, LoopPlace],
 ) -> ReportedWorstCase | MissingWorstCase:
     """Return the worst case of a report: one that was found, or one that a file asks for, with its run.
@@ -94,10 +94,10 @@ def find_reported(
         names = {w: p.name for w in given.loops for p in moved if w == p.wire or p.wire.endswith(f".{w}")}
         given = task = replace(given, loops=tuple(names.get(wire, wire) for wire in given.loops))
         try:
-            given = task.find(diagram, asked, at=at, progress=lambda line: tell(f"{KEY}: {line}"), **options)
+            given = task.find(diagram, asked, at=at, progress=lambda line: notify(f"{KEY}: {line}"), **options)
         except LoopwrightError as error:
             return MissingWorstCase(task.find_limits(diagram, asked), say(error))
-    tell("confirming the worst case by a run")
+    notify("confirming the worst case by a run")
     try:
         return ReportedWorstCase(given, given.confirm())
     except LoopwrightError as error:
@@ -196,8 +196,8 @@ class ReportedWorstCase:
         path = f"{KEY}.worst.{quantity}" if case is found.worst and quantity == case.quantity else ""
         result = replace(result, verdict=verdict, reason=reason, distance=distance, number=number, path=path)
         if found.failures and verdict is not Verdict.FAILED:
-            told = found.failures[0].reason.rstrip(".")
-            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.NOT_ANALYSED, detail=told)
+            reason = found.failures[0].reason.rstrip(".")
+            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.NOT_ANALYSED, detail=reason)
         if verdict is Verdict.PASSED and len(known) < len(numbers):  # some case has no such number
             return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.NO_VALUE)
         if verdict is Verdict.PASSED and any(one.state is CaseState.MOVING for one in found.cases):
