@@ -82,6 +82,9 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--communication", choices=("any", "ticks"), help="steps of any length, or from tick to tick (default: any)"
     )
     build.add_argument("--solver", metavar="NAME", help="of a diagram with continuous states (default: RK45)")
+    build.add_argument(
+        "--no-clocks", action="store_true", help="of a diagram in FMI 3.0: its sample times are no input clocks"
+    )
     build.add_argument("--no-arrays", action="store_true", help="a scalar variable for each element of a vector")
     build.add_argument(
         "--python", action="store_true", help="put the Python code inside, for equations that can't be traced"
@@ -171,13 +174,16 @@ def run_build(arguments: argparse.Namespace) -> int:
     return 0
 
 
+_LEFT_OUT = ("arrays", "clocks")
+"""Keywords that are True unless an option --no-… is given."""
+
+
 def _build_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the given keywords for ``build``, checked against each other."""
     names: tuple[str, ...] = ("name", "integrator", "tolerance", "internal_step", "fmi", "platform")
     names += ("subsystem", "outside", "outputs", "communication", "solver")
     options = {name: value for name in names if (value := getattr(arguments, name)) is not None}
-    if arguments.no_arrays:
-        options["arrays"] = False
+    options |= {name: False for name in _LEFT_OUT if getattr(arguments, f"no_{name}")}
     name = options.get("name", "model")
     if not (name.isidentifier() and name.isascii()):
         raise OptionError(f"found {name!r}; expected letters, digits and _, such as my_model.", port="--name")
@@ -192,7 +198,7 @@ def _build_options(arguments: argparse.Namespace) -> dict[str, Any]:
     if arguments.python:
         if options.pop("fmi", 2) != 2:
             raise OptionError("found 3; an FMU with Python inside is one of FMI 2.0. Give --fmi 2.", port="--fmi")
-        own = ("subsystem", "outside", "outputs", "communication", "solver")
+        own = ("subsystem", "outside", "outputs", "communication", "solver", "clocks")
         for name in ("platform", "integrator", "tolerance", "arrays", *own):
             if name in options:
                 raise OptionError("it can't be chosen with --python. Leave it out.", port=_option_text(name))
@@ -200,7 +206,7 @@ def _build_options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _option_text(name: str) -> str:
-    return "--no-arrays" if name == "arrays" else f"--{name.replace('_', '-')}"
+    return f"--no-{name}" if name in _LEFT_OUT else f"--{name.replace('_', '-')}"
 
 
 Make = Callable[[dict[str, Any], Path | None, Path], Path]

@@ -119,6 +119,7 @@ def loop_spec(
         states=variables.states(),
         base=flat.base,
         clocks=tuple((clock.every, clock.offset) for clock in flat.distinct),
+        clocked=variables.clocked(),
         sets=tuple(sum(1 << i for i, clock in enumerate(flat.distinct) if clock in one) for one in acting),
         hybrid=hybrid,
         memory=memory,
@@ -300,7 +301,20 @@ class _Variables:
         port = self._flat.table.blocks[wire.block].outputs[wire.port]
         sampled = self._flat.table.is_sampled(self._flat.table.subsystem_of[wire.block])
         variable = Variable(name, causality, "continuous", self._shape(wire), _unit(unit), port.description)
-        return Placed(variable, "log", self._place(wire), sampled)
+        return Placed(variable, "log", self._place(wire), sampled, self._clock(wire.block))
+
+    def _clock(self, path: str) -> int | None:
+        """Return the number of the clock that a block acts at."""
+        clock = self._flat.clocks.get(self._flat.table.subsystem_of[path])
+        return None if clock is None else self._flat.distinct.index(clock)
+
+    def clocked(self) -> tuple[str, ...]:
+        """Return the subsystems of each clock, by their paths; none for the whole."""
+        flat, found = self._flat, []
+        for clock in flat.distinct:
+            paths = [self._opened.shown(path) for path, own in flat.clocks.items() if own == clock and path]
+            found.append(", ".join(paths))
+        return tuple(found)
 
     def outputs(self) -> tuple[Placed, ...]:
         """Return the outputs."""
@@ -348,7 +362,8 @@ class _Variables:
                 label, about = join(self._opened.shown(path), name), (_unit(port.unit), port.description)
                 kind: Literal["continuous", "discrete"] = "continuous" if computed else "discrete"
                 variable = Variable(label, "local", kind, shape, *about, start=start, state=not computed)
-                found.append(Placed(variable, "x", tuple(range(where.start, where.stop)), sampled=True))
+                places = tuple(range(where.start, where.stop))
+                found.append(Placed(variable, "x", places, sampled=True, clock=self._clock(path)))
         return tuple(found)
 
     def found_at_build(self) -> tuple[str, ...]:

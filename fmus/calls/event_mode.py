@@ -13,7 +13,7 @@ from ..archive import FmuVariable, OtherVariable
 from .fmi_calls import MOST_ROUNDS
 from .fmu_block import check_next_time
 from .step_failures import ROUNDED, StepFailures
-from .transfer import WatchedInputs
+from .transfer import Transfer, WatchedInputs
 
 _CHANGED = 2
 """Qualifier of an interval that the FMU has set again (fmi3IntervalChanged)."""
@@ -90,6 +90,9 @@ class EventMode:
         for port in self.discrete:
             by_clocks.setdefault(tuple(name for name in inputs[port].clocks if name in ours), []).append(port)
         self._jumping = WatchedInputs(self.fmi, inputs, vector, by_clocks.pop((), []))
+        continuous = [port for port in inputs if port not in self.discrete]
+        self._sampled = Transfer(self.fmi, "Set", inputs, vector, continuous) if ours and continuous else None
+        """Continuous inputs, which a tick may sample."""
         self._clocked = [(names, WatchedInputs(self.fmi, inputs, vector, ports)) for names, ports in by_clocks.items()]
         self._triggered = {name: v for name, v in ours.items() if v.interval_variability == "triggered"}
         self.clocks = [InputClock(v) for v in ours.values() if v.interval_variability != "triggered"]
@@ -145,6 +148,8 @@ class EventMode:
         if changed or self._is_fresh or waiting or due or self.next_event <= t + ROUNDED * h:
             self._enter()
             self.fmu.set_inputs(self._jumping.transfer, t)
+            if self._sampled is not None:
+                self.fmu.set_inputs(self._sampled, t)
             self._activate(t, due, waiting)
             self._settle(t)
             self.fmu.check_end(t, h, t)

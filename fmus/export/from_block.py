@@ -156,7 +156,7 @@ def _state(block: Block, name: str, shape: Shape, shapes: dict[str, Shape]) -> V
     )
 
 
-@accepts(name=kinds.text)
+@accepts(name=kinds.text, clocks=kinds.flag)
 def build(
     block: Any,
     out: Path | str | None = None,
@@ -177,6 +177,7 @@ def build(
     outputs: Iterable[str] | None = None,
     communication: Literal["any", "ticks"] = "any",
     solver: str | None = None,
+    clocks: bool = True,
 ) -> Path:
     """Export a continuous block, a subsystem or a diagram as an FMU and return the file.
 
@@ -237,6 +238,10 @@ def build(
     solver : str, optional
         Of a diagram with continuous states: its solver, as `Diagram.simulate` takes it, but for those of other
         libraries; "RK45" without it.
+    clocks : bool, default True
+        Of a diagram or subsystem in FMI 3.0: whether its sample times are periodic input clocks of the FMU, by which an
+        importer with Event Mode makes the ticks. One without makes its steps as it does without clocks. Leave them out
+        for an importer that refuses every FMU with clocks.
 
     Raises
     ------
@@ -261,6 +266,7 @@ def build(
             outside=outside,
             outputs=outputs,
             steps_on_ticks=_is_on_ticks(communication),
+            offers_clocks=clocks,
             stop_time=stop_time,
             step_size=step_size,
             solver=solver,
@@ -270,10 +276,10 @@ def build(
         return build_fmu(
             made, out, fmi=fmi, arrays=arrays, platform=platform, documentation=documentation or "", notify=notify
         )
-    if subsystem or tuple(outside) or outputs is not None or communication != "any" or solver is not None:
+    if subsystem or tuple(outside) or outputs is not None or communication != "any" or solver or not clocks:
         raise OptionError(
-            "subsystem=, outside=, outputs=, communication= and solver= are options of diagrams and subsystems. Leave "
-            "them out.",
+            "subsystem=, outside=, outputs=, communication=, solver= and clocks= are options of diagrams and "
+            "subsystems. Leave them out.",
             block=name or type(block).__name__.lower(),
         )
     spec = model_spec(

@@ -7,7 +7,8 @@ is the loop of the diagram (``runtime/loop.c``) in place of a model's integrator
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import lru_cache
 from html import escape
 from importlib import resources
@@ -71,27 +72,67 @@ def loop_layout(spec: LoopSpec) -> tuple[Entry, ...]:
     )
 
 
+@dataclass(frozen=True)
+class OfferedClock:
+    """A clock of a diagram as a periodic input clock of its FMU (FMI 3.0, 2.2.9).
+
+    Attributes
+    ----------
+    name, description : str
+        Its name and what ticks by it.
+    reference : int
+        Value reference.
+    interval, shift : Fraction
+        Seconds between two ticks, and before the first one.
+    """
+
+    name: str
+    description: str
+    reference: int
+    interval: Fraction
+    shift: Fraction
+
+
+def offered_clocks(spec: LoopSpec, fmi: int) -> tuple[OfferedClock, ...]:
+    """Return the clocks that an FMU of a diagram offers, in the order of `LoopSpec.clocks`; none in FMI 2.0."""
+    if fmi != 3 or not spec.offers_clocks:
+        return ()
+    entries = loop_layout(spec)
+    taken = {entry.name for entry in entries}
+    found: list[OfferedClock] = []
+    for i, ((every, offset), members) in enumerate(zip(spec.clocks, spec.clocked, strict=True)):
+        name = "clock" if len(spec.clocks) == 1 else f"clock_{i + 1}"
+        while name in taken:
+            name += "_"
+        taken.add(name)
+        about = f"Ticks of {members or spec.name}"
+        found.append(OfferedClock(name, about, len(entries) + i, every * spec.base, offset * spec.base))
+    return tuple(found)
+
+
 # ---- C text ----
 
 
 def generate_loop(spec: LoopSpec, token: str, fmi: int) -> str:
     """Return the text of ``model.c``; see `loopwright.fmus.export.c_code.generate`."""
     entries = loop_layout(spec)
+    clocks = offered_clocks(spec, fmi)
     parts = [
-        _dimensions(spec, entries, token, fmi),
+        _dimensions(spec, entries, token, fmi, len(clocks)),
         write_unit(spec, own_functions=spec.own_functions),
         '#include "model.h"\n',
         _table(entries),
         _starts(entries),
         *_places(spec),
         *_labels(spec),
+        _array("char *const", "lw_clock_names", (f'"{clock.name}"' for clock in clocks)) if clocks else "",
         "static const double lw_nominals[] = {1.0};\n",
         "".join(f'#include "{name}"\n' for name in RUNTIME[fmi][1:]),
     ]
     return "\n".join(parts)
 
 
-def _dimensions(spec: LoopSpec, entries: tuple[Entry, ...], token: str, fmi: int) -> str:
+def _dimensions(spec: LoopSpec, entries: tuple[Entry, ...], token: str, fmi: int, clocks: int) -> str:
     def count(*kinds: str) -> int:
         return sum(e.variable.size for e in entries if e.kind in kinds)
 
@@ -105,6 +146,7 @@ def _dimensions(spec: LoopSpec, entries: tuple[Entry, ...], token: str, fmi: int
         f"#define LW_FMI {fmi}",
         f'#define LW_ORDER "{ORDER[fmi]}"',
         f"#define LW_ON_TICKS {int(spec.steps_on_ticks)}",
+        f"#define LW_CLOCKS {clocks}",
         "#define LW_HAS_DERIVATIVES 0",
         *(f"#define LW_N_{letter} {number}" for letter, number in numbers.items()),
         *(f"#define LW_SZ_{kind} 1" for kind in ("ARG", "RES", "IW", "W")),
@@ -142,7 +184,7 @@ def loop_runtime(fmi: int) -> dict[str, str]:
 # ---- descriptions ----
 
 
-def about_steps(spec: LoopSpec) -> str:
+def about_steps(spec: LoopSpec, fmi: int) -> str:
     """Return in words when ticks act, which an importer has to know."""
     base = f"{float(spec.base):.9g} s"
     ticks = f"It is sampled (time between two ticks: {base}). " if spec.clocks else ""
@@ -164,7 +206,14 @@ def about_steps(spec: LoopSpec) -> str:
         if spec.found_at_build
         else ""
     )
-    return f"{ticks}{fit}{acts}{starts}".strip()
+    clocks = [clock.name for clock in offered_clocks(spec, fmi)]
+    exact = (
+        f"With Event Mode the importer makes the ticks by {'the input clock' if len(clocks) == 1 else 'input clocks,'} "
+        f"{', '.join(clocks)}, and values that are exchanged at a tick belong to that tick. "
+        if clocks
+        else ""
+    )
+    return f"{ticks}{fit}{acts}{exact}{starts}".strip()
 
 
 def _variability(kind: str, one: Placed | None) -> str:
@@ -227,6 +276,7 @@ def _rows(spec: LoopSpec) -> list[tuple[Entry, Placed | None]]:
 
 def _describe3(spec: LoopSpec, token: str) -> str:
     rows = _rows(spec)
+    clocks = offered_clocks(spec, 3)
     entries = tuple(entry for entry, _ in rows)
     types = type_names(entries)
     inputs = _inputs(spec, entries)
@@ -234,7 +284,7 @@ def _describe3(spec: LoopSpec, token: str) -> str:
         "fmiVersion": "3.0",
         "modelName": spec.name,
         "instantiationToken": token,
-        "description": f"{spec.description} {about_steps(spec)}".strip(),
+        "description": f"{spec.description} {about_steps(spec, 3)}".strip(),
         "generationTool": f"Loopwright {package_version()}",
         "variableNamingConvention": "structured",
     }
@@ -243,6 +293,8 @@ def _describe3(spec: LoopSpec, token: str) -> str:
         "canGetAndSetFMUState": True,
         "canSerializeFMUState": True,
         "canHandleVariableCommunicationStepSize": True,
+        "hasEventMode": bool(clocks) or None,
+        "mightReturnEarlyFromDoStep": bool(clocks) or None,
         "fixedInternalStepSize": float(spec.base) if spec.steps_on_ticks else None,
         "maxOutputDerivativeOrder": 0,
     }
@@ -251,15 +303,18 @@ def _describe3(spec: LoopSpec, token: str) -> str:
             "Float64",
             _attributes(entry, one)
             | _limits(entry, types)
-            | {"start": " ".join(map(repr, entry.variable.flat_start)) or None},
+            | {"start": " ".join(map(repr, entry.variable.flat_start)) or None}
+            | {"clocks": _clock_of(entry, one, clocks)},
             [_element("Dimension", {"start": n}) for n in entry.variable.shape],
         )
         for entry, one in rows
     ]
+    variables += [_element("Clock", _clock_attributes(clock, spec)) for clock in clocks]
     structure = []
     for entry in entries:
         if entry.is_output:
             needed = dict.fromkeys(e.reference for e in _dependencies(spec, entry, inputs))
+            needed |= dict.fromkeys(clock.reference for clock in clocks)  # what is held changes at ticks
             about = {
                 "valueReference": entry.reference,
                 "dependencies": " ".join(map(str, needed)),
@@ -279,6 +334,31 @@ def _describe3(spec: LoopSpec, token: str) -> str:
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + _element("fmiModelDescription", root, children) + "\n"
 
 
+def _clock_of(entry: Entry, one: Placed | None, clocks: tuple[OfferedClock, ...]) -> int | None:
+    """Return the clock of a variable that is clocked: local ones. Outputs are held, and can be read at any time."""
+    if one is None or one.clock is None or not clocks or entry.is_output or entry.kind not in ("discrete", "output"):
+        return None
+    return clocks[one.clock].reference
+
+
+def _clock_attributes(clock: OfferedClock, spec: LoopSpec) -> dict[str, object]:
+    resolution = spec.base.denominator
+    return {
+        "name": clock.name,
+        "valueReference": clock.reference,
+        "description": clock.description,
+        "causality": "input",
+        "variability": "discrete",
+        "intervalVariability": "constant",
+        "intervalDecimal": float(clock.interval),
+        "shiftDecimal": float(clock.shift) or None,
+        "supportsFraction": True,
+        "resolution": resolution,
+        "intervalCounter": int(clock.interval * resolution),
+        "shiftCounter": int(clock.shift * resolution) or None,
+    }
+
+
 def _describe2(spec: LoopSpec, token: str) -> str:
     rows = _rows(spec)
     entries = tuple(entry for entry, _ in rows)
@@ -288,7 +368,7 @@ def _describe2(spec: LoopSpec, token: str) -> str:
         "fmiVersion": "2.0",
         "modelName": spec.name,
         "guid": token,
-        "description": f"{spec.description} {about_steps(spec)}".strip(),
+        "description": f"{spec.description} {about_steps(spec, 2)}".strip(),
         "generationTool": f"Loopwright {package_version()}",
         "variableNamingConvention": "structured",
         "numberOfEventIndicators": 0,
@@ -349,5 +429,5 @@ def _describe2(spec: LoopSpec, token: str) -> str:
 
 def loop_page(spec: LoopSpec, text: str = "", *, fmi: int = 3) -> str:
     """Return the text of ``documentation/index.html``: when ticks act, and the table of variables."""
-    steps = [f"<p>{escape(about_steps(spec))}</p>"]
+    steps = [f"<p>{escape(about_steps(spec, fmi))}</p>"]
     return page_of(spec.name, spec.description, text, {"Steps": steps}, loop_layout(spec), fmi=fmi)

@@ -38,12 +38,15 @@ class Placed:
         The entries, row by row.
     sampled : bool
         Whether it changes at ticks and events only.
+    clock : int, optional
+        The clock that its block acts at, among `LoopSpec.clocks`; None in continuous time and for a triggered block.
     """
 
     variable: Variable
     vector: str
     places: tuple[int, ...]
     sampled: bool = False
+    clock: int | None = None
 
 
 @dataclass(frozen=True)
@@ -125,6 +128,10 @@ class LoopSpec:
         Seconds between two ticks.
     clocks : tuple of (int, int)
         Ticks at which sampled subsystems act: every so many ticks, from an offset on.
+    clocked : tuple of str
+        The subsystems of each clock, in words.
+    offers_clocks : bool
+        Whether an FMU of FMI 3.0 has its clocks as input clocks.
     sets : tuple of int
         Sets of clocks that act together, as bits, in the order of the loop's kinds of ticks.
     hybrid : bool
@@ -186,6 +193,8 @@ class LoopSpec:
     edges: tuple[tuple[float, float], ...] = ()
     periodic: tuple[tuple[float, float], ...] = ()
     depends: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    clocked: tuple[str, ...] = ()
+    offers_clocks: bool = True
     found_at_build: tuple[str, ...] = ()
     steps_on_ticks: bool = False
     own_functions: bool = False

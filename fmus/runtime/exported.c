@@ -26,11 +26,17 @@ static inline double lw_time_of(int64_t tick) {
 /* Whether a time comes before another one, and is not the same but for rounding. */
 static inline bool lw_comes_before(double a, double b) { return a < b - LW_NEAR * lw_time_of(1); }
 
-/* Return the kind of a tick: the place of the set of clocks that act; -1: none does, or a set that there is no code for. */
-static int64_t lw_kind_of(int64_t tick) {
+/* Return the clocks that act at a tick, as bits. */
+static uint64_t lw_acting_at(int64_t tick) {
     uint64_t acting = 0;
     for (int i = 0; i < LW_N_CLOCKS; i++)
         if (tick >= lw_clocks[i].offset && (tick - lw_clocks[i].offset) % lw_clocks[i].every == 0) acting |= UINT64_C(1) << i;
+    return acting;
+}
+
+/* Return the kind of a tick: the place of the set of clocks that act; -1: none does, or a set that there is no code for. */
+static int64_t lw_kind_of(int64_t tick) {
+    const uint64_t acting = lw_acting_at(tick);
     for (int i = 0; i < LW_N_SETS; i++)
         if (lw_sets[i] == acting) return i;
     return -1;
@@ -52,13 +58,15 @@ static inline bool lw_acts_before(const lw_memory *m, double to) {
     return m->tick != INT64_MAX && lw_comes_before(lw_time_of(m->tick), to);
 }
 
+/* Whether a tick is due at the present instant. */
+static inline bool lw_is_due(const lw_memory *m) { return m->tick != INT64_MAX && !lw_comes_before(m->now, lw_time_of(m->tick)); }
+
 /* Put the time to where a run begins. */
 static void lw_put_time(lw_memory *m, double start) {
     const double ticks = start / lw_time_of(1);
     m->now = *LW_LOOP_OF(m)->t = start;
     m->tick = lw_tick_from((int64_t)ceil(ticks - LW_NEAR));
-    const bool acts = m->tick != INT64_MAX && !lw_comes_before(start, lw_time_of(m->tick));
-    if (acts) m->now = *LW_LOOP_OF(m)->t = lw_time_of(m->tick);
+    if (lw_is_due(m)) m->now = *LW_LOOP_OF(m)->t = lw_time_of(m->tick);
 }
 
 /* Evaluate a tick of some kind; false: it can't be, and m->lost is the kind. */
@@ -88,23 +96,31 @@ static bool lw_find_start(lw_memory *m) {
 static bool lw_begin(lw_memory *m, double start) {
     lw_put_time(m, start);
     if (!lw_find_start(m)) return false;
-    if (m->tick == INT64_MAX || lw_comes_before(m->now, lw_time_of(m->tick))) return true;
-    return lw_evaluate(m, lw_kind_of(m->tick));
+    return !lw_is_due(m) || lw_evaluate(m, lw_kind_of(m->tick));
+}
+
+/* Go through the present instant with the inputs in the memory, and with the tick that is due there where `acts`. */
+static bool lw_act(lw_memory *m, bool acts) {
+    loop *l = &m->loop;
+    if (!acts) return true;
+    *l->t = m->now = lw_time_of(m->tick);
+    if (!lw_evaluate(m, lw_kind_of(m->tick))) return false;
+    memcpy(l->x, l->x_next, (size_t)l->states * sizeof(double));
+    m->tick = lw_tick_from(m->tick + 1);
+    return true;
 }
 
 /* Continue to a time with the inputs in the memory: ticks from the present instant on, before that time. False: the tick
    m->tick can't be evaluated, and nothing of it is taken over. */
 static bool lw_go(lw_memory *m, double to) {
-    loop *l = &m->loop;
-    while (lw_acts_before(m, to)) {
-        *l->t = m->now = lw_time_of(m->tick);
-        if (!lw_evaluate(m, lw_kind_of(m->tick))) return false;
-        memcpy(l->x, l->x_next, (size_t)l->states * sizeof(double));
-        m->tick = lw_tick_from(m->tick + 1);
-    }
+    while (lw_acts_before(m, to))
+        if (!lw_act(m, true)) return false;
     m->now = to;
     return true;
 }
+
+/* Evaluate everything at the present instant, after what happens there: nothing is between ticks. */
+static inline bool lw_settle(lw_memory *m) { return (void)m, true; }
 #else
 
 /* Write the discontinuities of sources after t, up to and with `end`, in order; where there is no room for all of them, the
@@ -225,29 +241,39 @@ static bool lw_begin(lw_memory *m, double start) {
     if (!lw_find_start(m)) return false;
     memcpy(h->p.x, h->l.x, (size_t)h->l.states * sizeof(double));
     if (!lw_begin_events(m)) return m->lost = h->between, false;
-    const bool acts = m->tick != INT64_MAX && !lw_comes_before(m->now, lw_time_of(m->tick));
-    return lw_evaluate(m, acts ? lw_kind_of(m->tick) : h->between);
+    return lw_evaluate(m, lw_is_due(m) ? lw_kind_of(m->tick) : h->between);
+}
+
+/* Go through the present instant with the inputs in the memory: events of inputs that have jumped, and the tick that is due
+   there where `acts`. `lw_settle` evaluates everything then. */
+static bool lw_act(lw_memory *m, bool acts) {
+    if (acts) m->now = lw_time_of(m->tick);
+    if (!lw_land(m, m->now, acts ? lw_kind_of(m->tick) : m->hybrid.between)) return false;
+    if (acts) m->tick = lw_tick_from(m->tick + 1);
+    return true;
+}
+
+/* Evaluate everything at the present instant, after what happens there. */
+static bool lw_settle(lw_memory *m) {
+    *m->hybrid.l.t = m->now;
+    return lw_evaluate(m, m->hybrid.between);
 }
 
 /* Continue to a time with the inputs in the memory. What is at the present instant comes first: events of inputs that have
    jumped, and a tick; ticks up to that time follow, but not one at it. */
 static bool lw_go(lw_memory *m, double to) {
-    hybrid *h = &m->hybrid;
     const double ticks = to / lw_time_of(1), nearest = floor(ticks + 0.5);
     if (LW_N_CLOCKS && fabs(ticks - nearest) <= LW_NEAR) to = lw_time_of((int64_t)nearest); /* as a run has it */
     m->reason = DONE;
     for (bool first = true;; first = false) {
-        const bool acts = m->tick != INT64_MAX && !lw_comes_before(m->now, lw_time_of(m->tick));
+        const bool acts = lw_is_due(m);
         if (!first && !acts) break;
-        if (acts) m->now = lw_time_of(m->tick);
-        if (!lw_land(m, m->now, acts ? lw_kind_of(m->tick) : h->between)) return false;
-        if (acts) m->tick = lw_tick_from(m->tick + 1);
+        if (!lw_act(m, acts)) return false;
         const double next = lw_acts_before(m, to) ? lw_time_of(m->tick) : to;
         if (next > m->now && !lw_flow(m, m->now, next)) return false;
         m->now = next;
         if (!(next < to)) break;
     }
-    *h->l.t = m->now;
-    return lw_evaluate(m, h->between);
+    return lw_settle(m);
 }
 #endif

@@ -530,6 +530,7 @@ static inline bool lw_start(lw_instance *self, const char *function, lw_mode nex
 #if LW_N_Z
     if (!lw_start_domains(self)) return false;
 #endif
+    self->s.begun = 1;
 #if LW_HAS_DERIVATIVES && LW_N_X
     lw_compare_step(self);
 #endif

@@ -108,7 +108,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String instanceName, fmi3String ins
     self->event_mode_used = eventModeUsed;
     self->early_return_allowed = earlyReturnAllowed;
     bool ok = true;
-    if (eventModeUsed && !LW_N_Z)
+    if (eventModeUsed && !LW_EVENT_MODE)
         ok = lw_fail(self, "this FMU has no events, and no Event Mode. Instantiate it with eventModeUsed = fmi3False.");
     if (ok && nRequiredIntermediateVariables && !requiredIntermediateVariables)
         ok = lw_fail(self, "requiredIntermediateVariables is NULL, and nRequiredIntermediateVariables is %zu. Give as many value "

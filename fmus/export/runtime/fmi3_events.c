@@ -1,10 +1,10 @@
 /* FMI 3.0: Event Mode, and Model Exchange. */
 
-/* ---- Event Mode (FMI 3.0, 2.3.5; in Co-Simulation if there are events) ---- */
+/* ---- Event Mode (FMI 3.0, 2.3.5; in Co-Simulation if there are events or clocks) ---- */
 
 static bool lw_has_event_mode(lw_instance *self, const char *function) {
     if (self->s.model_exchange || self->event_mode_used) return true;
-#if LW_N_Z
+#if LW_EVENT_MODE
     return lw_fail(self, "%s: this instance has no Event Mode. Instantiate it with eventModeUsed = fmi3True.", function);
 #else
     return lw_fail(self, "%s: this FMU has no Event Mode in Co-Simulation (hasEventMode = false).", function);
@@ -38,6 +38,108 @@ fmi3Status fmi3EnterStepMode(fmi3Instance instance) {
         return LW_OK(lw_fail(self, "fmi3EnterStepMode: this is a Model Exchange instance. Call fmi3EnterContinuousTimeMode."));
     return LW_OK(lw_has_event_mode(self, "fmi3EnterStepMode") && lw_leave_event_mode(self, "fmi3EnterStepMode", LW_STEPPING));
 }
+
+/* ---- clocks (FMI 3.0, 2.2.9 and 2.3.5): the ticks of a diagram, as periodic input clocks of constant intervals ---- */
+
+#if LW_CLOCKS
+/* Return the number of the clock with a value reference, those behind all variables; -1: there is none. */
+static int lw_clock_of(lw_instance *self, const char *function, fmi3ValueReference reference) {
+    if (reference >= LW_N_VARIABLES && reference - LW_N_VARIABLES < LW_CLOCKS) return (int)(reference - LW_N_VARIABLES);
+    lw_fail(self, "%s: there is no clock with value reference %u. modelDescription.xml lists %d to %d.", function,
+            (unsigned)reference, LW_N_VARIABLES, LW_N_VARIABLES + LW_CLOCKS - 1);
+    return -1;
+}
+
+/* Are there values, and is each value reference that of a clock? */
+static bool lw_are_clocks(lw_instance *self, const char *function, const fmi3ValueReference *references, size_t n, const void *values) {
+    if (!n) return true;
+    if (!references) return lw_fail(self, "%s: the pointer to the value references is NULL. Give %zu.", function, n);
+    if (!lw_has_room(self, function, values)) return false;
+    for (size_t i = 0; i < n; i++)
+        if (lw_clock_of(self, function, references[i]) < 0) return false;
+    return true;
+}
+
+fmi3Status fmi3SetClock(fmi3Instance instance, const fmi3ValueReference valueReferences[], size_t nValueReferences,
+                        const fmi3Clock values[]) {
+    LW_SELF;
+    const char *function = "fmi3SetClock";
+    if (!lw_has_event_mode(self, function) || !lw_in_mode(self, function, LW_EVENT)) return fmi3Error;
+    if (!lw_are_clocks(self, function, valueReferences, nValueReferences, values)) return fmi3Error;
+    for (size_t i = 0; i < nValueReferences; i++)
+        if (!lw_set_clock(self, function, lw_clock_of(self, function, valueReferences[i]), values[i])) return fmi3Error;
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetClock(fmi3Instance instance, const fmi3ValueReference valueReferences[], size_t nValueReferences, fmi3Clock values[]) {
+    LW_SELF;
+    const char *function = "fmi3GetClock";
+    if (!lw_has_event_mode(self, function) || !lw_in_mode(self, function, LW_EVENT)) return fmi3Error;
+    if (!lw_are_clocks(self, function, valueReferences, nValueReferences, values)) return fmi3Error;
+    for (size_t i = 0; i < nValueReferences; i++)
+        values[i] = self->s.active >> lw_clock_of(self, function, valueReferences[i]) & 1;
+    return fmi3OK;
+}
+
+/* The interval of a clock, or its shift, in ticks of the base. */
+static int64_t lw_ticks_of(fmi3ValueReference reference, bool shift) {
+    const int clock = (int)(reference - LW_N_VARIABLES);
+    return shift ? lw_clocks[clock].offset : lw_clocks[clock].every;
+}
+
+static bool lw_may_ask(lw_instance *self, const char *function, const fmi3ValueReference *references, size_t n, const void *values) {
+    if (self->s.mode != LW_INITIALIZING && self->s.mode != LW_EVENT && !lw_in_mode(self, function, LW_EVENT)) return false;
+    return lw_are_clocks(self, function, references, n, values);
+}
+
+fmi3Status fmi3GetIntervalDecimal(fmi3Instance instance, const fmi3ValueReference valueReferences[], size_t nValueReferences,
+                                  fmi3Float64 intervals[], fmi3IntervalQualifier qualifiers[]) {
+    LW_SELF;
+    const char *function = "fmi3GetIntervalDecimal";
+    if (!lw_may_ask(self, function, valueReferences, nValueReferences, intervals)) return fmi3Error;
+    if (nValueReferences && !lw_has_room(self, function, qualifiers)) return fmi3Error;
+    for (size_t i = 0; i < nValueReferences; i++) {
+        intervals[i] = lw_time_of(lw_ticks_of(valueReferences[i], false));
+        qualifiers[i] = fmi3IntervalUnchanged;
+    }
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetIntervalFraction(fmi3Instance instance, const fmi3ValueReference valueReferences[], size_t nValueReferences,
+                                   fmi3UInt64 counters[], fmi3UInt64 resolutions[], fmi3IntervalQualifier qualifiers[]) {
+    LW_SELF;
+    const char *function = "fmi3GetIntervalFraction";
+    if (!lw_may_ask(self, function, valueReferences, nValueReferences, counters)) return fmi3Error;
+    if (nValueReferences && (!lw_has_room(self, function, resolutions) || !lw_has_room(self, function, qualifiers))) return fmi3Error;
+    for (size_t i = 0; i < nValueReferences; i++) {
+        counters[i] = (fmi3UInt64)(lw_ticks_of(valueReferences[i], false) * LW_BASE_NUMERATOR);
+        resolutions[i] = (fmi3UInt64)LW_BASE_DENOMINATOR;
+        qualifiers[i] = fmi3IntervalUnchanged;
+    }
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetShiftDecimal(fmi3Instance instance, const fmi3ValueReference valueReferences[], size_t nValueReferences,
+                               fmi3Float64 shifts[]) {
+    LW_SELF;
+    if (!lw_may_ask(self, "fmi3GetShiftDecimal", valueReferences, nValueReferences, shifts)) return fmi3Error;
+    for (size_t i = 0; i < nValueReferences; i++) shifts[i] = lw_time_of(lw_ticks_of(valueReferences[i], true));
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetShiftFraction(fmi3Instance instance, const fmi3ValueReference valueReferences[], size_t nValueReferences,
+                                fmi3UInt64 counters[], fmi3UInt64 resolutions[]) {
+    LW_SELF;
+    const char *function = "fmi3GetShiftFraction";
+    if (!lw_may_ask(self, function, valueReferences, nValueReferences, counters)) return fmi3Error;
+    if (nValueReferences && !lw_has_room(self, function, resolutions)) return fmi3Error;
+    for (size_t i = 0; i < nValueReferences; i++) {
+        counters[i] = (fmi3UInt64)(lw_ticks_of(valueReferences[i], true) * LW_BASE_NUMERATOR);
+        resolutions[i] = (fmi3UInt64)LW_BASE_DENOMINATOR;
+    }
+    return fmi3OK;
+}
+#endif
 
 /* ---- Model Exchange (FMI 3.0, 3.2) ---- */
 

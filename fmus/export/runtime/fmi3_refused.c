@@ -34,8 +34,10 @@ LW_NO_NUMBERS(Boolean)
 LW_NO_NUMBERS(String)
 LW_NO_TYPE(fmi3GetBinary, size_t valueSizes[], fmi3Binary values[], size_t nValues)
 LW_NO_TYPE(fmi3SetBinary, const size_t valueSizes[], const fmi3Binary values[], size_t nValues)
+#if !LW_CLOCKS
 LW_NO_TYPE(fmi3GetClock, fmi3Clock values[])
 LW_NO_TYPE(fmi3SetClock, const fmi3Clock values[])
+#endif
 
 /* ---- other interface types ---- */
 
@@ -76,6 +78,9 @@ LW_REFUSE(fmi3GetOutputDerivatives, "maxOutputDerivativeOrder is 0", fmi3Instanc
           const fmi3ValueReference valueReferences[], size_t nValueReferences, const fmi3Int32 orders[], fmi3Float64 values[],
           size_t nValues)
 
+#if LW_CLOCKS
+#define LW_NO_CLOCKS "the intervals of its clocks are constant; see modelDescription.xml"
+#else
 #define LW_NO_CLOCKS "this FMU has no clocks"
 LW_REFUSE(fmi3GetIntervalDecimal, LW_NO_CLOCKS, fmi3Instance instance, const fmi3ValueReference v[], size_t n,
           fmi3Float64 intervals[], fmi3IntervalQualifier qualifiers[])
@@ -84,6 +89,7 @@ LW_REFUSE(fmi3GetIntervalFraction, LW_NO_CLOCKS, fmi3Instance instance, const fm
 LW_REFUSE(fmi3GetShiftDecimal, LW_NO_CLOCKS, fmi3Instance instance, const fmi3ValueReference v[], size_t n, fmi3Float64 shifts[])
 LW_REFUSE(fmi3GetShiftFraction, LW_NO_CLOCKS, fmi3Instance instance, const fmi3ValueReference v[], size_t n,
           fmi3UInt64 counters[], fmi3UInt64 resolutions[])
+#endif
 LW_REFUSE(fmi3SetIntervalDecimal, LW_NO_CLOCKS, fmi3Instance instance, const fmi3ValueReference v[], size_t n,
           const fmi3Float64 intervals[])
 LW_REFUSE(fmi3SetIntervalFraction, LW_NO_CLOCKS, fmi3Instance instance, const fmi3ValueReference v[], size_t n,

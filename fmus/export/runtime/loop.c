@@ -22,13 +22,18 @@ static void lw_put_parameters(lw_instance *self) {
     lw_renew(m);
 }
 
-/* Copy outputs and states from the memory. */
-static void lw_take_values(lw_instance *self) {
+/* Copy outputs from the memory. */
+static void lw_take_outputs(lw_instance *self) {
     const lw_memory *m = &self->s.memory;
     double *v = self->s.values;
-    for (size_t i = 0; i < LW_N_D; i++) v[LW_D + i] = m->x[lw_places_d[i]];
     for (size_t i = 0; i < LW_N_Y; i++) v[LW_Y + i] = lw_places_y[i] < 0 ? m->x[-1 - lw_places_y[i]] : m->log[lw_places_y[i]];
     self->s.have_outputs = 1;
+}
+
+/* Copy outputs and states from the memory. */
+static void lw_take_values(lw_instance *self) {
+    for (size_t i = 0; i < LW_N_D; i++) self->s.values[LW_D + i] = self->s.memory.x[lw_places_d[i]];
+    lw_take_outputs(self);
 }
 
 /* Say which block is to blame where everything can't be evaluated. */
@@ -59,26 +64,108 @@ static bool lw_blame(lw_instance *self) {
                    "algebraic loop there may be no solution.", t);
 }
 
-/* Evaluate everything at the start, with the values that have been set. */
+/* Take over parameters and inputs that have been set. */
+static void lw_put_values(lw_instance *self) {
+    lw_put_parameters(self);
+    lw_put(lw_places_u, LW_N_U, self->s.values + LW_U, self->s.memory.w);
+}
+
+#if LW_CLOCKS
+/* Event Mode: evaluate everything with the clocks that are active and the inputs as they are now. The importer may set other
+ * inputs yet, so that states and time stay: lw_update_discrete_states takes them over. */
+static bool lw_preview(lw_instance *self) {
+    lw_memory *m = &self->s.memory;
+    lw_put_values(self);
+    memcpy(&self->kept, m, sizeof *m);
+    const bool ok = lw_act(m, self->s.active) && lw_settle(m);
+    if (ok) lw_take_outputs(self);
+    else lw_blame(self);
+    memcpy(m, &self->kept, sizeof *m);
+    return ok;
+}
+#endif
+
+/* Evaluate everything at the start, with the values that have been set; afterwards in Event Mode alone. */
 static bool lw_update_outputs(lw_instance *self) {
     lw_memory *m = &self->s.memory;
     if (self->s.have_outputs) return true;
-    lw_put_parameters(self);
-    lw_put(lw_places_u, LW_N_U, self->s.values + LW_U, m->w);
+#if LW_CLOCKS
+    if (self->s.begun && self->s.mode == LW_EVENT) return lw_preview(self);
+#endif
+    if (self->s.begun) return lw_take_outputs(self), true;
+    lw_put_values(self);
     lw_put(lw_places_d, LW_N_D, self->s.values + LW_D, m->x);
     if (!lw_begin(m, self->s.values[0])) return lw_blame(self);
     lw_take_values(self);
     return true;
 }
 
-static bool lw_enter_event_mode(lw_instance *self, const char *function) { return lw_in_mode(self, function, LW_STEPPING); }
+/* ---- Event Mode, in which the importer makes the ticks by clocks (FMI 3.0, 2.3.5) ---- */
+
+#if LW_CLOCKS
+/* Write the names of clocks, given as bits, with commas between them. */
+static const char *lw_name_clocks(uint64_t clocks, char *text, size_t size) {
+    size_t n = 0;
+    text[0] = 0;
+    for (int i = 0; i < LW_CLOCKS && n < size; i++)
+        if (clocks >> i & 1) n += (size_t)snprintf(text + n, size - n, "%s%s", n ? ", " : "", lw_clock_names[i]);
+    return text;
+}
+
+static bool lw_set_clock(lw_instance *self, const char *function, int clock, bool active) {
+    const lw_memory *m = &self->s.memory;
+    const uint64_t bit = UINT64_C(1) << clock;
+    if (!active && self->s.active & bit)
+        return lw_fail(self, "%s: %s is active at t = %.9g s, and can't be deactivated (canBeDeactivated = false).", function,
+                       lw_clock_names[clock], m->now);
+    if (!active) return true;
+    if (!lw_is_due(m) || !(lw_acting_at(m->tick) & bit)) {
+        int64_t next = m->tick;
+        while (!(lw_acting_at(next) & bit)) next = lw_tick_from(next + 1);
+        return lw_fail(self, "%s: %s was activated at t = %.9g s, but it ticks next at %.9g s. Its ticks count from t = 0, and "
+                       "each comes once. Activate it there.", function, lw_clock_names[clock], m->now, lw_time_of(next));
+    }
+    self->s.active |= bit;
+    self->s.have_outputs = 0;
+    return true;
+}
+
+/* Take over a value of the importer's: has it activated all clocks of a tick, or none? */
+static bool lw_check_active(lw_instance *self, const char *function) {
+    char text[256];
+    const uint64_t missing = self->s.active ? lw_acting_at(self->s.memory.tick) & ~self->s.active : 0;
+    if (!missing) return true;
+    return lw_fail(self, "%s: these clocks tick at t = %.9g s, too, and are not active: %s. They make one tick together: activate "
+                   "all of them before the update.", function, self->s.memory.now, lw_name_clocks(missing, text, sizeof text));
+}
+#endif
+
+static bool lw_enter_event_mode(lw_instance *self, const char *function) {
+    if (!lw_in_mode(self, function, LW_STEPPING)) return false;
+    self->s.mode = LW_EVENT;
+    return true;
+}
 
 static bool lw_update_discrete_states(lw_instance *self, const char *function, bool *again, bool *moved) {
-    return (void)again, (void)moved, lw_in_mode(self, function, LW_EVENT);
+    (void)again, (void)moved; /* all of an instant happens at once, and states are no variables of the importer's */
+    if (!lw_in_mode(self, function, LW_EVENT)) return false;
+#if LW_CLOCKS
+    lw_memory *m = &self->s.memory;
+    if (!lw_check_active(self, function)) return false;
+    lw_put_values(self);
+    if (!lw_act(m, self->s.active) || !lw_settle(m)) return lw_blame(self);
+    self->s.active = 0;
+    lw_take_values(self);
+#endif
+    return true;
 }
 
 static bool lw_leave_event_mode(lw_instance *self, const char *function, lw_mode next) {
-    return (void)next, lw_in_mode(self, function, LW_EVENT);
+    if (!lw_in_mode(self, function, LW_EVENT)) return false;
+    if (self->s.active)
+        return lw_fail(self, "%s: clocks are active. Call " LW_API "UpdateDiscreteStates first.", function);
+    self->s.mode = next;
+    return true;
 }
 
 #if LW_ON_TICKS
@@ -89,18 +176,30 @@ static bool lw_is_tick(double t) {
 }
 #endif
 
-/* Step from t over h: ticks from t on and before t + h act. */
+/* Step from t over h: ticks from t on and before t + h act, but where the importer makes the ticks by clocks. */
 static bool lw_step(lw_instance *self, double t, double h) {
     lw_memory *m = &self->s.memory;
+    self->event_found = false;
 #if LW_ON_TICKS
     if (!lw_is_tick(t) || !lw_is_tick(t + h))
         return lw_fail(self, "the communication step of %g s from t = %.9g s doesn't fit: this FMU was built for steps from tick to "
                        "tick, which come every %g s. Take a multiple of that.", h, t, lw_time_of(1));
 #endif
-    lw_put_parameters(self);
-    lw_put(lw_places_u, LW_N_U, self->s.values + LW_U, m->w);
-    if (!lw_go(m, t + h)) return lw_blame(self);
-    self->s.values[0] = t + h;
+    double end = t + h;
+#if LW_CLOCKS
+    char text[256];
+    if (self->event_mode_used && lw_acts_before(m, end)) {
+        if (lw_is_due(m) || !self->early_return_allowed)
+            return lw_fail(self, "the step from t = %.9g s to %.9g s passes the tick at %.9g s of %s. End a step there, and activate "
+                           "it by fmi3SetClock in Event Mode; with eventModeUsed = fmi3False the FMU makes its ticks itself.", t, end,
+                           lw_time_of(m->tick), lw_name_clocks(lw_acting_at(m->tick), text, sizeof text));
+        end = lw_time_of(m->tick);
+        self->event_found = true;
+    }
+#endif
+    lw_put_values(self);
+    if (!lw_go(m, end)) return lw_blame(self);
+    self->s.values[0] = end;
     lw_take_values(self);
     return true;
 }

@@ -23,6 +23,10 @@
 #ifndef LW_LOOP
 #define LW_LOOP 0 /* 1: of a diagram, whose loop (fmus/runtime/exported.c) stands before this file; loop.c says what differs */
 #endif
+#ifndef LW_CLOCKS
+#define LW_CLOCKS 0 /* input clocks that are offered: those of a diagram's ticks, in FMI 3.0 */
+#endif
+#define LW_EVENT_MODE (LW_N_Z || LW_CLOCKS) /* is there an Event Mode in Co-Simulation? */
 #define LW_N_S (LW_N_X + LW_N_D) /* all states, as the equations take them */
 #define LW_P 1
 #define LW_U (LW_P + LW_N_P)
@@ -106,7 +110,8 @@ typedef struct {
     uint8_t have_outputs, have_derivatives, have_indicators; /* are these up to date? */
     uint8_t model_exchange;
     uint8_t stop_time_defined, tolerance_given, iterations; /* iterations in this visit of Event Mode */
-    uint8_t moving, moved, unused[3]; /* do the inputs move in the next step; did they in the last one? */
+    uint8_t moving, moved; /* do the inputs move in the next step; did they in the last one? */
+    uint8_t begun, unused[2]; /* of a diagram: has the start been taken over? */
     double stop_time;
     double step_size; /* of the adaptive integrators, to try next; 0: choose again */
     double values[LW_N_VALUES];
@@ -117,6 +122,7 @@ typedef struct {
     lw_event_memory events;
 #endif
 #if LW_LOOP
+    uint64_t active; /* clocks that tick in this visit of Event Mode, as bits */
     lw_memory memory;
 #endif
 } lw_state;
@@ -130,6 +136,9 @@ struct lw_instance {
     bool (*update)(lw_instance *self, double t, bool can_return_early, double *until);
     void (*update_sink)(void);
     lw_state *before; /* with an update: the state before the step */
+#if LW_LOOP && LW_CLOCKS
+    lw_memory kept; /* the memory before an evaluation in Event Mode, which comes back */
+#endif
 #if LW_MOVING_INPUTS
     double step_start, inputs[LW_N_U]; /* time at which the derivatives of the inputs hold; the inputs at a later time */
 #endif

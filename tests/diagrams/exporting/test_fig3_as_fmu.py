@@ -28,7 +28,7 @@ def test_the_trajectories_are_those_of_the_run_to_the_last_bit(make, tmp_path):
     file = build(diagram.sampled(1e-3), tmp_path, outside=["plant"], name="all_but_the_gantry")
     rest = open_instance(file, tmp_path / "rest")
     plant = open_instance(block.description.file, tmp_path / "plant")
-    kinds = {v.name: v.causality for v in rest.description.modelVariables}
+    kinds = {v.name: v.causality for v in rest.description.modelVariables if v.type != "Clock"}
     inputs, outputs = ([n for n, kind in kinds.items() if kind == one] for one in ("input", "output"))
     assert {*inputs} <= {"position", "velocity", "acceleration", "contact_force"}
     assert {*outputs} == {"motor_force", "external_force"}
