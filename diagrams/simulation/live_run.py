@@ -80,8 +80,8 @@ class Advancing(Protocol):
     def set_parameters(self, path: str, block: Block) -> None:
         """Let a block continue with other parameters."""
 
-    def run(self) -> Run:
-        """Return what was recorded."""
+    def run(self, *, final: bool = True) -> Run:
+        """Return what was recorded, with the complete state at its end or without it."""
 
 
 @dataclass(frozen=True)
@@ -177,11 +177,23 @@ class Controls:
             try:
                 block = change_parameter(self._blocks[control.path], control.keys, value)
             except LoopwrightError as error:
-                raise error.at(block=control.path) from None
+                raise _explain_value(error.at(block=control.path), control, t) from None
             self._blocks[control.path] = moved[control.path] = block
             changes.append((t, f"{control.path}.{'.'.join(control.keys)}", value))
         for path, block in moved.items():
             simulation.set_parameters(path, block)
+
+
+def _explain_value(error: LoopwrightError, control: _Control, t: float) -> LoopwrightError:
+    """Return the error of a value that a function or a slider has given: it says when."""
+    if not (callable(control.source) or hasattr(control.source, "value")):
+        return error
+    return SimulationError(
+        f"what is given for {control.name!r} can't be taken: {error.message}",
+        block=error.block,
+        port=error.port,
+        t=t,
+    )
 
 
 @explain_calls
@@ -191,7 +203,7 @@ class LiveRun(ShownAsTable):
     Attributes
     ----------
     run : Run
-        What was recorded. It is there once the run has ended.
+        What was recorded. It is there once the run has ended, by an error too.
     t : float
         Simulated time in s that has been reached.
     is_running : bool
@@ -223,6 +235,8 @@ class LiveRun(ShownAsTable):
     def __init__(self, name: str, pace: Pace):
         self._name, self._pace = name, pace
         self._late, self._busy, self._due_in_all = array("d"), 0.0, 0.0
+        self._in_functions = 0.0  # seconds of the clock in functions of the user's
+        self._thread: threading.Thread | None = None
         self._worst, self._longest = 0.0, 0.0
         self._stop, self._done = threading.Event(), threading.Event()
         self._is_stopped: Callable[[], object] = bool
@@ -241,6 +255,11 @@ class LiveRun(ShownAsTable):
         return not self._done.is_set()
 
     @property
+    def is_running_elsewhere(self) -> bool:
+        """Whether another thread runs it."""
+        return self.is_running and self._thread is not None and self._thread is not threading.current_thread()
+
+    @property
     def run(self) -> Run:
         """What was recorded.
 
@@ -250,7 +269,7 @@ class LiveRun(ShownAsTable):
             If it still runs.
         """
         if self._run is None:
-            if self._error is not None:
+            if self._error is not None:  # before anything was recorded
                 raise self._error
             raise OptionError(
                 f"found a run that has come to t = {self.t:g} s; expected one that has ended. Call stop(), then "
@@ -291,6 +310,12 @@ class LiveRun(ShownAsTable):
             return (
                 f"Computing takes {self.load:.0%} of the time, so that something else held the machine up: close it, "
                 f"or take a longer frame than {self._pace.frame:.3g} s."
+            )
+        if self._in_functions > 0.5 * self._busy:
+            return (
+                f"Functions of inputs= and on_frame= take {self._in_functions / self._due_in_all:.0%} of the time, and "
+                f"computing {(self._busy - self._in_functions) / self._due_in_all:.0%}: let them do less, or take a "
+                f"longer frame than {self._pace.frame:.3g} s."
             )
         slower = float(f"{0.7 * self._simulated / self._busy:.1g}")
         return (
@@ -366,7 +391,12 @@ class LiveRun(ShownAsTable):
         def drive() -> None:
             try:
                 with nullcontext() if simulation.is_open else simulation:
-                    self.ended_by = self._go(simulation, duration, controls, on_frame)
+                    try:
+                        self.ended_by = self._go(simulation, duration, controls, on_frame)
+                    except SimulationError as error:
+                        self._run = error.run if error.run is not None else simulation.run(final=False)
+                        error.keep(self._run)
+                        raise
                     run = simulation.run()
                     self._run = replace(run, messages=(*run.messages, self.message)) if self.message else run
             except BaseException as error:
@@ -377,7 +407,8 @@ class LiveRun(ShownAsTable):
                 self._done.set()
 
         if background:
-            threading.Thread(target=drive, name=f"live run of {self._name}", daemon=True).start()
+            self._thread = threading.Thread(target=drive, name=f"live run of {self._name}", daemon=True)
+            self._thread.start()
         else:
             drive()
 
@@ -410,10 +441,12 @@ class LiveRun(ShownAsTable):
                 ticks = in_a_frame if left is None else min(in_a_frame, left)
                 span = ticks * base if ticks else rest
                 controls.move(simulation, self.changes)
+                moved = pace.clock()
                 simulation.advance(span)
-                self.t = simulation.t
+                self.t, computed = simulation.t, pace.clock()
                 if on_frame is not None:
-                    on_frame(simulation.view)
+                    _call("on_frame", lambda: on_frame(simulation.view), self.t, self._name)
+                self._in_functions += moved - began + pace.clock() - computed
                 self._account(began, due, span)
                 if ticks:
                     done += ticks
@@ -447,7 +480,7 @@ class LiveRun(ShownAsTable):
         while True:
             if interrupted.is_set():
                 return "Ctrl-C"
-            if self._stop.is_set() or self._is_stopped():
+            if self._stop.is_set() or _call("stop", self._is_stopped, self.t, self._name):
                 return "stop"
             wait = due - self._pace.clock()
             if wait <= 0.0:
@@ -458,6 +491,20 @@ class LiveRun(ShownAsTable):
     def _ticks_of(simulation: Advancing, duration: float) -> tuple[int, float]:
         count, rest = ticks_in(duration, simulation.flat.base, simulation.wired.name)
         return int(count), float(rest)
+
+
+def _call(option: str, function: Callable[[], object], t: float, name: str) -> object:
+    """Call a function of the user's; what it raises ends the run as an error of it, with what was recorded."""
+    try:
+        return function()
+    except Exception as error:
+        raise SimulationError(
+            f"the function given as {option} failed: {type(error).__name__}: {error}. Correct it; error.run has what "
+            "was recorded.",
+            block=name,
+            port=option,
+            t=t,
+        ) from error
 
 
 @contextmanager

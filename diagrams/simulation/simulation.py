@@ -102,6 +102,7 @@ class Simulation:
         )
         self._elapsed, self._begun = 0.0, False
         self._open: bool | None = None  # until it begins; False once it has ended
+        self._live: LiveRun | None = None  # the last one
         self._recorder = self._new_recorder()
 
     def __repr__(self) -> str:
@@ -218,6 +219,7 @@ class Simulation:
             A duration that is not positive, or no multiple of the step where an FMU takes steps of one length
             only; a run that has not begun, or has ended.
         """
+        self._refuse_second_driver()
         if not self._open:
             raise not_open_error(self._open, self.wired.name)
         position = self._engine.position
@@ -326,10 +328,12 @@ class Simulation:
         UnknownNameError, ParameterError, OptionError
             A name that is no parameter; one that a run can't take over, see `set_parameters`; an option out of range.
         """
+        self._refuse_second_driver()
         pace = Pace(float(speed), float(frame), float(catch_up), clock, sleep)
         live = LiveRun(self.wired.name, pace)
         controls = Controls(self.wired.structure, inputs or {}, self.wired.name)
         self._let_move(controls)
+        self._live = live
         live.drive(self, duration, controls, on_frame, stop, background=bool(background))
         return live
 
@@ -342,6 +346,15 @@ class Simulation:
                 self._recorder.finish()
                 options = replace(options, overwrite=True)
             self.__init__(free, options, duration=duration)  # type: ignore[misc]
+
+    def _refuse_second_driver(self) -> None:
+        """Refuse a call while a live run in the background advances this simulation."""
+        if self._live is not None and self._live.is_running_elsewhere:
+            raise OptionError(
+                f"a live run in the background drives this simulation, now at t = {self._live.t:.9g} s; expected it to "
+                "have ended. Call its stop(), then wait(). What is moved meanwhile are its inputs=….",
+                block=self.wired.name,
+            )
 
     def prepare(self) -> None:
         """Make what the first tick needs, before a clock runs."""
@@ -375,6 +388,7 @@ class Simulation:
         ParameterError
             If the block's equations change, or how fast a source in continuous time changes: steps are limited by that.
         """
+        self._refuse_second_driver()
         self._engine.set_parameters(path, block)
 
     def take_over(self, x: np.ndarray, of: FlatDiagram) -> None:
@@ -397,6 +411,7 @@ class Simulation:
         SimulationError
             If a value is not finite there, or a guard fails.
         """
+        self._refuse_second_driver()
         if not self._open:
             raise not_open_error(self._open, self.wired.name)
         self._engine.take_over(x, of)
@@ -417,6 +432,7 @@ class Simulation:
         last : bool
             End the FMUs first, so that the run's messages name those that do not end well; nothing runs on.
         """
+        self._refuse_second_driver()
         recorder = self._recorder
         state = self.save() if final and self.can_save else None
         if final and self._begun and not self._engine.is_ahead:
@@ -478,6 +494,7 @@ class Simulation:
         OptionError
             If the run has not begun, or has ended and its FMUs are freed, or has ended between two ticks.
         """
+        self._refuse_second_driver()
         if not self._begun or (self._engine.has_plants and not self._open):
             raise not_open_error(self._open, self.wired.name)
         return save_state(self._engine)
@@ -491,6 +508,7 @@ class Simulation:
             If it is no state of such a diagram: another base, other blocks or states. If the run has not begun, or has
             ended.
         """
+        self._refuse_second_driver()
         if not self._open:
             raise not_open_error(self._open, self.wired.name)
         check_fits(state, self.flat, self.wired.name)

@@ -10,6 +10,7 @@ from loopwright import Diagram, Fmu, subsystem
 from loopwright.blocks import Clock, Compare, Constant, Gain, Integrator, Sine, Step, StopCondition, TransferFunction
 from loopwright.diagrams import OptionError, ParameterError, SimulationError, UnknownNameError
 from loopwright.fmus import mass_spring_damper
+from loopwright.types import Simulation
 
 T = 0.125
 
@@ -50,7 +51,8 @@ LAG = Diagram(
 def live(diagram, duration=None, work=None, step=None, **options):
     clock = FakeClock(work)
     options = {"frame": 2 * T, "on_frame": clock.take, **options}
-    return diagram.simulation(step=step).run_realtime(duration, clock=clock, sleep=clock.sleep, **options), clock
+    options = {"clock": clock, "sleep": clock.sleep, **options}
+    return diagram.simulation(step=step).run_realtime(duration, **options), clock
 
 
 # --- numbers ------------------------------------------------------------------------------------------------------------
@@ -134,9 +136,18 @@ def test_overruns_are_counted_and_caught_up():
     assert found.run.messages[-1] == found.message
 
 
-def test_a_long_delay_is_given_up_and_one_warning_says_what_to_do():
+def test_a_long_delay_is_given_up_and_one_warning_says_what_to_do(monkeypatch):
+    """The machine computes for 1 s in frames that last 0.25 s."""
+    clock = FakeClock(work={0: 1.0, 2: 1.0})
+
+    def advance(self, duration):
+        clock.take(None)
+        return computed(self, duration)
+
+    computed = Simulation.advance
+    monkeypatch.setattr(Simulation, "advance", advance)
     with pytest.warns(RuntimeWarning, match=r"was 750 ms behind the clock at most: 1 of 1 frame.*speed=0\.2") as warned:
-        found, clock = live(LAG, 1.0, step=T, work={0: 1.0, 2: 1.0}, catch_up=0.5)
+        found, _ = live(LAG, 1.0, step=T, catch_up=0.5, clock=clock, sleep=clock.sleep, on_frame=None)
     assert len(warned) == 1
     assert found.overruns == 2
     assert found.lateness.tolist() == [0.0, 0.75, 0.0, 0.75]
@@ -146,6 +157,13 @@ def test_a_long_delay_is_given_up_and_one_warning_says_what_to_do():
     assert "gave up 1.5 s of the clock: 2 of 4 frames" in found.message
     assert "speed=0.3" in found.message  # 0.7 of what it reached, 1 s in 2 s, in one digit
     assert "overruns    2, the longest by 750 ms" in str(found)
+
+
+def test_slow_functions_of_the_user_are_named_and_not_the_machine():
+    with pytest.warns(RuntimeWarning, match=r"Functions of inputs= and on_frame= take 400% of the time.*0%") as warned:
+        found, _ = live(LAG, 1.0, step=T, work={0: 1.0, 2: 1.0}, catch_up=0.5)
+    assert len(warned) == 1
+    assert "take 200% of the time, and computing 0%" in found.message
 
 
 def test_frames_have_whole_ticks_one_at_least():
@@ -257,6 +275,39 @@ def test_an_error_in_the_background_is_raised_by_wait():
         found.wait(30.0)
     assert "failed" in repr(found)
     assert "ZeroDivisionError" in str(found)
+
+
+@pytest.mark.parametrize(
+    ("broken", "words"),
+    [
+        ({"inputs": {"u": lambda t: 1.0 if t < 0.5 else float("nan")}}, r"u\.value, t = 0\.5 s: what is given.*nan"),
+        ({"inputs": {"u": lambda t: 1.0 if t < 0.5 else 1 / 0}}, r"u\.value, t = 0\.5 s: the function given for 'u'"),
+        ({"on_frame": lambda view: 1 / (view.t - 0.5)}, r"lag\.on_frame, t = 0\.5 s: .*on_frame failed: ZeroDiv"),
+    ],
+)
+def test_what_was_recorded_until_an_error_is_kept(broken, words):
+    with pytest.raises(SimulationError, match=words) as caught:
+        live(LAG, 1.0, step=T, **broken)
+    kept = caught.value.run
+    assert kept.t.tolist() == [0.0, 0.125, 0.25, 0.375, 0.5]
+    np.testing.assert_allclose(kept["y"], 1.0 - np.exp(-kept.t), atol=1e-6)
+    behind, _ = live(LAG, 1.0, step=T, background=True, **broken)
+    with pytest.raises(SimulationError):
+        behind.wait(30.0)
+    assert behind.run["y"].tolist() == kept["y"].tolist()
+
+
+def test_a_simulation_has_one_driver():
+    """Two threads in one simulation mixed the samples of both."""
+    simulation = LAG.simulation(step=T)
+    found = simulation.run_realtime(background=True, speed=10.0)
+    calls = (lambda: simulation.run_realtime(1.0), lambda: simulation.advance(1.0), simulation.run, simulation.save)
+    for call in calls:
+        with pytest.raises(OptionError, match=r"a live run in the background drives this simulation.*stop\(\)"):
+            call()
+    found.stop()
+    run = found.wait(30.0).run
+    np.testing.assert_allclose(run["y"], 1.0 - np.exp(-run.t), atol=1e-6)
 
 
 # --- sources in continuous time whose parameters change in a run ----------------------------------------------------------
