@@ -22,11 +22,6 @@ def cache_folder() -> Path:
     """Return the folder of files that can be built again: LOOPWRIGHT_CACHE, else the user's cache folder.
 
     Its path is absolute, since the working folder changes for moments.
-
-    Raises
-    ------
-    FmuError
-        If there is no home folder, or if LOOPWRIGHT_CACHE is a relative path and the working folder was removed.
     """
     given = os.environ.get("LOOPWRIGHT_CACHE")
     try:
@@ -89,13 +84,7 @@ def is_built_here(digest: str) -> bool:
 
 
 def check_cache() -> Path:
-    """Return the cache folder, after creating it and writing to it.
-
-    Raises
-    ------
-    FmuError
-        If it can't be written.
-    """
+    """Return the cache folder, after creating it and writing to it."""
     folder = cache_folder()
     with explain_cache_errors():
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)  # the compiler's own cache is there, too

@@ -105,11 +105,6 @@ def accepts(called: str | None = "", error: type[LoopwrightError] = OptionError,
         Class of the error.
     **kinds
         A kind for each argument that is checked; one of ``*args`` or ``**kwargs`` holds for each of their values.
-
-    Raises
-    ------
-    OptionError
-        By the function: an argument of another kind.
     """
 
     def wrap(subject: F) -> F:
@@ -172,13 +167,7 @@ def _checked(function: F, called: str | None, error: type[LoopwrightError], kind
 def check_argument(
     value: Any, kind: Kind, name: str, function: str | None, error: type[LoopwrightError] = OptionError
 ) -> None:
-    """Refuse an argument of another kind.
-
-    Raises
-    ------
-    OptionError
-        It names the function, the argument, what was found and what is expected; or the class that is given.
-    """
+    """Refuse an argument of another kind."""
     if not kind.holds(value):
         raise error(kind.complaint(name, value), block=function, port=name)
 

@@ -36,13 +36,7 @@ def describe_shape(shape: tuple[int, ...] | None) -> str:
 
 
 def check_shapes(**values: Array) -> None:
-    """Refuse values of different shapes; a scalar goes with any.
-
-    Raises
-    ------
-    ShapeError
-        For two shapes that differ.
-    """
+    """Refuse values of different shapes; a scalar goes with any."""
     first = next(((name, shape_of(v)) for name, v in values.items() if shape_of(v)), ("", ()))
     for name, value in values.items():
         if shape_of(value) not in ((), first[1]):

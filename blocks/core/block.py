@@ -412,11 +412,6 @@ def _bind(block: Block, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[s
     """Match the arguments of a call with the block's inputs.
 
     Signals by position go to the inputs in their order, or, if they are as many as inputs without a default, to these.
-
-    Raises
-    ------
-    UnwiredInputError, DoubleDriveError, UnknownNameError, WiringError
-        For a required input left out, an input given twice, an unknown input, too many signals.
     """
     inputs, who = block.inputs, block.label
     if len(args) > len(inputs):

@@ -101,11 +101,6 @@ def explain_disk_errors(
         Class of the error.
     **where
         ``block`` and ``port`` of the error.
-
-    Raises
-    ------
-    LoopwrightError
-        Of the class ``raised``.
     """
     try:
         yield

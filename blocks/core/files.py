@@ -18,13 +18,7 @@ OTHER_FILE = "Name a file in another folder."
 
 
 def check_file(path: str | os.PathLike[str]) -> Path:
-    """Return the file of a path that a user gave; find out, before anything is computed, whether it can be written.
-
-    Raises
-    ------
-    OptionError
-        A folder, or a file in a folder that isn't there or can't be written to; the message says why.
-    """
+    """Return the file of a path that a user gave; find out, before anything is computed, whether it can be written."""
     file = Path(path).expanduser()
     with explain_disk_errors(f"{str(path)!r} can't be written", file, OTHER_FILE, OptionError, port="path"):
         if file.is_dir():

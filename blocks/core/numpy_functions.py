@@ -195,13 +195,7 @@ RULES: Mapping[Any, Rule] = {**_ENTRYWISE, **_AS_A_WHOLE}
 
 
 def result_unit(function: Any, units: Units) -> str | tuple[str, ...] | None:
-    """Return the unit of the result of a NumPy function of inputs in these units; None where it is not known.
-
-    Raises
-    ------
-    UnitError
-        For units that the function does not take; its port is the input.
-    """
+    """Return the unit of the result of a NumPy function of inputs in these units; None where it is not known."""
     call = function.function if isinstance(function, NumpyCall) else function
     rule = RULES.get(call) if isinstance(call, np.ufunc) or callable(call) else None
     if rule is None or not units or any(unit is None for unit in units.values()):

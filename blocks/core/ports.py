@@ -87,13 +87,7 @@ def _unit_of(given: Any) -> PortUnit:
 
 
 def _known(kind: str, limits: Mapping[str, Any], *more: str) -> dict[str, Any]:
-    """Return further arguments of a port, ``nominal``, ``minimum`` and ``maximum``; refuse others.
-
-    Raises
-    ------
-    DefinitionError
-        For an argument that the kind of port does not have.
-    """
+    """Return further arguments of a port, ``nominal``, ``minimum`` and ``maximum``; refuse others."""
     for name in limits:
         if name not in LIMITS:
             raise DefinitionError(f"{kind} has no argument {name!r}. {near(name, (*more, *LIMITS))}")
@@ -106,13 +100,7 @@ _TAKEN |= {"drawn_as", "drawn_inside"}
 
 
 def check_port_names(cls: type) -> None:
-    """Refuse ports of a class whose names have another meaning already.
-
-    Raises
-    ------
-    DefinitionError
-        For ``T``, an attribute of every block, and a name that begins with an underscore.
-    """
+    """Refuse ports of a class whose names have another meaning already."""
     for name in (n for n, item in vars(cls).items() if isinstance(item, Port)):
         if name == "T":
             why, step = "in equations T is the sample time in s", "another name, such as temperature or T_1"

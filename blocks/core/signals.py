@@ -204,13 +204,7 @@ def primary_outputs(outputs: Mapping[str, Any]) -> list[str]:
 
 
 def check_name(name: Any) -> str:
-    """Return ``name`` if it can name a block or a wire.
-
-    Raises
-    ------
-    WiringError
-        For anything but an identifier (letters, digits, underscores).
-    """
+    """Return ``name`` if it can name a block or a wire."""
     if not (isinstance(name, str) and name.isidentifier()):
         raise WiringError(f"found the name {name!r}; expected letters, digits and underscores, such as 'v_perp'.")
     return name
@@ -220,11 +214,6 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
     """Return the signal that ``value`` stands for: a signal, a call or block with one output, or a number.
 
     A tuple, a list or an array of these, as `np.stack` and `np.hstack` make it, is one signal: their entries in a row.
-
-    Raises
-    ------
-    WiringError
-        For anything else.
     """
     if isinstance(value, Wireable):
         return value._signal()

@@ -244,11 +244,6 @@ def same_unit(a: Unit | str, b: Unit | str) -> bool:
 def convert_unit(a: Unit | str, b: Unit | str) -> tuple[float, float]:
     """Return the factor and the offset by which a number in ``a`` becomes one in ``b``: factor · number + offset.
 
-    Raises
-    ------
-    UnitError
-        If they are of different dimensions.
-
     Examples
     --------
     >>> convert_unit("°C", "K")

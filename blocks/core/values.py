@@ -217,11 +217,6 @@ def convert(value: Any, spec: ParameterSpec, owner: str, name: str) -> Any:
 
     Numbers become float, sequences of numbers read-only float64 arrays, integers stay integers where the declaration
     says ``int``. Mappings, lists and sets become read-only copies.
-
-    Raises
-    ------
-    ParameterError
-        For a value of the wrong kind or shape, not finite, out of bounds, or not hashable.
     """
 
     def error(found: str, expected: str) -> ParameterError:

@@ -11,13 +11,7 @@ from ..core import Array, Block, Input, ShapeError, check_shapes, number_inputs,
 
 
 def check_fits(value: Array, port: str, main: Array, main_port: str) -> None:
-    """Refuse a signal that is neither a scalar nor of the main signal's shape, which a state has as well.
-
-    Raises
-    ------
-    ShapeError
-        For any other shape.
-    """
+    """Refuse a signal that is neither a scalar nor of the main signal's shape, which a state has as well."""
     if shape_of(value) not in ((), shape_of(main)):
         raise ShapeError(
             f"found shape {shape_of(value)}; expected a scalar, or {shape_of(main)} as {main_port} has. Take a part of "
@@ -32,13 +26,7 @@ def truth(u: Array) -> Array:
 
 
 def expect_scalar(value: Array, port: str) -> Array:
-    """Return the signal of an event, and refuse a vector: an event is one crossing of one number.
-
-    Raises
-    ------
-    ShapeError
-        For a signal of several entries.
-    """
+    """Return the signal of an event, and refuse a vector: an event is one crossing of one number."""
     if shape_of(value):
         raise ShapeError(
             f"found shape {shape_of(value)}; expected a scalar in a continuous subsystem, where it switches by events. "

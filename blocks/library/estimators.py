@@ -47,13 +47,7 @@ def as_control(model: Any) -> Any:
 
 
 def _design(cls: type[Block], name: str, compute: Callable[[], Any]) -> np.ndarray:
-    """Return the gain that a function of python-control finds.
-
-    Raises
-    ------
-    ParameterError
-        If it finds none, with its reason.
-    """
+    """Return the gain that a function of python-control finds."""
     try:
         gain = np.asarray(compute(), dtype=float)
         if np.all(np.isfinite(gain)):

@@ -32,13 +32,7 @@ class Integrator(Block):
 
 
 def check_limits(block: Any, start: str | None = None) -> None:
-    """Refuse limits in the wrong order, and a start value (the parameter ``start``) outside of them.
-
-    Raises
-    ------
-    ParameterError
-        For a ``lower`` that is not below ``upper``, and a start value beyond a limit.
-    """
+    """Refuse limits in the wrong order, and a start value (the parameter ``start``) outside of them."""
     low, high = (np.inf * s if v is None else v for s, v in ((-1.0, block.lower), (1.0, block.upper)))
     if not low < high:
         raise ParameterError(

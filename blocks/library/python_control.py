@@ -22,11 +22,6 @@ def check_system(cls: type[Block], system: Any, kind: str) -> dict[str, Any]:
         The object to check.
     kind : {"StateSpace", "TransferFunction"}
         Class of python-control that is expected.
-
-    Raises
-    ------
-    ParameterError
-        For another class, and for the other kind of time.
     """
     import control
 
@@ -68,13 +63,7 @@ def block_name(system: Any, name: str | None) -> str | None:
 
 
 def check_single(cls: type[Block], system: Any) -> None:
-    """Refuse a transfer function of several inputs or outputs.
-
-    Raises
-    ------
-    ParameterError
-        For any other number of each.
-    """
+    """Refuse a transfer function of several inputs or outputs."""
     if system.ninputs != 1 or system.noutputs != 1:
         raise ParameterError(
             f"found {system.ninputs} inputs and {system.noutputs} outputs; expected one each. Take one entry, "
@@ -103,13 +92,7 @@ def sample_time_of(block: Block) -> float | bool:
 
 
 def check_names(block: Any, **numbers: int) -> None:
-    """Refuse a number of names that is not that of the signals.
-
-    Raises
-    ------
-    ParameterError
-        For another number of names.
-    """
+    """Refuse a number of names that is not that of the signals."""
     for parameter, n in numbers.items():
         names = getattr(block, parameter)
         if names is not None and not kinds.names.holds(names):

@@ -400,13 +400,7 @@ class Path(Value):
 
 
 def check_order(path: Path, order: int) -> int:
-    """Refuse an order of differentiation that isn't 0, 1, 2 or 3.
-
-    Raises
-    ------
-    ParameterError
-        For any other order.
-    """
+    """Refuse an order of differentiation that isn't 0, 1, 2 or 3."""
     if order not in (0, 1, 2, 3):
         raise ParameterError(f"found order {order!r}; expected 0, 1, 2 or 3.", block=type(path).__name__, port="sigma")
     return order
@@ -455,13 +449,7 @@ def _invert(path: Path, s: np.ndarray) -> np.ndarray:
 
 
 def as_positions(path: Path, y: object) -> np.ndarray:
-    """Return positions as an array, and refuse other shapes.
-
-    Raises
-    ------
-    ParameterError
-        For another shape than (2,) or (2, N).
-    """
+    """Return positions as an array, and refuse other shapes."""
     try:
         array = np.asarray(y, dtype=float)
     except (TypeError, ValueError):

@@ -31,15 +31,7 @@ _SAMPLED = ("output", "update", "guards")  # may take T besides
 
 
 def check_definition(block: Block) -> None:
-    """Refuse equations with other arguments than theirs, and ports that hide an equation.
-
-    Raises
-    ------
-    DefinitionError
-        For a port that is named like an equation, or like an attribute of every block.
-    TraceError
-        For an equation with other arguments.
-    """
+    """Refuse equations with other arguments than theirs, and ports that hide an equation."""
     cls = type(block)
     ports: dict[str, Port] = {**block.inputs, **block.states, **block.outputs, **block.events}
     for name in ports:
@@ -128,13 +120,7 @@ def _shape(value: Any) -> Shape | None:
 
 
 def parts_of(result: Any, names: list[str], equation: str) -> list[Any]:
-    """Return the values of an equation, one for each name.
-
-    Raises
-    ------
-    TraceError
-        If it returned nothing, or not as many values as there are names.
-    """
+    """Return the values of an equation, one for each name."""
     if result is None and names:
         raise TraceError(f"its {equation} returned nothing; expected {_describe_values(names)}. End it with a return.")
     if len(names) == 1:
@@ -154,13 +140,7 @@ def _describe_values(names: list[str]) -> str:
 def match_ports(
     result: Any, declared: Mapping[str, Shape | None], equation: str
 ) -> tuple[dict[str, Any], dict[str, Shape]]:
-    """Return columns and shapes of the values that an equation returned, by the names of the declared ports.
-
-    Raises
-    ------
-    TraceError, ShapeError
-        If there is not one value for each port, or one is no array of the declared shape.
-    """
+    """Return columns and shapes of the values that an equation returned, by the names of the declared ports."""
     made, shapes = {}, {}
     names = list(declared)
     for name, part in zip(names, parts_of(result, names, equation), strict=True):
@@ -199,13 +179,7 @@ def _column(part: Any, expected: Shape | None, name: str, equation: str) -> tupl
 
 
 def guards_of(result: Any) -> dict[str, Any]:
-    """Return the guards' scalar columns by name.
-
-    Raises
-    ------
-    TraceError, ShapeError
-        If they are no dictionary, or an expression is no scalar.
-    """
+    """Return the guards' scalar columns by name."""
     if not isinstance(result, Mapping) or not all(isinstance(name, str) for name in result):
         raise TraceError(
             f"its guards returned {_describe(result)}; expected a dictionary of expressions by name, which must stay "
@@ -223,15 +197,7 @@ def guards_of(result: Any) -> dict[str, Any]:
 
 
 def start_values(block: Block, shapes: Mapping[str, Shape]) -> dict[str, np.ndarray]:
-    """Return the start value of every state, for inputs of the given shapes.
-
-    Raises
-    ------
-    DefinitionError
-        If a start or a ``like`` names nothing, or a start is no number.
-    ShapeError
-        If a start value doesn't fit the input whose shape the state takes.
-    """
+    """Return the start value of every state, for inputs of the given shapes."""
     values = {}
     for name, port in block.states.items():
         if port.like is not None and port.like not in shapes:
@@ -274,24 +240,12 @@ def start_shapes(block: Block) -> list[Shape]:
 
 
 def initial_state(block: Any, states: Mapping[str, Shape], u: Any) -> np.ndarray:
-    """Return the state that ``initial`` computes from the inputs ``u``, flat.
-
-    Raises
-    ------
-    TraceError, ShapeError
-        If there is not one value for each state, or one has another shape.
-    """
+    """Return the state that ``initial`` computes from the inputs ``u``, flat."""
     return _flat_states(block.initial(u), states, "initial")
 
 
 def state_after_start(block: Any, states: Mapping[str, Shape], x: Any, u: Any, T: float | None) -> np.ndarray:
-    """Return the state that ``after_start`` gives, flat; ``T`` is the sample time in s, None in continuous time.
-
-    Raises
-    ------
-    TraceError, ShapeError
-        If there is not one value for each state, or one has another shape.
-    """
+    """Return the state that ``after_start`` gives, flat; ``T`` is the sample time in s, None in continuous time."""
     return _flat_states(block.after_start(x, u, T), states, "after_start") if states else np.zeros(0)
 
 

@@ -26,11 +26,6 @@ def describe_model_exchange(block: Block, shapes: Mapping[str, Shape], *, sample
         Shape of every input.
     sampled : bool
         Whether the block is in a sampled subsystem.
-
-    Raises
-    ------
-    SampleTimeError
-        If it is: its states belong to a solver.
     """
     if sampled:
         raise SampleTimeError(

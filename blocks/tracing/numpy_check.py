@@ -48,11 +48,6 @@ def compare(
         Shapes of the inputs, start values of the states, parameters and precomputed numbers.
     sampled : bool
         Whether the block is in a sampled subsystem; the sample time is then 1 s.
-
-    Raises
-    ------
-    TraceError
-        If they differ, or if the equations round halves to even, which a trace does not.
     """
     T = 1.0 if sampled else float("nan")
     p = np.concatenate([*(np.ravel(v) for _, v in entries), [T], *map(np.ravel, constants.values())])

@@ -113,13 +113,6 @@ def trace(
     cache : dict, optional
         Traces of users' blocks that may be shared: one dictionary for each build of a diagram. Blocks of the library
         share theirs in the whole process.
-
-    Raises
-    ------
-    TraceError
-        For an operation that can't be traced, or whose traced result differs from NumPy's.
-    ShapeError
-        For an equation that returns another shape than declared.
     """
     shared = None if block.opaque else _CACHE if _is_ours(block) else cache
     key = (structure(block), tuple(shapes.items()), sampled, method, zeros)

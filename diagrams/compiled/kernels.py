@@ -80,13 +80,6 @@ class Kernels:
 class BlockKinds:
     """The kinds of blocks in some functions of a large diagram, and the operations on single values.
 
-    Parameters
-    ----------
-    flat : FlatDiagram
-        The diagram.
-    programs : iterable of Program
-        The functions.
-
     Attributes
     ----------
     exact : bool

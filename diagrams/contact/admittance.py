@@ -70,13 +70,7 @@ def look_again(parts: ContactParts, direction: np.ndarray, omega: float) -> floa
 
 
 def compute_admittance(parts: ContactParts, direction: np.ndarray, omega: Array) -> np.ndarray:
-    """Return the admittance along a direction, m/(N s).
-
-    Raises
-    ------
-    OptionError
-        If a frequency is not positive, or not below the Nyquist frequency π/T of a sampled loop.
-    """
+    """Return the admittance along a direction, m/(N s)."""
     w, T = np.asarray(omega, dtype=float), parts.shortest
     top = math.pi / T if T else math.inf
     if not np.all((w > 0.0) & (w < top)):

@@ -146,11 +146,6 @@ def attach_environment(
         Sample time of a sampled diagram in s.
     held : bool
         Keep the plant in co-simulation, and hold the force between communication points.
-
-    Raises
-    ------
-    OptionError
-        If the plant measures the force itself, or does not show the acceleration that a mass needs.
     """
     path, block = ports.plant, diagram.blocks[ports.plant]
     if measured is not None and measured.port[0] == path:
@@ -271,13 +266,7 @@ def _find_feedthrough(diagram: WiredDiagram, path: str, model: PlantEquations) -
 
 
 def _find_acceleration(table: Structure, ports: Ports, model: PlantEquations) -> Wire:
-    """Return the output with the acceleration of the contact; a plant without one gets it, from its derivatives.
-
-    Raises
-    ------
-    OptionError
-        If the velocity is no state whose derivative could be shown.
-    """
+    """Return the output with the acceleration of the contact; a plant without one gets it, from its derivatives."""
     path, block = ports.plant, table.blocks[ports.plant]
     V = model.C[model.outputs.entries([ports.velocity])]
     a, a_u = V @ model.A, V @ model.B

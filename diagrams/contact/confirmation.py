@@ -123,13 +123,7 @@ class LimitTrials:
 
     @classmethod
     def of(cls, contact: TriedContact, limit: ContactLimit, method: TrialMethod | str | None) -> LimitTrials:
-        """Return the trials of a contact's limit.
-
-        Raises
-        ------
-        OptionError
-            If a method is unknown, or not possible with this plant.
-        """
+        """Return the trials of a contact's limit."""
         chosen = _choose(contact, limit, method)
         model = None
         if chosen is not TrialMethod.INSIDE:

@@ -44,13 +44,7 @@ class Ports:
 
     @classmethod
     def find(cls, diagram: WiredDiagram, flat: FlatDiagram, names: PortNames) -> Ports:
-        """Return the ports that names denote.
-
-        Raises
-        ------
-        UnknownNameError, OptionError
-            If a name denotes none, or position and velocity are not outputs of the block with the force port.
-        """
+        """Return the ports that names denote."""
         force = diagram.contact_port if names.port is None else names.port
         if force is None:
             raise UnknownNameError(

@@ -206,15 +206,7 @@ class ContactParts:
 def take_apart(
     diagram: WiredDiagram, ports: Ports, measured: str | None, point: OperatingPoint, options: Mapping[str, Any]
 ) -> tuple[ContactParts, bool]:
-    """Return the linear parts of a diagram at a point, and whether that point is a start unlike every later tick.
-
-    Raises
-    ------
-    ParameterError
-        If the point is not at rest, the plant has no continuous linear model, or its ports are not those of a contact.
-    OptionError
-        If signals around a plant with equations change between the ticks, or the measured force lies behind states.
-    """
+    """Return the linear parts of a diagram at a point, and whether that point is a start unlike every later tick."""
     path, block = ports.plant, diagram.blocks[ports.plant]
     flat = diagram.flatten_like(point)
     wires = _find_sources(flat, path)

@@ -25,13 +25,7 @@ def points_in_a_decade(fewest: int) -> Kind:
 
 
 def read_number(value: Any, port: str, unit: str) -> float:
-    """Return a number that is finite and not negative.
-
-    Raises
-    ------
-    ParameterError
-        If it is something else.
-    """
+    """Return a number that is finite and not negative."""
     found = _as_array(value)
     if found is None or found.ndim != 0 or not 0.0 <= float(found) < math.inf:
         raise ParameterError(
@@ -43,13 +37,7 @@ def read_number(value: Any, port: str, unit: str) -> float:
 
 
 def read_row(value: Any, name: str, *, rising: bool) -> np.ndarray:
-    """Return a row of finite values of a property that are not negative; with ``rising``, positive ones that rise.
-
-    Raises
-    ------
-    OptionError
-        If it is something else.
-    """
+    """Return a row of finite values of a property that are not negative; with ``rising``, positive ones that rise."""
     unit = UNITS[name]
     found = _as_array(value)
     if found is None or found.ndim != 1 or not len(found) or not np.all(np.isfinite(found)):
@@ -73,13 +61,7 @@ def read_vector(value: Any) -> np.ndarray | None:
 
 
 def check_property(name: Any, port: str) -> str:
-    """Return a property of an environment.
-
-    Raises
-    ------
-    OptionError
-        If an environment has none of this name.
-    """
+    """Return a property of an environment."""
     if not isinstance(name, str) or name not in UNITS:
         raise UnknownArgumentError(str(name), UNITS, block=None, found="an environment has no").at(port=port)
     return name
@@ -98,13 +80,7 @@ def check_environment(**values: Array | None) -> None:
 
 
 def check_properties(held: Mapping[str, Any], vary: str) -> dict[str, float]:
-    """Return the properties of an environment that are held, as numbers.
-
-    Raises
-    ------
-    OptionError, ParameterError
-        If a property is unknown, or held and varied; if its value is no finite number that is not negative.
-    """
+    """Return the properties of an environment that are held, as numbers."""
     check_property(vary, "vary")
     for name in held:
         check_property(name, str(name))

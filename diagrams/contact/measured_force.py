@@ -62,11 +62,6 @@ def find_entry(
         Outputs of the plant that are used.
     options : mapping
         Options of the linear model.
-
-    Raises
-    ------
-    OptionError
-        If the measured force lies behind states, and the wire of the force port does not lead there.
     """
     flat, source = diagram.flatten_like(point), wires.get(ports.force)
     if source is not None and (source.block, source.port) == signal.port:
@@ -195,13 +190,7 @@ class Tool:
     problem: str = ""
 
     def check(self) -> None:
-        """Refuse another tool where a model and a run would be different loops.
-
-        Raises
-        ------
-        OptionError
-            With the reason.
-        """
+        """Refuse another tool where a model and a run would be different loops."""
         if self.problem:
             raise OptionError(self.problem, block=self.sensor or "", port="tool_mass")
 

@@ -185,11 +185,6 @@ def moored_diagram(
         The environment.
     tool : dict, optional
         Mass in kg beyond a force sensor, by the sensor's path; the diagram's own without it.
-
-    Raises
-    ------
-    OptionError
-        If the plant is none of the library, or measures the force itself.
     """
     block = diagram.blocks[plant]
     cls = library_class(block)

@@ -109,13 +109,7 @@ class FoundLimit(NamedTuple):
 
 
 def scan_points(name: str, ends: tuple[float | None, float | None], per_decade: int) -> np.ndarray:
-    """Return the values of a property at which its scan looks; None stands for the usual end, see `SCANNED`.
-
-    Raises
-    ------
-    OptionError
-        If the ends don't rise.
-    """
+    """Return the values of a property at which its scan looks; None stands for the usual end, see `SCANNED`."""
     first, last = (usual if end is None else end for usual, end in zip(SCANNED[name], ends, strict=True))
     if not 0.0 < first < last < math.inf:
         raise OptionError(
@@ -570,13 +564,7 @@ def map_growth(
 def read_scan(
     vary: str, low: float | None = None, high: float | None = None, per_decade: int = PER_DECADE
 ) -> np.ndarray:
-    """Return the values of a property at which its scan looks.
-
-    Raises
-    ------
-    OptionError
-        If the scan does not rise or is too coarse.
-    """
+    """Return the values of a property at which its scan looks."""
     first, last = (None if end is None else float(end) for end in (low, high))
     return scan_points(vary, (first, last), int(per_decade))
 

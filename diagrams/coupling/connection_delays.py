@@ -119,13 +119,7 @@ class CouplingReport:
 
 
 def report_coupling(flat: FlatDiagram, coupling: Coupling) -> CouplingReport:
-    """List the delays of all connections from and to the FMUs of a diagram.
-
-    Raises
-    ------
-    OptionError
-        If the order of "gauss_seidel" does not name each FMU once.
-    """
+    """List the delays of all connections from and to the FMUs of a diagram."""
     links = Links(flat)
     order = links.order(coupling.order) if coupling.scheme == Scheme.GAUSS_SEIDEL else ()
     found = [*_into(links, coupling, order), *_out_of(links, coupling)]

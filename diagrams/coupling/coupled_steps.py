@@ -57,11 +57,6 @@ class CoupledSteps:
         Gives the inputs that follow from w at a time in s, between ticks.
     rest : Rest
         The blocks in continuous time.
-
-    Raises
-    ------
-    OptionError
-        If a plant lacks what the scheme needs, or they do not all step at all ticks that are visited.
     """
 
     def __init__(
@@ -157,11 +152,6 @@ class CoupledSteps:
         -------
         float or None
             Time in s at which a stop condition has ended the run before the next tick.
-
-        Raises
-        ------
-        SimulationError
-            If an iteration does not converge, a communication step gets too short, or a plant fails.
         """
         if self.coupling.error is not None or self.coupling.scheme == Scheme.ITERATED:
             try_steps(self._plants.values())

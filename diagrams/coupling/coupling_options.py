@@ -101,11 +101,6 @@ def refuse_model_exchange(coupling: Coupling, blocks: Mapping[str, Any]) -> None
         The coupling.
     blocks : mapping
         The FMUs that are evaluated by the solver, by path.
-
-    Raises
-    ------
-    OptionError
-        If one can't turn its state into bytes.
     """
     if coupling.scheme != Scheme.ITERATED and coupling.error is None:
         return
@@ -121,13 +116,7 @@ def refuse_model_exchange(coupling: Coupling, blocks: Mapping[str, Any]) -> None
 
 
 def to_coupling(value: Any, *, block: str) -> Coupling:
-    """Return the coupling of a run from its option: a `Coupling`, or the name of a scheme.
-
-    Raises
-    ------
-    OptionError
-        If it is neither.
-    """
+    """Return the coupling of a run from its option: a `Coupling`, or the name of a scheme."""
     if isinstance(value, Coupling):
         return value
     if isinstance(value, str):

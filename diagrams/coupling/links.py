@@ -152,11 +152,6 @@ class Links:
 
         Without a wanted order the next one is always the plant that waits for the fewest others: first by inputs that
         it passes straight on, then by all its inputs, then by its path.
-
-        Raises
-        ------
-        OptionError
-            If the wanted order does not name each plant once.
         """
         if wanted:
             for path in wanted:

@@ -52,11 +52,6 @@ class Rollback:
             Outputs of all plants, read after a restore at the beginning of the step.
         t : float or None
             Time of the state in s.
-
-        Raises
-        ------
-        FmuRuntimeError
-            If an output is not that of the step's beginning.
         """
         mine = self._links.outputs[path]
         found, expected = self._w[mine], begun[mine]
@@ -98,11 +93,6 @@ def find_taken_back(links: Links, paths: Iterable[str], made: Sequence[np.ndarra
         Outputs of all plants after half a step, after two halves, and after a whole step.
     t : float
         Time in s at which these begin.
-
-    Raises
-    ------
-    FmuRuntimeError
-        If such an FMU takes its first half step back.
     """
     moved, (half, halves, whole) = set(), made
     for path in paths:

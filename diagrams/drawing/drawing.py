@@ -138,11 +138,6 @@ def draw(
         Subsystems that are drawn closed, all or some; by default all of them in a diagram of more than 40 blocks.
     width : float
         Width in pixels above which chains of blocks are broken into rows.
-
-    Raises
-    ------
-    OptionError
-        If a path stands for no subsystem.
     """
     shut = find_closed(table, subsystem, closed, diagram=name) - {subsystem}
     page = DiagramPicture(table, shut, width).page(subsystem, subsystem or name)

@@ -8,13 +8,7 @@ from ...blocks.core import OptionError
 
 
 def printer(wanted: str, instead: str, port: str) -> Any:
-    """Return the library; ``wanted`` and ``instead`` say in the error what needs it and what does without.
-
-    Raises
-    ------
-    OptionError
-        If it isn't installed.
-    """
+    """Return the library; ``wanted`` and ``instead`` say in the error what needs it and what does without."""
     try:
         import plutoprint
     except ImportError as error:

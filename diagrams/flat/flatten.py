@@ -45,11 +45,6 @@ def flatten(
         The diagram's name, for errors.
     between : bool, default False
         Whether outputs are evaluated between ticks though nothing happens there: all sampled ones are held then.
-
-    Raises
-    ------
-    SampleTimeError
-        No sample time anywhere, a step that does not divide one.
     """
     base, clocks = _clocks(table, step, name)
     traced, blocks = checked.traced, table.blocks

@@ -156,13 +156,7 @@ class OpaqueStage:
     by_time: bool = True
 
     def evaluator(self, evaluators: Evaluators) -> Evaluator:
-        """Return what evaluates it.
-
-        Raises
-        ------
-        SimulationError
-            If nothing was given that does.
-        """
+        """Return what evaluates it."""
         if self.path not in evaluators:
             raise no_evaluator(self.path)
         return evaluators[self.path]
@@ -217,13 +211,7 @@ class Schedule:
 
     @property
     def function(self) -> Any:
-        """The one CasADi function of a schedule without opaque stages.
-
-        Raises
-        ------
-        SimulationError
-            Of a schedule that has some: there is no one function.
-        """
+        """The one CasADi function of a schedule without opaque stages."""
         if self.opaque:
             raise no_evaluator(self.opaque[0].path)
         return self.last.function

@@ -39,11 +39,6 @@ class Derivative:
         By which arguments, and which entries of them.
     values : bool, default: True
         Whether the results themselves are wanted, too.
-
-    Raises
-    ------
-    ParameterError
-        A derivative by the parameters, where a block with an evaluator has some.
     """
 
     def __init__(self, schedule: Schedule, by: Sequence[By], *, values: bool = True):

@@ -262,13 +262,7 @@ def _rounds(view: View) -> list[float]:
 
 
 def refuse_delays(loop: Any, name: str) -> None:
-    """Refuse the locus of a loop with delays, which has infinitely many branches.
-
-    Raises
-    ------
-    OptionError
-        If the loop has delays.
-    """
+    """Refuse the locus of a loop with delays, which has infinitely many branches."""
     if hasattr(loop, "delays"):
         raise OptionError(
             "found a loop with delays, whose poles are infinitely many; expected one without. Take a rational "

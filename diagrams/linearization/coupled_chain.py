@@ -155,13 +155,7 @@ class CoupledChain:
         return made
 
     def check_ticks(self, holds: bool) -> None:
-        """Refuse FMUs of which one does not step at a tick, as where the clock that it is wired to is held.
-
-        Raises
-        ------
-        OptionError
-            If one ``holds`` its outputs over a tick.
-        """
+        """Refuse FMUs of which one does not step at a tick, as where the clock that it is wired to is held."""
         if holds:
             raise OptionError(
                 "found an FMU that does not step at every tick, with a coupling whose inputs follow outputs within a "
@@ -194,11 +188,6 @@ def coupling_at(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) 
     """Return the steps of the coupling of the run at a point; None where inputs are held from a step's beginning.
 
     The default coupling holds them. Where every input comes from sampled subsystems, every scheme does.
-
-    Raises
-    ------
-    OptionError
-        If the run takes adaptive communication steps, or tells an FMU slopes.
     """
     for path, inputs in Links(flat).inputs.items():
         if inputs.stop > inputs.start and passes_slopes(flat.table.blocks[path]):

@@ -20,13 +20,7 @@ def name_of_cut(wire: str, inputs: Sequence[tuple[str, str]]) -> str:
 
 
 def cut_to(diagram: WiredDiagram, wire: str, to: str | Iterable[str]) -> tuple[WiredDiagram, str]:
-    """Return the diagram in which a wire has a name ahead of some of its consumers, and that name.
-
-    Raises
-    ------
-    UnknownNameError, WiringError
-        If there is no such input, it is fed by another wire, or inputs stand in several subsystems.
-    """
+    """Return the diagram in which a wire has a name ahead of some of its consumers, and that name."""
     flat = diagram.flatten(None if diagram.has_clock else STEP)
     inputs = find_inputs(diagram, flat, wire, [to] if isinstance(to, str) else to)
     name = name_of_cut(wire, inputs)

@@ -58,11 +58,6 @@ class DelayedFlow:
     ----------
     held : tuple of ndarray
         Places in x, w and d of the signals that are held between ticks.
-
-    Raises
-    ------
-    OptionError
-        If a delay acts back on itself between ticks.
     """
 
     def __init__(
@@ -91,13 +86,7 @@ class DelayedFlow:
         self._starts: dict[tuple[int, Fraction], Past] = {}
 
     def check_same(self, J: Numbers) -> None:
-        """Refuse derivatives at a later tick that are not those of the first.
-
-        Raises
-        ------
-        OptionError
-            If an entry differs by more than rounding.
-        """
+        """Refuse derivatives at a later tick that are not those of the first."""
         later = DelayedFlow(self.channels, self.continuous, J, self.ticks, self.period)
         for mine, other in zip(self._matrices(), later._matrices(), strict=True):
             if np.max(np.abs(mine - other), initial=0.0) > SAME_SLOPES * (1.0 + np.max(np.abs(mine), initial=0.0)):

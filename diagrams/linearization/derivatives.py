@@ -84,13 +84,7 @@ class Tap:
 
 
 def find_signal(flat: FlatDiagram, name: str) -> Tap:
-    """Return the port, or entries of one, that a name of a wire or port denotes.
-
-    Raises
-    ------
-    UnknownNameError
-        If the name denotes none, or several.
-    """
+    """Return the port, or entries of one, that a name of a wire or port denotes."""
     wires, ports = flat.table.names, flat.log.slices
     if not isinstance(name, str):
         raise UnknownNameError(f"found {name!r}; expected the name of a wire, or the path of a port. Give a text.")
@@ -359,11 +353,6 @@ class LocalDerivatives:
 
         ``found["z"]`` is a value, ``found["z", "w"]`` the derivative of z by w. Algebraic loops are solved, and
         eliminated by the implicit function theorem.
-
-        Raises
-        ------
-        NonFiniteError
-            If a derivative is not finite, such as that of a square root at zero.
         """
         if self.direction is not None:
             return self._differentiate_along(self.direction, acting, t, x, w)

@@ -119,11 +119,6 @@ def evaluators_at(flat: FlatDiagram, at: OperatingPoint) -> Evaluators | None:
     """Return the evaluators of the FMUs in model exchange at an operating point; None without such FMUs.
 
     Each point has instances of its own, with the discrete states there.
-
-    Raises
-    ------
-    FmuError
-        If an FMU can't be loaded, or doesn't accept the states of the point.
     """
     if not flat.in_model_exchange:
         return None

@@ -184,11 +184,6 @@ def find_free_motions(model: ClosedModel, required: Iterable[str] = ()) -> FreeM
         Linear model of a diagram.
     required : iterable of str
         Wires and ports on which something is required: a motion that changes one of them is not free.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such wire or port.
     """
     none = FreeMotions.none(len(model.A))
     kept = [i for i, name in enumerate(model.states) if name not in model.memory]

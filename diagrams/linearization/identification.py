@@ -98,11 +98,6 @@ def identify_step(
     samples : int
         Steps of a response.
 
-    Raises
-    ------
-    FmuError
-        If the FMU does not come to rest with these inputs, or rests at other outputs, or its responses are noise.
-
     Notes
     -----
     Each point of an FMU is identified once, however many loops are looked at; errors are not kept.
@@ -317,11 +312,6 @@ def realize(G: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
         Markov parameters from k = 1 on.
     noise : (outputs, inputs) ndarray
         Estimated errors of G.
-
-    Raises
-    ------
-    FmuError
-        If G is noise.
     """
     samples, q, p = G.shape
     rows = np.max(np.abs(G), axis=(0, 2), initial=0.0)

@@ -65,11 +65,6 @@ def split_inputs(
 
     Names of wires and outputs are left out: an input has what no signal is called. An injection at a block's port
     reaches that input alone.
-
-    Raises
-    ------
-    UnknownNameError
-        If a name is neither a signal nor an input that is wired.
     """
     found: dict[str, str] = {}
     for name in dict.fromkeys(names):
@@ -151,13 +146,7 @@ def _insert(table: Structure, inputs: Sequence[Port]) -> str:
 
 
 def name_wire_to(diagram: WiredDiagram, name: str, inputs: Sequence[Port]) -> WiredDiagram:
-    """Return the diagram with a block ahead of some consumers of a wire; the wire between them has a name.
-
-    Raises
-    ------
-    WiringError
-        If consumers stand in several subsystems.
-    """
+    """Return the diagram with a block ahead of some consumers of a wire; the wire between them has a name."""
     table = diagram.structure.copy()
     _check_one_subsystem(diagram, inputs)
     table.names[name] = Wire(_insert(table, inputs), "y")
@@ -203,15 +192,6 @@ def split_consumers(
     """Return the diagram with a block ahead of some consumers of a wire, its operating point, and the block's port.
 
     The block passes the signal on.
-
-    Raises
-    ------
-    OptionError
-        If there is not exactly one wire, or algebraic loops are solved for other signals with the block.
-    UnknownNameError
-        If there is no such input.
-    WiringError
-        If an input has another source, or consumers stand in several subsystems.
     """
     if len(wires) != 1:
         raise OptionError(
@@ -238,15 +218,7 @@ def _check_one_subsystem(diagram: WiredDiagram, inputs: Sequence[Port]) -> None:
 
 
 def find_inputs(diagram: WiredDiagram, flat: FlatDiagram, wire: str, to: Iterable[str]) -> list[Port]:
-    """Return the inputs of some names, which a wire feeds.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such input.
-    WiringError
-        If an input has another source.
-    """
+    """Return the inputs of some names, which a wire feeds."""
     signal, table = find_signal(flat, wire), diagram.structure
     fed = [port for port, source in table.wires.items() if (source.block, source.port) == signal.port]
     inputs = [_find_input(diagram, name, fed) for name in to]

@@ -545,11 +545,6 @@ def linearize_within(
     -------
     Linearization
         Its inputs are held over the period; its outputs are those of the first instant, then those of the next one, ….
-
-    Raises
-    ------
-    LoopwrightError
-        As of `linearize`.
     """
     return _linearize(
         diagram,
@@ -565,13 +560,7 @@ def linearize_within(
 
 
 def find_flow_poles(diagram: WiredDiagram, point: OperatingPoint) -> np.ndarray:
-    """Return the poles in 1/s of what moves on between two ticks, with everything sampled held.
-
-    Raises
-    ------
-    LoopwrightError
-        An FMU that gives no linear model of its equations.
-    """
+    """Return the poles in 1/s of what moves on between two ticks, with everything sampled held."""
     between = refine_ticks(diagram, point, 2)  # with ticks at which nothing acts, x holds all that is held there
     flat = diagram.flatten_like(between)
     local = LocalDerivatives(flat, (), (), (), evaluators_at(flat, between))

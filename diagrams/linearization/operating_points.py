@@ -34,13 +34,7 @@ MORE = {
 
 
 def capture(simulation: Simulation, how: PointOrigin = PointOrigin.RUN) -> OperatingPoint:
-    """Return the operating point at the tick that a simulation has reached.
-
-    Raises
-    ------
-    OptionError
-        If an FMU of one step length is on its way from one communication point to the next.
-    """
+    """Return the operating point at the tick that a simulation has reached."""
     flat, view = simulation.flat, simulation.view
     plants = {path: plant.operating_point() for path, plant in view.plants.items()}
     for path, reached in simulation.reached.items():
@@ -100,13 +94,7 @@ def with_residual(flat: FlatDiagram, point: OperatingPoint, x_next: np.ndarray) 
 
 
 def check_options(options: Mapping[str, Any], caller: str) -> None:
-    """Refuse options that a run to an operating point does not have; ``caller`` is the name of the method.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is such an option.
-    """
+    """Refuse options that a run to an operating point does not have; ``caller`` is the name of the method."""
     for name in options:
         if name not in RUN_OPTIONS:
             words = POINT if caller == "linearize" else {}
@@ -119,11 +107,6 @@ def operating_point(
     """Return an operating point: as it is, or by a run to a recorded instant, to a time in s or to the start (None).
 
     It is past the branches of the start that blocks have, unless ``begun`` is False.
-
-    Raises
-    ------
-    OptionError
-        If the point is of another type, of another diagram, or can't be reached.
     """
     if isinstance(point, OperatingPoint):
         return point
@@ -297,11 +280,6 @@ def copy_point(diagram: WiredDiagram, point: OperatingPoint, other: WiredDiagram
         The point.
     other : Diagram
         The other diagram.
-
-    Raises
-    ------
-    OptionError
-        If the point stands on no tick of the other diagram.
     """
     from ..simulation import copy_states
 

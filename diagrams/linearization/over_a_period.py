@@ -271,13 +271,7 @@ def model_loop(
     lifted: bool,
     frozen: frozenset[TickPattern] = NONE,
 ) -> tuple[Model, list[str]]:
-    """Return the model from the injected to the returning signals at the same wires, and the names of its channels.
-
-    Raises
-    ------
-    PeriodicLoopError
-        If a wire is renewed, and used, several times in the period, unless ``lifted``.
-    """
+    """Return the model from the injected to the returning signals at the same wires, and the names of its channels."""
     period, m = period_of(flat, frozen), local.n_inputs
     chain = Chain(flat, local, at, way, period, frozen)
     chain.go_on()

@@ -104,11 +104,6 @@ def differentiate_loop(
 
     left_out : dict, optional
         Takes the messages of parameters that have no derivative, by their paths; without it they are errors.
-
-    Raises
-    ------
-    UnknownNameError, ParameterError
-        A parameter that isn't there, isn't a number, or that the equations do not contain.
     """
     cut = _Cut(model, tuple(wires), slow)
     found = []

@@ -158,13 +158,7 @@ def plant_changes(flat: FlatDiagram, at: OperatingPoint) -> dict[str, np.ndarray
 
 
 def model_equations(flat: FlatDiagram, at: OperatingPoint, way: str | None) -> list[PlantModel]:
-    """Return the linear models of the equations of all FMUs.
-
-    Raises
-    ------
-    OptionError
-        If the model of a step is asked for: a continuous model has none.
-    """
+    """Return the linear models of the equations of all FMUs."""
     check_way(way)
     if way == "step" and plant_paths(flat):
         raise OptionError(
@@ -227,13 +221,6 @@ def model_step(
         equilibrium; "step" differences the step itself; "identified" takes pulse responses from rest. None takes the
         first at an equilibrium, else the second; where the FMU does not allow that, the first with its error, or the
         third.
-
-    Raises
-    ------
-    OptionError
-        If there is no such way.
-    FmuError
-        If an FMU can't be linearized in this way.
     """
     mine, w, wired = plant_entries(flat, path)
     block = fmu_at(flat, path)
@@ -471,13 +458,6 @@ def linearize_plant(diagram: WiredDiagram, at: OperatingPoint, path: str) -> Pla
         Instant of the diagram.
     path : str
         Path of the plant.
-
-    Raises
-    ------
-    FmuError
-        If the FMU gives no model of its equations.
-    ParameterError
-        If the block has no equations in continuous time.
     """
     flat, block = diagram.flatten_like(at), diagram.blocks[path]
     trace = flat.checked.traced.get(path)

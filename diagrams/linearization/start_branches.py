@@ -27,11 +27,6 @@ def leave_start(flat: FlatDiagram, x: np.ndarray, values: Mapping[str, Any]) -> 
         The vector x of the flattened diagram.
     values : mapping of str to array
         Signals by the paths of their ports, as an operating point has them.
-
-    Raises
-    ------
-    SimulationError, ShapeError, TraceError
-        A block's ``after_start`` that fails, or gives other states.
     """
     found = x.copy()
     for path, trace in flat.checked.traced.items():

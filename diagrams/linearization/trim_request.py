@@ -198,15 +198,7 @@ def read_targets(
     fixed: Iterable[str],
     bounds: Mapping[str, Any],
 ) -> Target:
-    """Return the wanted values from the arguments of `Diagram.trim`.
-
-    Raises
-    ------
-    UnknownNameError
-        If a state or signal is unknown.
-    OptionError
-        If a value has another shape.
-    """
+    """Return the wanted values from the arguments of `Diagram.trim`."""
     signals: list[tuple[tuple[str, str], tuple[int, ...]]] = []
     labels: list[str] = []
     wanted: list[np.ndarray] = []
@@ -268,13 +260,6 @@ def free_parameters(diagram: WiredDiagram, asked: Mapping[str, Any]) -> tuple[li
 
     A trace takes an exact zero for structure, so a parameter that is zero starts beside it. Start values of
     FMUs are no symbols.
-
-    Raises
-    ------
-    UnknownNameError
-        If a parameter is unknown.
-    ParameterError
-        If a parameter is no number, or the equations don't contain it.
     """
     found, moved = [], {}
     for name, given in asked.items():

@@ -308,11 +308,6 @@ def _make_basis(rows: np.ndarray) -> np.ndarray:
 
     Singular vectors of one value may be turned against each other. The columns are chosen by their lengths in the
     space, which a turn leaves as they are.
-
-    Parameters
-    ----------
-    rows : ndarray, shape (m, n)
-        Orthonormal rows.
     """
     pivots: list[int] = []
     rest = rows.copy()

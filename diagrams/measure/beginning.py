@@ -36,13 +36,7 @@ def has_transport_delay(diagram: WiredDiagram) -> bool:
 
 
 def can_start_at(diagram: WiredDiagram, point: OperatingPoint) -> bool:
-    """Return whether a run can start in the states of an operating point; if not, it has to run there.
-
-    Raises
-    ------
-    FmuError
-        An FMU whose states can't be set, at an operating point that no run has reached.
-    """
+    """Return whether a run can start in the states of an operating point; if not, it has to run there."""
     if point.how is not PointOrigin.RUN:
         return True
     if point.unjudged or has_transport_delay(diagram):  # FMUs that list no states, and the past of delays
@@ -55,13 +49,7 @@ def can_start_at(diagram: WiredDiagram, point: OperatingPoint) -> bool:
 
 
 def check_reached(simulation: Simulation, point: OperatingPoint) -> None:
-    """Refuse a repeated run that is not at its operating point: that was reached from another start.
-
-    Raises
-    ------
-    OptionError
-        A state, or an output of an FMU, that is elsewhere.
-    """
+    """Refuse a repeated run that is not at its operating point: that was reached from another start."""
     off = 0.0
     for found, expected in ((simulation.view.x, point.x), (simulation.view.w, point.w)):
         off = max(off, float(np.max(np.abs(found - expected) / (1.0 + np.abs(expected)), initial=0.0)))

@@ -86,13 +86,7 @@ def refine_tolerances(flat: FlatDiagram, chosen: Mapping[str, Any]) -> dict[str,
 
 
 def _check_size(run: InjectionRun, part: Part, v: np.ndarray, largest: float) -> None:
-    """Refuse to continue where a signal grows without end.
-
-    Raises
-    ------
-    SimulationError
-        If the signal at the wire is larger than any stable loop makes it.
-    """
+    """Refuse to continue where a signal grows without end."""
     size = float(np.max(np.abs(v), initial=0.0))
     if size <= largest:
         return

@@ -19,13 +19,7 @@ _SLOW_PART = 0.5  # part of the time between two ticks within which so many inst
 
 
 class OwnEvents:
-    """Counts of the events of blocks in model exchange, and the errors where they pile up.
-
-    Parameters
-    ----------
-    blocks : BlocksInModelExchange
-        The blocks.
-    """
+    """Counts of the events of blocks in model exchange, and the errors where they pile up."""
 
     def __init__(self, blocks: BlocksInModelExchange):
         self.flat: FlatDiagram = blocks.flat

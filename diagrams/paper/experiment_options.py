@@ -63,11 +63,6 @@ def merge(letter: str, duration: float, given: Mapping[str, Any], **own: Any) ->
         Options that were given.
     **own
         Options of this experiment alone, with their defaults.
-
-    Raises
-    ------
-    OptionError
-        For an unknown option, or a value that is out of range.
     """
     known = {**DEFAULTS, **own}
     for name in given:

@@ -19,13 +19,7 @@ _CONTROLLER = "controller"
 
 
 def plant_path(diagram: WiredDiagram) -> str:
-    """Return the path of the plant: the block whose acceleration is wired to the force sensor.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no force sensor, or no acceleration is wired to it.
-    """
+    """Return the path of the plant: the block whose acceleration is wired to the force sensor."""
     wire = diagram.structure.wires.get((SENSOR, "acceleration"))
     if wire is None:
         raise UnknownNameError(
@@ -43,13 +37,7 @@ def find_kinks(diagram: WiredDiagram, point: OperatingPoint | None) -> tuple[Fin
 
 
 def check_wires(diagram: WiredDiagram) -> None:
-    """Refuse a diagram with other blocks between those that the reduced loop is made from.
-
-    Raises
-    ------
-    ParameterError
-        If an input has another source than in Fig. 3, such as an encoder, a filter or an actuator.
-    """
+    """Refuse a diagram with other blocks between those that the reduced loop is made from."""
     plant, wires = plant_path(diagram), diagram.structure.wires
     for (block, port), expected in _expected_wires(diagram, plant).items():
         wire = wires.get((block, port))
@@ -92,14 +80,7 @@ def _expected_wires(diagram: WiredDiagram, plant: str) -> dict[tuple[str, str], 
 
 
 def delay_of(diagram: WiredDiagram) -> int:
-    """Return the samples of delay of the motor force: the controller's own, and that of the block ``computation``.
-
-    Raises
-    ------
-    ParameterError
-        If the sensors have another sample time or offset than the controller, or a delay, or if ``computation`` is
-        more than a delay.
-    """
+    """Return the samples of delay of the motor force: the controller's own, and that of the block ``computation``."""
     subsystems = diagram.subsystems
     controller, sensors = subsystems[_CONTROLLER], subsystems["sensors"]
     found = (sensors.sample_time, sensors.offset, sensors.delay)

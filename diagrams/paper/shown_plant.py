@@ -95,11 +95,6 @@ def check_plant(
         Position in m and velocity in m/s of both models; those of the plant without them.
     point : OperatingPoint, optional
         Instant of the diagram that gives the plant's other states; its start without it.
-
-    Raises
-    ------
-    ParameterError
-        If the plant has no linear model, another number of states, or other entries.
     """
     try:
         linear = _linearize_at(

@@ -162,15 +162,7 @@ def wire(
 
 
 def check_plant(plant: Fmu) -> None:
-    """Refuse a plant without the ports that Fig. 3 wires, and say which they are.
-
-    Raises
-    ------
-    UnknownNameError
-        If a port is missing.
-    ShapeError
-        If one has other than two entries.
-    """
+    """Refuse a plant without the ports that Fig. 3 wires, and say which they are."""
     inputs, outputs = plant.inputs, plant.outputs
     missing = [f"input {n!r}" for n in INPUTS if n not in inputs] + [
         f"output {n!r}" for n in OUTPUTS if n not in outputs

@@ -142,13 +142,7 @@ def column_labels(name: str, shape: tuple[int, ...]) -> list[str]:
 
 
 def import_library(name: str) -> Any:
-    """Import a library of the extra ``export``.
-
-    Raises
-    ------
-    OptionError
-        If it is not installed.
-    """
+    """Import a library of the extra ``export``."""
     try:
         return importlib.import_module(name)
     except ImportError as error:

@@ -37,11 +37,6 @@ def check_memory(
         One of so many samples is recorded.
     to : path, optional
         Folder on disk for the samples; without it they stay in memory.
-
-    Raises
-    ------
-    OptionError
-        If they need more than 80 % of the memory, or more than is free on the disk.
     """
     needed = -(-samples // every) * 8 * (width + 1)
     if to is None:

@@ -64,11 +64,6 @@ class Recorder:
         Header of the run on disk (`stored.header`); needed with ``to``.
     overwrite : bool
         Whether a stored run at ``to`` may be replaced.
-
-    Raises
-    ------
-    OptionError
-        For an ``every`` that is no positive integer, or if something at ``to`` is in the way.
     """
 
     row: Callable[[float, np.ndarray], None]
@@ -383,11 +378,6 @@ def select(
         Whether the states are kept.
     blocks : mapping, optional
         Blocks by path, for errors; see `resolve`.
-
-    Raises
-    ------
-    UnknownNameError
-        For a name that stands for no signal, or for several.
     """
     if record is None:
         return None if states else np.arange(layout.total)

@@ -81,13 +81,7 @@ def _lay_out(flat: FlatDiagram) -> StateLayout:
 
 
 def check_fits(state: RunState, flat: FlatDiagram, name: str) -> None:
-    """Refuse a state that another kind of diagram has made.
-
-    Raises
-    ------
-    OptionError
-        Another version, another base, other blocks, states or ports.
-    """
+    """Refuse a state that another kind of diagram has made."""
     if not isinstance(state, RunState):
         raise OptionError(
             f"found {shorten(state)}; expected a saved state. {_next_step(state)}",

@@ -52,11 +52,6 @@ def resolve(
         Blocks by path, whose names stand for their outputs; an error names their variables that are no ports.
     outputs : mapping, optional
         Outputs by their blocks' paths, where the blocks are not there: those of `outputs_of`.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is none, or several.
     """
     if not isinstance(name, str):
         raise UnknownNameError(
@@ -112,13 +107,7 @@ def find_blocks(name: str, paths: Collection[str]) -> list[str]:
 
 
 def _only_output(name: str, ports: Collection[str], outputs: BlockOutputs) -> str:
-    """Return the path of the only output of the blocks that a name stands for, "" where there is none.
-
-    Raises
-    ------
-    UnknownNameError
-        If there are several.
-    """
+    """Return the path of the only output of the blocks that a name stands for, "" where there is none."""
     paths = find_blocks(name, outputs)
     found = [full for path in paths for full in (f"{path}.{output}" for output in outputs[path]) if full in ports]
     if len(found) < 2:
@@ -144,13 +133,7 @@ def _hidden_variable(name: str, blocks: Mapping[str, Any]) -> tuple[str, str] | 
 
 
 def entries(full: str, layout: Layout, wires: Mapping[str, Wire]) -> np.ndarray:
-    """Return the numbers of a signal's entries in the vector of a sample, in the signal's shape.
-
-    Raises
-    ------
-    UnknownNameError
-        If the signal has no such entry.
-    """
+    """Return the numbers of a signal's entries in the vector of a sample, in the signal's shape."""
     name, entry = split_entry(full, {*wires, *layout.slices})
     wire = wires.get(name)
     whole = layout.index(name if wire is None else f"{wire.block}.{wire.port}")

@@ -177,11 +177,6 @@ def measure_info(
         Whether the signal is constant between its samples.
     final : float, optional
         Value that is expected at the end.
-
-    Raises
-    ------
-    OptionError
-        If there is hardly a sample after the step.
     """
     first = int(np.searchsorted(t, since * (1.0 - 1e-12) - 1e-12))
     after = t[first:]

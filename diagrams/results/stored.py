@@ -201,13 +201,7 @@ def header(
 
 
 def prepare(folder: Path, overwrite: bool) -> None:
-    """Check that a run may be written to a folder, without writing.
-
-    Raises
-    ------
-    OptionError
-        If something there may not be replaced.
-    """
+    """Check that a run may be written to a folder, without writing."""
     place = os.fspath(folder)
     with explain_disk_errors(f"the run can't be kept in {place!r}", place, OTHER_PATH, OptionError):
         if not folder.exists():
@@ -357,13 +351,7 @@ class Stored:
 
 
 def read(path: PathLike) -> Stored:
-    """Open a stored run.
-
-    Raises
-    ------
-    OptionError
-        If there is none, or one of another version.
-    """
+    """Open a stored run."""
     check_argument(path, kinds.path, "path", "Run.open")
     folder, place = Path(path), os.fspath(path)
     try:

@@ -69,11 +69,6 @@ class LoopSolver:
         Newton's method with the exact derivative; a step that makes the residual larger is halved, and on, as long as
         that helps. At the start, where no solution comes before, ``search`` begins from a few other values if that does
         not lead to one; of the solutions that are found, the nearest to the values in x is taken.
-
-        Raises
-        ------
-        SimulationError
-            If there is no solution, or Newton's method does not find it.
         """
         before = self.x[self.where].copy()
         found = self._seek()
@@ -129,13 +124,7 @@ class LoopSolver:
     # --- solutions that are not the only ones -------------------------------------------------------------------------
 
     def check_determined(self) -> None:
-        """Refuse values that the loops do not determine: neighbours in some direction solve them as well.
-
-        Raises
-        ------
-        SimulationError
-            With the entries that are free.
-        """
+        """Refuse values that the loops do not determine: neighbours in some direction solve them as well."""
         J = self.J
         gain = float(np.max(np.abs(J + np.eye(len(J))), initial=0.0))
         if not np.all(np.isfinite(J)):

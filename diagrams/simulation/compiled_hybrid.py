@@ -253,13 +253,7 @@ class HybridTicks:
         return found
 
     def _look_at(self, loop: CompiledHybrid, found: HybridOutcome) -> None:
-        """Take note of what has happened.
-
-        Raises
-        ------
-        SimulationError
-            If the run can't continue.
-        """
+        """Take note of what has happened."""
         loop.ticks.check()
         self._report()
         failure = loop.take_failure()

@@ -119,13 +119,7 @@ class PlantsInC:
     def continue_steps(
         self, loop: CompiledLoop, found: Outcome | HybridOutcome, k: int, following: int, last: int
     ) -> None:
-        """Continue with the steps from a visited tick to the next one, from the plant on that C could not go beyond.
-
-        Raises
-        ------
-        SimulationError
-            Of the first plant that fails, once no other one is under way.
-        """
+        """Continue with the steps from a visited tick to the next one, from the plant on that C could not go beyond."""
         if found.stage == REFUSED:
             self.go(k, following, last)
             return

@@ -282,11 +282,6 @@ class Engine:
             Records the samples.
         progress : callable
             Called with the time now and then, and at the end.
-
-        Raises
-        ------
-        SimulationError
-            With the block that is to blame.
         """
         self.is_ahead, ticks = False, self._ticks()
         if self._compile == "auto" and not self._generated:

@@ -99,13 +99,7 @@ class _Start:
         self._lengths: list[float] = []
 
     def make_pass(self) -> None:
-        """Make one pass.
-
-        Raises
-        ------
-        SimulationError
-            A value that is not finite, or a guard that fails.
-        """
+        """Make one pass."""
         workspace, delays = self.workspace, self.delays
         self._at = (workspace.here.w.copy(), workspace.here.x.copy())
         self.set_start(workspace)
@@ -185,13 +179,7 @@ class _Start:
         return w & Links(flat).smooth_outputs, x & bool(self.workspace.looped or self.exchanged)
 
     def search(self) -> None:
-        """Find the values that a pass returns unchanged.
-
-        Raises
-        ------
-        SimulationError
-            If there are none.
-        """
+        """Find the values that a pass returns unchanged."""
         here = self.workspace.here
         if self._ran_away:
             here.w[:], here.x[:] = self._first
@@ -272,13 +260,7 @@ def _set_initial_states(workspace: Workspace) -> None:
 
 
 def find_initial_state(flat: FlatDiagram, path: str, inputs: dict[str, Any], block: Block | None = None) -> np.ndarray:
-    """Return the initial state that a block, or another one in its place, computes from its inputs' columns, flat.
-
-    Raises
-    ------
-    SimulationError
-        An input that is not finite; a block that fails.
-    """
+    """Return the initial state that a block, or another one in its place, computes from its inputs' columns, flat."""
     trace = flat.checked.traced[path]
     for port, column in inputs.items():
         _check_finite(flat, path, port, column)

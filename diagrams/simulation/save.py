@@ -21,15 +21,7 @@ def can_save(engine: Engine) -> bool:
 
 
 def save_state(engine: Engine) -> RunState:
-    """Return the complete state of a run at the tick that it has reached.
-
-    Raises
-    ------
-    FmuError
-        An FMU that can't save its state, or can't turn it into bytes, or has asked for the end of the run.
-    OptionError
-        A run that has ended between two ticks.
-    """
+    """Return the complete state of a run at the tick that it has reached."""
     workspace, position = engine.workspace, engine.position
     if engine.ended_by:
         raise FmuError(
@@ -61,13 +53,7 @@ def save_state(engine: Engine) -> RunState:
 
 
 def restore_state(engine: Engine, state: RunState) -> None:
-    """Put a run into a state that fits it.
-
-    Raises
-    ------
-    FmuRuntimeError
-        An FMU that says that it has restored its state, and has not: an output stays as it was.
-    """
+    """Put a run into a state that fits it."""
     w = engine.workspace.here.w
     for path, plant in engine.plants.items():
         before = w.copy()

@@ -19,15 +19,7 @@ PASSES = 120
 
 
 def apply_point(diagram: WiredDiagram, point: OperatingPoint) -> WiredDiagram:
-    """Return the diagram with the parameters of an operating point, and with its FMUs started in their states there.
-
-    Raises
-    ------
-    FmuError
-        An FMU whose states can't be set at the start, and that starts in others.
-    OptionError
-        An FMU whose states or ports are in other units there.
-    """
+    """Return the diagram with the parameters of an operating point, and with its FMUs started in their states there."""
     point.check_units(diagram.blocks, diagram.name)
     changes: dict[str, Any] = dict(point.parameters)
     variant = diagram.replace(changes) if changes else diagram

@@ -109,13 +109,7 @@ class Workspace:
         self._evaluation(acting)()
 
     def check(self, acting: frozenset[TickPattern] = NONE) -> None:
-        """Raise the error of the first block that is to blame, if the last evaluation is not ok.
-
-        Raises
-        ------
-        SimulationError
-            A value that is not finite, or a guard that fails.
-        """
+        """Raise the error of the first block that is to blame, if the last evaluation is not ok."""
         if not self.ok[0]:
             raise failure(self.flat, self.here, self.log, acting, self.evaluators).at(t=float(self.here.t[0]))
 
@@ -178,13 +172,7 @@ class Workspace:
         return jump
 
     def set_parameters(self, path: str, block: Block) -> None:
-        """Let a block continue with the parameters of another one of its kind.
-
-        Raises
-        ------
-        ParameterError
-            If its equations change with them: another class, other options, another number in the place of a zero.
-        """
+        """Let a block continue with the parameters of another one of its kind."""
         self.check_equations(path, block)
         self.p[self.flat.parameters.slices[path]] = self.flat.pack(path, block)
 

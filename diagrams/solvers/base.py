@@ -316,13 +316,7 @@ FIXED = tuple(name for name, facts in METHODS.items() if facts.kind is MethodKin
 
 
 def solver_name(name: str) -> str:
-    """Return the name as `SOLVERS` spells it; capitals don't matter.
-
-    Raises
-    ------
-    OptionError
-        If it is none of them.
-    """
+    """Return the name as `SOLVERS` spells it; capitals don't matter."""
     spelled = {known.lower(): known for known in SOLVERS} | {"cvode": "CVODE_BDF"}
     if not isinstance(name, str) or name.lower() not in spelled:
         alike = OTHER_NAMES.get(str(name).lower())

@@ -79,11 +79,6 @@ def make_solver(
         They hold each step's error in entry i below about atol[i] + rtol·|x[i]|.
     max_step : float, optional
         Upper bound of the step, s.
-
-    Raises
-    ------
-    OptionError
-        If the name is unknown or an option is out of its range.
     """
     name, tolerance = _check(name, problem.size, rtol=rtol, atol=atol, max_step=max_step)
     longest = math.inf if max_step is None else float(max_step)
@@ -113,11 +108,6 @@ class Method(Integration):
         Step of a fixed-step method, s.
     max_step : float, optional
         Upper bound of the step of a variable-step method, s.
-
-    Raises
-    ------
-    OptionError
-        If the name is unknown or an option is out of its range.
     """
 
     def __init__(

@@ -139,13 +139,7 @@ def describe(case: StudyCase) -> str:
 def make_goal(
     loops: str | Iterable[str] | None, quantity: str | None, requirements: Requirements | None, diagram: str
 ) -> Goal:
-    """Return the numbers to be looked at.
-
-    Raises
-    ------
-    OptionError
-        If neither a number nor requirements are given, or both; no loop; requirements that limit no loop's number.
-    """
+    """Return the numbers to be looked at."""
     if (quantity is None) == (requirements is None):
         raise OptionError(
             f"found quantity={quantity!r} and requirements={requirements!r}; expected one of them. Give a number, such "

@@ -117,11 +117,6 @@ def confirm_case(
     """Return the confirmation of a case by a run of the diagram with its parameters.
 
     ``options`` are those of the linear models.
-
-    Raises
-    ------
-    OptionError
-        If the case could not be analysed, its loop has several wires, or the number can't be measured at one frequency.
     """
     if not case.loop or delay:
         raise OptionError(

@@ -56,11 +56,6 @@ class ContactTask:
                 [contact.hand.requirements]
                 stiffness = 5e4
                 with = {damping = 10}
-
-        Raises
-        ------
-        OptionError
-            A file that isn't there, isn't TOML or has no such table; an unknown entry, or a limit that is none.
         """
         file = source if isinstance(source, TomlFile) else TomlFile.read(source, TABLE)
         tables = file.table(TABLE)
@@ -84,23 +79,11 @@ class ContactTask:
         return cls(file, {name: {k: v for k, v in t.items() if k != REQUIRED} for name, t in named.items()}, limits)
 
     def check(self, diagram: WiredDiagram) -> None:
-        """Make the contacts, before anything else is computed.
-
-        Raises
-        ------
-        OptionError
-            A port, a wire or a direction that makes no contact. It names the file and the line.
-        """
+        """Make the contacts, before anything else is computed."""
         self.find(diagram)
 
     def find(self, diagram: WiredDiagram) -> Mapping[str, Contact]:
-        """Return the contacts by their names.
-
-        Raises
-        ------
-        OptionError
-            As `check`.
-        """
+        """Return the contacts by their names."""
         for name, given in self.places.items():
             if name in self._made and self._made[name].wired is diagram:
                 continue

@@ -61,11 +61,6 @@ def find_places(diagram: WiredDiagram, wires: Mapping[str, str], asked: Requirem
 
     They are those that requirements name. Else a wire that also feeds a model of the controller's own is cut ahead of
     the plant, and any other behind its source.
-
-    Raises
-    ------
-    UnknownNameError, WiringError
-        If the inputs of a requirement are none of the wire.
     """
     found: dict[str, LoopPlace] = {}
     flat = diagram.flatten(None if diagram.has_clock else STEP)
@@ -119,13 +114,6 @@ def place_loops(
     Places are those that requirements name, or ``to`` of a single wire: inputs of blocks, none for all consumers. Else
     a wire that also feeds a model of the controller's own is cut ahead of the plant, unless it is cut together with
     other wires.
-
-    Raises
-    ------
-    OptionError
-        If ``to`` is given beside several wires, or beside requirements, which have one of their own.
-    UnknownNameError, WiringError
-        If the inputs are none of the wire.
     """
     wires = [loops] if isinstance(loops, str) else list(loops or ())
     if to is not None and (requirements is not None or len(wires) != 1):

@@ -34,11 +34,6 @@ class ContactMeasure:
         The diagram.
     options : mapping
         Options of the run, and ``stairs``.
-
-    Raises
-    ------
-    OptionError
-        An unknown argument.
     """
 
     def __init__(self, given: Mapping[str, Any], diagram: WiredDiagram, options: Mapping[str, Any]):
@@ -99,13 +94,7 @@ class FunctionMeasure:
         self.name = name if name.isidentifier() else "value"
 
     def __call__(self, diagram: WiredDiagram, at: Any) -> Number:
-        """Return the function's value.
-
-        Raises
-        ------
-        OptionError
-            If it is no number, or the function fails.
-        """
+        """Return the function's value."""
         try:
             found = self._function(diagram.facade)
         except LoopwrightError:

@@ -67,11 +67,6 @@ def check_parameters(diagram: WiredDiagram, names: Iterable[str], study: str, *,
         The study, for errors.
     blocks : bool
         Whether whole blocks may be named.
-
-    Raises
-    ------
-    OptionError
-        Such a parameter.
     """
     for name in names:
         if name in diagram.structure.blocks and blocks:
@@ -124,13 +119,7 @@ def unit_of(diagram: WiredDiagram, parameter: str) -> str:
 
 
 def changed_entry(diagram: WiredDiagram, parameter: str, value: float) -> dict[str, Any]:
-    """Return the change for `Diagram.replace` that sets a parameter, or one entry of an array: ``"pid.poles[2]"``.
-
-    Raises
-    ------
-    OptionError
-        If an entry is meant that the parameter does not have.
-    """
+    """Return the change for `Diagram.replace` that sets a parameter, or one entry of an array: ``"pid.poles[2]"``."""
     name, bracket, entry = parameter.partition("[")
     if not bracket:
         return {name: value}

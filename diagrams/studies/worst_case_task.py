@@ -68,11 +68,6 @@ class WorstCaseTask:
                 [worst_case.ranges]
                 "plant.mass" = [0.9, 1.5]
                 "pid.kp" = {low = 1, high = 100, scale = "log"}
-
-        Raises
-        ------
-        OptionError
-            A file that isn't there, isn't TOML or has no such table; an unknown entry, or a value that is none.
         """
         file = source if isinstance(source, TomlFile) else TomlFile.read(source, TABLE)
         table = file.table(TABLE)
@@ -104,13 +99,7 @@ class WorstCaseTask:
         return cls(file, ranges, loops, limits, options)
 
     def check(self, diagram: WiredDiagram, requirements: Requirements | None = None) -> None:
-        """Check the task against a diagram, before anything is computed.
-
-        Raises
-        ------
-        OptionError
-            A parameter, a wire or a number that isn't there; a range that is none. It names the file and the line.
-        """
+        """Check the task against a diagram, before anything is computed."""
         flat = diagram.flatten(None if diagram.has_clock else STEP)
         for wire in self.loops:
             with _Placed(self.file, f"{TABLE}.loop"):
@@ -157,11 +146,6 @@ class WorstCaseTask:
             Told a line for every case.
         **options
             Of `Diagram.worst_case`, such as ``at``.
-
-        Raises
-        ------
-        OptionError
-            As `check`; or the diagram as it is can't be analysed. It names the file, the line and the entry.
         """
         self.check(diagram, requirements)
         given = {key: value for key, value in self.options.items() if key != "quantity"}

@@ -139,11 +139,6 @@ class BoundRun:
             Numbers of the diagram.
         progress : callable
             Called with the time in s now and then; an exception that it raises ends the run.
-
-        Raises
-        ------
-        SimulationError
-            As of `Diagram.simulate`; ``error.run`` holds what was recorded until then.
         """
         engine, recorder, started = self.engine, self.recorder, perf_counter()
         recorder.begin_again()

@@ -151,20 +151,6 @@ def run_on_cluster(plan: Plan, samples: Sequence[Sample], client: Any) -> Genera
     """Yield the outcomes of samples, in the order in which they are ready.
 
     A worker that ends gives its samples to others. A sample with which workers end again and again is a failure.
-
-    Parameters
-    ----------
-    plan : Plan
-        The sweep.
-    samples : sequence of Sample
-        The samples.
-    client : distributed.Client
-        The cluster.
-
-    Raises
-    ------
-    OptionError
-        If it is no client of a cluster, it has no workers, or they can't run the sweep.
     """
     if not all(hasattr(client, name) for name in ("submit", "nthreads", "cancel")):
         raise OptionError(

@@ -44,11 +44,6 @@ class LaneWorker(Worker):
     """Runs samples of a sweep side by side; those whose runs can't go so are run one after the other.
 
     A run that fails in its lane is run again by itself, which says what has happened.
-
-    Parameters
-    ----------
-    plan : Plan
-        The sweep.
     """
 
     def __init__(self, plan: Plan):

@@ -101,13 +101,7 @@ class Plan:
 
 
 class Worker:
-    """Runs samples of a sweep, one after the other; used in a ``with`` statement.
-
-    Parameters
-    ----------
-    plan : Plan
-        The sweep.
-    """
+    """Runs samples of a sweep, one after the other; used in a ``with`` statement."""
 
     width = 1
     """Samples that it is best given at a time."""

@@ -28,20 +28,6 @@ def run_in_processes(plan: Plan, samples: Iterable[Sample], count: int) -> Gener
     """Yield the outcomes of samples, in the order in which they are ready.
 
     A process that ends in a run, such as by a crash, makes only that sample a failure; another process continues.
-
-    Parameters
-    ----------
-    plan : Plan
-        The sweep.
-    samples : iterable of Sample
-        The samples.
-    count : int
-        Number of processes.
-
-    Raises
-    ------
-    OptionError
-        If the diagram, or a function of the sweep, can't be sent to a process, or no process can be started.
     """
     data = to_bytes(plan, plan.diagram.name)
     try:

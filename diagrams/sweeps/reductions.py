@@ -109,13 +109,7 @@ def settling_time(signal: str, *, band: float, target: float | None = None, sinc
 
 
 def check_reductions(reduce: Any, diagram: str) -> dict[str, Callable[[Run], Any]]:
-    """Return reductions by name.
-
-    Raises
-    ------
-    OptionError
-        If they are no mapping from names to functions of a run.
-    """
+    """Return reductions by name."""
     if not isinstance(reduce, Mapping) or not all(isinstance(name, str) for name in reduce):
         raise OptionError(
             f"found reduce={reduce!r}; expected reductions by name, such as {{'end': final('y')}}.", block=diagram

@@ -12,13 +12,7 @@ from .samples import Sample
 
 
 class SampleQueue:
-    """Samples that workers take, and the outcomes that they return.
-
-    Parameters
-    ----------
-    samples : iterable of Sample
-        The samples.
-    """
+    """Samples that workers take, and the outcomes that they return."""
 
     def __init__(self, samples: Iterable[Sample]):
         self._waiting, self._lock, self._closed = iter(samples), threading.Lock(), threading.Event()

@@ -35,11 +35,6 @@ class Store:
         Facts for people who look into the folder.
     overwrite : bool
         Replace a sweep of another revision in the folder.
-
-    Raises
-    ------
-    OptionError
-        If the folder holds something else.
     """
 
     def __init__(self, folder: Path, parts: Parts, about: dict[str, Any], *, overwrite: bool = False):
@@ -90,13 +85,7 @@ class Store:
             path.unlink()
 
     def read(self) -> dict[str, SampleOutcome]:
-        """Return the outcomes that are there, by the keys of their samples; unfinished parts don't count.
-
-        Raises
-        ------
-        OptionError
-            If a part can't be read.
-        """
+        """Return the outcomes that are there, by the keys of their samples; unfinished parts don't count."""
         found: dict[str, SampleOutcome] = {}
         for path in sorted(self.folder.glob("part-*.npz")):
             found.update(_read_part(path))

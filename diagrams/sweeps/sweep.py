@@ -141,15 +141,7 @@ def make_plan(
     count: int = 1,
     lanes: bool | int = False,
 ) -> Plan:
-    """Return a sweep as a value, with its names and options checked.
-
-    Raises
-    ------
-    OptionError
-        If nothing is to be kept, for options that are none of a run, or of a single run only.
-    UnknownNameError
-        For a signal or a parameter that isn't there.
-    """
+    """Return a sweep as a value, with its names and options checked."""
     name = diagram.name
     for option, reason in _REFUSED.items():
         if option in options:

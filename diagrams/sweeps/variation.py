@@ -67,13 +67,7 @@ class Variation:
         self._descriptions: dict[str, FmuDescription] = {}
 
     def find(self, parameters: Mapping[str, Any]) -> Numbers:
-        """Return the numbers of a sample.
-
-        Raises
-        ------
-        LoopwrightError
-            A value that a parameter does not take.
-        """
+        """Return the numbers of a sample."""
         other: set[str] = set()
         blocks: dict[str, Block] = {}
         starts: dict[str, dict[str, Any]] = {}

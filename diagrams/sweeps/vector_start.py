@@ -32,11 +32,6 @@ _KEPT = 1000
 class StartSearch:
     """What the start of a bound diagram's runs needs, read once.
 
-    Parameters
-    ----------
-    bound : BoundRun
-        The diagram.
-
     Attributes
     ----------
     source : StartSource or None

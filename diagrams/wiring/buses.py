@@ -101,13 +101,7 @@ def is_bus(value: object) -> bool:
 
 
 def flatten(bus: Any, owner: str, port: str) -> dict[tuple[str, ...], Signal]:
-    """Return the signals of a bus by the names that lead to each.
-
-    Raises
-    ------
-    WiringError
-        For a bus without signals, and a name that is none.
-    """
+    """Return the signals of a bus by the names that lead to each."""
     found: dict[tuple[str, ...], Signal] = {}
     for name, value in bus.items():
         try:

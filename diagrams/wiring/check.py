@@ -38,15 +38,7 @@ class Checked:
 
 
 def check(table: Structure) -> Checked:
-    """Check the wiring, and trace every block for the shapes it is wired to.
-
-    Raises
-    ------
-    WiringError
-        One of its kinds: `UnknownNameError`, `UnwiredInputError`, `ShapeError`, `UnitError`, `SampleTimeError`.
-    TraceError
-        A block whose equations can't be traced.
-    """
+    """Check the wiring, and trace every block for the shapes it is wired to."""
     _check_ports(table)
     traced, shapes = _infer_shapes(table)
     _check_subsystems(table, traced, shapes)

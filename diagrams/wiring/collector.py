@@ -46,13 +46,6 @@ class Collector:
     ----------
     roots : iterable of Wireable
         The calls that close the diagram.
-
-    Raises
-    ------
-    WiringError
-        For a root that is no call.
-    DoubleDriveError
-        For a block that is called twice.
     """
 
     def __init__(self, roots: Iterable[object]):
@@ -119,17 +112,7 @@ class Collector:
         self.consumers.setdefault(id(block), []).append(consumer)
 
     def structure(self) -> Structure:
-        """Return the structure.
-
-        Raises
-        ------
-        DuplicateNameError
-            If two blocks, subsystems or wires in one place have the same name.
-        UnwiredInputError
-            If an output of a block with inputs is used, and the block is never called.
-        WiringError
-            If a part of a part of a signal is taken across a subsystem's border.
-        """
+        """Return the structure."""
         places = _Places(self.subsystems.values())
         table = Structure(subsystems={"": SubsystemSettings("", None, "exact")})
         for inner in sorted(self.subsystems.values(), key=lambda s: (places.path(s).count("."), places.path(s))):

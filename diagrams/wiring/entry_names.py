@@ -22,13 +22,7 @@ def split_entry(name: str, known: Collection[str]) -> tuple[str, Entry]:
 
 
 def index_of(entry: Entry, shape: tuple[int, ...], name: str) -> tuple[int, ...]:
-    """Return the index of an entry in an array of a shape, counted from 0.
-
-    Raises
-    ------
-    UnknownNameError
-        If the array has no such entry.
-    """
+    """Return the index of an entry in an array of a shape, counted from 0."""
     if len(entry) == len(shape) and all(1 <= i <= n for i, n in zip(entry, shape, strict=True)):
         return tuple(i - 1 for i in entry)
     if len(entry) == 1 and 1 <= entry[0] <= int(np.prod(shape)) and shape:
@@ -41,15 +35,7 @@ def index_of(entry: Entry, shape: tuple[int, ...], name: str) -> tuple[int, ...]
 
 
 def with_entry(array: object, entry: Entry, value: object, name: str) -> object:
-    """Return an array of numbers with another value of one entry: an array, or lists if it was none.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no array of numbers, or it has no such entry.
-    ParameterError
-        If the value is not one number.
-    """
+    """Return an array of numbers with another value of one entry: an array, or lists if it was none."""
     whole = np.asarray(array)
     if whole.dtype.kind not in "iuf":
         raise UnknownNameError(f"{name!r} is {shorten(array)}, without entries that are numbers. Name it alone.")

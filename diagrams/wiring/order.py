@@ -77,11 +77,6 @@ def evaluation_order(
         The order of initialization; see `dependencies`.
     solve : bool
         Tear algebraic loops instead of refusing them.
-
-    Raises
-    ------
-    AlgebraicLoopError
-        A loop that is not to be solved, printed port by port.
     """
     waits = dependencies(table, traced, start=start)
     steps, stuck = _sort(traced, waits)

@@ -31,13 +31,6 @@ def find_name(table: Structure, name: object, diagram: str) -> str:
         The path, or its unique end.
     diagram : str
         The diagram's name, for errors.
-
-    Raises
-    ------
-    OptionError
-        If it is no text.
-    UnknownNameError
-        If nothing, or more than one thing, is called that; near names are offered.
     """
     name = check_name(name, diagram)
     if name in table.blocks:
@@ -65,13 +58,7 @@ def check_name(name: object, diagram: str) -> str:
 
 
 def find_place(table: Structure, name: str, diagram: str) -> tuple[str, list[str]]:
-    """Return the path of a block, and the names that lead to a parameter in it, from its path or the end of one.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such parameter, or more than one; near names are offered.
-    """
+    """Return the path of a block, and the names that lead to a parameter in it, from its path or the end of one."""
     path, keys = split_path(table, name, diagram)
     return path, _inside(table.blocks[path], path, keys)
 
@@ -81,11 +68,6 @@ def find_control(table: Structure, name: object, diagram: str) -> tuple[str, lis
 
     Next to a parameter (`find_place`), a source is named by its own name, or by that of the wire that comes out of it:
     ``value`` of the `Constant` or `Reference` there is meant.
-
-    Raises
-    ------
-    OptionError, UnknownNameError
-        As `find_place`; a wire that comes out of another block, with the parameters of that.
     """
     name = check_name(name, diagram)
     found = [name] if name in table.blocks else [path for path in table.blocks if path.endswith("." + name)]

@@ -35,14 +35,7 @@ ENABLED, TRIGGERED = ("held", "reset"), ("rising", "falling", "both")
 
 
 def exact_time(value: SupportsFloat | str, *, block: str = "") -> Fraction:
-    """Return a sample time as an exact fraction of a second: a Fraction as it is, a float as `read_time` reads it.
-
-    Raises
-    ------
-    SampleTimeError
-        If it is not positive, or a float that is neither a multiple of 1 ns nor a fraction with a denominator up to
-        10⁶, such as 1/3.
-    """
+    """Return a sample time as an exact fraction of a second: a Fraction as it is, a float as `read_time` reads it."""
     try:
         time = value if isinstance(value, Fraction) else read_time(float(value))
     except (TypeError, ValueError, OverflowError):
@@ -62,13 +55,7 @@ def exact_time(value: SupportsFloat | str, *, block: str = "") -> Fraction:
 
 
 def exact_offset(value: SupportsFloat | str, sample_time: Fraction | None, *, block: str) -> Fraction:
-    """Return an offset as an exact fraction of a second.
-
-    Raises
-    ------
-    SampleTimeError
-        If it is negative, not less than the sample time, or there is no sample time.
-    """
+    """Return an offset as an exact fraction of a second."""
     if isinstance(value, int | float | Fraction) and not isinstance(value, bool) and value == 0:
         return Fraction(0)
     offset = exact_time(value, block=block)
@@ -83,13 +70,7 @@ def exact_offset(value: SupportsFloat | str, sample_time: Fraction | None, *, bl
 
 
 def check_delay(value: object, sample_time: Fraction | None, *, block: str) -> int:
-    """Return a computational delay in samples, checked.
-
-    Raises
-    ------
-    SampleTimeError
-        If it is no whole number, is negative, or there is no sample time.
-    """
+    """Return a computational delay in samples, checked."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise SampleTimeError(f"found delay={value!r}; expected a whole number of samples, 0 or more.", block=block)
     if value and sample_time is None:

@@ -59,13 +59,7 @@ def follow_units(table: Structure, converted: Mapping[Port, Unit]) -> dict[Port,
 
 
 def check_units(table: Structure) -> dict[Port, Unit]:
-    """Return the units of all outputs that have one.
-
-    Raises
-    ------
-    UnitError
-        For a wire between two units.
-    """
+    """Return the units of all outputs that have one."""
     units = follow_units(table, {})
     for path, block in sorted(table.blocks.items()):
         first: tuple[Wire, Unit] | None = None

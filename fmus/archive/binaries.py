@@ -99,11 +99,6 @@ def check_binary(archive: FmuArchive, binary: str, version: str, *, model_exchan
         Version of FMI in the description.
     model_exchange : bool
         Whether it is for model exchange.
-
-    Raises
-    ------
-    FmuFileError
-        If the library is cut off or damaged, is for another machine, or lacks functions without which it can't run.
     """
     library, native, file = read_library(archive.read(binary)), native_platform(), str(archive.path)
     if library.platforms and native not in library.platforms:

@@ -40,12 +40,6 @@ def check_entries(
         Limits of its content.
     noun : str
         What the archive is, for messages: "FMU" or "SSP".
-
-    Raises
-    ------
-    FmuFileError
-        For a path out of the archive's folder, a link, an encrypted file, an unknown compression, different files of
-        one name (also by letter case), or sizes beyond the limits.
     """
     items = list(items)
     if len(items) > limits.entries:

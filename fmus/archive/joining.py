@@ -32,12 +32,6 @@ def join_scalars(description: FmuDescription, rename: Mapping[str, str], label: 
         FMU's names of ports and their new names; those without an index are left alone.
     label : str
         The block's name, for messages.
-
-    Raises
-    ------
-    ParameterError
-        If elements are missing or there twice, don't begin at 0 or 1, or are of different types, causalities,
-        variabilities or units; or if an array is to be an element.
     """
     if not rename or not any("[" in new for new in rename.values()):
         return description

@@ -28,11 +28,6 @@ def read_model(path: Path, text: bytes, root: Any, limits: ArchiveLimits | None 
         The root of that; references that don't exist are taken out of it.
     limits : ArchiveLimits, optional
         Limits of the number of elements of a variable.
-
-    Raises
-    ------
-    FmuFileError
-        If it can't be read, or is refused by `check_version`, `check_structure` or `check_variables`.
     """
     from fmpy.validation import validate_model_description
     from lxml import etree

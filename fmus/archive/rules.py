@@ -49,11 +49,6 @@ def check_version(path: Path, root: Any) -> None:
         The FMU, for messages.
     root : lxml.etree.Element
         Root of its description, with an ``fmiVersion``.
-
-    Raises
-    ------
-    FmuFileError
-        If the description is refused.
     """
     version, form = root.get("fmiVersion"), _form(root)
     if not re.fullmatch(KNOWN_VERSIONS, version) and not (version.startswith("3.") and form in ("", "3.0")):
@@ -101,11 +96,6 @@ def check_structure(path: Path, root: Any) -> None:
         The FMU, for messages.
     root : lxml.etree.Element
         Root of its description.
-
-    Raises
-    ------
-    FmuFileError
-        If the description is refused.
     """
     variables = root.find("ModelVariables")
     if variables is None:
@@ -141,13 +131,6 @@ def check_variables(path: Path, root: Any, model: Any, limits: ArchiveLimits) ->
         FMPy's reading of it.
     limits : ArchiveLimits
         Limits; `elements` counts.
-
-    Raises
-    ------
-    FmuFileError
-        If two variables have one name, unless the second is a local that is no state; if two have one value reference
-        with different types or shapes; if a reference is no unsigned integer of 32 bits, a variable of FMI 1.0 or 2.0
-        has no type, or a variable has a negative size or too many elements.
     """
 
     def refuse(fault: FmuFault, name: str, text: str) -> FmuFileError:

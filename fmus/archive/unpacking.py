@@ -22,16 +22,7 @@ RESOURCES = "resources"
 
 
 def unpack(description: FmuDescription) -> Path:
-    """Unpack an FMU, once for each content, and return the folder of its files.
-
-    Raises
-    ------
-    FmuError
-        If the cache can't be written, or is full.
-    FmuFileError
-        If the archive can't be unpacked or is not the file that was described, or if the library for this platform
-        can't be loaded safely.
-    """
+    """Unpack an FMU, once for each content, and return the folder of its files."""
     folder, resources = _place_of(cache_folder(), description.digest)
     if os.path.exists(resources):
         return folder
@@ -58,15 +49,7 @@ def _place_of(cache: Path, digest: str) -> tuple[Path, Path]:
 
 
 def unpack_archive(archive: FmuArchive, folder: Path) -> None:
-    """Unpack a checked archive into a folder, which appears whole or not at all.
-
-    Raises
-    ------
-    FmuError
-        If the folder can't be written.
-    FmuFileError
-        If a file in the archive is damaged.
-    """
+    """Unpack a checked archive into a folder, which appears whole or not at all."""
     check_cache()
     with explain_cache_errors(f"the {archive.noun} {str(archive.path)!r} can't be unpacked"):
         folder.parent.mkdir(parents=True, exist_ok=True)

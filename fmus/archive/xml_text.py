@@ -25,11 +25,6 @@ def parse_xml(path: Path, name: str, text: bytes, noun: str = "FMU") -> Any:
         Its content.
     noun : str
         What it is part of, for messages: "FMU" or "SSP".
-
-    Raises
-    ------
-    FmuFileError
-        If it is no XML, or defines entities.
     """
     from lxml import etree
 

@@ -65,13 +65,7 @@ class FmuArchive:
     def open(
         cls, file: str | os.PathLike[str], limits: ArchiveLimits | None = None, *, noun: str = "FMU"
     ) -> FmuArchive:
-        """Open an archive and check its table of contents.
-
-        Raises
-        ------
-        FmuFileError
-            If the file is missing or no zip archive, or is refused by `check_entries`.
-        """
+        """Open an archive and check its table of contents."""
         path, limits = Path(file).expanduser(), limits or ArchiveLimits()
         with _reading(path, noun):
             if not path.is_file():
@@ -98,11 +92,6 @@ class FmuArchive:
             Its path in the archive, with forward slashes.
         most : int, optional
             Largest size in bytes; the limit of the whole archive without one.
-
-        Raises
-        ------
-        FmuFileError
-            If it is missing, damaged or too large.
         """
         return b"".join(self.chunks(name, most))
 
@@ -131,13 +120,7 @@ class FmuArchive:
                 raise zipfile.BadZipFile(f"{name} is not as long as the table of contents says")
 
     def description(self) -> bytes:
-        """Return the text of ``modelDescription.xml``.
-
-        Raises
-        ------
-        FmuFileError
-            If it is missing, damaged or too large.
-        """
+        """Return the text of ``modelDescription.xml``."""
         if DESCRIPTION not in self.files:
             nested = next((name for name in self.files if name.endswith(f"/{DESCRIPTION}")), None)
             other = next((name for name in self.files if name.casefold() == DESCRIPTION.casefold()), None)
@@ -150,13 +133,7 @@ class FmuArchive:
         return self.read(DESCRIPTION, self.limits.description)
 
     def for_fmpy(self) -> io.BytesIO:
-        """Return an archive of the checked descriptions only, so that FMPy sees nothing else.
-
-        Raises
-        ------
-        FmuFileError
-            If a description is missing, damaged, too large or unsafe XML.
-        """
+        """Return an archive of the checked descriptions only, so that FMPy sees nothing else."""
         texts = {DESCRIPTION: self.description()}
         if BUILD_DESCRIPTION in self.files:
             texts[BUILD_DESCRIPTION] = self.read(BUILD_DESCRIPTION, self.limits.description)

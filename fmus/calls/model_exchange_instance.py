@@ -475,15 +475,7 @@ class ModelExchangeInstance(RunningFmu):
         return self.about.can_serialize
 
     def serialize(self) -> bytes:
-        """Return its complete state.
-
-        Raises
-        ------
-        FmuError
-            If the FMU can't serialize its state (`can_serialize`).
-        FmuRuntimeError
-            If the FMU's function fails.
-        """
+        """Return its complete state."""
         self._check_can()
         self._final = False
         handle = self.call("saving its state", self.fmi.save_state)
@@ -495,15 +487,7 @@ class ModelExchangeInstance(RunningFmu):
         return _FORMAT.pack(self.description.digest, self.t, self.next_time, data=data)
 
     def restore_bytes(self, data: bytes) -> None:
-        """Go to a state that `serialize` has returned.
-
-        Raises
-        ------
-        FmuError
-            If the bytes are no state of this FMU in model exchange on this platform.
-        FmuRuntimeError
-            If the FMU's function fails.
-        """
+        """Go to a state that `serialize` has returned."""
         self._check_can()
         n = 8 * sum(v.size for v in self._ports.values())
         (t, next_time), rest = _FORMAT.unpack(data, self.description.digest, self.block.label, least=n)

@@ -200,13 +200,7 @@ class StateFormat:
         return self._head.pack(self._magic, *self._identify(digest), *numbers) + data
 
     def unpack(self, data: bytes, digest: str, label: str, *, least: int = 0) -> tuple[tuple[Any, ...], bytes]:
-        """Return the numbers of a state, and the FMU's bytes, which are not less than so many.
-
-        Raises
-        ------
-        FmuError
-            If the bytes are no state of the FMU with this digest on this platform; ``label`` names its block.
-        """
+        """Return the numbers of a state, and the FMU's bytes, which are not less than so many."""
         if len(data) < self.size + least or not data.startswith(self._magic):
             raise FmuError(
                 f"found {len(data)} bytes that are no {self._kind}; expected {self._expected}. Give these.", block=label

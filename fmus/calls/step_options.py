@@ -114,13 +114,7 @@ class StepOptions:
 
 
 def check_offered(options: StepOptions, about: FmuDescription, label: str) -> None:
-    """Refuse options that an FMU does not offer.
-
-    Raises
-    ------
-    ParameterError
-        With the option's name as its port.
-    """
+    """Refuse options that an FMU does not offer."""
     for name, offered, needed in (
         ("event_mode", about.has_event_mode, "hasEventMode is false in its description"),
         ("early_return", about.fmi.startswith("3"), f"only FMI 3.0 has that, and it is of FMI {about.fmi}"),

@@ -63,11 +63,6 @@ def temporary_folder(failed: str, raised: type[LoopwrightError] = DiskError, **w
     """Yield a fresh folder among the system's temporary files, which is removed when the block ends.
 
     Parameters are those of `explain_disk_errors`, which covers the block.
-
-    Raises
-    ------
-    LoopwrightError
-        Of the class ``raised``: the folder can't be made, or a file in it can't be written.
     """
     folder = make_temporary_folder(failed, raised, **where)
     try:
@@ -83,11 +78,6 @@ def make_temporary_folder(
     """Return a fresh folder among the system's temporary files, as `make_folder` does.
 
     The other parameters are those of `explain_disk_errors`.
-
-    Raises
-    ------
-    LoopwrightError
-        Of the class ``raised``: it can't be made.
     """
     place = next((value for name in ("TMPDIR", "TEMP", "TMP") if (value := os.environ.get(name))), "/tmp")
     try:

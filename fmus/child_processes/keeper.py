@@ -26,13 +26,7 @@ _LONGEST_END = 10.0  # s that a keeper may take to end all and itself
 
 
 def find_python() -> str:
-    """Return the program of this Python.
-
-    Raises
-    ------
-    LoopwrightError
-        If Python doesn't know it, as in a program that embeds Python.
-    """
+    """Return the program of this Python."""
     if not sys.executable:
         raise LoopwrightError(
             f"sys.executable is {sys.executable!r}, so that no other Python process can be started; expected the path "

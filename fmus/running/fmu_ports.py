@@ -37,11 +37,6 @@ def choose_ports(
         Variables that are ports; None for all inputs and outputs.
     label : str
         The block's name, for messages.
-
-    Raises
-    ------
-    UnknownNameError, ParameterError
-        For a name that is no variable, a variable that can't be a port, and two ports of one name.
     """
     members = {n: description.elements[n][0] for n in description.members}
     names = {n: port for n, port in rename if n not in members} | dict(description.joined)
@@ -190,13 +185,7 @@ def _check_chosen(description: FmuDescription, chosen: tuple[str, ...], label: s
 def find_element(
     description: FmuDescription, outputs: Mapping[str, FmuVariable], name: str, label: str
 ) -> tuple[str, int] | None:
-    """Return the port of a vector and the place in it that an FMU's name of an element means; None for other names.
-
-    Raises
-    ------
-    UnknownNameError
-        For an element of a matrix.
-    """
+    """Return the port of a vector and the place in it that an FMU's name of an element means; None for other names."""
     array, index = description.elements.get(description.spelled.get(name, name), ("", ()))
     ports = [port for port, v in outputs.items() if v.name == array]
     if not ports:

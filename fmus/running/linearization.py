@@ -436,11 +436,6 @@ def find_step_gap(
         As of `Fmu.step_difference`.
     A, B : ndarray
         States after the step, by states before it and by inputs.
-
-    Raises
-    ------
-    FmuError
-        If the FMU can't take the steps.
     """
     point = FmuPoint(block, t, state, inputs)
     about = point.about

@@ -33,15 +33,7 @@ def interface_text(about: FmuDescription, used: str) -> str:
 
 
 def choose_interface(description: FmuDescription, asked: str | None, label: str) -> str:
-    """Return the interface by which an FMU runs: that asked for, else co-simulation where it offers it.
-
-    Raises
-    ------
-    ParameterError
-        For an unknown name.
-    FmuFileError
-        If the FMU doesn't offer the interface.
-    """
+    """Return the interface by which an FMU runs: that asked for, else co-simulation where it offers it."""
     if asked is None:
         return INTERFACES[0] if description.co_simulation else INTERFACES[1]
     there = description.co_simulation if asked == INTERFACES[0] else description.exchange is not None

@@ -30,11 +30,6 @@ def take_shifted_steps(
     -------
     list of (ndarray, ndarray)
         States and outputs at the end of the step.
-
-    Raises
-    ------
-    FmuError
-        If a state can't be set at the start, or the FMU can't take the steps.
     """
     point = FmuPoint(block, t, state, inputs)
     about = point.about

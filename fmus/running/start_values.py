@@ -15,13 +15,7 @@ from .fmu_ports import taken_apart
 
 
 def check_start(description: FmuDescription, start: Mapping[str, Any], label: str) -> dict[str, Any]:
-    """Return start values in their variables' shapes; those of a gathered array's scalars are put into the array's.
-
-    Raises
-    ------
-    UnknownNameError, ParameterError
-        For an unknown variable, one that can't be set, another shape or type, and a value out of its range.
-    """
+    """Return start values in their variables' shapes; those of a gathered array's scalars are put into the array's."""
     found: dict[str, Any] = {}
     parts: dict[str, dict[str, Any]] = {}
     for name, value in start.items():
@@ -63,13 +57,7 @@ def check_start(description: FmuDescription, start: Mapping[str, Any], label: st
 
 
 def check_state(variable: FmuVariable, value: Any, label: str) -> np.ndarray:
-    """Return a state's value in its shape; it need not be one that can be set at the start.
-
-    Raises
-    ------
-    ParameterError
-        For another shape, and numbers that are not finite.
-    """
+    """Return a state's value in its shape; it need not be one that can be set at the start."""
     try:
         found = np.array(np.broadcast_to(np.asarray(value, dtype=float), variable.shape))
     except (TypeError, ValueError):
@@ -237,13 +225,6 @@ def read_sized(
         Limits of the file.
     label : str
         Name of the block, for messages.
-
-    Raises
-    ------
-    FmuFileError
-        If the file can't be used here.
-    ParameterError
-        If a structural parameter can't have the value.
     """
     try:
         description = read_description(file, limits=limits)
