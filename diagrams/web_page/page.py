@@ -15,18 +15,25 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+import numpy as np
+
 from ...blocks.core import OptionError, accepts, brief, check_file, explain_calls, kinds, write_text
-from ..drawing import Facts, draw
+from ..drawing import Drawing, Facts, draw
 from ..flat import Target, WiredDiagram
-from ..wiring import Wire
+from ..results import Run
+from ..wiring import Wire, join
 from .module import Tuned, make_module
+from .notebook_link import Change, PageRecord, runs_in_kernel
+from .repeated import repeat
 from .shown_signals import PlotNames, ShownColumns, plots_of
 from .sliders import Slider, default_sources, find_sliders, place_of
 
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
 SPANS = (2.0, 5.0, 10.0, 30.0, 60.0)
 _SCRIPTS = ("shared", "model", "record", "plots", "sliders", "page")
-_LARGEST_DRAWING = 400_000
+_LARGEST_DRAWING, _LARGEST_PICTURE = 400_000, 60_000
+_DATA = '<script type="application/json" id="lw-data">{'
+"""What the page's data begins with; in a notebook a key of it comes first."""
 _HINT = (
     "Double-click a name to set it back. Keys: space runs and pauses, → is one step, r resets. Point at a plot to read "
     "its numbers."
@@ -64,9 +71,31 @@ class PageText:
     hint: str = _HINT
 
 
+@dataclass(frozen=True)
+class Played:
+    """Parts of a page that its record needs.
+
+    Attributes
+    ----------
+    diagram : Diagram
+        The diagram.
+    columns : ShownColumns
+        Columns of a sample.
+    sliders : mapping of str to Slider
+        All that is moved, by name.
+    options : mapping
+        The step and the solver.
+    """
+
+    diagram: Any
+    columns: ShownColumns
+    sliders: Mapping[str, Slider]
+    options: Mapping[str, Any]
+
+
 @explain_calls
 class WebPage:
-    """A page on which a diagram runs; a notebook shows it.
+    """A page on which a diagram runs; a notebook shows it, and what was played there comes back.
 
     Attributes
     ----------
@@ -74,28 +103,113 @@ class WebPage:
         The page: a whole file.
     size : int
         Its size in bytes.
+    run : Run
+        The samples since the page's last reset, in a notebook.
+    changes : list of Change
+        What was moved meanwhile, in a notebook.
 
     Methods
     -------
     save(path)
         Write it to a file.
+    simulate()
+        Return the same run in Python.
     """
 
-    def __init__(self, html: str, name: str, height: int):
-        self.html, self._name, self._height = html, name, height
+    def __init__(self, html: str, name: str, height: int, picture: str, played: Played):
+        self.html, self._name, self._height, self._picture, self._played = html, name, height, picture, played
+        self._record = PageRecord(len(played.columns.found) + 1)
 
     @property
     def size(self) -> int:
         """Size of the page in bytes."""
         return len(self.html.encode())
 
+    @property
+    def run(self) -> Run:
+        """The samples since the page's last reset, of the signals that the page has.
+
+        They come while the page is played in a notebook of JupyterLab with the extra ``notebook``.
+
+        Raises
+        ------
+        OptionError
+            If nothing has come.
+        """
+        flat, rows = self._played.columns.flat, self._rows()
+        return Run(
+            t=rows[:, 0].copy(),
+            data=rows[:, 1:],
+            layout=flat.log,
+            wires=dict(flat.table.names),
+            units={join(*port): unit for port, unit in flat.checked.units.items()},
+            diagram=self._played.diagram,
+            tier="page",
+            messages=(self._record.message,) if self._record.message else (),
+            columns=np.array([column.place for column in self._played.columns.found]),
+            has_states=False,
+        )
+
+    @property
+    def changes(self) -> list[Change]:
+        """What was moved since the page's last reset: number of samples before, time, name and value.
+
+        Raises
+        ------
+        OptionError
+            If nothing has come.
+        """
+        self._rows()
+        return self._record.changes
+
+    def simulate(self) -> Run:
+        """Return the same run in Python: as long, with the same moves after the same samples.
+
+        Where the diagram has no elementary functions, its samples are those of `run` bit for bit.
+
+        Raises
+        ------
+        OptionError
+            If nothing has come; if a parameter of an FMU was moved while the page ran.
+        """
+        played, rows = self._played, self._rows()
+        return repeat(played.diagram, played.sliders, self._record.changes, float(rows[-1, 0]), played.options)
+
+    def _rows(self) -> np.ndarray:
+        rows = self._record.rows
+        if not len(rows):
+            raise OptionError(f"found no sample of this page; {self._why_nothing()}", block=self._name, port="run")
+        return rows
+
+    def _why_nothing(self) -> str:
+        if not runs_in_kernel():
+            return (
+                "they come back from a page that is shown in a notebook. Elsewhere save the record as CSV on the page."
+            )
+        if not self._record.listen():
+            return (
+                "expected the package anywidget, which brings them back. Install it: pip install "
+                '"loopwright[notebook]", restart the kernel, and reload the window.'
+            )
+        return (
+            "expected the page to be shown in this notebook. Show it (the page as last line of a cell), and press Run."
+        )
+
     def __repr__(self) -> str:
-        return brief(f"page of {self._name!r}", f"{self.size / 1e3:.0f} kB", then=".save('page.html'), .html")
+        return brief(f"page of {self._name!r}", f"{self.size / 1e3:.0f} kB", then=".save('page.html'), .html, .run")
 
     def _repr_html_(self) -> str:
+        html = self.html
+        if self._record.listen():
+            html = html.replace(_DATA, f'{_DATA}"key":"{self._record.key}",', 1)
+        # sites and notebooks that forbid frames leave the text and the picture below it
         return (
-            f'<iframe sandbox="allow-scripts allow-downloads" style="width:100%;height:{self._height}px;border:0" '
-            f'srcdoc="{escape(self.html, quote=True)}"></iframe>'
+            f'<div style="position:relative;height:{self._height}px;overflow:hidden">'
+            f'<div aria-hidden="true"><p>The page of {escape(self._name)} is shown in a trusted notebook (JupyterLab: '
+            f"Trust Notebook in the command palette), or when this cell has run.</p>{self._picture}</div>"
+            '<iframe sandbox="allow-scripts allow-downloads" title="the page" '
+            'style="position:absolute;top:0;left:0;width:100%;height:100%;border:0" '
+            f'srcdoc="{escape(html, quote=True)}"></iframe></div>'
         )
 
     @accepts(path=kinds.path)
@@ -176,7 +290,7 @@ def make_page(
     def place(one: Slider) -> int:  # those of FMUs from -1 downwards
         return place_of(one, spec) if one.reference is None else -1 - tuned_plants.index(_tuned(one))
 
-    hidden = {} if scene is None else {n: place_of(Slider.of_scene(n, t, i), spec) for n, (t, i) in scene.moved.items()}
+    pulled = {} if scene is None else {n: Slider.of_scene(wired, n, t, i) for n, (t, i) in scene.moved.items()}
     data = {
         "name": wired.name,
         "step": float(spec.base),
@@ -192,7 +306,7 @@ def make_page(
             for head, group in groups
             if group
         ],
-        "hidden": hidden,
+        "hidden": {name: place_of(one, spec) for name, one in pulled.items()},
         "labels": [list(label) for label in spec.labels],
         "plants": list(module.plants),
         "guards": [list(guard) for guards in spec.guards for guard in guards.names],
@@ -201,9 +315,11 @@ def make_page(
     }
     if path is not None:
         _check_page(path)
-    html = _fill(text, data, module.compile(), _draw(wired, facts), scene, speed=speed, span=span)
-    height = 240 + 180 * len(shown) + (460 if scene else 0)
-    page = WebPage(html, wired.name, min(height, 900))
+    drawing = draw(wired.structure, wired.name, facts)
+    html = _fill(text, data, module.compile(), _choose(drawing), scene, speed=speed, span=span)
+    height = 130 + max(180 * len(shown) + (460 if scene else 0), 90 + 57 * len(every))
+    played = Played(wired.facade, columns, {one.name: one for one in every} | pulled, {"step": step, "solver": solver})
+    page = WebPage(html, wired.name, min(height, 900), _still(drawing), played)
     if path is not None:
         page.save(path)
     return page
@@ -227,10 +343,19 @@ def _slider(one: Slider, place: int, labels: Mapping[str, str]) -> dict[str, Any
     }
 
 
-def _draw(wired: WiredDiagram, facts: Facts) -> str:
-    """Return the drawing: the one that answers, or where that is large the picture alone."""
-    drawing = draw(wired.structure, wired.name, facts)
+def _choose(drawing: Drawing) -> str:
+    """Return the drawing that answers, or where that is large the picture alone."""
     return drawing.html if len(drawing.html) < _LARGEST_DRAWING else drawing.svg
+
+
+def _still(drawing: Drawing) -> str:
+    """Return the drawing as a picture without a script; nothing where it is large."""
+    svg = drawing.svg.encode()
+    return (
+        ""
+        if len(svg) > _LARGEST_PICTURE
+        else f'<img alt="" src="data:image/svg+xml;base64,{base64.b64encode(svg).decode()}">'
+    )
 
 
 def _fill(

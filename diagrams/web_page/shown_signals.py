@@ -30,6 +30,8 @@ class ShownColumn:
         Where it comes from.
     entry : int
         Its place in the output, flat.
+    place : int
+        Its place among all outputs of a sample.
     """
 
     name: str
@@ -37,6 +39,7 @@ class ShownColumn:
     block: str
     port: str
     entry: int
+    place: int
 
 
 @dataclass
@@ -83,7 +86,7 @@ class ShownColumns:
         unit: Any = self.flat.checked.units.get((block, output))
         if isinstance(unit, tuple):
             unit = unit[entry] if entry < len(unit) else None
-        self.found.append(ShownColumn(name, "" if unit in (None, "1") else str(unit), block, output, entry))
+        self.found.append(ShownColumn(name, "" if unit in (None, "1") else str(unit), block, output, entry, place))
         return len(self.found) - 1
 
 

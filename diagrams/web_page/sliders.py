@@ -29,10 +29,11 @@ class _Bounds:
     maximum: float | None
 
     @classmethod
-    def of(cls, least: float | None, most: float | None) -> _Bounds:
-        """Return the bounds of a variable; the least number above 0 is how an FMU says "above 0"."""
-        is_open = least is not None and 0.0 < least <= np.finfo(float).tiny
-        return cls(None if is_open else least, 0.0 if is_open else None, most)
+    def of(cls, least: Any, most: Any) -> _Bounds:
+        """Return the bounds of a variable, of all its entries; the least number above 0 says "above 0"."""
+        lowest = None if least is None else float(np.max(least))
+        is_open = lowest is not None and 0.0 < lowest <= np.finfo(float).tiny
+        return cls(None if is_open else lowest, 0.0 if is_open else None, None if most is None else float(np.min(most)))
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,8 @@ class Slider:
         What the page calls it.
     reference : int or None
         Of a parameter of an FMU the value reference, in which ``entry`` counts; None for one of a block.
+    index : str
+        The entry that the keys don't have, such as ``[2]``; empty of a number, and where the keys have it.
     """
 
     name: str
@@ -67,16 +70,29 @@ class Slider:
     unit: str = ""
     label: str = ""
     reference: int | None = None
+    index: str = ""
 
     @classmethod
-    def of_scene(cls, name: str, target: Target, entry: int) -> Slider:
+    def of_scene(cls, wired: WiredDiagram, name: str, target: Target, entry: int) -> Slider:
         """Return a number that a picture moves, which has no range."""
-        return cls(name, target[0], tuple(target[1]), entry, 0.0, 0.0, 0.0)
+        path, keys = target
+        values = np.asarray(_value_of(wired.structure.blocks[path], keys)[0])
+        index = f"[{_number(entry, values.shape)}]" if values.ndim else ""
+        return cls(name, path, tuple(keys), entry, float(values.flat[entry]), 0.0, 0.0, index=index)
 
     @property
     def target(self) -> Target:
         """The parameter, as `find_control` names it."""
         return self.path, [*self.keys]
+
+    @property
+    def parameter(self) -> str:
+        """The number's dotted path, with the entry of an array, as `Diagram.replace` takes it."""
+        return ".".join([self.path, *self.keys[:-1], self.keys[-1] + self.index])
+
+    def value_in(self, block: Block) -> float:
+        """Return the number in a variant of the block."""
+        return float(np.ravel(_value_of(block, list(self.keys))[0])[self.entry])
 
     @property
     def is_logarithmic(self) -> bool:
@@ -141,10 +157,12 @@ def _sliders_of(wired: WiredDiagram, name: str, limits: Any, option: str) -> lis
     chosen = [entry] if entry is not None else range(values.size)
     sliders = []
     for i in chosen:
-        label = name if entry is not None or not values.ndim else f"{name}[{_number(i, values.shape)}]"
+        index = "" if entry is not None or not values.ndim else f"[{_number(i, values.shape)}]"
         value = float(values.ravel()[i])
         low, high = _range(value, spec, limits, path, name, option)
-        sliders.append(Slider(label, path, tuple(keys), int(i), value, low, high, unit, label))
+        sliders.append(
+            Slider(name + index, path, tuple(keys), int(i), value, low, high, unit, name + index, index=index)
+        )
     return sliders
 
 
@@ -185,9 +203,9 @@ def _sliders_of_plant(plant: Fmu, path: str, keys: list[str], name: str, limits:
     for i in entries:
         value = float(values.flat[i])
         low, high = _range(value, bounds, limits, path, name, option)
-        label = name if chosen or not values.ndim else f"{name}[{_number(i, values.shape)}]"
-        reference = variable.references[i // size]
-        sliders.append(Slider(label, path, tuple(keys), i % size, value, low, high, unit, label, reference))
+        index = "" if chosen or not values.ndim else f"[{_number(i, values.shape)}]"
+        reference, label = variable.references[i // size], name + index
+        sliders.append(Slider(label, path, tuple(keys), i % size, value, low, high, unit, label, reference, index))
     return sliders
 
 

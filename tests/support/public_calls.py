@@ -14,6 +14,8 @@ import loopwright.sweeps as sweeps
 import loopwright.types as types
 from loopwright.blocks import Constant, Gain, Integrator, StateSpace, Step
 from loopwright.diagrams import Diagram, Requirements, experiments, subsystem
+from loopwright.diagrams.web_page.page import Played
+from loopwright.diagrams.web_page.shown_signals import ShownColumns
 
 from .carts import cart_contact
 
@@ -105,7 +107,8 @@ def sampled():
 
 
 def web_page():
-    return types.WebPage("<!doctype html>", "sampled", 300)
+    columns = ShownColumns(sampled().wired.flatten(None), "sampled")
+    return types.WebPage("<!doctype html>", "sampled", 300, "", Played(sampled(), columns, {}, {}))
 
 
 @cache

@@ -130,7 +130,7 @@ const notebook = {
     this.last = now; this.sent = until; this.told = Math.max(0, record.changes.length - 1);  // the last one may still change
   },
 };
-if (window.parent !== window) {
+if (data.key && window.parent !== window) {
   data.view = Math.random().toString(36).slice(2);
   window.addEventListener('message', event => {
     if (event.source === window.parent && event.data && event.data.loopwright === data.key && event.data.attach) { notebook.to = event.source; notebook.begin(); }

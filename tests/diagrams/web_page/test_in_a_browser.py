@@ -1,14 +1,13 @@
 """Pages in a real browser, opened from the disk: they run, answer, keep to themselves, and have a run's samples."""
 
 import csv
-import shutil
-from contextlib import contextmanager
 from functools import cache
 
 import numpy as np
 import pytest
 
 from loopwright import experiments
+from support.browser import opened
 from support.web_modules import Module
 
 pytestmark = pytest.mark.slow
@@ -23,28 +22,6 @@ POINTER = """async ([moves, pause]) => {
         await new Promise(done => setTimeout(done, pause));
     }
 }"""
-
-
-@contextmanager
-def opened(file, size=SIZES[0], scheme="light"):
-    """Open a page from the disk; what it says in the console, and what it asks for, must be nothing."""
-    from playwright.sync_api import sync_playwright  # in the extra `test`
-
-    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    assert browser, "a browser is needed: install chromium (apt-get install chromium), then run this test again"
-    said, asked, url = [], [], file.as_uri()
-    with sync_playwright() as playwright:
-        program = playwright.chromium.launch(executable_path=browser, args=["--no-sandbox", "--disable-gpu"])
-        context = program.new_context(viewport=dict(zip(("width", "height"), size, strict=True)), color_scheme=scheme)
-        page = context.new_page()
-        page.on("console", lambda message: said.append(message.text))
-        page.on("pageerror", lambda error: said.append(str(error)))
-        page.on("request", lambda request: asked.append(request.url))
-        page.goto(url)
-        yield page
-        program.close()
-    assert said == []
-    assert [one for one in asked if one != url and not one.startswith(("data:", "blob:"))] == []
 
 
 @cache

@@ -1,6 +1,7 @@
 """Diagrams as pages: their modules, run by wasmtime, have the samples of runs in Python."""
 
 import base64
+import copy
 import hashlib
 import re
 from functools import cache
@@ -11,6 +12,7 @@ import pytest
 from loopwright import Diagram, Fmu, subsystem
 from loopwright.blocks import Constant, DiscreteIntegrator, Gain, PythonFunction, Step, TransferFunction, UnitDelay
 from loopwright.diagrams import DefinitionError, OptionError, UnknownNameError
+from loopwright.diagrams.web_page.notebook_link import PageRecord
 from loopwright.fmus import bouncing_ball, dc_motor, mass_spring_damper
 from support.web_modules import Module
 
@@ -165,11 +167,51 @@ def step(value):
 
 def test_a_page_is_shown_in_a_notebook_and_saved(tmp_path):
     shown = page()._repr_html_()
-    assert shown.startswith('<iframe sandbox="allow-scripts allow-downloads"')
+    assert '<iframe sandbox="allow-scripts allow-downloads"' in shown
     assert "<script" not in shown  # all of it is text of an attribute
+    assert "is shown in a trusted notebook" in shown.partition("<iframe")[0]
     assert page().save(tmp_path / "drive.html").read_text(encoding="utf-8") == page().html
     with pytest.raises(OptionError, match=r"expected a page; name it drive\.html"):
         page().save(tmp_path / "drive.txt")
+
+
+# --- what was played in a notebook ----------------------------------------------------------------------------------------
+
+
+def sent(rows, first, *changes, run=1):
+    """Return a message of a page, as a notebook passes it on."""
+    listed = [{"after": after, "t": t, "name": name, "value": value} for after, t, name, value in changes]
+    return {"view": "a", "run": run, "first": first, "count": len(rows), "changes": listed}, [rows.tobytes()]
+
+
+def test_the_samples_of_a_page_come_back_and_the_same_run_in_python_has_them():
+    played, module = copy.copy(page()), Module(page().html)
+    played._record = PageRecord(len(module.names) + 1)
+    with pytest.raises(
+        OptionError, match=r"found no sample of this page; they come back .* notebook.*save the record as CSV"
+    ):
+        _ = played.run
+    module.set(module.slider("kp.gain")["place"], 0.1)
+    assert module.begin()
+    first = module.run(300)
+    module.set(module.slider("target")["place"], 100.0)
+    rows = np.concatenate([first, module.run(700)])
+    gain, aim = (0, None, "kp.gain", 0.1), (300, 0.299, "target", 100.0)
+    played._record.take(None, *sent(rows[:5], 0, run=0))  # before a reset
+    played._record.take(None, *sent(rows[:300], 0, gain))
+    played._record.take(None, *sent(rows[300:900], 300, (*aim[:3], 70.0)))
+    played._record.take(None, *sent(rows[700:], 700, aim))  # some rows twice; the slider was moved on at the same tick
+    run = played.run
+    assert np.array_equal(run.t, rows[:, 0])
+    assert np.array_equal(run["speed"], rows[:, 1])
+    assert np.array_equal(run["motor.current"], rows[:, 1 + module.names.index("motor.current")])
+    assert run.unit("speed") == "rad/s"
+    assert [(c.t, c.name, c.value) for c in played.changes] == [gain[1:], aim[1:]]
+    again = played.simulate()
+    assert all(np.array_equal(run[name], again[name]) for name in run.names)
+    played._record.take(None, *sent(rows[:0], 1000, (1000, 0.999, "motor.resistance", 2.0)))
+    with pytest.raises(OptionError, match=r"'motor.resistance' was moved at t = 0.999 s; expected .* before the run"):
+        played.simulate()
 
 
 # --- what is refused, before anything is compiled -------------------------------------------------------------------------
