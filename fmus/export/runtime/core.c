@@ -63,6 +63,13 @@ static bool lw_has_room(lw_instance *self, const char *function, const void *roo
     return room || lw_fail(self, "%s: the pointer to the result is NULL. Give one.", function);
 }
 
+/* Are there as many value references, and as many values, as the call says? */
+static bool lw_has_lists(lw_instance *self, const char *function, const void *references, size_t n, const void *values, size_t size) {
+    if ((references || !n) && (values || !size)) return true;
+    return lw_fail(self, "%s: the pointer to the %s is NULL. Give %zu, or 0 as their number.", function,
+                   references || !n ? "values" : "value references", references || !n ? size : n);
+}
+
 /* May values be read: once initialization has begun, also in Terminated (FMI 3.0, 2.3.8; FMI 2.0, 3.2.3)? */
 static bool lw_is_readable(lw_instance *self) {
     return self->s.mode == LW_INITIALIZING || self->s.mode == LW_TERMINATED;
@@ -205,6 +212,7 @@ static bool lw_all_used(lw_instance *self, const char *function, const lw_variab
 
 static bool lw_get(lw_instance *self, const char *function, const uint32_t *references, size_t n, double *values, size_t left) {
     const lw_variable *variable = NULL;
+    if (!lw_has_lists(self, function, references, n, values, left)) return false;
     for (size_t i = 0; i < n; i++) {
         if (!(variable = lw_variable_at(self, function, references[i], left))) return false;
         lw_kind kind = variable->kind;
@@ -263,6 +271,7 @@ static bool lw_check_set(lw_instance *self, const char *function, const lw_varia
 
 static bool lw_set(lw_instance *self, const char *function, const uint32_t *references, size_t n, const double *values, size_t left) {
     const lw_variable *variable = NULL;
+    if (!lw_has_lists(self, function, references, n, values, left)) return false;
     for (size_t i = 0; i < n; i++) {
         if (!(variable = lw_variable_at(self, function, references[i], left))) return false;
         if (!lw_check_set(self, function, variable, values)) return false;
@@ -336,6 +345,8 @@ static bool lw_derive(lw_instance *self, const char *function, bool adjoint, con
     size_t n_in = adjoint ? n_unknowns : n_knowns, n_out = adjoint ? n_knowns : n_unknowns;
     bool between = self->s.mode == LW_INITIALIZING || self->s.mode == LW_INTERMEDIATE;
     if (!between && !lw_is_initialized(self, function)) return false;
+    if (!lw_has_lists(self, function, unknowns, n_unknowns, sensitivity, n_sensitivity)) return false;
+    if (!lw_has_lists(self, function, knowns, n_knowns, seed, n_seed)) return false;
     memset(in, 0, sizeof self->seed);
     if (!lw_transfer(self, function, adjoint ? unknowns : knowns, n_in, adjoint, seed, NULL, in, n_seed)) return false;
     memcpy(out, in, sizeof self->seed); /* a state that is an output depends on itself */

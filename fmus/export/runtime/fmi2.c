@@ -135,6 +135,7 @@ static bool lw_set_slopes(lw_instance *self, const char *function, const fmi2Val
                           const fmi2Integer *orders, const double *values) {
     lw_mode mode = (lw_mode)self->s.mode;
     if (mode != LW_INSTANTIATED && mode != LW_INITIALIZING && !lw_in_mode(self, function, LW_STEPPING)) return false;
+    if (!lw_has_lists(self, function, references, n, orders, n) || !lw_has_lists(self, function, NULL, 0, values, n)) return false;
     for (size_t i = 0; i < n; i++) {
         const lw_variable *variable = lw_variable_at(self, function, references[i], 1);
         if (!variable) return false;
@@ -197,11 +198,11 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real currentCommunicationPoint, fmi2R
 /* ---- Model Exchange (FMI 2.0, 3.2.1 and 3.2.2) ---- */
 
 /* Is the call allowed, and is the number of values right? */
-static bool lw_check_vector(lw_instance *self, const char *function, bool reading, size_t found, size_t expected) {
+static bool lw_check_vector(lw_instance *self, const char *function, bool reading, const void *values, size_t found, size_t expected) {
     if (!self->s.model_exchange)
         return lw_fail(self, "%s: this is a Co-Simulation instance. Instantiate it as fmi2ModelExchange.", function);
     if (!(reading && lw_is_readable(self)) && !lw_is_initialized(self, function)) return false;
-    if (found == expected) return true;
+    if (found == expected) return lw_has_lists(self, function, NULL, 0, values, found);
     return lw_fail(self, "%s: found room for %zu values, expected %zu.", function, found, expected);
 }
 
@@ -220,13 +221,13 @@ static bool lw_copy(double *to, const double *from, size_t n) {
 
 fmi2Status fmi2EnterEventMode(fmi2Component c) {
     LW_SELF;
-    return LW_OK(lw_check_vector(self, "fmi2EnterEventMode", false, 0, 0) && lw_enter_event_mode(self, "fmi2EnterEventMode"));
+    return LW_OK(lw_check_vector(self, "fmi2EnterEventMode", false, NULL, 0, 0) && lw_enter_event_mode(self, "fmi2EnterEventMode"));
 }
 
 fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *eventInfo) {
     LW_SELF;
     bool again = false, moved = false;
-    bool ok = lw_check_vector(self, "fmi2NewDiscreteStates", false, 0, 0)
+    bool ok = lw_check_vector(self, "fmi2NewDiscreteStates", false, NULL, 0, 0)
               && lw_update_discrete_states(self, "fmi2NewDiscreteStates", &again, &moved);
     if (eventInfo) *eventInfo = (fmi2EventInfo){.newDiscreteStatesNeeded = again, .valuesOfContinuousStatesChanged = moved};
     return LW_OK(ok);
@@ -234,7 +235,7 @@ fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *eventInfo) {
 
 fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) {
     LW_SELF;
-    return LW_OK(lw_check_vector(self, "fmi2EnterContinuousTimeMode", false, 0, 0)
+    return LW_OK(lw_check_vector(self, "fmi2EnterContinuousTimeMode", false, NULL, 0, 0)
                  && lw_leave_event_mode(self, "fmi2EnterContinuousTimeMode", LW_CONTINUOUS));
 }
 
@@ -244,43 +245,43 @@ fmi2Status fmi2CompletedIntegratorStep(fmi2Component c, fmi2Boolean noSetFMUStat
     (void)noSetFMUStatePriorToCurrentPoint; /* nothing is buffered */
     if (enterEventMode) *enterEventMode = fmi2False;
     if (terminateSimulation) *terminateSimulation = fmi2False;
-    return LW_OK(lw_check_vector(self, "fmi2CompletedIntegratorStep", false, 0, 0)
+    return LW_OK(lw_check_vector(self, "fmi2CompletedIntegratorStep", false, NULL, 0, 0)
                  && lw_in_mode(self, "fmi2CompletedIntegratorStep", LW_CONTINUOUS));
 }
 
 fmi2Status fmi2SetTime(fmi2Component c, fmi2Real time) {
     LW_SELF;
-    return LW_OK(lw_check_vector(self, "fmi2SetTime", false, 0, 0) && lw_set_time(self, "fmi2SetTime", time));
+    return LW_OK(lw_check_vector(self, "fmi2SetTime", false, NULL, 0, 0) && lw_set_time(self, "fmi2SetTime", time));
 }
 
 fmi2Status fmi2SetContinuousStates(fmi2Component c, const fmi2Real x[], size_t nx) {
     LW_SELF;
-    return LW_OK(lw_check_vector(self, "fmi2SetContinuousStates", false, nx, LW_N_X)
+    return LW_OK(lw_check_vector(self, "fmi2SetContinuousStates", false, x, nx, LW_N_X)
                  && lw_set_states(self, "fmi2SetContinuousStates", x));
 }
 
 fmi2Status fmi2GetContinuousStates(fmi2Component c, fmi2Real x[], size_t nx) {
     LW_SELF;
-    return LW_OK(lw_check_vector(self, "fmi2GetContinuousStates", true, nx, LW_N_X) && lw_copy(x, self->s.values + LW_X, nx));
+    return LW_OK(lw_check_vector(self, "fmi2GetContinuousStates", true, x, nx, LW_N_X) && lw_copy(x, self->s.values + LW_X, nx));
 }
 
 fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real derivatives[], size_t nx) {
     LW_SELF;
     int32_t mode = self->s.mode;
-    if (!lw_check_vector(self, "fmi2GetDerivatives", true, nx, LW_N_X)) return fmi2Error;
+    if (!lw_check_vector(self, "fmi2GetDerivatives", true, derivatives, nx, LW_N_X)) return fmi2Error;
     return lw_evaluated(self, mode, lw_update_derivatives(self) && lw_copy(derivatives, self->s.values + LW_DX, nx));
 }
 
 fmi2Status fmi2GetEventIndicators(fmi2Component c, fmi2Real eventIndicators[], size_t ni) {
     LW_SELF;
     int32_t mode = self->s.mode;
-    if (!lw_check_vector(self, "fmi2GetEventIndicators", true, ni, LW_N_Z)) return fmi2Error;
+    if (!lw_check_vector(self, "fmi2GetEventIndicators", true, eventIndicators, ni, LW_N_Z)) return fmi2Error;
     return lw_evaluated(self, mode, lw_update_indicators(self) && lw_copy(eventIndicators, self->s.values + LW_Z, ni));
 }
 
 fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real x_nominal[], size_t nx) {
     LW_SELF;
-    return LW_OK(lw_check_vector(self, "fmi2GetNominalsOfContinuousStates", true, nx, LW_N_X)
+    return LW_OK(lw_check_vector(self, "fmi2GetNominalsOfContinuousStates", true, x_nominal, nx, LW_N_X)
                  && lw_copy(x_nominal, lw_nominals, nx));
 }
 

@@ -48,6 +48,7 @@ fmi2Status fmi2GetStatus(fmi2Component c, const fmi2StatusKind s, fmi2Status *va
 fmi2Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind s, fmi2Real *value) {
     LW_SELF;
     if (s != fmi2LastSuccessfulTime) return lw_discard(c, "fmi2GetRealStatus", "the only kind of type Real is fmi2LastSuccessfulTime");
+    if (!lw_has_room(self, "fmi2GetRealStatus", value)) return fmi2Error;
     *value = self->s.values[0];
     return fmi2OK;
 }
@@ -57,8 +58,9 @@ fmi2Status fmi2GetIntegerStatus(fmi2Component c, const fmi2StatusKind s, fmi2Int
 }
 
 fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind s, fmi2Boolean *value) {
-    if (!c) return fmi2Error;
+    LW_SELF;
     if (s != fmi2Terminated) return lw_discard(c, "fmi2GetBooleanStatus", "the only kind of type Boolean is fmi2Terminated");
+    if (!lw_has_room(self, "fmi2GetBooleanStatus", value)) return fmi2Error;
     *value = fmi2False; /* the model never ends the simulation */
     return fmi2OK;
 }

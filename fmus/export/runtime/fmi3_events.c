@@ -52,9 +52,7 @@ static int lw_clock_of(lw_instance *self, const char *function, fmi3ValueReferen
 
 /* Are there values, and is each value reference that of a clock? */
 static bool lw_are_clocks(lw_instance *self, const char *function, const fmi3ValueReference *references, size_t n, const void *values) {
-    if (!n) return true;
-    if (!references) return lw_fail(self, "%s: the pointer to the value references is NULL. Give %zu.", function, n);
-    if (!lw_has_room(self, function, values)) return false;
+    if (!lw_has_lists(self, function, references, n, values, n)) return false;
     for (size_t i = 0; i < n; i++)
         if (lw_clock_of(self, function, references[i]) < 0) return false;
     return true;
@@ -149,10 +147,10 @@ static bool lw_is_model_exchange(lw_instance *self, const char *function) {
 }
 
 /* Is the call allowed, and is the number of values right? */
-static bool lw_check_vector(lw_instance *self, const char *function, bool reading, size_t found, size_t expected) {
+static bool lw_check_vector(lw_instance *self, const char *function, bool reading, const void *values, size_t found, size_t expected) {
     if (!lw_is_model_exchange(self, function)) return false;
     if (!(reading && lw_is_readable(self)) && !lw_is_initialized(self, function)) return false;
-    if (found == expected) return true;
+    if (found == expected) return lw_has_lists(self, function, NULL, 0, values, found);
     return lw_fail(self, "%s: found room for %zu values, expected %zu.", function, found, expected);
 }
 
@@ -187,38 +185,38 @@ fmi3Status fmi3CompletedIntegratorStep(fmi3Instance instance, fmi3Boolean noSetF
 
 fmi3Status fmi3SetTime(fmi3Instance instance, fmi3Float64 time) {
     LW_SELF;
-    return LW_OK(lw_check_vector(self, "fmi3SetTime", false, 0, 0) && lw_set_time(self, "fmi3SetTime", time));
+    return LW_OK(lw_check_vector(self, "fmi3SetTime", false, NULL, 0, 0) && lw_set_time(self, "fmi3SetTime", time));
 }
 
 fmi3Status fmi3SetContinuousStates(fmi3Instance instance, const fmi3Float64 continuousStates[], size_t nContinuousStates) {
     LW_SELF;
-    return LW_OK(lw_check_vector(self, "fmi3SetContinuousStates", false, nContinuousStates, LW_N_X)
+    return LW_OK(lw_check_vector(self, "fmi3SetContinuousStates", false, continuousStates, nContinuousStates, LW_N_X)
                  && lw_set_states(self, "fmi3SetContinuousStates", continuousStates));
 }
 
 fmi3Status fmi3GetContinuousStates(fmi3Instance instance, fmi3Float64 continuousStates[], size_t nContinuousStates) {
     LW_SELF;
-    return LW_OK(lw_check_vector(self, "fmi3GetContinuousStates", true, nContinuousStates, LW_N_X)
+    return LW_OK(lw_check_vector(self, "fmi3GetContinuousStates", true, continuousStates, nContinuousStates, LW_N_X)
                  && lw_copy(continuousStates, self->s.values + LW_X, LW_N_X));
 }
 
 fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance instance, fmi3Float64 derivatives[], size_t nContinuousStates) {
     LW_SELF;
     int32_t mode = self->s.mode;
-    if (!lw_check_vector(self, "fmi3GetContinuousStateDerivatives", true, nContinuousStates, LW_N_X)) return fmi3Error;
+    if (!lw_check_vector(self, "fmi3GetContinuousStateDerivatives", true, derivatives, nContinuousStates, LW_N_X)) return fmi3Error;
     return lw_evaluated(self, mode, lw_update_derivatives(self) && lw_copy(derivatives, self->s.values + LW_DX, LW_N_X));
 }
 
 fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 eventIndicators[], size_t nEventIndicators) {
     LW_SELF;
     int32_t mode = self->s.mode;
-    if (!lw_check_vector(self, "fmi3GetEventIndicators", true, nEventIndicators, LW_N_Z)) return fmi3Error;
+    if (!lw_check_vector(self, "fmi3GetEventIndicators", true, eventIndicators, nEventIndicators, LW_N_Z)) return fmi3Error;
     return lw_evaluated(self, mode, lw_update_indicators(self) && lw_copy(eventIndicators, self->s.values + LW_Z, LW_N_Z));
 }
 
 fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance instance, fmi3Float64 nominals[], size_t nContinuousStates) {
     LW_SELF;
-    return LW_OK(lw_check_vector(self, "fmi3GetNominalsOfContinuousStates", true, nContinuousStates, LW_N_X)
+    return LW_OK(lw_check_vector(self, "fmi3GetNominalsOfContinuousStates", true, nominals, nContinuousStates, LW_N_X)
                  && lw_copy(nominals, lw_nominals, LW_N_X));
 }
 
