@@ -7,7 +7,7 @@ from .fixed_points import find_fixed_point
 from .links import Links
 from .loops import note_loops
 from .plant_steps import PlantSteps, end_all, runs_apart, step_all
-from .plants import Plant, load_plants, note_steps
+from .plants import Plant, bind, load_plants, note_steps
 from .rollback import accept_steps, try_steps
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "PlantSteps",
     "Scheme",
     "accept_steps",
+    "bind",
     "end_all",
     "find_fixed_point",
     "load_plants",

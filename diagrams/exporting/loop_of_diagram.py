@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 
 from ...blocks.core import DefinitionError, OptionError, SimulationError
 from ...blocks.tracing import traced_parameters
-from ...fmus.export import ROOM_FOR_EDGES, CFunction, ComputedNumbers, LoopSpec, Placed, Variable, parameter_variable
+from ...fmus.export import (
+    ROOM_FOR_EDGES,
+    CFunction,
+    ComputedNumbers,
+    Field,
+    LoopMemory,
+    LoopSpec,
+    Placed,
+    Variable,
+    parameter_variable,
+)
 from ..compiled import (
     CompiledHybrid,
     CompiledLoop,
@@ -21,6 +32,7 @@ from ..compiled import (
     write_hybrid,
     write_ticks,
 )
+from ..coupling import bind
 from ..flat import NONE, FlatDiagram, TickPattern, flatten, kinds_of
 from ..model_exchange import BlocksInModelExchange
 from ..simulation import (
@@ -36,6 +48,7 @@ from ..simulation import (
 from ..solvers import METHODS, MethodKind
 from ..wiring import Wire, exact_time, join
 from .edges import find_edges
+from .merged_plants import loaded, merge, own_fmus
 from .more_functions import trace_computed_numbers, trace_guards
 from .obstacles import refuse
 from .open_diagram import OpenDiagram
@@ -78,6 +91,7 @@ def loop_spec(
         If its start isn't found.
     """
     refuse(opened)
+    own_fmus(opened)  # or refused, before anything is made
     flat = _flatten(opened, name, options.get("step_size", 1e-3), between=between)
     workspace = _start(opened, flat)
     here = workspace.here
@@ -104,6 +118,8 @@ def loop_spec(
         sources = write_ticks(flat, acting, straight=True, whole=True)
         loop = _bind_ticks(workspace, sources.make([code] * len(sources.writers)))
         memory = read_memory({"loop": loop.structure}, vectors, loop.kept, code)
+    plants, more = merge(opened, flat, flat.parameters.total)
+    memory = _with_parameters(memory, here.p, more)
     guards = [trace_guards(flat, clocks, i, opened) for i, clocks in enumerate(acting)]
     start, untraced = trace_start_values(flat, workspace)
     numbers = trace_computed_numbers(flat)
@@ -115,7 +131,7 @@ def loop_spec(
         inputs=variables.inputs(),
         outputs=variables.outputs(),
         signals=variables.signals(),
-        parameters=variables.parameters(),
+        parameters=(*variables.parameters(), *more),
         states=variables.states(),
         base=flat.base,
         clocks=tuple((clock.every, clock.offset) for clock in flat.distinct),
@@ -129,10 +145,20 @@ def loop_spec(
         start=None if start is None else CFunction.of(start),
         start_kind=_start_kind(flat, acting, name),
         numbers=tuple(one for one, f in numbers.values() if f is not None),
+        plants=plants,
         depends=variables.depends(acting),
         found_at_build=variables.found_at_build(),
         **facts,
         **options,
+    )
+
+
+def _with_parameters(memory: LoopMemory, p: np.ndarray, more: Sequence[Placed]) -> LoopMemory:
+    """Return a memory with the parameters of FMUs behind the diagram's own."""
+    starts = [np.ravel(np.asarray(one.variable.start)) for one in more]
+    longer = Field.of("p", np.concatenate([p, *starts]))
+    return (
+        replace(memory, fields=tuple(longer if one.name == "p" else one for one in memory.fields)) if more else memory
     )
 
 
@@ -218,11 +244,15 @@ def _bind_hybrid(
 def _start(opened: OpenDiagram, flat: FlatDiagram) -> Workspace:
     """Return the numbers of a diagram at t = 0, with the start values of its inputs."""
     workspace = Workspace(flat)
-    workspace.here.w[:] = opened.starts
-    try:
-        initialize(workspace, {}, None, lambda: None, BlocksInModelExchange(flat), "none", find_start_values)
-    except SimulationError as error:
-        raise error.at(t=0.0) from error.__cause__
+    for name, values in opened.starts.items():
+        workspace.here.w[flat.plant_outputs.slices[name]] = values
+    with loaded(opened, flat) as plants:
+        bind(flat, plants, workspace.z, workspace.here.w)
+        exchanged, passes_on = BlocksInModelExchange(flat), "agree" if plants else "none"
+        try:
+            initialize(workspace, plants, None, lambda: None, exchanged, passes_on, find_start_values)
+        except SimulationError as error:
+            raise error.at(t=0.0) from error.__cause__
     for path, values in opened.states.items():
         if path in flat.states.slices:
             workspace.here.x[flat.states.slices[path]] = values
@@ -270,7 +300,8 @@ class _Variables:
     def _place(self, wire: Wire) -> tuple[int, ...]:
         """Return the entries of the log that a wire takes."""
         full = join(wire.block, wire.port)
-        where, shape = self._flat.log.slices[full], self._flat.log.shapes[full]
+        layout = self._flat.plant_outputs if full in self._flat.plant_outputs.slices else self._flat.log
+        where, shape = layout.slices[full], layout.shapes[full]
         entries = np.arange(where.start, where.stop).reshape(shape)
         return tuple(np.ravel(entries if wire.index is None else entries[wire.index]).tolist())
 
@@ -301,7 +332,8 @@ class _Variables:
         port = self._flat.table.blocks[wire.block].outputs[wire.port]
         sampled = self._flat.table.is_sampled(self._flat.table.subsystem_of[wire.block])
         variable = Variable(name, causality, "continuous", self._shape(wire), _unit(unit), port.description)
-        return Placed(variable, "log", self._place(wire), sampled, self._clock(wire.block))
+        vector = "w" if join(wire.block, wire.port) in self._flat.plant_outputs.slices else "log"
+        return Placed(variable, vector, self._place(wire), sampled, self._clock(wire.block))
 
     def _clock(self, path: str) -> int | None:
         """Return the number of the clock that a block acts at."""

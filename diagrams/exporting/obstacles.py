@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ...blocks.core import DefinitionError
+from ...fmus import Fmu
 from .open_diagram import OpenDiagram
 
 
@@ -19,20 +20,13 @@ def refuse(opened: OpenDiagram) -> None:
         if path == opened.outside:
             continue
         shown = opened.shown(path)
-        if block.in_model_exchange or (block.stepped and not block.transport):
-            raise DefinitionError(
-                "it is an FMU, which is not exported with the diagram. Leave it outside, "
-                f"build(diagram, outside=[{shown!r}]), and couple the two FMUs where they are used; "
-                "diagram.to_ssp(…) writes both, and how they are coupled, into one file.",
-                block=shown,
-            )
         if block.transport and not table.is_sampled(table.subsystem_of[path]):
             raise DefinitionError(
                 "it is a transport delay in continuous time, whose memory has no bound; an exported diagram has a "
                 "fixed one. Put it into a sampled subsystem, where it is a delay by whole samples.",
                 block=shown,
             )
-        if block.opaque:
+        if block.opaque and not isinstance(block, Fmu):
             raise DefinitionError(
                 "Python evaluates it, and nothing exported has Python inside. Write its equations with NumPy functions "
                 "that can be traced, or export the part of the diagram without it.",

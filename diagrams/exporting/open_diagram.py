@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import UnknownNameError, near
 from ..flat import Target, WiredDiagram, with_movable
 from ..wiring import Collector, Structure, Subsystem, Wire, find_path, join, split_entry
 from .outside import Outside
@@ -49,13 +48,13 @@ class OpenDiagram:
         return path.removeprefix(f"{self.inside}.") if self.inside else path
 
     @property
-    def starts(self) -> np.ndarray:
-        """Start values of the inputs, in their order in w."""
+    def starts(self) -> dict[str, np.ndarray]:
+        """Start values of the inputs, flat, by their full names in the diagram."""
         if not self.outside:
-            return np.zeros(0)
+            return {}
         block = self.wired.blocks[self.outside]
         assert isinstance(block, Outside)
-        return np.concatenate([block.start_of(name) for name in block.outputs])
+        return {join(self.outside, name): block.start_of(name) for name in block.outputs}
 
 
 def open_subsystem(subsystem: Subsystem, facade_class: type[Any], name: str) -> OpenDiagram:
@@ -254,7 +253,7 @@ def _apart(outputs: Mapping[str, Wire], inputs: Collection[str], inside: str) ->
 
 
 def choose_outputs(opened: OpenDiagram, outputs: tuple[str, ...] | None) -> OpenDiagram:
-    """Return a diagram with some outputs: named wires, or outputs of blocks by their paths."""
+    """Return a diagram with some outputs: named wires, or outputs of blocks by their paths, or the ends of these."""
     if outputs is None:
         return opened
     chosen: dict[str, Wire] = {}
@@ -265,7 +264,5 @@ def choose_outputs(opened: OpenDiagram, outputs: tuple[str, ...] | None) -> Open
         **opened.outputs,
     }
     for name in outputs:
-        if name not in known:
-            raise UnknownNameError(f"there is no signal {name!r} in it. {near(name, known)}", block=wired.name)
-        chosen[name] = known[name]
+        chosen[name] = known[find_path(name, known, "signal", wired.name)]
     return replace(opened, outputs=chosen)

@@ -131,6 +131,7 @@ def target_spec(opened: OpenDiagram, *, name: str, description: str) -> TargetSp
         If its start isn't found.
     """
     refuse(opened)
+    _refuse_fmus(opened)
     if not opened.wired.has_clock:
         _refuse_states(opened)
         raise DefinitionError(
@@ -168,6 +169,16 @@ def _trace_numbers(
             numbers = share_terms(expanded)
             found.append(TargetNumbers(opened.shown(path), one.first, one.parameters, one.count, numbers))
     return tuple(found), tuple(fixed)
+
+
+def _refuse_fmus(opened: OpenDiagram) -> None:
+    """Refuse FMUs: a target has the plant in front of it."""
+    for path, block in opened.wired.scheduled.blocks.items():
+        if path != opened.outside and (block.in_model_exchange or (block.stepped and not block.transport)):
+            shown = opened.shown(path)
+            raise DefinitionError(
+                "it is an FMU, and no target has one. Leave it outside: outside=[" + repr(shown) + "].", block=shown
+            )
 
 
 def _refuse_states(opened: OpenDiagram) -> None:

@@ -6,7 +6,9 @@ from .inlined import inline_model, own_functions
 from .loop_memory import Field, LoopMemory, c_number
 from .loop_spec import ROOM_FOR_EDGES, CFunction, ComputedNumbers, Guards, LoopSpec, Placed, write_unit
 from .merged import merge_model
-from .model import Integrator, ModelSpec, Variable
+from .merged_plants import MergedPlant, PlacedPlant
+from .model import INTEGRATORS, Integrator, ModelSpec, Variable
+from .own_sources import read_own_sources
 from .package import build_fmu, clear_cache
 from .python_fmu import build_python
 from .scalar_code import Lookup, split_lookups
@@ -19,6 +21,7 @@ from .written_equations import WrittenEquations, read_equations
 
 __all__ = [
     "CLOCK_LIMIT",
+    "INTEGRATORS",
     "PROCESSORS",
     "ROOM_FOR_EDGES",
     "BlockOutput",
@@ -31,9 +34,11 @@ __all__ = [
     "Lookup",
     "LoopMemory",
     "LoopSpec",
+    "MergedPlant",
     "ModelSpec",
     "Number",
     "Placed",
+    "PlacedPlant",
     "ProcessorMeasurement",
     "TargetCode",
     "TargetMeasurement",
@@ -61,6 +66,7 @@ __all__ = [
     "parameter_variable",
     "processor_flags",
     "read_equations",
+    "read_own_sources",
     "run_here",
     "split_lookups",
     "tune",

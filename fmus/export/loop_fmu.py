@@ -147,6 +147,7 @@ def _dimensions(spec: LoopSpec, entries: tuple[Entry, ...], token: str, fmi: int
         f'#define LW_ORDER "{ORDER[fmi]}"',
         f"#define LW_ON_TICKS {int(spec.steps_on_ticks)}",
         f"#define LW_CLOCKS {clocks}",
+        f"#define LW_LOGGED {_logged(spec)}",
         "#define LW_HAS_DERIVATIVES 0",
         *(f"#define LW_N_{letter} {number}" for letter, number in numbers.items()),
         *(f"#define LW_SZ_{kind} 1" for kind in ("ARG", "RES", "IW", "W")),
@@ -159,12 +160,21 @@ def _places(spec: LoopSpec) -> Iterator[str]:
     groups = {"p": ("fixed", "tunable"), "u": ("input",), "d": ("discrete",), "y": ("output",)}
     for letter, kinds in groups.items():
         found = [
-            -1 - place if letter == "y" and one.vector == "x" else place
+            _code_of(spec, one, place) if letter == "y" else place
             for kind, one in loop_rows(spec)
             if kind in kinds
             for place in one.places
         ]
         yield _array("int32_t", f"lw_places_{letter}", found)
+
+
+def _code_of(spec: LoopSpec, one: Placed, place: int) -> int:
+    """Return where the value of an output is, as `runtime/loop.c` reads it."""
+    return {"x": -1 - place, "w": _logged(spec) + place}.get(one.vector, place)
+
+
+def _logged(spec: LoopSpec) -> int:
+    return next(one.length for one in spec.memory.fields if one.name == "log")
 
 
 def _labels(spec: LoopSpec) -> Iterator[str]:

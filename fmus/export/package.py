@@ -98,7 +98,7 @@ def _code_parts(spec: ModelSpec | LoopSpec, fmi: int) -> list[str]:
     folder = Path(__file__).parent
     written = ["c_code", "elementary_tables", "html_page", "package", "quantities", "scalars", "xml_fmi2", "xml_fmi3"]
     if isinstance(spec, LoopSpec):
-        written += ["loop_fmu", "loop_memory", "loop_spec"]
+        written += ["loop_fmu", "loop_memory", "loop_spec", "merged_plants", "own_sources"]
     modules = [(folder / f"{name}.py").read_text(encoding="utf-8") for name in written]
     unit = [write_unit(spec)] if isinstance(spec, LoopSpec) else []
     return [package_version(), *(text for _, text in sorted(_runtime_of(spec, fmi).items())), *modules, *unit]

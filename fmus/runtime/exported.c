@@ -1,4 +1,5 @@
-/* An exported diagram: its loop, from one communication point to the next, in one block of memory.
+/* An exported diagram: its loop, from one communication point to the next, in one block of memory. `exported_plants.c` puts
+   the FMUs that are merged into it around this.
 
    It comes after the loop's files and the diagram's own text, which defines: `lw_memory`, `lw_fill` and `lw_bind`; the seconds
    between two ticks, LW_BASE_NUMERATOR / LW_BASE_DENOMINATOR; LW_N_CLOCKS clocks, `lw_clocks`; LW_N_SETS sets of clocks that
@@ -93,7 +94,7 @@ static bool lw_find_start(lw_memory *m) {
 #if !LW_HYBRID
 
 /* Evaluate everything at the start, with the parameters, inputs and states in the memory; false: it can't be. */
-static bool lw_begin(lw_memory *m, double start) {
+static bool lw_begin_loop(lw_memory *m, double start) {
     lw_put_time(m, start);
     if (!lw_find_start(m)) return false;
     return !lw_is_due(m) || lw_evaluate(m, lw_kind_of(m->tick));
@@ -112,7 +113,7 @@ static bool lw_act(lw_memory *m, bool acts) {
 
 /* Continue to a time with the inputs in the memory: ticks from the present instant on, before that time. False: the tick
    m->tick can't be evaluated, and nothing of it is taken over. */
-static bool lw_go(lw_memory *m, double to) {
+static bool lw_go_loop(lw_memory *m, double to) {
     while (lw_acts_before(m, to))
         if (!lw_act(m, true)) return false;
     m->now = to;
@@ -234,7 +235,7 @@ static bool lw_begin_events(lw_memory *m) {
     return (void)m, true;
 }
 
-static bool lw_begin(lw_memory *m, double start) {
+static bool lw_begin_loop(lw_memory *m, double start) {
     hybrid *h = &m->hybrid;
     lw_put_time(m, start);
     m->reason = DONE;
@@ -261,7 +262,7 @@ static bool lw_settle(lw_memory *m) {
 
 /* Continue to a time with the inputs in the memory. What is at the present instant comes first: events of inputs that have
    jumped, and a tick; ticks up to that time follow, but not one at it. */
-static bool lw_go(lw_memory *m, double to) {
+static bool lw_go_loop(lw_memory *m, double to) {
     const double ticks = to / lw_time_of(1), nearest = floor(ticks + 0.5);
     if (LW_N_CLOCKS && fabs(ticks - nearest) <= LW_NEAR) to = lw_time_of((int64_t)nearest); /* as a run has it */
     m->reason = DONE;

@@ -378,6 +378,7 @@ static void lw_reset(lw_instance *self) {
     lw_changed(self);
 }
 
+#if !LW_MERGED
 static lw_instance *lw_create(const char *name, size_t length) {
     lw_instance *self = calloc(1, sizeof *self);
     if (!self) return NULL;
@@ -475,6 +476,8 @@ static bool lw_deserialize_state(lw_instance *self, const char *function, const 
     *state = fresh;
     return true;
 }
+
+#endif
 
 /* ---- initialization ---- */
 

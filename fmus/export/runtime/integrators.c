@@ -257,9 +257,15 @@ static double lw_rodas_step(lw_instance *self, double t, double h, const double 
     return failed || !isfinite(error) ? INFINITY : error;
 }
 
+#if LW_MERGED
+static bool lw_need_matrix(lw_instance *self) {
+    return LW_N_MATRIX || lw_fail(self, "integrator = 3 needs memory that it was not given. Start with it.");
+}
+#else
 static bool lw_need_matrix(lw_instance *self) {
     if (self->matrix) return true;
     self->matrix = malloc((size_t)LW_N_X * LW_AT_LEAST_1(LW_N_X) * sizeof(double));
     return self->matrix || lw_fail(self, "out of memory for the Jacobian of %d states. Set integrator = 1 or 2.", LW_N_X);
 }
+#endif
 #endif

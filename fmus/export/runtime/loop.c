@@ -4,7 +4,7 @@
  * The values are those of model.h, where all states are discrete ones: start values, which can be set before
  * initialization ends. The outputs are those of the diagram, its other signals, and states that are computed at the start.
  * Tables say where each value is in the memory: lw_places_p, lw_places_u, lw_places_d, and lw_places_y, in which -1 - i
- * is state i. lw_labels lists the outputs of blocks in the order of evaluation, and lw_guards what must stay positive. It
+ * is state i, and LW_LOGGED + i is entry i of w. lw_labels lists the outputs of blocks in the order of evaluation, and lw_guards what must stay positive. It
  * comes in the place of integrators.c, events.c and stepping.c. */
 
 static void lw_put(const int32_t *places, size_t n, const double *from, double *to) {
@@ -26,7 +26,10 @@ static void lw_put_parameters(lw_instance *self) {
 static void lw_take_outputs(lw_instance *self) {
     const lw_memory *m = &self->s.memory;
     double *v = self->s.values;
-    for (size_t i = 0; i < LW_N_Y; i++) v[LW_Y + i] = lw_places_y[i] < 0 ? m->x[-1 - lw_places_y[i]] : m->log[lw_places_y[i]];
+    for (size_t i = 0; i < LW_N_Y; i++) {
+        const int32_t place = lw_places_y[i];
+        v[LW_Y + i] = place < 0 ? m->x[-1 - place] : place < LW_LOGGED ? m->log[place] : m->w[place - LW_LOGGED];
+    }
     self->s.have_outputs = 1;
 }
 
@@ -36,10 +39,26 @@ static void lw_take_values(lw_instance *self) {
     lw_take_outputs(self);
 }
 
+#if LW_N_MERGED
+/* Say what a merged FMU has said. */
+static void lw_pass_on(lw_instance *self) {
+    char *said = self->s.memory.said;
+    if (said[0] == LW_LOG_WARNING) lw_warn(self, "%s", said + 1);
+    if (said[0] == LW_LOG_ERROR) lw_fail(self, "%s", said + 1);
+    memset(said, 0, sizeof self->s.memory.said);
+}
+#endif
+
 /* Say which block is to blame where everything can't be evaluated. */
 static bool lw_blame(lw_instance *self) {
     lw_memory *m = &self->s.memory;
     const double t = *LW_LOOP_OF(m)->t;
+#if LW_N_MERGED
+    if (m->culprit > LW_N_MERGED)
+        return lw_fail(self, LW_MODEL_NAME " at t = %.9g s: inputs and outputs of the FMUs in it don't agree at the start after %d "
+                       "passes. Check their start values, or put a UnitDelay between them.", t, LW_MOST_PASSES);
+    if (m->culprit) return lw_pass_on(self), false;
+#endif
 #if LW_HYBRID
     const hybrid *h = &m->hybrid;
     if (m->reason == PILED_UP && LW_N_EVENTS)
@@ -96,6 +115,9 @@ static bool lw_update_outputs(lw_instance *self) {
     lw_put_values(self);
     lw_put(lw_places_d, LW_N_D, self->s.values + LW_D, m->x);
     if (!lw_begin(m, self->s.values[0])) return lw_blame(self);
+#if LW_N_MERGED
+    lw_pass_on(self);
+#endif
     lw_take_values(self);
     return true;
 }
@@ -199,6 +221,9 @@ static bool lw_step(lw_instance *self, double t, double h) {
 #endif
     lw_put_values(self);
     if (!lw_go(m, end)) return lw_blame(self);
+#if LW_N_MERGED
+    lw_pass_on(self);
+#endif
     self->s.values[0] = end;
     lw_take_values(self);
     return true;

@@ -27,6 +27,9 @@
 #define LW_CLOCKS 0 /* input clocks that are offered: those of a diagram's ticks, in FMI 3.0 */
 #endif
 #define LW_EVENT_MODE (LW_N_Z || LW_CLOCKS) /* is there an Event Mode in Co-Simulation? */
+#ifndef LW_MERGED
+#define LW_MERGED 0 /* 1: merged into a diagram, which owns the instance, and copies it: nothing is allocated, see merged_plants.py */
+#endif
 #define LW_N_S (LW_N_X + LW_N_D) /* all states, as the equations take them */
 #define LW_P 1
 #define LW_U (LW_P + LW_N_P)
@@ -148,7 +151,11 @@ struct lw_instance {
     double k[7 * LW_AT_LEAST_1(LW_N_X)];     /* slopes of the stages of an adaptive step, one after the other */
     double dense[4 * LW_AT_LEAST_1(LW_N_X)]; /* the solution within the last step, see lw_interpolate */
     double absolute[LW_AT_LEAST_1(LW_N_X)];  /* the absolute tolerance of each state */
-    double *matrix;                          /* LU factors of rodas; allocated when needed */
+#if LW_MERGED
+    double matrix[LW_AT_LEAST_1(LW_N_MATRIX)]; /* LU factors of rodas */
+#else
+    double *matrix; /* the same, allocated when needed */
+#endif
     int64_t pivots[LW_AT_LEAST_1(LW_N_X)];
     double jacobian[LW_AT_LEAST_1(LW_N_J)], slope[LW_AT_LEAST_1(LW_N_X)]; /* of the derivatives: by states; by time */
     double scratch[LW_N_VALUES + LW_N_Z];

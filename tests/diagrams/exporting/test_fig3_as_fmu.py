@@ -1,4 +1,4 @@
-"""The whole of Fig. 3 but the gantry as an FMU, beside the gantry's FMU in FMPy: experiments A to D, every bit.
+"""Fig. 3 as an FMU, experiments A to D, every bit: without the gantry, beside its FMU in FMPy, and all of it in one.
 
 The master steps the controller, which acts at the start of its step, before the plant.
 """
@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from loopwright import build, experiments
-from loopwright.blocks import DefinitionError
 from support.instances import open_instance
 
 MAKERS = (
@@ -69,9 +68,18 @@ def test_a_parameter_of_table_iii_is_tuned_with_what_is_computed_from_it(tmp_pat
 
 
 @pytest.mark.slow
-def test_an_fmu_inside_is_named_with_the_ways_out():
-    with pytest.raises(DefinitionError) as caught:
-        build(experiments.path_following().diagram)
-    assert caught.value.block == "plant"
-    assert "outside=['plant']" in str(caught.value)
-    assert "to_ssp" in str(caught.value)
+@pytest.mark.parametrize("make", MAKERS, ids=lambda make: make.__name__)
+def test_the_whole_loop_is_one_fmu_with_the_trajectories_of_the_run(make, tmp_path):
+    """Controller, hand, references and the gantry's own FMU, merged: at any communication points, here every 50 ms."""
+    experiment = make()
+    run = experiment.diagram.simulate(experiment.duration, progress=False)
+    names = ("position", "velocity", "motor_force", "v_perp")
+    file = build(experiment.diagram.sampled(1e-3), tmp_path, outputs=names, name="whole_loop")
+    item = open_instance(file, tmp_path / "item").initialize()
+    for k in range(0, len(run.t) - 1, 50):
+        for name in names[:2]:
+            np.testing.assert_array_equal(item[name], run[name][k])
+        item.step(run.t[k], 0.05)
+        for name in names[2:]:
+            np.testing.assert_array_equal(item[name], run[name][k + 49])
+    item.free()

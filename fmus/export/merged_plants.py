@@ -1,0 +1,234 @@
+"""An FMU of our own that is merged into an exported diagram: its C text, with the instance in the diagram's memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from .loop_memory import Field, c_number
+from .own_sources import expand_sources, name_apart
+
+SAID = 512
+"""Bytes of the message of a plant."""
+_HEAD = """#define LW_MERGED 1
+#define LW_N_MATRIX (%(implicit)d * LW_N_X * LW_N_X)
+"""
+_INSTANCE = """
+/* The instance, in place of the functions of FMI: it starts and is stepped as an importer starts and steps it. Pointers
+   that a call has left in it are cleared, so that equal instances have equal bytes. */
+static const uint32_t lw_plant_inputs[] = {%(inputs)s}, lw_plant_outputs[] = {%(outputs)s};
+static const uint32_t lw_plant_parameters[] = {%(parameters)s};
+static const uint8_t lw_plant_is_tunable[] = {%(tunable)s};
+
+static bool lw_plant_end(lw_instance *self, bool done) {
+    memset(self->arg, 0, sizeof self->arg);
+    memset(self->res, 0, sizeof self->res);
+    return done;
+}
+
+/* Keep what it says, behind the category. */
+static void lw_plant_say(lw_instance *self, lw_category category, const char *text) {
+    char *to = self->environment;
+    if (to[0] == LW_LOG_ERROR) return;
+    *to++ = (char)category;
+    for (int i = 0; i < %(said)d - 2 && *text; i++) *to++ = *text++;
+    *to = 0;
+}
+
+/* Begin again: start values are set, and it is initializing. */
+static bool lw_plant_enter(void *plant, double start, const double *p) {
+    static const uint32_t references[] = {%(started)s};
+    static const double values[] = {%(values)s};
+    lw_instance *self = plant;
+    self->categories = LW_LOG_WARNING | LW_LOG_ERROR;
+    lw_reset(self);
+    return lw_plant_end(self, lw_set(self, "", references, %(n_started)d, values, %(n_values)d)
+                              && lw_set(self, "", lw_plant_parameters, %(n_parameters)d, p + %(first)d, %(n_p)d)
+                              && lw_initialize(self, "", start, false, 0.0));
+}
+
+/* Set the inputs u, and get the outputs y. */
+static bool lw_plant_exchange(void *plant, const double *u, double *y) {
+    lw_instance *self = plant;
+    return lw_plant_end(self, lw_set(self, "", lw_plant_inputs, %(n_inputs)d, u, %(n_u)d)
+                              && lw_get(self, "", lw_plant_outputs, %(n_outputs)d, y, %(n_y)d));
+}
+
+/* End initialization. */
+static bool lw_plant_start(void *plant) {
+    lw_instance *self = plant;
+    return lw_plant_end(self, lw_start(self, "", LW_STEPPING));
+}
+
+/* Step from t by h with the inputs u to the outputs y. */
+static bool lw_plant_step(void *plant, const double *u, double t, double h, double *y) {
+    lw_instance *self = plant;
+    return lw_plant_end(self, lw_set(self, "", lw_plant_inputs, %(n_inputs)d, u, %(n_u)d) && lw_step(self, t, h)
+                              && lw_get(self, "", lw_plant_outputs, %(n_outputs)d, y, %(n_y)d));
+}
+
+/* Take over tunable parameters that have changed; all are set where it begins. */
+static void lw_plant_tune(void *plant, const double *p) {
+    lw_instance *self = plant;
+    const double *from = p + %(first)d;
+    for (int i = 0; i < %(n_parameters)d && self->s.mode == LW_STEPPING; i++) {
+        const lw_variable *variable = lw_variables + lw_plant_parameters[i];
+        if (lw_plant_is_tunable[i] && memcmp(self->s.values + variable->first, from, variable->size * sizeof(double)))
+            lw_set(self, "", lw_plant_parameters + i, 1, from, variable->size);
+        from += variable->size;
+    }
+    lw_plant_end(self, true);
+}
+"""
+
+Sized = Sequence[tuple[int, int]]
+"""Value references of variables, each with its number of elements."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacedPlant:
+    """Where a merged FMU is in the loop of its diagram.
+
+    Attributes
+    ----------
+    path : str
+        Its path in the diagram.
+    clocks : tuple of (int, int)
+        Ticks that are its communication points: every so many ticks, from an offset on.
+    first_input, first_output, first_parameter : int
+        Entries of z, w and p at which its inputs, outputs and parameters begin.
+    """
+
+    path: str
+    clocks: tuple[tuple[int, int], ...]
+    first_input: int
+    first_output: int
+    first_parameter: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class MergedPlant:
+    """An FMU of our own that is merged into an exported diagram.
+
+    Attributes
+    ----------
+    sources : dict of str to str
+        The C sources that it carries; see `read_own_sources`.
+    inputs, outputs : sequence of (int, int)
+        What is set before a step, and got after it.
+    parameters : sequence of (int, int)
+        What is set from the diagram's parameters.
+    tunable : sequence of bool
+        Which of these may be set between two steps.
+    start : sequence of (int, sequence of float)
+        Value references, each with its start value; before the parameters.
+    implicit : bool
+        Whether it starts with the implicit integrator, which needs a matrix.
+    placed : PlacedPlant
+        Where it is in the diagram.
+    """
+
+    sources: dict[str, str]
+    inputs: Sized
+    outputs: Sized
+    parameters: Sized
+    tunable: Sequence[bool]
+    start: Sequence[tuple[int, Sequence[float]]]
+    implicit: bool
+    placed: PlacedPlant
+
+    def write(self, prefix: str) -> str:
+        """Return it as C text, with a prefix in front of every name, so that several are in one unit.
+
+        The text defines the type ``<prefix>lw_instance``, and functions of it: ``<prefix>lw_plant_enter``,
+        ``…exchange``, ``…start``, ``…step`` and ``…tune``.
+        """
+        values = [value for _, each in self.start for value in each]
+        numbers: dict[str, object] = {
+            "implicit": int(self.implicit),
+            "said": SAID,
+            "inputs": _listed(reference for reference, _ in self.inputs),
+            "outputs": _listed(reference for reference, _ in self.outputs),
+            "parameters": _listed(reference for reference, _ in self.parameters),
+            "tunable": _listed(map(int, self.tunable)),
+            "started": _listed(reference for reference, _ in self.start),
+            "values": ", ".join(map(c_number, values)) or "0",
+            "n_inputs": len(self.inputs),
+            "n_outputs": len(self.outputs),
+            "n_parameters": len(self.parameters),
+            "n_started": len(self.start),
+            "n_values": len(values),
+            "n_u": count(self.inputs),
+            "n_y": count(self.outputs),
+            "n_p": count(self.parameters),
+            "first": self.placed.first_parameter,
+        }
+        text = _HEAD % numbers + expand_sources("model.c", self.sources) + _INSTANCE % numbers
+        return name_apart(text, prefix)
+
+
+def write_plants(plants: Sequence[MergedPlant]) -> str:
+    """Return the C text of the FMUs that are merged into a diagram, which comes before all of the diagram's."""
+    return "\n".join(plant.write(f"m{j}") for j, plant in enumerate(plants))
+
+
+def plant_fields(plants: Sequence[MergedPlant], inputs: int) -> tuple[list[Field], list[tuple[str, str]]]:
+    """Return the members of a memory that merged FMUs need, and its pointers; ``inputs`` is the size of z."""
+    if not plants:
+        return [], []
+    fields = [Field("exchange", "int64_t"), Field("culprit", "int64_t"), Field("reached", "int64_t", len(plants))]
+    fields += [Field("begun", "double"), Field("held", "double", max(1, inputs)), Field("said", "char", SAID)]
+    pointers = []
+    for j, plant in enumerate(plants):
+        fields.append(Field(f"plant{j}", f"m{j}lw_instance"))
+        pointers.append((f"plant{j}.name", f'(char *)"{plant.placed.path}"'))
+        pointers.append((f"plant{j}.environment", "m->said"))
+        pointers.append((f"plant{j}.write", f"m{j}lw_plant_say"))
+    return fields, pointers
+
+
+def describe_plants(plants: Sequence[MergedPlant]) -> str:
+    """Return the C text of the table of merged FMUs, which comes behind the memory."""
+    if not plants:
+        return "#define LW_N_MERGED 0"
+    lines, rows = [], []
+    for j, plant in enumerate(plants):
+        own, at = f"m{j}lw_plant_", plant.placed
+        due = ", ".join(f"{{{every}, {offset}}}" for every, offset in at.clocks)
+        lines.append(f"static const int64_t lw_due{j}[][2] = {{{due}}};")
+        places = f"{count(plant.inputs)}, {count(plant.outputs)}, {at.first_input}, {at.first_output}"
+        functions = ", ".join(f"{own}{name}" for name in ("enter", "exchange", "start", "step", "tune"))
+        label = f'"{at.path}", offsetof(lw_memory, plant{j})'
+        rows.append(f"    {{{label}, {functions}, {places}, {len(at.clocks)}, lw_due{j}}},")
+    return "\n".join(
+        [
+            f"#define LW_N_MERGED {len(plants)}",
+            f"#define LW_MOST_MERGED {max(1, *(count(plant.outputs) for plant in plants))}",
+            *lines,
+            _TABLE,
+            *rows,
+            "};",
+        ]
+    )
+
+
+_TABLE = """typedef struct {
+    const char *path;
+    size_t place; /* of its instance in the memory */
+    bool (*enter)(void *plant, double start, const double *p), (*exchange)(void *plant, const double *u, double *y);
+    bool (*start)(void *plant), (*step)(void *plant, const double *u, double t, double h, double *y);
+    void (*tune)(void *plant, const double *p);
+    int inputs, outputs, from, to; /* numbers of elements, and where they begin in z and w */
+    int clocks;
+    const int64_t (*due)[2]; /* its communication points: every so many ticks, from an offset on */
+} lw_merged_plant;
+static const lw_merged_plant lw_merged[LW_N_MERGED] = {"""
+
+
+def count(variables: Sized) -> int:
+    """Return the number of elements of variables."""
+    return sum(size for _, size in variables)
+
+
+def _listed(references: Iterable[int]) -> str:
+    return ", ".join(map(str, references)) or "0"
