@@ -283,7 +283,7 @@ def test_an_fmu_of_a_diagram_is_refused():
     """It has clocks and events of its own; its diagram is put in its place."""
     inner = Fmu(build(speed_loop), name="inner")
     motor = Fmu(dc_motor.build(), name="motor")
-    whole = Diagram("drive", motor(voltage=inner(speed=motor.speed), load_torque=Constant(value=0.0)))
+    whole = Diagram("drive", motor(voltage=inner(wanted=0.0, speed=motor.speed), load_torque=Constant(value=0.0)))
     with pytest.raises(DefinitionError, match="put its blocks into this diagram") as caught:
         build(whole)
     assert caught.value.block == "inner"
