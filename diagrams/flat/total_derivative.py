@@ -63,7 +63,7 @@ class Derivative:
         staged = bool(self.schedule.opaque)
         whole = [] if not staged else [(stage.arguments[-1], None)]
         variables = [*((symbols[name], entries) for name, entries in self.by), *whole]
-        slopes = [_slope(e, symbol, entries) for e in stage.results for symbol, entries in variables]
+        slopes = _slopes(stage.results, variables)
         names = [*self.schedule.arguments, *(["carried"] if staged else [])]
         shown = [ca.densify(e) for e in stage.results if staged or self.values]
         outputs = [f"o{i}" for i in range(len(shown) + len(slopes))]
@@ -207,9 +207,15 @@ def size_of_motion(value: np.ndarray, slope: np.ndarray) -> float:
     return float(np.max(np.abs(slope[moves]) / (1.0 + np.abs(value[moves])), initial=0.0))
 
 
-def _slope(expression: Any, symbol: Any, entries: Sequence[int] | None) -> Any:
-    slope = ca.jacobian(expression, symbol)
-    return ca.densify(slope if entries is None else slope[:, list(entries)])
+def _slopes(results: Sequence[Any], variables: Sequence[tuple[Any, Sequence[int] | None]]) -> list[Any]:
+    """Return the derivative of each column by each symbol, or by some entries of it: all columns at once."""
+    together, cuts = ca.vertcat(*results), Layout.of({str(i): (e.numel(),) for i, e in enumerate(results)}).cuts
+    by_symbol = []
+    for symbol, entries in variables:
+        slope = ca.jacobian(together, symbol)
+        parts = ca.vertsplit(slope if entries is None else slope[:, list(entries)], cuts)
+        by_symbol.append([ca.densify(part) for part in parts])
+    return [slopes[i] for i in range(len(results)) for slopes in by_symbol]
 
 
 def _forward_by_time(stage: OpaqueStage, evaluator: Evaluator, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:

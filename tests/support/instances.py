@@ -1,6 +1,8 @@
 """Exported FMUs of both versions under FMPy's low-level interface, by names, with what they log."""
 
 import ctypes
+import os
+from functools import cache
 
 import fmpy
 import fmpy.fmi2
@@ -9,13 +11,23 @@ import numpy as np
 import pytest
 
 
+def described(path):
+    """Return FMPy's description of an FMU, read once for each file."""
+    return _described(str(path), os.stat(path).st_mtime_ns)
+
+
+@cache
+def _described(path, changed):
+    return fmpy.read_model_description(path)
+
+
 class Instance:
     """An FMU of FMI 2.0 or 3.0, stepped or for Model Exchange; a vector is read and set as a whole in both."""
 
     fmi: int
 
     def __init__(self, path, folder, *, start_time=0.0, stop_time=None):
-        self.description = fmpy.read_model_description(str(path))
+        self.description = described(path)
         self.folder, self.start_time, self.stop_time, self.log = folder, start_time, stop_time, []
         self.n_states = self.description.numberOfContinuousStates
         self.n_events = self.description.numberOfEventIndicators
@@ -147,7 +159,7 @@ class Instance2(Instance):
 
 def open_instance(path, folder, **options):
     """Instantiate an FMU of either version."""
-    kind = Instance2 if fmpy.read_model_description(str(path)).fmiVersion == "2.0" else Instance3
+    kind = Instance2 if described(path).fmiVersion == "2.0" else Instance3
     return kind(path, folder, **options)
 
 
