@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..core import Array, Block, Input, Output, SampleTimeError, Shape, ShapeError, State, parameter, read_time
+from .initial_values import StartsAtInput
 
 
 class History(State):
@@ -41,7 +42,7 @@ def push(line: Array, value: Array) -> Array:
     return np.concatenate([line[1:], np.stack([value])])
 
 
-class Delay(Block):
+class Delay(StartsAtInput, Block):
     """Delay by whole samples: y[k] = u[k − n].
 
     The first n outputs are ``initial_value``; without it, the input just before t = 0: of a source that jumps there,
@@ -61,15 +62,7 @@ class Delay(Block):
     u = Input(shape=None, description="signal to delay, a scalar or a vector")
     y = Output(like="u", description="the input n ticks ago")
     line = History("steps", "initial_value", description="the last n inputs, the oldest first, one row for each")
-
-    @property
-    def starts_from_inputs(self) -> bool:
-        """Whether `initial` computes the state."""
-        return self.initial_value is None
-
-    def initial(self, u: Any) -> Array:
-        """Return the state at the start, all rows the input just before t = 0."""
-        return np.stack([u.u] * self.steps)
+    _rows = "steps"
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the oldest input."""
@@ -80,7 +73,7 @@ class Delay(Block):
         return push(x.line, u.u)
 
 
-class VariableDelay(Block):
+class VariableDelay(StartsAtInput, Block):
     """Delay of a sampled subsystem that varies: y[k] = u(t_k − τ[k]), with straight lines between the samples of u.
 
     The delay is an input, from 0 to ``samples`` times the sample time; beyond it the run stops. Before the start u is
@@ -101,20 +94,12 @@ class VariableDelay(Block):
     delay = Input(unit="s", description="delay τ")
     y = Output(like="u", description="the input τ ago")
     line = History("samples", "initial_value", description="the last inputs, the oldest first, one row for each")
+    _rows = "samples"
 
     @property
     def drawn_inside(self) -> str:
         """What a drawing shows."""
         return "u(t − τ)"
-
-    @property
-    def starts_from_inputs(self) -> bool:
-        """Whether `initial` computes the state."""
-        return self.initial_value is None
-
-    def initial(self, u: Any) -> Array:
-        """Return the state at the start, all rows the input just before t = 0."""
-        return np.stack([u.u] * self.samples)
 
     def guards(self, t: Array, x: Any, u: Any, T: Array) -> dict[str, Array]:
         """Return the distances of the delay from its limits, in samples, beyond rounding."""

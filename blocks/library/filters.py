@@ -10,6 +10,7 @@ import numpy as np
 from ..core import Array, Block, Input, Output, ParameterError, State, kinds, lay_out, parameter
 from .branching import truth
 from .delays import History, push
+from .initial_values import StartsAtInput
 from .integrators import check_limits, clip
 from .linear import section
 
@@ -81,7 +82,7 @@ class DiscreteIntegrator(Block):
         return self.sums(x, u, T)[1], u.reset
 
 
-class FIR(Block):
+class FIR(StartsAtInput, Block):
     """FIR filter: y[k] = c₀ u[k] + c₁ u[k − 1] + … + c_n u[k − n], of a scalar or, element by element, of a vector.
 
     The inputs before the first tick are ``initial_value``; without it, the input just before t = 0: of a source that
@@ -103,20 +104,12 @@ class FIR(Block):
     u = Input(shape=None, description="signal to filter, a scalar or a vector")
     y = Output(shape=None, description="the filtered input")
     line = History("taps", "initial_value", description="the last inputs, the oldest first, one row for each")
+    _rows = "taps"
 
     @property
     def taps(self) -> int:
         """Number of past inputs that are kept."""
         return len(self.coefficients) - 1
-
-    @property
-    def starts_from_inputs(self) -> bool:
-        """Whether `initial` computes the state."""
-        return self.initial_value is None
-
-    def initial(self, u: Any) -> Array:
-        """Return the state at the start, all rows the input just before t = 0."""
-        return np.stack([u.u] * self.taps)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the weighted sum."""
@@ -127,7 +120,7 @@ class FIR(Block):
         return push(x.line, u.u)
 
 
-class MovingAverage(Block):
+class MovingAverage(StartsAtInput, Block):
     """Moving average: y[k] = (u[k] + u[k − 1] + … + u[k − n + 1]) / n, of a scalar or a vector.
 
     The sum is computed in full at each tick, so no rounding error builds up. The inputs before the first tick are
@@ -144,20 +137,12 @@ class MovingAverage(Block):
     u = Input(shape=None, description="signal to average, a scalar or a vector")
     y = Output(like="u", description="the average of the last n inputs")
     line = History("taps", "initial_value", description="the last inputs, the oldest first, one row for each")
+    _rows = "taps"
 
     @property
     def taps(self) -> int:
         """Number of past inputs that are kept."""
         return self.samples - 1
-
-    @property
-    def starts_from_inputs(self) -> bool:
-        """Whether `initial` computes the state."""
-        return self.initial_value is None
-
-    def initial(self, u: Any) -> Array:
-        """Return the state at the start, all rows the input just before t = 0."""
-        return np.stack([u.u] * self.taps)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the average."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..core import Array, Block, Event, Input, Output, ParameterError, ShapeError, State, parameter
 from .branching import truth
+from .initial_values import StartsAtInput
 
 
 class Integrator(Block):
@@ -252,7 +253,7 @@ class ResettableIntegrator(_Limits, Block):
         return (new, u.reset, self.find_side(new)) if self.has_limits else (new, u.reset)
 
 
-class FilteredDerivative(Block):
+class FilteredDerivative(StartsAtInput, Block):
     """Filtered derivative: Y(s) = s / (T_f s + 1) U(s), element by element.
 
     T_f ẋ = u − x, y = (u − x) / T_f. The filter starts at ``initial_value``; without it, at the input just before t =
@@ -269,15 +270,6 @@ class FilteredDerivative(Block):
     u = Input(shape=None, description="signal to differentiate, of any shape")
     y = Output(shape=None, description="the filtered derivative")
     filtered = State(start="initial_value", like="u", description="the filtered input, x")
-
-    @property
-    def starts_from_inputs(self) -> bool:
-        """Whether `initial` computes the state."""
-        return self.initial_value is None
-
-    def initial(self, u: Any) -> Array:
-        """Return the state at the start."""
-        return u.u
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the derivative of the filtered input."""

@@ -29,6 +29,7 @@ from ..core import (
     same_unit,
 )
 from .branching import NumberedInputs, check_fits, expect_scalar, truth
+from .initial_values import StartsAtInput
 
 _OPERATORS = {">": (1.0, 1.0), "<": (-1.0, 1.0), "<=": (1.0, 0.0), ">=": (-1.0, 0.0)}
 """For each relation: a sign s, and the value of y where s (u₁ − u₂) is positive."""
@@ -218,7 +219,7 @@ class Switch(Block):
         return ()
 
 
-class EdgeDetector(Block):
+class EdgeDetector(StartsAtInput, Block):
     """Edge detector of a sampled subsystem: y[k] = 1 at the tick at which u becomes true, else 0.
 
     With ``edge="falling"`` y is 1 at the tick at which u becomes false, with ``"both"`` at either. The first tick
@@ -242,15 +243,6 @@ class EdgeDetector(Block):
     u = Input(shape=None, description="logic signal, of any shape")
     y = Output(shape=None, description="1 at an edge, else 0")
     last = State(start="initial_value", like="u", description="u at the last tick")
-
-    @property
-    def starts_from_inputs(self) -> bool:
-        """Whether `initial` computes the state."""
-        return self.initial_value is None
-
-    def initial(self, u: Any) -> Array:
-        """Return the state at the start."""
-        return u.u
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return 1 where there is an edge, else 0."""

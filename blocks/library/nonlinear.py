@@ -26,6 +26,7 @@ from ..core import (
     shorten,
 )
 from .branching import expect_scalar
+from .initial_values import StartsAtInput
 
 
 class Quantizer(Block):
@@ -227,7 +228,7 @@ class Backlash(Block):
         return np.where(np.abs(drive) > 0.5, x.rest, stays), drive  # while driven, rest keeps its last value
 
 
-class RateLimiter(Block):
+class RateLimiter(StartsAtInput, Block):
     """Rate limiter: y follows u, and rises and falls no faster than the limits.
 
     At a tick, exactly: y[k] = y[k − 1] + (u[k] − y[k − 1] limited to [−falling·T, rising·T]). Before the first tick y
@@ -254,15 +255,6 @@ class RateLimiter(Block):
     u = Input(shape=None, description="signal to follow, of any shape")
     y = Output(like="u", description="the limited signal")
     last = State(start="initial_value", like="u", description="y at the last tick; in a continuous subsystem y itself")
-
-    @property
-    def starts_from_inputs(self) -> bool:
-        """Whether `initial` computes the state."""
-        return self.initial_value is None
-
-    def initial(self, u: Any) -> Array:
-        """Return the state at the start."""
-        return u.u
 
     def clip_change(self, change: Array, span: Array) -> Array:
         """Return a change within the limits for a span of time; NaN passes through."""

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from ..core import Array, Block, Input, Output, State, parameter
+from .initial_values import StartsAtInput
 
 
-class UnitDelay(Block):
+class UnitDelay(StartsAtInput, Block):
     """Delay by one sample: y[k] = u[k − 1].
 
     The first output is ``initial_value``; without it, the input just before t = 0. That is u[0], which then acts in
@@ -26,15 +27,6 @@ class UnitDelay(Block):
     u = Input(shape=None, description="signal to delay, of any shape")
     y = Output(like="u", description="the input one tick ago")
     last = State(start="initial_value", like="u", description="the last input")
-
-    @property
-    def starts_from_inputs(self) -> bool:
-        """Whether `initial` computes the state."""
-        return self.initial_value is None
-
-    def initial(self, u: Any) -> Array:
-        """Return the state at the start."""
-        return u.u
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the last input."""
