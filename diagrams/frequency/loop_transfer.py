@@ -82,6 +82,13 @@ class LoopPlots:
     def _repr_html_(self) -> None:
         """Return None: a notebook shows the short text; python-control's matrices grow with the states."""
 
+    def _draw_with(
+        self, others: Sequence[Any], labels: Sequence[str] | None, omega: ArrayLike | None, *, marked: bool
+    ) -> tuple[tuple[Any, ...], list[DrawnLoop]]:
+        """Return this loop and the others, and all of them as they are drawn."""
+        loops = (self, *others)
+        return loops, drawn_loops(loops, _name_loops(loops, labels), omega, marked=marked)
+
     @accepts(omega=kinds.frequencies, labels=kinds.names, db=kinds.flag, hz=kinds.flag, margins=kinds.flag)
     def bode(
         self,
@@ -116,9 +123,9 @@ class LoopPlots:
         OptionError
             If a loop has several inputs or outputs, or the labels or frequencies don't fit.
         """
-        loops = (self, *others)
-        drawn = drawn_loops(loops, _name_loops(loops, labels), omega, marked=margins)
-        return _plot_bode(loops, drawn, omega, AxisUnits(decibels=db, hertz=hz))
+        return _plot_bode(
+            *self._draw_with(others, labels, omega, marked=margins), omega, AxisUnits(decibels=db, hertz=hz)
+        )
 
     @accepts(omega=kinds.frequencies, labels=kinds.names, margins=kinds.flag)
     def nyquist(
@@ -134,8 +141,7 @@ class LoopPlots:
         are the points with |L| = 1 (○), the crossings of the negative real axis (□), and the largest circle around −1
         that L keeps out of (dotted). See `bode` for the parameters.
         """
-        loops = (self, *others)
-        return _plot_nyquist(loops, drawn_loops(loops, _name_loops(loops, labels), omega, marked=margins), omega)
+        return _plot_nyquist(*self._draw_with(others, labels, omega, marked=margins), omega)
 
     @accepts(omega=kinds.frequencies, labels=kinds.names, margins=kinds.flag)
     def nichols(
@@ -146,8 +152,7 @@ class LoopPlots:
         margins: bool = True,
     ) -> Figure:
         """Return gain over phase, with contours of |T| in dB. See `bode` for the parameters."""
-        loops = (self, *others)
-        return _plot_nichols(loops, drawn_loops(loops, _name_loops(loops, labels), omega, marked=margins), omega)
+        return _plot_nichols(*self._draw_with(others, labels, omega, marked=margins), omega)
 
     @accepts(gains=kinds.numbers, margins=kinds.flag)
     def root_locus(self, gains: ArrayLike | None = None, *, margins: bool = True) -> Figure:

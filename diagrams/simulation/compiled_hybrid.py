@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import CompilerError, SimulationError
+from ...blocks.core import SimulationError
 from ..compiled import (
     BackgroundCode,
     CompiledHybrid,
@@ -40,7 +40,7 @@ from .compiled_hand_over import (
     restore_plans,
 )
 from .compiled_plants import PlantsInC
-from .compiled_ticks import FIRST, LARGEST_CHUNK, WISHED, LaterCode
+from .compiled_ticks import FIRST, LARGEST_CHUNK, WISHED, LaterCode, make_in_c
 from .continuous import Continuous
 from .diagnosis import forget_trials
 from .workspace import Workspace
@@ -409,25 +409,19 @@ def make_hybrid(
     fuse : bool, default False
         Compile them for the processor of this machine.
     """
-    flat = workspace.flat
-    reason = None if machine else find_code_obstacle(flat)
-    if reason is None:
-        try:
-            found = HybridTicks(workspace, continuous, plants, stops, every=every, machine=machine, fuse=fuse)
-        except CompilerError as error:
-            if machine:
-                raise
-            reason = str(error)
-        else:
-            if machine:
-                return found, ()
-            compiled_text = (
-                f"Compiled: {describe_methods(methods_of(continuous), continuous.method.name)}, by the same rules as "
-                "interpreted; values differ from those of an interpreted run by rounding and within the tolerances."
-            )
-            fused = (
-                "Fused: ticks and rates are compiled for this processor; values differ by rounding, which some motions "
-                "magnify."
-            )
-            return found, (*((compiled_text,) if continuous.where.size else ()), *((fused,) if fuse else ()))
-    return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)
+
+    def make() -> HybridTicks:
+        return HybridTicks(workspace, continuous, plants, stops, every=every, machine=machine, fuse=fuse)
+
+    def messages(made: HybridTicks) -> tuple[str, ...]:
+        compiled = (
+            f"Compiled: {describe_methods(methods_of(continuous), continuous.method.name)}, by the same rules as "
+            "interpreted; values differ from those of an interpreted run by rounding and within the tolerances."
+        )
+        fused = (
+            "Fused: ticks and rates are compiled for this processor; values differ by rounding, which some motions "
+            "magnify."
+        )
+        return *((compiled,) if continuous.where.size else ()), *((fused,) if fuse else ())
+
+    return make_in_c(None if machine else find_code_obstacle(workspace.flat), make, messages, machine=machine)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, Generic
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
@@ -62,6 +62,9 @@ _LOOPS = (
     "Compiled: an algebraic loop has {} values. C solves the linear equations of Newton's method with another rounding "
     "than an interpreted run, so that its values may differ by some 1e-14 times the condition of these equations."
 )
+
+Made = TypeVar("Made")
+"""Ticks in C: `CompiledTicks`, or those with continuous states between them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,20 +314,33 @@ def make_compiled(
     fuse : bool, default False
         Compile ticks and plants of our own together, for the processor of this machine.
     """
-    reason = None if machine else find_obstacle(workspace.flat)
-    if reason is None:
+    flat = workspace.flat
+
+    def make() -> CompiledTicks:
+        code = _fuse(flat, plants, every=every) if fuse else None
+        code = interpret_ticks(flat, kinds_of(flat, every=every)) if machine else code
+        return CompiledTicks(workspace, plants, stops, every=every, code=code)
+
+    return make_in_c(None if machine else find_obstacle(flat), make, lambda made: made.messages, machine=machine)
+
+
+def make_in_c(
+    obstacle: str | None, make: Callable[[], Made], messages: Callable[[Made], tuple[str, ...]], *, machine: bool
+) -> tuple[Made | None, tuple[str, ...]]:
+    """Return what ``make`` makes, and its messages; None and a message where there can't be generated code.
+
+    For the virtual machine there is nothing to say; that its library can't be had is an error.
+    """
+    if obstacle is None:
         try:
-            acting = kinds_of(workspace.flat, every=every)
-            code = _fuse(workspace.flat, plants, every=every) if fuse else None
-            code = interpret_ticks(workspace.flat, acting) if machine else code
-            found = CompiledTicks(workspace, plants, stops, every=every, code=code)
+            made = make()
         except CompilerError as error:
             if machine:
                 raise
-            reason = str(error)
+            obstacle = str(error)
         else:
-            return found, () if machine else found.messages
-    return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)
+            return made, () if machine else messages(made)
+    return None, (f"Interpreted, though compile=True asks for C: {obstacle.rstrip('.')}.",)
 
 
 def _fuse(flat: FlatDiagram, plants: PlantsInC, *, every: bool) -> TickCode:
