@@ -7,6 +7,7 @@ warning is an error. Nothing is asked of a network, neither here nor by the page
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import posixpath
 import re
 import shutil
@@ -88,6 +89,8 @@ def build(folder: Path) -> int:
         say("Sphinx: about a minute of processor time; warnings follow")
         options = ["-W", "--keep-going", "-q", "-j", "auto", "-d", str(trees), "-c", str(HERE / "site")]
         status = sphinx([*options, str(sources), str(folder)])
+        for process in multiprocessing.active_children():  # of a build that broke off: they wait for a reader
+            process.terminate()
         say("done" if status == 0 else "there were warnings")
         return status
 

@@ -19,6 +19,7 @@ extensions = [
     "docstrings",
     "links",
     "mathml",
+    "navigation",
 ]
 
 # Pages

@@ -38,11 +38,11 @@ def _units() -> str:
 
 
 def _help_of(*command: str) -> str:
-    """Return what a command prints for ``--help``, 100 columns wide."""
+    """Return what a command prints for ``--help``, 88 columns wide."""
     from loopwright.diagrams.cli import main
 
     printed = io.StringIO()
-    with redirect_stdout(printed), suppress(SystemExit), patch.dict(os.environ, COLUMNS="100"):
+    with redirect_stdout(printed), suppress(SystemExit), patch.dict(os.environ, COLUMNS="88"):
         main([*command, "--help"])
     return "\n".join(line.rstrip() for line in printed.getvalue().splitlines())
 

@@ -32,6 +32,9 @@ _STYLE = {
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
+_PLACE = (0.12, 0.2, 0.64, 0.74)
+"""Place of the axes in a figure, the same in all; the legend is at its right."""
+
 _SHOWN = """.. image:: /reference/responses/{name}_symbol.svg
    :alt: {name} in a diagram
 
@@ -320,9 +323,8 @@ def _wired(example: Example) -> Any:
     return Diagram("example", subsystem(sample_time=example.sample_time)(calls[len(wires)])(*wires.values()))
 
 
-def _draw(axes: Axes, example: Example) -> None:
-    """Run an example and draw its signals."""
-    diagram = _wired(example)
+def _draw(axes: Axes, example: Example, diagram: Any) -> None:
+    """Run the diagram of an example and draw its signals."""
     step = example.duration / 500
     run = diagram.simulate(example.duration, step=step, progress=False)
     path = next(path for path, block in diagram.blocks.items() if block == example.block)
@@ -351,10 +353,11 @@ def draw_all(folder: Path) -> dict[str, str]:
     folder.mkdir(parents=True, exist_ok=True)
     found = {}
     for name, example in examples().items():
+        diagram = _wired(example)
         with matplotlib.rc_context(_STYLE):
-            figure = Figure(figsize=(5.2, 2.0), layout="constrained")
-            _draw(figure.add_subplot(), example)
+            figure = Figure(figsize=(5.2, 2.0))
+            _draw(figure.add_axes(_PLACE), example, diagram)
             figure.savefig(folder / f"{name}.svg", transparent=True, metadata={"Date": None})
-        _wired(example).draw().save(folder / f"{name}_symbol.svg")
+        diagram.draw().save(folder / f"{name}_symbol.svg")
         found[name] = _SHOWN.format(name=name)
     return found
