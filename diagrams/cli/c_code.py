@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import argparse
 import csv
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, OptionError, explain_disk_errors
+from ...blocks.core import OptionError, explain_disk_errors
 from ..exporting import to_c
 from ..wiring import Subsystem
 from .subjects import open_user_diagram
-from .text import say
+from .text import add_json, say, say_json
 from .user_models import load_user_file
 
 
@@ -59,6 +58,7 @@ def add_c(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None
         metavar="FILE.csv",
         help="test signal for --measure: a column for each input, such as force or force[1]; a row for each tick",
     )
+    add_json(parser, "the files and the report")
 
 
 def c_command(arguments: argparse.Namespace) -> int:
@@ -66,20 +66,14 @@ def c_command(arguments: argparse.Namespace) -> int:
     if arguments.test and not arguments.measure:
         raise OptionError("it is for --measure. Give both, or none.", port="--test")
     inputs = _read_signal(Path(arguments.test)) if arguments.test else {}
-    try:
-        code = _write(arguments)
-        for file in code.files:
-            say(str(file))
-        if arguments.measure:
-            code.measure(inputs)
-    except OptionError:
-        raise
-    except LoopwrightError as error:
-        say(f"loopwright: error: {error}", sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        say("loopwright: interrupted", sys.stderr)
-        return 130
+    code = _write(arguments)
+    for file in code.files if not arguments.json else ():
+        say(str(file))
+    if arguments.measure:
+        code.measure(inputs)
+    if arguments.json:
+        say_json({"files": list(code.files), "report": code.report.rstrip()})
+        return 0
     say("")
     say(code.report.rstrip())
     return 0

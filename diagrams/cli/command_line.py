@@ -18,7 +18,6 @@ from tempfile import TemporaryFile
 from typing import Any
 
 from ...blocks.core import (
-    DiskError,
     FmuError,
     FmuFileError,
     LoopwrightError,
@@ -62,6 +61,8 @@ SIGNALS = (
 """Signals of the CSV file, in order."""
 HOLDS = "✓"
 """Mark of a closed form that holds."""
+_AT_ONCE = ("build", "draw", "page", "ssp", "sweep")
+"""Commands that write their file at the end, and all of it at once."""
 _SHOWN = {"m": ("mm", 1e3), "1": ("%", 100.0), "m/s2": ("m/s²", 1.0)}
 
 
@@ -96,11 +97,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OptionError as error:
         _say(f"loopwright: error: {error}", sys.stderr)
         return 2
-    except DiskError as error:
+    except LoopwrightError as error:
         _say(f"loopwright: error: {error}", sys.stderr)
         return 1
     except KeyboardInterrupt:
-        _say("loopwright: interrupted.", sys.stderr)
+        at_once = "; nothing is written" if arguments.command in _AT_ONCE else ""
+        _say(f"loopwright: interrupted{at_once}.", sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of a pipe, such as head, has had enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it ends

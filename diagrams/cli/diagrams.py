@@ -28,7 +28,7 @@ from ..results import Run
 from ..simulation import Interrupted
 from .options import parse_value
 from .subjects import open_user_diagram, proposed
-from .text import say
+from .text import add_json, say, say_json
 
 MOST_DRAWN = 12
 """Wires of a run's figure."""
@@ -52,7 +52,7 @@ def add_diagram_options(run: argparse.ArgumentParser) -> None:
     add_set(group)
     group.add_argument("--step", type=parse_positive, metavar="S", help="step between ticks, where there is no clock")
     group.add_argument("--solver", metavar="NAME", help="solver of the continuous part, such as RK45")
-    group.add_argument("--json", action="store_true", help="print the results as JSON in place of the table")
+    add_json(group, "the results")
 
 
 def add_diagrams(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -69,6 +69,7 @@ def add_diagrams(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     draw.add_argument("--out", metavar="FILE", help="file: .svg, .html, .png or .pdf (default: NAME.svg)")
     draw.add_argument("--subsystem", metavar="PATH", default="", help="draw the inside of this subsystem")
     draw.add_argument("--closed", action="store_true", help="draw all subsystems closed")
+    add_json(draw, "the file, and the blocks and wires of the diagram,")
     sweep = commands.add_parser(
         "sweep",
         help="run a diagram with many values of parameters",
@@ -105,7 +106,7 @@ def add_diagrams(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     sweep.add_argument("--solver", metavar="NAME", help="solver of the continuous part")
     sweep.add_argument("--workers", type=int, metavar="N", help="number of threads (default: as many as cores)")
     sweep.add_argument("--out", metavar="FILE.csv", help="file for the table")
-    sweep.add_argument("--json", action="store_true", help="print the table as JSON")
+    add_json(sweep, "the table")
 
 
 def add_set(parser: Any) -> None:
@@ -166,7 +167,7 @@ def run_diagram(subject: str, arguments: argparse.Namespace) -> int:
     if run is None or not len(run.t):
         say("loopwright: nothing was recorded, so nothing is written.", sys.stderr)
     elif arguments.json:
-        print(json.dumps(_facts(run, problem) | {"files": [str(file) for file in files]}, indent=2))
+        say_json(_facts(run, problem) | {"files": [str(file) for file in files]})
     else:
         say(str(run))
         say(f"\nWritten: {'  '.join(map(str, files))}")
@@ -270,16 +271,16 @@ def _write_run(name: str, run: Run, problem: str | None, folder: Path) -> list[P
 
 def draw_command(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright draw``."""
-    try:
-        with open_user_diagram(arguments.diagram) as (diagram, _):
-            out = Path(arguments.out or f"{diagram.name}.svg").expanduser()
-            diagram.draw(out, subsystem=arguments.subsystem, closed=True if arguments.closed else None)
-    except OptionError:
-        raise
-    except LoopwrightError as error:
-        say(f"loopwright: error: {error}", sys.stderr)
-        return 1
-    say(f"Written: {out}")
+    with open_user_diagram(arguments.diagram) as (diagram, _):
+        out = Path(arguments.out or f"{diagram.name}.svg").expanduser()
+        diagram.draw(out, subsystem=arguments.subsystem, closed=True if arguments.closed else None)
+        if arguments.json:
+            blocks = {path: type(block).__name__ for path, block in diagram.blocks.items()}
+            wires = [{"from": str(wire), "to": f"{path}.{port}"} for (path, port), wire in diagram.wires.items()]
+            names = {name: str(wire) for name, wire in diagram.names.items()}
+            say_json({"file": out, "diagram": diagram.name, "blocks": blocks, "wires": wires, "names": names})
+        else:
+            say(f"Written: {out}")
     return 0
 
 
@@ -293,27 +294,18 @@ def sweep_command(arguments: argparse.Namespace) -> int:
         raise OptionError("ranges need the number of samples. Give it, such as --count 20.", port="--count")
     if samples == "grid" and arguments.count is not None:
         raise OptionError("it is for ranges; a list of values has its own number. Leave it out.", port="--count")
-    try:
-        with open_user_diagram(arguments.diagram) as (diagram, _):
-            diagram = change_diagram(diagram, arguments)
-            found = diagram.sweep(
-                parameters,
-                arguments.duration,
-                samples=samples,
-                count=arguments.count,
-                seed=arguments.seed,
-                reduce=_parse_reductions(arguments.reduce, diagram),
-                workers=arguments.workers,
-                **_run_options(arguments),
-            )
-    except OptionError:
-        raise
-    except LoopwrightError as error:
-        say(f"loopwright: error: {error}", sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        say("loopwright: interrupted; nothing is written.", sys.stderr)
-        return 130
+    with open_user_diagram(arguments.diagram) as (diagram, _):
+        diagram = change_diagram(diagram, arguments)
+        found = diagram.sweep(
+            parameters,
+            arguments.duration,
+            samples=samples,
+            count=arguments.count,
+            seed=arguments.seed,
+            reduce=_parse_reductions(arguments.reduce, diagram),
+            workers=arguments.workers,
+            **_run_options(arguments),
+        )
     columns, rows = _sweep_rows(found)
     if arguments.out is not None:
         out = Path(arguments.out).expanduser()
@@ -325,7 +317,7 @@ def sweep_command(arguments: argparse.Namespace) -> int:
             csv.writer(file).writerows([columns, *rows])
     if arguments.json:
         cells = ([_finite(v) if isinstance(v, float) else v for v in row] for row in rows)
-        print(json.dumps([dict(zip(columns, row, strict=True)) for row in cells], indent=2, default=str))
+        say_json([dict(zip(columns, row, strict=True)) for row in cells])
     else:
         say(str(found))
     if arguments.out is not None and not arguments.json:

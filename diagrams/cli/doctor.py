@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import sys
 from pathlib import Path
 
 from ...fmus.archive import ArchiveLimits
 from ...fmus.checks import doctor
-from .text import check_file, say
+from .text import add_json, check_file, say, say_json
 
 
 def add_doctor(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -34,7 +32,7 @@ def add_doctor(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--max-size", type=float, metavar="GB", help="unpacked size up to which it is read (default: 8)"
     )
-    parser.add_argument("--json", action="store_true", help="all of it as JSON")
+    add_json(parser, "all of it")
 
 
 def run_doctor(arguments: argparse.Namespace) -> int:
@@ -46,13 +44,9 @@ def run_doctor(arguments: argparse.Namespace) -> int:
     limits = None
     if arguments.max_size is not None:
         limits = ArchiveLimits(size=arguments.max_size * 1e9, ratio=float("inf"))
-    try:
-        diagnosis = doctor(path, run=arguments.run, limits=limits)
-    except KeyboardInterrupt:
-        say("loopwright: interrupted", sys.stderr)
-        return 130
+    diagnosis = doctor(path, run=arguments.run, limits=limits)
     if arguments.json:
-        print(json.dumps(diagnosis.as_dict(), indent=2))  # ASCII: it prints on any terminal
+        say_json(diagnosis.as_dict())
     else:
         say(str(diagnosis))
     if not usable:

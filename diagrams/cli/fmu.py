@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
-import json
 import math
 import pkgutil
 import sys
@@ -16,8 +15,6 @@ from typing import Any
 
 from ...blocks.core import (
     Block,
-    FmuFileError,
-    LoopwrightError,
     OptionError,
     TraceError,
     close_names,
@@ -34,7 +31,7 @@ from ..exporting import name_of
 from .doctor import add_doctor, run_doctor
 from .ssp import inspect_ssp
 from .subjects import is_ssp
-from .text import check_file, fit, say
+from .text import add_json, check_file, fit, say, say_json
 from .user_models import load_user_model
 
 _WIDTH = 120  # of a table that goes into a file
@@ -85,6 +82,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     build.add_argument(
         "--no-clocks", action="store_true", help="of a diagram in FMI 3.0: its sample times are no input clocks"
     )
+    add_json(build, "the file and its description")
     build.add_argument("--no-arrays", action="store_true", help="a scalar variable for each element of a vector")
     build.add_argument(
         "--python", action="store_true", help="put the Python code inside, for equations that can't be traced"
@@ -99,7 +97,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     inspect.add_argument("file", metavar="FILE", help="a .fmu, .ssp or .ssd")
     inspect.add_argument("--all", action="store_true", help="local variables, too")
-    inspect.add_argument("--json", action="store_true", help="the same as JSON, all variables")
+    add_json(inspect, "the same, with all variables,")
     check = commands.add_parser(
         "validate",
         help="check an FMU and run it for some steps",
@@ -111,6 +109,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     check.add_argument("file", metavar="FILE.fmu")
     check.add_argument("--no-run", action="store_true", help="don't run it: an FMU is a program of its maker's")
+    add_json(check, "the problems, and what was checked,")
     add_doctor(commands)
 
 
@@ -156,16 +155,12 @@ def run_build(arguments: argparse.Namespace) -> int:
         with _find_model(arguments) as make:
             built = make(options, out if out_is_file else None, out)
         summary = summarize(built)
-    except OptionError:
-        raise
     except TraceError as error:
         hint = "" if arguments.python or error.is_mistake else " Or put its Python code inside: --python."
         return _complain(f"{error}{hint}")
-    except LoopwrightError as error:
-        return _complain(error)
-    except KeyboardInterrupt:
-        say("loopwright: interrupted; nothing is written", sys.stderr)
-        return 130
+    if arguments.json:
+        say_json(summary)
+        return 0
     say(f"{built}  ({_size_text(summary['size'])})")
     say(f"FMI {summary['fmi_version']}, {' and '.join(INTERFACES[kind] for kind in summary['interfaces'])}")
     say(f"platforms: {', '.join(summary['platforms'])}")
@@ -255,12 +250,9 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     if is_ssp(arguments.file):
         return inspect_ssp(arguments.file, as_json=arguments.json)
     path = check_file(arguments.file)
-    try:
-        summary = summarize(path)
-    except FmuFileError as error:
-        return _complain(error)
+    summary = summarize(path)
     if arguments.json:
-        print(json.dumps(summary, indent=2))  # ASCII: it prints on any terminal
+        say_json(summary)
         return 0
     for label, text in _summary_lines(summary):
         say(f"{label:<15}{text}")
@@ -362,11 +354,12 @@ def _start_text(value: Any) -> str:
 def run_validate(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright validate``."""
     path = check_file(arguments.file)
-    try:
-        report = validate(path, run=not arguments.no_run)
-    except KeyboardInterrupt:
-        say("loopwright: interrupted", sys.stderr)
-        return 130
+    report = validate(path, run=not arguments.no_run)
+    if arguments.json:
+        problems = [{"found": problem.found, "next": problem.step} for problem in report.problems]
+        checked = {"checked": list(report.done), "not_checked": list(report.left)}
+        say_json({"file": path, "clean": not problems, "problems": problems} | checked)
+        return 1 if problems else 0
     n = len(report.problems)
     say(f"{path}: {'clean' if n == 0 else '1 problem' if n == 1 else f'{n} problems'}")
     for i, problem in enumerate(report.problems, 1):

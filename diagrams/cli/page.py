@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...blocks.core import LoopwrightError, OptionError
+from ...blocks.core import OptionError
 from ..paper import experiments
 from .subjects import open_user_diagram
-from .text import say
+from .text import add_json, say, say_json
 
 if TYPE_CHECKING:
     from ..web_page import WebPage
@@ -54,18 +53,16 @@ def add_page(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     page.add_argument("--step", type=float, metavar="S", help="seconds between samples, where there is no clock")
     page.add_argument("--speed", type=float, default=1.0, metavar="X", help="times real time at first (default: 1)")
+    add_json(page, "the file and its size")
 
 
 def page_command(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright page``."""
-    try:
-        page, file = _make(arguments)
-    except OptionError:
-        raise
-    except LoopwrightError as error:
-        say(f"loopwright: error: {error}", sys.stderr)
-        return 1
-    say(f"{file}: {page.size / 1e3:.0f} kB")
+    page, file = _make(arguments)
+    if arguments.json:
+        say_json({"file": file, "size": page.size})
+    else:
+        say(f"{file}: {page.size / 1e3:.0f} kB")
     return 0
 
 

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import sys
 from pathlib import Path
 from typing import Any
 
-from ...blocks.core import LoopwrightError, OptionError
 from ..ssp import SspDescription, read_ssp
 from .diagrams import add_set, change_diagram, parse_positive
 from .subjects import open_user_diagram, split_ssp
-from .text import say
+from .text import add_json, say, say_json
 
 
 def add_ssp(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -38,21 +35,19 @@ def add_ssp(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         "--flat", action="store_true", help="one level without inputs and outputs, for readers that know no more"
     )
     add_set(made)
+    add_json(made, "the file and its content")
 
 
 def ssp_command(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright ssp``."""
-    try:
-        with open_user_diagram(arguments.diagram) as (diagram, _):
-            changed = change_diagram(diagram, arguments)
-            file = Path(arguments.out or f"{changed.name}.ssp").expanduser()
-            written = changed.to_ssp(file, stop=arguments.stop, step=arguments.step, flat=arguments.flat)
-    except OptionError:
-        raise
-    except LoopwrightError as error:
-        say(f"loopwright: error: {error}", sys.stderr)
-        return 1
+    with open_user_diagram(arguments.diagram) as (diagram, _):
+        changed = change_diagram(diagram, arguments)
+        file = Path(arguments.out or f"{changed.name}.ssp").expanduser()
+        written = changed.to_ssp(file, stop=arguments.stop, step=arguments.step, flat=arguments.flat)
     about = read_ssp(written)
+    if arguments.json:
+        say_json({"file": written} | _facts(about))
+        return 0
     say(f"{written}  ({written.stat().st_size / 1e3:.1f} kB)")
     say(f"SSP {about.version}, {len(about.components)} components")
     return 0
@@ -61,13 +56,9 @@ def ssp_command(arguments: argparse.Namespace) -> int:
 def inspect_ssp(name: str, *, as_json: bool) -> int:
     """Carry out ``loopwright inspect FILE.ssp``."""
     file, variant = split_ssp(name)
-    try:
-        about = read_ssp(file, variant)
-    except LoopwrightError as error:
-        say(f"loopwright: error: {error}", sys.stderr)
-        return 1
+    about = read_ssp(file, variant)
     if as_json:
-        print(json.dumps(_facts(about), indent=2))
+        say_json(_facts(about))
     else:
         say(str(about))
     return 0

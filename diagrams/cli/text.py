@@ -1,11 +1,13 @@
-"""Output of the command line, as the terminal can show it, and files that are named on it."""
+"""Output of the command line, as the terminal can show it or as JSON, and files that are named on it."""
 
 from __future__ import annotations
 
+import argparse
+import json
 import re
 import sys
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from ...blocks.core import OptionError, explain_disk_errors
 
@@ -34,6 +36,16 @@ def say(text: str, stream: IO[str] | None = None) -> None:
     """Print a line, at once; on standard output without a stream."""
     stream = stream or sys.stdout
     print(fit(text, stream), file=stream, flush=True)
+
+
+def add_json(parser: argparse.ArgumentParser | argparse._ArgumentGroup, content: str) -> None:
+    """Add ``--json``, which prints a content as JSON in place of the text."""
+    parser.add_argument("--json", action="store_true", help=f"print {content} as JSON")
+
+
+def say_json(content: Any) -> None:
+    """Print a content as JSON, in ASCII, which any terminal can show."""
+    print(json.dumps(content, indent=2, default=str))
 
 
 def fit(text: str, stream: IO[str]) -> str:

@@ -20,6 +20,7 @@ extensions = [
     "links",
     "mathml",
     "navigation",
+    "search_words",
 ]
 
 # Pages

@@ -109,6 +109,29 @@ def test_a_diagram_is_drawn_to_a_file(loop, capsys):
     assert main(["draw", "loop.py:loop", "--subsystem", "nowhere"]) == 2
 
 
+def test_the_drawn_diagram_comes_as_json(loop, capsys):
+    assert main(["draw", "loop.py:loop", "--json", "--out", "l.html"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found == {
+        "file": "l.html",
+        "diagram": "loop",
+        "blocks": {"lag": "StateSpace", "kp": "Gain", "step": "Step"},
+        "wires": [{"from": "kp.y", "to": "lag.u"}, {"from": "step.y", "to": "kp.u"}],
+        "names": {"u": "kp.y", "y": "lag.y"},
+    }
+    assert "<svg" in (loop / "l.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("command", ["draw", "page", "ssp", "sweep", "c"])
+def test_an_interrupt_of_any_command_is_one_line(loop, capsys, command):
+    (loop / "late.py").write_text("def loop():\n    raise KeyboardInterrupt\n", encoding="utf-8")
+    options = ["--duration", "1", "--vary", "k=1"] if command == "sweep" else []
+    assert main([command, "late.py:loop", *options]) == 130
+    said = "interrupted." if command == "c" else "interrupted; nothing is written."
+    assert capsys.readouterr() == ("", f"loopwright: {said}\n")
+    assert sorted(file.name for file in loop.iterdir()) == ["bad.py", "late.py", "loop.py"]
+
+
 def test_a_sweep_has_a_row_for_each_sample(loop, capsys):
     asked = ["--vary", "kp.gain=1,2,4", "--reduce", "maximum:y", "--duration", "1", "--step", "0.1"]
     assert main(["sweep", "loop.py:loop", *asked, "--out", "table.csv", "--json"]) == 0

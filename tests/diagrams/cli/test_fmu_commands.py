@@ -231,6 +231,13 @@ def test_a_file_to_write(here, uncompiled):
     assert names(here) == sorted(["a/b.fmu", *SOURCES])
 
 
+def test_what_was_built_comes_as_json(here, uncompiled, capsys):
+    assert main(["build", "mine.py:Lag", "--out", "c.fmu", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["file"], found["model_name"]) == ("c.fmu", "lag")
+    assert found["size"] == (here / "c.fmu").stat().st_size
+
+
 def test_platforms(here, capsys, monkeypatch):
     """Names reach the builder; compiling for others is tested with the compiler."""
     asked = []
@@ -615,6 +622,21 @@ def test_ours_are_clean_and_run(lag, name, capsys):
     assert out.startswith(f"{lag / name}: clean\nchecked: description against FMI ")
     assert "co-simulation run for 10 steps" in out
     assert "not checked" not in out
+
+
+def test_problems_come_as_json(lag, altered, capsys):
+    assert main(["validate", str(lag / "lag.fmu"), "--no-run", "--json"]) == 0
+    clean = json.loads(capsys.readouterr().out)
+    assert (clean["file"], clean["clean"], clean["problems"]) == (str(lag / "lag.fmu"), True, [])
+    assert clean["checked"][0].startswith("description against FMI ")
+    file = altered("lag.fmu", drop=["sources/model.c"])
+    assert main(["validate", str(file), "--no-run", "--json"]) == 1
+    (problem,) = json.loads(capsys.readouterr().out)["problems"]
+    assert (
+        problem["found"]
+        == "sources/buildDescription.xml declares the source file model.c; there is no sources/model.c."
+    )
+    assert problem["next"]
 
 
 def test_description_against_the_schema(altered, capsys):
