@@ -12,6 +12,7 @@ from loopwright.diagrams import DefinitionError, OptionError
 from loopwright.diagrams.exporting import open_subsystem, target_spec
 from loopwright.fmus.export import measure, run_here, unit_name, write_target
 from loopwright.fmus.export.target_measure import find_bound
+from support.exported_loops import Loop
 from support.target_diagrams import DIAGRAMS, run_of, spec_of
 
 TICKS = 300
@@ -53,6 +54,28 @@ def test_the_numbers_are_those_of_the_run_in_every_bit(name):
     for signal, values in found.items():
         np.testing.assert_array_equal(values, run[signal][:TICKS])
     assert max(np.ptp(values) for values in found.values()) > 0.1
+
+
+@pytest.mark.parametrize(
+    "name", ["tables", *(pytest.param(n, marks=pytest.mark.slow) for n in DIAGRAMS if n != "tables")]
+)
+def test_with_own_functions_it_has_the_bits_of_the_loop_that_has_them(name):
+    """The loop of runs and FMUs, with the same functions in place of those of math.h."""
+    spec, (run, inputs) = spec_of(name), run_of(name, TICKS)
+    found = run_here(write_target(spec, own_functions=True), inputs, TICKS)
+    loop = Loop(spec.loop, own_functions=True)
+    rows = {signal: [] for signal in found}
+    for k in range(TICKS):
+        for argument, values in inputs.items():
+            loop[argument] = values[k]
+        assert k or loop.start()
+        assert loop.advance(float((k + 1) * spec.loop.base))
+        for signal, row in rows.items():
+            row.append(loop[signal])
+    for signal, values in found.items():
+        np.testing.assert_array_equal(values, rows[signal])
+    if name == "path_following":
+        assert any(np.any(values != run[signal][:TICKS]) for signal, values in found.items())  # math.h's are others
 
 
 @pytest.mark.slow
