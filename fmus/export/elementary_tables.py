@@ -1,6 +1,7 @@
 """Tables of the elementary functions in exported FMUs, computed in decimal arithmetic: no platform's function is asked.
 
-The functions themselves are in ``runtime/elementary.c``. The equations of a generated ``model.c`` call them under
+The functions themselves are in ``runtime/elementary.c``, those of single precision in ``runtime/elementary_single.c``.
+The equations of a generated ``model.c`` call them under
 their own names, so that an FMU computes the same bits on every platform.
 """
 
@@ -12,8 +13,12 @@ from decimal import Context, Decimal, localcontext
 from functools import lru_cache
 from math import factorial, frexp, ldexp
 
+import numpy as np
+
 FUNCTIONS = ("sin", "cos", "tanh", "exp", "expm1", "log", "pow")
 """The functions that are our own; others (such as atan2) are the platform's."""
+SINGLE_FUNCTIONS = (*FUNCTIONS, "floor", "ceil", "fmin", "fmax")
+"""Those of single precision: with what a processor for it has no instruction for."""
 _NODES = 306  # of tanh, up to which it differs from 1
 _DIGITS = 60
 
@@ -46,6 +51,37 @@ def prepare_functions(equations: str) -> str:
 def restore_functions() -> str:
     """Return the C text that goes after the equations: the names of math.h are its own again."""
     return "".join(f"#undef {name}\n" for name in FUNCTIONS)
+
+
+def prepare_single(called: Iterable[str]) -> str:
+    """Return the C text that goes before functions of single precision: their tables, and which are called.
+
+    Parameters
+    ----------
+    called : iterable of str
+        Of `SINGLE_FUNCTIONS`. ``sin`` is ``lw_sinf`` in C, and so on.
+    """
+    needs = [f"#define LW_NEEDS_{name.upper()}_SINGLE 1\n" for name in called]
+    tables = dict.fromkeys(table for name in called for table in _OF_SINGLE.get(name, ()))
+    with localcontext(Context(prec=_DIGITS)):
+        texts = [_SINGLE_TABLES[table]() for table in tables]
+    return "".join([*needs, *texts, '#include "elementary_single.c"\n'])
+
+
+def _write_single(value: Decimal) -> str:
+    """Return the float nearest to a value as C text; the shortest that reads as this float."""
+    nearest = np.float32(float(value))  # rounded twice: the values here are not so near to a middle
+    return f"{np.format_float_scientific(nearest, unique=True, trim='0')}f"
+
+
+def _single_array(name: str, values: Iterable[Decimal]) -> str:
+    texts = [_write_single(v) for v in values]
+    lines = [", ".join(texts[i : i + 6]) for i in range(0, len(texts), 6)]
+    return f"static const float {name}_single[] = {{\n    " + ",\n    ".join(lines) + "\n};\n"
+
+
+def _single_constants(**values: Decimal) -> str:
+    return "".join(f"#define LW_{name.upper()}_SINGLE {_write_single(value)}\n" for name, value in values.items())
 
 
 def _write(value: Decimal) -> str:
@@ -184,4 +220,71 @@ _OF = {
     "expm1": ("exp", "expm1"),
     "log": ("log", "series"),
     "pow": ("exp", "log"),
+}
+
+
+def _single_exp() -> str:
+    """Return ln 2/16 in two parts, and 2^(i/16) as a float with the rest, relative to it."""
+    step = Decimal(2).ln() / 16
+    high, low = _split(step, 12)
+    rows: list[Decimal] = []
+    for i in range(16):
+        exact = (step * i).exp()
+        nearest = Decimal(float(np.float32(float(exact))))
+        rows += [nearest, exact / nearest - 1]
+    constants = _single_constants(inverse_step=1 / step, step_hi=high, step_lo=low, twenty_fourth=1 / Decimal(24))
+    return constants + _single_array("lw_exp_table", rows)
+
+
+def _single_log() -> str:
+    """Return ln 2 in two parts; for each of 64 intervals of m an inverse of 9 bits, and -ln of it in two parts."""
+    high, low = _split(Decimal(2).ln(), 15)
+    rows: list[Decimal] = []
+    for i in range(64):
+        ends = [_from_single_bits(0x3F350000 + (j << 17)) for j in (i, i + 1)]  # m from about √½ to √2
+        inverse = Decimal(1) if ends[0] <= 1 <= ends[1] else (512 / (ends[0] + ends[1])).to_integral_value() / 256
+        logarithm = -inverse.ln()
+        first, rest = _split(logarithm, 15 + min(0, frexp(float(logarithm))[1])) if logarithm else [Decimal(0)] * 2
+        rows += [inverse, first, rest]
+    return _single_constants(log2_hi=high, log2_lo=low) + _single_array("lw_log_table", rows)
+
+
+def _from_single_bits(bits: int) -> Decimal:
+    return Decimal(float(np.uint32(bits).view(np.float32)))
+
+
+def _single_circle() -> str:
+    """Return π/2 in two parts, 2/π in words of 32 bits behind one of zeros, and the series of sine and cosine."""
+    with localcontext(Context(prec=120)):
+        half = _pi(110) / 2
+        bits = int((2 ** Decimal(32 * 7) / half).to_integral_value(rounding="ROUND_DOWN"))
+    words = [0, *(bits >> 32 * (6 - i) & 0xFFFFFFFF for i in range(7))]
+    upper, lower = _split(half, 12)
+    table = ", ".join(f"0x{word:08x}u" for word in words)
+    return (
+        _single_constants(half_pi_upper=upper, half_pi_lower=lower)
+        + f"static const uint32_t lw_two_over_pi_single[] = {{{table}}};\n"
+        + _single_array("lw_sin_series", (Decimal((-1) ** k) / factorial(2 * k + 1) for k in range(1, 5)))
+        + _single_array("lw_cos_series", (Decimal((-1) ** k) / factorial(2 * k) for k in range(2, 6)))
+    )
+
+
+_SINGLE_TABLES = {
+    "third": lambda: _single_constants(third=1 / Decimal(3)),
+    "circle": _single_circle,
+    "exp": _single_exp,
+    "expm1": lambda: _single_array("lw_expm1_series", (1 / Decimal(factorial(k)) for k in range(3, 8))),
+    "tanh": lambda: _single_array(
+        "lw_tanh_series", [Decimal(-1) / 3, Decimal(2) / 15, Decimal(-17) / 315, Decimal(62) / 2835]
+    ),
+    "log": _single_log,
+}
+_OF_SINGLE = {
+    "sin": ("circle",),
+    "cos": ("circle",),
+    "tanh": ("third", "exp", "expm1", "tanh"),
+    "exp": ("third", "exp"),
+    "expm1": ("third", "exp", "expm1"),
+    "log": ("third", "log"),
+    "pow": ("third", "exp", "log"),
 }

@@ -363,6 +363,7 @@ class Tables:
     def __init__(self) -> None:
         self.values: list[np.ndarray] = []
         self.read: set[tuple[int, bool]] = set()
+        self.sought: set[tuple[int, bool]] = set()
         self._known: dict[bytes, int] = {}
 
     def name(self, number: int, fine: bool) -> str:
@@ -496,10 +497,9 @@ class Expressions:
             return self._binary(operation, arguments, fine)
         if operation == FIND:
             self._note("find", fine)
+            self._tables.sought.add((node.place[0], fine))
             table = self._tables.name(node.place[0], fine)
-            count = self._tables.values[node.place[0]].size
-            sought = self._number(arguments[0], _LOGIC, fine)
-            return f"find_piece{OF_TIME * fine}({table}, {count}u, {sought})", _ATOM
+            return f"find_in_{table}({self._number(arguments[0], _LOGIC, fine)})", _ATOM
         if operation == TAKE:
             self._note("take", fine)
             table = self._tables.name(node.place[0], fine)

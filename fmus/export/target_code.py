@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core import explain_calls
-from .elementary_tables import FUNCTIONS, prepare_functions
+from .elementary_tables import FUNCTIONS, SINGLE_FUNCTIONS, prepare_functions, prepare_single
 from .loop_spec import Placed
 from .model import Variable
 from .scalar_code import OF_MATH, OF_TIME, Expressions, Scalars, Tables, c_constant
@@ -29,8 +29,8 @@ _MACRO = re.compile(
     r"|(DBL|FLT|LDBL|FP|DECIMAL|MATH|SEEK|M)_\w+|U?INT\w*_(MAX|MIN)|(SIZE|PTRDIFF|WCHAR|WINT|SIG_ATOMIC)_(MAX|MIN)"
 )
 """Macros of the headers that the source, or a program with it, includes: they are no names of members."""
-_IN_TWO = ("choose", "sign_of", "find_piece")
-_HELPERS = f"is_finite exact choose sign_of find_piece start_values {' '.join(f'{one}{OF_TIME}' for one in _IN_TWO)}"
+_IN_TWO = ("choose", "sign_of")
+_HELPERS = f"is_finite exact choose sign_of start_values {' '.join(f'{one}{OF_TIME}' for one in _IN_TWO)}"
 _OF_FILES = f"""{_HELPERS}
 math string float stddef stdint stdbool stdio stdlib errno assert time signal ctype limits locale
 abs labs div ldiv exit abort atexit system getenv malloc calloc realloc free rand srand qsort bsearch atoi atof atol
@@ -44,7 +44,7 @@ j0 j1 jn y0 y1 yn index rindex isnan isinf isfinite isnormal signbit fpclassify 
 _FUNCTION = re.compile(r"^static [^\n;=]*\b(lw_\w+)\([^\n]*\) \{(?:[^\n]*\}|\n.*?^\})\n", re.MULTILINE | re.DOTALL)
 _KEYWORDS = frozenset(_C_KEYWORDS.split())
 _FILE_NAMES = frozenset(_OF_FILES.split())
-_FILE_NAME = re.compile(r"(t|table_|tick_)\d+|(lw|own)_\w+|u?int\w*_t|.*_t")
+_FILE_NAME = re.compile(r"(t|(find_in_)?table_|tick_)\d+|(lw|own)_\w+|u?int\w*_t|.*_t")
 _INPUTS = 2  # argument w of a tick: the inputs
 _GROUPS = ("parameters", "numbers", "inputs", "outputs", "signals", "states")
 _KIND = {"inputs": "input", "outputs": "output", "signals": "signal", "parameters": "parameter"}
@@ -170,7 +170,7 @@ def write_target(spec: TargetSpec, *, number: Number = "double", own_functions: 
         Type of all numbers.
     own_functions : bool, default False
         Take sine, cosine, tangent hyperbolic, exponential, exp(x) - 1, logarithm and power from this package, with the
-        same bits on every platform, and not from math.h. In ``float`` they compute in double precision, and round.
+        same bits on every platform, and not from math.h. In ``float`` they compute in single precision.
     """
     return _SourceWriter(spec, number, own_functions).write()
 
@@ -190,8 +190,8 @@ def unit_name(name: str) -> str:
     return f"{found}_" if taken else found
 
 
-def _elementary_source() -> str:
-    return (resources.files(__package__) / "runtime" / "elementary.c").read_text(encoding="utf-8")
+def _read_runtime(name: str) -> str:
+    return (resources.files(__package__) / "runtime" / name).read_text(encoding="utf-8")
 
 
 @dataclass
@@ -367,8 +367,8 @@ class _SourceWriter:
         source = self._source(ticks)
         files = {f"{self.name}.h": self._header(), f"{self.name}.c": source, f"{self.name}_example.c": self._example()}
         members = tuple(member for group in _GROUPS for member in self.members[group])
-        own = FUNCTIONS if self.own else ()
-        platform = {"fabs"} | {f for f in self.called | self.called_fine if f in OF_MATH and f not in own}
+        own, own_fine = ((SINGLE_FUNCTIONS if self.single else FUNCTIONS), FUNCTIONS) if self.own else ((), ())
+        platform = {"fabs", *(self.called - {*own}), *(self.called_fine - {*own_fine})} & OF_MATH
         return TargetText(
             self.name,
             self.number,
@@ -518,8 +518,8 @@ class _SourceWriter:
 
     def _call(self, function: str, fine: bool = False) -> str:
         single = self.single and not fine
-        if self.own and function in FUNCTIONS:
-            return f"own_{function}f" if single else f"lw_{function}"
+        if self.own and function in (SINGLE_FUNCTIONS if single else FUNCTIONS):
+            return f"lw_{function}f" if single else f"lw_{function}"
         return f"{function}f" if single else function
 
     def _constant(self, value: float, fine: bool = False) -> str:
@@ -791,28 +791,27 @@ class _SourceWriter:
         return "\n".join(lines)
 
     def _own_functions(self) -> list[str]:
-        called = [f for f in FUNCTIONS if f in self.called | self.called_fine] if self.own else []
-        if not called:
+        single = [f for f in SINGLE_FUNCTIONS if self.own and self.single and f in self.called]
+        double = [f for f in FUNCTIONS if self.own and f in (self.called_fine if self.single else self.called)]
+        if not (single or double):
             return []
-        text = prepare_functions(" ".join(f"{f}(" for f in called)).replace(
-            '#include "elementary.c"\n', _elementary_source()
-        )
-        text = re.sub(r"^#define (\w+) lw_\1\n", "", text, flags=re.MULTILINE)
-        text = re.sub(
-            r"\b0x[0-9a-f.]+p[+-]?\d+\b", lambda found: repr(float.fromhex(found[0])), text
-        )  # the same number
-        text = re.sub(r"\b(INFINITY|NAN)\b", r"(double)\1", text)  # they are of single precision in C
-        text = _leave_out_unused(text, [f"lw_{f}" for f in called])
-        found = ["/* ---- elementary functions, with the same bits on every platform ---- */", "", text]
-        for function in [f for f in called if f in self.called] if self.single else ():
-            names = ("x", "y") if function == "pow" else ("x",)
-            found += [
-                f"static inline float own_{function}f({', '.join(f'float {n}' for n in names)}) {{",
-                f"    return (float)lw_{function}({', '.join(f'(double){n}' for n in names)});",
-                "}",
-                "",
-            ]
-        return found
+        texts = []
+        if double:
+            text = prepare_functions(" ".join(f"{f}(" for f in double)).replace(
+                '#include "elementary.c"\n', _read_runtime("elementary.c")
+            )
+            text = re.sub(r"^#define (\w+) lw_\1\n", "", text, flags=re.MULTILINE)
+            text = re.sub(
+                r"\b0x[0-9a-f.]+p[+-]?\d+\b", lambda found: repr(float.fromhex(found[0])), text
+            )  # the same number
+            texts.append(re.sub(r"\b(INFINITY|NAN)\b", r"(double)\1", text))  # they are of single precision in C
+        if single:
+            texts.append(
+                prepare_single(single).replace('#include "elementary_single.c"\n', _read_runtime("elementary_single.c"))
+            )
+        wanted = [*(f"lw_{f}" for f in double), *(f"lw_{f}f" for f in single)]
+        text = _leave_out_unused("\n".join(texts), wanted)
+        return ["/* ---- elementary functions, with the same bits on every platform ---- */", "", text]
 
     def _helpers(self) -> list[str]:
         real, largest = self.real, "FLT_MAX" if self.single else "DBL_MAX"
@@ -845,37 +844,40 @@ class _SourceWriter:
                     "}",
                     "",
                 ]
-            if "find" in called:
-                found += [
-                    "/* The piece of a table that x is in: the last breakpoint up to x, or an end piece. */",
-                    f"static inline {type_} find_piece{end}(const {type_} *breakpoints, uint32_t count, {type_} x) {{",
-                    "    uint32_t low = 0u, high = count - 1u;",
-                    "    while (high - low > 1u) {",
-                    "        const uint32_t middle = low + (high - low) / 2u;",
-                    "        if (x < breakpoints[middle]) {",
-                    "            high = middle;",
-                    "        } else {",
-                    "            low = middle;",
-                    "        }",
-                    "    }",
-                    f"    return ({type_})low;",
-                    "}",
-                    "",
-                ]
         return found
 
     def _table_lines(self) -> list[str]:
         found = ["/* ---- tables ---- */", ""] if self.tables.read else []
         for i, fine in sorted(self.tables.read):
-            table, type_ = self.tables.values[i], "double" if fine else self.real
-            texts = [c_constant(v, single=self.single and not fine) for v in table.tolist()]
+            name, values, type_ = self.tables.name(i, fine), self.tables.values[i], "double" if fine else self.real
+            texts = [c_constant(v, single=self.single and not fine) for v in values.tolist()]
             found += [
-                f"static const {type_} {self.tables.name(i, fine)}[{table.size}] = {{",
+                f"static const {type_} {name}[{values.size}] = {{",
                 *_fill("    ", texts, ", ", ""),
                 "};",
                 "",
             ]
+            if (i, fine) in self.tables.sought:
+                found += self._finder(name, values.size - 1, type_)
         return found
+
+    @staticmethod
+    def _finder(table: str, pieces: int, type_: str) -> list[str]:
+        """Return the function that finds the piece of a table in halves: always as many steps, and no loop."""
+        steps = []
+        while pieces > 1:
+            half = pieces // 2
+            steps.append(f"    piece += (x < {table}[piece + {half}u]) ? 0u : {half}u;")
+            pieces -= half
+        return [
+            "/* The piece of a table that x is in: the last breakpoint up to x, or an end piece. */",
+            f"static inline {type_} find_in_{table}({type_} x) {{",
+            f"    {'uint32_t' if steps else 'const uint32_t'} piece = 0u;",
+            *(steps or ["    (void)x;"]),
+            f"    return ({type_})piece;",
+            "}",
+            "",
+        ]
 
     def _start_lines(self) -> list[str]:
         name = self.name

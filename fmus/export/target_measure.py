@@ -48,6 +48,7 @@ void _start(void) {{
 _STRING = """#include <stddef.h>
 void *memcpy(void *to, const void *from, size_t count);
 void *memset(void *to, int value, size_t count);
+#define memcpy __builtin_memcpy
 """
 _UNARY = """sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp expm1 log log1p sqrt floor ceil fabs
 erf"""

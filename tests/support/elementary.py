@@ -6,9 +6,16 @@ from importlib import resources
 import numpy as np
 
 import loopwright.fmus.export as export
-from loopwright.fmus.export.elementary_tables import FUNCTIONS, prepare_functions, restore_functions
+from loopwright.fmus.export.elementary_tables import (
+    FUNCTIONS,
+    SINGLE_FUNCTIONS,
+    prepare_functions,
+    prepare_single,
+    restore_functions,
+)
 
 RUNTIME = resources.files(export) / "runtime" / "elementary.c"
+RUNTIME_SINGLE = resources.files(export) / "runtime" / "elementary_single.c"
 ONE_FUNCTION = """
 #ifdef _WIN32
 __declspec(dllexport)
@@ -25,6 +32,15 @@ void many_{0}(const double *x, const double *z, double *y, long long n) {{
 def source() -> str:
     text = prepare_functions(" ".join(f"{name}(x)" for name in FUNCTIONS)) + restore_functions()
     return text + "".join(ONE_FUNCTION.format(name, ", z[i]" if name == "pow" else "") for name in FUNCTIONS)
+
+
+def source_single() -> str:
+    """The functions of single precision, called in the same way."""
+    text = "#include <stdint.h>\n" + prepare_single(SINGLE_FUNCTIONS)
+    for name in SINGLE_FUNCTIONS:
+        more = ", z[i]" if name in ("pow", "fmin", "fmax") else ""
+        text += ONE_FUNCTION.format(name, more).replace("double", "float").replace(f"lw_{name}(", f"lw_{name}f(")
+    return text
 
 
 def signed(rng, sizes):

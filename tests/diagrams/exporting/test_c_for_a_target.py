@@ -93,17 +93,29 @@ def test_single_precision_is_within_its_rounding_of_double(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*DIAGRAMS])
-@pytest.mark.parametrize("processor", ["cortex-m4", "cortex-m0"])
-def test_a_cortex_m_computes_the_bits_of_this_machine(name, processor):
-    """With our own functions, in double precision; it is compiled with warnings as errors."""
+@pytest.mark.parametrize(
+    ("processor", "number"), [("cortex-m4", "double"), ("cortex-m0", "double"), ("cortex-m4", "float")]
+)
+def test_a_cortex_m_computes_the_bits_of_this_machine(name, processor, number):
+    """With our own functions; it is compiled with warnings as errors."""
     _, inputs = run_of(name, TICKS)
-    text = write_target(spec_of(name), own_functions=True)
+    text = write_target(spec_of(name), own_functions=True, number=number)
     here, there = run_here(text, inputs, 40), measure(text, processor, inputs, 40)
     assert not there.missing
     for signal, values in here.items():
         np.testing.assert_array_equal(values, there.outputs[signal])
     assert len(there.instructions) == 40
     assert there.stack > 0
+    assert there.bound is None or there.bound >= there.largest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["machine", "path_following"])
+def test_a_tick_in_float_with_own_functions_has_a_bound(name):
+    """Neither tables nor functions loop, and none of a library is called."""
+    _, inputs = run_of(name, TICKS)
+    found = measure(write_target(spec_of(name), own_functions=True, number="float"), "cortex-m4", inputs, 40)
+    assert found.largest <= found.bound < 1.5 * found.largest
 
 
 @pytest.mark.slow

@@ -18,21 +18,25 @@ from loopwright.fmus import Fmu, build
 from loopwright.fmus.export import compile_shared, own_functions, processor_flags
 from loopwright.fmus.export.elementary_tables import FUNCTIONS, prepare_functions
 from loopwright.fmus.models import gantry
-from support.elementary import ONE_FUNCTION, RUNTIME, arguments, powers, signed, source
+from support.elementary import ONE_FUNCTION, RUNTIME, RUNTIME_SINGLE, arguments, powers, signed, source, source_single
 
 BOUNDS = {"sin": 0.78, "cos": 0.78, "tanh": 0.58, "exp": 0.52, "expm1": 0.6, "log": 0.52, "pow": 0.54}
 """Largest errors in ulp that docs/reference/exported_fmus.md states, for results that are neither tiny nor near overflow."""
 
 
+SINGLE_BOUNDS = {"sin": 0.8, "cos": 0.8, "tanh": 1.9, "exp": 0.78, "expm1": 0.78, "log": 0.56, "pow": 0.79}
+"""Largest errors of single precision in ulp that docs/howto/c_for_a_target.md states."""
+
+
 class Functions:
     """The functions of a compiled library, for arrays."""
 
-    def __init__(self, path):
-        self._library = ctypes.CDLL(str(path))
+    def __init__(self, path, kind=float):
+        self._library, self._kind = ctypes.CDLL(str(path)), kind
 
     def __call__(self, name, x, z=None):
-        x = np.ascontiguousarray(x, dtype=float)
-        z = x if z is None else np.ascontiguousarray(z, dtype=float)
+        x = np.ascontiguousarray(x, dtype=self._kind)
+        z = x if z is None else np.ascontiguousarray(z, dtype=self._kind)
         y = np.empty_like(x)
         pointers = [ctypes.c_void_p(a.ctypes.data) for a in (x, z, y)]
         getattr(self._library, f"many_{name}")(*pointers, ctypes.c_longlong(x.size))
@@ -70,6 +74,85 @@ def largest_error(ours, name, n, seed):
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_errors_stay_below_their_bounds(name, ours):
     assert largest_error(ours, name, 250, 1) < BOUNDS[name]
+
+
+# --- single precision: NumPy's functions in double precision are exact beside it ----------------------------------------
+
+
+@pytest.fixture(scope="module")
+def single(tmp_path_factory):
+    out = tmp_path_factory.mktemp("elementary") / "single.so"
+    sources = {"all.c": source_single(), "elementary_single.c": RUNTIME_SINGLE.read_text("utf-8")}
+    compile_shared(sources, out, compiled=["all.c"])
+    return Functions(out, np.float32)
+
+
+def floats(step, first=0):
+    """Every so many-th float of all that there are, NaNs too."""
+    return np.arange(first, 2**32, step, dtype=np.uint64).astype(np.uint32).view(np.float32)
+
+
+def single_ulps(found, exact):
+    with np.errstate(all="ignore"):
+        error = np.abs(found.astype(float) - exact) / np.maximum(np.spacing(np.abs(exact).astype(np.float32)), 1.4e-45)
+    same = (found.astype(float) == exact) | (np.isnan(found) & np.isnan(exact))
+    error[same | (np.isinf(found) & (np.abs(exact) > np.finfo(np.float32).max))] = 0.0
+    return float(np.max(error))  # NaN where only one is NaN
+
+
+def single_powers(n, rng):
+    x = np.exp(rng.normal(size=n) * rng.choice([1e-3, 0.1, 1, 20], n)).astype(np.float32)
+    y = rng.uniform(-100, 100, n) / np.maximum(np.abs(np.log(x.astype(float))), 1e-7)
+    y = np.where(rng.random(n) < 0.3, rng.integers(-20, 20, n), y).astype(np.float32)
+    return np.where((y == np.round(y)) & (rng.random(n) < 0.3), -x, x).astype(np.float32), y
+
+
+def largest_single_error(single, name, step):
+    with np.errstate(all="ignore"):
+        if name == "pow":
+            x, y = single_powers(2**32 // step, np.random.default_rng(step))
+            return single_ulps(single("pow", x, y), np.power(x.astype(float), y.astype(float)))
+        x = floats(step)
+        return single_ulps(single(name, x), getattr(np, name)(x.astype(float)))
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_errors_of_single_precision_stay_below_their_bounds(name, single):
+    assert 0.2 < largest_single_error(single, name, 40_009) < SINGLE_BOUNDS[name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_errors_of_many_floats_stay_below_their_bounds(name, single):
+    assert largest_single_error(single, name, 211) < SINGLE_BOUNDS[name]
+
+
+def test_rounding_and_extremes_of_single_precision_are_exact(single):
+    x = np.concatenate([floats(40_009), np.array([0.0, -0.0, 0.5, -0.5, 8388607.5, -8388607.5, 8388608.0], np.float32)])
+    for name in ("floor", "ceil"):
+        with np.errstate(invalid="ignore"):  # a signaling NaN
+            found, exact = single(name, x), getattr(np, name)(x)
+        np.testing.assert_array_equal(found, exact)
+        np.testing.assert_array_equal(np.signbit(found[exact == 0]), np.signbit(exact[exact == 0]))
+    x = np.where(np.isnan(x), np.float32(np.nan), x)
+    y = x[::-1]
+    np.testing.assert_array_equal(single("fmin", x, y), np.fmin(x, y))
+    np.testing.assert_array_equal(single("fmax", x, y), np.fmax(x, y))
+
+
+SPECIAL_POWERS = [
+    (-0.0, 3.0, -0.0), (-0.0, -3.0, -np.inf), (0.0, -2.0, np.inf), (-2.0, 3.0, -8.0), (-2.0, 2.0, 4.0),
+    (-2.0, 0.5, np.nan), (-1.0, np.inf, 1.0), (1.0, np.nan, 1.0), (np.nan, 0.0, 1.0), (np.inf, -1.0, 0.0),
+    (-np.inf, 3.0, -np.inf), (0.5, np.inf, 0.0), (0.5, -np.inf, np.inf), (2.0, 128.0, np.inf), (-2.0, 16777217.0, np.inf),
+    (2.0, -149.0, 2.0**-149), (4.0, 1e-20, 1.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("x", "y", "exact"), SPECIAL_POWERS)
+def test_special_powers_of_single_precision(x, y, exact, single):
+    found = single("pow", [x], [y])[0]
+    assert np.array_equal(found, np.float32(exact), equal_nan=True)
+    assert np.isnan(exact) or np.signbit(found) == np.signbit(exact)
 
 
 @pytest.mark.slow
