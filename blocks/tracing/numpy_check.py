@@ -204,6 +204,7 @@ def evaluate(
     if GUARDS in names and hasattr(block, "guards"):
         result[GUARDS] = np.concatenate([*(_numbers(v, k) for k, v in call("guards").items()), np.zeros(0)])
     if "derivative" in names:
+        # the trace has a rate for every state, also 0 for those that only events change
         rates = {n: np.zeros(np.shape(v)) for n, v in x.items()}
         continuous = [n for n, port in block.states.items() if not port.discrete]
         rates.update(zip(continuous, values("derivative", continuous), strict=True))

@@ -137,6 +137,7 @@ class Watch:
             self._put(name, part)
         self._slid = np.full(m, np.nan)
         self._put("slid", self._slid)
+        # at least a row for each event: all of them may fire at one instant
         row = 2 + 2 * self._width
         self._log = np.zeros((max(200 if logged else 1, m, logged // (8 * row)), row))
         self._put("log", self._log)

@@ -123,6 +123,7 @@ def moor(plant: type[Block], port: str, position: str, velocity: str) -> type[Bl
                 - self.environment_stiffness * (d @ (p - self.environment_anchor))
                 - self.environment_damping * (d @ v)
             )
+            # the acceleration is affine in the force: two evaluations give its value without the force, and its slope
             there = [_Pushed(u, port, getattr(u, port) + d * force) for force in (0.0, 1.0)]
             a0, a1 = (d @ rate(self, t, x, pushed) for pushed in there)
             return d * ((f - self.environment_mass * a0) / (1.0 + self.environment_mass * (a1 - a0)))

@@ -208,6 +208,7 @@ def check_events(bench: Bench) -> tuple[int, set[str]]:
     h = exercise.times[1]
     for i, t in enumerate(exercise.times):
         inputs = [np.ravel(v) for v in exercise.inputs_at(i).values()]
+        # jumps follow each other at one instant until nothing fires, as in a run
         for count in range(_SAME_INSTANT + 1):
             z = bench.evaluate("indicators", [t, x, *inputs])
             if not np.all(np.isfinite(z)):
@@ -236,6 +237,7 @@ def check_events(bench: Bench) -> tuple[int, set[str]]:
                 )
             shown += fired
             x = bench.evaluate("jump", [t, x, *inputs], fired.astype(float))
+        # Euler's method: where events fire matters here, and not how exact the states are
         if bench.traced.advance == "derivative":
             x = x + h * np.ravel(bench.evaluate_trace([t, x, *inputs])[len(bench.traced.outputs)])
     return int(shown.sum()), {n for n, count in zip(names, shown, strict=True) if not count}

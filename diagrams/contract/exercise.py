@@ -153,6 +153,7 @@ class Exercise:
             if shape is None:
                 shape = tuple(shapes.get(name, () if port.default is None else np.shape(port.default)))
             given = inputs.get(name)
+            # where nothing is given: some nominal values around 0, moved within the limits that the port declares
             reach = 3.0 * (port.nominal or 1.0)
             low, high = port.minimum, port.maximum
             low = low if low is not None else -reach if high is None else min(-reach, high - 2.0 * reach)

@@ -88,6 +88,7 @@ def check_derivatives(bench: Bench) -> float:
         flat = np.concatenate(at[1:]) if len(at) > 1 else np.zeros(0)
         parts = lay_out(np.size(v) for v in at[1:])
         h = np.diag(_STEP * (1.0 + np.abs(flat)))
+        # all points around this one at once: both sides, and half the distance, which shows whether it is smooth there
         many = flat[:, None] + np.hstack([h, -h, 0.5 * h, -0.5 * h, 0.0 * h[:, :1]])
         y = np.array(values.call([at[0], *(many[part] for part in parts), bench.p])[0])
         n, d = len(flat), np.diag(h)
@@ -103,6 +104,7 @@ def check_derivatives(bench: Bench) -> float:
         with np.errstate(all="ignore"):
             smooth = (np.abs(up - down) < 1e-3 * size) & (np.abs(measured - half) < 1e-4 * size)
             off = np.where(smooth, np.abs(J - measured) / size, 0.0)
+        # a derivative that is no number is wrong wherever differences are one
         off = np.where(np.isnan(off), np.inf, off)
         i, j = np.unravel_index(int(np.argmax(off)), off.shape)
         if off[i, j] > 1e-4:

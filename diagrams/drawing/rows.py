@@ -114,6 +114,7 @@ def _stack(nodes: Sequence[Node], nets: Sequence[Net], row_of: dict[str, int]) -
         if source.side:
             at_border.append((source, rows[home], net, -1))
         at_border += [(node, rows[home], net, 1) for node in border]
+        # in each row such a net is a part of its own, from or to a pin at the row's border; `_connect` joins the parts
         across = [row for row in behind if row != home]
         for row in sorted({home, *across}):
             here = [(node.key, pin) for node, pin in ends if not node.side and row_of[node.key] == row]

@@ -113,6 +113,7 @@ class DiagramPicture:
             elif path in self.closed:
                 nodes.append(self._closed_node(path))
             else:
+                # an open subsystem is as large as its inside, so that this is laid out first
                 body, w, h, pins = self._lay_out(path, depth + 1)
                 node = Node(path, max(w + 2 * MARGIN, width_of(self._header(path), 10, True) + 20), h + HEADER + MARGIN)
                 node.ins = {name: p.y + HEADER for p in pins for name in p.outs}

@@ -74,6 +74,7 @@ class DelayedRealization:
         n, m = len(A), len(loop.delays)
         both = np.block([[A, B[:, 1:]], [C[1:], D[1:, 1:]]]) != 0.0
         reached, seen = np.append(B[:, 0], D[1:, 0]) != 0.0, np.append(C[0], D[0, 1:]) != 0.0
+        # what the input reaches and the output sees, over states and delays, by structure
         for _ in range(n + m):
             reached, seen = reached | both[:, reached].any(axis=1), seen | both[seen].any(axis=0)
         keep = reached & seen

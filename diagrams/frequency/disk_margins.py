@@ -206,6 +206,7 @@ def _compute_disk_margin(r: Realization, skew: float) -> DiskMargin:
     bound = mu_bound(matrix(omega))
     alpha = 1 / bound
     lower, delta = mu_lower_bound(matrix(omega))
+    # the upper bound of µ is exact for up to three channels: a gap to the lower one is an error, not a property
     if n <= 3 and lower < bound * (1 - 1e-5):
         raise ConfirmationError(
             f"found α = {alpha:.9g}, but {1 / lower:.9g} as the smallest destabilizing perturbation; expected the same "
@@ -214,6 +215,7 @@ def _compute_disk_margin(r: Realization, skew: float) -> DiskMargin:
             block="disk_margin",
         )
     how = _confirm_destabilizing(r, delta, skew)
+    # with one channel the margin is the peak of one transfer function, which is found in another way
     if n == 1:
         how = how.and_by(confirm_peak(r, (1 + skew) / 2, -(1 - skew) / 2, bound, "disk_margin"))
     else:

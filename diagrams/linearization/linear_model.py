@@ -621,6 +621,7 @@ def _linearize(
     means = replace_stairs(diagram, flat, at, stairs)
     channels = list[str]()
     local = LocalDerivatives(flat, found[0], found[1], found[2], evaluators_at(flat, at), means)
+    # a sampled diagram's model is the map over a period, a continuous one's the derivatives at the instant
     if _is_discrete(diagram, step):
         if loop:
             _check_loop(flat, local, at)
@@ -641,6 +642,7 @@ def _linearize(
     entries = (EntryTaken(s.name, s.entry) for group in found for s in group if s.entry)
     methods, error = derivations_at(flat, at, model.derivations)
     every = tuple(dict.fromkeys((*known, *model.findings, *findings_on(methods), *at.free, *entries)))
+    # of all findings, those on the way from the inputs to the outputs go with a loop that is made of the model
     ways = SignalPaths(flat, [s.port for s in found[2]])
     carried = ways.between(every, *([s.port for s in group] for group in found[:2]))
     carried += find_cut_findings(flat, at, [s.port for s in found[2]], carried) if loop else ()

@@ -175,6 +175,7 @@ def run_to(diagram: WiredDiagram, t: float, options: Mapping[str, Any], *, begun
             block=diagram.name,
             port="operating point",
         )
+    # nothing says where ticks are: one step that ends at the time, if it may be chosen
     if not diagram.has_base:
         if start is not None:
             options.setdefault("step", start.base)
@@ -301,6 +302,7 @@ def copy_point(diagram: WiredDiagram, point: OperatingPoint, other: WiredDiagram
     _copy(point.w, old.plant_outputs, flat.plant_outputs, w)
     _copy(point.z, old.plant_inputs, flat.plant_inputs, z)
     states: dict[str, dict[str, Any]] = {path: known["state"] for path, known in point.plants.items()}
+    # in model exchange the solver has the continuous states of an FMU, in co-simulation its saved point has them
     for path, known in point.exchanged.items():
         states[path] = {**known["state"], **old.states.of_block[path].split(point.x)}
     plants, exchanged = dict(guess.plants), dict(guess.exchanged)

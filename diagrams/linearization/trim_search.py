@@ -426,6 +426,7 @@ def _solve_trim(
         )
     changed = equations.plants.change_blocks(parameters, q)
     plants = equations.plants.points(xp, equations.residual_at(unknown)[2], changed)
+    # an FMU that lists no states may move, though no equation holds it
     drift = equations.plants.drift(plants, changed) if how is PointOrigin.TRIM else {}
     check_drift(drift, tolerance, diagram.name, guess.t)
     residuals = dict(sorted((residuals | drift).items(), key=lambda r: -r[1]))

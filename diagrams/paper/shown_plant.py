@@ -208,6 +208,7 @@ def _linearize_at(
             np.abs(moving) <= _AT * (1.0 + np.max(np.abs(m.u0)))
         ):
             return m
+        # position and velocity as wanted, and no acceleration: as many equations as states and motor forces
         J = np.block([[T, m.D[np.ix_(rows, force)]], [T[2:] @ m.A, T[2:] @ m.B[:, force]]])
         try:
             step = np.linalg.solve(J, np.concatenate([off, moving]))

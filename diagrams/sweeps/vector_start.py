@@ -198,6 +198,7 @@ class VectorStart:
                 with np.errstate(invalid="ignore"):
                     near = np.abs(before - z) <= START_SETTLED * np.abs(z)
                 settled = (same | near).all(axis=0)[:count]
+            # a lane that has settled keeps its values; the others take another pass
             now = settled & left
             if now.all():
                 ends = [after, w, z, plants]

@@ -44,6 +44,7 @@ def choose_ports(
         chosen = tuple(part for name in chosen for part in taken_apart(description, name) or (name,))
         _check_chosen(description, chosen, label)
         chosen = _choose_joined(description, chosen, members, label)
+    # an array is taken apart where one of its scalars is named
     split = {description.elements[n][0] for n in (*names, *(chosen or ())) if _is_part(description, n)}
     split -= set(chosen or ())
     both: tuple[dict[str, FmuVariable], dict[str, FmuVariable]] = {}, {}

@@ -139,11 +139,13 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
         own[v, cut] = with_findings(_numbers(m, L), m.findings)
         numbers |= {f"{at}.{name}": number for name, number in own[v, cut].items()}
         low, high = m.gain_margin_low.value, m.gain_margin_high.value
+        # stairs act with up to 4/π times their mean slope, and with none: a margin within that may be a limit cycle
         if (high < STEEPEST or low > 0.0) and any(isinstance(f, MeanSlope) for f in m.findings):
             notes.append(TEXTS.line("limit_cycle", variant=title, high=high if high < STEEPEST else 0.0, low=low))
         if m.hidden_unstable:
             shown = _poles(m.hidden_unstable, L.dt)
             notes.append(TEXTS.line("hidden_unstable", variant=title, poles=shown))
+        # loops of slower subsystems are open in the margins above, and closed in those over the whole period
         if cut is Cut.SLOW_OPEN:
             try:
                 p = periodic_margins(v.loop(wire, cut=Cut.PERIODIC))
@@ -159,6 +161,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
                     notes.append(TEXTS.line("unstable", variant=v.title, poles=shown))
         if not m.stable:
             notes.append(TEXTS.line("unstable", variant=title, poles=_poles(m.unstable_poles, L.dt)))
+        # python-control is asked about the design alone: a stable, rational loop, as its functions know no other
         elif v.is_design and isinstance(L, delayed_system_class()):
             notes.append(TEXTS.line("no_rational_model", variant=title))
         elif v.is_design:

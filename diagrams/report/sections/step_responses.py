@@ -132,6 +132,7 @@ def steps(case: Case) -> Section | None:
     for v in case.judged():
         if v.problem:
             continue
+        # a step of an unstable diagram grows, whatever its size: there is nothing to measure
         if Stability.of(v) is Stability.UNSTABLE:
             text.append(TEXTS.line("unstable", variant=v.title))
             continue
@@ -181,6 +182,7 @@ def steps(case: Case) -> Section | None:
                 text.append(TEXTS.line("unsettled", variant=v.title, wire=test.wire, length=own["length"].value))
             if got.moved > 1e-6:
                 text.append(TEXTS.line("moved", variant=v.title, wire=test.wire, moved=got.moved))
+            # tests that differ in their limits alone are one figure
             found.setdefault(replace(test, limits=None), {})[v.key] = got
     if not found:
         return Section("steps", TITLE, tuple(dict.fromkeys(text)), absent=absent) if text else None
