@@ -2,6 +2,7 @@
 
 from .loop_of_diagram import loop_spec
 from .make_exported import make_exported, name_of
+from .merged_plants import own_fmus
 from .open_diagram import let_move, open_part, open_subsystem, open_whole
 from .target import target_spec, to_c
 
@@ -13,6 +14,7 @@ __all__ = [
     "open_part",
     "open_subsystem",
     "open_whole",
+    "own_fmus",
     "target_spec",
     "to_c",
 ]

@@ -23,8 +23,8 @@ _WAY_OUT = (
 )
 
 
-def own_fmus(opened: OpenDiagram) -> dict[str, Fmu]:
-    """Return the FMUs of a diagram that are merged, by path.
+def own_fmus(opened: OpenDiagram, way_out: str = _WAY_OUT) -> dict[str, Fmu]:
+    """Return the FMUs of a diagram that are merged, by path; ``way_out`` is what an error says at last.
 
     Raises
     ------
@@ -35,15 +35,15 @@ def own_fmus(opened: OpenDiagram) -> dict[str, Fmu]:
     for path, block in opened.wired.scheduled.blocks.items():
         if path == opened.outside or block.transport or not (block.stepped or block.in_model_exchange):
             continue
-        _check(block, opened.shown(path))
+        _check(block, opened.shown(path), way_out)
         assert isinstance(block, Fmu)
         found[path] = block
     return dict(sorted(found.items()))
 
 
-def _check(block: Any, path: str) -> None:
+def _check(block: Any, path: str, way_out: str) -> None:
     """Refuse what can't be merged."""
-    way = _WAY_OUT.format(path=path)
+    way = way_out.format(path=path)
     if not isinstance(block, Fmu):
         raise DefinitionError(f"something outside steps it, of which there is no C code. {way}", block=path)
     name = block.description.file.name
@@ -56,9 +56,9 @@ def _check(block: Any, path: str) -> None:
     sources = read_own_sources(block.description.file)
     if sources is None:
         raise DefinitionError(
-            f"found {name}, an FMU that this version of Loopwright has not built from a block; of others there is no C "
-            "code to merge. Build it again, replace it by a plant in equations (docs/howto/export.md), or if it is a "
-            f"diagram's, put its blocks into this diagram. {way}",
+            f"found {name}, an FMU that this version of Loopwright has not built from a block; of others there is no "
+            "C code to merge. Replace it by a plant in equations (docs/howto/export.md), build it again with this "
+            f"version, or if it is a diagram's, put its blocks into this diagram. {way}",
             block=path,
         )
     if block.stepping != type(block.stepping)():

@@ -22,7 +22,7 @@ from ..drawing import Drawing, Facts, draw
 from ..flat import Target, WiredDiagram
 from ..results import Run
 from ..wiring import Wire, join
-from .module import Tuned, make_module
+from .module import make_module
 from .notebook_link import Change, PageRecord, runs_in_kernel
 from .repeated import repeat
 from .shown_signals import PlotNames, ShownColumns, plots_of
@@ -280,16 +280,11 @@ def make_page(
     columns.add_wires()
     groups = [("Inputs" if tuned else "", moved), ("Parameters", tuned)]
     every = [slider for _, group in groups for slider in group]
-    targets = [slider.target for slider in every if slider.reference is None]
-    tuned_plants = [_tuned(one) for one in every if one.reference is not None]
+    targets = [slider.target for slider in every if not slider.of_plant]
     targets += [target for target, _ in scene.moved.values()] if scene else []
     wires = [(Wire(column.block, column.port, None), column.entry) for column in columns.found]
-    module = make_module(wired, flat, wires, targets, tuned_plants, solver=solver)
+    module = make_module(wired, flat, wires, targets, solver=solver)
     spec = module.spec
-
-    def place(one: Slider) -> int:  # those of FMUs from -1 downwards
-        return place_of(one, spec) if one.reference is None else -1 - tuned_plants.index(_tuned(one))
-
     pulled = {} if scene is None else {n: Slider.of_scene(wired, n, t, i) for n, (t, i) in scene.moved.items()}
     data = {
         "name": wired.name,
@@ -302,13 +297,13 @@ def make_page(
         ],
         "plots": shown,
         "groups": [
-            {"title": head, "sliders": [_slider(one, place(one), labels or {}) for one in group]}
+            {"title": head, "sliders": [_slider(one, place_of(one, spec), labels or {}) for one in group]}
             for head, group in groups
             if group
         ],
         "hidden": {name: place_of(one, spec) for name, one in pulled.items()},
         "labels": [list(label) for label in spec.labels],
-        "plants": list(module.plants),
+        "plants": [plant.placed.path for plant in spec.plants],
         "guards": [list(guard) for guards in spec.guards for guard in guards.names],
         "events": [[block, name] for block, name, _ in spec.events],
         "scene": None if scene is None else dict(scene.data),
@@ -323,11 +318,6 @@ def make_page(
     if path is not None:
         page.save(path)
     return page
-
-
-def _tuned(one: Slider) -> Tuned:
-    assert one.reference is not None
-    return one.path, one.reference, one.entry
 
 
 def _slider(one: Slider, place: int, labels: Mapping[str, str]) -> dict[str, Any]:

@@ -41,7 +41,7 @@ def repeat(
         slider = sliders[one.name]
         if one.t is None:
             start[slider.parameter] = one.value
-        elif slider.reference is None:
+        elif not slider.of_plant:
             moves.setdefault(slider.parameter, []).append(one)
         else:
             raise OptionError(

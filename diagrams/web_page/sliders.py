@@ -54,8 +54,8 @@ class Slider:
         Its unit; empty without one.
     label : str
         What the page calls it.
-    reference : int or None
-        Of a parameter of an FMU the value reference, in which ``entry`` counts; None for one of a block.
+    of_plant : bool
+        Whether the parameter is that of an FMU.
     index : str
         The entry that the keys don't have, such as ``[2]``; empty of a number, and where the keys have it.
     """
@@ -69,7 +69,7 @@ class Slider:
     high: float
     unit: str = ""
     label: str = ""
-    reference: int | None = None
+    of_plant: bool = False
     index: str = ""
 
     @classmethod
@@ -194,7 +194,6 @@ def _sliders_of_plant(plant: Fmu, path: str, keys: list[str], name: str, limits:
         values = np.broadcast_to(values, variable.shape)
     bounds = _Bounds.of(variable.minimum, variable.maximum)
     unit = "" if variable.unit in (None, "1") else str(variable.unit)
-    size = variable.size // len(variable.references)
     if chosen:
         entries: Iterable[int] = [int(np.ravel_multi_index(index_of(chosen, values.shape, one), values.shape))]
     else:
@@ -204,8 +203,8 @@ def _sliders_of_plant(plant: Fmu, path: str, keys: list[str], name: str, limits:
         value = float(values.flat[i])
         low, high = _range(value, bounds, limits, path, name, option)
         index = "" if chosen or not values.ndim else f"[{_number(i, values.shape)}]"
-        reference, label = variable.references[i // size], name + index
-        sliders.append(Slider(label, path, tuple(keys), i % size, value, low, high, unit, label, reference, index))
+        label = name + index
+        sliders.append(Slider(label, path, tuple(keys), i, value, low, high, unit, label, True, index))
     return sliders
 
 
@@ -290,7 +289,13 @@ def place_of(slider: Slider, spec: LoopSpec) -> int:
     OptionError
         If the equations of the diagram don't take it as a number of its own.
     """
-    keys = [*slider.keys[:-1], split_entry(slider.keys[-1], ())[0]]
+    if slider.of_plant:
+        whole = [one.variable.name for one in spec.parameters]
+        keys = [
+            next(n for n in (slider.keys[-1], split_entry(slider.keys[-1], ())[0]) if join(slider.path, n) in whole)
+        ]
+    else:
+        keys = [*slider.keys[:-1], split_entry(slider.keys[-1], ())[0]]
     full = join(slider.path, ".".join(keys))
     for one in spec.parameters:
         if one.variable.name == full:

@@ -5,7 +5,6 @@ from .from_block import build, model_spec, parameter_variable
 from .inlined import inline_model, own_functions
 from .loop_memory import Field, LoopMemory, c_number
 from .loop_spec import ROOM_FOR_EDGES, CFunction, ComputedNumbers, Guards, LoopSpec, Placed, write_unit
-from .merged import merge_model
 from .merged_plants import MergedPlant, PlacedPlant
 from .model import INTEGRATORS, Integrator, ModelSpec, Variable
 from .own_sources import read_own_sources
@@ -60,7 +59,6 @@ __all__ = [
     "describe_processor",
     "inline_model",
     "measure",
-    "merge_model",
     "model_spec",
     "own_functions",
     "parameter_variable",

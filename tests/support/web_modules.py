@@ -42,11 +42,8 @@ class Module:
         content = self._calls["memory"].read(self._store, address, address + 8 * count)
         return np.frombuffer(bytes(content))
 
-    def set(self, place, value, begun=True):
-        """Set a parameter by its place, as a slider does: of a block, or from -1 downwards of an FMU."""
-        if place < 0:
-            self._call("tune", -1 - place, value, int(begun))
-            return
+    def set(self, place, value):
+        """Set a parameter of a block or of an FMU by its place, as a slider does."""
         address = self._call("parameters") + 8 * place
         self._calls["memory"].write(self._store, np.float64(value).tobytes(), address)
         self._call("renew")

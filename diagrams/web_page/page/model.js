@@ -13,7 +13,7 @@ class Model {
   }
   reset() {
     this.calls.fill();
-    for (const [place, value] of this.changed) this.put(place, value, false);
+    for (const [place, value] of this.changed) this.put(place, value);
     this.calls.renew();
     this.calls.begin();
     this.isNew = false;
@@ -22,13 +22,10 @@ class Model {
   numbers(address, count) { return new Float64Array(this.calls.memory.buffer, address, count); }
   set(place, value) {
     this.changed.set(place, value);
-    this.put(place, value, true);
+    this.put(place, value);
     this.isNew = true;
   }
-  put(place, value, begun) {  // of a block, or from -1 downwards of a plant
-    if (place < 0) this.calls.tune(-1 - place, value, begun ? 1 : 0);
-    else this.numbers(this.calls.parameters())[place] = value;
-  }
+  put(place, value) { this.numbers(this.calls.parameters())[place] = value; }
   run(count, until, record) {  // returns the number of ticks that were gone through, up to a time
     if (this.isNew) { this.calls.renew(); this.isNew = false; }
     let done = 0;

@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 
 from loopwright import Diagram, Fmu, subsystem
-from loopwright.blocks import Constant, DiscreteIntegrator, Gain, PythonFunction, Step, TransferFunction, UnitDelay
+from loopwright.blocks import (
+    Constant,
+    DiscreteIntegrator,
+    Gain,
+    PythonFunction,
+    Sine,
+    Step,
+    TransferFunction,
+    UnitDelay,
+)
 from loopwright.diagrams import DefinitionError, OptionError, UnknownNameError
 from loopwright.diagrams.web_page.notebook_link import PageRecord
 from loopwright.fmus import bouncing_ball, dc_motor, mass_spring_damper
@@ -89,7 +98,7 @@ def test_a_parameter_of_an_fmu_is_moved_from_the_start_on_as_its_start_value_is(
     module, diagram = Module(page().html), drive(TARGET.replace(value=50.0)).replace({"motor.resistance": 3.0})
     for _ in range(2):  # the second time after a reset
         module._call("fill")
-        module.set(module.slider("motor.resistance")["place"], 3.0, begun=False)
+        module.set(module.slider("motor.resistance")["place"], 3.0)
         module.set(module.slider("target")["place"], 50.0)
         assert module.begin()
         assert same(module.run(500), module, diagram.simulate(0.499, progress=False))
@@ -238,7 +247,7 @@ def test_a_function_of_python_is_refused_by_its_path(uncompiled):
 
 
 def test_an_fmu_of_others_is_refused_by_its_path(uncompiled, monkeypatch):
-    monkeypatch.setattr("loopwright.fmus.export.merged.read_own_sources", lambda path: None)
+    monkeypatch.setattr("loopwright.diagrams.exporting.merged_plants.read_own_sources", lambda path: None)
     with pytest.raises(DefinitionError, match=r"dc_motor\.fmu, an FMU that .*has not built.*Replace it by") as caught:
         drive(TARGET).to_html()
     assert caught.value.block == "motor"
@@ -278,6 +287,24 @@ def test_a_continuous_diagram_is_sampled_at_a_step():
     w = np.sqrt(1.0 - 0.25**2)
     assert np.array_equal(t, np.arange(200) / 20)
     assert np.abs(y - (1.0 - np.exp(-0.25 * t) * (np.cos(w * t) + 0.25 / w * np.sin(w * t)))).max() < 1e-6
+
+
+def test_a_page_without_clocks_and_states_is_evaluated_at_its_steps():
+    module = Module(Diagram("d", Gain(gain=2.0)(Sine(frequency=1.0)).named("y")).to_html(step=0.01, plots=["y"]).html)
+    assert module.begin()
+    t, y = module.run(101).T
+    np.testing.assert_allclose(y, 2.0 * np.sin(2.0 * np.pi * t), rtol=0, atol=1e-14)
+
+
+@pytest.mark.slow
+def test_a_plant_behind_blocks_in_continuous_time_steps_at_the_pages_steps():
+    motor = Fmu(dc_motor.build(), name="motor")
+    voltage = Gain(gain=-0.02)(motor.speed) + 1.0
+    diagram = Diagram("d", motor(voltage=voltage, load_torque=Constant(value=0.0)))
+    module = Module(diagram.to_html(step=T, inputs=[], plots=["motor.speed"]).html)
+    assert module.begin()
+    run = diagram.simulate(0.1, step=T, progress=False)
+    assert same(module.run(len(run.t)), module, run)
 
 
 @pytest.mark.slow
