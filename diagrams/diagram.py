@@ -344,7 +344,7 @@ class Diagram(ShownAsTable):
             them; such a run has no ``final_state``.
         progress : bool or callable, optional
             Show a progress bar, or a function that is called with the time in s; by default the bar is shown on a
-            terminal, and in a notebook where ipywidgets is installed.
+            terminal, and in a notebook.
         **options
             Options of the run by name: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step``, ``record``, ``every``,
             ``states``, ``to``, ``overwrite``, ``start``, ``coupling``, ``start_exchange``, ``compile`` (whether C goes

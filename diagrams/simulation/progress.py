@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from importlib.util import find_spec
+from types import SimpleNamespace
 from typing import Any
 
 from ...blocks.core import check_argument, kinds
@@ -21,12 +21,47 @@ LATE = 2.0
 
 
 def _is_shown(show: ProgressOption, name: str) -> bool:
-    """Whether progress is shown: where it is asked for; by default on a terminal and in a notebook with widgets."""
+    """Whether progress is shown: where it is asked for; by default on a terminal and in a notebook."""
     if show is not None:
         check_argument(show, kinds.progress, "progress", name)
         return not callable(show) and bool(show)
-    widgets = "ipykernel" in sys.modules and find_spec("ipywidgets") is not None
-    return sys.stderr.isatty() or widgets
+    return sys.stderr.isatty() or _in_notebook()
+
+
+def _in_notebook() -> bool:
+    """Whether a notebook's kernel runs this: it has a display, and no terminal."""
+    kernel = sys.modules.get("ipykernel.zmqshell")
+    return kernel is not None and kernel.ZMQInteractiveShell.initialized()
+
+
+class _NotebookLine:
+    """A line of text below a notebook's cell that changes while the cell runs, and is empty at the end.
+
+    It is plain text, so a saved notebook keeps no widget without a kernel behind it. Work under 2 s leaves no output.
+    """
+
+    def __init__(self) -> None:
+        self._begun = self._changed = time.monotonic()
+        self._shown: Any = None
+
+    def say(self, text: str, *, at_once: bool = False) -> None:
+        """Show a text; without ``at_once`` from 2 s on, five times a second at most."""
+        from IPython.display import display
+
+        now = time.monotonic()
+        if not at_once and (now - self._begun < LATE or now - self._changed < 0.2):
+            return
+        self._changed = now
+        content = {"text/plain": f"{text}  {now - self._begun:.0f} s"}
+        if self._shown is None:
+            self._shown = display(content, raw=True, display_id=True)
+        else:
+            self._shown.update(content, raw=True)
+
+    def clear(self) -> None:
+        """Empty the line."""
+        if self._shown is not None:
+            self._shown.update({"text/plain": ""}, raw=True)
 
 
 @contextmanager
@@ -36,6 +71,19 @@ def progress_bar(
     """Yield a function that takes the simulated time, or another count: the one given, or one that draws a bar."""
     if not _is_shown(show, name):
         yield show if callable(show) else lambda t: None
+        return
+    if _in_notebook():
+        line = _NotebookLine()
+
+        def note(t: float) -> None:
+            done = min(max((t - start) / (end - start), 0.0), 1.0) if end > start else 1.0
+            count = shown.format(task=SimpleNamespace(completed=t - start, total=end - start))
+            line.say(f"{name}  {'█' * round(30 * done):░<30}  {count}")
+
+        try:
+            yield note
+        finally:
+            line.clear()
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -69,10 +117,17 @@ def late_progress(
 def work_notes(name: str, show: ProgressOption = None) -> Iterator[Callable[[str], Any]]:
     """Yield a function that takes in words what is being computed: the one given, or one that shows it with the time.
 
-    It is shown once the work has taken 2 s; without a choice on a terminal, and in a notebook with widgets.
+    It is shown once the work has taken 2 s; without a choice on a terminal, and in a notebook.
     """
     if not _is_shown(show, name):
         yield show if callable(show) else lambda said: None
+        return
+    if _in_notebook():
+        line = _NotebookLine()
+        try:
+            yield lambda said: line.say(f"{name}: {said if ' ' in said else said.replace('_', ' ')}")
+        finally:
+            line.clear()
         return
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -97,6 +152,11 @@ def compiler_notes(show: ProgressOption, name: str) -> Iterator[None]:
     """Say within the ``with`` statement that a compiler runs, where progress is shown: a run may wait for it."""
     if not _is_shown(show, name):
         yield
+        return
+    if _in_notebook():
+        line = _NotebookLine()
+        with hear_builds(lambda note: line.say(note, at_once=True) if note else line.clear()):
+            yield
         return
     from rich.console import Console
 
