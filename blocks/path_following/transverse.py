@@ -17,8 +17,6 @@ from ..paths import Path, replace_unlimited
 from .planar_model import PlanarModel
 
 _NEWTON = 4  # iterations in a tick; from 1 mm away, three reach the last digit
-_CONVERGED = 1e-9  # largest remaining Newton step, relative to the path's parameter range
-
 
 A_PATH = kinds.one_of_class(Path, "a Path, such as Ellipse(semi_axes=(0.3, 0.15))").worded(
     step=lambda value: "The path comes first, then the model." if isinstance(value, PlanarModel) else "Give one."
@@ -45,6 +43,11 @@ class PathTracking(Block):
     memory = True
     path: Path = parameter(kw_only=False, description="the path", kind=A_PATH)
     minimum_q: float = parameter(default=0.05, minimum=0.0, description="smallest allowed q = 1 − κ ξ₁")
+    tolerance: float = parameter(
+        default=1e-9,
+        above=0.0,
+        description="largest remaining Newton step, as a part of the path's parameter range; 1e-5 in single precision",
+    )
     position = Input(shape=(2,), unit="m", description="position y in the plane")
     foot = State(description="last path parameter")
 
@@ -74,7 +77,7 @@ class PathTracking(Block):
         left, right = self.path.reach(theta)
         low, high = self.path.domain or (0.0, self.path.period or 1.0)
         checks = {
-            "newton": _CONVERGED * (high - low) - np.abs(residual),
+            "newton": self.tolerance * (high - low) - np.abs(residual),
             "q": 1.0 - frame.curvature * xi - self.minimum_q,
             "left": left - xi,
             "right": right + xi,
@@ -82,7 +85,7 @@ class PathTracking(Block):
         if self.path.period is not None:  # beyond half a lap, the lap would be a guess
             checks["lap"] = 0.5 * self.path.period - np.abs(theta - x.foot)
         if self.path.domain is not None:
-            slack = 1e-12 * (high - low)
+            slack = 1e-3 * self.tolerance * (high - low)
             checks |= {"start": theta - low + slack, "end": high - theta + slack}
         return checks
 

@@ -182,8 +182,8 @@ def test_the_signature_is_that_of_the_declarations():
     assert signature.parameters["mass"].default is inspect.Parameter.empty
     assert signature.parameters["damping"].default is None
     assert signature.parameters["mass"].annotation == "float"
-    assert (
-        str(inspect.signature(HandForce)) == "(path: 'Path', *, minimum_q: 'float' = 0.05, name: 'str | None' = None)"
+    assert str(inspect.signature(HandForce)) == (
+        "(path: 'Path', *, minimum_q: 'float' = 0.05, tolerance: 'float' = 1e-09, name: 'str | None' = None)"
     )
     assert "name" not in inspect.signature(Circle).parameters
     signature.bind(mass=1.0, stiffness=2.0)

@@ -9,7 +9,7 @@ import pytest
 from loopwright import Diagram, subsystem, to_c
 from loopwright.blocks import PID, BandLimitedNoise, Compare, Gain, PulseTrain, Sine, Step, Switch, TransferFunction
 from loopwright.diagrams import DefinitionError, OptionError
-from loopwright.diagrams.exporting import open_subsystem, target_spec
+from loopwright.diagrams.exporting import open_part, open_subsystem, target_spec
 from loopwright.fmus.export import measure, run_here, unit_name, write_target
 from loopwright.fmus.export.target_measure import find_bound
 from support.exported_loops import Loop
@@ -107,6 +107,27 @@ def test_a_cortex_m_computes_the_bits_of_this_machine(name, processor, number):
     assert len(there.instructions) == 40
     assert there.stack > 0
     assert there.bound is None or there.bound >= there.largest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("letter", "ABCD")
+def test_fig_3_runs_in_float_with_a_tolerance_of_float(letter):
+    """Where the hand pulls, θ and ξ are within a micrometre of those in double; 1e-9 of a lap is finer than a float."""
+    from loopwright import experiments
+
+    diagram = experiments.EXPERIMENTS[letter]().diagram.replace({"controller.path_projection.tolerance": 1e-5})
+    run = diagram.simulate(2.0, progress=False)
+    spec = target_spec(open_part(diagram.wired, "controller", "fig3"), name="fig3", description="")
+    inputs = {}
+    for (path, argument), wire in diagram.structure.arguments.items():
+        if path == "controller":
+            values = run[f"{wire.block}.{wire.port}"][:2000]
+            inputs[argument] = values if wire.index is None else values[:, wire.index]
+    found = run_here(write_target(spec, number="float", own_functions=True), inputs, 2000)
+    for signal, bound in (("theta", 1e-6), ("eta", 1e-6), ("xi", 1e-6), ("v_par", 0.1), ("v_perp", 0.01)):
+        assert 0.0 < np.max(np.abs(found[signal] - run[signal][:2000])) < bound
+    size = np.max(np.abs(run["motor_force"]))
+    assert np.max(np.abs(found["motor_force"] - run["motor_force"][:2000])) < 0.02 * size
 
 
 @pytest.mark.slow
