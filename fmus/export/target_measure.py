@@ -50,7 +50,7 @@ void *memcpy(void *to, const void *from, size_t count);
 void *memset(void *to, int value, size_t count);
 #define memcpy __builtin_memcpy
 """
-_UNARY = """sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp expm1 log log1p sqrt floor ceil fabs
+_OF_ONE = """sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp expm1 log log1p sqrt floor ceil fabs
 erf"""
 _OTHERS = "pow fmod remainder copysign fmin fmax atan2 hypot"
 
@@ -195,7 +195,7 @@ def _headers() -> dict[str, str]:
     """Return headers of a C library for a compiler without one: declarations alone."""
     lines = ['#define NAN __builtin_nanf("")', "#define INFINITY __builtin_inff()"]
     for kind, end in (("double", ""), ("float", "f")):
-        lines += [f"{kind} {f}{end}({kind} x);" for f in _UNARY.split()]
+        lines += [f"{kind} {f}{end}({kind} x);" for f in _OF_ONE.split()]
         lines += [f"{kind} {f}{end}({kind} x, {kind} y);" for f in _OTHERS.split()]
         lines += [f"#define {f}{end} __builtin_{f}{end}" for f in ("fabs", "sqrt", "copysign", "fmin", "fmax")]
     return {"include/math.h": "\n".join(lines) + "\n", "include/string.h": _STRING}

@@ -283,8 +283,14 @@ def test_names_of_c_and_names_that_differ_in_case_alone_compile():
     found = run_here(text, {"NAN": 0.5, "EOF": 0.25}, 1)
     assert (found["p"][0], found["P"][0], found["sin"][0]) == (1.0, 1.5, np.sin(0.25))
     assert [unit_name(n) for n in ("exp", "expf", "uint8_t", "math", "table_0", "my name", "1")] == [
-        "exp_", "expf_", "uint8_t_", "math_", "table_0_", "my_name", "n1",
-    ]  # fmt: skip
+        "exp_",
+        "expf_",
+        "uint8_t_",
+        "math_",
+        "table_0_",
+        "my_name",
+        "n1",
+    ]
 
 
 def test_sources_of_time_are_exact_in_single_precision():

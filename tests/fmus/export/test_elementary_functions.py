@@ -141,11 +141,24 @@ def test_rounding_and_extremes_of_single_precision_are_exact(single):
 
 
 SPECIAL_POWERS = [
-    (-0.0, 3.0, -0.0), (-0.0, -3.0, -np.inf), (0.0, -2.0, np.inf), (-2.0, 3.0, -8.0), (-2.0, 2.0, 4.0),
-    (-2.0, 0.5, np.nan), (-1.0, np.inf, 1.0), (1.0, np.nan, 1.0), (np.nan, 0.0, 1.0), (np.inf, -1.0, 0.0),
-    (-np.inf, 3.0, -np.inf), (0.5, np.inf, 0.0), (0.5, -np.inf, np.inf), (2.0, 128.0, np.inf), (-2.0, 16777217.0, np.inf),
-    (2.0, -149.0, 2.0**-149), (4.0, 1e-20, 1.0),
-]  # fmt: skip
+    (-0.0, 3.0, -0.0),
+    (-0.0, -3.0, -np.inf),
+    (0.0, -2.0, np.inf),
+    (-2.0, 3.0, -8.0),
+    (-2.0, 2.0, 4.0),
+    (-2.0, 0.5, np.nan),
+    (-1.0, np.inf, 1.0),
+    (1.0, np.nan, 1.0),
+    (np.nan, 0.0, 1.0),
+    (np.inf, -1.0, 0.0),
+    (-np.inf, 3.0, -np.inf),
+    (0.5, np.inf, 0.0),
+    (0.5, -np.inf, np.inf),
+    (2.0, 128.0, np.inf),
+    (-2.0, 16777217.0, np.inf),
+    (2.0, -149.0, 2.0**-149),
+    (4.0, 1e-20, 1.0),
+]
 
 
 @pytest.mark.parametrize(("x", "y", "exact"), SPECIAL_POWERS)
