@@ -399,7 +399,7 @@ def hand_page(path: str | os.PathLike[str] | None = None, **options: Any) -> Web
         As in `path_following`; as in `Diagram.to_html`.
     """
     from ..web_page import PageText, make_page
-    from .hand_scene import ABOUT, LABELS, PLOTS, TABLE_III, gantry_scene
+    from .hand_scene import ABOUT, HEADINGS, LABELS, PLOTS, TABLE_III, gantry_scene
 
     made = guided_by_hand(**options)
     return make_page(
@@ -411,6 +411,7 @@ def hand_page(path: str | os.PathLike[str] | None = None, **options: Any) -> Web
         plots=PLOTS,
         text=PageText("A robot that is guided by hand", ABOUT),
         labels=LABELS,
+        headings=HEADINGS,
         scene=gantry_scene(made.path),
     )
 

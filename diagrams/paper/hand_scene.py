@@ -25,6 +25,11 @@ TABLE_III = {
     "hand.stiffness": (10.0, 200.0),
 }
 """Sliders with their ranges: the impedances of Table III, and the hand's."""
+HEADINGS = {
+    **{name: "Along the path" for name in TABLE_III if name.startswith("admittance_par")},
+    **{name: "Across the path" for name in TABLE_III if name.startswith("admittance_perp")},
+    "hand.stiffness": "The hand",
+}
 LABELS = {
     "admittance_par.mass": "mass m∥",
     "admittance_par.damping": "damping d∥",
@@ -32,12 +37,12 @@ LABELS = {
     "admittance_perp.mass": "mass m⊥",
     "admittance_perp.damping_ratio": "damping ratio ζ⊥",
     "admittance_perp.stiffness": "stiffness k⊥",
-    "hand.stiffness": "the hand's spring",
-    "xi[1]": "ξ",
+    "hand.stiffness": "spring stiffness",
+    "xi[1]": "ξ, across the path",
     "xi_p[1]": "ξ of the admittance",
-    "eta[1]": "η",
-    "force_projection.f_par": "F∥",
-    "force_projection.f_perp": "F⊥",
+    "eta[1]": "η, along the path",
+    "force_projection.f_par": "F∥ along",
+    "force_projection.f_perp": "F⊥ across",
     "motor_force[1]": "motor y",
     "motor_force[2]": "motor z",
 }

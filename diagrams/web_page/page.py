@@ -7,10 +7,11 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
+from itertools import groupby
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -254,6 +255,7 @@ def make_page(
     title: str | None = None,
     text: PageText | None = None,
     labels: Mapping[str, str] | None = None,
+    headings: Mapping[str, str] | None = None,
     scene: Scene | None = None,
 ) -> WebPage:
     """Return a diagram as a page that runs; see `Diagram.to_html`.
@@ -266,6 +268,8 @@ def make_page(
         Its words; ``title`` is one of them.
     labels : mapping of str to str, optional
         What the page calls sliders and signals, by their names.
+    headings : mapping of str to str, optional
+        Headings above sliders of parameters, by their names; those of one heading follow each other.
     scene : Scene, optional
         A picture above the plots.
     """
@@ -278,8 +282,8 @@ def make_page(
     for name in scene.signals if scene else ():
         columns.add(name)
     columns.add_wires()
-    groups = [("Inputs" if tuned else "", moved), ("Parameters", tuned)]
-    every = [slider for _, group in groups for slider in group]
+    groups = [("Inputs" if tuned else "", moved), *_under_headings(tuned, headings or {})]
+    every = [*moved, *tuned]
     targets = [slider.target for slider in every if not slider.of_plant]
     targets += [target for target, _ in scene.moved.values()] if scene else []
     wires = [(Wire(column.block, column.port, None), column.entry) for column in columns.found]
@@ -318,6 +322,12 @@ def make_page(
     if path is not None:
         page.save(path)
     return page
+
+
+def _under_headings(sliders: Sequence[Slider], headings: Mapping[str, str]) -> list[tuple[str, list[Slider]]]:
+    """Return headings with their sliders, in order."""
+    grouped = groupby(sliders, key=lambda one: headings.get(one.name, "Parameters"))
+    return [(heading, list(each)) for heading, each in grouped]
 
 
 def _slider(one: Slider, place: int, labels: Mapping[str, str]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 const LONGEST = 0.25;   // s of the clock that are caught up after a delay; a longer one is given up
 const BUDGET = 0.012;   // s of a picture that may be spent in ticks; half of the time since the last one if that is more
 const JUDGED = 1;       // s over which the speed that is reached is measured
+const BRIEFLY = 5;      // s that a message is shown of what is over
 const SENT_EVERY = 400; // ms between two messages to a notebook
 
 const model = new Model(Uint8Array.from(atob($('lw-module').textContent.trim()), c => c.charCodeAt(0)));
@@ -11,7 +12,7 @@ const plots = data.plots.map(of => new Plot(of, record)), calm = matchMedia('(pr
 let speed = data.speed, span = data.span, ticksDone = 0, drawn = false, scene = null;
 let origin = 0, base = 0, before = 0;          // the clock and the time from which it runs, and the last picture
 let behind = 0, judged = 0, judgedAt = 0;      // s that were given up, and where the judged stretch begins
-let outOfSight = 0, clockReadAt = 0;
+let outOfSight = 0, clockReadAt = 0, saidUntil = Infinity;
 
 for (const group of data.groups) {
   const box = document.createElement('section');
@@ -21,7 +22,11 @@ for (const group of data.groups) {
   $('sliders').append(box);
 }
 
-function say(text) { if ($('note').textContent !== text) $('note').textContent = text; $('note').hidden = !text; }
+function say(text, seconds = Infinity) {  // for so many seconds of the clock
+  saidUntil = performance.now() / 1000 + seconds;
+  if ($('note').textContent !== text) $('note').textContent = text;
+  $('note').hidden = !text;
+}
 function time() { return record.count ? record.time(record.count - 1) : 0; }
 function move(name, place, value) {
   moved.set(name, value);
@@ -48,7 +53,9 @@ function frame(now) {
   const gap = now - before;
   before = now;
   if (running) keepPace(now, gap);
+  if (now > saidUntil) say('');
   if (!drawn) draw(now * 1000);
+  else if (scene && scene.moves && !calm.matches) drawScene(now * 1000);
   requestAnimationFrame(frame);
 }
 function keepPace(now, gap) {
@@ -70,7 +77,7 @@ function keepPace(now, gap) {
 function giveUp(lost, now, why = '') {
   behind += lost;
   origin = now; base = time();
-  if (why) { say(why); startJudging(now); }
+  if (why) { say(why, BRIEFLY); startJudging(now); }
 }
 function startJudging(now) { judged = time(); judgedAt = now; }
 function judge(now) {
@@ -103,10 +110,11 @@ function draw(now = performance.now()) {
     $('time').textContent = t.toFixed(data.step < 0.01 ? 2 : data.step < 1 ? 1 : 0);
     clockReadAt = now;
   }
-  if (scene && !hidden.has($('scene').firstChild)) scene.draw(now, calm.matches);
+  if (scene) drawScene(now);
   for (const plot of plots) if (!hidden.has(plot.canvas)) plot.draw(now, t, span, calm.matches);
   notebook.send(now);
 }
+function drawScene(now) { if (!hidden.has($('scene').firstChild)) scene.draw(now, calm.matches); }
 function save() {
   const link = document.createElement('a');
   link.href = URL.createObjectURL(new Blob([record.csv()], { type: 'text/csv' }));
@@ -155,7 +163,7 @@ matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => { re
 document.onvisibilitychange = () => {  // no pictures and no ticks out of sight
   const now = performance.now() / 1000;
   if (document.hidden) { outOfSight = now; return; }
-  if (running) { say(`The page was out of sight for ${short(now - outOfSight, 2)} s; the run has waited.`); start(now); }
+  if (running) { say(`The page was out of sight for ${short(now - outOfSight, 2)} s; the run has waited.`, BRIEFLY); start(now); }
 };
 
 readColours();

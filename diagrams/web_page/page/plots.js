@@ -1,7 +1,6 @@
 // Plots that scroll. Each keeps the smallest and the largest value of every pixel, and adds new samples alone.
 
 const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3]];  // of the curves of a plot, in their order
-const SHRINK = 0.05;                                // of a scale that is too large, in a picture
 const READ_EVERY = 100;                             // ms between two numbers that are shown while it runs
 
 // ---- numbers and colours ----
@@ -111,19 +110,16 @@ class Plot {
     box.className = 'plot';
     const legend = document.createElement('figcaption');
     legend.className = 'legend';
-    const several = of.curves.length > 1;
     this.outputs = of.curves.map((curve, i) => {
       const key = document.createElement('span'), mark = document.createElement('i'), value = document.createElement('output');
       key.className = `key d${i % DASHES.length}`;
       key.style.setProperty('--curve', `var(--c${i % 6})`);
-      if (!several) key.classList.add('alone');
-      const column = data.columns[curve], own = column.unit && column.unit !== of.unit ? ` ${unitText(column.unit)}` : '';
-      key.append(mark, `${column.label} `, value, own);
+      const column = data.columns[curve];
+      key.append(mark, `${column.label} `, value);
       key.title = column.name;
       legend.append(key);
       return value;
     });
-    if (of.unit) legend.append(Object.assign(document.createElement('span'), { className: 'unit', textContent: unitText(of.unit) }));
     this.canvas = document.createElement('canvas');
     this.canvas.setAttribute('role', 'img');
     this.canvas.setAttribute('aria-label', `${of.curves.map(c => data.columns[c].label).join(', ')} over time`);
@@ -136,15 +132,16 @@ class Plot {
   }
   restart() { this.low = this.high = null; this.envelope = null; }
   timeAt(x) { return this.t0 + (x - this.left) / (this.w - this.left) * (this.t1 - this.t0); }
-  scale(low, high, still) {  // the scale grows at once, and shrinks slowly; that of a constant is not kept
+  scale(low, high) {  // whole steps of the axis: it moves when a curve leaves it, or fills less than a third of it
     if (!(low <= high)) { low = 0; high = 1; }
-    const least = Math.max(Math.abs(low), Math.abs(high)) * 1e-6 || 1e-9, flat = high - low < least;
-    if (flat) { const middle = (low + high) / 2, half = Math.max(least, 0.5 * Math.abs(middle) || 0.5); low = middle - half; high = middle + half; }
-    if (this.flat || flat || still) this.low = this.high = null;
-    this.flat = flat;
-    this.low = this.low === null || low < this.low ? low : this.low + (low - this.low) * SHRINK;
-    this.high = this.high === null || high > this.high ? high : this.high + (high - this.high) * SHRINK;
-    const pad = 0.06 * (this.high - this.low);
+    const least = Math.max(Math.abs(low), Math.abs(high)) * 1e-6 || 1e-9;
+    if (high - low < least) { const middle = (low + high) / 2, half = Math.max(least, 0.5 * Math.abs(middle) || 0.5); low = middle - half; high = middle + half; }
+    if (this.low === null || low < this.low || high > this.high || high - low < 0.33 * (this.high - this.low)) {
+      const size = stepOf(low, high, 4);
+      this.low = Math.floor(low / size) * size;
+      this.high = Math.ceil(high / size) * size;
+    }
+    const pad = 0.03 * (this.high - this.low);
     return [this.low - pad, this.high + pad];
   }
   draw(now, t, span, calm) {
@@ -156,7 +153,7 @@ class Plot {
     const bins = Math.max(1, Math.round((w - left) * Math.min(2, window.devicePixelRatio || 1)));
     if (!this.envelope || !this.envelope.fits(record, span, bins)) this.envelope = new Envelope(curves, record, span, bins);
     this.envelope.take();
-    const [y0, y1] = this.scale(...this.envelope.range(t0), calm);
+    const [y0, y1] = this.scale(...this.envelope.range(t0));
     const x = time => left + (time - t0) / span * (w - left), y = v => bottom - (v - y0) / (y1 - y0) * (bottom - top);
     ctx.clearRect(0, 0, w, h);
     this.drawGrid(ctx, x, y, [t0, t1, y0, y1], [left, w, top, bottom, h]);
@@ -179,7 +176,7 @@ class Plot {
     } else if (running && now - this.read < READ_EVERY) return;
     this.read = now;
     curves.forEach((curve, k) => {
-      const text = n ? short(record.value(row, curve)) : '';
+      const text = n ? `${short(record.value(row, curve))} ${unitText(data.columns[curve].unit)}` : '';
       if (this.texts[k] !== text) this.outputs[k].textContent = this.texts[k] = text;
     });
   }
@@ -197,12 +194,15 @@ class Plot {
   }
 }
 
-function ticks(low, high, count) {
+function stepOf(low, high, count) {  // of the numbers at an axis, which has two at least
   const rough = (high - low) / count, power = 10 ** Math.floor(Math.log10(rough));
   const sizes = [0.2, 0.5, 1, 2, 5, 10].map(m => m * power), multiples = size => Math.floor(high / size) - Math.ceil(low / size) + 1;
   let i = sizes.findIndex(size => size >= rough);
-  while (i > 0 && multiples(sizes[i]) < 2) i--;  // an axis has two numbers at least
-  const size = sizes[i], found = [];
+  while (i > 0 && multiples(sizes[i]) < 2) i--;
+  return sizes[i];
+}
+function ticks(low, high, count) {
+  const size = stepOf(low, high, count), found = [];
   for (let k = Math.ceil(low / size); k * size <= high; k++) found.push(k * size);
   return found;
 }
