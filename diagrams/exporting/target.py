@@ -20,6 +20,7 @@ from ...fmus.export import (
     TargetSpec,
     TargetTick,
     Variable,
+    check_ascii,
     split_lookups,
     unit_name,
     write_c,
@@ -142,6 +143,8 @@ def target_spec(opened: OpenDiagram, *, name: str, description: str) -> TargetSp
     flat = opened.wired.flatten()
     _refuse_between_ticks(opened, flat)
     loop = loop_spec(opened, name=name, description=description)
+    for placed in (loop.inputs, loop.outputs, loop.signals, loop.parameters, loop.states):
+        check_ascii(one.variable.name for one in placed)
     acting = kinds_of(flat, every=False)
     numbers, fixed = _trace_numbers(opened, flat)
     start = {f.name: np.asarray(f.start) for f in loop.memory.fields if f.name in ("x", "w", "p", "log")}

@@ -6,7 +6,7 @@ from .inlined import inline_model, own_functions
 from .loop_memory import Field, LoopMemory, c_number
 from .loop_spec import ROOM_FOR_EDGES, CFunction, ComputedNumbers, Guards, LoopSpec, Placed, write_unit
 from .merged_plants import MergedPlant, PlacedPlant
-from .model import INTEGRATORS, Integrator, ModelSpec, Variable
+from .model import INTEGRATORS, Integrator, ModelSpec, Variable, check_ascii
 from .own_sources import read_own_sources
 from .package import build_fmu, clear_cache
 from .python_fmu import build_python
@@ -52,6 +52,7 @@ __all__ = [
     "build_fmu",
     "build_python",
     "c_number",
+    "check_ascii",
     "clear_cache",
     "compile_shared",
     "compile_webassembly",

@@ -17,7 +17,7 @@ from ...blocks.core import lay_out
 from .c_code import ORDER, Entry, Kind, _array, _starts, _table
 from .html_page import page_of
 from .loop_spec import LoopSpec, Placed, write_unit
-from .model import Variable
+from .model import Variable, check_ascii
 from .quantities import type_names
 from .scalars import _elements
 from .xml_fmi3 import LOG_CATEGORIES, _element, _types, _units_and_types, package_version
@@ -65,6 +65,7 @@ def loop_layout(spec: LoopSpec) -> tuple[Entry, ...]:
     time = Variable("t", unit="s", description="Simulation time")
     rows: list[tuple[Kind, Variable, str]] = [("time", time, "time")]
     rows += [(kind, one.variable, one.variable.name) for kind, one in loop_rows(spec)]
+    check_ascii(name for *_, name in rows)
     places = lay_out(v.size for _, v, _ in rows)
     return tuple(
         Entry(reference, kind, variable, name, place.start)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -26,7 +26,7 @@ RESERVED = ("time", "internal_step", "integrator", "tolerance")
 #: Values of the FMU's parameter ``integrator``.
 INTEGRATORS: dict[str, int] = {"rk4": 1, "dopri5": 2, "rodas": 3}
 DIRECTIONS: dict[str, int] = {"both": 0, "rising": 1, "falling": -1}
-_NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", re.ASCII)
+_NAME = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
 _ALLOWED: dict[str, tuple[str, ...]] = {
     "input": ("continuous", "discrete"),
     "output": ("continuous", "discrete"),
@@ -184,6 +184,16 @@ class EventSpec:
         return f"{self.name}.indicator"
 
 
+def check_ascii(names: Iterable[str]) -> None:
+    """Refuse names with letters that FMI's structured names don't have (FMI 3.0, 2.4.7.5.1); a web page has them."""
+    for name in names:
+        if not name.isascii():
+            raise DefinitionError(
+                f"the variable name {name!r} is not made of identifiers. Use letters, digits, _ and dots; letters are "
+                "those from A to Z here."
+            )
+
+
 def check_file_name(name: str) -> None:
     """Refuse a model name that no file can have on Windows: that of a device, such as con or lpt1."""
     if re.fullmatch(r"con|prn|aux|nul|(com|lpt)\d", name, re.IGNORECASE):
@@ -335,6 +345,7 @@ class ModelSpec:
 
     def _check_names(self) -> None:
         names = [*(v.name for v in self), *(e.indicator for e in self.events)]
+        check_ascii(names)
         for name in names:
             if names.count(name) > 1:
                 raise DefinitionError(

@@ -22,7 +22,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import DefinitionError, OptionError, UnknownNameError
 from loopwright.diagrams.web_page.notebook_link import PageRecord
-from loopwright.fmus import bouncing_ball, dc_motor, mass_spring_damper
+from loopwright.fmus import bouncing_ball, build, dc_motor, mass_spring_damper
 from support.web_modules import Module
 
 T = 1e-3
@@ -162,6 +162,28 @@ def test_without_choices_a_page_has_the_constants_and_the_named_wires():
     assert [s["name"] for group in data["groups"] for s in group["sliders"]] == ["u", "level"]
     assert [s["high"] for group in data["groups"] for s in group["sliders"]] == [6.0, 1.0]
     assert [c["name"] for c in data["columns"]] == ["y[1]", "y[2]"]
+
+
+def test_names_have_letters_of_all_alphabets_on_a_page_alone(tmp_path):
+    @subsystem(sample_time=0.5)
+    def box(φ):
+        return DiscreteIntegrator(name="ω")(φ).named("θ")
+
+    diagram = Diagram("Größe", box(Constant(value=1.0, unit="N.m", name="φ")))
+    made = diagram.to_html(title="<script>alert('x')</script> & Söhne")
+    module = Module(made.html)
+    assert [c["name"] for c in module.data["columns"]] == ["θ"]
+    assert module.slider("φ")["unit"] == "N.m"
+    assert module.begin()
+    assert module.run(4)[:, 1].tolist() == [0.0, 0.5, 1.0, 1.5]
+    assert made.html.count("<script>") == 2  # of ours
+    assert "<title>&lt;script&gt;alert(&#x27;x&#x27;)&lt;/script&gt; &amp; Söhne</title>" in made.html
+    for leaves in (
+        lambda: build(diagram, tmp_path / "d.fmu", name="d"),
+        lambda: diagram.to_c(tmp_path, subsystem="box"),
+    ):
+        with pytest.raises(DefinitionError, match=r"the variable name '[\w.]+' is not made of identifiers.*A to Z"):
+            leaves()
 
 
 def step(value):
