@@ -11,9 +11,7 @@ _STEPS = 5
 _TOLERANCE = 1e-9  # of the correction after the last step, relative to each state and to its nominal value
 
 
-def trapezoidal_step(
-    rates: Any, arguments: list[Any], T: Any, nominals: np.ndarray, *, steps: int = _STEPS
-) -> tuple[Any, Any]:
+def trapezoidal_step(rates: Any, arguments: list[Any], T: Any, nominals: np.ndarray) -> tuple[Any, Any]:
     """Return the states at the end of a step, x⁺ = x + T/2 (f(t, x, u) + f(t + T, x⁺, u)), and a guard.
 
     Newton's method starts from x (an explicit guess would be far off in a stiff block), has the exact Jacobian, and
@@ -50,7 +48,7 @@ def trapezoidal_step(
         matrix = ca.MX(ca.DM.eye(n)) - T / 2 * jacobian(t + T, new, *held)
         return solve(ca.project(matrix, solve.sparsity_in(0)), new - x - T / 2 * (start + after)), after
 
-    for _ in range(steps):
+    for _ in range(_STEPS):
         new = new - newton(new)[0]
     left = ca.fabs(newton(new)[0])
     allowed = _TOLERANCE * (nominals + ca.fabs(new))

@@ -107,18 +107,18 @@ class Delays:
         if self.noted + edges > len(self.edges):
             self.edges = np.concatenate([self.edges, np.empty((len(self.edges) + edges, 2))])
 
-    def note_edge(self, t: float, order: int = 0) -> None:
-        """Note a discontinuity of the inputs, or of their derivative of some order; one instant is noted once."""
+    def note_edge(self, t: float) -> None:
+        """Note a discontinuity of the inputs; one instant is noted once."""
         for tau in sorted(set(self.taus)):
             edges = self.edges[: self.noted]
             i = int(edges[:, 0].searchsorted(t + tau))
             near = [k for k in (i - 1, i) if 0 <= k < self.noted and _same(edges[k, 0], t + tau)]
             if near:
-                edges[near[0], 1] = min(edges[near[0], 1], order)
+                edges[near[0], 1] = 0  # of the inputs, and not of a derivative alone
             else:
                 self.make_room(t)
                 self.edges[i + 1 : self.noted + 1] = self.edges[i : self.noted].copy()
-                self.edges[i], self.noted = (t + tau, order), self.noted + 1
+                self.edges[i], self.noted = (t + tau, 0), self.noted + 1
 
     def outputs_at(self, t: float, w: np.ndarray) -> None:
         """Write the outputs at a time into w."""

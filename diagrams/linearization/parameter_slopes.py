@@ -101,7 +101,6 @@ def differentiate_loop(
         Without it, an equilibrium follows the parameter, and any other point keeps its states.
     slow : {"closed", "open"}
         As of `Linearization.loop`.
-
     left_out : dict, optional
         Takes the messages of parameters that have no derivative, by their paths; without it they are errors.
     """

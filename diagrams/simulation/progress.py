@@ -95,10 +95,8 @@ def progress_bar(
 
 
 @contextmanager
-def late_progress(
-    name: str, start: float, end: float, show: ProgressOption = None
-) -> Iterator[Callable[[float], None]]:
-    """Yield a function that is told how far some work is; it is drawn as by `progress_bar` once it has taken 2 s."""
+def late_progress(name: str, start: float, end: float) -> Iterator[Callable[[float], None]]:
+    """Yield a function that takes how far some work is; it is drawn as by `progress_bar` once it has taken 2 s."""
     begun = time.monotonic()
     with ExitStack() as stack:
         draw: Callable[[float], None] | None = None
@@ -106,7 +104,7 @@ def late_progress(
         def note(t: float) -> None:
             nonlocal draw
             if draw is None and time.monotonic() - begun > LATE:
-                draw = stack.enter_context(progress_bar(name, start, end, show))
+                draw = stack.enter_context(progress_bar(name, start, end, None))
             if draw is not None:
                 draw(t)
 
