@@ -7,26 +7,17 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
-from loopwright.blocks import Block, Constant, Gain, Input, OptionError, State, TransferFunction
+from loopwright.blocks import Constant, Gain, OptionError, TransferFunction
 from loopwright.diagrams import Diagram, subsystem
+from support.carts import Cart
 
 M, DRAG, SHARE, T = 2.0, 60.0, 3.0, 2e-3
 PORTS = {"position": "cart.position", "velocity": "cart.velocity"}
 
 
-class Cart(Block):
-    motor = Input(unit="N")
-    push = Input(unit="N")
-    position = State(unit="m", start=0.0, output=True)
-    velocity = State(unit="m/s", start=0.0, output=True)
-
-    def derivative(self, t, x, u):
-        return x.velocity, (u.motor + u.push) / M
-
-
 def bare_diagram(scale=None, cell=False):
     """The cart without a sensor: the drive reads the force on it, which is scaled on its way to the cart."""
-    cart, hand = Cart(name="cart"), Constant(value=0.0, unit="N", name="hand")
+    cart, hand = Cart(mass=M, name="cart"), Constant(value=0.0, unit="N", name="hand")
 
     @subsystem(sample_time=T)
     def drive(velocity, felt):
@@ -39,7 +30,7 @@ def bare_diagram(scale=None, cell=False):
 
 def diagram(sensor, delay=0, slow=T, wired=True):
     """A cart whose drive amplifies the measured force, sampled by T, and damps it; the sensor is sampled by ``slow``."""
-    cart, hand = Cart(name="cart"), Constant(value=0.0, unit="N", name="hand")
+    cart, hand = Cart(mass=M, name="cart"), Constant(value=0.0, unit="N", name="hand")
     other = hand if wired else Constant(value=0.0, unit="N", name="other")
 
     @subsystem(sample_time=slow, delay=delay)
@@ -133,7 +124,7 @@ def test_the_wire_ahead_of_a_delay_passes_the_delay():
 
 
 def test_a_continuous_filter_of_the_force_is_on_the_way():
-    cart, hand = Cart(name="cart"), Constant(value=0.0, unit="N", name="hand")
+    cart, hand = Cart(mass=M, name="cart"), Constant(value=0.0, unit="N", name="hand")
     felt = TransferFunction(numerator=[1.0], denominator=[LAG, 1.0], name="cell")(hand).named("felt")
     drive = Gain(gain=SHARE, name="share")(felt) - Gain(gain=DRAG, name="drag")(cart.velocity)
     here = Diagram("cart", cart(motor=drive, push=hand)).contact("cart.push", force="felt", direction=[1.0], **PORTS)

@@ -33,6 +33,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, FmuError, build, dc_motor
+from support.hidden_states import Hidden
 
 T = 0.01
 
@@ -386,26 +387,6 @@ def test_a_cart_under_a_pendulum_without_position_feedback_is_a_ramp():
     assert states_of(diagram) == ()
     poles = np.sort(np.abs(diagram.linearize().poles))
     assert poles[1] < 1e-6 < poles[2]
-
-
-class Hidden(Block):
-    """A speed with a PI-controlled lag, and more states inside that no output shows."""
-
-    growth: float = parameter(default=0.0)
-    frequency: float = parameter(default=0.0)
-    u = Input()
-    y = State(output=True)
-    angle = State()
-    a = State()
-    b = State()
-
-    def derivative(self, t, x, u):
-        return (
-            u.u - x.y,
-            x.y,
-            self.growth * x.a + self.frequency * x.b,
-            self.growth * x.b - self.frequency * x.a,
-        )
 
 
 @pytest.mark.parametrize(

@@ -7,34 +7,16 @@ import re
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Constant, Gain, Input, OptionError, State, TransferFunction
-from loopwright.diagrams import Diagram, analyse
+from loopwright.blocks import OptionError
+from loopwright.diagrams import analyse
+from support.carts import DRAG, SHARE, TAU, M, cart_diagram
 
-M, TAU, SHARE, DRAG = 3.0, 0.02, 4.0, 8.0
 PORTS = {"position": "cart.position", "velocity": "cart.velocity", "force": "felt", "direction": [1.0]}
-
-
-class Cart(Block):
-    motor = Input(unit="N")
-    push = Input(unit="N")
-    position = State(unit="m", start=0.0, output=True)
-    velocity = State(unit="m/s", start=0.0, output=True)
-
-    def derivative(self, t, x, u):
-        return x.velocity, (u.motor + u.push) / M
-
-
-def cart(share=SHARE):
-    plant, hand = Cart(name="cart"), Constant(value=0.0, unit="N", name="hand")
-    felt = Gain(gain=1.0, name="sensor")(hand).named("felt")
-    lag = TransferFunction(numerator=(1.0,), denominator=(TAU, 1.0), name="drive")
-    wanted = Gain(gain=share, name="share")(felt) - Gain(gain=DRAG, name="drag")(plant.velocity)
-    return Diagram("cart", plant(motor=lag(wanted), push=hand))
 
 
 @pytest.mark.slow
 def test_a_users_contact_gets_its_limits_their_trial_and_figures(tmp_path):
-    made = cart()
+    made = cart_diagram()
     report = made.report(
         tmp_path / "cart.html", json=True, only=("poles",), contacts={"hand": made.contact("cart.push", **PORTS)}
     )
@@ -72,8 +54,8 @@ def test_a_users_contact_gets_its_limits_their_trial_and_figures(tmp_path):
     ],
 )
 def test_what_is_no_contact_of_the_diagram_is_refused(contacts, words):
-    made = cart()
-    given = {"own": made, "other": cart(share=3.0)}
+    made = cart_diagram()
+    given = {"own": made, "other": cart_diagram(share=3.0)}
     contacts = {
         name: given[value].contact("cart.push", **PORTS) if value in given else value
         for name, value in contacts.items()

@@ -8,16 +8,12 @@ import pytest
 
 from loopwright.blocks import (
     PID,
-    Block,
     Constant,
     Gain,
-    Input,
     Integrator,
     Saturation,
-    State,
     StateSpace,
     TransferFunction,
-    parameter,
 )
 from loopwright.diagrams import Diagram, Requirements, analyse, subsystem
 from loopwright.diagrams.cli.command_line import main
@@ -25,6 +21,7 @@ from loopwright.diagrams.cli.report import verdict_text
 from loopwright.diagrams.report.pages.json import to_json
 from loopwright.diagrams.requirements import Reason
 from loopwright.types import Verdict
+from support.hidden_states import Hidden
 
 pytestmark = pytest.mark.usefixtures("without_drawings")
 
@@ -114,22 +111,6 @@ def test_a_drive_that_turns_passes_at_its_speed():
 
 
 # --- what must not pass -----------------------------------------------------------------------------------------------
-
-
-class Hidden(Block):
-    """A lag with an angle, and two more states inside that no output shows."""
-
-    growth: float = parameter(default=0.0)
-    frequency: float = parameter(default=0.0)
-    u = Input()
-    y = State(output=True)
-    angle = State()
-    a = State()
-    b = State()
-
-    def derivative(self, t, x, u):
-        growth, frequency = self.growth, self.frequency
-        return u.u - x.y, x.y, growth * x.a + frequency * x.b, growth * x.b - frequency * x.a
 
 
 def hidden(**what):
