@@ -138,7 +138,9 @@ class Derivative:
     @cached_property
     def _forward(self) -> Any:
         """The forward derivative of the one function of a schedule without opaque stages."""
-        return self._functions[id(self.schedule.last)].forward(1)
+        forward = self._functions[id(self.schedule.last)].forward(1)
+        given = forward.mx_in()
+        return ca.Function("forward", given, [ca.densify(e) for e in forward.call(given)])
 
     def along(
         self, arguments: Sequence[np.ndarray], direction: Sequence[np.ndarray], evaluators: Evaluators | None = None
@@ -156,12 +158,9 @@ class Derivative:
         """
         schedule = self.schedule
         if not schedule.opaque:
-            made = self._functions[id(schedule.last)].call([*arguments])
-            slopes = self._forward.call([*arguments, *made, *direction])
-            many = len(schedule.results)
-            skipped, count = (0, many) if self.values else (many, 0)
-            values = [np.array(v).reshape(v.shape) for v in made[skipped:]]
-            along = [np.array(v).reshape(v.shape) for v in slopes[skipped:]]
+            values = call_function(self._functions[id(schedule.last)], arguments)
+            along = call_function(self._forward, [*arguments, *(v.ravel(order="F") for v in values), *direction])
+            count = len(schedule.results) if self.values else 0
             return (
                 [*map(np.ravel, values[:count]), *values[count:]],
                 [*map(np.ravel, along[:count]), *along[count:]],
