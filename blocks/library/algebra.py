@@ -139,7 +139,7 @@ class Saturation(Limited):
     Raises
     ------
     ParameterError
-        For no limit, for ``limit`` beside ``lower`` or ``upper``, and for limits that cross.
+        For no limit, for ``limit`` next to ``lower`` or ``upper``, and for limits that cross.
     ShapeError
         For limits and a signal of different shapes, when the diagram is built.
     """
@@ -161,7 +161,7 @@ class DeadZone(Limited):
     Raises
     ------
     ParameterError
-        For no limit, for ``limit`` beside ``lower`` or ``upper``, and for limits that cross.
+        For no limit, for ``limit`` next to ``lower`` or ``upper``, and for limits that cross.
     ShapeError
         For limits and a signal of different shapes, when the diagram is built.
     """

@@ -22,7 +22,7 @@ PER_DECADE = 40
 TURNS_MATTER = 0.3
 """|L| below which the turns that a delay makes don't matter for the encirclements of −1."""
 HALVINGS = 24
-"""Halvings of the steps of a scan beside roots at which |L| may be too small to be looked for."""
+"""Halvings of the steps of a scan next to roots at which |L| may be too small to be looked for."""
 MANY = 100
 """Roots between samples above which those that can't have the largest |L| below 1 are left out."""
 NARROWINGS = 12
@@ -136,7 +136,7 @@ class _Search:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return samples of L and its slope, and more between those where |L| may fall below the least.
 
-        A response that passes 0 has a root beside it each time, and most of these turn out to be too small. All are
+        A response that passes 0 has a root next to it each time, and most of these turn out to be too small. All are
         computed at once, which takes far less time than to refine one root after the other.
         """
         for _ in range(HALVINGS):

@@ -46,7 +46,7 @@ from .plant_models import EQUILIBRIUM, PlantModel, model_equations, model_step
 
 T = TypeVar("T")
 SLOPE = 2.0**-140
-"""Factor of the slopes that imaginary parts carry: so small that its square vanishes beside any value."""
+"""Factor of the slopes that imaginary parts carry: so small that its square vanishes next to any value."""
 STEP = 2.0**-9
 """Step of a difference of fourth order between models of an FMU, relative to 1 + the size of what moves."""
 ROUNDING = 1e-13

@@ -38,7 +38,7 @@ class PointEvaluator(ModelExchangeEvaluator):
         self.error = 0.0
         """Largest known error of a derivative so far; 0 where the FMU computes them."""
         self.noise = 0.0
-        """The same error, relative to the largest derivative beside it."""
+        """The same error, relative to the largest derivative next to it."""
         exchange = self._fmu.description.exchange
         directional = exchange is not None and exchange.has_derivatives
         self.derivation = Derivation(

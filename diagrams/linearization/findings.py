@@ -61,7 +61,7 @@ class StepsOnly(BlockFinding):
 
 @dataclass(frozen=True)
 class EventsOnly(StepsOnly):
-    """An output of an FMU in model exchange beside a discrete input, which acts at events: that slope is left out."""
+    """An output of an FMU in model exchange next to a discrete input, which acts at events: that slope is left out."""
 
     def __str__(self) -> str:
         return (
@@ -423,7 +423,7 @@ class RefutedDerivatives(Finding):
 class CoarseValues(Finding):
     """Values of an FMU without directional derivatives that are too coarse to tell all their slopes by differences.
 
-    They move in steps (a converter, single precision beside a large offset), or have a kink at the point.
+    They move in steps (a converter, single precision with a large offset), or have a kink at the point.
 
     Attributes
     ----------

@@ -299,7 +299,7 @@ def _localize(V: np.ndarray, M: np.ndarray, rest: float) -> np.ndarray:
     _, _, order = qr(scaled.T, pivoting=True, mode="economic")
     own = order[: V.shape[1]]
     made, balanced = scaled @ np.linalg.inv(scaled[own]), M * d / d[:, None]
-    for _ in range(2):  # a slow pole beside them turns singular vectors by the rounding over its size
+    for _ in range(2):  # a slow pole next to them turns singular vectors by the rounding over its size
         made = made - np.linalg.lstsq(balanced, balanced @ made, rcond=rest)[0]
     made[np.abs(made) <= UNSEEN * np.max(np.abs(made), axis=0)] = 0.0
     return np.asarray(d[:, None] * made)

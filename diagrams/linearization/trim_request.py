@@ -128,7 +128,7 @@ class Free:
 
 
 def spread_nodes(value: float, h: float, low: float, high: float) -> tuple[float, tuple[float, ...]]:
-    """Return a step, and the places beside a value, in steps, at which `difference` needs a function.
+    """Return a step, and the places next to a value, in steps, at which `difference` needs a function.
 
     They lie on both sides, on one side where the value is at a bound.
     """
@@ -258,7 +258,7 @@ def set_states(flat: FlatDiagram, at: OperatingPoint, states: Mapping[str, Any])
 def free_parameters(diagram: WiredDiagram, asked: Mapping[str, Any]) -> tuple[list[Free], WiredDiagram]:
     """Return the free parameters, and a diagram in whose equations all of them are symbols.
 
-    A trace takes an exact zero for structure, so a parameter that is zero starts beside it. Start values of
+    A trace takes an exact zero for structure, so a parameter that is zero starts next to it. Start values of
     FMUs are no symbols.
     """
     found, moved = [], {}

@@ -17,7 +17,7 @@ a held signal then cuts no loop: there is no L.
 **Procedure.** The signal is ramped in over a window. Windows of whole periods follow, until the phasors of two of them
 agree, their distance is noise (it has stopped falling), or the largest number of windows is reached. Offset and drift
 are subtracted. The last window gives the result; where the distance is noise, the mean of the windows since then.
-The rest beside the lines is the distortion, a sign of an amplitude that leaves the linear range.
+The rest next to the lines is the distortion, a sign of an amplitude that leaves the linear range.
 
 **Uncertainty.** Three estimates are added up:
 
@@ -100,7 +100,7 @@ class FrequencyResponse:
         Estimated relative error of L, that of v plus that of u, with what a second amplitude and the movement of the
         operating point show; infinite where the operating point has moved.
     distortion : (K,) ndarray
-        Rms of the rest of v beside the line, relative to the line; NaN for a chirp, which has all lines.
+        Rms of the rest of v next to the line, relative to the line; NaN for a chirp, which has all lines.
     windows : (K,) ndarray of int
         Number of windows.
     settled : (K,) ndarray of bool

@@ -1,4 +1,4 @@
-"""Responses of the running diagram to a step that is added to a wire, beside those of its linear model.
+"""Responses of the running diagram to a step that is added to a wire, next to those of its linear model.
 
 The consumers of the wire get its signal v plus a step d, as `frequency_response` adds sines: from the point on, and
 held between the samples where the diagram is sampled. At an equilibrium the sources keep their values, so that a step

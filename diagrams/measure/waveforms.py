@@ -92,7 +92,7 @@ def plan_signal(kind: str, omega: np.ndarray, dt: float, amplitude: float) -> It
 def compute_phasors(part: Part, data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the phasors, by line and signal, and the distortion of the first signal.
 
-    The distortion is the rms of the rest beside the lines, relative to that of each line; NaN for a part with every
+    The distortion is the rms of the rest next to the lines, relative to that of each line; NaN for a part with every
     line. Over a window of whole periods the lines are orthogonal to all others. The difference of the window's end from
     its beginning is a drift, and is subtracted.
 

@@ -287,7 +287,7 @@ class Requirements(LoopLimits):
 
     @property
     def further_variants(self) -> tuple[str, ...]:
-        """Keys of the variants that are judged beside the diagram as it is."""
+        """Keys of the variants that are judged along with the diagram as it is."""
         named = [*self.variants, *(key for limits in self.loops.values() for key in limits.variants)]
         return tuple(dict.fromkeys(named))
 

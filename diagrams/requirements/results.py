@@ -20,7 +20,7 @@ class StepSize(StrEnum):
     SOURCE = "its source's own step"
     """The wire comes from a source that steps, such as `Step`: the height of its step."""
     CHOSEN = "chosen small"
-    """Nothing says it: it is small beside the signal, and large beside quanta."""
+    """Nothing says it: it is small compared with the signal, and large compared with quanta."""
 
 
 @dataclass(frozen=True)

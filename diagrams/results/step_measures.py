@@ -28,7 +28,7 @@ NONE = Measured(math.nan, math.nan)
 
 @dataclass(frozen=True, eq=False)
 class ExpectedStep:
-    """The linear model's response to a step, beside which a response is measured.
+    """The linear model's response to a step, next to which a response is measured.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ def measure_step(
     """Return the numbers of a step response: ``final``, ``overshoot``, ``settling``, ``rise`` and ``peak``.
 
     The tolerances contain what may lie between two samples, and what the response may still do after its record. With a
-    linear model beside it, its final value is that of the model plus the distance at the end of the record. That
+    linear model next to it, its final value is that of the model plus the distance at the end of the record. That
     distance, or without a model the response itself, may still change by what its slowest mode has left, by its
     movement in the second half of the record.
 

@@ -42,7 +42,7 @@ from ...blocks.core import NonFiniteError, OptionError, SimulationError, near
 
 STRETCH = 2_000  # steps between two looks at the progress
 HOPELESS = 1e7  # steps to go, at which a run is given up
-LARGE = 1e6  # size of a state beside its scale, from which on its growth is what an error names
+LARGE = 1e6  # size of a state compared with its scale, from which on its growth is what an error names
 
 
 @dataclass(frozen=True)

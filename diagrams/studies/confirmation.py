@@ -47,7 +47,7 @@ MARGIN_AGREEMENT = 1e-2
 """Relative difference of a measured number that confirms a margin."""
 
 LARGER = (2.0, 4.0, 8.0)
-"""Factors on a sine of the least size beside quanta, where its measurement is uncertain."""
+"""Factors on a sine of the least size compared with quanta, where its measurement is uncertain."""
 SAME_MARGIN = 1e-3
 """Relative difference up to which a crossing has the margin that is confirmed; a measurement is judged by more."""
 MOST_UNCERTAIN = 1e-2
@@ -151,7 +151,7 @@ def _measure_margin(
 ) -> RunConfirmation:
     """Measure L at the frequency that decides a margin, and read the margin from it.
 
-    A sine that is not given is small, and large beside the quanta of converters and encoders.
+    A sine that is not given is small, and large compared with the quanta of converters and encoders.
     """
     L, wire = model.loop(*case.loop), case.loop[0]
     omega = _deciding_frequency(L, case.quantity, case.value, diagram.name)
@@ -230,7 +230,7 @@ def _inside(omega: float, L: Any, name: str) -> float:
 
 
 def _read_bandwidth(L: Any, measured: np.ndarray, predicted: np.ndarray, omega: float, value: float) -> float:
-    """Return the bandwidth with a measured L: beside the model's, |T| falls as the model's does."""
+    """Return the bandwidth with a measured L: compared with the model's, |T| falls as the model's does."""
     T, there = (abs(complex(M[0, 0]) / (1.0 + complex(M[0, 0]))) for M in (measured, predicted))
     w = omega * np.array([0.999, 1.001])
     ends = np.ravel(L(np.exp(1j * w * L.dt) if L.dt else 1j * w))

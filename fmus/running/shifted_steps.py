@@ -1,4 +1,4 @@
-"""Communication steps of an FMU from states and inputs beside an operating point."""
+"""Communication steps of an FMU from states and inputs next to an operating point."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ def level_text(value: float, position: int | None = None) -> str:
 
 
 DOTTED: Mapping[str, Any] = {"color": DARK, "linestyle": (0, (1, 1.5)), "linewidth": 1.6}
-"""Look of a target beside what is rendered."""
+"""Look of a target next to what is rendered."""
 
 
 def draw_admittances(w: np.ndarray, curves: Iterable[tuple[str, np.ndarray, Mapping[str, Any]]]) -> Figure:

@@ -91,7 +91,7 @@ def draw_bode(of: DrawnLoops, height: float, width: float) -> Figure:
 
 
 def nyquist(key: str, of: DrawnLoops) -> Plot:
-    """Draw L in the complex plane: near −1, and beside it so far that all crossings of the real axis are in view."""
+    """Draw L in the complex plane: near −1, and next to it so far that all crossings of the real axis are in view."""
     return Plot(key, TEXTS.line("nyquist", wire=of.wire), lambda: _draw_nyquist(of))
 
 

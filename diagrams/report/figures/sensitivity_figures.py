@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 TEXTS = Texts(__package__, "figures")
 LONGEST = 44
-"""Letters of a parameter's path that fit beside the bars."""
+"""Letters of a parameter's path that fit next to the bars."""
 
 
 def sensitivity_bars(key: str, wire: str, title: str, changes: Mapping[str, float]) -> Plot:

@@ -14,7 +14,7 @@ from .document import Document
 
 
 def to_json(report: Document) -> str:
-    """Return all numbers, nested by the dots of their paths, with ``meta`` beside them.
+    """Return all numbers, nested by the dots of their paths, with ``meta`` next to them.
 
     Beside them stands ``requirements``, where there were some: the verdict, the counts, and each requirement.
 

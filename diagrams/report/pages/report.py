@@ -67,7 +67,7 @@ def write_report(
     json: bool = False,
     paper: str = "A4",
 ) -> list[Path]:
-    """Write a report's page and, beside it, its PDF and its numbers; return the files."""
+    """Write a report's page and, next to it, its PDF and its numbers; return the files."""
     if path is None:
         return []
     file = Path(path).expanduser()

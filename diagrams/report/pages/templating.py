@@ -1,4 +1,4 @@
-"""Templates: pages that escape what they show, and the report's longer texts, kept beside the code that fills them."""
+"""Templates: pages that escape what they show, and the report's longer texts, kept next to the code that fills them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Loops that were measured elsewhere, on a machine, say, beside those of the linear model."""
+"""Loops that were measured elsewhere, on a machine, say, next to those of the linear model."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TEXTS = Texts(__package__, "measured")
 MEASURED = "measured"
 """Key of what was measured, in place of a variant's, in requirements and their verdicts."""
 QUANTITIES = ("phase_margin_deg", "gain_margin_low", "gain_margin_high", "delay_margin_s", "modulus_margin", "ms")
-"""Margins that stand beside the model's, by their names in dotted paths."""
+"""Margins that are next to the model's, by their names in dotted paths."""
 SOURCE = "the data's uncertainty, and the distance of their points"
 
 

@@ -1,4 +1,4 @@
-"""Responses of the running diagram to steps, beside those of its linear model, and the effort that they take."""
+"""Responses of the running diagram to steps, next to those of its linear model, and the effort that they take."""
 
 from __future__ import annotations
 
@@ -283,7 +283,7 @@ def _without_converters(
 def _least_step(
     diagram: WiredDiagram, point: OperatingPoint, test: StepTest, length: float
 ) -> tuple[float, Quantum | None]:
-    """Return the height of a step that is large beside quanta, with the quantum; 0 where none is known."""
+    """Return the height of a step that is large compared with quanta, with the quantum; 0 where none is known."""
     try:
         found = find_least_step(diagram, point, test.wire, test.output or test.wire, length)
     except LoopwrightError:  # no linear model: the run may be had all the same
@@ -586,7 +586,7 @@ def unit_at(diagram: WiredDiagram, name: str) -> str:
 
 
 def _rounded(value: float, size: float) -> float:
-    """Return a value, 0 where it is rounding beside values of a size."""
+    """Return a value, 0 where it is rounding compared with values of a size."""
     return 0.0 if abs(value) <= ROUNDING * max(size, 1e-300) else value
 
 

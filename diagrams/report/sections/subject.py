@@ -120,7 +120,7 @@ def _parameters(block: Block) -> Any:
     for name, spec in block.parameter_specs.items():
         value = getattr(block, name)
         if name == "unit" and isinstance(value, str):
-            continue  # it stands beside the value
+            continue  # it is next to the value
         if hasattr(value, "parameter_specs"):
             inner = ", ".join(f"{n} = {_shown(getattr(value, n))}" for n in value.parameter_specs if n[:6] != "start_")
             yield name, f"{type(value).__name__}({inner})", "", value
