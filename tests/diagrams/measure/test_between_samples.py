@@ -45,15 +45,19 @@ def held(A, B, h):
 def closed(samples, parts, A=A, B=B, C=C, kp=KP, ki=KI):
     """Return y at ``parts`` instants of each sample, after a step of the wish from 0 to 1."""
     M, N = held(A, B, T / parts)
+    by_x, by_u = [np.eye(len(A))], [np.zeros(len(A))]  # the states within a sample, by those at its beginning and by u
+    for _ in range(parts):
+        by_x.append(M @ by_x[-1])
+        by_u.append(M @ by_u[-1] + N)
+    y_by_x, y_by_u = np.array(by_x[:-1]).transpose(0, 2, 1) @ C, np.array(by_u[:-1]) @ C
     x, integral, y = np.zeros(len(A)), 0.0, []
     for _ in range(samples):
         e = 1.0 - C @ x
         u = kp * e + integral
         integral += ki * T * e
-        for _ in range(parts):
-            y.append(C @ x)
-            x = M @ x + N * u
-    return np.array(y)
+        y.append(y_by_x @ x + y_by_u * u)
+        x = by_x[-1] @ x + by_u[-1] * u
+    return np.concatenate(y)
 
 
 def overshoot_of(got, slowest=0.03):
