@@ -37,7 +37,7 @@ class Model {
     return done;
   }
   reason(t) {
-    const when = `at t = ${short(t, 9)} s`, plant = this.calls.plant(), event = this.calls.event(), guard = this.calls.guard();
+    const when = `after t = ${short(t, 9)} s`, plant = this.calls.plant(), event = this.calls.event(), guard = this.calls.guard();
     if (plant >= 0) return `${data.plants[plant]} can't continue ${when}: a value of it is not finite, or out of its range.`;
     if (event >= data.events.length) return `the solver finds no step ${when}; a stiff diagram needs solver="Radau".`;
     if (event >= 0) return `${data.events[event].join('.')} fires without end ${when}.`;

@@ -52,7 +52,7 @@ function frame(now) {
   now /= 1000;
   const gap = now - before;
   before = now;
-  if (running) keepPace(now, gap);
+  if (running && !document.hidden) keepPace(now, gap);
   if (now > saidUntil) say('');
   if (!drawn) draw(now * 1000);
   else if (scene && scene.moves && !calm.matches) drawScene(now * 1000);

@@ -1,6 +1,7 @@
 """Pages in a real browser, opened from the disk: they run, answer, keep to themselves, and have a run's samples."""
 
 import csv
+import re
 from functools import cache
 
 import numpy as np
@@ -133,8 +134,13 @@ def test_a_run_that_cannot_continue_says_why(file):
         page.evaluate("for (const [n, v] of [['hand_y', 0.5], ['hand_z', 0.5], ['grip', 1]]) page.set(n, v)")
         page.evaluate("page.advance(20000)")
         text = page.inner_text("#note")
-        assert text.startswith("It has ended: ")
+        assert text.startswith("It has ended: controller.path_projection.left is not positive after t = 0.")
         assert "Change what led there, and reset." in text
+        ticks = page.evaluate("page.ticks")
+        for button in ("#step", "#play"):
+            page.click(button)
+        assert page.evaluate("[page.ticks, page.running]") == [ticks, False]
+        assert page.inner_text("#note") == text
         page.evaluate("page.set('admittance_perp.stiffness', 200)")
         page.click("#reset")
         assert page.evaluate("[page.ticks, page.model.failed]") == [1, False]
@@ -151,6 +157,119 @@ def test_it_fits_the_screen_in_both_schemes(file, size, scheme):
         assert page.is_visible(".scene canvas")
         ground = page.evaluate("getComputedStyle(document.documentElement).backgroundColor")
         assert ground == {"light": "rgb(255, 255, 255)", "dark": "rgb(20, 25, 31)"}[scheme]
+
+
+def test_a_delay_is_given_up_and_the_page_says_so(file):
+    """The browser is held up for 0.7 s; then the page is out of sight as long: the run is late by that, and no jump."""
+    away = """async hidden => {
+        Object.defineProperty(document, 'hidden', {value: hidden, configurable: true});
+        document.dispatchEvent(new Event('visibilitychange'));
+    }"""
+    with opened(file) as page:
+        page.evaluate("page.play()")
+        page.wait_for_timeout(300)
+        held = page.evaluate(
+            """async () => {
+                const before = page.ticks, began = performance.now();
+                while (performance.now() < began + 700);
+                await new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)));
+                return [page.ticks - before, page.behind];
+            }"""
+        )
+        assert held[0] < 300
+        assert held[1] > 0.6
+        assert page.inner_text("#note").startswith("The browser held the page up for 0.")
+        page.evaluate(away, True)
+        page.wait_for_timeout(100)
+        before = page.evaluate("page.ticks")
+        page.wait_for_timeout(600)
+        assert page.evaluate("page.ticks") == before
+        page.evaluate(away, False)
+        page.wait_for_timeout(100)
+        assert before < page.evaluate("page.ticks") < before + 500
+        assert page.inner_text("#note").startswith("The page was out of sight for 0.")
+        page.click("#reset")
+        assert page.is_hidden("#note")
+
+
+def test_a_machine_that_is_too_slow_is_named_with_the_speed_that_it_reaches(file):
+    """Each tick takes 2 ms, at a speed of 10: half of real time at most."""
+    with opened(file) as page:
+        page.evaluate(
+            """() => {
+                const run = page.model.run.bind(page.model);
+                page.model.run = (...given) => {
+                    const done = run(...given), began = performance.now();
+                    while (performance.now() < began + 2 * done);
+                    return done;
+                };
+                page.play();
+            }"""
+        )
+        page.select_option("#speed", "10")
+        page.wait_for_timeout(4000)
+        found = re.match(
+            r"Slower than asked for: (\S+) × real time instead of 10 ×, (\S+) s behind", page.inner_text("#note")
+        )
+        assert 0.0 < float(found[1]) <= 0.5
+        assert float(found[2]) > 1.0
+
+
+def test_keys_pull_the_tool_and_move_sliders(file):
+    with opened(file) as page:
+        page.focus(".scene canvas")
+        page.keyboard.down("ArrowLeft")
+        page.wait_for_timeout(400)
+        assert page.evaluate("[page.running, page.now('hand.force[1]') < -4, page.now('hand_grip')]") == [True, True, 1]
+        page.keyboard.up("ArrowLeft")
+        page.wait_for_timeout(200)
+        assert page.evaluate("page.now('hand_grip')") == 0
+        slider = "page.sliders.get('admittance_perp.stiffness').value"
+        page.get_by_label("stiffness k⊥", exact=True).focus()
+        before = page.evaluate(slider)
+        page.keyboard.press("ArrowRight")
+        assert page.evaluate(slider) == pytest.approx(before + 0.01 * 1850.0, abs=1.0)  # a hundredth of the way
+        page.keyboard.press("End")
+        assert page.evaluate(slider) == 2000.0
+        page.get_by_label("stiffness k⊥: back to 200 N/m").click()
+        assert page.evaluate(slider) == 200.0
+        page.get_by_label("stiffness k⊥, value").fill("1e9")
+        page.keyboard.press("Enter")
+        assert page.evaluate(slider) == 2000.0  # the end of its range
+
+
+def test_a_plot_has_every_extreme_however_long_it_is(file):
+    """Of each pixel the smallest and the largest sample, added as they come: as from the whole record at once."""
+    with opened(file) as page:
+        page.evaluate("for (const [n, v] of [['hand_y', 0.7], ['hand_z', 0.6], ['grip', 1]]) page.set(n, v)")
+        found = page.evaluate(
+            """() => {
+                for (let i = 0; i < 60; i++) { page.advance(237); page.draw(); }
+                const plot = plots[2], {least, most, width, size, newest} = plot.envelope, worst = [0, 0, 0];
+                const lows = new Map(), highs = new Map();
+                for (let i = 0; i < page.record.count; i++) {
+                    const bin = Math.floor(page.record.time(i) / width), v = page.record.value(i, plot.of.curves[0]);
+                    lows.set(bin, Math.min(v, lows.get(bin) ?? Infinity));
+                    highs.set(bin, Math.max(v, highs.get(bin) ?? -Infinity));
+                }
+                for (let bin = newest - size + 1; bin <= newest; bin++) {
+                    worst[0] += least[0][bin % size] !== lows.get(bin);
+                    worst[1] += most[0][bin % size] !== highs.get(bin);
+                    worst[2] += 1;
+                }
+                return worst;
+            }"""
+        )
+        assert found[:2] == [0, 0]
+        assert found[2] > 500
+
+
+def test_less_motion(file):
+    """Plots move by a quarter of their width: 10 s end at 12.5 s at t = 10.4 s."""
+    with opened(file, reduced_motion="reduce") as page:
+        page.evaluate("page.advance(10400)")
+        page.wait_for_timeout(100)
+        assert page.evaluate("[plots[0].t0, plots[0].t1]") == [2.5, 12.5]
 
 
 def test_it_keeps_pace(file, record_property):
