@@ -33,7 +33,7 @@ from ..compiled import (
     write_ticks,
 )
 from ..coupling import bind
-from ..flat import NONE, FlatDiagram, TickPattern, flatten, kinds_of
+from ..flat import NONE, FlatDiagram, TickPattern, bits_of, flatten, has_all_kinds, kinds_of
 from ..model_exchange import BlocksInModelExchange
 from ..simulation import (
     Continuous,
@@ -136,7 +136,7 @@ def loop_spec(
         base=flat.base,
         clocks=tuple((clock.every, clock.offset) for clock in flat.distinct),
         clocked=variables.clocked(),
-        sets=tuple(sum(1 << i for i, clock in enumerate(flat.distinct) if clock in one) for one in acting),
+        sets=tuple(bits_of(flat, one) for one in acting),
         hybrid=hybrid,
         memory=memory,
         code=function_text([*code.functions, *dict.fromkeys(f for f in functions if f is not None)]),
@@ -264,6 +264,13 @@ def _check_clocks(flat: FlatDiagram, sets: int, name: str) -> None:
         raise DefinitionError(
             f"found {len(flat.distinct)} sample times, of which {sets} sets act together; at most {_MOST_CLOCKS} and "
             f"{_MOST_SETS} are exported. Choose sample times that are multiples of each other.",
+            block=name,
+        )
+    if not has_all_kinds(flat):
+        raise DefinitionError(
+            "its sample times act together again only after more than a million ticks of "
+            f"{float(flat.base):g} s, and an exported diagram has code for each set that acts together. Choose sample "
+            "times that are multiples of each other.",
             block=name,
         )
 

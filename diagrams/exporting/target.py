@@ -25,7 +25,7 @@ from ...fmus.export import (
     unit_name,
     write_c,
 )
-from ..flat import FlatDiagram, TickPattern, kinds_of, share_terms, speed_up, trace_guarded_tick
+from ..flat import FlatDiagram, TickPattern, bits_of, kinds_of, share_terms, speed_up, trace_guarded_tick
 from ..wiring import join
 from .loop_of_diagram import loop_spec
 from .make_exported import open_model
@@ -145,7 +145,7 @@ def target_spec(opened: OpenDiagram, *, name: str, description: str) -> TargetSp
     loop = loop_spec(opened, name=name, description=description)
     for placed in (loop.inputs, loop.outputs, loop.signals, loop.parameters, loop.states):
         check_ascii(one.variable.name for one in placed)
-    acting = kinds_of(flat, every=False)
+    acting = kinds_of(flat, every=loop.hybrid)  # what is in continuous time is computed at each tick
     numbers, fixed = _trace_numbers(opened, flat)
     start = {f.name: np.asarray(f.start) for f in loop.memory.fields if f.name in ("x", "w", "p", "log")}
     return TargetSpec(
@@ -244,7 +244,7 @@ def _trace_tick(opened: OpenDiagram, flat: FlatDiagram, clocks: frozenset[TickPa
                 kind = type(table.blocks[path]).__name__
                 outputs.append(BlockOutput(opened.shown(path), port, kind, where.start, where.stop - where.start))
     guards = tuple((opened.shown(path), guard) for path, guard in made.guards)
-    return TargetTick(share_terms(function), lookups, tuple(outputs), guards)
+    return TargetTick(bits_of(flat, clocks), share_terms(function), lookups, tuple(outputs), guards)
 
 
 def _expand(function: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from ...blocks.core import Layout
 from .announced import Announcer, Times, announcers
-from .clock_sets import kinds_of, times_of
+from .clock_sets import bits_of, has_all_kinds, kinds_of, times_of
 from .clocks import EVERY, NONE, ClockSets, TickPattern, ticks_after
 from .evaluation import JUMP, Apart, Instant, evaluate, just_after, no_evaluator, sort_names
 from .fast_functions import share_terms, speed_up
@@ -59,9 +59,11 @@ __all__ = [
     "WiredDiagram",
     "announcers",
     "bind_function",
+    "bits_of",
     "evaluate",
     "evaluate_apart",
     "flatten",
+    "has_all_kinds",
     "indicators_of",
     "is_true",
     "join_columns",

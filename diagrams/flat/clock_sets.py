@@ -32,10 +32,25 @@ def kinds_of(flat: FlatLayout, *, every: bool) -> list[frozenset[TickPattern]]:
     return [acting for acting in _sets_of(flat.distinct) if acting or idle]
 
 
+def bits_of(flat: FlatLayout, acting: frozenset[TickPattern]) -> int:
+    """Return a set of clocks as bits, in the order of the diagram's clocks."""
+    return sum(1 << i for i, clock in enumerate(flat.distinct) if clock in acting)
+
+
+def has_all_kinds(flat: FlatLayout) -> bool:
+    """Whether all sets of clocks that ever act together do so in the first million ticks."""
+    return _ticks_until_again(flat.distinct) <= _MOST_TICKS
+
+
+def _ticks_until_again(clocks: Sequence[TickPattern]) -> int:
+    """Return the number of ticks after which the sets of clocks that act together repeat."""
+    period = int(np.lcm.reduce([1, *(clock.every for clock in clocks)], dtype=object))
+    return max((clock.offset for clock in clocks), default=0) + period + 1
+
+
 @lru_cache(maxsize=64)
 def _sets_of(clocks: Sequence[TickPattern]) -> list[frozenset[TickPattern]]:
-    period = int(np.lcm.reduce([1, *(clock.every for clock in clocks)], dtype=object))
-    ticks = np.arange(min(max((clock.offset for clock in clocks), default=0) + period + 1, _MOST_TICKS))
+    ticks = np.arange(min(_ticks_until_again(clocks), _MOST_TICKS))
     group = np.zeros(len(ticks), dtype=np.int64)  # ticks at which the same clocks act, from the last clock on
     for end in range(len(clocks), 0, -_AT_ONCE):
         bits = group << _AT_ONCE

@@ -390,7 +390,7 @@ class _SourceWriter:
         return found
 
     def _facts(self, tick: _WrittenTick) -> TickFacts:
-        bits = self.spec.loop.sets[tick.number]
+        bits = tick.tick.acting
         subsystems = [p or "the diagram" for i, paths in enumerate(self.spec.acting) if bits >> i & 1 for p in paths]
         names = {kind: tuple(found) for kind, found in tick.touched.items()}
         return TickFacts(
@@ -761,7 +761,7 @@ class _SourceWriter:
             *self._start_lines(),
         ]
         for tick in ticks:
-            bits = self.spec.loop.sets[tick.number]
+            bits = tick.tick.acting
             if self.counted and not bits and tick.is_empty:
                 continue
             when = self._when(bits)
@@ -898,7 +898,7 @@ class _SourceWriter:
         return [*lines, "};", "", f"void {name}_init({name} *c) {{ *c = start_values; }}", ""]
 
     def _tick_lines(self, ticks: Sequence[_WrittenTick]) -> list[str]:
-        name, upper, sets = self.name, self.upper, self.spec.loop.sets
+        name, upper = self.name, self.upper
         lines = ["/* ---- one tick ---- */", "", f"{name}_status {name}_tick({name} *c) {{"]
         if not self.counted:
             lines += [f"    const {name}_status status = tick_0(c);", f"    if (status == {upper}_OK) {{"]
@@ -911,13 +911,13 @@ class _SourceWriter:
             "    switch (acting) {",
         ]
         for tick in ticks:
-            if sets[tick.number]:
+            if bits := tick.tick.acting:
                 lines += [
-                    f"    case {sets[tick.number]}u: /* {self._when(sets[tick.number])} */",
+                    f"    case {bits}u: /* {self._when(bits)} */",
                     f"        status = tick_{tick.number}(c);",
                     "        break;",
                 ]
-        idle = next((t for t in ticks if not sets[t.number] and not t.is_empty), None)
+        idle = next((t for t in ticks if not t.tick.acting and not t.is_empty), None)
         lines += [
             "    default:" if idle else "    default: /* nothing is due */",
             *([f"        status = tick_{idle.number}(c);"] if idle else []),

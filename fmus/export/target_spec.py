@@ -45,6 +45,8 @@ class TargetTick:
 
     Attributes
     ----------
+    acting : int
+        The set, as bits in the order of ``loop.clocks``.
     function : casadi.Function
         Scalar operations ``(t, x, w, p, …) -> (x_next, log, guards, …)``; behind them what `lookups` find, and seek.
     lookups : tuple of Lookup
@@ -55,6 +57,7 @@ class TargetTick:
         Block and name of each guard.
     """
 
+    acting: int
     function: Any
     lookups: tuple[Lookup, ...]
     outputs: tuple[BlockOutput, ...]
@@ -107,7 +110,7 @@ class TargetSpec:
     loop : LoopSpec
         Its variables and clocks.
     ticks : tuple of TargetTick
-        By set of clocks, in the order of ``loop.sets``.
+        Its kinds of ticks: each set of clocks that act together is in one of them.
     kept : tuple of Kept
         All of x.
     start : mapping of str to ndarray

@@ -1,5 +1,6 @@
 """C for a target: the numbers of the run in every bit, on this machine and on a Cortex-M, without a warning."""
 
+import itertools
 import shutil
 import subprocess
 
@@ -7,9 +8,21 @@ import numpy as np
 import pytest
 
 from loopwright import Diagram, subsystem, to_c
-from loopwright.blocks import PID, BandLimitedNoise, Compare, Gain, PulseTrain, Sine, Step, Switch, TransferFunction
+from loopwright.blocks import (
+    PID,
+    BandLimitedNoise,
+    Clock,
+    Compare,
+    DiscreteStateSpace,
+    Gain,
+    PulseTrain,
+    Sine,
+    Step,
+    Switch,
+    TransferFunction,
+)
 from loopwright.diagrams import DefinitionError, OptionError
-from loopwright.diagrams.exporting import open_part, open_subsystem, target_spec
+from loopwright.diagrams.exporting import open_part, open_subsystem, open_whole, target_spec
 from loopwright.fmus.export import measure, run_here, unit_name, write_target
 from loopwright.fmus.export.target_measure import find_bound
 from support.exported_loops import Loop
@@ -308,6 +321,89 @@ def test_sources_of_time_are_exact_in_single_precision():
     exact = BandLimitedNoise(sample_time=0.3, variance=2.0, seed=5, name="noise")
     run = Diagram("noise", exact.y.named("noisy")).simulate(40.0, step=0.1, progress=False)
     np.testing.assert_allclose(found["noisy"], run["noisy"][:400], rtol=EPS)
+
+
+CLOCKS = {
+    "slow, then fast": [(10, 0), (1, 0)],
+    "fast, then slow": [(1, 0), (10, 0)],
+    "ticks without any": [(2, 0), (3, 0)],
+    "three": [(1, 0), (4, 0), (6, 1)],
+    "offsets": [(4, 0), (4, 2), (6, 3)],
+    "never at once": [(2, 0), (2, 1)],
+    "one, and an offset": [(3, 2)],
+    "one": [(1, 0)],
+}
+OUTSIDE = {"no source": ("clock", "pulses"), "one source": ("pulses",), "two sources": ()}
+QUICK = (("slow, then fast", "one source"), ("ticks without any", "two sources"), ("three", "no source"))
+
+
+@pytest.mark.parametrize(
+    ("rates", "inside"),
+    [
+        pytest.param(r, i, marks=() if (r, i) in QUICK else pytest.mark.slow)
+        for r, i in itertools.product(CLOCKS, OUTSIDE)
+    ],
+)
+def test_each_tick_runs_the_subsystems_that_are_due(rates, inside):
+    """Sums of integers, against a loop of plain Python; sources in continuous time are in the C, or are its inputs."""
+    clocks, count, first = CLOCKS[rates], 40, 1.0
+
+    def chain(*sources):
+        y = first
+        for i, (every, offset) in enumerate(clocks):
+
+            def add(before, u, i=i, dt=float(every)):
+                total = DiscreteStateSpace(A=[[1.0]], B=[1.0], C=[1.0], D=1.0, dt=dt, name="sum")
+                return total(before + u).named(f"y{i}")
+
+            y = subsystem(sample_time=float(every), offset=float(offset), name=f"s{i}")(add)(y, sources[i % 2])
+        return y
+
+    now = Clock(name="clock").y.named("seconds")
+    pulses = PulseTrain(amplitude=5.0, period=7.0, duty=3 / 7, delay=2.0, name="pulses").y.named("pulsed")
+    diagram = Diagram("d", (3.0 * chain(now, pulses)).named("thrice"), now, pulses)
+    opened = open_whole(diagram.wired, OUTSIDE[inside], "d")
+
+    k = np.arange(count, dtype=float)
+    u = k, 5.0 * ((k >= 2) & ((k - 2) % 7 < 3))
+    sums, held, expected = [0.0] * len(clocks), [0.0] * len(clocks), np.zeros((count, len(clocks)))
+    for tick in range(count):
+        before = first
+        for i, (every, offset) in enumerate(clocks):
+            if tick >= offset and (tick - offset) % every == 0:
+                sums[i] += before + u[i % 2][tick]
+                held[i] = sums[i]
+            before = held[i]
+        expected[tick] = held
+
+    text = write_target(target_spec(opened, name="d", description=""))
+    found = run_here(text, {name: u[name == "pulses"] for name in OUTSIDE[inside]}, count)
+    begin = max(offset for _, offset in clocks)  # before its first tick a subsystem holds what it has at the start
+    for i in range(len(clocks)):
+        np.testing.assert_array_equal(found[f"s{i}.y{i}"][begin:], expected[begin:, i])
+    np.testing.assert_array_equal(found["thrice"][begin:], 3.0 * expected[begin:, -1])
+    for name, values in zip(("seconds", "pulsed"), u, strict=True):
+        if name in found or inside == "two sources":
+            np.testing.assert_array_equal(found[name], values)
+    for tick in text.ticks:  # the report names the subsystems whose sums are in it
+        acting = {one for one in tick.subsystems if one.startswith("s")}
+        assert {block.partition(".")[0] for block in tick.blocks if block.startswith("s")} == acting
+
+
+def test_sets_of_clocks_that_act_together_after_a_million_ticks_are_refused():
+    """Periods of 997, 1009 and 1013 ticks, prime to each other: all three meet once in a billion ticks."""
+
+    def diagram(*periods):
+        value = Clock(name="clock").y
+        for i, period in enumerate(periods):
+            one = subsystem(sample_time=period, offset=float(i), name=f"s{i}")(lambda u: 2.0 * u)
+            value = one(value)
+        return Diagram("d", value.named("last"))
+
+    with pytest.raises(DefinitionError, match=r"^d: its sample times act together again only after more than a mill"):
+        target_spec(open_whole(diagram(997.0, 1009.0, 1013.0).wired, (), "d"), name="d", description="")
+    spec = target_spec(open_whole(diagram(97.0, 101.0).wired, (), "d"), name="d", description="")
+    assert sorted(tick.acting for tick in spec.ticks) == [0, 1, 2, 3]
 
 
 def test_a_bound_counts_each_instruction_and_each_call_once():
