@@ -181,8 +181,27 @@ def initialize_at(point: FmuPoint, exchange: bool) -> Iterator[LoadedFmu]:
     """Load the FMU and enter Initialization Mode at the operating point."""
     instance = open_fmu(LoadedFmu, point.block, model_exchange=exchange)
     try:
-        exact = {n: v for n, v in point.given.items() if point.about.find(n).initial == "exact"}
-        instance.initialize(None, start_time=point.t, values=exact)
+        instance.initialize(None, start_time=point.t, values=_exact(point, {}))
         yield instance
     finally:
         instance.close()
+
+
+def step_from(point: FmuPoint, instance: LoadedFmu, h: float, moved: Mapping[str, Any], lost: str) -> np.ndarray:
+    """Take a step of h seconds from a point's start with some values moved; return states and inputs before it.
+
+    Exact start values are set by the initialization, inputs in Step Mode. ``lost`` says in an error what there is not
+    if the step ends early.
+    """
+    instance.reset()
+    instance.initialize(None, start_time=point.t, values=_exact(point, moved))
+    instance.begin()
+    instance.call("setting its inputs", instance.set_values, {n: moved[n] for n in point.inputs if n in moved})
+    before = np.concatenate([instance.values(point.states), instance.values(point.inputs)])
+    if instance.call(f"a step by {h:g} s", instance.fmi.do_step, point.t, h, True):
+        raise FmuError(f"it ends its step early, so {lost}.", block=point.block.label)
+    return before
+
+
+def _exact(point: FmuPoint, moved: Mapping[str, Any]) -> dict[str, Any]:
+    return {n: v for n, v in {**point.given, **moved}.items() if point.about.find(n).initial == "exact"}

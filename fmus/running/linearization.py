@@ -20,7 +20,7 @@ from ..archive import FmuVariable
 from ..calls import FmuBlock, LoadedFmu, is_smooth
 from .derivation import Derivation, DerivativeMethod
 from .difference_quotients import Column, Differences, differentiate
-from .fmu_point import FmuLinearization, FmuPoint, initialize_at
+from .fmu_point import FmuLinearization, FmuPoint, initialize_at, step_from
 from .model_exchange_members import ModelExchangeMembers
 from .restored_point import RestoredPoint
 from .slope_check import SlopeCheck, check_slopes
@@ -444,14 +444,7 @@ def find_step_gap(
 
         def step(moved: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
             """Return the states and inputs before a step, and the states after it."""
-            instance.reset()
-            values = {n: v for n, v in {**point.given, **moved}.items() if about.find(n).initial == "exact"}
-            instance.initialize(None, start_time=point.t, values=values)
-            instance.begin()
-            instance.call("setting its inputs", instance.set_values, {n: moved[n] for n in point.inputs if n in moved})
-            before = np.concatenate([instance.values(point.states), instance.values(point.inputs)])
-            if instance.call(f"a step by {h:g} s", instance.fmi.do_step, point.t, h, True):
-                raise FmuError("it ends its step early, so the step has no derivative.", block=block.label)
+            before = step_from(point, instance, h, moved, "the step has no derivative")
             return before, instance.values(point.states)
 
         at = np.concatenate([instance.values(point.states), instance.values(point.inputs)])

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ...blocks.core import FmuError
 from ..calls import FmuBlock
-from .fmu_point import FmuPoint, initialize_at
+from .fmu_point import FmuPoint, initialize_at, step_from
 
 
 def take_shifted_steps(
@@ -49,15 +49,7 @@ def take_shifted_steps(
 
         def step(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             parts = layout.split(values)
-            begin: dict[str, Any] = {**point.given, **{n: parts[n] for n in names if n in moved}}
-            instance.reset()
-            settable = {n: v for n, v in begin.items() if about.find(n).initial == "exact"}
-            instance.initialize(None, start_time=point.t, values=settable)
-            instance.begin()
-            now: Mapping[str, Any] = {n: parts[n] for n in point.inputs if n in moved}
-            instance.call("setting its inputs", instance.set_values, now)
-            if instance.call(f"a step by {h:g} s", instance.fmi.do_step, point.t, h, True):
-                raise FmuError("it ends its step early, so steps can't be compared.", block=block.label)
+            step_from(point, instance, h, {n: parts[n] for n in names if n in moved}, "steps can't be compared")
             return instance.values(point.states), instance.values(point.outputs)
 
         return [step(at + np.concatenate(shift)) for shift in ((0.0 * at, np.zeros(0)), *shifts)]
