@@ -78,9 +78,14 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     build.add_argument(
         "--communication", choices=("any", "ticks"), help="steps of any length, or from tick to tick (default: any)"
     )
-    build.add_argument("--solver", metavar="NAME", help="of a diagram with continuous states (default: RK45)")
+    build.add_argument(
+        "--solver", metavar="NAME", help="of a diagram with continuous states (default: RK45; Radau if it is stiff)"
+    )
     build.add_argument(
         "--no-clocks", action="store_true", help="of a diagram in FMI 3.0: its sample times are no input clocks"
+    )
+    build.add_argument(
+        "--own-functions", action="store_true", default=None, help="of a diagram: sine and so on by Loopwright"
     )
     add_json(build, "the file and its description")
     build.add_argument("--no-arrays", action="store_true", help="a scalar variable for each element of a vector")
@@ -176,7 +181,7 @@ _LEFT_OUT = ("arrays", "clocks")
 def _build_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the given keywords for ``build``, checked against each other."""
     names: tuple[str, ...] = ("name", "integrator", "tolerance", "internal_step", "fmi", "platform")
-    names += ("subsystem", "outside", "outputs", "communication", "solver")
+    names += ("subsystem", "outside", "outputs", "communication", "solver", "own_functions")
     options = {name: value for name in names if (value := getattr(arguments, name)) is not None}
     options |= {name: False for name in _LEFT_OUT if getattr(arguments, f"no_{name}")}
     name = options.get("name", "model")
@@ -193,7 +198,7 @@ def _build_options(arguments: argparse.Namespace) -> dict[str, Any]:
     if arguments.python:
         if options.pop("fmi", 2) != 2:
             raise OptionError("found 3; an FMU with Python inside is one of FMI 2.0. Give --fmi 2.", port="--fmi")
-        own = ("subsystem", "outside", "outputs", "communication", "solver", "clocks")
+        own = ("subsystem", "outside", "outputs", "communication", "solver", "own_functions", "clocks")
         for name in ("platform", "integrator", "tolerance", "arrays", *own):
             if name in options:
                 raise OptionError("it can't be chosen with --python. Leave it out.", port=_option_text(name))

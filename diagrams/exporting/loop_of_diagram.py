@@ -55,6 +55,9 @@ from .open_diagram import OpenDiagram
 from .start_function import trace_left, trace_start_values
 
 _MOST_CLOCKS, _MOST_SETS = 64, 250
+_STIFF = 50.0
+"""Time constants of the fastest mode in a communication step above which a diagram is stiff: an explicit method takes
+15 steps there for its stability alone."""
 
 
 def loop_spec(
@@ -75,7 +78,7 @@ def loop_spec(
     opened : OpenDiagram
         The diagram, with its inputs and outputs.
     solver : str
-        Method between ticks; "auto" is RK45.
+        Method between ticks; "auto" is chosen by `_choose_solver`.
     rtol, atol : float
         Relative and absolute tolerance of a method of variable step.
     between : bool, default True
@@ -106,7 +109,8 @@ def loop_spec(
     functions: list[Any] = []
     if hybrid:
         vectors |= {"edge": np.zeros(ROOM_FOR_EDGES), "late": np.zeros(ROOM_FOR_EDGES)}
-        continuous = _continuous(workspace, name, solver, rtol, atol)
+        step = options.get("step_size", LoopSpec.step_size)
+        continuous = _continuous(workspace, name, solver, rtol, atol, step)
         bound = _bind_hybrid(workspace, continuous, acting, code)
         memory = read_memory({"hybrid": bound.structure}, vectors, bound.kept, code)
         facts["edges"], facts["periodic"] = find_edges(opened, continuous.sources)
@@ -179,7 +183,7 @@ def _flatten(opened: OpenDiagram, name: str, step: float, *, between: bool) -> F
     return flatten(wired.scheduled, wired.checked, wired.orders, name=name, between=True)
 
 
-def _continuous(workspace: Workspace, name: str, solver: str, rtol: float, atol: float) -> Continuous:
+def _continuous(workspace: Workspace, name: str, solver: str, rtol: float, atol: float, step: float) -> Continuous:
     """Return the continuous part, with a method that C has.
 
     Raises
@@ -187,8 +191,7 @@ def _continuous(workspace: Workspace, name: str, solver: str, rtol: float, atol:
     OptionError
         For a method of another library.
     """
-    chosen = "RK45" if solver == "auto" else solver
-    known = METHODS.get(chosen)
+    known = METHODS.get(solver)
     if known is not None and known.kind is MethodKind.LIBRARY:
         raise OptionError(
             f"found solver={solver!r}, whose steps another library takes, which isn't exported. Give 'RK45', or "
@@ -196,9 +199,24 @@ def _continuous(workspace: Workspace, name: str, solver: str, rtol: float, atol:
             block=name,
             port="solver",
         )
-    continuous = Continuous(workspace, name, chosen, rtol, atol, None, lambda event: None)
+    continuous = Continuous(workspace, name, solver, rtol, atol, None, lambda event: None)
     continuous.begin(at_start=True)
-    return continuous
+    if solver != "auto":
+        return continuous
+    return _continuous(workspace, name, _choose_solver(continuous, step), rtol, atol, step)
+
+
+def _choose_solver(continuous: Continuous, step: float) -> str:
+    """Return the explicit method of "auto", or the implicit one where stability would ask for many steps.
+
+    A run changes between the two as it goes; an exported diagram keeps the one that suits its start.
+    """
+    method = continuous.method
+    if len(method.names) == 1:
+        return method.active
+    explicit, implicit = method.names
+    fastest = -method.leftmost_eigenvalue(0.0, continuous.workspace.here.x[continuous.where])
+    return implicit if _STIFF < fastest * step < np.inf else explicit
 
 
 def _bind_ticks(workspace: Workspace, ticks: TickCode) -> CompiledLoop:

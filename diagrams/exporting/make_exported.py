@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from ...blocks.core import OptionError, accepts, kinds
 from ...fmus.export import LoopSpec
-from ..flat import WiredDiagram
+from ..flat import WiredDiagram, find_movable
 from ..wiring import Subsystem, SubsystemCall
 from .loop_of_diagram import loop_spec
-from .open_diagram import OpenDiagram, choose_outputs, open_part, open_subsystem, open_whole
+from .open_diagram import OpenDiagram, choose_outputs, let_move, open_part, open_subsystem, open_whole, start_at
 
 
 def make_exported(
@@ -22,6 +22,7 @@ def make_exported(
     subsystem: str | None = None,
     outside: Iterable[str] = (),
     outputs: Iterable[str] | None = None,
+    start: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> LoopSpec | None:
     """Return what is exported of a diagram or a subsystem; None for anything else.
@@ -36,6 +37,8 @@ def make_exported(
         Paths of blocks of a diagram that are not exported; see `open_whole`.
     outputs : iterable of str, optional
         Signals that are outputs.
+    start : mapping of str, optional
+        Start values of inputs, by their names.
     **options
         Fields of `LoopSpec`.
     """
@@ -45,6 +48,8 @@ def make_exported(
     label, opened, about = found
     base = {"step_size": float(opened.wired.flatten().base)} if opened.wired.has_base else {}
     chosen = {**base, **{key: value for key, value in options.items() if value is not None}}
+    opened = start_at(opened, start or {})
+    opened = let_move(opened, find_movable(opened.wired))
     return loop_spec(opened, name=label, description=about, **chosen)
 
 

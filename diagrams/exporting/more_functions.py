@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ...blocks.tracing import GUARDS, trace_numbers, traced_parameters
+from ...blocks.core import SOLVED, Block
+from ...blocks.tracing import GUARDS, bundle, trace_numbers, traced_parameters
 from ...fmus.export import CFunction, ComputedNumbers, Guards
 from ..flat import FlatDiagram, TickPattern, evaluate, sample_time_of, share_terms, speed_up
 from .open_diagram import OpenDiagram
@@ -17,11 +19,13 @@ def trace_guards(
     flat: FlatDiagram, clocks: frozenset[TickPattern], kind: int, opened: OpenDiagram
 ) -> tuple[Guards, Any]:
     """Return what must stay positive at a kind of tick, and the function of their values; None without any."""
-    names: list[tuple[str, str]] = []
+    names, texts = list[tuple[str, str]](), list[str]()
 
     def visit(instant: Any, path: str, inputs: Any, made: Any) -> None:
         if GUARDS in made:
-            names.extend((opened.shown(path), name) for name in flat.checked.traced[path].guards)
+            for name in flat.checked.traced[path].guards:
+                names.append((opened.shown(path), name))
+                texts.append(_text_of_guard(flat, path, name))
 
     symbols = flat.symbols()
     instant = evaluate(flat, flat.blocks, clocks, **symbols, visit=visit)
@@ -29,7 +33,32 @@ def trace_guards(
         return Guards(), None
     made = ca.Function(f"lw_guards_of{kind}", [*symbols.values()], [ca.densify(ca.vertcat(*instant.guards))])
     function = share_terms(speed_up(made), made.name())
-    return Guards(tuple(names), CFunction.of(function)), function
+    return Guards(tuple(names), CFunction.of(function), tuple(texts)), function
+
+
+_NUMBERS = (0.37, 1.73, -40.0, 0.0)
+"""Numbers that inputs, outputs and states have in messages of a guard: what differs between these depends on them."""
+_ANY_GUARD = "The block's equations are not valid there; look up its inputs."
+
+
+def _text_of_guard(flat: FlatDiagram, path: str, name: str) -> str:
+    """Return what a block says where a guard of it fails, without the clauses that tell numbers of a run."""
+    block, trace = flat.table.blocks[path], flat.checked.traced[path]
+    if type(block).guard_error is Block.guard_error and name != SOLVED:
+        return _ANY_GUARD
+    said = []
+    for number in _NUMBERS:
+        groups = {"u": trace.inputs, "y": trace.outputs, "x": trace.states}
+        u, y, x = (
+            bundle(kind, {n: np.full(shape, number) if shape else number for n, shape in ports.items()})
+            for kind, ports in groups.items()
+        )
+        try:
+            said.append(re.split(r"(?<=[.;:])\s+", str(block.guard_error(name, -number, u, y, x).args[0])))
+        except Exception:  # a block's own Python, with numbers that it may not know
+            return _ANY_GUARD
+    kept = [clause for clause in said[0] if all(clause in other for other in said)]
+    return " ".join(clause[:1].upper() + clause[1:] for clause in kept) if kept else _ANY_GUARD
 
 
 def trace_computed_numbers(flat: FlatDiagram) -> dict[str, tuple[ComputedNumbers, Any]]:

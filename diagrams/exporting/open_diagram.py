@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...blocks.core import ParameterError, UnknownNameError, near
 from ..flat import Target, WiredDiagram, with_movable
 from ..wiring import Collector, Structure, Subsystem, Wire, find_path, join, split_entry
 from .outside import Outside
@@ -68,9 +69,10 @@ def open_subsystem(subsystem: Subsystem, facade_class: type[Any], name: str) -> 
     names = [p.name for p in subsystem.parameters]
     if subsystem.control_input and subsystem.control_input not in names:
         names.append(subsystem.control_input)
-    guessed = Outside([(n, (), None, "", 0.0) for n in names], name=_OUTSIDE)
+    given = {p.name: p.default for p in subsystem.parameters if _is_number(p.default)}
+    guessed = Outside([(n, np.shape(given.get(n, 0.0)), None, "", 0.0) for n in names], name=_OUTSIDE)
     table = _wire(subsystem, guessed, names)
-    ports = [_declared(table, n) for n in names]
+    ports = [_declared(table, n, given.get(n, 0.0)) for n in names]
     table = _wire(subsystem, Outside(ports, name=_OUTSIDE), names)
     path = next(p for p in table.subsystems if p and "." not in p)
     wired = WiredDiagram(name, table, "error", facade_class)
@@ -82,9 +84,14 @@ def _wire(subsystem: Subsystem, outside: Outside, names: list[str]) -> Structure
     return Collector([subsystem(**{n: getattr(outside, n) for n in names})]).structure()
 
 
-def _declared(table: Structure, name: str) -> tuple[str, tuple[int, ...], str | None, str, float]:
+def _is_number(value: object) -> bool:
+    """Whether the default of an argument is a number, or an array of them."""
+    return isinstance(value, int | float | list | tuple | np.ndarray) and np.asarray(value).dtype.kind in "if"
+
+
+def _declared(table: Structure, name: str, start: Any) -> tuple[str, tuple[int, ...], str | None, str, Any]:
     """Return an input with the shape and the unit that the blocks declare that read it."""
-    shape: tuple[int, ...] = ()
+    shape = np.shape(start)
     unit, description = None, ""
     for (path, port), wire in table.wires.items():
         if (wire.block, wire.port) != (_OUTSIDE, name):
@@ -95,7 +102,7 @@ def _declared(table: Structure, name: str) -> tuple[str, tuple[int, ...], str | 
         if wire.index is None and isinstance(declared.unit, str):
             unit = declared.unit
         description = description or declared.description
-    return name, shape, unit, description, 0.0
+    return name, shape, unit, description, start
 
 
 def open_part(wired: WiredDiagram, path: str, name: str) -> OpenDiagram:
@@ -221,6 +228,44 @@ def open_whole(wired: WiredDiagram, outside: Sequence[str], name: str) -> OpenDi
     outputs = {n: w for n, w in outputs.items() if w.block != _OUTSIDE}
     outputs = _apart(outputs, [p[0] for p in ports], "")
     return OpenDiagram(opened, _OUTSIDE if ports else "", outputs, states=start.states)
+
+
+def start_at(opened: OpenDiagram, start: Mapping[str, Any]) -> OpenDiagram:
+    """Return a diagram whose inputs have other start values, by their names.
+
+    Raises
+    ------
+    UnknownNameError, ParameterError
+        For a name that no input has, and what are no finite numbers of its shape.
+    """
+    if not start:
+        return opened
+    outside = opened.wired.structure.blocks[opened.outside] if opened.outside else None
+    assert outside is None or isinstance(outside, Outside)
+    shapes = {} if outside is None else {name: shape for name, shape, *_ in outside.ports}
+    for name, value in start.items():
+        if name not in shapes:
+            near_names = near(name, shapes) if shapes else "It has no inputs."
+            raise UnknownNameError(
+                f"there is no input {name!r} in it. {near_names}", block=opened.wired.name, port="start"
+            )
+        try:
+            is_sound = bool(np.all(np.isfinite(np.broadcast_to(np.asarray(value, dtype=float), shapes[name]))))
+        except (TypeError, ValueError):
+            is_sound = False
+        if not is_sound:
+            raise ParameterError(
+                f"found {value!r} for the start of {name!r}; expected finite numbers of shape {shapes[name]}.",
+                block=opened.wired.name,
+                port="start",
+            )
+    assert outside is not None
+    structure = opened.wired.structure.copy()
+    ports = [(name, *rest, start.get(name, value)) for name, *rest, value in outside.ports]
+    structure.blocks[opened.outside] = Outside(ports, name=_OUTSIDE)
+    wired = opened.wired
+    made = WiredDiagram(wired.name, structure, wired.loops, wired.facade_class)
+    return replace(opened, wired=made, states={})  # states that begin with inputs are found again
 
 
 def let_move(opened: OpenDiagram, targets: Sequence[Target]) -> OpenDiagram:

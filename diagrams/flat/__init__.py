@@ -11,7 +11,7 @@ from .flat_functions import indicators_of, trace_guarded_tick
 from .flat_layout import FlatEvent, StateLayout, sample_time_of
 from .flatten import flatten, renumber, write_numbers
 from .logic import TRUE, is_true
-from .movable import Target, with_movable
+from .movable import Target, find_movable, with_movable
 from .plant_ticks import StepTable, own_step, takes_any_step
 from .program import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE_OF, Ids, Operation, PartProgram, Program, TickProgram
 from .stages import Bound, Evaluators, OpaqueStage, Schedule, bind_function, evaluate_apart
@@ -62,6 +62,7 @@ __all__ = [
     "bits_of",
     "evaluate",
     "evaluate_apart",
+    "find_movable",
     "flatten",
     "has_all_kinds",
     "indicators_of",

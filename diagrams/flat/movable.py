@@ -8,14 +8,18 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Block, LoopwrightError
-from ...blocks.tracing import is_traced_by
+from ...blocks.tracing import Traced, is_traced_by, trace, traced_parameters
 from ..wiring import change_parameter, index_of, split_entry
+from .flat_layout import sample_time_of
 from .wired_diagram import WiredDiagram
 
 Target = tuple[str, list[str]]
 """Path of a block, and the names that lead to a parameter in it, as `find_control` returns them."""
 _OTHER = (1.0, 0.5, 2.0, 1e-3, -1.0)
 """Numbers that are tried in the place of a zero: a parameter may have limits."""
+
+_ROUNDING = 1e-12
+"""Relative difference of results that are summed in another order."""
 
 
 def with_movable(wired: WiredDiagram, targets: Iterable[Target]) -> WiredDiagram:
@@ -34,13 +38,7 @@ def with_movable(wired: WiredDiagram, targets: Iterable[Target]) -> WiredDiagram
     table, other = wired.structure, dict[str, Block]()
     for path, keys in targets:
         block = other.get(path, table.blocks[path])
-        for number in _OTHER:
-            try:
-                moved = change_parameter(block, keys, _without_zeros(block, keys, number))
-            except LoopwrightError:
-                continue
-            other[path] = moved
-            break
+        other[path] = _move(block, keys) or block
     changed = {path: block for path, block in other.items() if not is_traced_by(block, table.blocks[path])}
     kept = {path: table.blocks[path] for path in changed if is_traced_by(table.blocks[path], changed[path])}
     if not kept:
@@ -48,6 +46,59 @@ def with_movable(wired: WiredDiagram, targets: Iterable[Target]) -> WiredDiagram
     structure = table.copy()
     structure.blocks.update({path: changed[path] for path in kept})
     return wired.with_structure(structure).renumbered(kept)
+
+
+def find_movable(wired: WiredDiagram) -> list[Target]:
+    """Return the parameters with zeros that can be numbers: what depends on what in their blocks stays as it is.
+
+    A zero that keeps an input from an output, such as the D of a state space, stays structure.
+    """
+    found: list[Target] = []
+    table = wired.scheduled
+    for path, traced in wired.checked.traced.items():
+        block = wired.structure.blocks.get(path)
+        if block is None or block is not table.blocks.get(path):
+            continue
+        for key, value in traced_parameters(block):
+            keys = key.split(".")
+            moved = None if np.all(np.asarray(value) != 0) else _move(block, keys)
+            if moved is None:
+                continue
+            sampled = table.is_sampled(table.subsystem_of[path])
+            try:
+                other = trace(moved, traced.inputs, sampled=sampled, method=traced.method)
+            except LoopwrightError:
+                continue
+            alike = (other.depends, other.advance, other.guards) == (traced.depends, traced.advance, traced.guards)
+            if alike and _agree(traced, other, table.blocks[path], sample_time_of(table, path)):
+                found.append((path, keys))
+                block = moved
+    return found
+
+
+def _agree(traced: Traced, other: Traced, block: Block, T: float) -> bool:
+    """Whether equations that were traced with other numbers in the place of zeros hold for the zeros, too.
+
+    Quotients by a zero, and cases that are made for it, are no number there, or another one.
+    """
+    found = []
+    for one in (traced, other):
+        f = one.function
+        given = [np.linspace(0.3, 1.7, f.numel_in(i)).reshape(f.size_in(i)) for i in range(f.n_in() - 1)]
+        with np.errstate(all="ignore"):
+            numbers = one.pack(block, T)
+        found.append(np.concatenate([np.ravel(part.full()) for part in f.call([*given, numbers])]))
+    return found[0].shape == found[1].shape and np.allclose(*found, rtol=_ROUNDING, atol=0.0, equal_nan=False)
+
+
+def _move(block: Block, keys: list[str]) -> Block | None:
+    """Return a block with another number in the place of the zeros of a parameter; None where it allows none."""
+    for number in _OTHER:
+        try:
+            return change_parameter(block, keys, _without_zeros(block, keys, number))
+        except LoopwrightError:
+            continue
+    return None
 
 
 def _without_zeros(block: Block, keys: list[str], number: float) -> Any:

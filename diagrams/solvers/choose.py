@@ -161,7 +161,7 @@ class Method(Integration):
         if stuck:
             return self._change(implicit, t, None, "no step is small enough")
         self.stop = t
-        if -h * self._leftmost_eigenvalue(t, x) > 0.5 * _STABLE[explicit]:
+        if -h * self.leftmost_eigenvalue(t, x) > 0.5 * _STABLE[explicit]:
             return self._change(implicit, t, h, f"stiff at steps of {h:.2g} s")
         return ()
 
@@ -173,7 +173,7 @@ class Method(Integration):
             return ("… and more such changes",) if self._changes == _MOST_CHANGES + 1 else ()
         return (message,)
 
-    def _leftmost_eigenvalue(self, t: float, x: np.ndarray) -> float:
+    def leftmost_eigenvalue(self, t: float, x: np.ndarray) -> float:
         """Return the real part of the leftmost eigenvalue: that of the fastest decaying mode."""
         if self.problem.size > _LARGE:  # the eigenvalues would cost more than many steps; trust the estimate
             return -math.inf

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -178,6 +178,8 @@ def build(
     communication: Literal["any", "ticks"] = "any",
     solver: str | None = None,
     clocks: bool = True,
+    start: Mapping[str, Any] | None = None,
+    own_functions: bool = False,
 ) -> Path:
     """Export a continuous block, a subsystem or a diagram as an FMU and return the file.
 
@@ -237,7 +239,15 @@ def build(
         from tick to tick.
     solver : str, optional
         Of a diagram with continuous states: its solver, as `Diagram.simulate` takes it, but for those of other
-        libraries; "RK45" without it.
+        libraries. Without it, "RK45", or "DOP853" for a tolerance below 1e-8, and "Radau" where the fastest mode at the
+        start decays more than 50 times within a step of ``step_size``.
+    start : mapping of str, optional
+        Of a diagram or subsystem: start values of its inputs, by their names. Without them, those that the diagram
+        around it has at the start; those of a subsystem by itself are defaults of its arguments, or 0.
+    own_functions : bool
+        Of a diagram or subsystem: take sine, cosine, tangent hyperbolic, exponential, exp(x) - 1, logarithm and power
+        from Loopwright, with the same bits on every platform, and not from the platform's library, with the bits of
+        `Diagram.simulate` here. An exported block always has Loopwright's.
     clocks : bool, default True
         Of a diagram or subsystem in FMI 3.0: whether its sample times are periodic input clocks of the FMU, by which an
         importer with Event Mode makes the ticks. One without makes its steps as it does without clocks. Leave them out
@@ -271,15 +281,18 @@ def build(
             step_size=step_size,
             solver=solver,
             rtol=tolerance,
+            start=start,
+            own_functions=own_functions,
         )
     if made is not None:
         return build_fmu(
             made, out, fmi=fmi, arrays=arrays, platform=platform, documentation=documentation or "", notify=notify
         )
-    if subsystem or tuple(outside) or outputs is not None or communication != "any" or solver or not clocks:
+    of_parts = subsystem or tuple(outside) or outputs is not None or start
+    if of_parts or communication != "any" or solver or own_functions or not clocks:
         raise OptionError(
-            "subsystem=, outside=, outputs=, communication=, solver= and clocks= are options of diagrams and "
-            "subsystems. Leave them out.",
+            "subsystem=, outside=, outputs=, start=, communication=, solver=, own_functions= and clocks= are options "
+            "of diagrams and subsystems. Leave them out.",
             block=name or type(block).__name__.lower(),
         )
     spec = model_spec(

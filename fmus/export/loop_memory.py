@@ -108,6 +108,12 @@ class LoopMemory:
         yield "}\n"
 
 
+def c_text(text: str) -> str:
+    """Return a text as a C string."""
+    escaped = (f"\\{byte:03o}" if byte < 32 or byte > 126 or byte in b'"\\?' else chr(byte) for byte in text.encode())
+    return f'"{"".join(escaped)}"'
+
+
 def c_number(value: float) -> str:
     """Return a number as C text, exactly."""
     if isinstance(value, int):

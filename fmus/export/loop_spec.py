@@ -15,7 +15,7 @@ from typing import Any
 from ...blocks.core import brief, count_of
 from ..runtime import read_sources
 from .elementary_tables import prepare_functions, restore_functions
-from .loop_memory import LoopMemory, c_number
+from .loop_memory import LoopMemory, c_number, c_text
 from .merged_plants import MergedPlant, describe_plants, plant_fields, write_plants
 from .model import Variable
 
@@ -90,10 +90,13 @@ class Guards:
         Block and name of each.
     function : CFunction or None
         The function of (t, x, w, p) that has their values; None without any.
+    texts : tuple of str
+        What each block says of it.
     """
 
     names: tuple[tuple[str, str], ...] = ()
     function: CFunction | None = None
+    texts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -328,9 +331,13 @@ def _size(memory: LoopMemory, name: str) -> int:
 
 def _guards(spec: LoopSpec) -> Iterator[str]:
     """Yield the C text that finds a guard that fails: a table of them, and a search after a tick that has failed."""
-    yield "typedef struct {\n    const char *block, *name;\n} lw_guard;"
-    rows = [f'    {{"{block}", "{name}"}},' for guards in spec.guards for block, name in guards.names]
-    yield "static const lw_guard lw_guards[] = {\n" + "\n".join(rows or ['    {"", ""},']) + "\n};"
+    yield "typedef struct {\n    const char *block, *name, *text;\n} lw_guard;"
+    rows = [
+        f'    {{"{block}", "{name}", {c_text(text)}}},'
+        for guards in spec.guards
+        for (block, name), text in zip(guards.names, guards.texts, strict=True)
+    ]
+    yield "static const lw_guard lw_guards[] = {\n" + "\n".join(rows or ['    {"", "", ""},']) + "\n};"
     yield "/* Return the first guard that is not positive where the last evaluation has failed; -1: there is none. */"
     yield "static int lw_find_guard(lw_memory *m) {"
     first = 0

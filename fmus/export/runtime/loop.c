@@ -70,8 +70,8 @@ static bool lw_blame(lw_instance *self) {
 #endif
     int guard = lw_find_guard(m);
     if (guard >= 0)
-        return lw_fail(self, "%s.%s at t = %.9g s: this guard is not positive. The block's equations are not valid there; look up "
-                       "its inputs.", lw_guards[guard].block, lw_guards[guard].name, t);
+        return lw_fail(self, "%s.%s at t = %.9g s: this guard is not positive. %s", lw_guards[guard].block, lw_guards[guard].name, t,
+                       lw_guards[guard].text);
     for (size_t i = 0; i < LW_N_LABELS; i++) {
         const lw_label *label = lw_labels + i;
         for (uint32_t k = 0; k < label->size; k++)

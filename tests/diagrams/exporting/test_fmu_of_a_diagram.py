@@ -1,11 +1,26 @@
 """What an FMU of a diagram does: its start, saved states, parameters that are tuned, steps that don't fit, errors."""
 
+import time
+
 import numpy as np
 import pytest
 from fmpy.fmi1 import FMICallException
 
 from loopwright import build, experiments
-from loopwright.blocks import PID, Constant, Gain, Power, Sum, UnitDelay
+from loopwright.blocks import (
+    PID,
+    Constant,
+    DiscreteStateSpace,
+    Gain,
+    ParameterError,
+    Power,
+    Sine,
+    Step,
+    Sum,
+    TransferFunction,
+    UnitDelay,
+    UnknownNameError,
+)
 from loopwright.diagrams import Diagram, subsystem
 from support import exported_diagrams
 from support.instances import open_instance
@@ -119,6 +134,7 @@ def test_a_guard_that_fails_names_its_block(fmi, tmp_path):
         item.step(1e-3, 1e-3, position=np.array([0.5, 0.5]))  # the ellipse's centre
     assert "path_projection." in item.log[-1][2]
     assert "this guard is not positive" in item.log[-1][2]
+    assert "Start nearer to the path, or limit the force that drives the position off it." in item.log[-1][2]
     assert "path_projection.foot" in item.description.description
     item.free()
 
@@ -155,4 +171,65 @@ def test_ticks_and_steps_of_any_length_agree(tmp_path):
         item.step(t, h)
         t += h
         assert item["number"] == np.floor((t - 1e-9) / 0.01) + 1
+    item.free()
+
+
+@pytest.mark.slow
+def test_zeros_can_be_set_where_nothing_else_depends_on_them(tmp_path):
+    """A sine's phase and bias are 0; D = 0 of a state space would be a new wire, and is none."""
+
+    @subsystem(sample_time=0.01)
+    def both(u):
+        made = DiscreteStateSpace(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]], name="space")(u)
+        return Sum(signs="++")(made, Sine(frequency=1.0, name="wave")).named("y")
+
+    item = open_instance(build(both), tmp_path).initialize(**{"wave.bias": 2.0, "wave.phase": np.pi / 2})
+    item.step(0.0, 0.01)
+    assert item["y"] == pytest.approx(3.0, rel=1e-15)
+    item.step(0.01, 0.01, **{"wave.bias": -1.0})
+    assert item["y"] == pytest.approx(np.cos(2 * np.pi * 0.01) - 1.0, rel=1e-14)
+    assert "space.D" not in {v.name for v in item.description.modelVariables}
+    item.free()
+
+
+@pytest.mark.slow
+def test_inputs_start_where_they_are_to(tmp_path):
+    """By start=, by the default of an argument, else at 0; states begin with them: the filter of D with the level."""
+
+    @subsystem(sample_time=0.01)
+    def own(reference=2.0, level=0.0):
+        return PID(kp=2.0, ki=3.0, kd=0.1, filter_time=0.02, name="pid")(reference, level).named("effort")
+
+    item = open_instance(build(own, start={"level": 0.5}), tmp_path).initialize()
+    starts = {v.name: v.start for v in item.description.modelVariables}
+    assert (starts["reference"], starts["level"]) == ("2.0", "0.5")
+    assert item["effort"] == 3.0
+    assert item["pid.filtered"] == -0.5
+    item.free()
+
+
+def test_starts_that_no_input_has_are_refused():
+    with pytest.raises(UnknownNameError, match=r"no input 'levle' in it\. Did you mean 'level'"):
+        build(controller, start={"levle": 1.0})
+    with pytest.raises(ParameterError, match=r"found \[1\.0, 2\.0\] for the start of 'level'; expected finite numbers"):
+        build(controller, start={"level": [1.0, 2.0]})
+
+
+def lag(tau):
+    """A lag of a second behind one of tau."""
+    fast = TransferFunction(numerator=[1.0], denominator=[tau, 1.0], name="fast")(Step(times=0.5, values=1.0))
+    return Diagram("lags", TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="slow")(fast).named("y"))
+
+
+@pytest.mark.slow
+def test_a_stiff_diagram_gets_an_implicit_method(tmp_path):
+    """Time constants of 1 s and 1e-7 s, at steps of 10 ms: the explicit method would take 30,000 steps in each."""
+    file = build(lag(1e-7), step_size=0.01, tolerance=1e-8)
+    item = open_instance(file, tmp_path).initialize()
+    began = time.process_time()
+    for k in range(200):
+        item.step(0.01 * k, 0.01)
+        t = 0.01 * (k + 1)
+        assert item["y"] == pytest.approx(max(0.0, 1.0 - np.exp(-(t - 0.5))), rel=0, abs=2e-7)
+    assert time.process_time() - began < 2.0  # 0.02 s; 15 s by the explicit method
     item.free()
