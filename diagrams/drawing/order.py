@@ -84,7 +84,8 @@ def cut_loops(
     pairs : list of pairs
         The wires.
     plants : set of str
-        Nodes behind which loops are closed.
+        Nodes behind which loops are closed. What is between one and a controller, such as the integrator of a speed,
+        stays on its right: such a loop is closed ahead of the controller.
     controllers : mapping of str to int
         Nodes ahead of which other loops are closed, so that a plant is on the right of them, with their ranks: the
         lowest is taken, and of these one that the loop is entered at: in a cascade the outermost one, which has the
@@ -99,8 +100,10 @@ def cut_loops(
         gone: set[tuple[str, str]] = set()
         for knot in knots:
             plant = min(knot & plants, key=place.__getitem__, default=None)
-            if plant is not None and not plants >= knot:
-                gone |= {(a, b) for a, b in left if a == plant and b in knot}
+            behind = {b for a, b in left if a == plant and b in knot}
+            behind = behind & controllers.keys() if knot & controllers.keys() else behind
+            if behind and not plants >= knot:
+                gone |= {(plant, b) for b in behind if plant is not None}
             else:
                 entered = {b for a, b in left if b in knot and a not in knot}
                 known = [key for key in (*entered, *knot) if key in controllers]

@@ -61,7 +61,9 @@ def arrange_in_rows(nodes: Sequence[Node], nets: Sequence[Net], limit: float) ->
     inner = [node for node in nodes if not node.side]
     if size[0] <= SLACK * limit or not inner:
         return size
-    row_of = _find_rows(inner, nets, limit)
+    row_of, wider = (_find_rows(inner, nets, width) for width in (limit, (1.0 + SLACK) / 2 * limit))
+    if max(wider.values()) < max(row_of.values()):
+        row_of = wider
     if not any(row_of.values()):
         return size
     for net in nets:

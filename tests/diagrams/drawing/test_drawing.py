@@ -166,6 +166,15 @@ def test_loops_are_cut_behind_the_plant_and_else_where_they_are_entered():
     assert cut_loops(["a"], [("a", "a")], set()) == []
 
 
+def test_what_is_between_an_fmu_and_its_controller_is_on_the_right_of_the_fmu():
+    keys = ["wish", "position_loop", "speed_loop", "motor", "angle"]
+    wires = [*zip(keys, keys[1:], strict=False), ("motor", "speed_loop"), ("angle", "position_loop")]
+    cut = set(wires) - set(cut_loops(keys, wires, {"motor"}, {"position_loop": 0, "speed_loop": 0}))
+    assert cut == {("motor", "speed_loop"), ("angle", "position_loop")}
+    without_controllers = cut_loops(keys, wires, {"motor"})
+    assert set(wires) - set(without_controllers) == {("motor", "speed_loop"), ("motor", "angle")}
+
+
 @pytest.mark.parametrize("kind", ["sampled", "sum", "pid"])
 def test_a_plant_is_right_of_its_controller_however_it_is_written(kind):
     plant = TransferFunction(numerator=1.0, denominator=[1.0, 1.0], name="plant")  # written first, with its disturbance
