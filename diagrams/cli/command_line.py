@@ -42,7 +42,7 @@ from .ssp import add_ssp, ssp_command
 from .subjects import is_user_file
 from .text import fit as _fit
 from .text import say as _say
-from .unknown_options import explain_unknown
+from .unknown_options import check_command, explain_unknown
 
 SIGNALS = (
     "eta",
@@ -76,6 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     parser = _make_parser()
     try:
+        check_command(parser, sys.argv[1:] if argv is None else argv, [*_commands(parser)])
         arguments, unknown = parser.parse_known_args(argv)
         if unknown:
             explain_unknown(_find_command(parser, arguments.command), unknown)
@@ -177,8 +178,13 @@ def _make_parser() -> argparse.ArgumentParser:
 
 def _find_command(parser: argparse.ArgumentParser, name: str | None) -> argparse.ArgumentParser:
     """Return the parser of a command, or that of the command line without one."""
+    return parser if name is None else _commands(parser)[name]
+
+
+def _commands(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:
+    """Return the parsers of all commands by their names."""
     groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
-    found: argparse.ArgumentParser = groups[0].choices[name] if name is not None else parser
+    found: Mapping[str, argparse.ArgumentParser] = groups[0].choices
     return found
 
 

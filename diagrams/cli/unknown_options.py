@@ -1,4 +1,4 @@
-"""Options that a command doesn't have: the one that may be meant."""
+"""Commands that there are not, and options that a command doesn't have: the one that may be meant."""
 
 from __future__ import annotations
 
@@ -15,6 +15,23 @@ _MEANT = {
     **dict.fromkeys(("param", "parameter", "parameters", "start_values"), "--set"),
     **dict.fromkeys(("output", "o", "output_file", "outdir", "folder"), "--out"),
 }
+_COMMANDS = {
+    **dict.fromkeys(("simulate", "sim", "start", "plot"), "run"),
+    **dict.fromkeys(("export", "compile"), "build"),
+    **dict.fromkeys(("info", "dump", "show"), "inspect"),
+    **dict.fromkeys(("analyse", "analyze", "check"), "report"),
+    **dict.fromkeys(("html", "web"), "page"),
+    "codegen": "c",
+}
+"""Words of other tools for commands."""
+
+
+def check_command(parser: argparse.ArgumentParser, given: Sequence[str], known: Sequence[str]) -> None:
+    """Print the usage, and the command that may be meant, where there is none of that name; then exit."""
+    name = next(iter(given), "-")
+    if not name.startswith("-") and name not in known:
+        offer = f"Did you mean {_COMMANDS[name]!r}?" if name in _COMMANDS else near(name, known)
+        parser.error(f"there is no command {name!r}. {offer}")
 
 
 def explain_unknown(command: argparse.ArgumentParser, unknown: Sequence[str]) -> NoReturn:

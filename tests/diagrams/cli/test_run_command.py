@@ -270,7 +270,8 @@ def test_interrupted(tmp_path, capsys, monkeypatch, undrawn):
             "--plant: the plant is given twice; give it once.",
         ),
         (["run", "--out"], "expected one argument"),
-        (["ran"], "invalid choice: 'ran'"),
+        (["ran"], "there is no command 'ran'. Did you mean 'run'"),
+        (["simulate", "loop.py:loop"], "there is no command 'simulate'. Did you mean 'run'?"),
         (
             ["run", "loop.py:loop", "--stop-time", "2"],
             "run: error: there is no option --stop-time. Did you mean '--dur",
