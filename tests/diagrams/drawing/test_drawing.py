@@ -6,6 +6,7 @@ import random
 import re
 import subprocess
 import sys
+from itertools import pairwise
 from xml.etree import ElementTree as ET
 
 import pytest
@@ -168,7 +169,7 @@ def test_loops_are_cut_behind_the_plant_and_else_where_they_are_entered():
 
 def test_what_is_between_an_fmu_and_its_controller_is_on_the_right_of_the_fmu():
     keys = ["wish", "position_loop", "speed_loop", "motor", "angle"]
-    wires = [*zip(keys, keys[1:], strict=False), ("motor", "speed_loop"), ("angle", "position_loop")]
+    wires = [*pairwise(keys), ("motor", "speed_loop"), ("angle", "position_loop")]
     cut = set(wires) - set(cut_loops(keys, wires, {"motor"}, {"position_loop": 0, "speed_loop": 0}))
     assert cut == {("motor", "speed_loop"), ("angle", "position_loop")}
     without_controllers = cut_loops(keys, wires, {"motor"})
