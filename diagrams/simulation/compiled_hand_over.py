@@ -177,6 +177,32 @@ def find_edges(
     return edges, np.array([continuous.late.get(float(edge), float(edge)) for edge in edges])
 
 
+class EdgesAhead:
+    """Discontinuities of sources that are found once for a stretch of ticks, in however many calls C goes through it.
+
+    Parameters
+    ----------
+    continuous : Continuous
+        The solver, with the sources.
+    """
+
+    def __init__(self, continuous: Continuous):
+        self._continuous = continuous
+        self._begin, self._end = math.inf, -math.inf
+        self._found = np.zeros(0), np.zeros(0)
+
+    def until(self, t: float, end: float, *, limited: bool) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return those from t on, up to an end and the first one of each source after it; see `find_edges`."""
+        if t < self._begin or end > self._end:
+            found = find_edges(self._continuous, t, end, limited=limited)
+            if found is None:
+                return None
+            self._begin, self._end, self._found = t, end, found
+        edges, late = self._found
+        first = int(np.searchsorted(edges, t, side="left" if t in self._continuous.late else "right"))
+        return edges[first:], late[first:]
+
+
 def active_method(continuous: Continuous) -> int:
     """Return the place of the method that a run continues with."""
     return continuous.method.names.index(continuous.method.active) if continuous.where.size else 0

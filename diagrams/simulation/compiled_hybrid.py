@@ -29,6 +29,7 @@ from ..results import Recorder
 from ..solvers import METHODS
 from .broken_off import explain, explain_library, pile_up
 from .compiled_hand_over import (
+    EdgesAhead,
     active_method,
     bind_hybrid,
     changes_method,
@@ -149,12 +150,14 @@ class HybridTicks:
     ) -> float | None:
         visited, rest = (EVERY,) if self._sampled else self._clocks, np.zeros(0, dtype=np.int64)
         stays = False  # whether the plants have come to the next tick, by Python
+        edges = EdgesAhead(self._continuous)
         while rest.size or (rest := ticks_after(visited, k, last, 1 if loop.coupled else self._chunk)).size:
             started = perf_counter()
-            span, lands = self._span(k, rest, last, t)
+            span, lands = self._span(k, rest, last, t, edges)
+            begun = perf_counter()
             found = self._call(loop, span._replace(stays=stays), recorder)
             stays, t = False, found.t
-            loop.limit_budget(perf_counter() - started)
+            loop.limit_budget(perf_counter() - begun)  # of steps in C: shorter calls don't shorten what Python does
             done, rest = rest[: found.ticks], rest[found.ticks :]
             if found.ticks:
                 k = int(done[-1])
@@ -280,12 +283,12 @@ class HybridTicks:
     def _time_of(self, k: int) -> float:
         return float(k * self._flat.base)
 
-    def _span(self, k: int, ticks: np.ndarray, last: int, t: float) -> tuple[Span, np.ndarray]:
+    def _span(self, k: int, ticks: np.ndarray, last: int, t: float, ahead: EdgesAhead) -> tuple[Span, np.ndarray]:
         """Return the ticks of a call, from tick ``k`` on, where the states have come to t; and which are landed on."""
-        edges = find_edges(self._continuous, t, self._time_of(int(ticks[-1])))
+        edges = ahead.until(t, self._time_of(int(ticks[-1])), limited=len(ticks) > 1)
         while edges is None:
             ticks = ticks[: max(1, len(ticks) // 2)]
-            edges = find_edges(self._continuous, t, self._time_of(int(ticks[-1])), limited=len(ticks) > 1)
+            edges = ahead.until(t, self._time_of(int(ticks[-1])), limited=len(ticks) > 1)
         lands = np.ones(len(ticks), dtype=np.uint8)
         if not self._lands:
             lands[:] = ticks == last

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import (
+    BandLimitedNoise,
     Block,
     Clock,
     Constant,
@@ -18,10 +19,13 @@ from loopwright.blocks import (
     PythonFunction,
     Ramp,
     Sum,
+    TransferFunction,
     UnitDelay,
     parameter,
 )
 from loopwright.diagrams import Diagram, check_block, subsystem
+from loopwright.diagrams.compiled import CompiledHybrid
+from loopwright.diagrams.simulation import compiled_hybrid
 
 WIDTH = 1e-3
 
@@ -139,3 +143,29 @@ def test_a_linear_model_along_the_motion_passes_through_the_pulse(case):
     grown = dict(zip(model.states, model.affine, strict=True))
     assert grown["x.y"] == pytest.approx(area, rel=1e-8)
     assert grown["z.y"] == pytest.approx(6.8, rel=1e-3)  # (10 s − 3.2 s), but for the width of the pulse
+
+
+def test_instants_between_samples_are_asked_for_once(monkeypatch):
+    """Noise that changes 6 times between two samples, by 1/(s + 1): each change is found once, however C is called."""
+    asked, spent, found = [], [], BandLimitedNoise.next_instant
+
+    def limit_budget(loop, seconds):
+        spent.append(seconds)
+        loop._hybrid.budget = 50
+
+    monkeypatch.setattr(BandLimitedNoise, "next_instant", lambda self, t: (asked.append(t), found(self, t))[1])
+    monkeypatch.setattr(CompiledHybrid, "limit_budget", limit_budget)
+    monkeypatch.setattr(compiled_hybrid, "perf_counter", lambda: float(len(asked)))  # 1 s for each question
+    T, count, held = 0.01, 6000, 6
+    noise = BandLimitedNoise(sample_time=T, seed=3, variance=4.0, name="noise")
+    lag = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="lag")
+    run = Diagram("noisy", lag(noise.y).named("out")).simulate(count * T, progress=False)
+    assert count <= len(asked) < 1.1 * count
+    assert len(spent) > count / 50 - 10
+    assert not any(spent)  # what Python takes doesn't limit the steps of a call of C
+
+    n = Diagram("noise", Gain(gain=1.0)(noise.y).named("n")).simulate(count * T, step=T, progress=False)["n"]
+    expected, a = [0.0], np.exp(-T)
+    for value in n[:count]:
+        expected.append(a * expected[-1] + (1.0 - a) * value)
+    np.testing.assert_allclose(run["out"], expected[::held], atol=1e-6)
