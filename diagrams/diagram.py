@@ -293,7 +293,7 @@ class Diagram(ShownAsTable):
         Raises
         ------
         SampleTimeError
-            A block that is defined at samples only, such as a `UnitDelay`.
+            A block that is defined at samples only, such as a `UnitDelay` or an `Encoder`: `replace` it first.
         """
         return self.of_wired(self.wired.continuous())
 

@@ -3,7 +3,7 @@
 from .computed import trace_initial, trace_numbers
 from .differences import differentiate, extrapolate
 from .discretization import check_method, find_hold, hold
-from .equations import initial_state, start_shapes, start_values, state_after_start
+from .equations import initial_state, is_only_sampled, start_shapes, start_values, state_after_start
 from .model_exchange import describe_model_exchange
 from .numpy_check import GUARDS, NEXT, evaluate
 from .opaque_equations import raise_failure
@@ -36,6 +36,7 @@ __all__ = [
     "hold",
     "initial_state",
     "is_nonzero",
+    "is_only_sampled",
     "is_traced_by",
     "raise_failure",
     "size",

@@ -63,6 +63,11 @@ def takes_update(block: Block, sampled: bool) -> bool:
     return sampled or not (hasattr(block, "derivative") or (block.events and not block.memory))
 
 
+def is_only_sampled(block: Block) -> bool:
+    """Whether a block has no meaning in continuous time: its states advance from sample to sample alone."""
+    return takes_update(block, False) and not block.memory
+
+
 def trace_error(error: Exception, block: Block, equation: str) -> TraceError:
     """Return the error of a trace that failed, with the line of the user's equations."""
     # the line is found by its file, which a notebook's cell and a script have too, and helpers of the equation share

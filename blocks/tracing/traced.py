@@ -25,7 +25,15 @@ import numpy as np
 
 from ..core import SOLVED, Block, Layout, LoopwrightError, SampleTimeError, Shape, TraceError, Value
 from .discretization import find_hold
-from .equations import check_definition, guards_of, match_ports, start_values, takes_update, trace_error
+from .equations import (
+    check_definition,
+    guards_of,
+    is_only_sampled,
+    match_ports,
+    start_values,
+    takes_update,
+    trace_error,
+)
 from .numpy_check import GUARDS, NEXT, compare
 from .opaque_equations import Foreign
 from .structure import structure, traced_parameters
@@ -318,7 +326,7 @@ class _Tracer:
 
         unused = ca.MX.sym("none", 0)
         if takes_update(self.block, self.sampled):
-            if not self.sampled and not self.block.memory:
+            if not self.sampled and is_only_sampled(self.block):
                 text = "a sampled block is in a continuous subsystem; put it into a @subsystem(sample_time=…)."
                 raise SampleTimeError(text)
             return "update", None, states_from("update"), unused

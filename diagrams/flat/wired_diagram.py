@@ -9,8 +9,8 @@ from dataclasses import replace as replace_fields
 from fractions import Fraction
 from typing import Any, Protocol
 
-from ...blocks.core import Block, LoopwrightError, check_argument, identity, kinds, without_collection
-from ...blocks.tracing import check_method
+from ...blocks.core import Block, LoopwrightError, SampleTimeError, check_argument, identity, kinds, without_collection
+from ...blocks.tracing import check_method, is_only_sampled
 from ..wiring import (
     Checked,
     Order,
@@ -181,6 +181,17 @@ class WiredDiagram:
     def continuous(self) -> WiredDiagram:
         """Return the diagram with every sampled subsystem as its ideal; see `Diagram.continuous`."""
         table = self.structure.copy()
+        sampled = [path for path in self.checked.traced if table.is_sampled(table.subsystem_of[path])]
+        if found := [path for path in sampled if is_only_sampled(table.blocks[path])]:
+            block = table.blocks[found[0]]
+            ports = f"the inputs {', '.join(block.inputs)} and the outputs {', '.join(block.outputs)}"
+            others = f" So are {', '.join(found[1:])}." if found[1:] else ""
+            raise SampleTimeError(
+                f"continuous() takes the sample times away, and a block {type(block).__name__} is defined at samples "
+                f"alone.{others} Replace it first, by a block in continuous time with {ports}: "
+                f"diagram.replace({{{found[0]!r}: …}}).continuous().",
+                block=found[0],
+            )
         for path, settings in table.subsystems.items():
             table.subsystems[path] = replace_fields(settings, sample_time=None, offset=Fraction(0), delay=0)
         return self.with_structure(table)

@@ -347,6 +347,27 @@ def test_a_sampled_block_in_a_continuous_frame():
         Diagram("d", UnitDelay(initial_value=0, name="delay")(Constant(value=1)))
 
 
+def test_a_block_at_samples_alone_has_no_continuous_ideal_and_can_be_replaced():
+    class Ideal(Block):
+        u, y = Input(), Output()
+
+        def output(self, t, x, u):
+            return u.u
+
+    @subsystem(sample_time=0.1)
+    def delayed(u):
+        return 3.0 * UnitDelay(initial_value=0.0, name="delay")(UnitDelay(initial_value=0.0, name="first")(u))
+
+    diagram = Diagram("d", delayed(Constant(value=2.0)).named("y"))
+    with pytest.raises(SampleTimeError, match=r"^delayed\.(delay|first): continuous\(\) takes the sample") as refused:
+        diagram.continuous()
+    for words in ("UnitDelay", "the inputs u and the outputs y", "So are delayed.", "diagram.replace({'delayed."):
+        assert words in str(refused.value)
+    ideal = diagram.replace({"delayed.delay": Ideal(), "delayed.first": Ideal()}).continuous()
+    assert not ideal.wired.has_clock
+    np.testing.assert_array_equal(ideal.simulate(1.0, step=0.1, progress=False)["y"], 6.0)
+
+
 @pytest.mark.parametrize(
     ("value", "words"),
     [(0, "positive"), (-1e-3, "positive"), ("fast", "expected seconds"), (1e-10, "multiple of 1 ns")],
