@@ -283,6 +283,17 @@ def test_a_saved_notebook_has_no_empty_outputs_errors_or_folders(path):
         assert not re.search(r"(?<![\w.])/(root|home|tmp|Users)/", json.dumps(data)), "the folders of one machine"
 
 
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_asks_one_question_draws_its_diagram_and_has_its_figure(path):
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    assert sum("".join(cell["source"]).count("**Question:**") for cell in cells) == 1
+    kinds = {kind for cell in cells for output in cell.get("outputs", []) for kind in output.get("data", {})}
+    assert kinds >= {"image/svg+xml", "image/png"}, "a drawing, which GitHub shows as a picture, and a figure"
+    for cell in cells:
+        lines = "".join(cell["source"]).splitlines()
+        assert cell["cell_type"] != "code" or len([line for line in lines if ".set" in line or "plt." in line]) < 6
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_the_notebooks_run(path):

@@ -11,8 +11,9 @@ import numpy as np
 
 from ...blocks.core import OptionError, explain_disk_errors
 from ..exporting import to_c
+from ..paper import Experiment
 from ..wiring import Subsystem
-from .subjects import open_user_diagram
+from .subjects import find_diagram
 from .text import add_json, say, say_json
 from .user_models import load_user_file
 
@@ -88,12 +89,11 @@ def _write(arguments: argparse.Namespace) -> Any:
         "number": arguments.number,
         "own_functions": arguments.own_functions,
     }
-    with load_user_file(arguments.model, port="MODEL") as (module, _, name):
+    with load_user_file(arguments.model, port="MODEL") as (module, path, name):
         found = vars(module).get(name)
-        if isinstance(found, Subsystem):
-            return to_c(found, arguments.out, **options)
-    with open_user_diagram(arguments.model) as (diagram, _):
-        return to_c(diagram, arguments.out, **options)
+        if not isinstance(found, Subsystem):
+            found = find_diagram(vars(module), path, name)
+        return to_c(found.diagram if isinstance(found, Experiment) else found, arguments.out, **options)
 
 
 def _read_signal(path: Path) -> dict[str, np.ndarray]:

@@ -75,7 +75,7 @@ def open_user_diagram(subject: str) -> Iterator[tuple[Diagram, Experiment | None
         yield Diagram.from_ssp(*split_ssp(subject)), None
         return
     with load_user_file(subject, port="DIAGRAM") as (module, path, name):
-        found = _find_diagram(vars(module), path, name)
+        found = find_diagram(vars(module), path, name)
         yield (found.diagram, found) if isinstance(found, Experiment) else (found, None)
 
 
@@ -92,7 +92,7 @@ def _make_experiment(name: str, arguments: argparse.Namespace) -> Experiment:
     return EXPERIMENTS[letter](**options)
 
 
-def _find_diagram(names: Mapping[str, object], path: Path, name: str) -> Diagram | Experiment:
+def find_diagram(names: Mapping[str, object], path: Path, name: str) -> Diagram | Experiment:
     """Return the diagram or experiment that a name stands for in a user's file."""
     source, file = str(path), path.name
     known = {key: value for key, value in names.items() if isinstance(value, Diagram | Experiment)}

@@ -1,5 +1,8 @@
 """The command ``loopwright c``: a sampled diagram or subsystem of a user's file as C for a target."""
 
+import json
+from pathlib import Path
+
 import pytest
 
 from loopwright.diagrams.cli import main
@@ -41,6 +44,17 @@ def test_what_cannot_be_written_is_named_with_its_status(file, tmp_path, capsys)
     assert not (tmp_path / "out").exists()
     assert main(["c", f"{file}:loop", "--test", "signal.csv"]) == 2
     assert "--measure" in capsys.readouterr().err
+
+
+def test_the_files_come_as_json_and_the_users_file_is_executed_once(file, tmp_path, capsys):
+    file.write_text(LOOP + "print('executed')\n", encoding="utf-8")
+    out = tmp_path / "out"
+    assert main(["c", f"{file}:loop", "--subsystem", "controller", "--out", str(out), "--json"]) == 0
+    printed = capsys.readouterr()
+    found = json.loads(printed.out)
+    assert {Path(name) for name in found["files"]} == set(out.iterdir())
+    assert "Tick 0: every 0.01 s" in found["report"]
+    assert printed.err == "executed\n"
 
 
 @pytest.mark.slow
