@@ -72,12 +72,14 @@ def find_largest(function: Function, omega: np.ndarray, values: np.ndarray) -> t
     """Return the largest value of a function of frequency, refined by bounded minimization, and its frequency.
 
     ``values`` are those at the frequencies ``omega`` of a scan, which rise, from 0 to infinity where it has the ends.
+    Of peaks that are equal but for rounding it is the one at the lowest frequency.
     """
     from scipy.optimize import minimize_scalar
 
     start = first_largest(values)
     best, where = float(values[start]), float(omega[start])
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
+    refined: list[tuple[float, float]] = []
     peaks = np.flatnonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:]))
     for k in peaks[np.argsort(-values[peaks], kind="stable")][:MOST_PEAKS]:
         if not 0.0 < omega[k] < np.inf:  # the ends, which are evaluated exactly
@@ -90,8 +92,11 @@ def find_largest(function: Function, omega: np.ndarray, values: np.ndarray) -> t
             method="bounded",
             options={"xatol": 1e-12},
         )
-        if -float(found.fun) > best:
-            best, where = -float(found.fun), float(np.exp(float(found.x)))
+        refined.append((float(np.exp(float(found.x))), -float(found.fun)))
+    refined.sort()
+    # a sample near a peak may equal it but for rounding: it counts where it is larger than every peak
+    if refined and (highest := max(value for _, value in refined)) > best * (1.0 - EQUAL):
+        best, where = max(best, highest), refined[first_largest([value for _, value in refined])][0]
     return best, where
 
 

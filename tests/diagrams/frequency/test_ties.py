@@ -1,10 +1,12 @@
 """Choices among numbers that are equal but for rounding."""
 
+import control
 import numpy as np
 import pytest
 
 from loopwright.diagrams.frequency import first_largest, order_key, refine_sign_change
 from loopwright.diagrams.linearization.trim_search import _make_basis
+from loopwright.frequency import disk_margin
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -36,3 +38,18 @@ def test_a_root_at_an_end_that_has_lost_its_sign_is_that_end():
     assert refine_sign_change(line, 2.0 + 1e-15, 5.0, xtol=1e-14) == 2.0 + 1e-15
     assert refine_sign_change(line, 1.0, 2.0 - 1e-15, xtol=1e-14) == 2.0 - 1e-15
     assert refine_sign_change(line, 2.0, 5.0, xtol=1e-14) == 2.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_of_equal_peaks_a_disk_margin_has_the_one_at_the_lowest_frequency(seed):
+    """Two channels of one loop 200/(s (s + 20)), the other twice as fast: the same peak at w and at 2 w."""
+    rng = np.random.default_rng(seed)
+    single = control.ss(control.tf([200.0], [1.0, 20.0, 0.0]))
+    alone = disk_margin(single)
+    turn = np.linalg.qr(rng.normal(size=(2, 2)))[0]
+    A = np.block([[single.A, np.zeros((2, 2))], [np.zeros((2, 2)), 2.0 * single.A]])
+    B = np.block([[single.B, np.zeros((2, 1))], [np.zeros((2, 1)), 2.0 * single.B]])
+    C = np.block([[single.C, np.zeros((1, 2))], [np.zeros((1, 2)), single.C]])
+    found = disk_margin(control.ss(A, B @ turn.T, turn @ C, np.zeros((2, 2))))
+    assert float(found.alpha) == pytest.approx(float(alone.alpha), rel=1e-8)
+    assert float(found.frequency) == pytest.approx(float(alone.frequency), rel=1e-3)
