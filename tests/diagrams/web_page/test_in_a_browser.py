@@ -273,9 +273,22 @@ def test_less_motion(file):
 
 
 def test_it_keeps_pace(file, record_property):
-    """What is sustained is reported, and not asserted: 1000 ticks and 60 pictures in a second."""
+    """What is sustained is reported, as it hangs on the machine: 1000 ticks and 60 pictures in a second.
+
+    A picture takes 8 ms of the processor's time at most in scripts (1 ms on the machine where it was written), and is
+    drawn without a new layout: the numbers that change ten times a second ask for one.
+    """
     with opened(file) as page:
-        measured = page.evaluate(
+        metrics = page.context.new_cdp_session(page)
+        metrics.send("Performance.enable", {"timeDomain": "threadTicks"})
+
+        def read():
+            return {one["name"]: one["value"] for one in metrics.send("Performance.getMetrics")["metrics"]}
+
+        page.select_option("#span", "60")
+        page.evaluate("page.advance(60000)")
+        before = read()
+        ticks, pictures, seconds, behind = page.evaluate(
             """async () => {
                 let pictures = 0, stop = false;
                 const count = () => { pictures++; if (!stop) requestAnimationFrame(count); };
@@ -285,9 +298,18 @@ def test_it_keeps_pace(file, record_property):
                 await new Promise(done => setTimeout(done, 3000));
                 const seconds = (performance.now() - began) / 1000;
                 stop = true; page.pause();
-                return [(page.ticks - ticks) / seconds, pictures / seconds, page.behind];
+                return [page.ticks - ticks, pictures, seconds, page.behind];
             }"""
         )
-        record_property("ticks, pictures per second, seconds behind", measured)
-        print("ticks and pictures per second, seconds behind:", measured)
-        assert measured[0] > 0.0
+        after = read()
+        script, task = (1e3 * (after[f"{n}Duration"] - before[f"{n}Duration"]) / pictures for n in ("Script", "Task"))
+        layouts = (after["LayoutCount"] - before["LayoutCount"]) / pictures
+        text = (
+            f"{ticks / seconds:.0f} ticks and {pictures / seconds:.1f} pictures per second, {behind:.2g} s behind; a picture "
+            f"takes {script:.2f} ms in scripts, {task:.2f} ms in all, and {layouts:.2f} layouts"
+        )
+        record_property("pace", text)
+        print(text)
+        assert ticks > 0
+        assert script < 8.0
+        assert layouts < 1.0
