@@ -31,6 +31,15 @@ def shorten(value: Any) -> str:
         return repr(value.tolist()) if value.size <= 12 else f"<{'×'.join(map(str, value.shape))} numbers>"
     if text := system_text(value):
         return text
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key!r}: {shorten(one)}" for key, one in value.items()) + "}"
+    if isinstance(value, tuple | list) and any(isinstance(one, np.ndarray | dict) for one in value):
+        begin, end = "()" if isinstance(value, tuple) else "[]"
+        return begin + ", ".join(map(shorten, value)) + end
+    if isinstance(value, list) and len(value) > 100:
+        return f"<{len(value)} values>"
+    if hasattr(value, "columns") and hasattr(value, "to_numpy"):
+        return f"<{type(value).__name__} of {len(value)} rows>"
     if isinstance(value, float) and abs(value) < 1e6 and value == int(value):
         return str(int(value))
     return repr(value)

@@ -29,6 +29,7 @@ from ...blocks.core import (
     with_unit,
 )
 from ..wiring import Wire, index_of, split_entry
+from .measured_signals import Data, MeasuredSignals, split_measured
 from .signal_names import BlockOutputs, Place, Places, entries, outputs_of, place_of, resolve
 from .stored import Occurrence, PathLike, Stopped, header, prepare, read, write
 from .texts import TextSignal
@@ -423,7 +424,7 @@ class Run(ShownAsTable):
     def plot(
         self,
         *names: str | Iterable[str],
-        against: Run | Mapping[str, Run] | None = None,
+        against: Run | Data | Mapping[str, Run | Data] | None = None,
         label: str = "this run",
         xlim: tuple[float, float] | None = None,
         axes: Sequence[Axes] | np.ndarray | None = None,
@@ -440,8 +441,10 @@ class Run(ShownAsTable):
         *names : str or list of str
             Signals or entries of them, ``"q[1]"``, each in an axis of its own; those of a list share one, and so do
             a vector's entries: ``run.plot("speed", ["reference", "angle"])``. Without any, all named wires.
-        against : Run or mapping of str to Run, optional
-            Runs to be drawn over this one, by the names that the legend has: ``{"kp = 10": other}``.
+        against : Run, measured data or mapping of str to them, optional
+            What is drawn over this run, by the names that the legend has: ``{"kp = 10": other}``. Measured data are a
+            pair of arrays where one signal is drawn, ``{"measured": (t, y)}``, or columns by the names of signals, in
+            a mapping of arrays or a data frame, with the times in s in ``"t"`` (or in the index of a frame).
         label : str
             Name of this run in the legend.
         xlim : (float, float), optional
@@ -459,16 +462,23 @@ class Run(ShownAsTable):
         UnknownNameError
             For a name that was not recorded.
         OptionError
-            For something else than names and runs, and times that are no range.
+            For something else than names, runs and measured data, and times that are no range.
         """
         from .plots import plot_signals
 
         groups = self._groups_to_draw(names)
-        runs = self._runs_to_draw(against, label)
+        others, data = split_measured(against)
+        runs = self._runs_to_draw(others, label, data)
+        names_drawn = [name for group in groups for name in group]
+        for one in data:
+            one.check_names(names_drawn)
         if xlim is not None:
             check_argument(xlim, _TIMES, "xlim", "Run.plot")
         panels = [[run.drawn(name, of) for of, run in runs.items() for name in group] for group in groups]
-        return plot_signals(panels, self.events if len(runs) == 1 else (), axes, xlim)
+        for panel in panels:
+            own = panel[: len(panel) // len(runs)]
+            panel += [found for one in data for like in own if (found := one.drawn(like)) is not None]
+        return plot_signals(panels, self.events if len(runs) + len(data) == 1 else (), axes, xlim)
 
     @accepts(since=kinds.number, until=kinds.number, final=kinds.number)
     def step_info(
@@ -606,20 +616,24 @@ class Run(ShownAsTable):
         wire = self.wires.get(full)
         return (wire.block, wire.port) if wire is not None else (full.rpartition(".")[0], full.rpartition(".")[2])
 
-    def _runs_to_draw(self, against: Run | Mapping[str, Run] | None, label: str) -> dict[str, Run]:
-        """Return this run and others by their labels; "" alone where there are no others."""
+    def _runs_to_draw(
+        self, against: Run | Mapping[str, Run] | None, label: str, data: Sequence[MeasuredSignals] = ()
+    ) -> dict[str, Run]:
+        """Return this run and others by their labels; "" alone where there are no others, and no measured data."""
         check_argument(label, kinds.text, "label", "Run.plot")
-        if against is None:
+        if against is None and not data:
             return {"": self}
         given = {"other run": against} if isinstance(against, Run) else against
         others = dict(given) if isinstance(given, Mapping) else {}
-        if not others or not all(isinstance(name, str) and isinstance(run, Run) for name, run in others.items()):
+        none = not others and (against is not None or not data)
+        if none or not all(isinstance(name, str) and isinstance(run, Run) for name, run in others.items()):
             raise OptionError(
-                f'found {shorten(against)}; expected runs by their names, such as against={{"kp = 10": other}}.',
+                f'found {shorten(against)}; expected runs by their names, such as against={{"kp = 10": other}}, or in '
+                'plot measured data, {"measured": (t, y)}.',
                 block="Run.plot",
                 port="against",
             )
-        if label in others:
+        if label in {*others, *(one.label for one in data)}:
             raise OptionError(
                 f"found {label!r} twice; expected a name for each run. Give this one another: label=….",
                 block="Run.plot",
