@@ -7,6 +7,7 @@ warning is an error. Nothing is asked of a network, neither here nor by the page
 from __future__ import annotations
 
 import argparse
+import json
 import multiprocessing
 import posixpath
 import re
@@ -38,6 +39,19 @@ def _restaged(page: Path, text: str) -> str:
     return LINK.sub(change, text)
 
 
+def _staged_text(page: Path) -> str:
+    """Return the text of a page, or of a notebook with its live drawings."""
+    text = page.read_text(encoding="utf-8")
+    if page.suffix != ".ipynb":
+        return text
+    from notebooks import with_live_drawings
+
+    notebook = json.loads(text)
+    for cell in notebook["cells"]:
+        with_live_drawings(cell.get("outputs", []))
+    return json.dumps(notebook, ensure_ascii=False, indent=1)
+
+
 def stage(folder: Path) -> None:
     """Write all sources of the site into a folder."""
     pages = [
@@ -51,7 +65,7 @@ def stage(folder: Path) -> None:
         place = folder / page.relative_to(HERE if HERE in page.parents else ROOT)
         place.parent.mkdir(parents=True, exist_ok=True)
         head = _NO_SEARCH if page.name == "CHANGELOG.md" else ""
-        place.write_text(head + _restaged(page, page.read_text(encoding="utf-8")), encoding="utf-8")
+        place.write_text(head + _restaged(page, _staged_text(page)), encoding="utf-8")
     for pictures in (HERE / "images", ROOT / "benchmarks" / "images"):
         shutil.copytree(pictures, folder / pictures.relative_to(HERE if HERE in pictures.parents else ROOT))
 

@@ -1,7 +1,7 @@
 """Execute notebooks and save them with their outputs of today: python docs/notebooks.py [NAME ...], all without one.
 
-Progress bars, which are shown where a run takes over two seconds, are left out: their widgets would be empty in a
-saved notebook.
+Progress, which is shown where a run takes over two seconds, is left out. A live drawing is saved as its picture, which
+GitHub shows (it strips scripts and styles); the live one is in the output's metadata, from where the site takes it.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from typing import Any
 
 import nbformat
 
+LIVE = "loopwright_live"
+"""Key of a live drawing in the metadata of its output."""
 FOLDER = Path(__file__).parent.parent / "notebooks"
 
 
@@ -34,6 +36,22 @@ def without_progress(outputs: list[Any]) -> list[Any]:
     return kept
 
 
+def with_pictures(outputs: list[Any]) -> list[Any]:
+    """Move live drawings into the metadata of their outputs, which leaves their pictures."""
+    for output in outputs:
+        if "image/svg+xml" in output.get("data", {}) and "text/html" in output["data"]:
+            output["metadata"][LIVE] = output["data"].pop("text/html")
+    return outputs
+
+
+def with_live_drawings(outputs: list[Any]) -> list[Any]:
+    """Move live drawings back; the other way round than `with_pictures`."""
+    for output in outputs:
+        if LIVE in output.get("metadata", {}):
+            output["data"]["text/html"] = output["metadata"].pop(LIVE)
+    return outputs
+
+
 def execute(path: Path) -> None:
     """Execute a notebook, and save it."""
     from nbclient import NotebookClient
@@ -43,7 +61,7 @@ def execute(path: Path) -> None:
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)  # the times
         if cell.cell_type == "code":
-            cell.outputs = without_progress(cell.outputs)
+            cell.outputs = with_pictures(without_progress(cell.outputs))
     nbformat.write(notebook, path)
 
 
