@@ -85,7 +85,8 @@ class Assembly:
             For a connector at which two connections end.
         """
         self.flow = Dataflow(self.root, self.parts, self.notes)
-        self.given, unused = apply_bindings(self.root, self.parts)
+        self.given, unused, notes = apply_bindings(self.root, self.parts)
+        self.notes += notes
         if unused:
             self.notes.append(f"{unused} values of parameter sets belong to no variable, and have no effect")
         self._check_inputs()

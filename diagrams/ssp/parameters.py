@@ -82,19 +82,27 @@ class Given:
         return known[text] if text in known else int(text)
 
 
-def apply_bindings(root: System, parts: Mapping[Names, FmuPart]) -> tuple[dict[ConnectorKey, Given], int]:
-    """Return the value that each connector and variable gets, and the number of values that belong to none.
+def apply_bindings(
+    root: System, parts: Mapping[Names, FmuPart]
+) -> tuple[dict[ConnectorKey, Given], int, tuple[str, ...]]:
+    """Return the value that each connector and variable gets, the number of values that belong to none, and notes.
 
     Bindings of an element are applied in their order; those of a system take precedence over those of what is in it.
     """
     found: dict[ConnectorKey, Given] = {}
-    unused = 0
+    unused, notes = 0, list[str]()
     for names, element in sorted(root.walk(), key=lambda item: -len(item[0])):
         for binding in element.bindings:
             values = {binding.prefix + value.name: value for value in binding.values}
             if binding.mapping is None:
                 entries = [(name, Given(value)) for name, value in values.items()]
             else:
+                notes += [
+                    f"a parameter mapping of {'.'.join(names) or 'the root system'} reads {entry.source!r}, which its "
+                    f"parameter set hasn't, so that {entry.target!r} keeps its value"
+                    for entry in binding.mapping
+                    if entry.source not in values
+                ]
                 entries = [
                     (entry.target, Given(values[entry.source], entry.transformation, entry.suppress_units))
                     for entry in binding.mapping
@@ -105,7 +113,7 @@ def apply_bindings(root: System, parts: Mapping[Names, FmuPart]) -> tuple[dict[C
                 unused += not nodes
                 for node in nodes:
                     found[node] = Given(given.value, given.transformation, given.suppress_units, str(node))
-    return found, unused
+    return found, unused, tuple(notes)
 
 
 def _find_targets(element: Any, names: Names, name: str, parts: Mapping[Names, FmuPart]) -> list[ConnectorKey]:
