@@ -103,7 +103,7 @@ class _Reader:
         for name, structure in roots.items():
             begin = ctypes.addressof(structure)
             self._inside.append((begin, begin + ctypes.sizeof(structure), name))
-            self._fields[name] = Field(name, _STRUCTS[type(structure)])
+            self._fields[name] = Field(name, _STRUCTS[type(structure)], each=ctypes.sizeof(structure))
         for owner in self._owners:
             known = self._names.get(_span(owner)[0])
             if known is not None and isinstance(owner, np.ndarray):
@@ -162,12 +162,12 @@ class _Reader:
             self._fields[name] = Field.of(name, owner)
         elif isinstance(owner, ctypes.Structure):
             name = f"s{number}"
-            self._fields[name] = Field(name, _STRUCTS[type(owner)], 1)
+            self._fields[name] = Field(name, _STRUCTS[type(owner)], 1, each=ctypes.sizeof(owner))
             self._names[begin] = name
             self._read_struct(f"{name}[0]", owner)
         elif issubclass(owner._type_, ctypes.Structure):
             name = f"s{number}"
-            self._fields[name] = Field(name, _STRUCTS[owner._type_], len(owner))
+            self._fields[name] = Field(name, _STRUCTS[owner._type_], len(owner), each=ctypes.sizeof(owner._type_))
             self._names[begin] = name
             for i, structure in enumerate(owner):
                 self._read_struct(f"{name}[{i}]", structure)

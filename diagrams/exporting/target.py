@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import DefinitionError, OptionError, accepts, kinds
+from ...fmus import Fmu
 from ...fmus.export import (
     CLOCK_LIMIT,
     BlockOutput,
@@ -24,6 +25,7 @@ from ...fmus.export import (
     split_lookups,
     unit_name,
     write_c,
+    write_loop_c,
 )
 from ..flat import FlatDiagram, TickPattern, bits_of, kinds_of, share_terms, speed_up, trace_guarded_tick
 from ..wiring import join
@@ -49,10 +51,11 @@ def to_c(
     number: Number = "double",
     own_functions: bool = False,
 ) -> TargetCode:
-    """Write a sampled diagram, or a subsystem, as C for a target: one header and one source, an example, a report.
+    """Write a diagram or a subsystem as C for a target: one header and one source, an example, a report.
 
     Standard C99 without allocation: an instance is one struct that the caller owns. In double precision its numbers are
-    those of a run, bit by bit. No compiler is needed.
+    those of a run, bit by bit. Where something happens between ticks, or an algebraic loop is solved, the loop of runs
+    is inside, in double precision alone; the numbers are those of a run with ``solver="rk4"``. No compiler is needed.
 
     Parameters
     ----------
@@ -78,7 +81,7 @@ def to_c(
     Returns
     -------
     TargetCode
-        The files; its ``measure`` compiles them for Cortex-M and counts instructions.
+        The files; its ``measure`` compiles them for Cortex-M and counts instructions, of sampled diagrams.
 
     Raises
     ------
@@ -117,6 +120,11 @@ def to_c(
     if found is None:
         raise OptionError(f"found {model!r}; expected a diagram, or a function with @subsystem.", block="to_c")
     label, opened, about = found
+    if number == "double" and opened.wired.has_clock and _needs_loop(opened):
+        base = float(opened.wired.flatten().base)
+        loop = loop_spec(opened, name=unit_name(label), description=about, solver="rk4", step_size=base)
+        _refuse_plants(opened)
+        return write_loop_c(loop, Path(folder).expanduser(), own_functions=own_functions)
     spec = target_spec(opened, name=unit_name(label), description=about)
     return write_c(spec, Path(folder).expanduser(), number=number, own_functions=own_functions)
 
@@ -184,17 +192,41 @@ def _refuse_fmus(opened: OpenDiagram) -> None:
             )
 
 
-def _refuse_states(opened: OpenDiagram) -> None:
-    """Refuse blocks with states in continuous time."""
+def _needs_loop(opened: OpenDiagram) -> bool:
+    """Return whether anything happens between ticks, or is solved by iterations: then the loop of runs is inside."""
+    refuse(opened)
+    flat = opened.wired.flatten()
+    return bool(_continuous(opened) or flat.events or flat.loops.slices)
+
+
+def _continuous(opened: OpenDiagram) -> list[str]:
+    """Return the paths of blocks with states in continuous time."""
     table = opened.wired.scheduled
-    for path, trace in opened.wired.checked.traced.items():
-        sampled = table.is_sampled(table.subsystem_of[path])
-        if not sampled and trace.advance == "derivative" and trace.states:
+    return [
+        path
+        for path, trace in opened.wired.checked.traced.items()
+        if not table.is_sampled(table.subsystem_of[path]) and trace.advance == "derivative" and trace.states
+    ]
+
+
+def _refuse_plants(opened: OpenDiagram) -> None:
+    """Refuse FMUs: C for a target has the diagram's own functions alone."""
+    for path, block in opened.wired.scheduled.blocks.items():
+        if path != opened.outside and isinstance(block, Fmu):
             raise DefinitionError(
-                "it is in continuous time, and on a target only ticks are. Put it into a sampled subsystem, "
-                "@subsystem(sample_time=…), or leave it outside.",
+                "it is an FMU, and C for a target has none inside. Leave it out: outside=[…], or subsystem=….",
                 block=opened.shown(path),
             )
+
+
+def _refuse_states(opened: OpenDiagram) -> None:
+    """Refuse blocks with states in continuous time."""
+    for path in _continuous(opened):
+        raise DefinitionError(
+            "it is in continuous time, and C in single precision has ticks alone. Take number='double', whose source "
+            "has the loop of runs inside, or put it into a sampled subsystem, @subsystem(sample_time=…).",
+            block=opened.shown(path),
+        )
 
 
 def _refuse_between_ticks(opened: OpenDiagram, flat: FlatDiagram) -> None:
@@ -202,15 +234,16 @@ def _refuse_between_ticks(opened: OpenDiagram, flat: FlatDiagram) -> None:
     _refuse_states(opened)
     for event in flat.events:
         raise DefinitionError(
-            f"its event {event.name!r} is between ticks, and on a target only ticks are. Put it into a sampled "
-            "subsystem, sample_time=…, or leave it outside.",
+            f"its event {event.name!r} is between ticks, and C in single precision has ticks alone. Take "
+            "number='double', whose source has the loop of runs inside, or put it into a sampled subsystem, "
+            "sample_time=….",
             block=opened.shown(event.path),
         )
     for full in flat.loops.slices:
         path, port = flat.ports[full]
         raise DefinitionError(
-            "an algebraic loop is solved here by iterations, whose number nobody knows before. Put a UnitDelay() "
-            "into the loop for the target.",
+            "an algebraic loop is solved by iterations, and C in single precision has none. Take number='double', "
+            "whose source has the loop of runs inside, or put a UnitDelay() into the loop.",
             block=opened.shown(path),
             port=port,
         )

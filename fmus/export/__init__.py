@@ -3,6 +3,7 @@
 from .compiler import compile_shared, compile_webassembly, describe_compiler
 from .from_block import build, model_spec, parameter_variable
 from .inlined import inline_model, own_functions
+from .loop_code import write_loop_c
 from .loop_memory import Field, LoopMemory, c_number
 from .loop_spec import ROOM_FOR_EDGES, CFunction, ComputedNumbers, Guards, LoopSpec, Placed, write_unit
 from .merged_plants import MergedPlant, PlacedPlant
@@ -71,6 +72,7 @@ __all__ = [
     "tune",
     "unit_name",
     "write_c",
+    "write_loop_c",
     "write_target",
     "write_unit",
 ]

@@ -25,17 +25,20 @@ class Field:
         Number of entries; 0 for a single one.
     start : ndarray, optional
         Start values of a vector.
+    each : int
+        Bytes of an entry, where pointers have eight.
     """
 
     name: str
     kind: str
     length: int = 0
     start: np.ndarray | None = None
+    each: int = 8
 
     @classmethod
     def of(cls, name: str, vector: np.ndarray) -> Field:
         """Return the member that holds a vector of numbers."""
-        return cls(name, _C_TYPES[vector.dtype.name], max(1, vector.size), vector.ravel().copy())
+        return cls(name, _C_TYPES[vector.dtype.name], max(1, vector.size), vector.ravel().copy(), vector.itemsize)
 
     @property
     def declaration(self) -> str:
@@ -60,6 +63,11 @@ class LoopMemory:
     fields: tuple[Field, ...]
     numbers: tuple[tuple[str, str], ...]
     pointers: tuple[tuple[str, str], ...]
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of it where pointers have eight; nowhere more."""
+        return 4 * 8 + sum(-(-field.each * max(1, field.length) // 8) * 8 for field in self.fields)
 
     def write(self) -> str:
         """Return the C text: the struct ``lw_memory``, and the functions ``lw_fill``, ``lw_bind`` and ``lw_unbind``.

@@ -79,10 +79,13 @@ class TargetCode:
     def __str__(self) -> str:
         return self.report
 
+    def _contents(self) -> Mapping[str, str]:
+        return self._text.files
+
     def _write(self) -> None:
         with explain_disk_errors("the C code can't be written", self.folder, "Name another folder.", block=self.name):
             self.folder.mkdir(parents=True, exist_ok=True)
-            for name, text in self._text.files.items():
+            for name, text in self._contents().items():
                 write_text(self.folder / name, text)
             write_text(self.files[-1], self.report)
 

@@ -16,8 +16,10 @@ from loopwright.blocks import (
     DiscreteStateSpace,
     Gain,
     PulseTrain,
+    Relay,
     Sine,
     Step,
+    Sum,
     Switch,
     TransferFunction,
 )
@@ -255,6 +257,91 @@ def test_what_cannot_be_on_a_target_is_named_before_anything_is_written(reason, 
     with pytest.raises(DefinitionError, match=rf"^{path}.*sample") as refused:
         make().to_c(tmp_path / "out")
     assert "sample_time=" in str(refused.value)
+    assert not (tmp_path / "out").exists()
+
+
+# --- with the loop of runs inside ---------------------------------------------------------------------------------------
+
+
+def solved():
+    """A sampled subsystem with an algebraic loop: y = u - y/2, so that y = 2/3 u."""
+    error, half = Sum(signs="+-", name="error"), Gain(gain=0.5, name="half")
+
+    @subsystem(sample_time=0.01)
+    def controller(u):
+        return error(u, half(error.y)).named("y")
+
+    return Diagram("solved", controller(Sine(frequency=1.0, name="u")), loops="solve")
+
+
+def between():
+    """A sampled PI with its plant in continuous time, and a relay, whose events lie between ticks."""
+    plant = TransferFunction(numerator=[1.0], denominator=[0.1, 1.0], name="plant")
+
+    @subsystem(sample_time=0.01)
+    def controller(wanted, level):
+        return PID(kp=2.0, ki=8.0, lower=-3.0, upper=3.0, name="pid")(wanted, level).named("effort")
+
+    on = Relay(on_point=0.5, off_point=0.3, name="relay")(plant.y).named("on")
+    return Diagram("between", plant(controller(Step(times=0.1, values=1.0, name="wanted"), plant.y)).named("y"), on)
+
+
+_COPIED = """#include "{name}.h"
+#include <stdio.h>
+int main(void) {{
+    static {name} c, kept;
+    {name}_init(&c);
+    for (int k = 0; k < 60; k++) {{
+        if (k == 20) kept = c;
+        if (k == 30) {{ /* an instance elsewhere makes the ticks from 20 on again, and goes on */
+            for (int j = 20; j < 30; j++) {name}_tick(&kept);
+            c = kept;
+            {name}_init(&kept);
+        }}
+        {sets}
+        if ({name}_tick(&c) != {upper}_OK) return 1;
+        double value;
+        {gets}
+        puts("");
+    }}
+    return 0;
+}}
+"""
+
+
+@pytest.mark.parametrize("make", [solved, between])
+def test_with_the_loop_of_runs_it_has_the_bits_of_rk4(make, tmp_path):
+    diagram = make()
+    run = diagram.simulate(0.6, solver="rk4", step=0.01, progress=False)
+    code = diagram.to_c(tmp_path)
+    prefix = code.name.upper()
+    gets = "".join(
+        f'{code.name}_get(&c, {prefix}_OUTPUT_{name.upper().replace(".", "_")}, 0u, &value); printf("%.17g ", value);'
+        for name in (one.variable.name for one in code._loop.outputs)
+    )
+    (tmp_path / "main.c").write_text(_COPIED.format(name=code.name, upper=prefix, sets="", gets=gets))
+    warnings = ["-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
+    command = ["gcc", "-std=c99", "-O1", *warnings, "-o", "main", f"{code.name}.c", "main.c", "-lm"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    said = subprocess.run(["./main"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+    found = np.array([line.split() for line in said.splitlines()], dtype=float)
+    for i, name in enumerate(one.variable.name for one in code._loop.outputs):
+        sampled = code._loop.outputs[i].sampled
+        expected = run[name][:60] if sampled else run[name][1:]
+        # Newton's method begins with the last solution, and the loop evaluates at the end of each period, too
+        np.testing.assert_allclose(found[:, i], expected, rtol=0.0, atol=4e-16 if make is solved else 0.0)
+        assert np.ptp(expected) > 0.1
+    if make is solved:
+        np.testing.assert_allclose(found[:, 0], 2 / 3 * run["u.y"][:60], rtol=0.0, atol=1e-12)
+    assert f"{prefix}_BYTES {code.bytes_of['struct']}" in code.files[0].read_text(encoding="utf-8")
+    with pytest.raises(OptionError, match="sampled diagrams alone"):
+        code.measure()
+
+
+@pytest.mark.parametrize(("make", "path"), [(solved, "controller.error.y"), (between, "plant")])
+def test_single_precision_has_ticks_alone(make, path, tmp_path):
+    with pytest.raises(DefinitionError, match=rf"^{path}: .*number='double'"):
+        make().to_c(tmp_path / "out", number="float")
     assert not (tmp_path / "out").exists()
 
 
