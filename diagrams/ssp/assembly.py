@@ -56,7 +56,7 @@ class Assembly:
     inputs : mapping
         Values of inputs of the root system, in place of those of the parameter sets.
     notes : list of str
-        Remarks on what has no effect.
+        Takes remarks on what has no effect.
     """
 
     root: System
@@ -85,10 +85,8 @@ class Assembly:
             For a connector at which two connections end.
         """
         self.flow = Dataflow(self.root, self.parts, self.notes)
-        self.given, unused, notes = apply_bindings(self.root, self.parts)
+        self.given, notes = apply_bindings(self.root, self.parts)
         self.notes += notes
-        if unused:
-            self.notes.append(f"{unused} values of parameter sets belong to no variable, and have no effect")
         self._check_inputs()
         self._place_systems()
         feeds = {node: self._feed(node) for node in self.flow.hops if node.element in self.parts}

@@ -82,15 +82,13 @@ class Given:
         return known[text] if text in known else int(text)
 
 
-def apply_bindings(
-    root: System, parts: Mapping[Names, FmuPart]
-) -> tuple[dict[ConnectorKey, Given], int, tuple[str, ...]]:
-    """Return the value that each connector and variable gets, the number of values that belong to none, and notes.
+def apply_bindings(root: System, parts: Mapping[Names, FmuPart]) -> tuple[dict[ConnectorKey, Given], tuple[str, ...]]:
+    """Return the value that each connector and variable gets, and notes. A value may belong to none.
 
     Bindings of an element are applied in their order; those of a system take precedence over those of what is in it.
     """
     found: dict[ConnectorKey, Given] = {}
-    unused, notes = 0, list[str]()
+    notes = list[str]()
     for names, element in sorted(root.walk(), key=lambda item: -len(item[0])):
         for binding in element.bindings:
             values = {binding.prefix + value.name: value for value in binding.values}
@@ -109,11 +107,9 @@ def apply_bindings(
                     if entry.source in values
                 ]
             for name, given in entries:
-                nodes = [*_find_targets(element, names, name, parts)]
-                unused += not nodes
-                for node in nodes:
+                for node in _find_targets(element, names, name, parts):
                     found[node] = Given(given.value, given.transformation, given.suppress_units, str(node))
-    return found, unused, tuple(notes)
+    return found, tuple(notes)
 
 
 def _find_targets(element: Any, names: Names, name: str, parts: Mapping[Names, FmuPart]) -> list[ConnectorKey]:

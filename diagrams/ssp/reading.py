@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -171,7 +172,10 @@ def read_structure(
         )
     parsed = parse_package(open_package(file, limits), variant)
     root: System = parsed.system
-    structure = Assembly(root, limits or ArchiveLimits(), inputs or {}, []).structure()
+    notes = [*parsed.notes]
+    structure = Assembly(root, limits or ArchiveLimits(), inputs or {}, notes).structure()
+    if notes:
+        warnings.warn(f"SSP {parsed.package.file.name!r}: {'; '.join(notes)}.", RuntimeWarning, stacklevel=4)
     if not structure.blocks:
         raise SspFileError(
             f"{str(parsed.package.file)!r} has no component; expected one FMU at least. Add one.", block=root.name

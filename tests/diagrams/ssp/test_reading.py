@@ -180,6 +180,16 @@ def test_a_value_is_converted_mapped_and_transformed(write):
     }
 
 
+def test_what_has_no_effect_is_a_warning(write):
+    """A mapping that reads what its set hasn't, and a unit without a definition, which isn't converted."""
+    mapping = '<ssm:MappingEntry source="sped" target="a.b"/><ssm:MappingEntry source="k" target="a.k"/>'
+    root = system("root", component("a", "output y"), bindings=inline("speed=Real 2; k=Real 3 furlong", mapping))
+    words = r"SSP 'x\.ssp': the unit 'furlong' has no definition.*mapping of the root system reads 'sped'.*'a\.b' keeps"
+    with pytest.warns(RuntimeWarning, match=words):
+        diagram = Diagram.from_ssp(write(root))
+    assert diagram["a"].start["k"] == 3.0
+
+
 def test_sets_and_mappings_in_files_and_values_of_all_types(write):
     """A text, an item of an enumeration by its name, a Boolean, and an output's start value."""
     values = set_of("name=String four; how=Enumeration fast; on=Boolean true; y=Real 2", spaces=f" {SPACES}")
