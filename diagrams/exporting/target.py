@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import DefinitionError, OptionError, accepts, kinds
-from ...fmus import Fmu
 from ...fmus.export import (
     CLOCK_LIMIT,
     BlockOutput,
     Kept,
+    LoopSpec,
     Number,
     TargetCode,
     TargetNumbers,
@@ -123,7 +123,7 @@ def to_c(
     if number == "double" and opened.wired.has_clock and _needs_loop(opened):
         base = float(opened.wired.flatten().base)
         loop = loop_spec(opened, name=unit_name(label), description=about, solver="rk4", step_size=base)
-        _refuse_plants(opened)
+        _check_names(loop)
         return write_loop_c(loop, Path(folder).expanduser(), own_functions=own_functions)
     spec = target_spec(opened, name=unit_name(label), description=about)
     return write_c(spec, Path(folder).expanduser(), number=number, own_functions=own_functions)
@@ -142,17 +142,16 @@ def target_spec(opened: OpenDiagram, *, name: str, description: str) -> TargetSp
     refuse(opened)
     _refuse_fmus(opened)
     if not opened.wired.has_clock:
-        _refuse_states(opened)
+        continuous = [opened.shown(path) for path in _continuous(opened)]
         raise DefinitionError(
-            "found no sample time, and a target has ticks alone. Give one: @subsystem(sample_time=1e-3), or "
-            "diagram.sampled(1e-3).",
-            block=opened.wired.name,
+            "found no sample time, at which a target calls tick. Give one: @subsystem(sample_time=1e-3) of the "
+            "controller, or diagram.sampled(1e-3) of all.",
+            block=continuous[0] if continuous else opened.wired.name,
         )
     flat = opened.wired.flatten()
     _refuse_between_ticks(opened, flat)
     loop = loop_spec(opened, name=name, description=description)
-    for placed in (loop.inputs, loop.outputs, loop.signals, loop.parameters, loop.states):
-        check_ascii(one.variable.name for one in placed)
+    _check_names(loop)
     acting = kinds_of(flat, every=loop.hybrid)  # what is in continuous time is computed at each tick
     numbers, fixed = _trace_numbers(opened, flat)
     start = {f.name: np.asarray(f.start) for f in loop.memory.fields if f.name in ("x", "w", "p", "log")}
@@ -192,9 +191,15 @@ def _refuse_fmus(opened: OpenDiagram) -> None:
             )
 
 
+def _check_names(loop: LoopSpec) -> None:
+    for placed in (loop.inputs, loop.outputs, loop.signals, loop.parameters, loop.states):
+        check_ascii(one.variable.name for one in placed)
+
+
 def _needs_loop(opened: OpenDiagram) -> bool:
     """Return whether anything happens between ticks, or is solved by iterations: then the loop of runs is inside."""
     refuse(opened)
+    _refuse_fmus(opened)
     flat = opened.wired.flatten()
     return bool(_continuous(opened) or flat.events or flat.loops.slices)
 
@@ -207,16 +212,6 @@ def _continuous(opened: OpenDiagram) -> list[str]:
         for path, trace in opened.wired.checked.traced.items()
         if not table.is_sampled(table.subsystem_of[path]) and trace.advance == "derivative" and trace.states
     ]
-
-
-def _refuse_plants(opened: OpenDiagram) -> None:
-    """Refuse FMUs: C for a target has the diagram's own functions alone."""
-    for path, block in opened.wired.scheduled.blocks.items():
-        if path != opened.outside and isinstance(block, Fmu):
-            raise DefinitionError(
-                "it is an FMU, and C for a target has none inside. Leave it out: outside=[…], or subsystem=….",
-                block=opened.shown(path),
-            )
 
 
 def _refuse_states(opened: OpenDiagram) -> None:
