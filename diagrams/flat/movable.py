@@ -88,7 +88,8 @@ def _agree(traced: Traced, other: Traced, block: Block, T: float) -> bool:
         with np.errstate(all="ignore"):
             numbers = one.pack(block, T)
         found.append(np.concatenate([np.ravel(part.full()) for part in f.call([*given, numbers])]))
-    return found[0].shape == found[1].shape and np.allclose(*found, rtol=_ROUNDING, atol=0.0, equal_nan=False)
+    first, second = found
+    return first.shape == second.shape and np.allclose(first, second, rtol=_ROUNDING, atol=0.0, equal_nan=False)
 
 
 def _move(block: Block, keys: list[str]) -> Block | None:

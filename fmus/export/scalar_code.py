@@ -266,8 +266,8 @@ class Scalars:
                 if one.operation == ca.OP_INPUT:
                     kinds[node] = one.place[0] == 0, one.place[0] in (1, 2)
                 else:
-                    found = [kinds[argument] for argument in one.arguments]
-                    kinds[node] = any(t for t, _ in found), any(other for _, other in found)
+                    before = [kinds[argument] for argument in one.arguments]
+                    kinds[node] = any(t for t, _ in before), any(other for _, other in before)
         found = {node for node, (timed, other) in kinds.items() if timed and not other}
         waiting = [*found]
         while waiting:  # with what they are computed from, such as 2π times a frequency

@@ -196,8 +196,8 @@ class ReportedWorstCase:
         path = f"{KEY}.worst.{quantity}" if case is found.worst and quantity == case.quantity else ""
         result = replace(result, verdict=verdict, reason=reason, distance=distance, number=number, path=path)
         if found.failures and verdict is not Verdict.FAILED:
-            reason = found.failures[0].reason.rstrip(".")
-            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.NOT_ANALYSED, detail=reason)
+            detail = found.failures[0].reason.rstrip(".")
+            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.NOT_ANALYSED, detail=detail)
         if verdict is Verdict.PASSED and len(known) < len(numbers):  # some case has no such number
             return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.NO_VALUE)
         if verdict is Verdict.PASSED and any(one.state is CaseState.MOVING for one in found.cases):
