@@ -40,6 +40,7 @@ class Slider {
   }
   show(byHand) {
     if (!byHand) this.range.value = this.scaled(this.value);
+    this.range.style.setProperty('--at', this.range.value);
     this.number.value = Number(this.value.toPrecision(6));
     this.range.setAttribute('aria-valuetext', `${short(this.value, 6)} ${unitText(this.of.unit)}`.trim());
     this.row.classList.toggle('moved', this.value !== this.of.value);
