@@ -52,6 +52,7 @@ from .merged_plants import loaded, merge, own_fmus
 from .more_functions import trace_computed_numbers, trace_guards
 from .obstacles import refuse
 from .open_diagram import OpenDiagram
+from .slopes import trace_rates, trace_slopes
 from .start_function import trace_left, trace_start_values
 
 _MOST_CLOCKS, _MOST_SETS = 64, 250
@@ -69,6 +70,7 @@ def loop_spec(
     rtol: float = 1e-6,
     atol: float = 1e-8,
     between: bool = True,
+    differentiated: bool = False,
     **options: Any,
 ) -> LoopSpec:
     """Return a diagram as it is exported.
@@ -83,6 +85,8 @@ def loop_spec(
         Relative and absolute tolerance of a method of variable step.
     between : bool, default True
         Whether outputs follow inputs between ticks, too, where nothing moves there.
+    differentiated : bool, default False
+        Whether its derivatives are wanted.
     name, description, **options
         Fields of `LoopSpec`.
 
@@ -128,6 +132,8 @@ def loop_spec(
     start, untraced = trace_start_values(flat, workspace)
     numbers = trace_computed_numbers(flat)
     variables = _Variables(opened, flat, here.x.copy(), untraced, numbers)
+    if differentiated and not plants:  # of plants inside only the steps are known
+        facts |= _slopes(flat, acting, variables, numbers, start, functions)
     functions += [start, *(f for _, f in numbers.values()), *(f for _, f in guards)]
     return LoopSpec(
         name=name,
@@ -164,6 +170,31 @@ def _with_parameters(memory: LoopMemory, p: np.ndarray, more: Sequence[Placed]) 
     return (
         replace(memory, fields=tuple(longer if one.name == "p" else one for one in memory.fields)) if more else memory
     )
+
+
+def _slopes(
+    flat: FlatDiagram,
+    acting: Sequence[frozenset[TickPattern]],
+    variables: _Variables,
+    numbers: Mapping[str, tuple[ComputedNumbers, Any]],
+    start: Any,
+    functions: list[Any],
+) -> dict[str, Any]:
+    """Return the derivatives as fields of a `LoopSpec`, and add their functions to the others."""
+    shown = (*variables.outputs(), *variables.signals())
+    if any(one.vector not in ("log", "x") for one in shown):
+        return {}
+    entries = sorted({place for one in shown for place in one.places})
+    integrated = bool(flat.continuous.size)
+    slopes, made, knowns = trace_slopes(flat, acting, entries, numbers, start, rates=integrated)
+    if slopes is None:
+        return {}
+    if integrated:
+        rates = trace_rates(flat)
+        slopes, made = replace(slopes, function=CFunction.of(rates)), [*made, rates]
+    functions += made
+    variables.are_rates_shown = integrated
+    return {"slopes": slopes, "knowns": knowns}
 
 
 def _is_sampled(flat: FlatDiagram) -> bool:
@@ -319,6 +350,7 @@ class _Variables:
         numbers: Mapping[str, tuple[ComputedNumbers, Any]],
     ):
         self._x = x
+        self.are_rates_shown = False
         self._opened, self._flat, self._untraced, self._numbers = opened, flat, untraced, numbers
         self._outputs = {self._place(wire): name for name, wire in opened.outputs.items()}
 
@@ -409,6 +441,8 @@ class _Variables:
         """Return the states of blocks."""
         flat = self._flat
         found = []
+        shown = flat.continuous.tolist() if self.are_rates_shown else []
+        rate_of = {entry: i for i, entry in enumerate(shown)}
         for path, own in flat.states.of_block.items():
             block = flat.table.blocks[path]
             for name, where in own.slices.items():
@@ -420,7 +454,12 @@ class _Variables:
                 kind: Literal["continuous", "discrete"] = "continuous" if computed else "discrete"
                 variable = Variable(label, "local", kind, shape, *about, start=start, state=not computed)
                 places = tuple(range(where.start, where.stop))
-                found.append(Placed(variable, "x", places, sampled=True, clock=self._clock(path)))
+                rates = () if computed else tuple(rate_of[i] for i in places if i in rate_of)
+                found.append(Placed(variable, "x", places, not rates, self._clock(path), rates))
+        if sum(len(one.rates) for one in found) < len(
+            rate_of
+        ):  # some are computed, and none is shown without the others
+            found = [replace(one, sampled=True, rates=()) for one in found]
         return tuple(found)
 
     def found_at_build(self) -> tuple[str, ...]:

@@ -50,7 +50,7 @@ def make_exported(
     chosen = {**base, **{key: value for key, value in options.items() if value is not None}}
     opened = start_at(opened, start or {})
     opened = let_move(opened, find_movable(opened.wired))
-    return loop_spec(opened, name=label, description=about, **chosen)
+    return loop_spec(opened, name=label, description=about, differentiated=True, **chosen)
 
 
 @accepts("build", subsystem=kinds.text.or_none(), outside=kinds.names, outputs=kinds.names.or_none())

@@ -69,7 +69,8 @@ class StepOptions:
         Relative tolerance that the FMU is told (toleranceDefined); None leaves it to the FMU.
     event_mode : bool, optional
         Use Event Mode (FMI 3.0, 4.2.1): events end a step, discrete inputs and tunable parameters change there, and
-        periodic input clocks tick. None: where the FMU has clocks and ``hasEventMode``.
+        periodic input clocks tick. None: where the FMU has clocks and ``hasEventMode``, and is none of Loopwright's,
+        which make the same ticks themselves, in less time.
     early_return : bool, optional
         Allow a step to end early; the rest follows at once, with the inputs held. None: where Event Mode is used.
     retries : int
@@ -146,7 +147,7 @@ class StepParts(Flag):
 
 def parts_of_step(about: FmuDescription, options: StepOptions) -> StepParts:
     """Return what belongs to the steps of an FMU."""
-    clocks = any(v.type_is_clock for v in about.other.values())
+    clocks = any(v.type_is_clock for v in about.other.values()) and not _ticks_by_itself(about)
     events = about.has_event_mode and (clocks if options.event_mode is None else options.event_mode)
     chosen = {
         StepParts.EVENTS: events,
@@ -156,6 +157,11 @@ def parts_of_step(about: FmuDescription, options: StepOptions) -> StepParts:
         StepParts.ADDED_TIME: options.time is StepTime.ADDED,
     }
     return reduce(or_, (part for part, belongs in chosen.items() if belongs), StepParts(0))
+
+
+def _ticks_by_itself(about: FmuDescription) -> bool:
+    """Whether an FMU with clocks makes their ticks without Event Mode: those that Loopwright has exported do."""
+    return about.generation_tool.startswith("Loopwright")
 
 
 def choose_modes(fmi: FmiCalls, about: FmuDescription, options: StepOptions) -> None:

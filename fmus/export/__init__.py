@@ -5,7 +5,7 @@ from .from_block import build, model_spec, parameter_variable
 from .inlined import inline_model, own_functions
 from .loop_code import write_loop_c
 from .loop_memory import Field, LoopMemory, c_number
-from .loop_spec import ROOM_FOR_EDGES, CFunction, ComputedNumbers, Guards, LoopSpec, Placed, write_unit
+from .loop_spec import ROOM_FOR_EDGES, CFunction, ComputedNumbers, Guards, LoopSpec, Placed, Slopes, write_unit
 from .merged_plants import MergedPlant, PlacedPlant
 from .model import INTEGRATORS, Integrator, ModelSpec, Variable, check_ascii
 from .own_sources import read_own_sources
@@ -40,6 +40,7 @@ __all__ = [
     "Placed",
     "PlacedPlant",
     "ProcessorMeasurement",
+    "Slopes",
     "TargetCode",
     "TargetMeasurement",
     "TargetNumbers",

@@ -14,7 +14,7 @@ from html import escape
 from importlib import resources
 
 from ...blocks.core import lay_out
-from .c_code import ORDER, Entry, Kind, _array, _starts, _table
+from .c_code import ORDER, Entry, Kind, _array, _rate, _starts, _table
 from .html_page import page_of
 from .loop_spec import LoopSpec, Placed, write_unit
 from .model import Variable, check_ascii
@@ -35,8 +35,9 @@ def scalarize_loop(spec: LoopSpec) -> LoopSpec:
             if not one.variable.shape:
                 yield one
                 continue
-            for element, place in zip(_elements(one.variable), one.places, strict=True):
-                yield replace(one, variable=element, places=(place,))
+            rates = [(rate,) for rate in one.rates] or [()] * len(one.places)
+            for element, place, rate in zip(_elements(one.variable), one.places, rates, strict=True):
+                yield replace(one, variable=element, places=(place,), rates=rate)
 
     return replace(
         spec,
@@ -54,10 +55,18 @@ def loop_rows(spec: LoopSpec) -> list[tuple[Kind, Placed]]:
         ("tunable" if one.variable.variability == "tunable" else "fixed", one) for one in spec.parameters
     ]
     rows += [("input", one) for one in spec.inputs]
-    rows += [("discrete", one) for one in spec.states if one.variable.state]
+    integrated = [one for one in spec.states if one.rates]
+    rows += [("state", one) for one in integrated]
+    rows += [("discrete", one) for one in spec.states if one.variable.state and not one.rates]
+    rows += [("derivative", _rate_of(one)) for one in integrated]
     rows += [("output", one) for one in (*spec.outputs, *spec.signals)]
     rows += [("output", one) for one in spec.states if not one.variable.state]
     return rows
+
+
+def _rate_of(one: Placed) -> Placed:
+    """Return the rates of a continuous state as a variable."""
+    return Placed(_rate(one.variable), "rates", one.rates)
 
 
 def loop_layout(spec: LoopSpec) -> tuple[Entry, ...]:
@@ -65,10 +74,13 @@ def loop_layout(spec: LoopSpec) -> tuple[Entry, ...]:
     time = Variable("t", unit="s", description="Simulation time")
     rows: list[tuple[Kind, Variable, str]] = [("time", time, "time")]
     rows += [(kind, one.variable, one.variable.name) for kind, one in loop_rows(spec)]
+    names = iter([f"der({name})" for kind, _, name in rows if kind == "state"])
+    rows = [(kind, v, next(names) if kind == "derivative" else name) for kind, v, name in rows]
     check_ascii(name for *_, name in rows)
     places = lay_out(v.size for _, v, _ in rows)
+    states = iter([reference for reference, (kind, _, _) in enumerate(rows) if kind == "state"])
     return tuple(
-        Entry(reference, kind, variable, name, place.start)
+        Entry(reference, kind, variable, name, place.start, next(states) if kind == "derivative" else None)
         for reference, ((kind, variable, name), place) in enumerate(zip(rows, places, strict=True))
     )
 
@@ -121,6 +133,7 @@ def generate_loop(spec: LoopSpec, token: str, fmi: int) -> str:
     parts = [
         _dimensions(spec, entries, token, fmi, len(clocks)),
         write_unit(spec, own_functions=spec.own_functions),
+        *_slopes(spec),
         '#include "model.h"\n',
         _table(entries),
         _starts(entries),
@@ -137,7 +150,7 @@ def _dimensions(spec: LoopSpec, entries: tuple[Entry, ...], token: str, fmi: int
     def count(*kinds: str) -> int:
         return sum(e.variable.size for e in entries if e.kind in kinds)
 
-    numbers = {"P": count("fixed", "tunable"), "U": count("input"), "X": 0, "D": count("discrete")}
+    numbers = {"P": count("fixed", "tunable"), "U": count("input"), "X": count("state"), "D": count("discrete")}
     numbers |= {"Y": count("output"), "Z": 0, "J": 0, "VARIABLES": len(entries), "LABELS": len(spec.labels)}
     lines = [
         "#define LW_LOOP 1",
@@ -149,7 +162,7 @@ def _dimensions(spec: LoopSpec, entries: tuple[Entry, ...], token: str, fmi: int
         f"#define LW_ON_TICKS {int(spec.steps_on_ticks)}",
         f"#define LW_CLOCKS {clocks}",
         f"#define LW_LOGGED {_logged(spec)}",
-        "#define LW_HAS_DERIVATIVES 0",
+        f"#define LW_HAS_DERIVATIVES {int(spec.slopes is not None)}",
         *(f"#define LW_N_{letter} {number}" for letter, number in numbers.items()),
         *(f"#define LW_SZ_{kind} 1" for kind in ("ARG", "RES", "IW", "W")),
     ]
@@ -158,7 +171,8 @@ def _dimensions(spec: LoopSpec, entries: tuple[Entry, ...], token: str, fmi: int
 
 def _places(spec: LoopSpec) -> Iterator[str]:
     """Yield the tables that say where each value is in the memory."""
-    groups = {"p": ("fixed", "tunable"), "u": ("input",), "d": ("discrete",), "y": ("output",)}
+    groups = {"p": ("fixed", "tunable"), "u": ("input",), "x": ("state",), "d": ("discrete",)}
+    groups |= {"dx": ("derivative",), "y": ("output",)}
     for letter, kinds in groups.items():
         found = [
             _code_of(spec, one, place) if letter == "y" else place
@@ -176,6 +190,42 @@ def _code_of(spec: LoopSpec, one: Placed, place: int) -> int:
 
 def _logged(spec: LoopSpec) -> int:
     return next(one.length for one in spec.memory.fields if one.name == "log")
+
+
+def _slopes(spec: LoopSpec) -> Iterator[str]:
+    """Yield the C text of the derivatives: the functions of each kind of tick, and where the outputs are among them."""
+    slopes = spec.slopes
+    if slopes is None:
+        return
+    index = {entry: i for i, entry in enumerate(slopes.entries)}
+    outputs = [one for kind, one in loop_rows(spec) if kind == "output"]
+    found = [index[place] if one.vector == "log" else -1 - place for one in outputs for place in one.places]
+    yield _array("int32_t", "lw_slope_places", found)
+    yield f"#define LW_N_SLOPES {len(slopes.entries) + slopes.rates}"
+    yield f"#define LW_FIRST_RATE {len(slopes.entries)}"
+    yield f"#define LW_HAS_START_SLOPES {int(bool(slopes.start))}"
+    vectors = ("&m->now", "m->x", "m->w", "m->p")
+    groups = {"forward": slopes.forward, "reverse": slopes.reverse}
+    for name, functions in groups.items():
+        yield f"/* The product of the {'transposed ' * (name == 'reverse')}Jacobian with a seed, at a kind of tick. */"
+        yield f"static bool lw_{name}_at(const lw_memory *m, int64_t kind, const double *seed, double *found) {{"
+        for kind, function in enumerate(functions):
+            yield f"    if (kind == {kind}) {{"
+            yield from function.call((*vectors, "seed"), "found", " " * 8)
+            yield f"        return !{function.name}(arguments, results, iw, w, 0);"
+            yield "    }"
+        yield "    return (void)m, (void)seed, (void)found, false;"
+        yield "}\n"
+    for name, function in zip(groups, slopes.start, strict=False):
+        yield f"static bool lw_{name}_start(const lw_memory *m, const double *seed, double *found) {{"
+        yield from function.call((*vectors, "seed"), "found", " " * 4)
+        yield f"    return !{function.name}(arguments, results, iw, w, 0);"
+        yield "}\n"
+    if slopes.function is not None:
+        yield "static bool lw_rates_at(const lw_memory *m, double *found) {"
+        yield from slopes.function.call(vectors, "found", " " * 4)
+        yield f"    return !{slopes.function.name}(arguments, results, iw, w, 0);"
+        yield "}\n"
 
 
 def _labels(spec: LoopSpec) -> Iterator[str]:
@@ -242,7 +292,8 @@ def describe_loop(spec: LoopSpec, token: str, fmi: int) -> str:
 
 def _attributes(entry: Entry, one: Placed | None) -> dict[str, object]:
     v = entry.variable
-    initial = {"fixed": "exact", "tunable": "exact", "discrete": "exact", "output": "calculated"}
+    initial = {"fixed": "exact", "tunable": "exact", "state": "exact", "discrete": "exact"}
+    initial |= {"derivative": "calculated", "output": "calculated"}
     return {
         "name": entry.name,
         "valueReference": entry.reference,
@@ -270,9 +321,29 @@ def _experiment(spec: LoopSpec) -> str:
 
 
 def _dependencies(spec: LoopSpec, entry: Entry, inputs: dict[int, Entry]) -> list[Entry]:
-    """Return the inputs that an output or another signal depends on at an instant."""
+    """Return the inputs that an output or another signal depends on at an instant.
+
+    With derivatives all that it depends on, since an importer takes those as zero that are not listed.
+    """
+    if spec.slopes is not None:
+        return _knowns(spec, entry)
     found = spec.depends.get(entry.name.partition("[")[0], tuple(inputs))
     return [inputs[i] for i in found if i in inputs]
+
+
+def _knowns(spec: LoopSpec, entry: Entry) -> list[Entry]:
+    """Return everything that an output or a rate depends on at an instant: time, parameters, inputs, states."""
+    vector_of = {"fixed": "p", "tunable": "p", "input": "w", "state": "x", "discrete": "x"}
+    found: list[Entry] = []
+    one = next(p for e, p in _rows(spec) if e.reference == entry.reference)
+    assert one is not None
+    needed = frozenset[tuple[str, int]]().union(*(spec.knowns.get((one.vector, i), frozenset()) for i in one.places))
+    for known, placed in _rows(spec):
+        vector = "t" if placed is None else vector_of.get(known.kind)
+        places = (0,) if placed is None else placed.places
+        if any((vector, place) in needed for place in places):
+            found.append(known)
+    return found
 
 
 def _inputs(spec: LoopSpec, entries: tuple[Entry, ...]) -> dict[int, Entry]:
@@ -308,6 +379,8 @@ def _describe3(spec: LoopSpec, token: str) -> str:
         "mightReturnEarlyFromDoStep": bool(clocks) or None,
         "fixedInternalStepSize": float(spec.base) if spec.steps_on_ticks else None,
         "maxOutputDerivativeOrder": 0,
+        "providesDirectionalDerivatives": spec.slopes is not None or None,
+        "providesAdjointDerivatives": spec.slopes is not None or None,
     }
     variables = [
         _element(
@@ -315,24 +388,24 @@ def _describe3(spec: LoopSpec, token: str) -> str:
             _attributes(entry, one)
             | _limits(entry, types)
             | {"start": " ".join(map(repr, entry.variable.flat_start)) or None}
-            | {"clocks": _clock_of(entry, one, clocks)},
+            | {"clocks": _clock_of(entry, one, clocks), "derivative": entry.of},
             [_element("Dimension", {"start": n}) for n in entry.variable.shape],
         )
         for entry, one in rows
     ]
     variables += [_element("Clock", _clock_attributes(clock, spec)) for clock in clocks]
     structure = []
-    for entry in entries:
+    for tag, entry in _unknowns(entries):
+        needed = dict.fromkeys(e.reference for e in _dependencies(spec, entry, inputs))
         if entry.is_output:
-            needed = dict.fromkeys(e.reference for e in _dependencies(spec, entry, inputs))
             needed |= dict.fromkeys(clock.reference for clock in clocks)  # what is held changes at ticks
-            about = {
-                "valueReference": entry.reference,
-                "dependencies": " ".join(map(str, needed)),
-                "dependenciesKind": " ".join(["dependent"] * len(needed)),
-            }
-            structure.append(_element("Output", about))
-    structure += [_element("InitialUnknown", {"valueReference": e.reference}) for e in entries if e.is_output]
+        about = {
+            "valueReference": entry.reference,
+            "dependencies": " ".join(map(str, needed)),
+            "dependenciesKind": " ".join(["dependent"] * len(needed)),
+        }
+        structure.append(_element(tag, about))
+    structure += [_element("InitialUnknown", {"valueReference": e.reference}) for _, e in _unknowns(entries)]
     categories = [_element("Category", {"name": n, "description": d}) for n, d in LOG_CATEGORIES.items()]
     children = [
         _element("CoSimulation", stepping),
@@ -343,6 +416,12 @@ def _describe3(spec: LoopSpec, token: str) -> str:
         _element("ModelStructure", {}, structure),
     ]
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + _element("fmiModelDescription", root, children) + "\n"
+
+
+def _unknowns(entries: tuple[Entry, ...]) -> list[tuple[str, Entry]]:
+    """Return outputs, then derivatives of continuous states, with their elements in FMI 3.0's model structure."""
+    outputs = [("Output", entry) for entry in entries if entry.is_output]
+    return outputs + [("ContinuousStateDerivative", entry) for entry in entries if entry.kind == "derivative"]
 
 
 def _clock_of(entry: Entry, one: Placed | None, clocks: tuple[OfferedClock, ...]) -> int | None:
@@ -393,7 +472,7 @@ def _describe2(spec: LoopSpec, token: str) -> str:
         "canNotUseMemoryManagementFunctions": True,
         "canGetAndSetFMUstate": True,
         "canSerializeFMUstate": True,
-        "providesDirectionalDerivative": False,
+        "providesDirectionalDerivative": spec.slopes is not None,
     }
     sources = _element("SourceFiles", {}, [_element("File", {"name": "model.c"})])
     variables = [
@@ -404,24 +483,26 @@ def _describe2(spec: LoopSpec, token: str) -> str:
                 _element(
                     "Real",
                     _limits(entry, types)
-                    | {"start": entry.variable.flat_start[0] if entry.variable.flat_start else None},
+                    | {"start": entry.variable.flat_start[0] if entry.variable.flat_start else None}
+                    | {"derivative": None if entry.of is None else entry.of + 1},
                 )
             ],
         )
         for entry, one in rows
     ]
-    outputs = []
-    for entry in entries:
-        if entry.is_output:
-            needed = dict.fromkeys(e.reference + 1 for e in _dependencies(spec, entry, inputs))
-            about = {
-                "index": entry.reference + 1,
-                "dependencies": " ".join(map(str, needed)),
-                "dependenciesKind": " ".join(["dependent"] * len(needed)),
-            }
-            outputs.append(_element("Unknown", about))
-    unknown = [_element("Unknown", {"index": e.reference + 1}) for e in entries if e.is_output]
-    lists = (("Outputs", outputs), ("InitialUnknowns", unknown))
+    listed: dict[str, list[str]] = {"Output": [], "ContinuousStateDerivative": []}
+    for tag, entry in _unknowns(entries):
+        known = [e for e in _dependencies(spec, entry, inputs) if e.kind in ("time", "input", "state")]
+        needed = dict.fromkeys(e.reference + 1 for e in known)
+        about = {
+            "index": entry.reference + 1,
+            "dependencies": " ".join(map(str, needed)),
+            "dependenciesKind": " ".join(["dependent"] * len(needed)),
+        }
+        listed[tag].append(_element("Unknown", about))
+    unknown = [_element("Unknown", {"index": i}) for i in sorted(e.reference + 1 for _, e in _unknowns(entries))]
+    outputs, rates = listed.values()
+    lists = (("Outputs", outputs), ("Derivatives", rates), ("InitialUnknowns", unknown))
     structure = [_element(tag, {}, items) for tag, items in lists if items]
     simple = [_element("SimpleType", {"name": about.pop("name")}, [_element("Real", about)]) for about in _types(types)]
     categories = LOG_CATEGORIES | {"logAll": "All of them"}

@@ -42,6 +42,8 @@ class Placed:
         Whether it changes at ticks and events only.
     clock : int, optional
         The clock that its block acts at, among `LoopSpec.clocks`; None in continuous time and for a triggered block.
+    rates : tuple of int
+        Of a continuous state with slopes: the entries of its rates.
     """
 
     variable: Variable
@@ -49,6 +51,7 @@ class Placed:
     places: tuple[int, ...]
     sampled: bool = False
     clock: int | None = None
+    rates: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,32 @@ class Guards:
     names: tuple[tuple[str, str], ...] = ()
     function: CFunction | None = None
     texts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """Derivatives of a diagram: of some entries of the log, and of the rates of all continuous states behind these.
+
+    Attributes
+    ----------
+    forward, reverse : tuple of CFunction
+        By kind of tick: of (t, x, w, p) and a seed, the product with the Jacobian by (t, x, w, p), or its transpose.
+    start : tuple of CFunction
+        Forward and reverse of the states at the start; none where none are computed.
+    entries : tuple of int
+        The entries of the log.
+    rates : int
+        Number of the rates.
+    function : CFunction or None
+        The rates, as a function of (t, x, w, p).
+    """
+
+    forward: tuple[CFunction, ...]
+    reverse: tuple[CFunction, ...]
+    start: tuple[CFunction, ...]
+    entries: tuple[int, ...]
+    rates: int
+    function: CFunction | None = None
 
 
 @dataclass(frozen=True)
@@ -165,6 +194,10 @@ class LoopSpec:
         Discontinuities of sources that repeat without end: the first one and the period, s.
     depends : mapping of str to tuple of int
         Entries of w on which each output and each signal depends at an instant; all where it is missing.
+    slopes : Slopes or None
+        Derivatives; None where there are none.
+    knowns : mapping of (str, int) to frozenset of (str, int)
+        With slopes: by "log" or "rates" and an entry, the entries of t, x, w and p that it depends on at an instant.
     found_at_build : tuple of str
         States whose start the blocks' Python code has found when it was exported: start values, which can be set.
     plants : tuple of MergedPlant
@@ -200,6 +233,8 @@ class LoopSpec:
     edges: tuple[tuple[float, float], ...] = ()
     periodic: tuple[tuple[float, float], ...] = ()
     depends: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    slopes: Slopes | None = None
+    knowns: Mapping[tuple[str, int], frozenset[tuple[str, int]]] = field(default_factory=dict)
     clocked: tuple[str, ...] = ()
     offers_clocks: bool = True
     found_at_build: tuple[str, ...] = ()

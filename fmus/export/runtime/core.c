@@ -96,7 +96,10 @@ static bool lw_check_finite(lw_instance *self, const double *values, size_t firs
 
 #if LW_LOOP
 static bool lw_update_outputs(lw_instance *self);
-static bool lw_update_derivatives(lw_instance *self) { return (void)self, true; }
+static bool lw_update_derivatives(lw_instance *self);
+#if LW_HAS_DERIVATIVES
+static bool lw_product(lw_instance *self, bool adjoint, const double *seed, double *found);
+#endif
 static bool lw_update_indicators(lw_instance *self) { return (void)self, true; }
 #else
 /* The inputs at t: u, held over the step, or if u is NULL those that move by their derivatives since its start. */
@@ -317,7 +320,7 @@ static bool lw_check_known(lw_instance *self, const char *function, const lw_var
     bool initializing = self->s.mode == LW_INITIALIZING;
     lw_kind kind = variable->kind;
     if (kind == LW_TIME || kind == LW_INPUT || kind == LW_STATE || kind == LW_TUNABLE) return true;
-    if (initializing && (kind == LW_FIXED || kind == LW_DISCRETE)) return true;
+    if ((initializing || LW_LOOP) && (kind == LW_FIXED || kind == LW_DISCRETE)) return true;
     return lw_fail(self, "%s: %s is no known in %s. Give inputs, states, tunable parameters or time%s.", function,
                    variable->name, lw_mode_names[self->s.mode], initializing ? ", or fixed parameters" : "");
 }
@@ -338,6 +341,16 @@ static bool lw_transfer(lw_instance *self, const char *function, const uint32_t 
     return lw_all_used(self, function, variable, left);
 }
 
+#if !LW_LOOP
+/* The product of the Jacobian, or its transpose, with a seed in the order of the values. */
+static bool lw_product(lw_instance *self, bool adjoint, const double *seed, double *found) {
+    self->arg[0] = self->s.values;
+    self->arg[1] = adjoint ? seed + LW_DX : seed;
+    self->res[0] = found;
+    return !(adjoint ? lw_reverse : lw_forward)(self->arg, self->res, self->iw, self->w, 0);
+}
+#endif
+
 static bool lw_derive(lw_instance *self, const char *function, bool adjoint, const uint32_t *unknowns, size_t n_unknowns,
                       const uint32_t *knowns, size_t n_knowns, const double *seed, size_t n_seed, double *sensitivity,
                       size_t n_sensitivity) {
@@ -351,10 +364,7 @@ static bool lw_derive(lw_instance *self, const char *function, bool adjoint, con
     if (!lw_transfer(self, function, adjoint ? unknowns : knowns, n_in, adjoint, seed, NULL, in, n_seed)) return false;
     memcpy(out, in, sizeof self->seed); /* a state that is an output depends on itself */
     if (!adjoint) memset(out + LW_DX, 0, LW_N_UNKNOWNS * sizeof(double));
-    self->arg[0] = self->s.values;
-    self->arg[1] = adjoint ? in + LW_DX : in;
-    self->res[0] = self->scratch;
-    if ((adjoint ? lw_reverse : lw_forward)(self->arg, self->res, self->iw, self->w, 0))
+    if (!lw_product(self, adjoint, in, self->scratch))
         return lw_fail(self, "%s: the derivatives can't be evaluated at t = %.9g s.", function, self->s.values[0]);
     size_t first = adjoint ? 0 : LW_DX, n = adjoint ? LW_DX : LW_N_UNKNOWNS;
     for (size_t i = 0; i < n; i++) out[first + i] += self->scratch[i];
@@ -503,7 +513,7 @@ static inline void lw_suggest_tolerance(lw_instance *self, double tolerance) {
 static bool lw_start_domains(lw_instance *self);
 #endif
 
-#if LW_HAS_DERIVATIVES && LW_N_X
+#if LW_HAS_DERIVATIVES && LW_N_X && !LW_LOOP
 #define LW_COARSE 0.5      /* steps of rk4 in time constants of the fastest mode: above, it is off by 5e-4 of that mode in each */
 #define LW_ITERATIONS 64   /* of the power method, whose growth in the second half is the size of the largest eigenvalue */
 
@@ -545,7 +555,7 @@ static inline bool lw_start(lw_instance *self, const char *function, lw_mode nex
     if (!lw_start_domains(self)) return false;
 #endif
     self->s.begun = 1;
-#if LW_HAS_DERIVATIVES && LW_N_X
+#if LW_HAS_DERIVATIVES && LW_N_X && !LW_LOOP
     lw_compare_step(self);
 #endif
     self->s.mode = next;

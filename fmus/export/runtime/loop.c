@@ -35,7 +35,9 @@ static void lw_take_outputs(lw_instance *self) {
 
 /* Copy outputs and states from the memory. */
 static void lw_take_values(lw_instance *self) {
+    for (size_t i = 0; i < LW_N_X; i++) self->s.values[LW_X + i] = self->s.memory.x[lw_places_x[i]];
     for (size_t i = 0; i < LW_N_D; i++) self->s.values[LW_D + i] = self->s.memory.x[lw_places_d[i]];
+    self->s.have_derivatives = 0;
     lw_take_outputs(self);
 }
 
@@ -113,6 +115,7 @@ static bool lw_update_outputs(lw_instance *self) {
 #endif
     if (self->s.begun) return lw_take_outputs(self), true;
     lw_put_values(self);
+    lw_put(lw_places_x, LW_N_X, self->s.values + LW_X, m->x);
     lw_put(lw_places_d, LW_N_D, self->s.values + LW_D, m->x);
     if (!lw_begin(m, self->s.values[0])) return lw_blame(self);
 #if LW_N_MERGED
@@ -121,6 +124,97 @@ static bool lw_update_outputs(lw_instance *self) {
     lw_take_values(self);
     return true;
 }
+
+/* Evaluate the rates of the continuous states at the present instant. */
+static bool lw_update_derivatives(lw_instance *self) {
+#if LW_N_X
+    lw_memory *m = &self->s.memory;
+    if (self->s.have_derivatives) return true;
+    if (!self->s.begun && !lw_update_outputs(self)) return false;
+    if (self->s.mode == LW_EVENT) lw_put_values(self);
+    if (!lw_rates_at(m, self->slopes)) return lw_fail(self, "the rates can't be evaluated at t = %.9g s.", m->now);
+    for (size_t i = 0; i < LW_N_X; i++) self->scratch[i] = self->slopes[lw_places_dx[i]];
+    if (!lw_check_finite(self, self->scratch, LW_DX, LW_N_X, m->now)) return false;
+    memcpy(self->s.values + LW_DX, self->scratch, LW_N_X * sizeof(double));
+    self->s.have_derivatives = 1;
+#endif
+    return (void)self, true;
+}
+
+/* ---- derivatives ---- */
+
+#if LW_HAS_DERIVATIVES
+/* The kind of tick of which derivatives are: in Event Mode that of the clocks that are active; where nothing is between ticks,
+ * the tick at hand, which the next step makes first, and at the start also with something between them. Else values of
+ * sampled subsystems are held: -1 where nothing is between ticks. */
+static int64_t lw_kind_of_slopes(const lw_instance *self) {
+    const lw_memory *m = &self->s.memory;
+    bool acts = lw_is_due(m) && (!LW_HYBRID || !self->s.begun);
+    if (self->s.mode == LW_EVENT) acts = self->s.active;
+#if LW_HYBRID
+    return acts ? lw_kind_of(m->tick) : m->hybrid.between;
+#else
+    return acts ? lw_kind_of(m->tick) : -1;
+#endif
+}
+
+/* Add values at their places to a vector, or take them from there. */
+static void lw_spread(const int32_t *places, size_t n, const double *from, double *to) {
+    for (size_t i = 0; i < n; i++) to[places[i]] += from[i];
+}
+static void lw_gather(const int32_t *places, size_t n, const double *from, double *to) {
+    for (size_t i = 0; i < n; i++) to[i] = from[places[i]];
+}
+
+/* The product of the Jacobian, or its transpose, with a seed in the order of the values; at the start with the states that
+ * are computed there. */
+static bool lw_product(lw_instance *self, bool adjoint, const double *seed, double *found) {
+    lw_memory *m = &self->s.memory;
+    double *by = self->knowns, *y = self->slopes;
+    if (!self->s.begun && !lw_update_outputs(self)) return false;
+    lw_put_values(self); /* those that the next step or update takes */
+    const int64_t kind = lw_kind_of_slopes(self);
+    memset(by, 0, sizeof self->knowns);
+    memset(y, 0, sizeof self->slopes);
+    if (!adjoint) {
+        by[0] = seed[0];
+        lw_spread(lw_places_p, LW_N_P, seed + LW_P, by + LW_KNOWN_P);
+        lw_spread(lw_places_u, LW_N_U, seed + LW_U, by + LW_KNOWN_W);
+        lw_spread(lw_places_x, LW_N_X, seed + LW_X, by + LW_KNOWN_X);
+        lw_spread(lw_places_d, LW_N_D, seed + LW_D, by + LW_KNOWN_X);
+#if LW_HAS_START_SLOPES
+        if (!self->s.begun) {
+            if (!lw_forward_start(m, by, self->begun)) return false;
+            memcpy(by + LW_KNOWN_X, self->begun, sizeof m->x);
+        }
+#endif
+        if (kind >= 0 && !lw_forward_at(m, kind, by, y)) return false;
+        lw_gather(lw_places_dx, LW_N_X, y + LW_FIRST_RATE, found);
+        for (size_t i = 0; i < LW_N_Y; i++)
+            found[LW_N_X + i] = lw_slope_places[i] < 0 ? by[LW_KNOWN_X + (-1 - lw_slope_places[i])] : y[lw_slope_places[i]];
+        return true;
+    }
+    lw_spread(lw_places_dx, LW_N_X, seed + LW_DX, y + LW_FIRST_RATE);
+    for (size_t i = 0; i < LW_N_Y; i++)
+        if (lw_slope_places[i] >= 0) y[lw_slope_places[i]] += seed[LW_Y + i];
+    if (kind >= 0 && !lw_reverse_at(m, kind, y, by)) return false;
+    for (size_t i = 0; i < LW_N_Y; i++)
+        if (lw_slope_places[i] < 0) by[LW_KNOWN_X + (-1 - lw_slope_places[i])] += seed[LW_Y + i];
+#if LW_HAS_START_SLOPES
+    if (!self->s.begun) {
+        if (!lw_reverse_start(m, by + LW_KNOWN_X, self->begun)) return false;
+        memset(by + LW_KNOWN_X, 0, sizeof m->x);
+        for (size_t i = 0; i < LW_N_KNOWNS; i++) by[i] += self->begun[i];
+    }
+#endif
+    found[0] = by[0];
+    lw_gather(lw_places_p, LW_N_P, by + LW_KNOWN_P, found + LW_P);
+    lw_gather(lw_places_u, LW_N_U, by + LW_KNOWN_W, found + LW_U);
+    lw_gather(lw_places_x, LW_N_X, by + LW_KNOWN_X, found + LW_X);
+    lw_gather(lw_places_d, LW_N_D, by + LW_KNOWN_X, found + LW_D);
+    return true;
+}
+#endif
 
 /* ---- Event Mode, in which the importer makes the ticks by clocks (FMI 3.0, 2.3.5) ---- */
 

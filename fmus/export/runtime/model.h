@@ -66,6 +66,15 @@ typedef enum {
     LW_TIME, LW_FIXED, LW_TUNABLE, LW_INPUT, LW_STATE, LW_DISCRETE, LW_DERIVATIVE, LW_OUTPUT, LW_INDICATOR
 } lw_kind;
 
+#if LW_LOOP && LW_HAS_DERIVATIVES
+/* What derivatives are by: time, states, inputs, parameters, as they are in the memory. */
+#define LW_LENGTH_OF(member) (sizeof ((lw_memory *)0)->member / sizeof(double))
+#define LW_KNOWN_X 1
+#define LW_KNOWN_W (LW_KNOWN_X + LW_LENGTH_OF(x))
+#define LW_KNOWN_P (LW_KNOWN_W + LW_LENGTH_OF(w))
+#define LW_N_KNOWNS (LW_KNOWN_P + LW_LENGTH_OF(p))
+#endif
+
 typedef struct {
     const char *name;
     lw_kind kind;
@@ -139,6 +148,9 @@ struct lw_instance {
     bool (*update)(lw_instance *self, double t, bool can_return_early, double *until);
     void (*update_sink)(void);
     lw_state *before; /* with an update: the state before the step */
+#if LW_LOOP && LW_HAS_DERIVATIVES
+    double slopes[LW_N_SLOPES + 1], knowns[LW_N_KNOWNS], begun[LW_N_KNOWNS]; /* seeds, or products, by the entries of the memory */
+#endif
 #if LW_LOOP && LW_CLOCKS
     lw_memory kept; /* the memory before an evaluation in Event Mode, which comes back */
 #endif

@@ -13,6 +13,7 @@ from fmpy.fmi1 import FMICallException
 from loopwright import Fmu, build
 from loopwright.blocks import Gain, Step, Sum, TransferFunction, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.fmus import StepOptions
 from support import exported_diagrams
 from support.instances import open_instance
 
@@ -329,9 +330,10 @@ def test_without_clocks_there_is_no_event_mode(tmp_path):
 
 
 @pytest.mark.slow
-def test_here_clocks_are_driven_and_tick_where_the_diagram_says():
-    """A run here makes the ticks by the clocks, with the inputs of the instant; what is read comes a step later."""
-    fmu = Fmu(build(rates), name="fmu")
+@pytest.mark.parametrize("event_mode", [None, True])
+def test_here_ticks_are_where_the_diagram_says(event_mode):
+    """With the clocks of Event Mode and without, with the inputs of the instant; what is read comes a step later."""
+    fmu = Fmu(build(rates), name="fmu", stepping=StepOptions(event_mode=event_mode))
     run = Diagram("here", fmu(u=Step(times=0.1, values=1.0))).simulate(0.3, step=0.005, progress=False)
     expected = np.cumsum(np.where(np.arange(61) % 4 == 0, run.t >= 0.1 - 1e-9, 0.0))
     np.testing.assert_allclose(run["fmu.both"][1:], expected[:-1] + np.where(run.t[:-1] > 0.1, 2.0, 0.0), atol=1e-12)
