@@ -82,7 +82,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--solver", metavar="NAME", help="of a diagram with continuous states (default: RK45; Radau if it is stiff)"
     )
     build.add_argument(
-        "--no-clocks", action="store_true", help="of a diagram in FMI 3.0: its sample times are no input clocks"
+        "--clocks", action="store_true", help="of a diagram in FMI 3.0: its sample times are input clocks (Event Mode)"
     )
     build.add_argument(
         "--own-functions", action="store_true", default=None, help="of a diagram: sine and so on by Loopwright"
@@ -174,16 +174,15 @@ def run_build(arguments: argparse.Namespace) -> int:
     return 0
 
 
-_LEFT_OUT = ("arrays", "clocks")
-"""Keywords that are True unless an option --no-… is given."""
-
-
 def _build_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the given keywords for ``build``, checked against each other."""
     names: tuple[str, ...] = ("name", "integrator", "tolerance", "internal_step", "fmi", "platform")
     names += ("subsystem", "outside", "outputs", "communication", "solver", "own_functions")
     options = {name: value for name in names if (value := getattr(arguments, name)) is not None}
-    options |= {name: False for name in _LEFT_OUT if getattr(arguments, f"no_{name}")}
+    if arguments.no_arrays:
+        options["arrays"] = False
+    if arguments.clocks:
+        options["clocks"] = True
     name = options.get("name", "model")
     if not (name.isidentifier() and name.isascii()):
         raise OptionError(f"found {name!r}; expected letters, digits and _, such as my_model.", port="--name")
@@ -206,7 +205,7 @@ def _build_options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _option_text(name: str) -> str:
-    return f"--no-{name}" if name in _LEFT_OUT else f"--{name.replace('_', '-')}"
+    return "--no-arrays" if name == "arrays" else f"--{name.replace('_', '-')}"
 
 
 Make = Callable[[dict[str, Any], Path | None, Path], Path]

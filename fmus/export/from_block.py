@@ -177,7 +177,7 @@ def build(
     outputs: Iterable[str] | None = None,
     communication: Literal["any", "ticks"] = "any",
     solver: str | None = None,
-    clocks: bool = True,
+    clocks: bool = False,
     start: Mapping[str, Any] | None = None,
     own_functions: bool = False,
 ) -> Path:
@@ -248,10 +248,10 @@ def build(
         Of a diagram or subsystem: take sine, cosine, tangent hyperbolic, exponential, exp(x) - 1, logarithm and power
         from Loopwright, with the same bits on every platform, and not from the platform's library, with the bits of
         `Diagram.simulate` here. An exported block always has Loopwright's.
-    clocks : bool, default True
+    clocks : bool, default False
         Of a diagram or subsystem in FMI 3.0: whether its sample times are periodic input clocks of the FMU, by which an
-        importer with Event Mode makes the ticks. One without makes its steps as it does without clocks. Leave them out
-        for an importer that refuses every FMU with clocks.
+        importer with Event Mode makes the ticks. One without Event Mode makes its steps as it does without clocks, but
+        some can't read an FMU that has any.
 
     Raises
     ------
@@ -289,7 +289,7 @@ def build(
             made, out, fmi=fmi, arrays=arrays, platform=platform, documentation=documentation or "", notify=notify
         )
     of_parts = subsystem or tuple(outside) or outputs is not None or start
-    if of_parts or communication != "any" or solver or own_functions or not clocks:
+    if of_parts or communication != "any" or solver or own_functions or clocks:
         raise OptionError(
             "subsystem=, outside=, outputs=, start=, communication=, solver=, own_functions= and clocks= are options "
             "of diagrams and subsystems. Leave them out.",

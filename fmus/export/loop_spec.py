@@ -236,7 +236,7 @@ class LoopSpec:
     slopes: Slopes | None = None
     knowns: Mapping[tuple[str, int], frozenset[tuple[str, int]]] = field(default_factory=dict)
     clocked: tuple[str, ...] = ()
-    offers_clocks: bool = True
+    offers_clocks: bool = False
     found_at_build: tuple[str, ...] = ()
     plants: tuple[MergedPlant, ...] = ()
     steps_on_ticks: bool = False

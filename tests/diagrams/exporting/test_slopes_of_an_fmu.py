@@ -129,7 +129,7 @@ def test_slopes_by_a_parameter_go_through_what_is_computed_from_it(tmp_path):
 
 @pytest.mark.slow
 def test_in_event_mode_slopes_are_those_of_the_active_tick(tmp_path):
-    item = Instance3(build(exported_diagrams.controller), tmp_path, eventModeUsed=True)
+    item = Instance3(build(exported_diagrams.controller, clocks=True), tmp_path, eventModeUsed=True)
     item.initialize(wanted=1.0)
     assert item.directional("effort", "level", [1.0])[0] == 0.0
     item.fmu.setClock([item.references["clock"]], [True])

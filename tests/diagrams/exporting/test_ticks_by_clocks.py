@@ -78,7 +78,7 @@ def closed_loop(delay, n):
 
 def test_values_that_are_exchanged_at_a_tick_belong_to_that_tick(tmp_path):
     """Controller and plant get each other's values at once: in Event Mode there is no sample of delay, without there is."""
-    file = build(exported_diagrams.controller)
+    file = build(exported_diagrams.controller, clocks=True)
     a, n = np.exp(-T), 100
     clocked = Clocked(file, tmp_path).begin()
     item, y, seen = clocked.item, 0.0, []
@@ -126,7 +126,7 @@ def rates(u):
 
 @pytest.mark.slow
 def test_clocks_have_the_intervals_and_shifts_of_the_subsystems(tmp_path):
-    file = build(rates)
+    file = build(rates, clocks=True)
     assert fmpy.validation.validate_fmu(str(file)) == []
     clocked = Clocked(file, tmp_path).begin()
     assert sorted(c[1:] for c in clocked.clocks.values()) == [(0.01, 0.005), (0.02, 0.0)]
@@ -153,7 +153,7 @@ def test_clocks_have_the_intervals_and_shifts_of_the_subsystems(tmp_path):
 @pytest.mark.slow
 def test_every_rate_ticks_at_its_own_instants(tmp_path):
     """The input is the time: the sum is that of the multiples of 0.02 s, the product twice the last (k + 1/2) 0.01 s."""
-    clocked = Clocked(build(rates), tmp_path).begin()
+    clocked = Clocked(build(rates, clocks=True), tmp_path).begin()
     item, h = clocked.item, 0.005
     for k in range(100):
         t = k * h
@@ -169,7 +169,7 @@ def test_every_rate_ticks_at_its_own_instants(tmp_path):
 @pytest.mark.slow
 def test_what_is_read_in_event_mode_is_not_taken_over_before_the_update(tmp_path):
     """An importer solves an algebraic loop by setting and reading; I grows by the last error alone."""
-    clocked = Clocked(build(exported_diagrams.controller), tmp_path).begin()
+    clocked = Clocked(build(exported_diagrams.controller, clocks=True), tmp_path).begin()
     item = clocked.item
     item["wanted"] = 1.0
     clocked.activate(0.0)
@@ -188,7 +188,7 @@ def test_what_is_read_in_event_mode_is_not_taken_over_before_the_update(tmp_path
 
 @pytest.mark.slow
 def test_a_saved_state_has_what_was_activated(tmp_path):
-    clocked = Clocked(build(exported_diagrams.controller), tmp_path).begin()
+    clocked = Clocked(build(exported_diagrams.controller, clocks=True), tmp_path).begin()
     item = clocked.item
     item["wanted"] = 1.0
     clocked.activate(0.0)
@@ -220,7 +220,7 @@ def loop_with_plant():
 @pytest.mark.slow
 def test_ticks_by_clocks_are_those_within_the_fmu(tmp_path):
     """The plant is inside, so that the order of exchange can't matter: the loop in closed form, both ways."""
-    file = build(loop_with_plant(), tolerance=1e-10)
+    file = build(loop_with_plant(), tolerance=1e-10, clocks=True)
     clocked = Clocked(file, tmp_path).begin()
     plain = open_instance(file, tmp_path / "plain").initialize(wanted=1.0)
     item, expected = clocked.item, closed_loop(0, 60)
@@ -247,7 +247,7 @@ def test_a_jump_of_an_input_is_seen_in_event_mode(tmp_path):
         x = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="lag")(held)
         return Sum(signs="++")(x, Gain(gain=3.0)(u)).named("y")
 
-    clocked = Clocked(build(direct), tmp_path).begin()
+    clocked = Clocked(build(direct, clocks=True), tmp_path).begin()
     item = clocked.item
     item["u"] = 1.0
     clocked.activate(0.0)
@@ -265,7 +265,7 @@ def test_a_jump_of_an_input_is_seen_in_event_mode(tmp_path):
 
 @pytest.mark.slow
 def test_a_step_beyond_a_tick_ends_there_or_is_refused(tmp_path):
-    file = build(exported_diagrams.controller)
+    file = build(exported_diagrams.controller, clocks=True)
     clocked = Clocked(file, tmp_path, earlyReturnAllowed=True).begin()
     clocked.activate(0.0)
     clocked.leave()
@@ -287,7 +287,7 @@ def test_a_step_beyond_a_tick_ends_there_or_is_refused(tmp_path):
 
 @pytest.mark.slow
 def test_activations_that_do_not_fit_are_named(tmp_path):
-    clocked = Clocked(build(rates), tmp_path).begin()
+    clocked = Clocked(build(rates, clocks=True), tmp_path).begin()
     item, references = clocked.item, {c[1]: c[0] for c in clocked.clocks.values()}
 
     def refused(call, *parts):
@@ -311,7 +311,7 @@ def test_activations_that_do_not_fit_are_named(tmp_path):
     three = subsystem(
         lambda u: Sum(signs="++")(slow_rate(u), subsystem(sample_time=0.04, name="c")(lambda v: Gain(gain=1.0)(v))(u))
     )
-    clocked = Clocked(build(three, name="three"), tmp_path / "three").begin()
+    clocked = Clocked(build(three, name="three", clocks=True), tmp_path / "three").begin()
     item, references = clocked.item, {c[1]: c[0] for c in clocked.clocks.values()}
     item.fmu.setClock([references[0.04]], [True])
     refused(item.fmu.updateDiscreteStates, "are not active: clock_1", "one tick together")
@@ -320,11 +320,11 @@ def test_activations_that_do_not_fit_are_named(tmp_path):
 
 @pytest.mark.slow
 def test_without_clocks_there_is_no_event_mode(tmp_path):
-    for options in ({"fmi": 2}, {"clocks": False}):
+    for options in ({"fmi": 2, "clocks": True}, {}):
         about = fmpy.read_model_description(str(build(exported_diagrams.controller, **options)))
         assert not [v for v in about.modelVariables if v.type == "Clock"]
         assert not getattr(about.coSimulation, "hasEventMode", False)
-    plain = build(exported_diagrams.controller, clocks=False)
+    plain = build(exported_diagrams.controller)
     with pytest.raises(Exception, match="instantiate"):
         open_instance(plain, tmp_path, eventModeUsed=True)
 
@@ -333,7 +333,7 @@ def test_without_clocks_there_is_no_event_mode(tmp_path):
 @pytest.mark.parametrize("event_mode", [None, True])
 def test_here_ticks_are_where_the_diagram_says(event_mode):
     """With the clocks of Event Mode and without, with the inputs of the instant; what is read comes a step later."""
-    fmu = Fmu(build(rates), name="fmu", stepping=StepOptions(event_mode=event_mode))
+    fmu = Fmu(build(rates, clocks=True), name="fmu", stepping=StepOptions(event_mode=event_mode))
     run = Diagram("here", fmu(u=Step(times=0.1, values=1.0))).simulate(0.3, step=0.005, progress=False)
     expected = np.cumsum(np.where(np.arange(61) % 4 == 0, run.t >= 0.1 - 1e-9, 0.0))
     np.testing.assert_allclose(run["fmu.both"][1:], expected[:-1] + np.where(run.t[:-1] > 0.1, 2.0, 0.0), atol=1e-12)

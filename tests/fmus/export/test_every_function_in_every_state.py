@@ -21,8 +21,8 @@ def late(u):
 
 
 MODELS = {
-    "controller": lambda fmi: build(exported_diagrams.controller, fmi=fmi),
-    "two rates": lambda fmi: build(late, fmi=fmi),
+    "controller": lambda fmi: build(exported_diagrams.controller, fmi=fmi, clocks=True),
+    "two rates": lambda fmi: build(late, fmi=fmi, clocks=True),
     "rates without inputs": lambda fmi: build(exported_diagrams.sampled(), fmi=fmi),
     "thermostat": lambda fmi: build(exported_diagrams.continuous(), fmi=fmi),
     "plant": lambda fmi: build_fmu(mass_spring_damper(), fmi=fmi),
