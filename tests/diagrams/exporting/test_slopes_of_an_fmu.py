@@ -66,8 +66,7 @@ def test_a_nonlinear_diagram_has_the_slopes_of_its_equations(fmi):
 @pytest.mark.slow
 def test_the_adjoint_is_the_transpose(tmp_path):
     item = open_instance(build(pendulum), tmp_path)
-    states = [n for n in item.references if n.startswith(("theta.", "omega."))]
-    assert len(states) == 2
+    states = ["omega.y", "theta.y"]
     item.initialize(**dict(zip(states, (0.4, -0.2), strict=True)), torque=0.1)
     knowns = [*states, "torque", "gravity.gain", "time"]
     unknowns = ["angle", "height", *(f"der({n})" for n in states)]
