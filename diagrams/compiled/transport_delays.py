@@ -90,6 +90,11 @@ class Delays:
                 self.start[where] = z[where]
         self.outputs_at(0.0, w)
 
+    def begin_at(self, w: np.ndarray) -> None:
+        """Take what is put out at the beginning of a run as all that went in before."""
+        for into, where in zip(self.outputs, self.inputs, strict=True):
+            self.start[where] = w[into]
+
     def look_from(self, t: float) -> None:
         """Take the side of a discontinuity that is towards a time within the segment that is being solved."""
         self._middle = t

@@ -13,6 +13,7 @@ from ...fmus.running import FmuLinearization, linearize_fmu
 from ..flat import Evaluators, FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import change_parameter, join
+from .delay_channels import delay_channels
 from .exchanged import evaluators_at, load_evaluators
 from .identification import WATCHED, output_drift
 from .plant_models import plant_entries, plant_layout
@@ -46,9 +47,10 @@ class PlantValues:
 class Plants:
     """All FMUs of a diagram, with their states one after the other."""
 
-    def __init__(self, flat: FlatDiagram, at: OperatingPoint, diagram: WiredDiagram):
-        self.flat, self.at_start, self.h = flat, at, float(flat.base)
+    def __init__(self, flat: FlatDiagram, at: OperatingPoint, diagram: WiredDiagram, *, rest: bool):
+        self.flat, self.at_start, self.h, self.rest = flat, at, float(flat.base), rest
         self.blocks = {path: cast("Fmu", diagram.blocks[path]) for path in sorted(at.plants)}
+        self.delays = delay_channels(flat)
         self.states = plant_layout(self.blocks, at.plants)
         self.own = self.states.slices
         self.by_step = {path: self._needs_step(path) for path in self.blocks}
@@ -127,7 +129,10 @@ class Plants:
         return found
 
     def evaluate(self, xp: np.ndarray, z: np.ndarray, free: list[Free], q: list[np.ndarray]) -> PlantValues:
-        """Evaluate all FMUs; the derivatives by their parameters are differences."""
+        """Evaluate all FMUs; the derivatives by their parameters are differences.
+
+        At rest a dead time puts out its input; else it puts out what it does where the search begins.
+        """
         flat, n = self.flat, self.total
         nw, nz = flat.plant_outputs.total, flat.plant_inputs.total
         f, y = np.zeros(n), np.zeros(nw)
@@ -150,6 +155,9 @@ class Plants:
 
         chosen = [i for i, parameter in enumerate(free) if parameter.path in self.blocks]
         f_by_q, y_by_q = differentiate_by(free, q, chosen, (n, nw), evaluate)
+        inputs, outputs = self.delays.inputs, self.delays.outputs
+        y[outputs] = z[inputs] if self.rest else self.at_start.w[outputs]
+        D[outputs, inputs] = float(self.rest)
         return PlantValues(f, y, A, B, C, D, f_by_q, y_by_q)
 
     def _evaluate_one(

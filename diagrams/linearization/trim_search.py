@@ -64,7 +64,7 @@ class _Equations:
 
     def __init__(self, diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, free: list[Free], target: Target):
         self.diagram, self.flat, self.at, self.parameters, self.target = diagram, flat, at, free, target
-        self.plants = Plants(flat, at, diagram)
+        self.plants = Plants(flat, at, diagram, rest=target.rest)
         self.exchanged = ExchangedPlants(diagram, flat, at, free)
         traced = flat.checked.traced
         self.sampled = flat.states.entries(p for p in flat.states.slices if traced[p].advance != "derivative")

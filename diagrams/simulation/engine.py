@@ -25,7 +25,7 @@ from .continuous_part import ContinuousPart
 from .diagnosis import opaque_failure
 from .initialize import find_start_values, initialize
 from .run_options import RunOptions
-from .start_at_point import start_at, take_over
+from .start_at_point import check_past, start_at, take_over
 from .start_values import choose_start_values
 from .stops import StopConditions
 from .view import Position, SimulationView
@@ -260,6 +260,9 @@ class Engine:
         first = 0 if point is None else start_at(workspace, point, self.name)
         now, acting = self.position.time_of(first), self.flat.acting(first)
         if continuous is not None:
+            if point is not None and continuous.delays is not None:
+                check_past(point, continuous.delays, self.name)
+                continuous.delays.begin_at(point.w)
             continuous.begin(at_start=point is None)
         workspace.begin(acting)
         if continuous is not None and (continuous.domains is not None or continuous.exchanged is not None):

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import FmuError, LoopwrightError, OptionError
+from ..compiled import Delays
 from ..flat import FlatDiagram, TickPattern, WiredDiagram
 from ..results import OperatingPoint, PointOrigin
 from .workspace import Workspace
 
 SAME = 1e-9
 """Distance between two states of an FMU, absolute and relative, up to which it need not be set."""
+_AT_REST = 1e-6
+"""Largest residual of a point of a run, and largest difference between both ends of a dead time, that count as rest."""
 PASSES = 120
 """Most ticks that states without a value, such as those of a delay, get to take one."""
 
@@ -106,6 +109,28 @@ def start_at(workspace: Workspace, point: OperatingPoint, name: str) -> int:
         )
     workspace.put(point.t, point.x, point.w)
     return int(tick)
+
+
+def check_past(point: OperatingPoint, delays: Delays, name: str) -> None:
+    """Refuse to start a run with dead times from a point of a run that moves: it doesn't hold what has gone in before.
+
+    At rest that is what comes out, as it is where states are given.
+    """
+    if point.how is not PointOrigin.RUN:
+        return
+    moved = [
+        np.abs(point.z[where] - point.w[out]) / (1.0 + np.abs(point.w[out]))
+        for where, out in zip(delays.inputs, delays.outputs, strict=True)
+    ]
+    most = max(float(np.max(np.concatenate(moved))), point.residual)
+    if not most <= _AT_REST:
+        raise OptionError(
+            f"the operating point at t = {point.t:.9g} s moves (by {most:.3g} relative to 1 + its size; expected at "
+            f"most {_AT_REST:g}), and it doesn't hold what is inside the diagram's TransportDelay. Continue the run "
+            "itself with start=run.final_state, or start from a point at rest: diagram.trim(…).",
+            block=name,
+            port="start",
+        )
 
 
 def take_over(workspace: Workspace, x: np.ndarray, of: FlatDiagram, acting: frozenset[TickPattern]) -> None:

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from loopwright.blocks import (
+    PID,
     Block,
     Constant,
     Delay,
@@ -19,6 +21,7 @@ from loopwright.blocks import (
     SimulationError,
     State,
     Sum,
+    TransportDelay,
     UnitDelay,
     UnknownNameError,
     parameter,
@@ -180,6 +183,49 @@ def test_an_algebraic_loop_is_solved_along():
     diagram = Diagram("d", x(v(v.y, x.y) - x.y), loops="solve")
     point = diagram.trim()
     assert point.values["x.y"] == pytest.approx(brentq(lambda s: np.cos(s) - 0.5 * s, 0, 2), rel=1e-10)
+
+
+def delayed(initial_value=0.0):
+    """Ẋ = pipe − √x, the pipe 1.05 s late, a sampled PI that wants √x to be 0.6."""
+    pipe, tank = (
+        TransportDelay(delay=1.05, initial_value=initial_value, name="pipe"),
+        Integrator(name="tank", initial_value=0.5),
+    )
+    root = Function(lambda x: np.sqrt(x), name="root")
+    controller = subsystem(sample_time=0.1)(lambda wanted, y: PID(kp=0.5, ki=0.1)(wanted, y).named("u"))
+    flow = root(tank.y)
+    return Diagram("delayed", tank(pipe(controller(Constant(value=0.6), flow)) - flow))
+
+
+@pytest.mark.parametrize("initial_value", [0.0, 0.5, None])
+def test_a_dead_time_at_rest_puts_out_its_input(initial_value):
+    """Whatever it holds at the start: the search wanted it to put out 0, and no such loop had an operating point."""
+    diagram = delayed(initial_value)
+    point = diagram.trim()
+    found = [point.values[name] for name in ("tank.y", "pipe.y", "root.y")]
+    assert found == pytest.approx([0.36, 0.6, 0.6], abs=1e-9)
+    run = diagram.simulate(3.0, start=point, progress=False)
+    assert run["tank.y"] == pytest.approx(np.full(31, 0.36), abs=1e-8)
+    assert point.free == ()
+
+
+def test_a_dead_time_puts_out_what_it_did_where_other_states_are_given():
+    """At 0.8 s nothing has passed it yet."""
+    point = delayed(0.25).operating_point(0.8, states={"tank.y": 0.49})
+    assert [point.values["pipe.y"], point.values["root.y"]] == pytest.approx([0.25, 0.7], abs=1e-12)
+
+
+def test_a_run_with_a_dead_time_starts_where_states_are_given_and_not_within_a_run():
+    """What has gone into the pipe is 0.25 V before, as at the start; of a point within a run it isn't known."""
+    diagram = delayed(0.25)
+    given = diagram.operating_point(0.0, states={"tank.y": 0.49})
+    run = diagram.simulate(1.0, start=given, progress=False)
+    exact = solve_ivp(lambda t, x: 0.25 - np.sqrt(x), (0.0, 1.0), [0.49], rtol=1e-10, atol=1e-12).y[0, -1]
+    assert run["tank.y"][-1] == pytest.approx(exact, abs=1e-6)
+    with pytest.raises(
+        OptionError, match=r"^delayed\.start: the operating point at t = 2 s moves .*start=run\.final_state"
+    ):
+        diagram.simulate(1.0, start=diagram.operating_point(2.0), progress=False)
 
 
 def test_targets_out_of_reach_are_an_error_with_what_is_left():
