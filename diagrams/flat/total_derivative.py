@@ -87,6 +87,22 @@ class Derivative:
         moved = symbols[argument] if entries is None else symbols[argument][list(entries)]
         return not ca.depends_on(slopes, moved)
 
+    def is_zero(self, result: str, argument: str) -> bool:
+        """Whether the derivative of a result by an argument is 0 wherever there is one, as that of a step by time.
+
+        False where a stage has an evaluator, or tables: its operations can't be looked at.
+        """
+        last, names = self.schedule.last, self.schedule.arguments
+        if self.schedule.opaque:
+            return False
+        try:
+            f = ca.Function("whole", [*last.arguments], [last.results[self.schedule.results.index(result)]]).expand()
+        except RuntimeError:
+            return False
+        symbols = dict(zip(names, f.sx_in(), strict=True))
+        (made,) = f.call(list(symbols.values()))
+        return all(entry.is_zero() for entry in ca.jacobian(made, symbols[argument]).elements())
+
     @cached_property
     def fast(self) -> Any:
         """The one function of a schedule without opaque stages as it is evaluated fastest."""

@@ -8,6 +8,7 @@ a period, and their slopes along a parameter, are made by the same functions.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -28,6 +29,7 @@ from ..flat import (
     Schedule,
     TickPattern,
     WiredDiagram,
+    announcers,
     evaluate,
     loop_mismatch,
     next_x,
@@ -184,6 +186,30 @@ class LocalDerivatives:
         return bool(self.flat.flow.depends("dx", "t").any()) or self._workspace is not None
 
     @cached_property
+    def jumps_in_time(self) -> bool:
+        """Whether the flow between ticks depends on time by jumps alone, at instants that its blocks announce."""
+        flat, known = self.flat, {path for path, _ in announcers(self.flat)}
+
+        def does() -> bool:
+            return Derivative(flat.flow, [("t", None)]).is_zero("dx", "t")
+
+        by_time = {
+            path
+            for path, trace in flat.checked.traced.items()
+            if not flat.table.is_sampled(flat.table.subsystem_of[path])
+            and any("t" in d for d in trace.depends.values())
+        }
+        return self._workspace is None and by_time <= known and flat.keep("jumps in time", does)
+
+    def stays_until(self, t: float) -> float:
+        """Return the time until which the flow between ticks does not depend on time from t on; t where it does."""
+        if not self.varies:
+            return math.inf
+        if not self.jumps_in_time:
+            return t
+        return min((source.next_instant(t) for _, source in announcers(self.flat)), default=math.inf)
+
+    @cached_property
     def is_linear(self) -> bool:
         """Whether the flow between ticks is linear in what changes there: its derivatives are constants."""
         made, continuous = self._trace_derivative(NONE), self.flat.continuous.tolist()
@@ -191,7 +217,7 @@ class LocalDerivatives:
         def is_constant() -> bool:
             return made.is_constant("dx", "t") and made.is_constant("dx", "x", continuous)
 
-        return not self.varies and self._kept("linear", NONE, is_constant)
+        return self._workspace is None and self._kept("linear", NONE, is_constant)
 
     @cached_property
     def has_constant_slopes(self) -> bool:

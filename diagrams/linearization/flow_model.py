@@ -100,10 +100,11 @@ def differentiate_flow(
         asked = (differentiate(min(t + part * h, left_of(end)), start) for part in STAGES)
         return all(np.array_equal(J, F) and np.array_equal(f, f0) for J, f in asked)
 
-    if rests and (not local.varies or stays()):
+    still = local.stays_until(t) >= end
+    if rests and (still or stays()):
         whole = np.hstack(hold_inputs(F[:, :nc], F[:, nc:], h))
         final[xc] = start + f0 * h
-    elif local.is_linear:
+    elif still and local.is_linear:
         whole = np.hstack(hold_inputs(F[:, :nc], np.hstack([F[:, nc:], f0[:, None]]), h))
         whole, final[xc] = whole[:, :-1], start + whole[:, -1]
     else:

@@ -12,7 +12,8 @@ inputs are its entries. The controller's own are, by what blocks and the structu
 - those that an FMU leads to, which the wire drives as well, if the way from them back to the wire avoids all FMUs.
 
 A wire that enters a sampled subsystem, and acts nowhere else, is one signal for all that is in it, as an error is for
-the parts of a PI law: no cut is made ahead of one of them.
+the parts of a PI law: no cut is made ahead of one of them. Nor is one where what is in continuous time puts a wire out
+and sampled blocks alone read it: that is a measurement, such as the angle that two loops of a drive follow.
 
 Where this leaves several entries, nothing tells the parallel parts of a plant from a plant and a model of it, as their
 graphs are the same: the cuts ahead of each are then as possible as that for all of them.
@@ -101,9 +102,9 @@ def find_ways_back(flat: FlatDiagram, port: Port) -> WaysBack:
     for to in plant:
         if to not in inner:
             possible.setdefault(to[0], []).append(to)
-    is_parted = 1 < len(possible) <= MOST and not _enters_as_one(
-        flat, parting := search.parting(port), search.consumers(parting)
-    )
+    consumers = search.consumers(parting := search.parting(port))
+    is_one = _enters_as_one(flat, parting, consumers) or _is_measurement(flat, port, consumers)
+    is_parted = 1 < len(possible) <= MOST and not is_one
     alone = [search.cut(port, inputs) for inputs in possible.values()] if is_parted else []
     found = tuple(sorted((cut for cut in alone if cut is not None), key=lambda cut: cut.to))
     if not own:
@@ -249,22 +250,29 @@ def _enters_as_one(flat: FlatDiagram, port: Port, consumers: Sequence[Port]) -> 
     return bool(common.difference(around(port[0])))
 
 
+def _is_measurement(flat: FlatDiagram, port: Port, consumers: Sequence[Port]) -> bool:
+    """Return whether a plant in continuous time puts it out, and sampled blocks alone read it."""
+    if _is_sampled(flat, port[0]) or not _is_dynamic(flat, port[0]) or not consumers:
+        return False
+    return all(_is_sampled(flat, block) for block, _ in consumers)
+
+
+def _is_sampled(flat: FlatDiagram, block: str) -> bool:
+    return not _is_fmu(flat, block) and flat.table.clock(flat.table.subsystem_of[block]) is not None
+
+
 def _borders(flat: FlatDiagram, source: str) -> Iterator[Callable[[str], bool]]:
     """Yield functions that return whether a block is outside the controller, if that is what a border around it says.
 
     The borders are the subsystems of the source, from the innermost on, and that between sampled and continuous blocks.
     """
     table = flat.table
-
-    def is_sampled(block: str) -> bool:
-        return not _is_fmu(flat, block) and table.clock(table.subsystem_of[block]) is not None
-
     subsystem = table.subsystem_of[source]
     while subsystem:
         yield lambda block, frame=f"{subsystem}.": not f"{table.subsystem_of[block]}.".startswith(frame)  # type: ignore[misc]
         subsystem = subsystem.rpartition(".")[0]
-    if is_sampled(source):
-        yield lambda block: not is_sampled(block)
+    if _is_sampled(flat, source):
+        yield lambda block: not _is_sampled(flat, block)
 
 
 def find_shared_cuts(flat: FlatDiagram, cut: Iterable[Port], name: Callable[[Port], str]) -> tuple[Finding, ...]:

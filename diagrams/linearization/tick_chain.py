@@ -133,7 +133,7 @@ class Chain:
         self.derivations: dict[str, Derivation] = {}
         self.uncertainty, self.n_p = 0.0, 0
         self._known_plants: dict[str, tuple[float, np.ndarray, np.ndarray, PlantModel]] = {}
-        self._known_flow: tuple[float, np.ndarray, np.ndarray, FourMatrices] | None = None
+        self._known_flow: tuple[float, np.ndarray, np.ndarray, FourMatrices, float] | None = None
         self.steps: list[FourMatrices] = []
         self.visits: list[Visit] = []
         self._fired: list[Finding] = []
@@ -284,11 +284,17 @@ class Chain:
     def _differentiate_flow(self, x1: np.ndarray, h: float) -> FourMatrices:
         """Return `differentiate_flow` from here on; at rest, that of the last tick is used again."""
         here, known = self.here, self._known_flow
-        if known is not None and known[0] == h and _are_same(known[1], x1) and _are_same(known[2], here.w):
+        if (
+            known is not None
+            and known[0] == h
+            and here.t + h <= known[4]
+            and _are_same(known[1], x1)
+            and _are_same(known[2], here.w)
+        ):
             return known[3]
         found = differentiate_flow(self.flat, self.local, here.t, x1, here.w, h)
-        if not self.local.varies and _are_same(found[3], x1):
-            self._known_flow = (h, x1, here.w, found)
+        if _are_same(found[3], x1):
+            self._known_flow = (h, x1, here.w, found, self.local.stays_until(here.t))
         self._note_events(found[3], h)
         return found
 

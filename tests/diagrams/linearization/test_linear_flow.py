@@ -5,7 +5,7 @@ import pytest
 import scipy.integrate
 from scipy.linalg import expm
 
-from loopwright.blocks import Block, Constant, Gain, Input, Output, State, TransferFunction, parameter
+from loopwright.blocks import Block, Constant, Gain, Input, Output, Sine, State, Step, TransferFunction, parameter
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.model_exchange import ModelExchangeEvaluator
 from loopwright.fmus import Fmu, build, mass_spring_damper
@@ -128,3 +128,42 @@ def test_an_fmu_at_rest_that_follows_time_is_integrated(start, transition, end, 
     model = exchanged(build(Dated()), gain=0.0, **start).linearize()
     assert model.A[0, 0] == pytest.approx(transition, rel=1e-9)
     assert model.affine[0] == pytest.approx(end, abs=1e-12)
+
+
+def pushed(load):
+    """ẏ = −2 y + u + load, u = −1.5 y held over 0.1 s."""
+    plant = TransferFunction(numerator=(1.0,), denominator=(1.0, 2.0), name="plant")
+    controller = subsystem(sample_time=0.1, name="controller")(lambda y: Gain(gain=-1.5)(y).named("u"))
+    return Diagram("loop", plant(controller(plant.y) + load))
+
+
+@pytest.mark.parametrize("k", [2, 3, 4])
+def test_a_step_that_pushes_a_plant_is_integrated_in_the_sample_alone_in_which_it_jumps(monkeypatch, k):
+    """Ahead of it and behind it the flow doesn't depend on time: a report of three rates took 80 s, and 30 s so."""
+    calls, plain = [], scipy.integrate.solve_ivp
+    monkeypatch.setattr(scipy.integrate, "solve_ivp", lambda *a, **o: calls.append(1) or plain(*a, **o))
+    model = pushed(Step(times=0.35, values=3.0, initial_value=1.0, name="load")).linearize(k / 10, outputs="plant.y")
+    y, e, half = 0.0, np.exp(-0.2), np.exp(-0.1)
+    for tick in range(k + 1):
+        before, push = y, 3.0 if tick > 3 else 1.0
+        y = e * y + (1.0 - e) / 2.0 * (-1.5 * y + push) + (1.0 - half) * (tick == 3)  # 2 more for the last 0.05 s
+    assert (model.C @ model.affine)[0] == pytest.approx(y - before, rel=1e-6)  # of the run up to there
+    assert model.A[0, 0] == pytest.approx(e - 1.5 * (1.0 - e) / 2.0, rel=1e-12)
+    assert bool(calls) == (k == 3)
+
+
+class Switched(Block):
+    """A source that jumps at 0.35 s, which can't be read from it."""
+
+    y = Output(shape=())
+
+    def output(self, t, x, u):
+        return np.where(t * t < 0.1225, 1.0, 3.0)
+
+
+@pytest.mark.parametrize("load", [Switched(name="load"), Sine(amplitude=1.0, frequency=3.0, name="load")])
+def test_a_source_that_announces_no_instants_or_that_moves_is_integrated(monkeypatch, load):
+    calls, plain = [], scipy.integrate.solve_ivp
+    monkeypatch.setattr(scipy.integrate, "solve_ivp", lambda *a, **o: calls.append(1) or plain(*a, **o))
+    pushed(load).linearize(0.1)
+    assert calls

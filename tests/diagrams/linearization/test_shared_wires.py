@@ -71,6 +71,20 @@ def test_the_parallel_parts_of_a_plant_are_no_way_of_the_controllers_own():
     assert whole(z) == pytest.approx(by_hand, rel=1e-10)
 
 
+@pytest.mark.parametrize("kind", [Integrator, TransferFunction])
+def test_a_measurement_that_several_loops_read_is_one_wire(kind):
+    """The angle of a drive, in its loop of position and in that of speed: it was cut ahead of each, too."""
+    given = {} if kind is Integrator else {"numerator": [1.0], "denominator": [1.0, 0.0]}
+    angle = kind(name="angle", **given)
+    outer = subsystem(sample_time=T, name="outer")(lambda y: Gain(gain=-0.4)(y).named("wish"))
+    inner = subsystem(sample_time=T, name="inner")(lambda wish, y: (wish - 0.3 * y + 0.1 * UnitDelay()(y)).named("u"))
+    u = inner(outer(angle.y), angle.y)
+    whole = Diagram("drive", angle(u).named("angle")).linearize().loop("angle")
+    assert whole.findings == ()
+    z = np.exp(0.3j)
+    assert whole(z) == pytest.approx((0.7 - 0.1 / z) * T / (z - 1.0), rel=1e-10)
+
+
 def test_a_way_that_leaves_the_subsystem_is_no_way_of_its_own():
     """A reference of an inner loop also feeds a filter in its subsystem, whose way back is through the plant."""
     speed = Integrator(name="speed")
