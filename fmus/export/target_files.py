@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import explain_calls, explain_disk_errors, write_text
+from ...blocks.core import accepts, explain_calls, explain_disk_errors, kinds, write_text
 from .target_code import Number, TargetText, TickFacts, write_target
 from .target_measure import PROCESSORS, ProcessorMeasurement, measure, run_here
 from .target_spec import TargetSpec
@@ -89,6 +89,7 @@ class TargetCode:
                 write_text(self.folder / name, text)
             write_text(self.files[-1], self.report)
 
+    @accepts(ticks=kinds.integer(1).or_none())
     def measure(
         self,
         inputs: Mapping[str, Any] | None = None,

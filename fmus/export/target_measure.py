@@ -169,7 +169,13 @@ def input_rows(text: TargetText, inputs: Mapping[str, Any], ticks: int) -> dict[
             raise OptionError(f"there is no input {name!r}. {near(name, members)}", block=text.name)
     found = {}
     for name, member in members.items():
-        values = np.asarray(inputs.get(name, member.start.reshape(member.variable.shape)), dtype=float)
+        try:
+            values = np.asarray(inputs.get(name, member.start.reshape(member.variable.shape)), dtype=float)
+        except (TypeError, ValueError):
+            raise OptionError(
+                f"found {inputs[name]!r} for the input {name!r}; expected numbers, one value or one for each tick.",
+                block=text.name,
+            ) from None
         if values.shape == member.variable.shape:
             values = np.broadcast_to(values, (ticks, *member.variable.shape))
         if values.shape[1:] != member.variable.shape or len(values) < ticks:

@@ -353,6 +353,11 @@ def test_options_that_do_not_fit_are_named(tmp_path):
     code = to_c(pi, tmp_path)
     with pytest.raises(OptionError, match="there is no input 'levle'. Did you mean 'level'"):
         code.measure({"levle": 1.0})
+    code = to_c(pi, tmp_path)
+    with pytest.raises(OptionError, match=r"ticks: found 0; expected a positive integer"):
+        code.measure(ticks=0)
+    with pytest.raises(OptionError, match="found 'fast' for the input 'reference'; expected numbers"):
+        code.measure({"reference": "fast"})
 
 
 def spec_of_function(function, name="ctl", **options):
