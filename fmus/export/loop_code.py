@@ -222,8 +222,8 @@ class _Writer:
         yield "   operations: gcc needs -std=c99 or -ffp-contract=off. Never use -ffast-math. */"
         yield f'#include "{name}.h"'
         yield "#if defined(__GNUC__)"
-        warnings = ("pedantic", "unused-parameter", "unused-function", "unused-const-variable", "conversion")
-        warnings += ("sign-conversion",)
+        unused = ("unused-parameter", "unused-function", "unused-const-variable")
+        warnings = ("pedantic", *unused, "conversion", "sign-conversion")
         yield from (f'#pragma GCC diagnostic ignored "-W{warning}"' for warning in warnings)
         yield "#endif"
         yield "#if defined(__clang__)"
