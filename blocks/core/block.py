@@ -416,6 +416,8 @@ def _bind(block: Block, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[s
     inputs, who = block.inputs, block.label
     if len(args) > len(inputs):
         step = f" For one vector of them give a tuple: {who}((…, …))." if len(inputs) == 1 else ""
+        if "count" in block.parameters:  # as many inputs as the parameter says
+            step = f" Say how many there are: {type(block).__name__}(count={len(args)})."
         raise WiringError(
             f"{len(args)} signals for {len(inputs)} inputs ({', '.join(inputs) or 'none'}).{step}", block=who
         )

@@ -342,6 +342,8 @@ def close_names(name: str, known: Iterable[str]) -> list[str]:
     asked = str(name).casefold()
     alike = [one for one in plain if len(asked) > 2 or one[:1] == asked[:1]]  # one letter of two, elsewhere, is chance
     close = difflib.get_close_matches(asked, alike, n=3, cutoff=0.5)
+    if not close and len(asked) > 2:  # the beginning of a long name, or of a part of a path
+        close = [one for one in plain if any(part.startswith(asked) for part in one.split("."))][:3]
     return [one for folded in close for one in plain[folded]][:3]
 
 

@@ -134,6 +134,7 @@ _PLAIN = {
 _PREFIXES = {"p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "d": 1e-1}
 _PREFIXES |= {"k": 1e3, "M": 1e6, "G": 1e9}
 _FACTOR = re.compile(r"(1|[^\W\d_]+|%|°C?)(?:\^?([+-]?\d+))?")
+_FRACTION = re.compile(r"[^\W\d_]\^?\(?[+-]?(\d+\.\d|\d*\.\d|\d+/\d)")
 _NEXT = "Write it as FMI does: 'm/s2', 'N.s/m', 'J/(kg.K)', '1' for no dimension."
 
 
@@ -153,6 +154,15 @@ def _symbol(symbol: str, text: str) -> Unit:
 _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 
 
+def _refuse_fractions(text: str) -> None:
+    """Raise `UnitError` for a unit that can't be read as it has a power such as 0.5."""
+    if _FRACTION.search(text.translate(_RAISED)) or "sqrt" in text:
+        raise UnitError(
+            f"the unit {text!r} has a power that is no whole number, and units have whole powers alone. Leave the unit "
+            "out, or write the equation with a parameter that has one: k √h is q₀ √(h/h₀)."
+        )
+
+
 def _powers(text: str) -> list[tuple[str, int]]:
     """Return the symbols of a unit with their powers, in the order in which they are written."""
     found: list[tuple[str, int]] = []
@@ -162,11 +172,13 @@ def _powers(text: str) -> list[tuple[str, int]]:
         bottom = bottom.strip()
         whole = bottom.startswith("(") and bottom.endswith(")")
         if slash and not whole and len(re.split(r"[.·*/\s]+", bottom)) > 1:
+            _refuse_fractions(text)
             hint = "Put a denominator of several factors in parentheses: 'J/(kg.K)'."
             raise UnitError(f"the unit {text!r} is ambiguous after '/'. {hint}")
         for word in re.split(r"[.·*\s]+", top.strip()):
             match = _FACTOR.fullmatch(word)
             if match is None:
+                _refuse_fractions(text)
                 raise UnitError(f"the unit {text!r} can't be read at {word!r}. {_NEXT}")
             found.append((match[1], sign * int(match[2] or 1)))
         if slash and not bottom.strip("() "):

@@ -71,7 +71,7 @@ class Encoder(Block):
     """
 
     quanta = MappingProxyType({"position": "quantum"})
-    quantum: float = parameter(unit="m", above=0.0, description="smallest step of the position, Δ")
+    quantum: float = parameter(above=0.0, description="smallest step Δ, in the position's unit")
     position = Input(shape=None, description="true position")
     velocity = Input(shape=None, description="true velocity, used at the first tick only")
     measured_position = Output(like="position", description="p, whole quanta")

@@ -219,9 +219,18 @@ def _refuse_states(opened: OpenDiagram) -> None:
     for path in _continuous(opened):
         raise DefinitionError(
             "it is in continuous time, and C in single precision has ticks alone. Take number='double', whose source "
-            "has the loop of runs inside, or put it into a sampled subsystem, @subsystem(sample_time=…).",
+            "has the loop of runs inside, put it into a sampled subsystem, @subsystem(sample_time=…), or leave it "
+            f"outside: {_leave_out(opened)}.",
             block=opened.shown(path),
         )
+
+
+def _leave_out(opened: OpenDiagram) -> str:
+    """Return what to write, so that blocks in continuous time with states stay outside."""
+    table = opened.wired.scheduled
+    clocked = [path for path in table.subsystems if path and "." not in path and table.is_sampled(path)]
+    alone = f", or write a sampled subsystem alone: subsystem={opened.shown(clocked[0])!r}" if clocked else ""
+    return f"outside={[opened.shown(path) for path in _continuous(opened)]}{alone}"
 
 
 def _refuse_between_ticks(opened: OpenDiagram, flat: FlatDiagram) -> None:

@@ -34,6 +34,7 @@ from ...blocks.core import (
     enumerate_some,
     explain_calls,
     kinds,
+    missing_member,
 )
 from ...fmus.running import Derivation, DerivativeMethod
 from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
@@ -71,6 +72,19 @@ if TYPE_CHECKING:
     from ..frequency import LoopTransfer
 
 
+WAYS = {
+    **dict.fromkeys(("bode", "nyquist", "nichols", "root_locus"), 'lin.loop("wire").{}(), the loop at a wire'),
+    **dict.fromkeys(("pole_zero_map", "plot_poles"), "lin.pzmap()"),
+    **dict.fromkeys(
+        ("margins", "margin", "stability_margins", "gain_margin", "phase_margin"),
+        'margins(lin.loop("wire")), after from loopwright import margins',
+    ),
+    **dict.fromkeys(("step_response", "step_info"), 'lin.loop("wire").step(), which closes the loop'),
+    **dict.fromkeys(("pole", "eigenvalues", "damp"), "lin.poles"),
+    **dict.fromkeys(("zero", "zeros"), "lin.system, whose zeros() are those from its inputs to its outputs"),
+    **dict.fromkeys(("ss", "state_space", "to_ss", "tf"), "lin.system, or lin.A, lin.B, lin.C, lin.D"),
+}
+"""What to write for names that users of other tools look for in a linear model."""
 MOST_SHOWN, MOST_NAMES = 60, 8
 """States up to which a model's table has the poles (a few milliseconds), and names that it shows in a row."""
 
@@ -123,6 +137,11 @@ class Linearization(ShownAsTable):
     pade : int
         Order of Padé's approximations of the delays, 0 where they are exact; the loops of this model use it too.
     """
+
+    if not TYPE_CHECKING:  # a type checker knows all members
+
+        def __getattr__(self, name):
+            raise missing_member(self, name, "a linear model", {key: way.format(key) for key, way in WAYS.items()})
 
     wired: WiredDiagram = field(repr=False)
     A: np.ndarray = field(repr=False)

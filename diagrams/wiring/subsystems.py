@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator, KeysView, Mapping
 from fractions import Fraction
-from typing import Any, SupportsFloat, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, Any, SupportsFloat, TypedDict, Unpack, overload
 
 from ...blocks.core import (
     Call,
@@ -141,6 +141,17 @@ class Subsystem(ShownAsTable):
         self.parameters = [p for p in every if p.kind is not inspect.Parameter.VAR_KEYWORD]
         self.open_ended = len(self.parameters) < len(every)
         self.__doc__, self.__name__ = function.__doc__, self.name
+
+    if not TYPE_CHECKING:  # a type checker knows all members
+
+        def __getattr__(self, name):
+            if name.startswith("_") or "name" not in vars(self):
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            raise UnknownAttributeError(
+                f"a subsystem has no {name!r} before its call, which makes its outputs. Write {self.name}(…), which "
+                f"returns them, or out = {self.name}(…) and out.{name}; into a loop lead a block's port, such as "
+                "plant.y, which there is before the block's call."
+            )
 
     def replace(self, **changes: Unpack[SubsystemKeywords]) -> Subsystem:
         """Return a variant; the keywords are those of `subsystem`.

@@ -26,7 +26,7 @@ from ..exported_models import make_exported
 from .html_page import block_text
 from .internal_step import choose_internal_step, compare_internal_step
 from .model import EventSpec, Integrator, ModelSpec, Variable
-from .package import build_fmu
+from .package import build_fmu, check_version
 
 _TINY = float(np.finfo(float).tiny)  # the least positive number that is not denormal
 
@@ -266,6 +266,7 @@ def build(
     --------
     ``build(fig3, subsystem="controller")`` and ``build(fig3, outside=["plant"])`` are two ways to export a controller.
     """
+    check_version(fmi)
     made = None
     if not isinstance(block, Block | type):
         _refuse_options(block, internal_step=internal_step, integrator=integrator)

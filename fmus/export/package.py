@@ -212,6 +212,12 @@ def write_atomically(path: Path, data: bytes, instead: str = OTHER_FOLDER) -> No
             fresh.chmod(0o644)
 
 
+def check_version(fmi: object) -> None:
+    """Raise `FmuError` unless FMUs of this version of FMI are built."""
+    if fmi not in (2, 3):
+        raise FmuError(f"found fmi={fmi!r}, expected 3 (FMI 3.0) or 2 (FMI 2.0). Give one of them.")
+
+
 @accepts(
     spec=kinds.one_of_class((ModelSpec, LoopSpec), "a ModelSpec, such as model_spec(block)"),
     out=kinds.path,
@@ -266,8 +272,7 @@ def build_fmu(
     FmuError
         For another ``fmi``, and if the cache or ``out`` can't be written.
     """
-    if fmi not in (2, 3):
-        raise FmuError(f"found fmi={fmi!r}, expected 3 (FMI 3.0) or 2 (FMI 2.0). Give one of them.")
+    check_version(fmi)
     chosen = TARGETS if platform == "all" else (platform,) if isinstance(platform, str) else platform
     platforms = tuple(sorted(set(chosen or (native_platform(),))))
     if not (arrays and fmi == 3):

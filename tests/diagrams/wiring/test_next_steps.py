@@ -1,0 +1,119 @@
+"""Errors that a newcomer meets say what to write."""
+
+import re
+
+import pytest
+
+from loopwright import Block, Diagram, Input, State, build, subsystem
+from loopwright.blocks import (
+    PID,
+    Encoder,
+    Gain,
+    Stack,
+    Step,
+    TransferFunction,
+    UnitError,
+    UnknownNameError,
+    WiringError,
+    parameter,
+)
+from loopwright.blocks.core import near, parse_unit
+from loopwright.diagrams import DefinitionError
+from loopwright.fmus import FmuError
+
+
+@subsystem(sample_time=0.01)
+def controller(reference, speed):
+    return PID(kp=1.0, ki=5.0, name="pid")(r=reference, y=speed).named("u")
+
+
+@pytest.fixture(scope="module")
+def loop():
+    motor = TransferFunction(numerator=[2.0], denominator=[0.1, 1.0], name="motor")
+    reference = Step(times=0.1, values=1.0, name="reference")
+    return Diagram("loop", motor(controller(reference, motor.y)).named("speed"))
+
+
+def test_a_stack_of_two_says_how_to_get_four():
+    signals = [Step(times=0.1, values=1.0, name=f"s{i}").y for i in range(4)]
+    with pytest.raises(
+        WiringError, match=r"4 signals for 2 inputs \(u1, u2\)\. Say how many there are: Stack\(count=4\)\."
+    ):
+        Stack()(*signals)
+    assert len(Stack(count=4)(*signals).block.inputs) == 4
+    with pytest.raises(WiringError, match=r"2 signals for 1 inputs \(u\)\. For one vector of them give a tuple"):
+        Gain(gain=2.0)(*signals[:2])
+
+
+@pytest.mark.parametrize("unit", ["m2.5/s", "m^0.5", "m^(1/2)", "m1/2", "sqrt(m)", "N/m0.5"])
+def test_a_unit_with_a_fractional_power_says_so(unit):
+    with pytest.raises(UnitError, match="has a power that is no whole number, .* Leave the unit out"):
+        parse_unit(unit)
+
+
+@pytest.mark.parametrize("unit", ["m2.s", "kg.m2", "m5/s2", "kg5/s", "N/(m.s)", "m^2.s^-1", "1/s"])
+def test_products_of_whole_powers_are_read(unit):
+    assert parse_unit(unit).factor == 1.0
+
+
+def test_a_linear_model_says_where_plots_and_margins_are(loop):
+    model = loop.linearize()
+    for name in ("bode", "nyquist", "root_locus"):
+        with pytest.raises(AttributeError, match=rf'Write lin\.loop\("wire"\)\.{name}\(\)'):
+            getattr(model, name)
+    for name in ("margins", "gain_margin"):
+        with pytest.raises(AttributeError, match=r'Write margins\(lin\.loop\("wire"\)\), after from loopwright import'):
+            getattr(model, name)
+    assert not hasattr(model, "_repr_png_")
+    with pytest.raises(AttributeError, match="a linear model has no 'affin'. Did you mean 'affine'"):
+        _ = model.affin
+
+
+@pytest.mark.parametrize("ask", [lambda m: m.linearize(inputs="ref"), lambda m: m.linearize().loop("ref")])
+def test_the_beginning_of_a_name_leads_to_it(loop, ask):
+    with pytest.raises(UnknownNameError, match="Did you mean 'reference.y'"):
+        ask(loop)
+
+
+def test_only_beginnings_of_three_letters_are_close():
+    assert near("ref", ["plant.reference", "speed"]) == "Did you mean 'plant.reference'?"
+    assert near("re", ["plant.reference", "speed"]).startswith("Known:")
+    assert near("xyz", ["plant.reference"]).startswith("Known:")
+
+
+def test_a_subsystem_before_its_call_says_what_to_write():
+    with pytest.raises(
+        AttributeError, match=r"a subsystem has no 'y' before its call.* out = controller\(…\) and out\.y"
+    ):
+        _ = controller.y
+    assert not hasattr(controller, "wired")
+
+
+def test_a_wrong_version_is_found_before_anything_about_the_block():
+    class Own(Block):
+        k: float = parameter(default=1.0)
+        u, y = Input(unit="m"), State(unit="m", output=True)
+
+        def derivative(self, t, x, u):
+            return self.k * (u.u - x.y)
+
+    with pytest.raises(FmuError, match="found fmi=4, expected 3"):
+        build(Own(), fmi=4)
+    with pytest.raises(DefinitionError, match="k without a unit, where others have one"):
+        build(Own())
+
+
+def test_c_of_a_diagram_with_a_plant_says_the_words_to_type(loop, tmp_path):
+    with pytest.raises(
+        DefinitionError, match=r"outside=\['motor'\], or write .* alone: subsystem='controller'"
+    ) as refused:
+        loop.to_c(tmp_path / "out", number="float")
+    assert not (tmp_path / "out").exists()
+    assert "leave it outside" in str(refused.value)
+    assert loop.to_c(tmp_path / "a", outside=["motor"]).files
+    assert loop.to_c(tmp_path / "b", subsystem="controller").files
+
+
+def test_an_encoder_has_no_unit_of_its_own():
+    """Its quantum is in the unit of its position, rad or m."""
+    assert re.search(r"quantum : float, above 0\n\s+smallest step Δ, in the position's unit", Encoder.__doc__)
