@@ -181,7 +181,8 @@ class WiredDiagram:
     def continuous(self) -> WiredDiagram:
         """Return the diagram with every sampled subsystem as its ideal; see `Diagram.continuous`."""
         table = self.structure.copy()
-        sampled = [path for path in self.checked.traced if table.is_sampled(table.subsystem_of[path])]
+        own = [path for path in self.checked.traced if path in table.blocks]  # not those of a computational delay
+        sampled = [path for path in own if table.is_sampled(table.subsystem_of[path])]
         if found := [path for path in sampled if is_only_sampled(table.blocks[path])]:
             block = table.blocks[found[0]]
             ports = f"the inputs {', '.join(block.inputs)} and the outputs {', '.join(block.outputs)}"
