@@ -34,7 +34,7 @@ class LoopCode(TargetCode):
         self.name, self.number, self.folder = spec.name, "double", folder
         self.ticks, self.measured = (), None
         self.bytes_of: Mapping[str, int] = {"struct": spec.memory.bytes + _SPARE}
-        self._files = _Writer(spec, own_functions, self.bytes_of["struct"]).files()
+        self._files = _LoopWriter(spec, own_functions, self.bytes_of["struct"]).files()
         self.files = tuple(folder / name for name in (*self._files, f"{spec.name}_report.txt"))
 
     def _contents(self) -> Mapping[str, str]:
@@ -94,7 +94,7 @@ def write_loop_c(spec: LoopSpec, folder: Path, *, own_functions: bool = False) -
     return code
 
 
-class _Writer:
+class _LoopWriter:
     def __init__(self, spec: LoopSpec, own_functions: bool, size: int):
         self.spec, self.own, self.size = spec, own_functions, size
         self.name, self.upper = spec.name, spec.name.upper()
