@@ -45,7 +45,7 @@ _ALL = slice(None)
 
 
 @dataclass(frozen=True, eq=False)
-class Slopes:
+class QuotientSlopes:
     """Slopes of all values by one argument.
 
     Attributes
@@ -60,7 +60,7 @@ class Slopes:
 
 def find_slopes(
     values: Callable[[float], np.ndarray], base: np.ndarray, size: float, first: float, limits: tuple[float, float]
-) -> Slopes:
+) -> QuotientSlopes:
     """Return the slopes of values at distance 0.
 
     Quotients over d, 2 d and 4 d are extrapolated twice, to order 6 in d (3 if a limit leaves one side only). The
@@ -110,7 +110,7 @@ class _AlongArgument:
         self.still = np.zeros(base.shape, bool)
         """Whether a value has not moved at all, as far as it was looked at."""
 
-    def find(self, first: float) -> Slopes:
+    def find(self, first: float) -> QuotientSlopes:
         near = self._compare(first)[0]
         reach = np.zeros(self.base.shape)
         with suppress(LoopwrightError):  # it can't be evaluated so far away
@@ -121,12 +121,12 @@ class _AlongArgument:
         with np.errstate(invalid="ignore"):
             clear = near.error * self.size <= CLEAR * np.abs(self.base) + PLAIN * np.abs(near.slope) * self.size
         if np.all(clear & ~stairs):
-            return Slopes(near.slope, near.error)
+            return QuotientSlopes(near.slope, near.error)
         best = self._try_other_lengths(near, first, ~clear | stairs, stairs, float(np.max(reach, initial=0.0)))
         unclear = stairs & ~(best.error < 0.5 * np.abs(best.slope))  # the local slope is as good as the mean one
         slope = np.where(unclear, near.slope, best.slope)
         known = np.where(np.isfinite(best.error), np.abs(best.slope - near.slope) + best.error, np.inf)
-        return Slopes(slope, np.where(unclear, known, best.error))
+        return QuotientSlopes(slope, np.where(unclear, known, best.error))
 
     def _try_other_lengths(
         self, near: _Quotients, first: float, needed: np.ndarray, stairs: np.ndarray, reach: float
