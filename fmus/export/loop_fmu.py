@@ -35,7 +35,8 @@ def scalarize_loop(spec: LoopSpec) -> LoopSpec:
             if not one.variable.shape:
                 yield one
                 continue
-            rates = [(rate,) for rate in one.rates] or [()] * len(one.places)
+            rates: list[tuple[int, ...]] = [(rate,) for rate in one.rates]
+            rates = rates or [()] * len(one.places)
             for element, place, rate in zip(_elements(one.variable), one.places, rates, strict=True):
                 yield replace(one, variable=element, places=(place,), rates=rate)
 
