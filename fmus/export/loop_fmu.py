@@ -17,7 +17,7 @@ from ...blocks.core import lay_out
 from .c_code import ORDER, Entry, Kind, _array, _rate, _starts, _table
 from .html_page import page_of
 from .loop_spec import LoopSpec, Placed, write_unit
-from .model import Variable, check_ascii
+from .model import Variable, naming_convention
 from .quantities import type_names
 from .scalars import _elements
 from .xml_fmi3 import LOG_CATEGORIES, _element, _types, _units_and_types, package_version
@@ -77,7 +77,6 @@ def loop_layout(spec: LoopSpec) -> tuple[Entry, ...]:
     rows += [(kind, one.variable, one.variable.name) for kind, one in loop_rows(spec)]
     names = iter([f"der({name})" for kind, _, name in rows if kind == "state"])
     rows = [(kind, v, next(names) if kind == "derivative" else name) for kind, v, name in rows]
-    check_ascii(name for *_, name in rows)
     places = lay_out(v.size for _, v, _ in rows)
     states = iter([reference for reference, (kind, _, _) in enumerate(rows) if kind == "state"])
     return tuple(
@@ -369,7 +368,7 @@ def _describe3(spec: LoopSpec, token: str) -> str:
         "instantiationToken": token,
         "description": f"{spec.description} {about_steps(spec, 3)}".strip(),
         "generationTool": f"Loopwright {package_version()}",
-        "variableNamingConvention": "structured",
+        "variableNamingConvention": naming_convention(e.name for e in entries),
     }
     stepping: dict[str, object] = {
         "modelIdentifier": spec.name,
@@ -461,7 +460,7 @@ def _describe2(spec: LoopSpec, token: str) -> str:
         "guid": token,
         "description": f"{spec.description} {about_steps(spec, 2)}".strip(),
         "generationTool": f"Loopwright {package_version()}",
-        "variableNamingConvention": "structured",
+        "variableNamingConvention": naming_convention(e.name for e in entries),
         "numberOfEventIndicators": 0,
     }
     stepping: dict[str, object] = {

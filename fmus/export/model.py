@@ -184,8 +184,13 @@ class EventSpec:
         return f"{self.name}.indicator"
 
 
+def naming_convention(names: Iterable[str]) -> str:
+    """Return the convention of some names: other letters than A to Z are for flat names alone (FMI 3.0, 2.4.7.5.1)."""
+    return "structured" if all(map(str.isascii, names)) else "flat"
+
+
 def check_ascii(names: Iterable[str]) -> None:
-    """Refuse names with letters that FMI's structured names don't have (FMI 3.0, 2.4.7.5.1); a web page has them."""
+    """Refuse names with letters that C's identifiers don't have; FMUs and web pages have them."""
     for name in names:
         if not name.isascii():
             raise DefinitionError(
@@ -345,7 +350,6 @@ class ModelSpec:
 
     def _check_names(self) -> None:
         names = [*(v.name for v in self), *(e.indicator for e in self.events)]
-        check_ascii(names)
         for name in names:
             if names.count(name) > 1:
                 raise DefinitionError(

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 
 from .c_code import Entry, layout
-from .model import ModelSpec
+from .model import ModelSpec, naming_convention
 from .quantities import type_names
 from .xml_fmi3 import (
     _CAUSALITY,
@@ -111,7 +111,7 @@ def model_description2(spec: ModelSpec, token: str, *, derivatives: bool) -> str
         "guid": token,
         "description": spec.description or None,
         "generationTool": f"Loopwright {package_version()}",
-        "variableNamingConvention": "structured",
+        "variableNamingConvention": naming_convention(e.name for e in entries),
         "numberOfEventIndicators": len(spec.events),
     }
     both: dict[str, object] = {

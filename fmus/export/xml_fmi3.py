@@ -16,7 +16,7 @@ import casadi as ca
 
 from ...blocks.core import BASE_UNITS, Layout, parse_unit
 from .c_code import Entry, expand_scalar, layout, to_symbols
-from .model import ModelSpec
+from .model import ModelSpec, naming_convention
 from .quantities import quantity, type_names
 
 #: Log categories (FMI 3.0, 2.4.5) that the runtime uses.
@@ -263,7 +263,7 @@ def model_description(spec: ModelSpec, token: str, *, derivatives: bool) -> str:
         "instantiationToken": token,
         "description": spec.description or None,
         "generationTool": f"Loopwright {package_version()}",
-        "variableNamingConvention": "structured",
+        "variableNamingConvention": naming_convention(e.name for e in entries),
     }
     both: dict[str, object] = {
         "modelIdentifier": spec.name,

@@ -38,7 +38,7 @@ LW_SEEN(guard) int lw_page_guard(void) { return lw_find_guard(&lw_page_memory); 
 /* The number of the event that fires without end, LW_N_EVENTS where the solver finds no step, or -1: neither. */
 LW_SEEN(event) int lw_page_event(void) {
 #if LW_HYBRID
-    if (lw_page_memory.reason == PILED_UP && LW_N_EVENTS) return (int)lw_page_memory.hybrid.w.culprit;
+    if (LW_N_EVENTS > 0 && lw_page_memory.reason == PILED_UP) return (int)lw_page_memory.hybrid.w.culprit;
     if (lw_page_memory.reason == BROKEN_OFF && lw_page_memory.hybrid.p.lost != AT_INSTANT) return LW_N_EVENTS;
 #endif
     return -1;

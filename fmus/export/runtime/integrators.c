@@ -259,7 +259,7 @@ static double lw_rodas_step(lw_instance *self, double t, double h, const double 
 
 #if LW_MERGED
 static bool lw_need_matrix(lw_instance *self) {
-    return LW_N_MATRIX || lw_fail(self, "integrator = 3 needs memory that it was not given. Start with it.");
+    return LW_N_MATRIX > 0 || lw_fail(self, "integrator = 3 needs memory that it was not given. Start with it.");
 }
 #else
 static bool lw_need_matrix(lw_instance *self) {

@@ -63,7 +63,7 @@ static bool lw_blame(lw_instance *self) {
 #endif
 #if LW_HYBRID
     const hybrid *h = &m->hybrid;
-    if (m->reason == PILED_UP && LW_N_EVENTS)
+    if (LW_N_EVENTS > 0 && m->reason == PILED_UP)
         return lw_fail(self, "%s.%s at t = %.9g s: this event fires without end, so that time doesn't go on. Declare a hysteresis, or "
                        "give the block a state of rest.", lw_events_of[h->w.culprit].block, lw_events_of[h->w.culprit].name, h->t);
     if (m->reason == BROKEN_OFF && h->p.lost != AT_INSTANT)

@@ -5,6 +5,7 @@ import time
 import numpy as np
 import pytest
 from fmpy.fmi1 import FMICallException
+from fmpy.validation import validate_fmu
 
 from loopwright import build, experiments
 from loopwright.blocks import (
@@ -22,6 +23,7 @@ from loopwright.blocks import (
     UnknownNameError,
 )
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.fmus.checks import validate
 from support import exported_diagrams
 from support.instances import open_instance
 
@@ -232,4 +234,23 @@ def test_a_stiff_diagram_gets_an_implicit_method(tmp_path):
         t = 0.01 * (k + 1)
         assert item["y"] == pytest.approx(max(0.0, 1.0 - np.exp(-(t - 0.5))), rel=0, abs=2e-7)
     assert time.process_time() - began < 2.0  # 0.02 s; 15 s by the explicit method
+    item.free()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fmi", FMI)
+def test_names_have_letters_of_all_alphabets(fmi, tmp_path):
+    """They are flat names then, which may have them; both ways of checking find nothing."""
+
+    @subsystem(sample_time=0.5)
+    def box(φ):
+        return Gain(gain=2.0, name="κ")(φ).named("θ")
+
+    file = build(box, tmp_path / "greek.fmu", fmi=fmi)
+    assert validate_fmu(str(file)) == []
+    assert not validate(file).problems
+    item = open_instance(file, tmp_path / "item").initialize(φ=1.5)
+    assert item.description.variableNamingConvention == "flat"
+    item.step(0.0, 0.5, **{"κ.gain": 4.0})
+    assert item["θ"] == 6.0
     item.free()

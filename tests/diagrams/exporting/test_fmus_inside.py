@@ -3,6 +3,8 @@
 Oracles: the matrix exponential for a motor with a sampled controller, and runs of the diagrams with the FMUs themselves.
 """
 
+import zipfile
+
 import numpy as np
 import pytest
 from fmpy.fmi1 import FMICallException
@@ -12,6 +14,10 @@ from loopwright import Fmu, build
 from loopwright.blocks import Constant, DefinitionError, Gain, Step, TransferFunction, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import StepOptions, bouncing_ball, dc_motor, mass_spring_damper
+from loopwright.fmus.export import compiler
+from loopwright.fmus.toolchain import flags
+from support import exported_diagrams
+from support.ecos import load_ecospy
 from support.instances import open_instance
 
 T = 1e-3
@@ -236,6 +242,36 @@ def test_parameters_of_plants_are_described(tmp_path):
     assert (one.unit, one.variability, one.start, one.min) == ("Ohm", "tunable", "1.2", found["motor.inductance"].min)
     assert "motor.internal_step" in found
     assert "motor.integrator" not in found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("make", "fmi"), [(drive, 3), (exported_diagrams.continuous, 2)])
+def test_it_is_compiled_for_other_platforms_without_a_warning(make, fmi, monkeypatch):
+    """Warnings are errors here; folders are those of the version's platforms."""
+    monkeypatch.setattr(compiler, "flags", lambda *platform, zig: (*flags(*platform, zig=zig), "-Werror"))
+    names = ("aarch64-linux", "x86_64-darwin", "aarch64-darwin")
+    with zipfile.ZipFile(build(make(), fmi=fmi, platform=names, name="cross_compiled")) as archive:
+        found = {n.split("/")[1]: n.rpartition(".")[2] for n in archive.namelist() if n.startswith("binaries/")}
+    darwin = "x86_64-darwin" if fmi == 3 else "darwin64"
+    assert found == {"aarch64-linux": "so", "aarch64-darwin": "dylib", darwin: "dylib"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fmi", FMI)
+def test_ecos_has_the_same_numbers(fmi):
+    """Without clocks: ecos 0.7.2 frees memory twice where it closes any FMU that has some."""
+    ecospy = load_ecospy()
+    file, rows = build(drive(), fmi=fmi, clocks=False), []
+    with ecospy.EcosSimulationStructure() as structure:
+        structure.add_model("drive", str(file))
+        structure.add_parameter_set("given", {})
+        with ecospy.EcosSimulation(structure=structure, step_size=T) as simulation:
+            assert simulation.init(parameter_set="given"), ecospy.EcosLib.get_last_error()
+            for _ in range(200):
+                simulation.step()
+                rows.append(simulation.get_real("drive::speed"))
+            simulation.terminate()
+    np.testing.assert_allclose(rows, exact(201)[1:], rtol=0, atol=1e-5)
 
 
 # --- what is refused, before anything is compiled ------------------------------------------------------------------------
