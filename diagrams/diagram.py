@@ -30,7 +30,7 @@ from .coupling import Coupling, CouplingReport, report_coupling, to_coupling
 from .flat import FlatDiagram, WiredDiagram
 from .results import OperatingPoint, Run
 from .simulation import KeptKeywords, ProgressOption, RunKeywords, RunOptions, Simulation, simulate
-from .wiring import Collector, Structure, SubsystemSettings, Wire, sheet_of_structure
+from .wiring import Collector, Structure, SubsystemSettings, SubsystemTable, Wire, sheet_of_structure
 
 if TYPE_CHECKING:
     from ..fmus import ArchiveLimits
@@ -222,7 +222,7 @@ class Diagram(ShownAsTable):
     @property
     def subsystems(self) -> Mapping[str, SubsystemSettings]:
         """Every subsystem by its dotted path; the diagram itself is ""."""
-        return dict(self.structure.subsystems)
+        return SubsystemTable(self.structure.subsystems)
 
     @property
     def wires(self) -> Mapping[tuple[str, str], Wire]:

@@ -10,8 +10,10 @@ from control import StateSpace, feedback
 from numpy.typing import ArrayLike
 
 from ...blocks.core import (
+    Grid,
     LoopwrightError,
     OptionError,
+    Sheet,
     accepts,
     brief,
     count_of,
@@ -75,12 +77,27 @@ class LoopPlots:
         sampling = f"T = {self.dt:g} s" if self.dt else "continuous"
         delays = count_of(len(getattr(self, "delays", ())), "delay") * hasattr(self, "delays")
         found = count_of(len(self.findings), "finding") * bool(self.findings)
-        facts = count_of(self.nstates, "state"), delays, sampling, found
+        facts = count_of(self.nstates, "state"), delays, sampling, found, "constant 0" * self._is_zero()
         then = "margins(loop), loop.bode(), loop.nyquist()" + ", print(…) shows its matrices" * (not delays)
         return brief(f"loop at {', '.join(self.wires)}" if self.wires else "loop", *facts, then=then)
 
-    def _repr_html_(self) -> None:
-        """Return None: a notebook shows the short text; python-control's matrices grow with the states."""
+    def _repr_html_(self) -> str:
+        """Return a short table for a notebook; python-control's matrices grow with the states."""
+        facts = (
+            ("states", self.nstates),
+            ("dead times", len(getattr(self, "delays", ())) or None),
+            ("sampling", f"T = {self.dt:g} s" if self.dt else "continuous"),
+            ("value", "0 at all frequencies: nothing comes back to this wire" * self._is_zero()),
+        )
+        head = f"loop at {', '.join(self.wires)}" if self.wires else "loop"
+        findings = Grid("Left out of the model", ("finding",), tuple((str(one),) for one in self.findings))
+        return Sheet(head, facts, (findings,), ("margins(loop), loop.bode(), loop.nyquist()",)).as_html()
+
+    def _is_zero(self) -> bool:
+        """Whether no way leads from the cut wire back to it, as at the output of a source."""
+        if not hasattr(self, "B") or not hasattr(self, "C"):
+            return False
+        return not np.any(self.D) and (not np.any(self.B) or not np.any(self.C))
 
     def _draw_with(
         self, others: Sequence[Any], labels: Sequence[str] | None, omega: ArrayLike | None, *, marked: bool

@@ -11,7 +11,7 @@ from .entry_order import OrderStep
 from .first_order_hold import first_order_hold
 from .order import Order, find_orders
 from .parameter_names import find_control, find_name, find_path, find_place, split_path
-from .structure import Structure, SubsystemSettings, Wire, join, stepped_blocks
+from .structure import Structure, SubsystemSettings, SubsystemTable, Wire, join, stepped_blocks
 from .structure_table import sheet_of_structure
 from .subsystems import Subsystem, SubsystemCall, exact_time, subsystem
 from .variants import apply_changes, change_parameter, change_parameters
@@ -27,6 +27,7 @@ __all__ = [
     "Subsystem",
     "SubsystemCall",
     "SubsystemSettings",
+    "SubsystemTable",
     "Wire",
     "add_delay_blocks",
     "add_unit_conversions",

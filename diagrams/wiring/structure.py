@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from fractions import Fraction
 
-from ...blocks.core import Block, explain_calls
+from ...blocks.core import Block, Grid, Sheet, ShownAsTable, brief, explain_calls
 
 
 @explain_calls
@@ -44,6 +44,33 @@ class SubsystemSettings:
     delay: int = 0
     control: str = ""
     when: str = ""
+
+    def __repr__(self) -> str:
+        facts = [text for text in (self.rate, f"{self.control} ({self.when})" if self.control else "") if text]
+        return f"<settings of {self.path or 'the diagram'}: {', '.join(facts) or 'those around it'}>"
+
+    @property
+    def rate(self) -> str:
+        """Its sample time, offset and delay in words; "" where it has none."""
+        if self.sample_time is None:
+            return ""
+        offset = f" from {float(self.offset):g} s on" if self.offset else ""
+        delay = f", delay {self.delay}" if self.delay else ""
+        return f"every {float(self.sample_time):g} s{offset}{delay}"
+
+
+class SubsystemTable(dict[str, SubsystemSettings], ShownAsTable):
+    """Settings of subsystems by path, shown as a table."""
+
+    def __repr__(self) -> str:
+        return brief("subsystems", *(path for path in self if path), then='["path"].sample_time')
+
+    def _sheet(self) -> Sheet:
+        rows = [
+            (path or "(the diagram)", one.rate, f"{one.control} {one.when}".strip(), ", ".join(one.inputs))
+            for path, one in self.items()
+        ]
+        return Sheet("subsystems", (), (Grid("", ("path", "sample time", "control", "inputs"), tuple(rows)),))
 
 
 @explain_calls

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from ...blocks.core import brief, explain_calls
+from ...blocks.core import Grid, Sheet, ShownAsTable, brief, explain_calls
 from ..archive import FmuFault, FmuFinding, FmuSeverity
 from .summary import INTERFACES
 from .trial import RUNS
@@ -22,6 +22,8 @@ _CAUSALITIES = {
 }
 _MOST_OF_A_FAULT = 5
 """Findings of one kind that the text shows."""
+_MOST_IN_A_TABLE = 20
+"""Findings that the table of a notebook shows."""
 
 
 class FmuVerdict(StrEnum):
@@ -62,7 +64,7 @@ class FmuTrial:
 
 @explain_calls
 @dataclass(frozen=True)
-class FmuDiagnosis:
+class FmuDiagnosis(ShownAsTable):
     """Result of `doctor`; its text is that of ``loopwright doctor``.
 
     Parameters
@@ -133,6 +135,14 @@ class FmuDiagnosis:
 
     def __str__(self) -> str:
         return "\n".join(line.translate(_CONTROL) for line in self._lines())
+
+    def _sheet(self) -> Sheet:
+        """Return it as a notebook shows it: the content by name, the findings as a table."""
+        shown = tuple((str(f.severity), f.found.translate(_CONTROL), f.step.translate(_CONTROL)) for f in self.findings)
+        rows, content = shown[:_MOST_IN_A_TABLE], tuple(self._content()) if self.summary else ()
+        facts = tuple((label, text.translate(_CONTROL)) for label, text in content)
+        grid = Grid("Findings", ("severity", "found", "next"), rows, total=len(shown))
+        return Sheet(f"{self.file}: {self.headline}".translate(_CONTROL), facts, (grid,))
 
     def _lines(self) -> Iterator[str]:
         yield f"{self.file}: {self.headline}"

@@ -86,6 +86,13 @@ def check_value(description: FmuDescription, name: str, value: Any, label: str) 
         raise UnknownNameError(f"the FMU has no variable {name!r}. {near(name, known)}", block=label, port="start")
     variable = description.find(name)
     if variable.causality in ("output", "local") and variable.start is None:
+        if name in description.states:
+            raise ParameterError(
+                "found a state without a start value in the FMU's description, as the FMU computes it when it "
+                "initializes; expected a variable that has one. Set the parameters or inputs that it is computed from.",
+                block=label,
+                port=port,
+            )
         raise ParameterError(
             "found a variable that is computed and has no start value; set the states and parameters that it "
             "depends on.",

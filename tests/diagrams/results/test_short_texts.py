@@ -39,7 +39,7 @@ def test_texts_of_results_are_short_and_say_units_or_next_steps(diagram, run):
         assert found.startswith("<")
         assert found.endswith(">")
         assert "array(" not in found
-    assert loop._repr_html_() is None
+    assert len(loop._repr_html_()) < 3000  # a few facts: python-control's matrices grow with the states
     assert "unstable, poles" in repr(shown[13])
     assert "margins(loop)" in repr(loop)
     assert repr(margins(loop)).startswith(

@@ -1,14 +1,18 @@
 """Errors that a newcomer meets say what to write."""
 
+import pickle
 import re
+from html import unescape
+from types import SimpleNamespace
 
 import pytest
 
-from loopwright import Block, Diagram, Input, State, build, subsystem
+from loopwright import Block, Diagram, Input, State, build, doctor, subsystem
 from loopwright.blocks import (
     PID,
     Encoder,
     Gain,
+    ParameterError,
     Stack,
     Step,
     TransferFunction,
@@ -20,6 +24,7 @@ from loopwright.blocks import (
 from loopwright.blocks.core import near, parse_unit
 from loopwright.diagrams import DefinitionError
 from loopwright.fmus import FmuError
+from loopwright.fmus.running.start_values import check_value
 
 
 @subsystem(sample_time=0.01)
@@ -117,3 +122,48 @@ def test_c_of_a_diagram_with_a_plant_says_the_words_to_type(loop, tmp_path):
 def test_an_encoder_has_no_unit_of_its_own():
     """Its quantum is in the unit of its position, rad or m."""
     assert re.search(r"quantum : float, above 0\n\s+smallest step Δ, in the position's unit", Encoder.__doc__)
+
+
+def test_settings_of_subsystems_are_a_table(loop):
+    """A dictionary by path all the same."""
+    found = loop.subsystems
+    assert [*found] == ["", "controller"]
+    assert found == dict(loop.structure.subsystems)
+    assert re.search(r"^controller +every 0\.01 s +reference, speed$", str(found), re.MULTILINE)
+    assert "<td>every 0.01 s</td>" in found._repr_html_()
+    assert repr(found["controller"]) == "<settings of controller: every 0.01 s>"
+    late = loop.replace({"controller.offset": 0.002, "controller.delay": 1}).subsystems["controller"]
+    assert late.rate == "every 0.01 s from 0.002 s on, delay 1"
+    assert pickle.loads(pickle.dumps(found)) == found
+
+
+def test_a_loop_at_a_source_is_constant_0_and_says_so(loop):
+    model = loop.linearize()
+    around = model.loop("u")
+    assert "constant 0" in repr(model.loop("reference"))
+    assert "0 at all frequencies" in model.loop("reference")._repr_html_()
+    assert "constant 0" not in repr(around)
+    assert "<td>2</td>" in around._repr_html_()
+    assert "0 at all" not in around._repr_html_()
+
+
+def test_a_state_that_an_fmu_computes_at_the_start_is_called_a_state():
+    def find(name):
+        return SimpleNamespace(causality="local", start=None, variability="continuous")
+
+    description = SimpleNamespace(
+        other={}, variables={"s": 0, "v": 0}, elements={}, spelled={}, states={"s": "der(s)"}, find=find
+    )
+    with pytest.raises(ParameterError, match=r"^fmu\.start\.s: found a state without a start value .* it initializes"):
+        check_value(description, "s", 1.0, "fmu")
+    with pytest.raises(ParameterError, match=r"^fmu\.start\.v: found a variable that is computed"):
+        check_value(description, "v", 1.0, "fmu")
+
+
+def test_an_examination_of_an_fmu_is_a_table_in_a_notebook():
+    found = doctor("absent.fmu")
+    html = found._repr_html_()
+    assert "absent.fmu: is refused" in html
+    assert html.count("<tr>") == 1 + len(found.findings)
+    assert found.findings[0].step in unescape(html)
+    assert str(found).startswith("absent.fmu: is refused")
