@@ -23,4 +23,4 @@ class StartsAtInput:
 
     def initial(self, u: Any) -> Array:
         """Return the state at the start, of several past inputs all rows."""
-        return np.stack([u.u] * getattr(self, self._rows)) if self._rows else u.u  # type: ignore[no-any-return]
+        return np.stack([u.u] * getattr(self, self._rows)) if self._rows else u.u
