@@ -36,8 +36,8 @@ def scalarize_loop(spec: LoopSpec) -> LoopSpec:
                 yield one
                 continue
             rates: list[tuple[int, ...]] = [(rate,) for rate in one.rates]
-            rates = rates or [()] * len(one.places)
-            for element, place, rate in zip(_elements(one.variable), one.places, rates, strict=True):
+            each = rates or [()] * len(one.places)
+            for element, place, rate in zip(_elements(one.variable), one.places, each, strict=True):
                 yield replace(one, variable=element, places=(place,), rates=rate)
 
     return replace(
