@@ -41,6 +41,7 @@ def load_on_use(name: str, file: str) -> tuple[Callable[[str], Any], Callable[[]
             found = getattr(import_module(source, package), wanted)
         else:
             found = import_module(f"{source}{wanted}", package)
+        if isinstance(found, ModuleType) and hasattr(found, "__all__"):  # also one that was imported before
             vars(found).setdefault("__dir__", found.__all__.copy)  # completion shows no import of it
         vars(sys.modules[name])[wanted] = found
         return found
