@@ -22,8 +22,9 @@ def refuse(opened: OpenDiagram) -> None:
         shown = opened.shown(path)
         if block.transport and not table.is_sampled(table.subsystem_of[path]):
             raise DefinitionError(
-                "it is a transport delay in continuous time, whose memory has no bound; an exported diagram has a "
-                "fixed one. Put it into a sampled subsystem, where it is a delay by whole samples.",
+                "it is a transport delay in continuous time, which keeps each step of the solver for the length of the "
+                "delay: its memory has no bound, also for a constant delay, and an exported diagram has a fixed one. "
+                "Put it into a sampled subsystem, @subsystem(sample_time=…), where it is a delay by whole samples.",
                 block=shown,
             )
         if block.opaque and not isinstance(block, Fmu):

@@ -5,6 +5,7 @@ import re
 from html import unescape
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from loopwright import Block, Diagram, Input, State, build, doctor, subsystem
@@ -16,6 +17,7 @@ from loopwright.blocks import (
     Stack,
     Step,
     TransferFunction,
+    TransportDelay,
     UnitError,
     UnknownNameError,
     WiringError,
@@ -23,6 +25,7 @@ from loopwright.blocks import (
 )
 from loopwright.blocks.core import near, parse_unit
 from loopwright.diagrams import DefinitionError
+from loopwright.diagrams.exporting import make_exported
 from loopwright.fmus import FmuError
 from loopwright.fmus.running.start_values import check_value
 
@@ -167,3 +170,18 @@ def test_an_examination_of_an_fmu_is_a_table_in_a_notebook():
     assert html.count("<tr>") == 1 + len(found.findings)
     assert found.findings[0].step in unescape(html)
     assert str(found).startswith("absent.fmu: is refused")
+
+
+def test_a_dead_time_leaves_in_a_sampled_subsystem():
+    lag = TransferFunction(numerator=[1.0], denominator=[5.0, 1.0], name="lag")
+    dead, step = TransportDelay(delay=7.3, name="dead"), Step(times=1.0, values=1.0, name="step")
+
+    def pipe(u):
+        return dead(u).named("late")
+
+    with pytest.raises(DefinitionError, match=r"dead: .* also for a constant delay.*Put it into .*sample_time="):
+        make_exported(Diagram("d", lag(pipe(step))))
+    sampled = Diagram("d", lag(subsystem(sample_time=0.1)(pipe)(step)))
+    assert make_exported(sampled).clocks == ((1, 0),)
+    run = sampled.simulate(10.0, progress=False)
+    assert run.t[np.argmax(run["late"] > 0.5)] == pytest.approx(8.3, abs=1e-12)
