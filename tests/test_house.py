@@ -35,6 +35,7 @@ ALLOWED = {
     "blocks/library/python_control.py": {"Discrete"},  # the beginning of a class's name
     "diagrams/compiled/reordered.py": {"  return 0;\n", "casadi_real "},  # C code that CasADi writes
     "diagrams/report/pages/svg.py": {r'<svg[^>]*?\bwidth="([\d.]+)(pt|px)?" height="([\d.]+)'},  # Matplotlib's SVG
+    "fmus/calls/step_options.py": {"Loopwright"},  # the tool that has built an FMU: its description has it as a text
     "fmus/checks/libraries.py": {r"^\s*(\S+) => not found", "linux"},  # ldd's output; sys.platform
     "fmus/checks/validation.py": {"has no start value", "is not defined"},  # FMPy's problems are texts alone
     "fmus/export/c_code.py": {"int "},  # in the C code that CasADi writes
