@@ -116,8 +116,9 @@ class DelayedSystem(StateSpace):  # type: ignore[misc]
 
     __str__ = __repr__
 
-    def _repr_html_(self) -> None:
+    def _repr_html_(self) -> str | None:
         """Return None: a notebook shows the short text."""
+        return None
 
     # --- response -----------------------------------------------------------------------------------------------------
 

@@ -81,7 +81,7 @@ class LoopPlots:
         then = "margins(loop), loop.bode(), loop.nyquist()" + ", print(…) shows its matrices" * (not delays)
         return brief(f"loop at {', '.join(self.wires)}" if self.wires else "loop", *facts, then=then)
 
-    def _repr_html_(self) -> str:
+    def _repr_html_(self) -> str | None:
         """Return a short table for a notebook; python-control's matrices grow with the states."""
         facts = (
             ("states", self.nstates),
@@ -95,9 +95,10 @@ class LoopPlots:
 
     def _is_zero(self) -> bool:
         """Whether no way leads from the cut wire back to it, as at the output of a source."""
-        if not hasattr(self, "B") or not hasattr(self, "C"):
+        if hasattr(self, "delays"):  # it has no matrices; a way may lead through a delay alone
             return False
-        return not np.any(self.D) and (not np.any(self.B) or not np.any(self.C))
+        B, C, D = (getattr(self, name, 1.0) for name in "BCD")
+        return not np.any(D) and not (np.any(B) and np.any(C))
 
     def _draw_with(
         self, others: Sequence[Any], labels: Sequence[str] | None, omega: ArrayLike | None, *, marked: bool

@@ -148,6 +148,11 @@ def test_a_loop_at_a_source_is_constant_0_and_says_so(loop):
     assert "constant 0" not in repr(around)
     assert "<td>2</td>" in around._repr_html_()
     assert "0 at all" not in around._repr_html_()
+    late, reference = TransportDelay(delay=1.0, name="late"), Step(times=0.1, values=1.0, name="reference")
+    delayed = Diagram("d", late((0.5 * (reference - late.y)).named("u"))).linearize().loop("u")
+    assert "constant 0" not in repr(delayed)
+    assert "<td>1</td>" in delayed._repr_html_()
+    assert np.abs(delayed(1j)) == pytest.approx(0.5)
 
 
 def test_a_state_that_an_fmu_computes_at_the_start_is_called_a_state():
