@@ -72,6 +72,9 @@ class ByArgument:
             root = 1j * c.omega
             system = r.close(complex(factor))
             value, slope = system.evaluate(np.array([root]))
+            if not len(system.A):  # gains and delays alone: det(I − H E) is the characteristic function
+                E = np.exp(-root * system.tau)
+                value, slope = (np.eye(len(E)) - system.H * E)[None], (system.H * (system.tau * E))[None]
             U, sigma, V = np.linalg.svd(value[0])
             moved = abs(np.conj(U[:, -1]) @ slope[0] @ np.conj(V[-1]))
             apart = float(sigma[-1] / max(moved, 1e-300))

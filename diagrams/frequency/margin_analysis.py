@@ -165,9 +165,9 @@ class MarginFinder(ABC, Generic[Found]):
         r = self.r
         poles = r.eigenvalues()
         if self.unstable:
-            near = r.growth(poles).max()
+            largest = f" (largest growth {r.growth(poles).max():.3g})" if len(poles) else ""
             count = f"{self.unstable:g}" if np.isfinite(self.unstable) else "infinitely many"
-            reason = f"the closed loop is not stable: {count} of its poles are not (largest growth {near:.3g})"
+            reason = f"the closed loop is not stable: {count} of its poles are not{largest}"
             names = [f.name for f in fields(self.result) if f.type == "Number"]
             found = {name: Number(np.nan, MARGIN_UNITS.get(name, "1"), np.nan, reason) for name in names}
         else:

@@ -615,3 +615,18 @@ def test_a_predictor_whose_model_is_exact_has_margins_ahead_of_its_model_in_no_t
     )
     assert len(calls) < 5000
     assert sum(calls) < 2_000_000
+
+
+@pytest.mark.parametrize("gain", [0.5, 0.8, 2.0])
+def test_a_gain_around_a_dead_time_has_the_margins_of_a_circle(gain):
+    """L = k e^(−s): |L| is k, and −1 is passed at odd multiples of π with the factor 1/k; above 1 nothing is stable."""
+    late, reference = TransportDelay(delay=1.0, name="late"), Constant(value=1.0)
+    diagram = Diagram("d", late((gain * (reference - late.y)).named("u")))
+    found = margins(diagram.linearize().loop("u"))
+    assert found.stable is (gain < 1.0)
+    if gain < 1.0:
+        assert float(found.gain_margin_high) == pytest.approx(1.0 / gain, rel=1e-9)
+        assert float(found.modulus_margin) == pytest.approx(1.0 - gain, rel=1e-6)
+        assert float(found.ms) == pytest.approx(1.0 / (1.0 - gain), rel=1e-6)
+    else:
+        assert np.isnan(float(found.gain_margin_high))
