@@ -1,5 +1,6 @@
 """The pages for users: the README's code, the pages under docs/ and the notebooks run, and say what is so."""
 
+import io
 import json
 import os
 import re
@@ -9,7 +10,7 @@ import subprocess
 import sys
 import types
 import zipfile
-from contextlib import chdir, nullcontext
+from contextlib import chdir, nullcontext, redirect_stdout
 from pathlib import Path
 from unittest.mock import patch
 from xml.etree import ElementTree as ET
@@ -25,7 +26,7 @@ from loopwright.diagrams.cli import main
 
 ROOT = Path(__file__).parent.parent
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-QUICK = "12_checked_by_hand"  # the notebook of the quick set
+QUICK = ["09_state_feedback", "12_checked_by_hand"]  # the cheapest notebooks: the code of these runs in the quick set
 
 
 def blocks_of_code(text):
@@ -204,19 +205,6 @@ def test_the_page_on_export_tells_the_flags_as_they_are(fmi, model, tmp_path, un
         assert told == attributes, interface
 
 
-@pytest.mark.slow
-def test_the_code_of_a_notebook_runs(monkeypatch):
-    import nbformat
-
-    monkeypatch.chdir(ROOT / "notebooks")
-    notebook, scope = nbformat.read(ROOT / "notebooks" / f"{QUICK}.ipynb", as_version=4), {}
-    for cell in notebook.cells:
-        if cell.cell_type == "code":
-            exec(cell.source, scope)
-    assert isinstance(scope["figure"], matplotlib.figure.Figure)
-    plt.close("all")
-
-
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 TINY = 1e-6
 """Size below which a printed number may be rounding: another machine's has the same size, within a factor of a thousand."""
@@ -268,6 +256,28 @@ def test_a_notebook_with_old_numbers_is_noticed(stored, made, fresh):
 
     with nullcontext() if fresh else pytest.raises(AssertionError, match="cell 0"):
         check_printed(notebook(stored), notebook(made))
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_the_code_of_a_notebook_runs_and_prints_what_the_notebook_holds(name, monkeypatch):
+    import nbformat
+
+    monkeypatch.chdir(ROOT / "notebooks")
+    stored = [
+        cell
+        for cell in nbformat.read(ROOT / "notebooks" / f"{name}.ipynb", as_version=4).cells
+        if cell.cell_type == "code"
+    ]
+    scope, made = {}, []
+    for cell in stored:
+        with redirect_stdout(io.StringIO()) as text:
+            exec(cell.source, scope)
+        cell.outputs = [o for o in cell.outputs if o.get("name") == "stdout"]  # a kernel shows the others
+        made.append({**cell, "outputs": [{"text": text.getvalue()}]})
+    assert any(cell.outputs for cell in stored)
+    check_printed({"cells": stored}, {"cells": made})
+    assert plt.get_fignums()
+    plt.close("all")
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
