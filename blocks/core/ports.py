@@ -125,6 +125,9 @@ class Input(Port):
     models_plant : bool
         Whether a model of the plant in this block, such as an observer's, gets the plant's input here. Loops at the
         wire are then cut ahead of the plant, and not here.
+    at_start_only : bool
+        Whether the block takes it at its first instant alone, as an encoder does the true velocity. No loop of a linear
+        model leads through it.
     """
 
     def __init__(
@@ -136,12 +139,15 @@ class Input(Port):
         default: Any = None,
         tracks: str | None = None,
         models_plant: bool = False,
+        at_start_only: bool = False,
         name: str = "",
         **limits: Any,
     ):
-        limits = _known("Input", limits, "shape", "unit", "description", "default", "tracks", "models_plant")
+        limits = _known(
+            "Input", limits, "shape", "unit", "description", "default", "tracks", "models_plant", "at_start_only"
+        )
         super().__init__(shape, unit, description, name, **limits)
-        self.tracks, self.models_plant = tracks, models_plant
+        self.tracks, self.models_plant, self.at_start_only = tracks, models_plant, at_start_only
         self.default = None if default is None else np.asarray(default, dtype=float)
 
     def __get__(self, instance: Any, owner: type | None = None) -> Any:

@@ -73,7 +73,7 @@ class Encoder(Block):
     quanta = MappingProxyType({"position": "quantum"})
     quantum: float = parameter(above=0.0, description="smallest step Δ, in the position's unit")
     position = Input(shape=None, description="true position")
-    velocity = Input(shape=None, description="true velocity, used at the first tick only")
+    velocity = Input(shape=None, description="true velocity, used at the first tick only", at_start_only=True)
     measured_position = Output(like="position", description="p, whole quanta")
     measured_velocity = Output(like="velocity", description="v, whole quanta per tick")
     last = State(like="position", description="last measured position")

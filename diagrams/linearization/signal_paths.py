@@ -24,8 +24,8 @@ class PathNode(NamedTuple):
 class SignalPaths:
     """The ways of signals: along wires, and through blocks from the inputs to the outputs that follow them.
 
-    An output follows an input at once, by states, or by events. Outputs of an FMU follow all its inputs; those of the
-    blocks in an enabled or triggered subsystem follow its control.
+    An output follows an input at once, by states, or by events, but none that counts at the start alone. Outputs of an
+    FMU follow all its inputs; those of the blocks in an enabled or triggered subsystem follow its control.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class SignalPaths:
         traced = self.flat.checked.traced
         edges = {node: set(to) for node, to in self._wires.items() if (node.block, node.port) not in self.cut}
         for path, block in self.flat.table.blocks.items():
-            for source in block.inputs:
+            for source in (name for name, port in block.inputs.items() if not port.at_start_only):
                 for port in block.outputs:
                     if path not in traced or slopes_of(traced[path]).follows(port, source):
                         edges.setdefault(PathNode(path, source, False), set()).add(PathNode(path, port, True))

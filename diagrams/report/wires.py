@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from fractions import Fraction
 from typing import Any
 
 from ..flat import FlatDiagram, WiredDiagram
@@ -23,11 +24,12 @@ def wires_on_loops(diagram: WiredDiagram, wires: Sequence[str] | None = None) ->
     if wires is not None:
         return {_key(name): name for name in wires}
     inside = blocks_on_loops(diagram)
+    paths = SignalPaths(diagram.flatten(None if diagram.has_base else Fraction(1)))  # any step: wires are the same
     seen: set[tuple[str, str, Any]] = set()
     names: dict[str, str] = {}
     for name, wire in sorted(diagram.names.items(), key=lambda item: (item[0].count("."), item[0])):
         where = (wire.block, wire.port, str(wire.index))
-        if wire.block in inside and where not in seen:
+        if wire.block in inside and where not in seen and paths.is_on_loop((wire.block, wire.port)):
             seen.add(where)
             names[name] = name
     if not names:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -28,7 +28,7 @@ from ...frequency import (
     periodic_margins,
     with_findings,
 )
-from ...linearization import MeanSlope, linearize
+from ...linearization import MeanSlope, SignalPaths, find_signal, linearize
 from ...studies import LoopPlace, cut_places, is_zero
 from ...wiring import join
 from .. import figures
@@ -77,7 +77,7 @@ def inner(case: Case) -> Section | None:
     for key, wire in wires.items():
         part = _wire(case, key, wire)
         if part is None:
-            reasons = left_out(case, wire, blocks_on_loops(case.diagram))
+            reasons = left_out(case, wire)
             text += reasons
             absent |= {key: reasons[0]} if reasons else {}
         else:
@@ -314,14 +314,14 @@ def _poles(poles: Iterable[complex], dt: float) -> str:
 # --- tolerances, and reasons for no margins ---------------------------------------------------------------------------
 
 
-def left_out(case: Case, wire: str, on_cycles: Collection[str]) -> list[str]:
+def left_out(case: Case, wire: str) -> list[str]:
     """Return why there are no margins at a wire."""
     said: dict[str, None] = {}
     for v in case.usable():
         try:
             L = v.loop(wire)
             if is_zero(L):
-                said |= dict.fromkeys([_zero(v, wire, on_cycles)])
+                said |= dict.fromkeys([_zero(v, wire)])
             else:
                 margins(L)
         except LoopwrightError as error:
@@ -340,14 +340,13 @@ def _no_margins(wire: str, v: Variant, error: LoopwrightError) -> str:
     return TEXTS.line("not_shown", wire=wire, variant=v.title, why=why, step=error.next_step)
 
 
-def _zero(v: Variant, wire: str, on_cycles: Collection[str]) -> str:
-    names = v.diagram.names
-    block = names[wire].block if wire in names else wire.rpartition(".")[0]
-    if block not in on_cycles:
+def _zero(v: Variant, wire: str) -> str:
+    flat = v.diagram.flatten_like(v.point)
+    if not SignalPaths(flat).is_on_loop(find_signal(flat, wire).port):
         return TEXTS.line("off_loops", wire=wire)
-    flat = [finding for finding in v.model.findings if finding.remedy]
-    remedies = dict.fromkeys(finding.remedy for finding in flat)
-    return TEXTS.line("slope_is_zero", wire=wire, flat=[*map(str, flat)], remedies=[*remedies])
+    found = [finding for finding in v.model.findings if finding.remedy]
+    remedies = dict.fromkeys(finding.remedy for finding in found)
+    return TEXTS.line("slope_is_zero", wire=wire, flat=[*map(str, found)], remedies=[*remedies])
 
 
 @dataclass(frozen=True)

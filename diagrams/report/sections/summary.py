@@ -155,6 +155,7 @@ def _with_words(case: Case, result: RequirementResult) -> RequirementResult:
     place = case.loop_wires().get(result.loop, result.loop) or result.place
     place = f"{place}, with {result.detail}" if result.variant == CONTACT and place and result.detail else place
     place = f"{place}: {result.step}" if result.step else place
+    place = TEXTS.line("all_renewals", wire=place) if f".{Cut.PERIODIC}." in result.path else place
     others = {MEASURED: "measured", WORST_CASE: "worst case", CONTACT: "as it is"}
     title = variant.title if variant else others.get(result.variant, NOTHING)
     return replace(result, words=words_of(result.quantity), where=place, title=title)

@@ -6,8 +6,20 @@ import control
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, Gain, Integrator, Saturation, StateSpace, UnitConversion
-from loopwright.diagrams import Diagram, Requirements
+from loopwright.blocks import (
+    Block,
+    Constant,
+    Encoder,
+    Gain,
+    Input,
+    Integrator,
+    Output,
+    Saturation,
+    State,
+    StateSpace,
+    UnitConversion,
+)
+from loopwright.diagrams import Diagram, Requirements, subsystem
 from loopwright.diagrams.cli.report import verdict_text
 from loopwright.diagrams.report.pages.tables import Numbered
 from loopwright.diagrams.requirements import Limit, Reason, RequirementResult, Verdict, by_loop
@@ -183,6 +195,40 @@ def test_a_required_margin_that_a_loop_of_several_entries_has_not_is_open():
     assert review.verdict is not Verdict.PASSED
     asked = Requirements(disk_margin=0.05)
     assert diagram.report(only=("inner", "poles"), requirements=asked).review.verdict is Verdict.PASSED
+
+
+class Drive(Block):
+    """ẍ = 50 (u − ẋ)."""
+
+    u = Input()
+    angle = State(output=True)
+    speed = State(output=True)
+    power = Output()
+
+    def derivative(self, t, x, u):
+        return x.speed, 50.0 * (u.u - x.speed)
+
+    def output(self, t, x, u):
+        return x.speed * u.u
+
+
+def test_a_wire_that_counts_at_the_start_alone_lies_on_no_loop():
+    """Speed and power of a drive, named for a plot: limits on them stayed open, as the drive itself is in a loop.
+
+    An encoder takes the speed, at its first tick.
+    """
+    drive = Drive(name="drive")
+
+    @subsystem(sample_time=0.1, name="controller")
+    def controller(position, velocity):
+        measured, _ = Encoder(quantum=1e-6, name="encoder")(position, velocity)
+        return Gain(gain=-2.0, name="kp")(measured).named("u")
+
+    driven = drive(controller(drive.angle, drive.speed.named("omega")))
+    diagram = Diagram("loop", driven.power.named("power"))
+    review = diagram.report(only=("inner", "poles"), requirements=Requirements(phase_margin_deg=45)).review
+    margins = [result for result in review.results if result.quantity == "phase_margin_deg"]
+    assert [(result.verdict, result.loop.rpartition(".")[2]) for result in margins] == [(Verdict.PASSED, "u")]
 
 
 def test_stability_without_the_chapter_on_poles_says_that_it_was_left_out():
