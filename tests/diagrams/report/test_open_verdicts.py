@@ -221,8 +221,8 @@ def test_a_wire_that_counts_at_the_start_alone_lies_on_no_loop():
 
     @subsystem(sample_time=0.1, name="controller")
     def controller(position, velocity):
-        measured, _ = Encoder(quantum=1e-6, name="encoder")(position, velocity)
-        return Gain(gain=-2.0, name="kp")(measured).named("u")
+        measured, rate = Encoder(quantum=1e-6, name="encoder")(position, velocity)
+        return (-2.0 * measured - 0.1 * rate).named("u")
 
     driven = drive(controller(drive.angle, drive.speed.named("omega")))
     diagram = Diagram("loop", driven.power.named("power"))
