@@ -97,7 +97,7 @@ class ShownAsTable:
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        for name in ("__repr__", "_repr_html_", "_repr_svg_"):
+        for name in ("__repr__", "__str__", "_repr_html_", "_repr_svg_"):
             if name in vars(cls):
                 setattr(cls, name, _safe(vars(cls)[name]))
 
@@ -128,7 +128,7 @@ def _safe(show: Callable[[Any], str]) -> Callable[[Any], str | None]:
             return show(self)
         except Exception as error:  # whatever the object lacks
             short = f"<{type(self).__name__} that can't be shown: {type(error).__name__}>"
-            return short if show.__name__ == "__repr__" else None
+            return short if show.__name__ in ("__repr__", "__str__") else None
 
     return shown
 

@@ -39,7 +39,7 @@ def test_a_subsystem_and_a_part_of_a_diagram_are_written(file, tmp_path, capsys)
 
 
 def test_what_cannot_be_written_is_named_with_its_status(file, tmp_path, capsys):
-    assert main(["c", f"{file}:loop", "--out", str(tmp_path / "out")]) == 1
+    assert main(["c", f"{file}:loop", "--number", "float", "--out", str(tmp_path / "out")]) == 1
     assert "plant: it is in continuous time" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     assert main(["c", f"{file}:loop", "--test", "signal.csv"]) == 2

@@ -250,7 +250,7 @@ def test_processes_that_only_garbage_holds_are_ended_before_many_are_there(folde
 def test_an_idle_process_ends_after_a_while(folder, monkeypatch):
     from loopwright.fmus.isolation import pool
 
-    monkeypatch.setattr(pool, "_IDLE", 0.2)
+    monkeypatch.setattr(pool, "_IDLE_TIME", 0.2)
     end_idle()
     with pool._LOCKS[0]:  # its timer waits
         run_once(Fmu(zoo_fmu(folder, 3), name="plant", isolate=Isolation()))
