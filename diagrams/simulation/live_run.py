@@ -27,6 +27,7 @@ from ...blocks.core import (
     Sheet,
     ShownAsTable,
     SimulationError,
+    UnknownNameError,
     brief,
     count_of,
     explain_calls,
@@ -34,7 +35,7 @@ from ...blocks.core import (
 )
 from ..flat import FlatDiagram, Target, WiredDiagram
 from ..results import Run, Stopped
-from ..wiring import Structure, change_parameter, find_control
+from ..wiring import Structure, change_parameter, find_control, join
 from .run_options import ticks_in
 from .view import SimulationView
 
@@ -158,6 +159,15 @@ class Controls:
                     port="inputs",
                 )
             path, keys = find_control(table, name, diagram)
+            if not table.is_traced(path):
+                whole = join(path, ".".join(keys))
+                raise UnknownNameError(
+                    f"{name!r} is of {path}, {type(table.blocks[path]).__name__}, which takes no parameters in a run; "
+                    "expected a parameter of a block that the run evaluates. Set it before the run: "
+                    f"diagram.replace({{{whole!r}: …}}).",
+                    block=diagram,
+                    port="inputs",
+                )
             self._blocks[path] = table.blocks[path]
             self._controls.append(_Control(name, path, keys, source))
 

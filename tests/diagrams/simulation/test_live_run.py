@@ -269,6 +269,14 @@ def test_mistakes_are_refused(options, error, words):
         live(LAG, 1.0, step=T, **options)
 
 
+@pytest.mark.parametrize("start", [{}, {"mass": 1.0}], ids=["none", "given"])
+def test_parameters_of_an_fmu_are_refused_with_the_way_out(start):
+    diagram = servo(Constant(value=1.0)).replace({"plant.start": start})
+    with pytest.raises(UnknownNameError, match=r"of plant, Fmu, .* no parameters in a run.*replace\(\{'plant.start.mass': …"):
+        live(diagram, 1.0, inputs={"plant.mass": 2.0})
+    assert diagram.replace({"plant.start.mass": 2.0})["plant"].start["mass"] == 2.0
+
+
 def test_an_error_in_the_background_is_raised_by_wait():
     found = LAG.simulation(step=T).run_realtime(background=True, inputs={"u": lambda t: 1 / t})
     with pytest.raises(SimulationError, match="ZeroDivisionError"):
