@@ -272,7 +272,9 @@ def test_mistakes_are_refused(options, error, words):
 @pytest.mark.parametrize("start", [{}, {"mass": 1.0}], ids=["none", "given"])
 def test_parameters_of_an_fmu_are_refused_with_the_way_out(start):
     diagram = servo(Constant(value=1.0)).replace({"plant.start": start})
-    with pytest.raises(UnknownNameError, match=r"of plant, Fmu, .* no parameters in a run.*replace\(\{'plant.start.mass': …"):
+    with pytest.raises(
+        UnknownNameError, match=r"of plant, Fmu, .* no parameters in a run.*replace\(\{'plant.start.mass': …"
+    ):
         live(diagram, 1.0, inputs={"plant.mass": 2.0})
     assert diagram.replace({"plant.start.mass": 2.0})["plant"].start["mass"] == 2.0
 
