@@ -34,6 +34,7 @@ _BLOCKS = {
     "FromWorkspace": "the block is Recorded",
     "FromFile": "the block is Recorded",
     "Hysteresis": "the block is Relay, which switches at two points, and play is Backlash",
+    "Kalman": "the blocks are Observer.from_lqe(…) and DiscreteObserver.from_lqe(…)",
     "KalmanFilter": "the blocks are Observer.from_lqe(…) and DiscreteObserver.from_lqe(…)",
     "Lag": "the block is PT1",
     "Limiter": "the block is Saturation",

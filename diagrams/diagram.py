@@ -53,7 +53,7 @@ WAYS = {
     **dict.fromkeys(("run", "sim", "start", "execute"), "diagram.simulate(2.0)"),
     **dict.fromkeys(("scope", "plot", "show"), 'run = diagram.simulate(2.0), then run.plot("wire")'),
     **dict.fromkeys(("margin", "margins"), f"margins({_LOOP}), after from loopwright import margins"),
-    **dict.fromkeys(("bode", "nyquist", "root_locus", "pzmap", "nichols"), f"{_LOOP}, which such plots take"),
+    **{name: f"{_LOOP}.{name}()" for name in ("bode", "nyquist", "root_locus", "pzmap", "nichols")},
     "step": f"{_LOOP}.step(), which closes the loop, or a Step as the reference and diagram.simulate(2.0)",
     **dict.fromkeys(("step_info", "stepinfo"), 'diagram.simulate(2.0).step_info("wire")'),
     **dict.fromkeys(("loop", "poles", "linmod"), f"diagram.linearize(), and {_LOOP} for the loop at a wire"),

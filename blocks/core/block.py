@@ -318,8 +318,10 @@ class Block(ShownAsTable, Value, Wireable, metaclass=ShownMembers):
             return port.__get__(self)  # type: ignore[attr-defined]  # raises the port's own error: it is no signal
         if name in self.outputs:  # outputs that follow from the parameters
             return Signal(self, name)
-        known = {*self.outputs, *self.parameter_specs}
-        raise UnknownAttributeError(f"it has no output or parameter {name!r}. {near(name, known)}", block=self.label)
+        hint = near(name, {*self.outputs, *self.parameter_specs})
+        if self.outputs and not any(repr(output) in hint for output in self.outputs) and not hint.startswith("Known"):
+            hint += f" Its outputs: {', '.join(self.outputs)}."
+        raise UnknownAttributeError(f"it has no output or parameter {name!r}. {hint}", block=self.label)
 
     def __dir__(self) -> list[str]:
         outputs = {name for name in self._ipython_key_completions_() if name.isidentifier()}

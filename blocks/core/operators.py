@@ -163,6 +163,9 @@ class Operators(Generic[S]):
             "system(u)",
         )
 
+    def __round__(self, digits: int | None = None) -> NoReturn:
+        raise self._number_error("round", _INSTEAD[np.round])
+
     def __rshift__(self, other: Any) -> NoReturn:
         raise WiringError(
             "blocks are wired by calls, not by >>. Call the second block with the first: second(first).",

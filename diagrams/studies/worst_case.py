@@ -89,7 +89,7 @@ class WorstCase(ShownAsTable):
         found = enumerate_some(f"{name} = {_short(value)}" for name, value in self.worst.parameters.items())
         facts = describe(self.worst), found
         return brief(
-            f"worst of {len(self.cases)} cases", *facts, then="print(…) tells more, .diagram, .confirm(), .plot()"
+            f"worst of {len(self.cases)} cases", *facts, then="print(…) shows all, .diagram, .confirm(), .plot()"
         )
 
     @property

@@ -16,6 +16,7 @@ from loopwright.blocks import (
     SmoothStep,
     State,
     Sum,
+    TransferFunction,
     UnitError,
     UnknownNameError,
     WiringError,
@@ -198,6 +199,8 @@ def test_a_misspelt_port_offers_near_names():
     with pytest.raises(UnknownNameError, match=r"gain: it has no output or parameter 'gian'.*Did you mean 'gain'"):
         _ = Gain(gain=1.0).gian
     assert not hasattr(Gain(gain=1.0), "velocty")
+    with pytest.raises(UnknownNameError, match=r"motor: it has no output or parameter 'out'.*Its outputs: y\.$"):
+        _ = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="motor").out
 
 
 def test_a_source_names_its_wire():
@@ -216,6 +219,7 @@ def test_a_source_names_its_wire():
         (np.floor, r"np.floor can't be applied to a signal: its values come with the run. It jumps, where a solver"),
         (np.sign, r"Write (u > 0.0) - (u < 0.0), whose"),
         (np.round, r"Use Quantizer(quantum=1.0)(u)"),
+        (round, r"Use Quantizer(quantum=1.0)(u)"),
         (lambda y: np.interp(y, [0, 1], [0, 1]), r"Use Lookup1D(breakpoints=…, values=…)(u)"),
         (np.shape, r"Its shape follows when the diagram is built"),
         (lambda y: np.sin(y, out=np.zeros(1)), r"np.sin can't be applied to a signal"),
