@@ -183,7 +183,7 @@ class Run(ShownAsTable):
         facts = (
             count_of(len(t), "sample") + span,
             count_of(len(names), "signal") + (f" (named: {enumerate_some(wires)})" if wires else ""),
-            self.tier,
+            "interpreted, then compiled" if self.tier == "both" else self.tier,
             f"stopped at {self.stopped.t:.9g} s by {self.stopped.block}" if self.stopped is not None else "",
             count_of(len(self.events), "event") if self.events else "",
             count_of(len(self.messages), "message") if self.messages else "",

@@ -1,5 +1,7 @@
 """Short texts of results: a cell of a notebook shows the kind, the facts that matter, and next steps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ def test_texts_of_a_run_say_its_samples_and_next_steps(run):
     found = repr(run)
     assert found.startswith("<run of 'drive': 101 samples from 0 to 2 s, 10 signals (named: y, u, e), interpreted; ")
     assert "run['y']" in found
+    assert "), interpreted, then compiled; " in repr(replace(run, tier="both"))
     assert repr(run.at(1.0)).startswith("<instant t = 1 s of 'drive': 10 signals, 7 states; ")
     assert repr(run.final_state) == (
         "<state of a run of 'drive': t = 2 s, tick 100 of 0.02 s; diagram.simulate(…, start=state)>"
