@@ -14,7 +14,7 @@ from ..wiring import Checked, Order, Structure, join, stepped_blocks
 from .clocks import TickPattern
 from .flat_diagram import FlatDiagram
 from .flat_layout import FlatEvent, StateLayout, sample_time_of
-from .plant_ticks import own_step
+from .plant_ticks import own_step, suggested_step
 
 _BLOCKS_FOR_ONE_THREAD = 300
 """Blocks from which on it pays to limit BLAS to one thread, which takes some 20 ms."""
@@ -190,9 +190,12 @@ def _clocks(table: Structure, step: Fraction | None, name: str) -> tuple[Fractio
     base = step
     if base is None:
         if not used and not own:
+            asked = [size for plant in stepped_blocks(table).values() if (size := suggested_step(plant))]
+            said = f"{min(asked):g}" if asked else "1e-3"
+            why = ", which an FMU's default experiment has" if asked else ""
             raise SampleTimeError(
-                "no subsystem has a sample time, so there is no clock. Give simulate(…, step=1e-3), or a "
-                "@subsystem(sample_time=1e-3).",
+                f"no subsystem has a sample time, so there is no clock. Give simulate(…, step={said}){why}, or a "
+                f"@subsystem(sample_time={said}).",
                 block=name or None,
             )
         times = [*own.values(), *(t for c in used.values() for t in (c.sample_time, c.offset) if t)]

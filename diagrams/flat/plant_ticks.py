@@ -51,6 +51,12 @@ def own_step(plant: Block) -> Fraction | None:
     return None if found is None else exact_time(found, block=plant.label)
 
 
+def suggested_step(plant: Block) -> float | None:
+    """Return the communication step in s of a plant's default experiment; None where it has none above 0."""
+    found = getattr(getattr(plant, "description", None), "step_size", None)
+    return found if found is not None and 0.0 < found < math.inf else None
+
+
 def find_plant_ticks(
     table: Structure, clocks: Mapping[str, TickPattern], base: Fraction, *, every: bool
 ) -> dict[str, tuple[TickPattern, ...]]:

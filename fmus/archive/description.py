@@ -107,6 +107,8 @@ class FmuDescription(ShownAsTable):
     of it."""
     stop_time: float | None = None
     """End of the default experiment in s, beyond which some FMUs take no step unless they are told a later one."""
+    step_size: float | None = None
+    """Communication step of the default experiment in s."""
     dependencies: Feedthrough = field(default_factory=dict)
     """Variables that each output depends on, as the model structure says."""
     states: dict[str, str] = field(default_factory=dict)
@@ -480,6 +482,7 @@ def _capabilities(root: Any, version: str) -> dict[str, Any]:
         "variable_step": _flag(steps, "canHandleVariableCommunicationStepSize"),
         "fixed_internal_step": None if fixed is None else float(fixed),
         "stop_time": None if experiment is None else _number(experiment.get("stopTime")),
+        "step_size": None if experiment is None else _number(experiment.get("stepSize")),
         "model_exchange": None if exchange is None else exchange.get("modelIdentifier"),
         "model_exchange_has_derivatives": _flag(exchange, derivative),
     }

@@ -12,6 +12,7 @@ from loopwright.blocks import (
     DoubleDriveError,
     Gain,
     Input,
+    Integrator,
     Output,
     ParameterError,
     SampleTimeError,
@@ -31,7 +32,8 @@ from loopwright.blocks import (
     parameter,
 )
 from loopwright.diagrams import AlgebraicLoopError, Diagram, DuplicateNameError, experiments, subsystem
-from loopwright.fmus import gantry
+from loopwright.fmus import Fmu, gantry
+from support.closed_form import closed_form_fmu
 
 
 class Lag(Block):
@@ -383,6 +385,19 @@ def test_a_float_sample_time_is_its_shortest_decimal():
         return Gain(gain=1)(u)
 
     assert box.sample_time == Fraction(7, 10000)
+
+
+def test_without_a_clock_the_step_that_an_fmu_suggests_is_named(tmp_path):
+    """An exported controller of 0.4 ms beside blocks in continuous time; 1e-3 would have given its inputs late."""
+    file = closed_form_fmu(
+        tmp_path,
+        3,
+        "dx[0] = u[0] - x[0]; y[0] = x[0];",
+        description=[("<ModelVariables>", '<DefaultExperiment stepSize="4e-4"/><ModelVariables>')],
+    )
+    plant = Fmu(file, name="plant")
+    with pytest.raises(SampleTimeError, match=r"step=0\.0004\), which an FMU's default experiment has"):
+        Diagram("d", Integrator()(plant(u1=1.0))).simulate(1.0, progress=False)
 
 
 def test_no_clock_at_all():
