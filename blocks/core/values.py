@@ -245,7 +245,7 @@ def convert(value: Any, spec: ParameterSpec, owner: str, name: str) -> Any:
         try:
             result = np.array(value, dtype=float)
         except (TypeError, ValueError):
-            raise error(shorten(value), "rows of one length" if _is_ragged(value) else "numbers") from None
+            raise error(shorten(value), _expected_numbers(value)) from None
         if spec.shape is not None:
             try:
                 result = np.array(np.broadcast_to(result, spec.shape))
@@ -275,11 +275,15 @@ def convert(value: Any, spec: ParameterSpec, owner: str, name: str) -> Any:
     return result
 
 
-def _is_ragged(value: Any) -> bool:
-    """Whether a value is a list of rows of numbers that differ in length."""
-    if not isinstance(value, list | tuple) or not all(isinstance(row, list | tuple | np.ndarray) for row in value):
-        return False
-    return len({len(row) for row in value}) > 1
+def _expected_numbers(value: Any) -> str:
+    """Return what is expected in place of a value that is no array of numbers."""
+    if not isinstance(value, list | tuple):
+        return "numbers"
+    if any(isinstance(part, np.ndarray) and part.ndim == 2 for part in value):
+        return "one matrix: of the several that a function of python-control returns, give the first, [0]"
+    if not all(isinstance(row, list | tuple | np.ndarray) for row in value):
+        return "numbers"
+    return "rows of one length" if len({len(row) for row in value}) > 1 else "numbers"
 
 
 _FLOAT = frozenset({"float", "None"})

@@ -46,13 +46,15 @@ def check_files(path: str | os.PathLike[str] | None, *, pdf: bool, json: bool, p
     """Find out, before anything is computed, whether the files of a report can be written."""
     if path is None:
         if pdf or json:
-            raise OptionError('a PDF or JSON stands beside the page; give its path, such as "fig3.html".', port="path")
+            raise OptionError(
+                'a PDF or JSON is written next to the page; give a path, such as "fig3.html".', port="path"
+            )
         return
     file = Path(path).expanduser()
     if file.suffix.lower() not in (".html", ".htm"):
         step = f" Name it {file.stem}.html."
         if file.suffix.lower() in (".pdf", ".json"):
-            step = f" Name it {file.stem}.html, and ask for the {file.suffix[1:].upper()} beside it."
+            step = f" Name it {file.stem}.html, and ask for the {file.suffix[1:].upper()} next to it."
         raise OptionError(f"found {str(path)!r}; expected a file that ends in .html.{step}", port="path")
     check_file(path)
     if pdf:

@@ -31,6 +31,15 @@ FORMS = ("predictor", "current")
 # --- gains -------------------------------------------------------------------------------------------------------------
 
 
+def test_all_that_lqr_returns_is_no_gain_and_the_error_says_which_part_is():
+    found = control.lqr(PLANT, Q, R)
+    with pytest.raises(
+        ParameterError, match=r"StateFeedback\.gain: found .*; expected one matrix: .* give the first, \[0\]"
+    ):
+        StateFeedback(found)
+    np.testing.assert_array_equal(StateFeedback(found[0]).gain, found[0])
+
+
 def test_gains_solve_the_riccati_equations():
     P = solve_continuous_are(A, B, Q, R)
     np.testing.assert_allclose(StateFeedback.from_lqr(PLANT, Q, R).gain, np.linalg.solve(R, B.T @ P), rtol=1e-9)

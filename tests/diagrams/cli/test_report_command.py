@@ -109,7 +109,7 @@ def test_a_diagram_of_a_users_file(what, folder, asked):
         (["nowhere.py:loop"], "there is no file"),
         (["loop.py:loop", "--option", "delay=1"], "it is for experiments"),
         (["--option", "dealy=1"], "no experiment has such an option"),
-        (["--out", "fig3.pdf"], "ask for the PDF beside it"),
+        (["--out", "fig3.pdf"], "ask for the PDF next to it"),
         (["--out", "nowhere/fig3.html"], "there is no folder"),
         (["--plant", "nowhere.fmu"], "nowhere.fmu"),
     ],

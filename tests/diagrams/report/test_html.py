@@ -397,7 +397,7 @@ def test_without_the_library_a_pdf_says_what_to_install(monkeypatch):
 @pytest.mark.parametrize(
     ("path", "message"),
     [
-        ("x.pdf", r"Name it x\.html, and ask for the PDF beside it"),
+        ("x.pdf", r"Name it x\.html, and ask for the PDF next to it"),
         ("x.txt", r"Name it x\.html\."),
         ("nowhere/x.html", "there is no folder 'nowhere'"),
     ],
