@@ -47,7 +47,7 @@ def check_files(path: str | os.PathLike[str] | None, *, pdf: bool, json: bool, p
     if path is None:
         if pdf or json:
             raise OptionError(
-                'a PDF or JSON is written next to the page; give a path, such as "fig3.html".', port="path"
+                'a PDF or JSON is written next to the page; give its path, such as "fig3.html".', port="path"
             )
         return
     file = Path(path).expanduser()
