@@ -172,7 +172,8 @@ def open_part(wired: WiredDiagram, path: str, name: str) -> OpenDiagram:
 def open_whole(wired: WiredDiagram, outside: Sequence[str], name: str) -> OpenDiagram:
     """Return a diagram without some of its blocks, such as the plant or a source, whose place is outside.
 
-    What they put out are its inputs, and what they read its outputs; if they read nothing, the named wires are.
+    What they put out are its inputs, and what they read its outputs; if they read nothing, the named wires are, and
+    without any the outputs of blocks that nothing reads.
 
     Parameters
     ----------
@@ -225,7 +226,7 @@ def open_whole(wired: WiredDiagram, outside: Sequence[str], name: str) -> OpenDi
     opened = WiredDiagram(name, table, wired.loops, wired.facade_class)
     scheduled = opened.scheduled
     outputs = {key: scheduled.results["", key] for key in read} or dict(scheduled.names)
-    outputs = {n: w for n, w in outputs.items() if w.block != _OUTSIDE}
+    outputs = {n: w for n, w in outputs.items() if w.block != _OUTSIDE} or _unread(opened)
     outputs = _apart(outputs, [p[0] for p in ports], "")
     return OpenDiagram(opened, _OUTSIDE if ports else "", outputs, states=start.states)
 
@@ -295,6 +296,14 @@ def _apart(outputs: Mapping[str, Wire], inputs: Collection[str], inside: str) ->
             taken.add(label)
         found[label] = wire
     return found
+
+
+def _unread(opened: WiredDiagram) -> dict[str, Wire]:
+    """Return the outputs of blocks that no wire leads from, by their paths."""
+    table = opened.scheduled
+    read = {(wire.block, wire.port) for wire in (*table.wires.values(), *table.controls.values())}
+    ports = [(p, q) for p, q in opened.checked.shapes if p != _OUTSIDE and (p, q) not in read]
+    return {join(p, q): Wire(p, q) for p, q in ports}
 
 
 def choose_outputs(opened: OpenDiagram, outputs: tuple[str, ...] | None) -> OpenDiagram:

@@ -254,3 +254,14 @@ def test_names_have_letters_of_all_alphabets(fmi, tmp_path):
     item.step(0.0, 0.5, **{"κ.gain": 4.0})
     assert item["θ"] == 6.0
     item.free()
+
+
+def test_a_diagram_without_names_puts_out_what_nothing_reads(tmp_path):
+    """It had no output at all; y = 3 (1 − exp(−t/2))."""
+    lag = TransferFunction(numerator=[1.0], denominator=[2.0, 1.0], name="lag")
+    diagram = Diagram("plain", Gain(gain=3.0, name="thrice")(lag(Constant(value=1.0, name="one"))))
+    item = open_instance(build(diagram, tolerance=1e-9), tmp_path).initialize()
+    assert item["thrice.y"] == 0.0
+    item.step(0.0, 1.0)
+    assert item["thrice.y"] == pytest.approx(3.0 * (1.0 - np.exp(-0.5)), rel=1e-7)
+    item.free()
