@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -119,6 +120,32 @@ class Plants:
             if not block.description.states
             for port, moved in output_drift(changed.get(path, block), points[path], self.h).items()
         }
+
+    def find_unmoved(
+        self,
+        xp: np.ndarray,
+        z: np.ndarray,
+        residuals: Mapping[str, float],
+        changed: Mapping[str, Fmu],
+        tolerance: float,
+    ) -> list[str]:
+        """Return the paths of FMUs because of which a search has ended: they list no states, and hide a memory.
+
+        Their outputs are off in the equations, and move with held inputs, or follow no input within a step.
+        """
+        found, points = [], self.points(xp, z, changed)
+        for path, block in self.blocks.items():
+            mine = plant_entries(self.flat, path)[1]
+            off = [i for i in mine if not residuals.get(self.flat.plant_outputs.labels[i], 0.0) <= tolerance]
+            if block.description.states or not off:
+                continue
+            now = changed.get(path, block)
+            with suppress(FmuError):  # the residuals alone are said of an FMU that can't be run on from there
+                model, _ = self._evaluate_one(path, now, xp, z)
+                moved = output_drift(now, points[path], self.h)
+                if not max(moved.values()) <= tolerance or not model.D.any():
+                    found.append(path)
+        return found
 
     def change_blocks(self, free: list[Free], q: list[np.ndarray]) -> dict[str, Fmu]:
         """Return the FMUs with free parameters, with these values of them, by path."""
@@ -252,6 +279,13 @@ def differentiate_by(
     return columns
 
 
+RUN_INSTEAD = (
+    "Run there instead: once a run has settled, diagram.operating_point(t) is its point, and linearize(t) and at=t "
+    "take it; or export the FMU with its derivatives listed."
+)
+"""The next step where an FMU lists no states."""
+
+
 def check_drift(drift: Mapping[str, float], tolerance: float, name: str, t: float) -> None:
     """Refuse a point at which an FMU that lists no states moves: nothing in the equations could let it rest."""
     moved = {port: value for port, value in drift.items() if not value <= tolerance}
@@ -260,7 +294,7 @@ def check_drift(drift: Mapping[str, float], tolerance: float, name: str, t: floa
         raise SimulationError(
             "no operating point was found: an FMU lists no states in its description, so a trim can't let them rest, "
             f"and with its inputs held its outputs move, relative to 1 + their size, by {shown}; expected at most "
-            f"{tolerance:g}. Run to rest with operating_point(t), or export the FMU with its derivatives listed.",
+            f"{tolerance:g}. {RUN_INSTEAD}",
             block=name,
             t=t,
         )

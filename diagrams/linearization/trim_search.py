@@ -44,7 +44,7 @@ from ..results import FreeDirection, OperatingPoint, PointOrigin, layout_of
 from .exchanged import evaluators_at
 from .operating_points import PointLike, copy_point, operating_point, values_of, with_residual
 from .start_branches import leave_start
-from .trim_plants import ExchangedPlants, Plants, check_drift
+from .trim_plants import RUN_INSTEAD, ExchangedPlants, Plants, check_drift
 from .trim_request import Free, Target, free_parameters, index_states, read_targets, set_states
 
 UNDETERMINED = 1e-10
@@ -407,10 +407,19 @@ def _solve_trim(
         shown = "; ".join(f"{name}: {value:.3g}" for name, value in list(residuals.items())[:5])
         stuck = [f.name for f, v in zip(parameters, q, strict=True) if f.is_at_bound(v)]
         advice = f"{', '.join(stuck)} is at its bound. " if stuck else ""
+        advice += "Free more parameters or states, widen bounds, begin nearer with at=…, or take the nearest point "
+        advice += "with tolerance=…."
+        changed, z = equations.plants.change_blocks(parameters, q), equations.residual_at(unknown)[2]
+        if hidden := equations.plants.find_unmoved(xp, z, residuals, changed, tolerance):
+            said = (
+                "FMUs list no states in their descriptions"
+                if len(hidden) > 1
+                else "FMU lists no states in its description"
+            )
+            advice = f"The {said} ({', '.join(hidden)}), so a trim can't move the outputs to their rest. {RUN_INSTEAD}"
         raise SimulationError(
             f"no operating point was found: relative to 1 + their size, these equations have the residuals {shown}; "
-            f"expected at most {tolerance:g}. {advice}Free more parameters or states, widen bounds, begin nearer with "
-            "at=…, or take the nearest point with tolerance=….",
+            f"expected at most {tolerance:g}. {advice}",
             block=diagram.name,
             t=guess.t,
         )

@@ -53,3 +53,18 @@ def test_an_fmu_that_stays_is_at_rest_and_says_that_its_states_are_not_judged(ca
     assert point.residual == 0.0
     assert point.unjudged == ("plant",)
     assert make(step, u).operating_point(0.01, step=0.01).unjudged == ("plant",)
+
+
+@pytest.mark.parametrize("step", ["c->y + h * (c->u - c->y)", "c->y"], ids=["lag", "constant"])
+def test_targets_that_hidden_states_keep_away_name_them_and_a_run(cache, make, step):
+    """y = 2 has a rest at u = 2 for the lag, which one step from y = 0 doesn't show: u would have to be 2000."""
+    loop = make(step)
+    with pytest.raises(SimulationError, match=r"The FMU lists no states .*\(plant\).*operating_point\(t\)") as e:
+        loop.trim({"input.value": (0.0, 10.0)}, {"plant.y": 2.0})
+    assert "widen bounds" not in str(e.value)
+
+
+def test_a_target_that_a_static_fmu_misses_at_a_bound_is_answered_with_the_bounds(cache, make):
+    with pytest.raises(SimulationError, match="input.value is at its bound. Free more") as e:
+        make("2.0 * c->u").trim({"input.value": (0.0, 1.5)}, {"plant.y": 4.0})
+    assert "lists no states" not in str(e.value)
