@@ -17,6 +17,7 @@ from .errors import (
     UnknownNameError,
     UnwiredInputError,
     WiringError,
+    close_names,
     near,
 )
 from .ports import Event, Input, Output, Port, PortUnit, State, check_port_names
@@ -318,8 +319,9 @@ class Block(ShownAsTable, Value, Wireable, metaclass=ShownMembers):
             return port.__get__(self)  # type: ignore[attr-defined]  # raises the port's own error: it is no signal
         if name in self.outputs:  # outputs that follow from the parameters
             return Signal(self, name)
-        hint = near(name, {*self.outputs, *self.parameter_specs})
-        if self.outputs and not any(repr(output) in hint for output in self.outputs) and not hint.startswith("Known"):
+        known = {*self.outputs, *self.parameter_specs}
+        hint, close = near(name, known), close_names(name, sorted(known))
+        if self.outputs and close and not any(output in close for output in self.outputs):
             hint += f" Its outputs: {', '.join(self.outputs)}."
         raise UnknownAttributeError(f"it has no output or parameter {name!r}. {hint}", block=self.label)
 
