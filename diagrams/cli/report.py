@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +21,17 @@ from ...blocks.core import (
 )
 from ..diagram import Diagram
 from ..paper import Experiment
-from ..requirements import STUDIES, Requirements, Review, TomlFile, Verdict, explain, read_requirements
+from ..requirements import (
+    STUDIES,
+    Reason,
+    RequirementResult,
+    Requirements,
+    Review,
+    TomlFile,
+    Verdict,
+    explain,
+    read_requirements,
+)
 from ..simulation import work_notes
 from .subjects import open_subject
 from .text import say
@@ -39,6 +50,8 @@ EXIT_STATUS = {Verdict.PASSED: 0, Verdict.FAILED: 3, Verdict.UNDECIDED: 4}
 """Exit status of ``--check``."""
 NARROW = "\u202f"
 """Narrow space between a number and its unit on the page."""
+TRIM = "trim"
+"""Word of ``--at`` for a point at which all is at rest."""
 DEFAULT = "B"
 """The experiment whose Fig. 3 is taken: both admittances are in it."""
 
@@ -54,7 +67,9 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "DIAGRAM is an experiment of the paper (A, B, C or D; B without one: Fig. 3 with both admittances)\n"
         "or FILE.py:NAME, a diagram of yours, or a function without arguments that returns one.",
         epilog="examples:\n  loopwright report loop.py:loop --out loop.html --pdf\n"
-        "  loopwright report loop.py:loop --requirements loop.toml --check\n  loopwright report C --option delay=1\n\n"
+        "  loopwright report loop.py:loop --requirements loop.toml --check\n"
+        "  loopwright report loop.py:loop --requirements loop.toml --check --at trim\n"
+        "  loopwright report C --option delay=1\n\n"
         "options of the experiments: as in loopwright run --help\n\n"
         "exit status:\n  0    done; with --check: all requirements are met\n"
         "  1    the analysis failed, or a plant could not be built; nothing is written\n"
@@ -63,6 +78,13 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "  130  interrupted (Ctrl-C); nothing is written",
     )
     report.add_argument("diagram", nargs="?", metavar="DIAGRAM", help="A, B, C, D, or FILE.py:NAME")
+    report.add_argument(
+        "--at",
+        type=_parse_at,
+        metavar="trim|SECONDS",
+        help="the operating point: trim for the one at rest that diagram.trim() finds, or the time in s to which the "
+        "diagram is run (default: the start)",
+    )
     report.add_argument("--out", metavar="FILE.html", help="the page (default: fig3.html, or the diagram's name)")
     report.add_argument("--pdf", action="store_true", help="the same as PDF next to it (pip install 'loopwright[pdf]')")
     report.add_argument("--json", action="store_true", help="all numbers as JSON next to it")
@@ -170,6 +192,8 @@ def report_command(arguments: argparse.Namespace) -> int:
     say(f"Written: {'  '.join(map(str, files))}")
     if report.review is not None:
         say(verdict_text(report.review))
+        if arguments.at != TRIM and any(_asks_for_rest(result) for result in report.review.of(Verdict.UNDECIDED)):
+            say("  Here, diagram.trim(…) is --at trim; --at SECONDS is a point that a run reaches.")
     return EXIT_STATUS[report.review.verdict] if arguments.check and report.review is not None else 0
 
 
@@ -229,6 +253,24 @@ def _read_measured(given: Sequence[str]) -> dict[str, Any]:
     return found
 
 
+def _parse_at(text: str) -> str | float:
+    """Return the operating point that was given as a text: `TRIM`, or a time in s."""
+    if text == TRIM:
+        return text
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value >= 0.0):
+        raise argparse.ArgumentTypeError(f"found {text!r}; expected trim, or a time in s that is not negative")
+    return value
+
+
+def _asks_for_rest(result: RequirementResult) -> bool:
+    """Return whether a requirement is open as its operating point moves."""
+    return result.reason is Reason.MOVING or "diagram.trim(" in explain(result)
+
+
 def verdict_text(reviewed: Review) -> str:
     """Return the verdict as lines of text: all requirements that are not met, by the paths of their numbers."""
     from ..report import quantity
@@ -259,6 +301,7 @@ def _analyse(
 
     made = analyse(
         diagram,
+        at=diagram.trim() if arguments.at == TRIM else arguments.at,
         experiment=experiment,
         stairs=arguments.stairs,
         requirements=asked,

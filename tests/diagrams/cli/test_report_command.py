@@ -1,6 +1,7 @@
 """The command ``loopwright report``."""
 
 import json
+import math
 import re
 import shlex
 from pathlib import Path
@@ -31,12 +32,38 @@ def broken():
     raise RuntimeError("no such thing")
 """
 
+TANK = """
+import numpy as np
+from loopwright.blocks import PID, Block, Constant, Input, Integrator, State
+from loopwright.diagrams import Diagram
+
+
+class Tank(Block):
+    inflow = Input()
+    level = State(start=1.0, output=True)
+
+    def derivative(self, t, x, u):
+        return u.inflow - 0.5 * np.sqrt(x.level)
+
+
+tank, law = Tank(name="tank"), PID(kp=2.0, ki=1.0, name="pid")
+filled = Diagram("filled", tank(law(Constant(value=4.0, name="wish"), tank.level).named("inflow")))
+never = Diagram("never", Integrator(name="ramp")(Constant(value=1.0, name="one")))
+"""
+"""A tank with the outflow of Torricelli, which is filled from a level of 1 to 4."""
+
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "loop.py").write_text(LOOP, encoding="utf-8")
     return tmp_path
+
+
+@pytest.fixture
+def tank(folder):
+    (folder / "tank.py").write_text(TANK, encoding="utf-8")
+    return folder
 
 
 @pytest.fixture
@@ -81,6 +108,39 @@ def test_flags_choose_the_pages(folder, asked, flags, summary, appendix):
     assert (options["summary"], options["appendix"]) == (summary, appendix)
 
 
+def test_the_operating_point_is_at_rest_or_that_of_a_time(tank, asked):
+    assert main(["report", "tank.py:filled", "--at", "trim"]) == 0
+    assert main(["report", "tank.py:filled", "--at", "400"]) == 0
+    assert main(["report", "tank.py:filled"]) == 0
+    trimmed, later, first = (options["at"] for _, options in asked)
+    assert trimmed.values["tank.level"] == pytest.approx(4.0, abs=1e-8)  # the wish
+    assert trimmed.values["pid.u"] == pytest.approx(1.0, abs=1e-8)  # the outflow, 0.5 √4
+    assert (later, first) == (400.0, None)
+
+
+def test_a_diagram_that_is_never_at_rest_writes_nothing(tank, asked, capsys):
+    assert main(["report", "tank.py:never", "--at", "trim"]) == 1
+    assert "no operating point" in capsys.readouterr().err
+    assert asked == []
+    assert not (tank / "never.html").exists()
+
+
+@pytest.mark.slow
+def test_a_loop_that_starts_away_from_rest_is_judged_where_it_rests(tank, capsys):
+    (tank / "limits.toml").write_text("phase_margin_deg = [60, 90]\n", encoding="utf-8")
+    command = ["report", "tank.py:filled", "--requirements", "limits.toml", "--check", "--json", "--summary"]
+    assert main(command) == 4
+    assert "diagram.trim(…) is --at trim" in capsys.readouterr().out
+    assert main([*command, "--at", "trim"]) == 0
+    assert "--at" not in capsys.readouterr().out
+    made = json.loads((tank / "filled.json").read_text(encoding="utf-8"))
+    found = made["inner"]["inflow"]["continuous"]["phase_margin_deg"]["value"]
+    # L = (2 s + 1)/(s (s + 1/8)), as d(0.5 √h)/dh = 1/8 at h = 4; |L| = 1 where w⁴ + (1/64 − 4) w² − 1 = 0
+    b = 1 / 64 - 4
+    w = math.sqrt((-b + math.sqrt(b * b + 4)) / 2)
+    assert found == pytest.approx(180 + math.degrees(math.atan(2 * w) - math.pi / 2 - math.atan(8 * w)), abs=1e-6)
+
+
 def test_options_reach_the_experiment(folder, asked):
     assert main(["report", "c", "--option", "delay=1", "--out", "c.html"]) == 0
     ((_, options),) = asked
@@ -110,6 +170,8 @@ def test_a_diagram_of_a_users_file(what, folder, asked):
         (["loop.py:loop", "--option", "delay=1"], "it is for experiments"),
         (["--option", "dealy=1"], "no experiment has such an option"),
         (["--out", "fig3.pdf"], "ask for the PDF next to it"),
+        (["loop.py:loop", "--at", "rest"], "found 'rest'; expected trim, or a time in s"),
+        (["loop.py:loop", "--at", "-1"], "found '-1'; expected trim, or a time in s"),
         (["--out", "nowhere/fig3.html"], "there is no folder"),
         (["--plant", "nowhere.fmu"], "nowhere.fmu"),
     ],
@@ -171,6 +233,6 @@ def test_the_commands_of_the_page_on_reports_are_understood():
     text = (Path(__file__).parents[3] / "docs" / "howto" / "reports.md").read_text(encoding="utf-8")
     lines = [line for part in re.findall(r"```sh\n(.*?)```", text, re.DOTALL) for line in part.splitlines()]
     commands = [shlex.split(line, comments=True)[1:] for line in lines]
-    assert len(commands) == 5
+    assert len(commands) == 6
     for command in commands:
         assert _make_parser().parse_args(command).command == "report"
