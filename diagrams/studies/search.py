@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, OptionError, UnknownArgumentError
+from ...blocks.core import LoopwrightError, OptionError, PeriodicLoopError, UnknownArgumentError
 from ..flat import WiredDiagram
 from ..frequency import Number, find_hidden_unstable, margin_slopes, order_key, realize
 from ..linearization import (
@@ -71,6 +71,7 @@ class Study:
         self._asked: dict[int, tuple[WiredDiagram, OperatingPoint]] = {}
         self._places: list[tuple[np.ndarray, list[StudyCase]]] = []  # in the ranges, with their cases
         self.has_no_loop = False  # at a wire of the diagram as it is
+        self.periodic: str | None = None  # a wire of it at which its loop is periodic
 
     # --- cases --------------------------------------------------------------------------------------------------------
 
@@ -119,8 +120,11 @@ class Study:
         """Return the loops of the diagram as it is, and note where it has none."""
         try:
             return {wires: base.loop(*wires) for wires in self.goal.loops}
-        except LoopwrightError:
+        except LoopwrightError as error:
             self.has_no_loop = True
+            if isinstance(error, PeriodicLoopError) and len(self.goal.loops) == 1:
+                ((self.periodic, *others),) = self.goal.loops
+                self.periodic = None if others else self.periodic
             raise
 
     def _take(self, case: StudyCase, measure: Measure, number: Number) -> StudyCase:

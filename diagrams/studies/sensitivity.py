@@ -13,6 +13,7 @@ import numpy as np
 from ...blocks.core import (
     Grid,
     LoopwrightError,
+    PeriodicLoopError,
     Sheet,
     ShownAsTable,
     UnknownNameError,
@@ -37,6 +38,7 @@ from ..linearization import (
 from ..plotting import BLUE, DARK, VERMILION, shown_figure
 from ..results import OperatingPoint
 from .loop_places import place_loops
+from .measures import write_open_loop
 from .parameters import check_parameters, list_parameters, unit_of
 
 if TYPE_CHECKING:
@@ -271,7 +273,16 @@ def find_sensitivities(
 
     point = find(diagram) if find is not None else carry_point(whole, at, diagram)
     model = linearize(diagram, point, plants=plants, stairs=stairs, **options)
-    return sensitivities_of(model, tuple(wires), parameters, find=find, delay=delay, skew=skew)
+    try:
+        return sensitivities_of(model, tuple(wires), parameters, find=find, delay=delay, skew=skew)
+    except PeriodicLoopError as error:
+        if len(wires) == 1 and wires[0] in ([loop] if isinstance(loop, str) else list(loop)):
+            way = write_open_loop(wires[0], "phase_margin_deg", at)
+            error.add(
+                f" Sensitivities take neither: take differences of f = {way}, such as f(diagram.replace({{…}})), or "
+            )
+            error.add("worst_case({…}, quantity=f).")
+        raise
 
 
 def sensitivities_of(

@@ -30,7 +30,7 @@ from ..sweeps import Box, Samples, read_samples
 from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe, make_goal
 from .confirmation import RunConfirmation, confirm_case
 from .loop_places import OtherCuts, place_loops
-from .measures import ContactMeasure, FunctionMeasure, Measure
+from .measures import ContactMeasure, FunctionMeasure, Measure, write_open_loop
 from .parameters import check_parameters
 from .search import Study
 from .worst_case_plot import plot_cases
@@ -252,7 +252,7 @@ def find_worst_case(
     **options: Any,
 ) -> WorstCase:
     """Return the worst case of a loop's numbers over ranges of parameters; see `Diagram.worst_case`."""
-    whole, others = diagram, dict[str, OtherCuts]()
+    whole, others, given_loop = diagram, dict[str, OtherCuts](), loop
     measure = _make_measure(diagram, loop, quantity, requirements, contact, options)
     if quantity is None and requirements is None and measure is None:
         quantity = "disk_margin"
@@ -275,8 +275,15 @@ def find_worst_case(
     study = Study(diagram, goal, boxes, places, delay, options, progress or (lambda text: None), measure)
     nominal = study.run({}, CaseOrigin.NOMINAL)
     if all(case.state is CaseState.FAILED for case in nominal):
+        way_out = "Mend that first."
+        if study.periodic is not None and study.periodic == given_loop:
+            name = next(iter(goal.loops[study.periodic,]))
+            way_out = (
+                "A worst case takes a loop at its own rate as a function: leave loop out, and give "
+                f"quantity={write_open_loop(study.periodic, name, points if at is None else at)}."
+            )
         raise OptionError(
-            f"the diagram as it is can't be analysed: {nominal[0].reason} Mend that first.",
+            f"the diagram as it is can't be analysed: {nominal[0].reason} {way_out}",
             block=diagram.name,
             port="loop" if study.has_no_loop else "",
         )
