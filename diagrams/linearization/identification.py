@@ -38,6 +38,8 @@ PULSE = 1e-2
 """Size of a pulse, relative to the larger of an input's nominal value and its value."""
 STILL = 1e-10
 """Change over a step below which an output is constant, relative to 1 + its size."""
+NEAR_REST, NEAR_0 = 1e-6, 1e-9
+"""How near outputs are to those at rest: relative to their size, and to 1 + the largest output's size."""
 WATCHED = 10
 """Steps over which the outputs of an FMU without listed states are watched in a trim."""
 FEW, ALIKE = 4, 0.1
@@ -124,15 +126,8 @@ def _identify(
     runner = _Runner(block, point, h)
     try:
         y0 = runner.settle()
-        if outputs is not None and not np.allclose(
-            y0, outputs, rtol=1e-6, atol=1e-9 * (1.0 + np.max(np.abs(y0), initial=0.0))
-        ):
-            raise FmuError(
-                f"by its responses alone it can be linearized only where it comes to rest by itself from its start "
-                f"values: found the outputs {y0.tolist()} there; expected those of the operating point, "
-                f"{np.ravel(outputs).tolist()}. Give the FMU start values of that point, or choose a point at rest.",
-                block=block.label,
-            )
+        if outputs is not None:
+            _check_rest(y0, outputs, block)
         runner.check_restoring(y0)
         G, noise = _measure_markov(runner, samples)
     finally:
@@ -145,6 +140,24 @@ def _identify(
         Derivation(DerivativeMethod.IDENTIFIED, order=len(A), restarted=runner.rest.lied),
     )
     return IdentifiedStep(A, B, C, y0, states, sigma, derivation, error)
+
+
+def _check_rest(y0: np.ndarray, outputs: np.ndarray, block: Fmu) -> None:
+    """Refuse an operating point whose outputs are others than those at which the FMU comes to rest, ``y0``."""
+    wanted = np.ravel(np.asarray(outputs, dtype=float))
+    nearest = NEAR_REST * np.abs(wanted) + NEAR_0 * (1.0 + np.max(np.abs(y0), initial=0.0))
+    off = np.abs(y0 - wanted)
+    if np.all(off <= nearest):
+        return
+    i = int(np.nanargmax(np.where(np.isnan(off), np.inf, off / nearest)))
+    layout = Layout.of({port: spec.shape or () for port, spec in block.outputs.items()})
+    raise FmuError(
+        f"by its responses alone it can be linearized only where it comes to rest by itself from its start values: "
+        f"found the operating point's {layout.labels[i]} = {wanted[i]:.9g}, which is {off[i]:.3g} from the rest at "
+        f"{y0[i]:.9g}; expected at most {nearest[i]:.3g}. Where the run still settles, take a later point, at=t; or "
+        "give the FMU start values of that point.",
+        block=block.label,
+    )
 
 
 def output_drift(block: Fmu, point: Mapping[str, Any], h: float) -> dict[str, float]:

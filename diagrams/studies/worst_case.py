@@ -154,8 +154,9 @@ class WorstCase(ShownAsTable):
         """
         if self.worst.state is CaseState.FAILED:
             raise OptionError(
-                f"found a worst case that failed: {self.worst.reason} Expected one that was analysed: look at "
-                "worst_analysed.",
+                f"found a worst case that failed: {self.worst.reason} Expected one that was analysed. The worst of "
+                f"those, found.worst_analysed, has {describe(self.worst_analysed)}: mend the reason, or give ranges "
+                "without the cases that failed, found.failures, and confirm what is found then.",
                 block=self.wired.name,
             )
         if self.measure is not None:
@@ -170,10 +171,15 @@ class WorstCase(ShownAsTable):
         worst, nominal = self.worst, min(self.nominal, key=lambda case: case.goodness)
         counts = {state: sum(case.state is state for case in self.cases) for state in CaseState}
         several = len(self.points) > 1
+        analysed, failed = self.worst_analysed, worst.state is CaseState.FAILED
+        shown = {"Parameters of the worst case": worst.parameters}
+        if failed:
+            shown["Parameters of the worst case that was analysed, found.worst_analysed"] = analysed.parameters
         return Sheet(
             f"worst of {len(self.cases)} cases",
             (
                 ("worst", describe(worst)),
+                ("worst analysed", describe(analysed) if failed else ""),
                 ("as it is", describe(nominal)),
                 ("found by", worst.origin.value),
                 ("cases", ", ".join(f"{count} {state.value}" for state, count in counts.items() if count)),
@@ -181,12 +187,13 @@ class WorstCase(ShownAsTable):
                 ("not looked at", ", ".join(self.goal.left_out)),
                 ("at other cuts", self._other_cuts()),
             ),
-            (
+            tuple(
                 Grid(
-                    "Parameters of the worst case",
+                    title,
                     ("parameter", "value", "from", "to"),
-                    tuple((name, value, *self._range(name)) for name, value in worst.parameters.items()),
-                ),
+                    tuple((name, value, *self._range(name)) for name, value in parameters.items()),
+                )
+                for title, parameters in shown.items()
             ),
             (f"{counts[CaseState.FAILED]} cases failed, the first: {self.failures[0].reason}",)
             if counts[CaseState.FAILED]

@@ -1,10 +1,12 @@
 """Trims of FMUs that list no states: some have a memory that they hide, and some have none."""
 
+import math
+
 import pytest
 
 from loopwright.blocks import Constant, SimulationError
 from loopwright.diagrams import Diagram
-from loopwright.fmus import Fmu
+from loopwright.fmus import Fmu, FmuError
 from support.small_fmus import small_fmu, values
 
 SOURCE = (
@@ -68,3 +70,12 @@ def test_a_target_that_a_static_fmu_misses_at_a_bound_is_answered_with_the_bound
     with pytest.raises(SimulationError, match="input.value is at its bound. Free more") as e:
         make("2.0 * c->u").trim({"input.value": (0.0, 1.5)}, {"plant.y": 4.0})
     assert "lists no states" not in str(e.value)
+
+
+def test_a_point_that_just_misses_rest_says_how_near_is_near_enough_and_a_later_one_does(cache, make):
+    """y' = 10 (u − y) is e^(−10 t) from its rest at 1."""
+    loop = make("c->u + (c->y - c->u) * exp(-10 * h)")
+    said = r"plant.*found .* y = 0\.9999546, which is 4\.54e-05 from the rest at 0\.99999999\d; expected at most 1e-06\. .*later"
+    with pytest.raises(FmuError, match=said):
+        loop.linearize(1.0, step=0.01)
+    assert loop.linearize(2.0, step=0.01).poles == pytest.approx([math.exp(-0.1)], rel=1e-6)

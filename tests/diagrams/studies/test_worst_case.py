@@ -197,8 +197,24 @@ def test_a_case_that_cannot_be_analysed_counts_as_the_worst_and_tells_why():
     assert "tank" in found.worst.reason
     assert found.worst_analysed.state is not CaseState.FAILED
     assert "1 cases failed" in str(found) or "failed" in str(found)
-    with pytest.raises(OptionError, match="failed"):
+    with pytest.raises(OptionError, match=r"failed.*found\.worst_analysed, has bandwidth = .*found\.failures"):
         found.confirm()
+
+
+def test_with_cases_that_failed_the_printed_worst_case_has_the_worst_of_the_others():
+    """An infinite gain is refused; the other two are analysed."""
+    samples = [{"p.gain": 0.5}, {"p.gain": 1.5}, {"p.gain": math.inf}]
+    found = make_pi_loop().worst_case(None, "u", quantity="phase_margin_deg", samples=samples, starts=0)
+    assert found.worst.state is CaseState.FAILED
+    shown = str(found)
+    number = found.worst_analysed.numbers["u",]["phase_margin_deg"]
+    assert found.worst_analysed.parameters in samples[:2]
+    assert re.search(rf"worst analysed +phase_margin_deg = {re.escape(str(number))} at u", shown)
+    value = found.worst_analysed.parameters["p.gain"]
+    assert re.search(rf"that was analysed, found\.worst_analysed\n.*\np\.gain +{value}", shown)
+    margins = [case.value for case in found.cases if case.parameters in samples[:2]]
+    assert number.value == min(margins)
+    assert "worst analysed" not in str(make_pi_loop().worst_case(None, "u", samples=samples[:2], starts=0))
 
 
 def test_a_point_that_no_longer_rests_says_so():
