@@ -216,18 +216,26 @@ class OperatingPoint(ShownAsTable):
             tuple(map(str, self.free)),
         )
 
-    def _state_rows(self) -> Iterator[tuple[str, Any, str]]:
-        """Yield the name, value and unit of each state, those of FMUs too."""
-        start = 0
+    @property
+    def states(self) -> dict[str, np.ndarray]:
+        """States of blocks and FMUs by their dotted paths, in their shapes and units, just before the tick.
+
+        An exported controller that begins at the point is given them: see docs/howto/export_a_controller.md.
+        """
+        found, first = {}, 0
         for name, shape in self.layout[0] if self.layout else ():
             size = math.prod(cast("tuple[int, ...]", shape))
-            entries = self.x[start : start + size]
-            yield from _entries(name, entries, "")
-            start += size
+            found[name] = np.array(self.x[first : first + size]).reshape(cast("tuple[int, ...]", shape))
+            first += size
         for path, about in {**self.plants, **self.exchanged}.items():
             if path not in self.exchanged:  # whose continuous states are in x, too
-                for name, value in about["state"].items():
-                    yield from _entries(f"{path}.{name}", np.ravel(value), self.units.get(f"{path}.{name}", ""))
+                found |= {f"{path}.{name}": np.array(value) for name, value in about["state"].items()}
+        return found
+
+    def _state_rows(self) -> Iterator[tuple[str, Any, str]]:
+        """Yield the name, value and unit of each state, those of FMUs too."""
+        for name, values in self.states.items():
+            yield from _entries(name, np.ravel(values), self.units.get(name, ""))
 
     """Remainder of each equation of a trim by name, largest first, relative to 1 + the size of its quantity."""
 

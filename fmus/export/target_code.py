@@ -54,7 +54,8 @@ _ABOUT = {
     "inputs": "Inputs: to be set before each tick; they are held until they are set again.",
     "outputs": "Outputs: valid after a tick, until the next one.",
     "signals": "Named signals inside, to be watched: valid after a tick.",
-    "states": "States from one tick to the next: saved and restored with the whole struct; not to be written.",
+    "states": "States from one tick to the next: saved and restored with the whole struct. "
+    "To be written right after init alone, for another start.",
 }
 
 

@@ -224,6 +224,44 @@ def test_variables_by_name_instances_and_a_tick_that_fails(pi_spec, tmp_path):
     assert said.split() == ["1100", "0011", "10", "4", "10.6"]
 
 
+_FROM_A_POINT = """#include "pi.h"
+#include <stdio.h>
+int main(void) {
+    pi c;
+    double reference, level;
+    pi_init(&c);
+    c.states.pi_integral = INTEGRAL;
+    while (scanf("%la %la", &reference, &level) == 2) {
+        c.inputs.reference = reference;
+        c.inputs.level = level;
+        if (pi_tick(&c) != PI_OK) {
+            return 1;
+        }
+        printf("%a\\n", c.outputs.effort);
+    }
+    return 0;
+}
+"""
+
+
+@pytest.mark.slow
+def test_with_the_states_of_an_operating_point_it_has_the_bits_of_the_run_from_there(tmp_path):
+    plant = TransferFunction(numerator=[1.0], denominator=[1.0, 2.0], name="plant")
+    wish = Step(times=0.5, values=1.0, initial_value=0.3, name="wish")
+    loop = Diagram("loop", plant(pi(wish, plant.y)))
+    point = loop.trim()
+    integral = float(point.states["pi.pi.integral"])
+    assert integral == pytest.approx(0.6, abs=1e-8)  # 2 · 0.3 hold the level
+    run = loop.simulate(3.0, start=point, progress=False)
+    loop.to_c(tmp_path, subsystem="pi")
+    (tmp_path / "main.c").write_text(_FROM_A_POINT.replace("INTEGRAL", integral.hex()), encoding="utf-8")
+    subprocess.run(["gcc", "-std=c99", "-o", "main", "pi.c", "main.c", "-lm"], cwd=tmp_path, check=True)
+    rows = zip(run["wish.y"][:30], run["plant.y"][:30], strict=True)
+    given = "".join(f"{float(r).hex()} {float(y).hex()}\n" for r, y in rows)
+    said = subprocess.run(["./main"], cwd=tmp_path, check=True, capture_output=True, text=True, input=given).stdout
+    assert [float.fromhex(line) for line in said.split()] == run["effort"][:30].tolist()
+
+
 def test_the_files_name_what_an_engineer_looks_for(tmp_path):
     code = to_c(pi, tmp_path, number="float")
     header, source, _, report = (file.read_text(encoding="utf-8") for file in code.files)
