@@ -375,7 +375,7 @@ def _find_size(v: Variant, test: StepTest) -> tuple[float | None, StepSize]:
     if test.limits.size is not None:
         return test.limits.size, StepSize.GIVEN
     signal = find_signal(v.diagram.flatten_like(v.point), test.wire)
-    source = v.diagram.blocks[signal.port[0]]
+    source = v.diagram.blocks.get(signal.port[0])  # None at the output of a delay that a variant adds
     own = source.own_step(v.point.t) if isinstance(source, Source) and signal.entries == (0,) else 0.0
     return (own, StepSize.SOURCE) if own else (None, StepSize.CHOSEN)
 

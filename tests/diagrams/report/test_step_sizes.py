@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Constant, Gain, Integrator, Pulse, PulseTrain, Saturation, Sine, SmoothStep, Step
-from loopwright.diagrams import Diagram, Requirements
+from loopwright.diagrams import Diagram, Requirements, subsystem
 from loopwright.diagrams.requirements import Verdict
 
 RAMP = 1.8 + np.log(5.0) / 5.0
@@ -47,6 +47,22 @@ def test_the_review_says_the_size_and_its_origin():
     assert "ref → v: a step of 2 rad/s, its source's own step" in said
     said = str(report_of(Constant(value=0.0, unit="rad/s", name="ref")).review)
     assert "ref → v: a step of 0.01 rad/s, chosen small" in said
+
+
+def test_a_step_at_the_output_of_a_delay_that_a_variant_adds_is_chosen():
+    """v(k+1) = v(k) - v(k-1)/20 has poles at (1 ± √0.8)/2, real: no overshoot, with the added delay neither."""
+
+    @subsystem(sample_time=0.1)
+    def controller(ref, v):
+        return Gain(gain=0.5, name="law")(ref - v).named("u")
+
+    v = Integrator(name="v")
+    diagram = Diagram("held", v(controller(Constant(value=0.0, name="ref"), v.y)))
+    asked = Requirements(step={"overshoot": 0.05}, loops={"u": {}}, variants=["sampled_d1"])
+    results = [r for r in diagram.report(only=("steps",), requirements=asked).review.results if r.is_step]
+    assert {r.variant for r in results} == {"sampled_d0", "sampled_d1"}
+    assert all(r.as_dict()["size_from"] == "chosen small" for r in results)
+    assert all(r.verdict is Verdict.PASSED and r.number.value < 1e-6 for r in results)
 
 
 def test_the_step_of_a_source_is_its_next_one():
