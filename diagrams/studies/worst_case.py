@@ -31,7 +31,7 @@ from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe, make_goal
 from .confirmation import RunConfirmation, confirm_case
 from .loop_places import OtherCuts, place_loops
 from .measures import ContactMeasure, FunctionMeasure, Measure, write_open_loop
-from .parameters import check_parameters
+from .parameters import check_parameters, check_ranges
 from .search import Study
 from .worst_case_plot import plot_cases
 
@@ -278,6 +278,7 @@ def find_worst_case(
     drawn = read_samples(diagram, parameters, samples, count=count, seed=seed)
     check_parameters(diagram, drawn.names, "a worst case", blocks=True)
     boxes = _read_boxes(drawn)
+    check_ranges(diagram, boxes)
     places = tuple(points) if points is not None else (at,)
     study = Study(diagram, goal, boxes, places, delay, options, progress or (lambda text: None), measure)
     nominal = study.run({}, CaseOrigin.NOMINAL)

@@ -15,7 +15,7 @@ from ..sweeps import Box, read_samples
 from .cases import Goal, make_goal
 from .loop_places import STEP
 from .measures import ContactMeasure
-from .parameters import check_parameters
+from .parameters import check_parameters, check_ranges
 from .worst_case import WorstCase, find_worst_case
 
 TABLE = "worst_case"
@@ -116,7 +116,7 @@ class WorstCaseTask:
                         'scale = "log"}; or samples = "grid".'
                     )
                 if samples == "latin":
-                    Box.of(values)
+                    check_ranges(diagram, {diagram.find_parameter(name): Box.of(values)})
         with _Placed(self.file, TABLE):
             if "contact" in self.options:
                 ContactMeasure(self.options["contact"], diagram, {})

@@ -18,6 +18,7 @@ from loopwright.blocks import (
     Output,
     Saturation,
     TransferFunction,
+    TransportDelay,
     UnknownNameError,
     parameter,
 )
@@ -383,3 +384,31 @@ def test_equal_samples_are_cases_of_their_own():
     ranges = {"p.gain": [0.5, 0.5, 1.0]}
     found = make_pi_loop().worst_case(ranges, "u", quantity="ms", samples="grid", starts=0)
     assert [case.origin for case in found.cases].count(CaseOrigin.SAMPLE) == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "ends", "said"),
+    [
+        ("dead.delay", (0.0, 0.9), "found a range from 0 to 0.9; expected values above 0 s"),
+        ("dead.delay", Box(-0.5, 0.9), "expected values above 0 s"),
+    ],
+)
+def test_a_range_with_an_end_that_the_parameter_refuses_is_refused_before_anything_is_computed(name, ends, said):
+    told = []
+    lag = TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="lag")
+    y = TransportDelay(delay=0.2, name="dead")(lag.y)
+    diagram = Diagram("late", lag(Gain(gain=2.0, name="k")(-1.0 * y).named("u")))
+    with pytest.raises(OptionError, match=rf"^{re.escape(name)}: .*{re.escape(said)}"):
+        diagram.worst_case({name: ends}, "u", count=2, progress=told.append)
+    assert not told
+    found = diagram.worst_case({name: (0.1, 0.3)}, "u", quantity="phase_margin_deg", count=2, starts=0)
+    assert not found.failures
+
+
+def test_ends_that_only_other_parameters_refuse_are_left_to_the_cases():
+    """A lower limit of 2 to 3 goes with an upper one of 4 to 5, and not with the present one, 1."""
+    diagram = Diagram("limited", Saturation(lower=-1.0, upper=1.0, name="limits")(Constant(value=9.0)).named("y"))
+    ranges = {"limits.lower": (2.0, 3.0), "limits.upper": (4.0, 5.0)}
+    found = diagram.worst_case(ranges, quantity=lambda d: d.operating_point(0.0).values["limits.y"], count=2, starts=1)
+    assert not found.failures
+    assert min(case.value for case in found.cases if case.parameters) == 4.0
