@@ -15,7 +15,6 @@ from ...blocks.core import LoopwrightError, OptionError, near
 from ..contact import Contact, ContactLimit, PortNames, make_contact
 from ..flat import WiredDiagram
 from ..frequency import Number
-from ..requirements import SENSES, Sense
 from .confirmation import GROWTH_AGREEMENT, ConfirmationKind, RunConfirmation
 
 OF_CONTACT = (*PortNames._fields, "direction")
@@ -121,15 +120,6 @@ class FunctionMeasure:
             "show. Simulate found.diagram.",
             block=self.place,
         )
-
-
-def write_open_loop(wire: str, quantity: str, at: object = None) -> str:
-    """Return how a number of a loop with slower subsystems held is written as a function for ``quantity``.
-
-    A function's value is the worse, the smaller it is: a number that is the worse, the larger, has its sign changed.
-    """
-    sign, point = "-" if SENSES[quantity] is Sense.MOST else "", "" if at is None else "at=…"
-    return f'lambda d: {sign}margins(d.linearize({point}).loop("{wire}", slow="open")).{quantity}.value'
 
 
 Measure = ContactMeasure | FunctionMeasure

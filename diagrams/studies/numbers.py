@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from ..frequency import Number, margins, mimo_disk_margin, scan_margins
+from ..requirements import SENSES, Sense
 
 
 def numbers_of(L: Any, delay: int = 0, skew: float = 0.0) -> dict[str, Number]:
@@ -27,3 +28,12 @@ def compared_numbers(L: Any, names: Iterable[str], delay: int = 0, skew: float =
     else:
         found = scan_margins(L, delay=delay, skew=skew)
     return {name: found[name].value if name in found else math.nan for name in names}
+
+
+def write_open_loop(wire: str, quantity: str, at: object = None) -> str:
+    """Return how a number of a loop with slower subsystems held is written as a function for ``quantity``.
+
+    A function's value is the worse, the smaller it is: a number that is the worse, the larger, has its sign changed.
+    """
+    sign, point = "-" if SENSES[quantity] is Sense.MOST else "", "" if at is None else "at=…"
+    return f'lambda d: {sign}margins(d.linearize({point}).loop("{wire}", slow="open")).{quantity}.value'

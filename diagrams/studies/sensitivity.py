@@ -38,7 +38,7 @@ from ..linearization import (
 from ..plotting import BLUE, DARK, VERMILION, shown_figure
 from ..results import OperatingPoint
 from .loop_places import place_loops
-from .measures import write_open_loop
+from .numbers import write_open_loop
 from .parameters import check_parameters, list_parameters, unit_of
 
 if TYPE_CHECKING:

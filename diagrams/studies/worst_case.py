@@ -30,7 +30,8 @@ from ..sweeps import Box, Samples, read_samples
 from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe, make_goal
 from .confirmation import RunConfirmation, confirm_case
 from .loop_places import OtherCuts, place_loops
-from .measures import ContactMeasure, FunctionMeasure, Measure, write_open_loop
+from .measures import ContactMeasure, FunctionMeasure, Measure
+from .numbers import write_open_loop
 from .parameters import check_parameters, check_ranges
 from .search import Study
 from .worst_case_plot import plot_cases

@@ -165,9 +165,9 @@ static inline float lw_powf(float x, float y) {
     }
     if (lw_bits_single(x) & LW_SIGN_SINGLE) {
         /* y is odd, even, or no integer; from 2^24 on all are even */
-        const float half = (b < 16777216.0f) ? (float)((int32_t)b / 2) * 2.0f : b;
-        const float over = b - half; /* below 2 */
-        if ((over != 0.0f) && (over != 1.0f) && (a != 0.0f) && (a <= largest) && (b <= largest)) {
+        const float small = (b < 16777216.0f) ? b : 0.0f;
+        const float over = small - (float)((int32_t)small / 2) * 2.0f; /* below 2 */
+        if ((over != 0.0f) && (over != 1.0f) && (a != 0.0f) && (a <= largest)) {
             return NAN;
         }
         sign = (over == 1.0f) ? -1.0f : 1.0f;
