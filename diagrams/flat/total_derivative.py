@@ -74,15 +74,10 @@ class Derivative:
 
         False where a stage has an evaluator, or tables: its operations can't be looked at.
         """
-        last, names = self.schedule.last, self.schedule.arguments
-        if self.schedule.opaque:
+        found = self._operations(result)
+        if found is None:
             return False
-        try:  # operation by operation: seen from outside, each call of a block's function depends on all it takes
-            f = ca.Function("whole", [*last.arguments], [last.results[self.schedule.results.index(result)]]).expand()
-        except RuntimeError:
-            return False
-        symbols = dict(zip(names, f.sx_in(), strict=True))
-        (made,) = f.call(list(symbols.values()))
+        made, symbols = found
         slopes = ca.jacobian(made, ca.vertcat(*(symbols[name] for name, _ in self.by)))
         moved = symbols[argument] if entries is None else symbols[argument][list(entries)]
         return not ca.depends_on(slopes, moved)
@@ -92,16 +87,26 @@ class Derivative:
 
         False where a stage has an evaluator, or tables: its operations can't be looked at.
         """
-        last, names = self.schedule.last, self.schedule.arguments
-        if self.schedule.opaque:
+        found = self._operations(result)
+        if found is None:
             return False
+        made, symbols = found
+        return bool(ca.sparsify(ca.jacobian(made, symbols[argument])).nnz() == 0)
+
+    def _operations(self, result: str) -> tuple[Any, dict[str, Any]] | None:
+        """Return a result by symbols of the arguments, operation by operation; None where it can't be looked at.
+
+        Seen from outside, each call of a block's function depends on all that it takes.
+        """
+        last = self.schedule.last
+        if self.schedule.opaque:
+            return None
         try:
             f = ca.Function("whole", [*last.arguments], [last.results[self.schedule.results.index(result)]]).expand()
         except RuntimeError:
-            return False
-        symbols = dict(zip(names, f.sx_in(), strict=True))
-        (made,) = f.call(list(symbols.values()))
-        return ca.sparsify(ca.jacobian(made, symbols[argument])).nnz() == 0
+            return None
+        symbols = dict(zip(self.schedule.arguments, f.sx_in(), strict=True))
+        return f.call(list(symbols.values()))[0], symbols
 
     @cached_property
     def fast(self) -> Any:

@@ -1,7 +1,8 @@
 """Diagrams that are exported in tests: one that is sampled, one with continuous states and events."""
 
-from loopwright.blocks import PID, Relay, Sine, Step, Sum, TransferFunction, UnitDelay
+from loopwright.blocks import PID, Gain, Relay, Sine, Step, Sum, TransferFunction, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.fmus import Fmu, mass_spring_damper
 
 
 @subsystem(sample_time=0.01)
@@ -42,3 +43,18 @@ def continuous():
 def diagrams():
     """Return both."""
     return sampled(), continuous()
+
+
+def mass_at_two_rates():
+    """Two subsystems, at 2 and 3 ms; the mass between them, as an FMU of our own, steps at the ticks of both."""
+
+    @subsystem(sample_time=0.002)
+    def twos(y):
+        return Gain(gain=-0.5)(y).named("force")
+
+    @subsystem(sample_time=0.003)
+    def threes(v):
+        return Gain(gain=0.5)(v).named("v")
+
+    plant = Fmu(mass_spring_damper.build(fmi=2), name="plant")
+    return Diagram("rates", plant(force=twos(plant.position) + 1.0), threes(plant.velocity))

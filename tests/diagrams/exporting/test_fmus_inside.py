@@ -13,7 +13,7 @@ from scipy.linalg import expm
 from loopwright import Fmu, build
 from loopwright.blocks import Constant, DefinitionError, Gain, Step, TransferFunction, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus import StepOptions, bouncing_ball, dc_motor, mass_spring_damper
+from loopwright.fmus import StepOptions, bouncing_ball, dc_motor
 from loopwright.fmus.export import compiler
 from loopwright.fmus.toolchain import flags
 from support import exported_diagrams
@@ -159,18 +159,7 @@ def test_a_start_between_two_ticks(tmp_path):
 
 
 def rates():
-    """Two subsystems of other rates; the mass steps at the ticks of both."""
-
-    @subsystem(sample_time=2 * T)
-    def twos(y):
-        return Gain(gain=-0.5)(y).named("force")
-
-    @subsystem(sample_time=3 * T)
-    def threes(v):
-        return Gain(gain=0.5)(v).named("v")
-
-    plant = Fmu(mass_spring_damper.build(fmi=2), name="plant")
-    return Diagram("rates", plant(force=twos(plant.position) + 1.0), threes(plant.velocity)), 0.3, ("force", "v")
+    return exported_diagrams.mass_at_two_rates(), 0.3, ("force", "v")
 
 
 def two_in_a_row():

@@ -22,7 +22,8 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import DefinitionError, OptionError, UnknownNameError
 from loopwright.diagrams.web_page.notebook_link import PageRecord
-from loopwright.fmus import bouncing_ball, dc_motor, mass_spring_damper
+from loopwright.fmus import bouncing_ball, dc_motor
+from support.exported_diagrams import mass_at_two_rates
 from support.web_modules import Module
 
 T = 1e-3
@@ -328,17 +329,7 @@ def test_a_plant_behind_blocks_in_continuous_time_steps_at_the_pages_steps():
 @pytest.mark.slow
 def test_plants_step_at_the_ticks_of_all_rates_around_them():
     """At 2 and 3 ticks: the plant steps at 2, 3, 4, 6, and each subsystem holds its outputs."""
-
-    @subsystem(sample_time=2 * T)
-    def twos(y):
-        return Gain(gain=-0.5)(y).named("force")
-
-    @subsystem(sample_time=3 * T)
-    def threes(v):
-        return Gain(gain=0.5)(v).named("v")
-
-    plant = Fmu(mass_spring_damper.build(fmi=2), name="plant")
-    diagram = Diagram("rates", plant(force=twos(plant.position) + 1.0), threes(plant.velocity))
+    diagram = mass_at_two_rates()
     module = Module(diagram.to_html(inputs=[], plots=["force", "v", "plant.position"]).html)
     assert module.begin()
     run = diagram.simulate(0.6, progress=False)
