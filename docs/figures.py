@@ -49,7 +49,7 @@ def bode() -> Figure:
 def main(folder: Path) -> None:
     """Write the figures into a folder."""
     from loopwright.diagrams import experiments
-    from loopwright.diagrams.paper.figures import plot_path
+    from loopwright.diagrams.paper.experiment_figures import plot_path
 
     folder.mkdir(parents=True, exist_ok=True)
     with chdir(folder):

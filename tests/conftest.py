@@ -202,7 +202,9 @@ def no_process_left(processes_of_earlier_tests_ended):
 def uncompiled(tmp_path_factory, monkeypatch):
     """Builds have an empty file as their binary, in a cache of their own: for tests of what else is in the file."""
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path_factory.mktemp("uncompiled")))
-    monkeypatch.setattr("loopwright.fmus.export.package.compile_shared", lambda sources, out, **options: out.touch())
+    monkeypatch.setattr(
+        "loopwright.fmus.export.fmu_package.compile_shared", lambda sources, out, **options: out.touch()
+    )
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from .background import BackgroundCode
 from .compiled_libraries import load_compiled
+from .compiled_loop import CompiledLoop, Outcome, ReturnReason
 from .event_domains import Domains
 from .exported_memory import NamedCode, function_text, read_memory
 from .function_code import Code
@@ -28,10 +29,9 @@ from .hybrid_code import (
 )
 from .kernels import Kernel
 from .library_method import StepFailure
-from .loop import CompiledLoop, Outcome, ReturnReason
 from .native_tick import bind_call
 from .newton import NewtonOptions
-from .remote import REFUSED, TAKEN_BY_PYTHON, UNDER_WAY, PythonStep, compile_other_side
+from .plants_called_back import REFUSED, TAKEN_BY_PYTHON, UNDER_WAY, PythonStep, compile_other_side
 from .runtime import load_runtime
 from .staged import NativeModelExchange, OwnEvent
 from .tick_code import LARGEST, TickCode, compile_ticks, find_obstacle, interpret_ticks, write_ticks

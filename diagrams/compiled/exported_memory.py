@@ -16,8 +16,8 @@ import numpy as np
 from ...fmus.export import Field, LoopMemory, c_number
 from ..flat import share_terms
 from .bound_functions import BoundFunction, CodeOfFunctions, CompiledFunction, TickStructure
+from .compiled_loop import LoopStructure
 from .hybrid_structures import DelaysStructure, HybridStructure, MethodStructure, ProblemStructure
-from .loop import LoopStructure
 from .newton import NewtonStructure
 from .watch import WatchStructure
 

@@ -13,11 +13,11 @@ import numpy as np
 from ..flat import NONE, FlatDiagram, StepTable, TickPattern
 from ..solvers import METHODS, MethodKind
 from .bound_functions import CALL, at
+from .compiled_loop import CompiledLoop, OutcomeStructure
 from .event_domains import Domains
 from .hybrid_code import Between, HybridCode
 from .hybrid_structures import HybridStructure, MethodStructure, ProblemStructure, SpanStructure
 from .library_method import LibraryMethod, StepFailure
-from .loop import CompiledLoop, OutcomeStructure
 from .newton import NewtonOptions, NewtonStructure
 from .radau import radau_numbers
 from .rate_differences import RateDifferences

@@ -6,7 +6,7 @@ import ctypes
 from typing import Any
 
 from .bound_functions import TickStructure
-from .loop import LoopStructure
+from .compiled_loop import LoopStructure
 from .watch import WatchStructure
 
 

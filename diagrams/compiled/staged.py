@@ -17,8 +17,8 @@ from ..flat import JUMP, OpaqueStage
 from ..model_exchange import OWN_EVENTS
 from .bound_functions import CALL, TickStructure, address_of, at, list_vectors
 from .newton import NewtonStructure
+from .plants_called_back import LateReplies, RemotePlants
 from .rate_differences import color_columns
-from .remote import LateReplies, RemotePlants
 from .staged_functions import Staged, StagedEquations, StagedSlopes
 
 _LOGGED = 2**20  # bytes of events in a call

@@ -1,12 +1,12 @@
 """Contact of an environment with a plant: the admittance that it feels, and coupled stability."""
 
 from .admittance import ContactAdmittance, compute_admittance
-from .confirmation import ContactConfirmation, ContactTrial, TrialMethod, try_limit
+from .confirmed_limits import ContactConfirmation, ContactTrial, TrialMethod, try_limit
 from .contact import SIDES, Contact, find_sign, make_contact
+from .contact_loop import close_loop, controller_rows, join_environment
 from .contact_ports import PortNames
 from .coupled_parts import restrict
 from .environment import check_properties, check_property
-from .loop import close_loop, controller_rows, join_environment
 from .measured_force import Tool
 from .passivity import LOWEST, Passivity, PassivityReason, PortPassivity
 from .stability_limits import (

@@ -15,8 +15,8 @@ import numpy as np
 
 from ...blocks.core import Array, Finding, OptionError, brief, count_of, explain_calls
 from ..frequency import refine_sign_change
+from .contact_loop import Joined, close_loop, join_environment
 from .coupled_parts import ContactParts
-from .loop import Joined, close_loop, join_environment
 
 
 @explain_calls

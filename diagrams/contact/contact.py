@@ -14,6 +14,7 @@ from ...blocks.core import Array, Finding, OptionError, UnknownNameError, accept
 from ...fmus.running import Derivation
 from ..linearization import check_options, operating_point
 from .admittance import ContactAdmittance, compute_admittance
+from .contact_loop import close_loop, join_environment
 from .contact_ports import PortNames, Ports
 from .coupled_parts import ContactParts, take_apart
 from .environment import (
@@ -24,7 +25,6 @@ from .environment import (
     read_row,
     read_vector,
 )
-from .loop import close_loop, join_environment
 from .passivity import (
     CONTINUOUS,
     HIGHEST,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from ..flat import WiredDiagram
     from ..linearization import PointLike
     from ..results import OperatingPoint
-    from .confirmation import ContactConfirmation, TrialMethod
+    from .confirmed_limits import ContactConfirmation, TrialMethod
 
 
 SIDES = ("par", "perp")
@@ -244,7 +244,7 @@ class Contact:
         ConfirmationError
             If the runs contradict the limit.
         """
-        from .confirmation import confirm_limit
+        from .confirmed_limits import confirm_limit
 
         return confirm_limit(self, limit, push, method)
 

@@ -28,9 +28,7 @@ from ...blocks.core import (
 )
 from ..frequency import Number, refine_sign_change
 from .admittance import look_again
-from .coupled_parts import ContactParts
-from .environment import UNITS, points_in_a_decade
-from .loop import (
+from .contact_loop import (
     ClosedLoop,
     Modes,
     close_loop,
@@ -40,6 +38,8 @@ from .loop import (
     join_environment,
     split_modes,
 )
+from .coupled_parts import ContactParts
+from .environment import UNITS, points_in_a_decade
 
 SCANNED = {"stiffness": (1e-2, 1e8), "damping": (1e-3, 1e6), "mass": (1e-4, 1e4), "tool_mass": (1e-4, 1e4)}
 """Ends of the scan for each property, by default."""

@@ -10,13 +10,13 @@ import numpy as np
 
 from ...blocks.core import OptionError, SimulationError, left_of
 from ..flat import FlatDiagram, takes_any_step
+from .coupling_iteration import Search
 from .coupling_options import Coupling, Scheme
 from .links import Links
 from .plant_steps import PlantSteps, step_all
 from .plants import Plant
 from .rest import Rest
 from .rollback import Beginning, Rollback, accept_steps, find_taken_back, save_plant, texts_of, try_steps
-from .search import Search
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 4.0
 """Of the next adaptive step: factor, and its smallest and largest change."""

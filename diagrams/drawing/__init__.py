@@ -1,9 +1,9 @@
 """Drawings of diagrams."""
 
+from .box_order import Node, Pin
 from .drawing import Drawing, draw
 from .drawing_layout import Net, arrange
 from .live import Facts, RecordedSignal
-from .order import Node, Pin
 from .printer import printer
 
 __all__ = [

@@ -10,8 +10,8 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
+from .box_order import Node, Pin
 from .drawing_layout import GAP, LANE, TRACK, Net, arrange
-from .order import Node, Pin
 
 SLACK = 1.2
 """Factor by which a drawing may be wider than asked for: a page shows it that much smaller."""

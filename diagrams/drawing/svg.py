@@ -9,9 +9,9 @@ from typing import NamedTuple
 from ...blocks import PID
 from ...blocks.core import OptionError, Sum, near
 from ..wiring import Structure, stepped_blocks
+from .box_order import Node, Pin
 from .drawing_layout import Net
 from .nets import Border, Nets, PinPlace
-from .order import Node, Pin
 from .rows import arrange_in_rows
 from .shapes import BORDER, GREY, INK, NAME, PLANT, WIRE, line, rect, seconds, style, text_at, width_of
 from .symbols import Symbol, symbol_of

@@ -2,8 +2,8 @@
 
 from .loop_of_diagram import loop_spec
 from .make_exported import make_exported, name_of
-from .merged_plants import own_fmus
 from .open_diagram import let_move, open_part, open_subsystem, open_whole
+from .plants_to_merge import own_fmus
 from .target import target_spec, to_c
 
 __all__ = [

@@ -48,10 +48,10 @@ from ..simulation import (
 from ..solvers import METHODS, MethodKind
 from ..wiring import Wire, exact_time, join
 from .edges import find_edges
-from .merged_plants import loaded, merge, own_fmus
 from .more_functions import trace_computed_numbers, trace_guards
 from .obstacles import refuse
 from .open_diagram import OpenDiagram
+from .plants_to_merge import loaded, merge, own_fmus
 from .slopes import trace_rates, trace_slopes
 from .start_function import trace_left, trace_start_values
 

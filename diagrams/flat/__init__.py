@@ -4,13 +4,13 @@ from ...blocks.core import Layout
 from .announced import Announcer, Times, announcers
 from .clock_sets import bits_of, has_all_kinds, kinds_of, times_of
 from .clocks import EVERY, NONE, ClockSets, TickPattern, ticks_after
+from .enabling_and_triggers import TRUE, is_true
 from .evaluation import JUMP, Apart, Instant, evaluate, just_after, no_evaluator, sort_names
 from .fast_functions import share_terms, speed_up
 from .flat_diagram import EXACT_LOOP, FlatDiagram
 from .flat_functions import indicators_of, trace_guarded_tick
 from .flat_layout import FlatEvent, StateLayout, sample_time_of
 from .flatten import flatten, renumber, write_numbers
-from .logic import TRUE, is_true
 from .movable import Target, find_movable, with_movable
 from .plant_ticks import StepTable, own_step, takes_any_step
 from .program import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE_OF, Ids, Operation, PartProgram, Program, TickProgram

@@ -18,8 +18,8 @@ from ...blocks.tracing import GUARDS, NEXT, size
 from ..wiring import OrderStep, Wire, join
 from .block_functions import BlockFunctions, call_block
 from .clocks import TickPattern
+from .enabling_and_triggers import choose, is_true, logic_and, logic_not, logic_or, to_number
 from .flat_layout import FlatLayout
-from .logic import choose, is_true, logic_and, logic_not, logic_or, to_number
 from .program import Cells
 
 INDICATORS, JUMP = "indicators", "jump"

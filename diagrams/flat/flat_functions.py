@@ -23,9 +23,9 @@ from ...blocks.core import without_collection
 from ...blocks.tracing import GUARDS
 from .block_functions import BlockFunctions
 from .clocks import NONE, TickPattern
+from .enabling_and_triggers import above_true, choose, is_true, logic_and, logic_not, logic_or, to_number
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, rows
 from .flat_layout import FlatLayout
-from .logic import above_true, choose, is_true, logic_and, logic_not, logic_or, to_number
 from .program import Cells, PartProgram, Program, TickProgram
 from .stages import Schedule
 from .total_derivative import Derivative

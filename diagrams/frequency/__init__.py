@@ -19,7 +19,7 @@ from .periodic_margins import PeriodicMargins, periodic_margins
 from .pole_maps import plot_poles
 from .pole_placement import place, relative_difference
 from .poles_and_zeros import find_hidden_unstable
-from .python_control import Comparison, compare_margins, compare_with_control
+from .python_control_margins import Comparison, compare_margins, compare_with_control
 from .realization import Realization
 from .sampled_design import SampledDesign, sampled_gains, sampled_poles
 from .scan_refine_confirm import first_largest, order_key, refine_sign_change

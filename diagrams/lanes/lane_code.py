@@ -15,12 +15,12 @@ from ..compiled import LARGEST, NewtonOptions, load_compiled
 from ..flat import NONE, TRUE, FlatDiagram, TickPattern
 from ..solvers import FIXED
 from .flow_code import FlowSource, write_flow
+from .lane_loops import LoopSource, write_loops
 from .lane_plants import LanePlant, read_plant
-from .loop_code import LoopSource, write_loops
+from .lane_ticks import TickSources, read_source, share
 from .no_lanes import NoLanesError
 from .scalar_calls import ScalarFunctions
 from .start_code import StartSource, write_start
-from .tick_code import TickSources, read_source, share
 
 # A product and a sum of one expression are fused, whatever the optimizer does; more of it gains nothing.
 FLAGS = ("-O2", "-ffp-contract=on")

@@ -10,8 +10,8 @@ import casadi as ca
 
 from ..flat import TickPattern
 from .lane_plants import LanePlant
+from .lane_ticks import TickSources
 from .scalar_calls import ScalarFunctions
-from .tick_code import TickSources
 
 _START = ("x", "w", "p", "left")
 _FIRST_TICK = """

@@ -3,7 +3,11 @@
 from .block_slopes import linearize_block
 from .cut_wires import carry_point, cut_to, name_of_cut
 from .derivatives import Tap, find_signal, moves_between_ticks
-from .findings import (
+from .flow_model import LinearDelays
+from .free_motions import FreeMotion, FreeMotions
+from .inserted_blocks import find_inputs, name_wire_to, with_passed_values
+from .kinks import find_kinks_between
+from .left_out_effects import (
     ApproximateDelay,
     BlockFinding,
     CoarseValues,
@@ -20,10 +24,6 @@ from .findings import (
     UnusualStart,
     ZeroSlope,
 )
-from .flow_model import LinearDelays
-from .free_motions import FreeMotion, FreeMotions
-from .inserted_blocks import find_inputs, name_wire_to, with_passed_values
-from .kinks import find_kinks_between
 from .linear_model import (
     Linearization,
     find_flow_poles,

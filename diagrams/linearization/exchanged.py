@@ -17,7 +17,7 @@ from ..flat import Evaluators, FlatDiagram
 from ..model_exchange import ModelExchangeEvaluator
 from ..results import OperatingPoint
 from ..wiring import join
-from .findings import CoarseValues, InexactDerivatives, RefutedDerivatives
+from .left_out_effects import CoarseValues, InexactDerivatives, RefutedDerivatives
 
 if TYPE_CHECKING:
     from ...fmus.running import Fmu

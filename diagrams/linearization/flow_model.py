@@ -16,7 +16,7 @@ from ..simulation import late_progress
 from .delay_channels import delay_channels
 from .derivatives import LocalDerivatives
 from .exchanged import noise_of
-from .findings import ApproximateDelay
+from .left_out_effects import ApproximateDelay
 from .plant_models import EQUILIBRIUM, join_matrices, states_of
 
 STAGES = (1.0, 0.6, 0.2816, 0.857, 0.0526, 0.3333, 0.6513, 0.1184, 0.25, 0.3077, 0.0789)

@@ -39,8 +39,8 @@ from ..results import OperatingPoint, layout_of
 from ..wiring import Structure, Wire, join
 from .block_slopes import slopes_of
 from .derivatives import find_signal
-from .findings import BlockFinding, CutFromTracking, InertConsumer
 from .kinks import read_arguments, read_log
+from .left_out_effects import BlockFinding, CutFromTracking, InertConsumer
 from .shared_wires import find_shared_cuts
 from .signal_paths import PathNode, SignalPaths
 

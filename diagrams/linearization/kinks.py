@@ -32,7 +32,7 @@ from ..results import OperatingPoint
 from ..wiring import join
 from .block_slopes import BlockSlopes, slopes_of
 from .exchanged import evaluators_at
-from .findings import EventsOnly, Kink, StepsOnly, ZeroSlope
+from .left_out_effects import EventsOnly, Kink, StepsOnly, ZeroSlope
 from .operating_points import operating_point
 from .plant_models import plant_paths
 from .signal_paths import SignalPaths

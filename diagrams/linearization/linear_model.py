@@ -52,11 +52,11 @@ from ..wiring import exact_time
 from .delay_channels import blocks_around
 from .derivatives import LocalDerivatives, Tap, find_moving, find_signal
 from .exchanged import derivations_at, evaluators_at, findings_on
-from .findings import EntryTaken
 from .flow_model import LinearDelays, Model, approximate_delays, model_continuous, relative_error
 from .free_motions import ClosedModel, FreeMotions, find_free_motions
 from .inserted_blocks import find_cut_findings, name_inputs, split_consumers, split_inputs
 from .kinks import find_kinks
+from .left_out_effects import EntryTaken
 from .mean_stairs import replace_stairs
 from .operating_points import PointLike, check_options, operating_point, refine_ticks
 from .over_a_period import begin_loop, confirm_loop, model_loop, model_period

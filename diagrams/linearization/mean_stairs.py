@@ -22,8 +22,8 @@ from ...blocks.tracing import NEXT
 from ..flat import FlatDiagram, Instant, WiredDiagram
 from ..results import OperatingPoint
 from .block_slopes import BlockSlopes, slopes_of
-from .findings import MeanSlope, StepsOnly
 from .kinks import read_arguments
+from .left_out_effects import MeanSlope, StepsOnly
 
 MEANS = {ca.OP_FLOOR: -0.5, ca.OP_CEIL: 0.5}
 """Mean of a rounded value, less the value."""

@@ -28,8 +28,8 @@ from ..frequency import FourMatrices
 from ..results import OperatingPoint
 from .derivatives import LocalDerivatives, Tap, find_signal
 from .exchanged import evaluators_at
-from .findings import MemoryActs
 from .flow_model import LinearDelays, Model
+from .left_out_effects import MemoryActs
 from .mean_stairs import replace_stairs
 from .plant_models import EQUILIBRIUM
 from .tick_chain import Chain, period_of

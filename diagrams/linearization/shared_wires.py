@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from ...blocks.core import Finding
 from ..flat import FlatDiagram
 from ..wiring import join
-from .findings import ParallelWays, SharedCut
+from .left_out_effects import ParallelWays, SharedCut
 from .signal_paths import PathNode, SignalPaths
 
 Port = tuple[str, str]

@@ -10,7 +10,7 @@ from ...blocks.core import Finding
 from ..flat import FlatDiagram
 from ..wiring import find_cyclic_parts
 from .block_slopes import slopes_of
-from .findings import BlockFinding, EventWithinPeriod, InexactDerivatives
+from .left_out_effects import BlockFinding, EventWithinPeriod, InexactDerivatives
 
 
 class PathNode(NamedTuple):

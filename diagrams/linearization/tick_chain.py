@@ -25,8 +25,8 @@ from .delay_channels import delay_channels
 from .delayed_flow import DelayedFlow, DelayLine, find_steady_slopes
 from .derivatives import LocalDerivatives, Numbers, slope_of
 from .exchanged import noise_of
-from .findings import EventWithinPeriod, UnusualStart
 from .flow_model import differentiate_flow
+from .left_out_effects import EventWithinPeriod, UnusualStart
 from .plant_models import (
     EQUILIBRIUM,
     PlantModel,

@@ -11,10 +11,11 @@ from .coupled_stability import (
     stability_map,
     stiffness_limits,
 )
+from .experiment_figures import plot_experiment, plot_path
 from .experiment_numbers import DEFINITIONS, Theory, key_numbers, theory_numbers
 from .experiments import DEFAULTS, EXPERIMENTS, Experiment
 from .fig3_diagram import Fig3Diagram, fig3
-from .figures import plot_experiment, plot_path
+from .fig3_wires import Channel, Rig
 from .rendered import (
     passivity,
     rendered_admittance,
@@ -22,7 +23,6 @@ from .rendered import (
     rendered_system,
     target_admittance,
 )
-from .wires import Channel, Rig
 
 __all__ = [
     "DEFAULTS",

@@ -68,9 +68,9 @@ from ..flat import WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import Wire
 from .fig3_parts import check_wires, delay_of, find_kinks, plant_path
+from .fig3_wires import Channel, Rig, wire
 from .robots_at_rest import PerfectRobot, RobotAtRest
 from .shown_plant import check_plant
-from .wires import Channel, Rig, wire
 
 IMPLEMENTATIONS = ("ideal", "continuous", "sampled")
 _ADMITTANCE = kinds.one_of_class(AdmittanceFilter, "an AdmittanceFilter(…)").worded(step="Give one.")

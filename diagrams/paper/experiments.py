@@ -37,8 +37,8 @@ from ..results import Run
 from ..simulation import ProgressOption, RunKeywords, RunOptions, simulate
 from .experiment_options import DEFAULTS, ELLIPSE, merge
 from .fig3_diagram import fig3
+from .fig3_wires import IMPEDANCE_PAR, IMPEDANCE_PERP, Channel, Rig, check_plant
 from .hand_scene import pull_by_hand
-from .wires import IMPEDANCE_PAR, IMPEDANCE_PERP, Channel, Rig, check_plant
 
 if TYPE_CHECKING:
     from ..sweeps import Sweep

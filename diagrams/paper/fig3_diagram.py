@@ -10,7 +10,7 @@ from ...blocks.core import explain_calls
 from ...fmus import Fmu
 from ...fmus.models import gantry
 from ..diagram import Diagram
-from .wires import IDEAL, Channel, Rig, wire
+from .fig3_wires import IDEAL, Channel, Rig, wire
 
 if TYPE_CHECKING:
     from ..report import ReportKind

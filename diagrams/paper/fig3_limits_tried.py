@@ -17,8 +17,8 @@ from ..report import Implementation, Section, TableForm, Texts
 from .compliance_loop import AdmittanceLoop
 from .fig3_admittance import not_shown
 from .fig3_case import Fig3Case
+from .fig3_wires import Channel, Rig, wire
 from .reduced_loops import FRICTION, ReducedLoops, each_implementation
-from .wires import Channel, Rig, wire
 
 TEXTS = Texts(__package__, "limits_tried")
 TITLE = "Limits tried in time domain"

@@ -18,11 +18,11 @@ from ..simulation import ProgressOption, work_notes
 from ..studies import ContactTask, WorstCase, WorstCaseTask
 from ..sweeps import processors
 from .case import Case, ReportedExperiment
+from .case_verdicts import review
 from .content_hash import content_hash
 from .pages import DEFINITIONS, Report
 from .points import STEP
 from .report_parts import ReportKind, ReportPart
-from .review import review
 from .sections.contacts import contact_sections, contacts_on_first_page, read_contacts
 from .sections.injection import injected
 from .sections.loops import inner

@@ -16,7 +16,7 @@ from ..requirements import Requirements
 from ..studies import LoopPlace, cut_places, find_places
 from .pages import Texts
 from .variant import Implementation, Variant, in_s, look_of
-from .wires import wires_on_loops
+from .wires_on_loops import wires_on_loops
 
 TEXTS = Texts(__package__, "variants")
 AS_IT_IS = "as it is"

@@ -20,8 +20,8 @@ from ..requirements import Requirements
 from ..results import Snapshot
 from ..second_process import SecondProcess
 from .case import Case, ReportedExperiment
+from .case_verdicts import check_names
 from .pages import Section, draw_section, keep_drawings
-from .review import check_names
 
 RADIANS = AxisUnits()
 LONG = 4

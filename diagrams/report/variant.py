@@ -19,7 +19,7 @@ from ..plotting import BLUE, DARK, GREEN, PURPLE, STONE, VERMILION
 from ..results import OperatingPoint
 from ..studies import is_zero
 from .points import point_of
-from .wires import ways_through
+from .wires_on_loops import ways_through
 
 AT_REST = 1e-6
 """Largest change of a state, relative to 1 + its size, at which nothing is said to move."""

@@ -2,6 +2,7 @@
 
 from .memory import machine_memory
 from .operating_point import FreeDirection, OperatingPoint, PointOrigin, units_of
+from .recorded_texts import TextSignal
 from .recorder import Recorder, select
 from .recording import Recording
 from .run import Run, Snapshot
@@ -10,7 +11,6 @@ from .signal_names import Places, entries, outputs_of, resolve
 from .step_info import StepInfo
 from .step_measures import ExpectedStep, is_at_rest, measure_step
 from .stored import Occurrence, Stopped
-from .texts import TextSignal
 
 __all__ = [
     "ExpectedStep",

@@ -30,9 +30,9 @@ from ...blocks.core import (
 )
 from ..wiring import Wire, index_of, split_entry
 from .measured_signals import Data, MeasuredSignals, split_measured
+from .recorded_texts import TextSignal
 from .signal_names import BlockOutputs, Place, Places, entries, outputs_of, place_of, resolve
 from .stored import Occurrence, PathLike, Stopped, header, prepare, read, write
-from .texts import TextSignal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -677,7 +677,7 @@ class Run(ShownAsTable):
         UnknownNameError, OptionError
             For a name that was not recorded; for a folder that isn't there.
         """
-        from .exports import to_csv
+        from .run_exports import to_csv
 
         to_csv(path, self.t, dict(self._columns(names)))
 
@@ -694,7 +694,7 @@ class Run(ShownAsTable):
         OptionError
             If pandas is not installed.
         """
-        from .exports import to_pandas
+        from .run_exports import to_pandas
 
         return to_pandas(self.t, dict(self._columns(names)), self._units_of_columns(names))
 
@@ -712,7 +712,7 @@ class Run(ShownAsTable):
         OptionError
             If xarray is not installed.
         """
-        from .exports import to_xarray
+        from .run_exports import to_xarray
 
         signals = {name: self[name] for name in self._names_to_export(names)}
         return to_xarray(self.t, signals, {name: self._units(name) for name in signals}, self.diagram_name)
@@ -729,7 +729,7 @@ class Run(ShownAsTable):
         OptionError
             If pyarrow is not installed, or the folder isn't there.
         """
-        from .exports import to_parquet
+        from .run_exports import to_parquet
 
         def read(samples: slice) -> Iterator[np.ndarray]:
             return (values for _, values in self._columns(names, samples))
@@ -753,7 +753,7 @@ class Run(ShownAsTable):
         OptionError
             If the folder isn't there, or a signal takes 2 GiB or more, which the format can't hold.
         """
-        from .exports import to_mat
+        from .run_exports import to_mat
 
         signals = {name: self[name] for name in self._names_to_export(names)}
         units = {name: self._units(name) if self.unit(name) else None for name in signals}
@@ -779,7 +779,7 @@ class Run(ShownAsTable):
 
     def _columns(self, names: Iterable[str], samples: slice = slice(None)) -> Iterator[tuple[str, np.ndarray]]:
         """Yield the name and the values of each column; entries of a vector are counted from 1."""
-        from .exports import column_labels, flatten_samples
+        from .run_exports import column_labels, flatten_samples
 
         for name in self._names_to_export(names):
             values = self.part(name, samples)
@@ -788,7 +788,7 @@ class Run(ShownAsTable):
 
     def _units_of_columns(self, names: Iterable[str]) -> dict[str, str]:
         """Return the unit of each column, "" where it is not declared."""
-        from .exports import column_labels
+        from .run_exports import column_labels
 
         units: dict[str, str] = {}
         for name in self._names_to_export(names):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import MOST_ROWS, Grid
-from .exports import column_labels
+from .run_exports import column_labels
 
 MOST_VALUES = 50_000_000
 """Values up to which the smallest and largest are looked for: 0.05 s."""

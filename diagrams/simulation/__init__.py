@@ -4,8 +4,8 @@ from .algebraic_loops import newton_options
 from .compiled_hand_over import accepts_of, methods_of
 from .compiled_hybrid import is_stiff
 from .continuous import Continuous
-from .diagnosis import START_SETTLED
 from .engine import Engine
+from .failed_blocks import START_SETTLED
 from .held_inputs import note_held_inputs
 from .initialize import find_initial_state, find_start_values, initialize, values_from_left
 from .live_run import LiveRun
@@ -14,8 +14,8 @@ from .run_options import START_EXCHANGES, KeptKeywords, RunKeywords, RunOptions,
 from .simulation import Simulation, simulate
 from .solver_setup import find_late, next_instant
 from .start_at_point import apply_point, copy_states
-from .start_values import Port, StartFunctions, StartValues, trace_start
 from .stops import StopConditions
+from .traced_start_values import Port, StartFunctions, StartValues, trace_start
 from .view import SimulationView
 from .workspace import Workspace
 

@@ -10,7 +10,7 @@ from ...blocks.core import NonFiniteError, SimulationError
 from ..compiled import BrokenOff, CompiledHybrid, Lost, Pile, StepFailure
 from ..solvers import Method
 from .continuous import Continuous
-from .diagnosis import failure, forget_trials, opaque_failure
+from .failed_blocks import failure, forget_trials, opaque_failure
 
 
 def explain(continuous: Continuous, broken: BrokenOff) -> BaseException:

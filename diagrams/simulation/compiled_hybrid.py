@@ -43,7 +43,7 @@ from .compiled_hand_over import (
 from .compiled_plants import PlantsInC
 from .compiled_ticks import FIRST, LARGEST_CHUNK, WISHED, LaterCode, make_in_c
 from .continuous import Continuous
-from .diagnosis import forget_trials
+from .failed_blocks import forget_trials
 from .workspace import Workspace
 
 

@@ -41,7 +41,7 @@ from ..flat import (
 from ..results import Recorder
 from .compiled_hand_over import bind_loop
 from .compiled_plants import PlantsInC
-from .diagnosis import forget_trials
+from .failed_blocks import forget_trials
 from .workspace import Workspace
 
 if TYPE_CHECKING:

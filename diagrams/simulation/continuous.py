@@ -15,7 +15,7 @@ from ..flat import FlatDiagram, announcers, renumber
 from ..model_exchange import BlocksInModelExchange, OwnEvents
 from ..results import Occurrence
 from ..solvers import METHODS, Method, MethodKind, Problem
-from .diagnosis import state_values
+from .failed_blocks import state_values
 from .initialize import domains_from_left
 from .solver_setup import absolute_tolerances, find_late, longest_step, scales_of, time_scale_of
 from .workspace import Workspace

@@ -22,12 +22,12 @@ from ..solvers import solver_name
 from .change_over import ChangeOver
 from .continuous import Continuous
 from .continuous_part import ContinuousPart
-from .diagnosis import opaque_failure
+from .failed_blocks import opaque_failure
 from .initialize import find_start_values, initialize
 from .run_options import RunOptions
 from .start_at_point import check_past, start_at, take_over
-from .start_values import choose_start_values
 from .stops import StopConditions
+from .traced_start_values import choose_start_values
 from .view import Position, SimulationView
 from .workspace import Workspace
 

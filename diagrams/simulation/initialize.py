@@ -18,7 +18,7 @@ from ..compiled import Delays
 from ..coupling import Links, Plant, find_fixed_point
 from ..flat import NONE, FlatDiagram, Instant, evaluate, evaluate_apart, indicators_of, is_true
 from ..model_exchange import BlocksInModelExchange
-from .diagnosis import START_SETTLED, inputs_text, shaped_inputs, unsettled, unsolved_start
+from .failed_blocks import START_SETTLED, inputs_text, shaped_inputs, unsettled, unsolved_start
 from .workspace import Workspace
 
 _PLAIN_PASSES = 10

@@ -22,7 +22,7 @@ from ..flat import (
     evaluate_apart,
 )
 from .algebraic_loops import LoopSolver, loop_solver
-from .diagnosis import failure
+from .failed_blocks import failure
 
 
 class Workspace:

@@ -28,7 +28,7 @@ from ...fmus import ArchiveLimits, Fmu
 from ..wiring import Structure, SubsystemSettings, Wire, join
 from .dataflow import ConnectorKey, Dataflow, Hop
 from .elements import OUTPUTS, Component, Names, System
-from .parameters import Given, apply_bindings, value_table
+from .parameter_sets import Given, apply_bindings, value_table
 from .parts import FmuPart
 from .value_table import ValueTable
 

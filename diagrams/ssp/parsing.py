@@ -30,7 +30,7 @@ from .elements import (
     System,
     Transformation,
 )
-from .package import DEFAULT, Package, PackagedFile, as_ssp_errors, open_package
+from .ssp_files import DEFAULT, Package, PackagedFile, as_ssp_errors, open_package
 
 _SPACE = "http://ssp-standard.org/SSP1/"
 _FULL = f"{_SPACE}SystemStructure"

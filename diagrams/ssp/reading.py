@@ -26,8 +26,8 @@ from ...fmus import ArchiveLimits
 from ..wiring import Structure
 from .assembly import Assembly
 from .elements import OUTPUTS, Component, System
-from .package import open_package
 from .parsing import Parsed, parse_package
+from .ssp_files import open_package
 
 
 @explain_calls

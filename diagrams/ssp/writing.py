@@ -26,9 +26,9 @@ from .documents import (
     write_dictionary,
     write_values,
 )
-from .exports import Export, build_export, find_export, order_sampled, split_diagram
+from .exported_parts import Export, build_export, find_export, order_sampled, split_diagram
 from .geometry import lay_out
-from .package import DEFAULT
+from .ssp_files import DEFAULT
 from .terms import Term, Terms
 
 _TIME = (2020, 1, 1, 0, 0, 0)

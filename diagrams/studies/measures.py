@@ -15,7 +15,7 @@ from ...blocks.core import LoopwrightError, OptionError, near
 from ..contact import Contact, ContactLimit, PortNames, make_contact
 from ..flat import WiredDiagram
 from ..frequency import Number
-from .confirmation import GROWTH_AGREEMENT, ConfirmationKind, RunConfirmation
+from .confirmed_cases import GROWTH_AGREEMENT, ConfirmationKind, RunConfirmation
 
 OF_CONTACT = (*PortNames._fields, "direction")
 """Arguments of `Diagram.contact`."""

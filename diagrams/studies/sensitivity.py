@@ -39,7 +39,7 @@ from ..plotting import BLUE, DARK, VERMILION, shown_figure
 from ..results import OperatingPoint
 from .loop_places import place_loops
 from .numbers import write_open_loop
-from .parameters import check_parameters, list_parameters, unit_of
+from .varied_parameters import check_parameters, list_parameters, unit_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

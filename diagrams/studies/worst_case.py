@@ -28,13 +28,13 @@ from ..linearization import carry_point
 from ..requirements import REQUIREMENTS, Requirements
 from ..sweeps import Box, Samples, read_samples
 from .cases import CaseOrigin, CaseState, Goal, StudyCase, describe, make_goal
-from .confirmation import RunConfirmation, confirm_case
+from .confirmed_cases import RunConfirmation, confirm_case
 from .loop_places import OtherCuts, place_loops
 from .measures import ContactMeasure, FunctionMeasure, Measure
 from .numbers import write_open_loop
-from .parameters import check_parameters, check_ranges
-from .search import Study
+from .varied_parameters import check_parameters, check_ranges
 from .worst_case_plot import plot_cases
+from .worst_case_search import Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

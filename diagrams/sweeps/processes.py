@@ -111,7 +111,7 @@ class _Process:
                 raise EOFError
             child, fresh = self._child, self._child is None
             if child is None:
-                child = self._child = PythonChild(self._group, "loopwright.diagrams.sweeps.child")
+                child = self._child = PythonChild(self._group, "loopwright.diagrams.sweeps.worker_process")
         if fresh:
             child.send(self._data)
             if text := child.receive():

@@ -1,5 +1,5 @@
 """Diagrams as pages that run: WebAssembly, plots that scroll, sliders."""
 
-from .page import PageText, Scene, WebPage, make_page
+from .web_page import PageText, Scene, WebPage, make_page
 
 __all__ = ["PageText", "Scene", "WebPage", "make_page"]

@@ -8,8 +8,8 @@ from .cycles import find_cyclic_parts
 from .delay_blocks import add_delay_blocks
 from .entry_names import index_of, split_entry
 from .entry_order import OrderStep
+from .evaluation_order import Order, find_orders
 from .first_order_hold import first_order_hold
-from .order import Order, find_orders
 from .parameter_names import find_control, find_name, find_path, find_place, split_path
 from .structure import Structure, SubsystemSettings, SubsystemTable, Wire, join, stepped_blocks
 from .structure_table import sheet_of_structure

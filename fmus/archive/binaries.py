@@ -8,7 +8,7 @@ from pathlib import Path
 from ...blocks.core import FmuFileError
 from ..platform import native_platform
 from .faults import FmuFault, FmuFinding
-from .library import SharedLibrary, read_library
+from .library_headers import SharedLibrary, read_library
 from .zip_file import FmuArchive
 
 _FOLDERS2 = {"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin": "darwin64"}

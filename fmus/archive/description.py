@@ -32,9 +32,9 @@ from .archive_limits import ArchiveLimits
 from .binaries import find_binary, judge_name
 from .faults import FmuFault, FmuFinding
 from .feedthrough import Feedthrough, feeds_through, read_feedthrough
+from .fmpy_description import read_model
 from .gathering import Elements, gather
-from .model import read_model
-from .model_exchange import ModelExchangeInfo, read_model_exchange
+from .model_exchange_description import ModelExchangeInfo, read_model_exchange
 from .negated import judge_negated, read_negated
 from .rules import KNOWN_VERSIONS, check_dimensions, unknown_version
 from .sizes import resize

@@ -16,7 +16,7 @@ from ...blocks.core import FmuFileError, describe_disk_error
 from .archive_limits import ArchiveLimits
 from .entries import check_entries
 from .faults import FmuFault, FmuFinding
-from .library import LFS_POINTER
+from .library_headers import LFS_POINTER
 from .xml_text import parse_xml
 
 DESCRIPTION = "modelDescription.xml"

@@ -22,15 +22,15 @@ from ...blocks.core import (
 from ..archive import FmuFault, FmuVariable, inexact, unpack
 from ..host_state import FOLDER, HostState
 from ..platform import is_built_here
-from .evaluation import order_questions
 from .fmi1 import Fmi1Calls
 from .fmi2 import Fmi2Calls
 from .fmi3 import Fmi3Calls
 from .fmi_calls import FATAL, FmiCalls
 from .fmu_block import FmuBlock
 from .message_log import MessageLog, clean_text, describe_end
+from .model_exchange_calls import order_questions
 from .step_options import choose_modes
-from .texts import is_readable, list_limits, read_text, waits_for_initialization, write_text
+from .text_values import is_readable, list_limits, read_text, waits_for_initialization, write_text
 from .transfer import BoundReading, BoundStart, is_kept
 
 CALLS: dict[str, type[FmiCalls]] = {"1": Fmi1Calls, "2": Fmi2Calls, "3": Fmi3Calls}

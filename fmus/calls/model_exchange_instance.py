@@ -15,11 +15,11 @@ from ...blocks.core import EvaluationVectors, FmuError, FmuRuntimeError, Layout,
 from ..archive import FmuVariable, ModelExchangeInfo
 from ..host_state import HostState
 from .bound_calls import DISCARD, ERROR, FATAL, WARNING, BoundCalls, Call
-from .evaluation import DirectEvaluation, Evaluation, Vector, call_actions
 from .event_calls import EventUpdate
 from .fmi_calls import MOST_ROUNDS
 from .fmu_block import FmuBlock, check_next_time
 from .loaded_library import MakeCalls
+from .model_exchange_calls import DirectEvaluation, Evaluation, Vector, call_actions
 from .model_structure import check_structure, is_smooth
 from .native_actions import ActionKind, NativeAction, NativeLook, copy_action, transfer_actions
 from .running_fmu import RunningFmu

@@ -12,7 +12,7 @@ from ..archive import FmuVariable
 from .bound_calls import WARNING
 from .fmu_block import FmuBlock
 from .loaded_library import LoadedFmu, MakeCalls
-from .texts import Text, TextRecord
+from .text_values import Text, TextRecord
 from .transfer import OutOfRangeError, Transfer, UnfitError
 
 

@@ -24,7 +24,7 @@ from .native_step import NativeStep, QuietStep, RemoteStep, native_step, remote_
 from .saved_state import FmuState
 from .step_failures import NEAR, ROUNDED, StepFailures
 from .step_options import StepParts, parts_of_step
-from .texts import watch_texts
+from .text_values import watch_texts
 from .transfer import Transfer, UnfitError, WatchedInputs
 
 _BY_PYTHON = StepParts.EVENTS | StepParts.EARLY_RETURN | StepParts.SLOPES | StepParts.ROLLBACK

@@ -13,7 +13,7 @@ from ...blocks.core import Layout
 from ..archive import FmuDescription, FmuVariable, inexact
 from .bound_calls import BoundCalls, Call
 from .fmi_calls import WARNING, FmiCalls
-from .texts import waits_for_initialization
+from .text_values import waits_for_initialization
 
 _ROUNDED = 1e-12
 _MOST_LISTS = 50

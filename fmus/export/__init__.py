@@ -1,15 +1,15 @@
 """Export of a block as an FMU: equations, C code, model description, binaries."""
 
 from .compiler import compile_shared, compile_webassembly, describe_compiler
+from .fmu_package import build_fmu, clear_cache
 from .from_block import build, model_spec, parameter_variable
 from .inlined import inline_model, own_functions
 from .loop_code import write_loop_c
 from .loop_memory import Field, LoopMemory, c_number
 from .loop_spec import ROOM_FOR_EDGES, CFunction, ComputedNumbers, Guards, LoopSpec, Placed, Slopes, write_unit
 from .merged_plants import MergedPlant, PlacedPlant
-from .model import INTEGRATORS, Integrator, ModelSpec, Variable, check_ascii
+from .model_spec import INTEGRATORS, Integrator, ModelSpec, Variable, check_ascii
 from .own_sources import read_own_sources
-from .package import build_fmu, clear_cache
 from .python_fmu import build_python
 from .scalar_code import Lookup, split_lookups
 from .target_code import Number, TargetText, TickFacts, unit_name, write_target

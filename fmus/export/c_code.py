@@ -19,7 +19,7 @@ import casadi as ca
 from ...blocks.core import DefinitionError, lay_out, rate_of
 from ..runtime import read_sources
 from .elementary_tables import prepare_functions, restore_functions
-from .model import DIRECTIONS, INTEGRATORS, ModelSpec, Variable
+from .model_spec import DIRECTIONS, INTEGRATORS, ModelSpec, Variable
 
 Kind = Literal["time", "fixed", "tunable", "input", "state", "discrete", "derivative", "output", "indicator"]
 _SHARED = ("linear.c", "fixed_step.c", "embedded.c", "crossings.c")  # of loopwright.fmus.runtime

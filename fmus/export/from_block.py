@@ -23,10 +23,10 @@ from ...blocks.core import (
 )
 from ...blocks.tracing import GUARDS, NEXT, Traced, constants_of, trace, traced_parameters
 from ..exported_models import make_exported
+from .fmu_package import build_fmu, check_version
 from .html_page import block_text
 from .internal_step import choose_internal_step, compare_internal_step
-from .model import EventSpec, Integrator, ModelSpec, Variable
-from .package import build_fmu, check_version
+from .model_spec import EventSpec, Integrator, ModelSpec, Variable
 
 _TINY = float(np.finfo(float).tiny)  # the least positive number that is not denormal
 

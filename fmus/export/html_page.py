@@ -14,7 +14,7 @@ import numpy as np
 from ...blocks.core import Block
 from .c_code import Entry, layout
 from .equation_text import equations, number
-from .model import ModelSpec, Variable
+from .model_spec import ModelSpec, Variable
 from .scalars import scalarize
 
 _STYLE = """

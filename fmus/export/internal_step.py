@@ -10,7 +10,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from .model import ModelSpec, Variable
+from .model_spec import ModelSpec, Variable
 
 LONGEST = 1e-3
 """Longest step in s that is chosen."""

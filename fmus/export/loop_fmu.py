@@ -17,7 +17,7 @@ from ...blocks.core import lay_out
 from .c_code import ORDER, Entry, Kind, _array, _rate, _starts, _table
 from .html_page import page_of
 from .loop_spec import LoopSpec, Placed, write_unit
-from .model import Variable, naming_convention
+from .model_spec import Variable, naming_convention
 from .quantities import type_names
 from .scalars import _elements
 from .xml_fmi3 import LOG_CATEGORIES, _element, _types, _units_and_types, package_version

@@ -17,7 +17,7 @@ from ..runtime import read_sources
 from .elementary_tables import prepare_functions, restore_functions
 from .loop_memory import LoopMemory, c_number, c_text
 from .merged_plants import MergedPlant, describe_plants, plant_fields, write_plants
-from .model import Variable
+from .model_spec import Variable
 
 ROOM_FOR_EDGES = 64
 """Discontinuities of sources in a stretch of a loop with continuous states."""

@@ -36,9 +36,9 @@ from ...blocks.core import (
 from ...blocks.tracing import bundle, traced_parameters
 from ..child_processes import find_python, run_in_group, temporary_folder
 from ..platform import record_build
+from .fmu_package import file_for, write_atomically, zip_files
 from .html_page import block_text
-from .model import check_file_name
-from .package import file_for, write_atomically, zip_files
+from .model_spec import check_file_name
 from .xml_fmi3 import _unit, package_version
 
 NEEDS = "Needs Python where it runs, with NumPy and Loopwright {version}: its equations are Python code."

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .model import ModelSpec, Variable
+from .model_spec import ModelSpec, Variable
 
 
 def _elements(variable: Variable) -> Iterator[Variable]:

@@ -15,7 +15,7 @@ import numpy as np
 from ...blocks.core import explain_calls
 from .elementary_tables import FUNCTIONS, SINGLE_FUNCTIONS, prepare_functions, prepare_single
 from .loop_spec import Placed
-from .model import Variable
+from .model_spec import Variable
 from .scalar_code import OF_MATH, OF_TIME, Expressions, Scalars, Tables, c_constant
 from .target_spec import TargetSpec, TargetTick
 

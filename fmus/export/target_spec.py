@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from .loop_spec import LoopSpec
-from .model import Variable
+from .model_spec import Variable
 from .scalar_code import Lookup
 
 CLOCK_LIMIT = 32

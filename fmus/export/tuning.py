@@ -13,7 +13,7 @@ from ...blocks.core import FmuError, FmuFileError, accepts, kinds
 from ..child_processes import folder_in
 from ..platform import cache_folder, explain_cache_errors, is_built_here, native_platform, record_build
 from .compiler import compile_shared, describe_compiler, find_compiler
-from .package import FOLDERS2, fmi_headers, zip_files
+from .fmu_package import FOLDERS2, fmi_headers, zip_files
 
 _FLAGS = ("-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math")
 

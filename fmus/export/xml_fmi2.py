@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 
 from .c_code import Entry, layout
-from .model import ModelSpec, naming_convention
+from .model_spec import ModelSpec, naming_convention
 from .quantities import type_names
 from .xml_fmi3 import (
     _CAUSALITY,

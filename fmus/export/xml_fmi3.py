@@ -16,7 +16,7 @@ import casadi as ca
 
 from ...blocks.core import BASE_UNITS, Layout, parse_unit
 from .c_code import Entry, expand_scalar, layout, to_symbols
-from .model import ModelSpec, naming_convention
+from .model_spec import ModelSpec, naming_convention
 from .quantities import quantity, type_names
 
 #: Log categories (FMI 3.0, 2.4.5) that the runtime uses.

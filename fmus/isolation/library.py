@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..calls import ERROR
-from .process import ChildProcess
+from .fmu_process import ChildProcess
 from .process_limits import Isolation
 
 _FUNCTION: Any = ctypes._CFuncPtr  # type: ignore[attr-defined]

@@ -11,7 +11,7 @@ from ..calls import FmiCalls, FmuBlock, LoadedFmu
 from ..platform import is_built_here
 from .pool import take
 from .process_limits import Isolation, default_memory
-from .remote import make_remote_calls
+from .remote_calls import make_remote_calls
 
 L = TypeVar("L", bound=LoadedFmu)
 _EACH = 256  # bytes of shared memory for an element of a variable; only those that are used take memory

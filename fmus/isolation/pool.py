@@ -10,7 +10,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from .process import ChildProcess
+from .fmu_process import ChildProcess
 
 _MOST_IDLE, _IDLE_TIME = 4, 20.0
 """Number of idle processes, and seconds after which an idle one is ended."""

@@ -27,6 +27,7 @@ from ..archive import (
 from ..calls import FmuInstance, StepOptions, check_offered
 from ..isolation import Isolation, open_fmu
 from .fmu_point import FmuLinearization
+from .fmu_start_values import check_start, check_value, read_sized
 from .linearization import STEP, linear_model, step_difference
 from .model_exchange_members import (
     DEPENDENCIES,
@@ -36,7 +37,6 @@ from .model_exchange_members import (
     interface_text,
 )
 from .replacement import check_replacement
-from .start_values import check_start, check_value, read_sized
 
 
 class Fmu(ModelExchangeMembers):

@@ -13,7 +13,7 @@ from ...blocks.core import FmuError, Layout, ParameterError, UnknownNameError, b
 from ..calls import FmuBlock, LoadedFmu, is_kept
 from ..isolation import open_fmu
 from .derivation import Derivation
-from .start_values import check_state, check_value
+from .fmu_start_values import check_state, check_value
 
 _KEPT, _ROUNDING = 1e-9, 1e-12
 """A state counts as set within these: relative to its value, and to its nominal value."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from loopwright.blocks import AdmittanceFilter, ErrorDynamics, Line, Output, Reference, Step, parameter
 from loopwright.diagrams import AdmittanceLoop, Channel, Rig, fig3
-from loopwright.diagrams.paper.wires import IMPEDANCE_PAR, IMPEDANCE_PERP, POLES_PAR, POLES_PERP
+from loopwright.diagrams.paper.fig3_wires import IMPEDANCE_PAR, IMPEDANCE_PERP, POLES_PAR, POLES_PERP
 from loopwright.fmus import Fmu, build, gantry
 from loopwright.types import Array
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from loopwright.fmus import ModelSpec, Variable
-from loopwright.fmus.export.model import EventSpec
+from loopwright.fmus.export.model_spec import EventSpec
 
 M, D, K = 2.0, 0.5, 10.0
 

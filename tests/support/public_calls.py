@@ -14,8 +14,8 @@ import loopwright.sweeps as sweeps
 import loopwright.types as types
 from loopwright.blocks import Constant, Gain, Integrator, StateSpace, Step
 from loopwright.diagrams import Diagram, Requirements, experiments, subsystem
-from loopwright.diagrams.web_page.page import Played
 from loopwright.diagrams.web_page.shown_signals import ShownColumns
+from loopwright.diagrams.web_page.web_page import Played
 
 from .carts import cart_contact
 

@@ -9,7 +9,7 @@ import numpy as np
 from loopwright.blocks import PID, Constant, DiscreteStateSpace, Function, Gain, Integrator, Saturation, StateSpace
 from loopwright.diagrams import Diagram, Requirements, subsystem
 from loopwright.diagrams.report.case import Case
-from loopwright.diagrams.report.review import review
+from loopwright.diagrams.report.case_verdicts import review
 
 # --- a drive: speed control around current control ----------------------------------------------------------------------
 

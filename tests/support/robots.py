@@ -17,7 +17,7 @@ from loopwright.blocks import (
     TransverseTransform,
 )
 from loopwright.diagrams import Channel, Diagram, Rig, fig3, subsystem
-from loopwright.diagrams.paper.wires import IMPEDANCE_PAR, IMPEDANCE_PERP, POLES_PAR, POLES_PERP
+from loopwright.diagrams.paper.fig3_wires import IMPEDANCE_PAR, IMPEDANCE_PERP, POLES_PAR, POLES_PERP
 from loopwright.fmus import Fmu, gantry, gantry_elastic, gantry_stiction, scara
 
 ELLIPSE = Ellipse(semi_axes=(0.3, 0.15), center=(0.5, 0.5))

@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from loopwright.fmus.export.package import fmi_headers
+from loopwright.fmus.export.fmu_package import fmi_headers
 
 WALKS = Path(__file__).parent / "walks"
 FLAGS = [

@@ -12,9 +12,9 @@ from ....blocks.core import print_unit
 from ...frequency import Number
 from .definitions import LOOP_TERMS, definition
 from .document import SUMMARY, Document, Plot, Section, Table
+from .page_tables import Numbered, TableView, anchor
 from .printed_values import cell, mark, reason, tolerance_text, value_text
 from .svg import EmbeddedFigure, embedded
-from .tables import Numbered, TableView, anchor
 
 ELSEWHERE = frozenset({"definitions", "versions", "variants", "fmus"})
 """Entries of ``meta`` that stand in sections."""

@@ -37,7 +37,7 @@ from ..error_sentences import say, say_found
 from ..pages import Plot, Section, Table, Texts
 from ..same_loops import find_same
 from ..variant import Cut, Variant, in_s
-from ..wires import blocks_on_loops
+from ..wires_on_loops import blocks_on_loops
 from .poles import list_poles
 
 TEXTS = Texts(__package__, "loops")

@@ -35,7 +35,7 @@ from ..error_sentences import say
 from ..pages import Plot, Section, Table, Texts
 from ..stability import Stability
 from ..variant import Variant, in_s
-from ..wires import blocks_on_loops
+from ..wires_on_loops import blocks_on_loops
 
 TEXTS = Texts(__package__, "steps")
 TITLE = "Step and disturbance responses"

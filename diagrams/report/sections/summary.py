@@ -26,9 +26,9 @@ from ...requirements import (
 )
 from ...studies import CaseState
 from ..case import Case
+from ..case_verdicts import weakest
 from ..figures import HEIGHTS, fit_overview
 from ..pages import SUMMARY, Judged, Plot, Section, Table, Texts
-from ..review import weakest
 from ..same_loops import find_same
 from ..stability import free_motions
 from ..variant import Cut, Implementation, Variant

@@ -21,7 +21,7 @@ from loopwright.fmus.archive import read_library
 from loopwright.fmus.checks import summary as _summary
 from loopwright.fmus.checks import trial as _trial
 from loopwright.fmus.export.compiler import find_compiler
-from loopwright.fmus.export.package import zip_files
+from loopwright.fmus.export.fmu_package import zip_files
 from loopwright.fmus.platform import native_platform
 from support.failing_disk import fail_below
 from support.zoo import zoo_fmu

@@ -18,8 +18,8 @@ from loopwright.diagrams import Interrupted, experiments
 from loopwright.diagrams.cli import command_line as _cli
 from loopwright.diagrams.cli import options as _cli_options
 from loopwright.diagrams.cli.command_line import main
+from loopwright.diagrams.paper.experiment_figures import plot_experiment, plot_path
 from loopwright.diagrams.paper.experiment_numbers import DEFINITIONS, key_numbers
-from loopwright.diagrams.paper.figures import plot_experiment, plot_path
 from loopwright.diagrams.plotting import save
 from loopwright.diagrams.plotting.style import STYLE
 from support.waiting import FAR

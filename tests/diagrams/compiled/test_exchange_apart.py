@@ -194,7 +194,7 @@ def test_a_long_run_under_auto_is_that_of_the_matrix_exponential(mass):
 
 
 def test_python_asks_the_process_where_c_can_not_wait_for_it(mass, monkeypatch):
-    monkeypatch.setattr("loopwright.fmus.isolation.process.ChildProcess.request_of", lambda self, sequence: None)
+    monkeypatch.setattr("loopwright.fmus.isolation.fmu_process.ChildProcess.request_of", lambda self, sequence: None)
     run = mass_loop(mass, True).simulate(0.05, compile=True, progress=False)
     assert run.tier == "compiled"
     np.testing.assert_allclose(run["plant.position"], exact_loop(51), rtol=0.0, atol=1e-6)

@@ -242,11 +242,11 @@ def test_calls_are_made_in_c_or_python_with_the_same_bits(folder, monkeypatch):
     end_idle()
     one = simulate(loop(zoo(zoo_fmu(folder, 3))), 1.0, True)
     end_idle()
-    monkeypatch.setattr("loopwright.diagrams.compiled.remote.compile_other_side", lambda: None)
+    monkeypatch.setattr("loopwright.diagrams.compiled.plants_called_back.compile_other_side", lambda: None)
     two = simulate(loop(zoo(zoo_fmu(folder, 3))), 1.0, True)
     assert_same_bits(one, two)
     end_idle()
-    monkeypatch.setattr("loopwright.diagrams.compiled.remote.compile_other_side", lambda: "/no/library.so")
+    monkeypatch.setattr("loopwright.diagrams.compiled.plants_called_back.compile_other_side", lambda: "/no/library.so")
     assert_same_bits(one, simulate(loop(zoo(zoo_fmu(folder, 3))), 1.0, True))
     assert count_processes() == (1, 1)  # it is kept
 

@@ -7,9 +7,9 @@ import pytest
 
 from loopwright.blocks import AdmittanceFilter, Line, OptionError, Reference
 from loopwright.diagrams import Channel, ConfirmationError, Rig, experiments, fig3
-from loopwright.diagrams.contact.confirmation import measure_growth
+from loopwright.diagrams.contact.confirmed_limits import measure_growth
 from loopwright.diagrams.contact.moored_plant import LIBRARY, library_class
-from loopwright.diagrams.paper.wires import IMPEDANCE_PAR, IMPEDANCE_PERP
+from loopwright.diagrams.paper.fig3_wires import IMPEDANCE_PAR, IMPEDANCE_PERP
 from loopwright.fmus import Fmu, gantry, gantry_elastic, gantry_stiction
 
 PATH = Line(start=(-1.0, 0.0), end=(1.0, 0.0))

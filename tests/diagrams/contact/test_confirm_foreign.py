@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 from loopwright.blocks import Block, Constant, Gain, Input, OptionError, Output, State
 from loopwright.diagrams import ConfirmationError, Diagram, subsystem
-from loopwright.diagrams.contact.confirmation import LimitTrials
+from loopwright.diagrams.contact.confirmed_limits import LimitTrials
 from loopwright.fmus import Fmu, build
 from loopwright.types import TrialMethod
 

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 from loopwright.blocks import Block, Constant, ForceSensor, Gain, Input, OptionError, Output, TransferFunction
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.contact.loop import Modes
+from loopwright.diagrams.contact.contact_loop import Modes
 from loopwright.diagrams.contact.stability_limits import growth_rounding
 from loopwright.fmus import Fmu, build, scara
 from loopwright.types import TrialMethod

@@ -273,7 +273,7 @@ def uncompiled(monkeypatch):
     def refuse(*arguments, **options):
         raise AssertionError("compiled")
 
-    monkeypatch.setattr("loopwright.fmus.export.package._archive", refuse)
+    monkeypatch.setattr("loopwright.fmus.export.fmu_package._archive", refuse)
     return file
 
 
@@ -288,7 +288,7 @@ def refused(motor):
 
 
 def test_an_fmu_of_others_is_refused(uncompiled, monkeypatch):
-    monkeypatch.setattr("loopwright.diagrams.exporting.merged_plants.read_own_sources", lambda path: None)
+    monkeypatch.setattr("loopwright.diagrams.exporting.plants_to_merge.read_own_sources", lambda path: None)
     assert "dc_motor.fmu, an FMU that this version of Loopwright has not built" in refused(
         Fmu(uncompiled, name="motor")
     )

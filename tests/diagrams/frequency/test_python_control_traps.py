@@ -9,7 +9,7 @@ import pytest
 from loopwright.blocks import ParameterError
 from loopwright.diagrams.frequency.loop_scan import make_grid
 from loopwright.diagrams.frequency.poles_and_zeros import Features
-from loopwright.diagrams.frequency.python_control import _Judge, compare_margins, respond_at_once
+from loopwright.diagrams.frequency.python_control_margins import _Judge, compare_margins, respond_at_once
 from loopwright.diagrams.frequency.realization import Realization
 from loopwright.frequency import compare_with_control, disk_margin, margins, nyquist_count, place
 from support.loops import sampled_triple, triple
@@ -243,7 +243,7 @@ def test_a_value_that_cannot_be_judged_does_not_end_the_comparison(monkeypatch):
 def test_margins_that_are_there_are_compared_without_a_second_reduction(monkeypatch):
     loop = triple(20.0)
     ours = margins(loop)
-    monkeypatch.setattr("loopwright.diagrams.frequency.python_control.margins", None)
+    monkeypatch.setattr("loopwright.diagrams.frequency.python_control_margins.margins", None)
     found = compare_margins(Realization.of(loop), ours, loop)
     assert {row.name for row in found} >= {"gain_margin_low", "phase_margin_deg"}
 

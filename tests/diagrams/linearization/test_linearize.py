@@ -36,7 +36,7 @@ from loopwright.blocks import (
     WiringError,
 )
 from loopwright.diagrams import Diagram, NonFiniteError, subsystem
-from loopwright.diagrams.linearization.findings import EventWithinPeriod, StepsOnly, UnusualStart
+from loopwright.diagrams.linearization.left_out_effects import EventWithinPeriod, StepsOnly, UnusualStart
 from loopwright.fmus.running.derivation import Derivation, DerivativeMethod
 from loopwright.types import Linearization, OperatingPoint
 from support.linear import by_simulation, differences

@@ -8,7 +8,7 @@ from loopwright.blocks import OptionError
 from loopwright.blocks.core.errors import UnknownNameError
 from loopwright.diagrams import Requirements, analyse
 from loopwright.diagrams.cli import main
-from loopwright.diagrams.contact import confirmation
+from loopwright.diagrams.contact import confirmed_limits
 from loopwright.diagrams.requirements import ContactLimits, Reason, Verdict
 from loopwright.diagrams.studies import ContactTask
 from support.carts import DRAG, SHARE, TAU, M, cart_diagram
@@ -83,7 +83,7 @@ def test_limits_without_contacts_are_not_decided_and_those_of_others_refused():
 
 
 def test_a_limit_that_a_run_contradicts_is_not_decided(monkeypatch):
-    monkeypatch.setattr(confirmation, "measure_growth", lambda *given: 3.0)
+    monkeypatch.setattr(confirmed_limits, "measure_growth", lambda *given: 3.0)
     (result,) = (r for r in review({"stiffness": 0.5 * SOFT}).review.results if r.quantity == "contact.stiffness")
     assert (result.verdict, result.reason) == (Verdict.UNDECIDED, Reason.REFUTED)
 

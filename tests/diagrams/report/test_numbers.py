@@ -11,7 +11,7 @@ from loopwright.diagrams import ConfirmationError, Diagram, analyse, experiments
 from loopwright.diagrams.paper.fig3_case import Fig3Case
 from loopwright.diagrams.report.case import delayed_subsystems
 from loopwright.diagrams.report.points import point_of
-from loopwright.diagrams.report.wires import wires_on_loops
+from loopwright.diagrams.report.wires_on_loops import wires_on_loops
 from loopwright.fmus import Fmu, dc_motor
 
 DESIGN = ("continuous", "sampled_d0", "sampled_d1")

@@ -21,7 +21,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Diagram, Requirements, subsystem
 from loopwright.diagrams.cli.report import verdict_text
-from loopwright.diagrams.report.pages.tables import Numbered
+from loopwright.diagrams.report.pages.page_tables import Numbered
 from loopwright.diagrams.requirements import Limit, Reason, RequirementResult, Verdict, by_loop
 
 pytestmark = pytest.mark.usefixtures("without_drawings")

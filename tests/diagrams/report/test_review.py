@@ -16,11 +16,11 @@ from loopwright.diagrams import Diagram, Requirements, analyse, experiments, sub
 from loopwright.diagrams.cli.command_line import main
 from loopwright.diagrams.cli.report import verdict_text
 from loopwright.diagrams.report.case import Case
+from loopwright.diagrams.report.case_verdicts import review
 from loopwright.diagrams.report.content_hash import content_hash
 from loopwright.diagrams.report.pages.definitions import definition
 from loopwright.diagrams.report.pages.html import to_html
 from loopwright.diagrams.report.pages.json import to_json
-from loopwright.diagrams.report.review import review
 from loopwright.diagrams.requirements import Limit, Reason, RequirementResult, Review
 from loopwright.frequency import Number
 from loopwright.types import Verdict

@@ -17,7 +17,7 @@ from loopwright.diagrams.requirements import (
     judge,
     read_requirements,
 )
-from loopwright.diagrams.requirements.review import row_of
+from loopwright.diagrams.requirements.verdict_table import row_of
 from loopwright.frequency import Number
 from loopwright.types import Kink, Verdict
 

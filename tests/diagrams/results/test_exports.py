@@ -13,7 +13,7 @@ from scipy.io import loadmat
 
 from loopwright.blocks import OptionError, UnknownNameError
 from loopwright.diagrams import Run
-from loopwright.diagrams.results import exports as _exports
+from loopwright.diagrams.results import run_exports as _exports
 from loopwright.types import Layout, Wire
 
 SHAPES = {"plant.position": (2,), "plant.mass": (2, 3), "box.pid.v": (), "box.e": ()}

@@ -5,7 +5,7 @@ import pytest
 
 from loopwright.blocks import PID, Constant, TransferFunction
 from loopwright.diagrams import Diagram
-from loopwright.diagrams.studies.confirmation import _deciding_frequency
+from loopwright.diagrams.studies.confirmed_cases import _deciding_frequency
 from loopwright.frequency import margins
 
 

@@ -25,7 +25,7 @@ from loopwright.blocks import (
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.linearization import loop_of_variant
 from loopwright.diagrams.requirements import Requirements
-from loopwright.diagrams.studies import CaseOrigin, CaseState, ConfirmationKind, search
+from loopwright.diagrams.studies import CaseOrigin, CaseState, ConfirmationKind, worst_case_search
 from loopwright.diagrams.sweeps import Box
 from support.tuned_loops import Tank, make_pi_loop, pi_phase_margin
 
@@ -140,7 +140,7 @@ def test_a_search_goes_down_to_the_worst_corner():
 
 def test_the_gradient_of_the_search_is_that_of_the_margin():
     from loopwright.diagrams.studies.cases import make_goal
-    from loopwright.diagrams.studies.search import Study
+    from loopwright.diagrams.studies.worst_case_search import Study
 
     diagram = make_pi_loop()
     boxes = {"p.gain": Box(0.5, 2.0), "ki.gain": Box(0.2, 4.0, "log")}
@@ -369,9 +369,11 @@ def test_a_search_computes_no_case_twice_and_finds_the_least_value():
 
 
 def test_slopes_by_differences_need_no_further_linear_model(monkeypatch):
-    made, linearize = [], search.linearize
-    monkeypatch.setattr(search, "linearize", lambda *of, **options: made.append(1) or linearize(*of, **options))
-    monkeypatch.setattr(search, "_is_start_value", lambda diagram, name: True)  # as an FMU's parameter
+    made, linearize = [], worst_case_search.linearize
+    monkeypatch.setattr(
+        worst_case_search, "linearize", lambda *of, **options: made.append(1) or linearize(*of, **options)
+    )
+    monkeypatch.setattr(worst_case_search, "_is_start_value", lambda diagram, name: True)  # as an FMU's parameter
     found = make_pi_loop().worst_case({"p.gain": (0.5, 2.0)}, "u", quantity="ms", count=3, starts=1, steps=3)
     s = 1j * np.geomspace(0.1, 100.0, 2001)
     by_hand = max(np.max(1 / np.abs(1 + (kp * s + 0.5) * 2.0 / (s * (s + 2.0)))) for kp in np.linspace(0.5, 2.0, 61))

@@ -266,7 +266,7 @@ def test_a_function_of_python_is_refused_by_its_path(uncompiled):
 
 
 def test_an_fmu_of_others_is_refused_by_its_path(uncompiled, monkeypatch):
-    monkeypatch.setattr("loopwright.diagrams.exporting.merged_plants.read_own_sources", lambda path: None)
+    monkeypatch.setattr("loopwright.diagrams.exporting.plants_to_merge.read_own_sources", lambda path: None)
     with pytest.raises(DefinitionError, match=r"dc_motor\.fmu, an FMU that .*has not built.*Replace it by") as caught:
         drive(TARGET).to_html()
     assert caught.value.block == "motor"

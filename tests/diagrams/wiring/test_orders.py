@@ -4,19 +4,19 @@ import pytest
 
 from loopwright.blocks import Constant, FilteredDerivative, Gain, Sine, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.wiring import order
+from loopwright.diagrams.wiring import evaluation_order
 
 
 @pytest.fixture
 def sorted_times(monkeypatch):
     calls = []
-    sort = order._sort
+    sort = evaluation_order._sort
 
     def count(*args):
         calls.append(args)
         return sort(*args)
 
-    monkeypatch.setattr(order, "_sort", count)
+    monkeypatch.setattr(evaluation_order, "_sort", count)
     return calls
 
 

@@ -17,7 +17,7 @@ from fmpy.validation import validate_fmu
 from loopwright.blocks.core.errors import CompilerError, DefinitionError, FmuError, ParameterError, UnitError
 from loopwright.fmus import Variable, build_fmu
 from loopwright.fmus.export import compiler as _compiler
-from loopwright.fmus.export import package as _build
+from loopwright.fmus.export import fmu_package as _build
 from loopwright.fmus.export.c_code import runtime
 from loopwright.fmus.export.compiler import TARGETS, compile_shared, find_compiler
 from loopwright.fmus.platform import native_platform

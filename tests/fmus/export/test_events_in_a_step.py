@@ -10,7 +10,7 @@ from fmpy.validation import validate_fmu
 
 from loopwright.blocks.core.errors import DefinitionError, ParameterError
 from loopwright.fmus import Variable, build_fmu
-from loopwright.fmus.export.model import EventSpec
+from loopwright.fmus.export.model_spec import EventSpec
 from support.exported import E, G, ball, bouncing_ball, counter, heating, mass_spring_damper, relay, thermostat
 
 INTEGRATORS = (1, 2, 3)

@@ -15,7 +15,7 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from loopwright.fmus import build, build_fmu, gantry
-from loopwright.fmus.export import package as _build
+from loopwright.fmus.export import fmu_package as _build
 from loopwright.fmus.platform import native_platform
 from support.exported import (
     bouncing_ball,

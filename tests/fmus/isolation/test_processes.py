@@ -342,10 +342,10 @@ def test_what_an_fmu_prints_is_told_at_the_end(folder):
 def test_the_child_imports_the_standard_library_only():
     """It is a second of NumPy, CasADi and FMPy faster so."""
     from loopwright.fmus.calls import printf
-    from loopwright.fmus.isolation import process
+    from loopwright.fmus.isolation import fmu_process
 
-    begin = process._START.replace("; main()", "; import loopwright_child.printf; print(*sys.modules)")
-    here = [str(Path(module.__file__).parent) for module in (process, printf)]
+    begin = fmu_process._START.replace("; main()", "; import loopwright_child.printf; print(*sys.modules)")
+    here = [str(Path(module.__file__).parent) for module in (fmu_process, printf)]
     done = subprocess.run([sys.executable, "-c", begin, *here], capture_output=True, text=True, check=True)
     assert "loopwright_child.child" in done.stdout.split()
     assert not {"numpy", "casadi", "fmpy", "loopwright", "scipy"} & set(done.stdout.split())

@@ -7,9 +7,9 @@ import pytest
 
 from loopwright.blocks import Block, Constant, Gain, OptionError, Output, ParameterError, Ramp, Sine
 from loopwright.diagrams import Diagram
-from loopwright.diagrams.compiled.remote import PythonSteps
+from loopwright.diagrams.compiled.plants_called_back import PythonSteps
 from loopwright.fmus import Fmu, FmuRuntimeError, StepOptions
-from loopwright.fmus.isolation.process import ChildProcess
+from loopwright.fmus.isolation.fmu_process import ChildProcess
 from support.careful_fmus import (
     BETWEEN,
     BETWEEN_MODEL,

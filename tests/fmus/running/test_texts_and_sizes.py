@@ -8,7 +8,7 @@ import pytest
 from loopwright.blocks import Constant, OptionError, ParameterError, UnknownNameError
 from loopwright.diagrams import Diagram, Run
 from loopwright.fmus import Fmu, read_description
-from loopwright.fmus.calls.texts import list_limits
+from loopwright.fmus.calls.text_values import list_limits
 from support.small_fmus import small_fmu
 
 SOURCE = """

@@ -25,7 +25,7 @@ from ..frequency import Confirmation, Margins, disk_margin, margins, mimo_disk_m
 from ..linearization import Linearization, find_signal, hold_sources, linearize, loop_of_variant, trim
 from ..measure import StepResponse, find_least_sine, frequency_response, step_response
 from .numbers import compared_numbers
-from .parameters import changed_entry
+from .varied_parameters import changed_entry
 
 if TYPE_CHECKING:
     from .cases import StudyCase

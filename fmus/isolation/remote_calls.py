@@ -27,9 +27,9 @@ from ..calls import (
 )
 from . import wire
 from .endings import describe_memory
+from .fmu_process import ChildProcess
 from .library import RemoteLibrary, describe_call, seconds_for
 from .pool import give_back
-from .process import ChildProcess
 from .process_limits import Isolation
 
 

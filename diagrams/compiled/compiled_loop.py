@@ -20,7 +20,7 @@ from ..flat import TRUE, StepTable, TickPattern
 from .bound_functions import CALL, TICK, TickStructure, at
 from .grouped_functions import GroupedTick
 from .newton import NewtonOptions, NewtonStructure
-from .remote import PythonStep, RemotePlants
+from .plants_called_back import PythonStep, RemotePlants
 from .runtime import load_runtime
 from .staged import NativeModelExchange
 from .staged_functions import Staged, StagedEquations

@@ -30,7 +30,7 @@ from .compiler import Compiler, check_platform, compile_shared, find_compiler
 from .html_page import index_html
 from .loop_fmu import describe_loop, generate_loop, loop_page, loop_runtime, scalarize_loop
 from .loop_spec import LoopSpec, write_unit
-from .model import ModelSpec
+from .model_spec import ModelSpec
 from .scalars import scalarize
 from .xml_fmi2 import model_description2
 from .xml_fmi3 import build_description, model_description, package_version
@@ -96,7 +96,16 @@ def _text(value: Any) -> str:
 def _code_parts(spec: ModelSpec | LoopSpec, fmi: int) -> list[str]:
     """Return the text of the modules that write the files, so that a change of them builds again."""
     folder = Path(__file__).parent
-    written = ["c_code", "elementary_tables", "html_page", "package", "quantities", "scalars", "xml_fmi2", "xml_fmi3"]
+    written = [
+        "c_code",
+        "elementary_tables",
+        "html_page",
+        "fmu_package",
+        "quantities",
+        "scalars",
+        "xml_fmi2",
+        "xml_fmi3",
+    ]
     if isinstance(spec, LoopSpec):
         written += ["loop_fmu", "loop_memory", "loop_spec", "merged_plants", "own_sources"]
     modules = [(folder / f"{name}.py").read_text(encoding="utf-8") for name in written]
