@@ -65,7 +65,7 @@ REASONS = (
         "",
         (
             "a variable is parameter and constant at once: a rule broken, and no reason not to run; `run.messages` "
-            "tells it"
+            "says it"
         ),
     ),
     (
@@ -77,7 +77,7 @@ REASONS = (
     (
         "FMPy/.*(Controller|Drivetrain)",
         "ModelExchange",
-        "nominal values of 0; 1 stands in for them, and `run.messages` tells it",
+        "nominal values of 0; 1 replaces them, and `run.messages` says it",
     ),
     ("Reference-FMUs.*Roberts", "ModelExchange", "stiff: Loopwright changes to an implicit method of its own accord"),
     (
