@@ -42,6 +42,7 @@ def describe_disk_error(error: OSError, place: str | os.PathLike[str], instead: 
     named = _name_in(error)
     path = named or os.fspath(place)
     there, code = _nearest(path), error.errno
+    # A relative path says nothing where the working folder is gone, so this comes before all other causes.
     if code == errno.ENOENT and (not named or not os.path.isabs(path)) and not _has_working_folder():
         return (
             "the working folder of this process has been removed; expected one that is there. Change to another one "
@@ -66,6 +67,7 @@ def describe_disk_error(error: OSError, place: str | os.PathLike[str], instead: 
         return f"{there!r} is on a file system that can only be read; expected one that can be written. {instead}"
     if code == errno.ENOENT:
         return _describe_missing(path, instead)
+    # The system names the whole path; the file in the way is the nearest part of it that exists.
     if code in _NO_FOLDER and not os.path.isdir(there):
         return f"{there!r} is a file; expected a folder. {instead}"
     if code == errno.EISDIR:

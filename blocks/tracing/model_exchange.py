@@ -41,6 +41,8 @@ def describe_model_exchange(block: Block, shapes: Mapping[str, Shape], *, sample
     u = [ca.MX.sym(f"u{i}", size(s)) for i, s in enumerate(shapes.values())]
     known = {"t": t, "x": x, **dict(zip(shapes, u, strict=True))}
     results, depends = [], {}
+    # Dependences are read from the sparsity of these functions, as for every block; so each result is NaN, and
+    # depends on what the FMU declares.
     for name, rows in sizes.items():
         patterns = {} if name == GUARDS else block.dependence(name)
         column = ca.MX.zeros(rows) if not rows else ca.MX.ones(rows) * np.nan

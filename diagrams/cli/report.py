@@ -140,6 +140,7 @@ def report_command(arguments: argparse.Namespace) -> int:
     """Make the diagram, analyse it, write the files; return the exit status."""
     from ..report import check_files, write_report
 
+    # All arguments and files are read and checked first: an analysis takes seconds to minutes.
     file = None if arguments.requirements is None else TomlFile.read(arguments.requirements, "--requirements")
     asked = None if file is None else read_requirements(file)
     searched = _read_worst_case(arguments.worst_case, file)
@@ -167,6 +168,7 @@ def report_command(arguments: argparse.Namespace) -> int:
         try:
             with work_notes(diagram.name) as progress:
                 report = _analyse(diagram, experiment, arguments, asked, about, progress, measured, searched, touched)
+        # A name in the requirements or measured files is wrong usage (2); one inside the analysis is a failure (1).
         except UnknownNameError as error:
             say(f"loopwright: error: {error}", sys.stderr)
             return 1 if asked is None and not measured else 2

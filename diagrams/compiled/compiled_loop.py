@@ -170,6 +170,7 @@ class CompiledLoop:
         x_next, _, log, ok = results
         self.kinds = {clocks: i for i, clocks in enumerate(code.ticks)}
         ticks = [self._tick(tick, arguments, results) for tick in code.ticks.values()]
+        # The tick after those with code stands for all other sets of clocks; C calls Python for it.
         if rest is not None:
             ticks.append(TickStructure(self.called.function(TICK, lambda *_: rest(), 1)))
         self.structure = LoopStructure(
@@ -192,6 +193,7 @@ class CompiledLoop:
             near=NEAR,
         )
         self.structure.apart = self._remote.address
+        # One array where plants take their inputs as they are; then C copies nothing.
         if held is not None and held[0] is not held[1]:
             self.structure.z, self.structure.held = map(self._array, held)
             self.structure.inputs = held[0].size
@@ -201,6 +203,7 @@ class CompiledLoop:
             self.structure.own = ctypes.addressof(self._own)
         if code.loops:
             solvers = [self.bind_loops(code, clocks, arguments, (loops or {}).get(clocks)) for clocks in code.ticks]
+            # C indexes solvers by the kind of the tick; the one that Python evaluates solves its loops itself.
             solvers += [NewtonStructure()] * (len(ticks) - len(solvers))
             self.structure.loops = self._address(solvers, NewtonStructure)
         self._outcome = OutcomeStructure()

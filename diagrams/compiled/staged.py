@@ -177,6 +177,7 @@ class NativeModelExchange:
         for i, (path, block) in enumerate(blocks.items()):
             e = self._each[i]
             e.of, e.place, e.first, e.next_time = ctypes.addressof(self.structure), i, first[path], np.inf
+            # Such a block has no functions that C could call; Python evaluates it, and its structure stays empty.
             e.by_python = find_obstacle(block) is not None
             if e.by_python:
                 continue

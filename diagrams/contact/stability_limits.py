@@ -505,6 +505,7 @@ def find_limit(
     """
     loop = CoupledLoop.of(parts, direction, vary, held)
     frequency, moved, second = math.nan, tuple[float, ...](), math.nan
+    # A mode that grows without the environment is no limit of it: then no value is stable, and nothing is scanned.
     if (fixed := loop.find_fixed_growth()) is not None:
         rate, frequency, moved = fixed
         grows = f"a mode that no such environment moves grows by {rate:.4g} 1/s"
@@ -523,6 +524,7 @@ def find_limit(
         )
         if found.value < math.inf:
             frequency, moved = loop.fastest_mode(found.value or float(grid[0]))
+        # A spring alone has a second way that shares nothing with the first: the frequency response at the contact.
         alone = vary == "stiffness" and not any(held.values()) and "tool_mass" not in held
         if alone and 0.0 < found.value < math.inf:
             second = look_again(parts, direction, frequency)

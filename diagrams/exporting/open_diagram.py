@@ -123,6 +123,7 @@ def open_part(wired: WiredDiagram, path: str, name: str) -> OpenDiagram:
     def enter(wire: Wire) -> Wire:
         if wire.block in inside:
             return wire
+        # A port is called as the argument of the subsystem's function, where there is one: the user chose that name.
         argument = next(
             (n for (p, n), w in table.arguments.items() if p == found and w in (wire, replace(wire, index=None))), None
         )
@@ -144,6 +145,7 @@ def open_part(wired: WiredDiagram, path: str, name: str) -> OpenDiagram:
             ports[key] = (label, shape, unit, description, value if index is None else value[index])
         return Wire(_OUTSIDE, ports[key][0], wire.index if index is None else None)
 
+    # Subsystems around stay, as they say the rate and when the part is enabled; their other blocks go.
     part = table.copy()
     around = [f.path for f in table.subsystems_around(found)]
     part.subsystems = {p: s for p, s in table.subsystems.items() if not p or p in around or p.startswith(f"{found}.")}
@@ -197,6 +199,7 @@ def open_whole(wired: WiredDiagram, outside: Sequence[str], name: str) -> OpenDi
         own, full = port.replace(".", "_"), f"{path}_{port}".replace(".", "_")
         return path.replace(".", "_") if alone else own if own not in taken and len(paths) == 1 else full
 
+    # What a removed block gave becomes an input, and what it read becomes an output.
     for path in paths:
         block = table.blocks.pop(path)
         del table.subsystem_of[path]
@@ -225,6 +228,7 @@ def open_whole(wired: WiredDiagram, outside: Sequence[str], name: str) -> OpenDi
         table.subsystem_of[_OUTSIDE] = ""
     opened = WiredDiagram(name, table, wired.loops, wired.facade_class)
     scheduled = opened.scheduled
+    # Without wires to removed blocks the named wires are the outputs; without those, whatever nothing reads.
     outputs = {key: scheduled.results["", key] for key in read} or dict(scheduled.names)
     outputs = {n: w for n, w in outputs.items() if w.block != _OUTSIDE} or _unread(opened)
     outputs = _apart(outputs, [p[0] for p in ports], "")

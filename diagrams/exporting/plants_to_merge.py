@@ -86,6 +86,7 @@ def merge(opened: OpenDiagram, flat: FlatDiagram, width: int) -> tuple[tuple[Mer
         wired = [port for port in block.inputs if (path, port) in flat.table.wires]
         ins = [block.input_variables[port] for port in wired]
         outs = [block.output_variables[port] for port in block.outputs]
+        # A parameter that a wire sets is an input here; the solver's own settings are no parameters of the model.
         taken = {key for one in ins for key in one.keys}
         own = [
             v
@@ -108,6 +109,7 @@ def merge(opened: OpenDiagram, flat: FlatDiagram, width: int) -> tuple[tuple[Mer
             )
             parameters.append(Placed(variable, "p", tuple(range(width, width + one.size))))
             width += one.size
+        # Start values that are no parameter of the whole are written into the code once.
         set_here = {v.name for v in own}
         start = [
             (reference, values)

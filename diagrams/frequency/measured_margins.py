@@ -312,6 +312,7 @@ def read_frequency_data(file: str | os.PathLike[str], *, dt: float = 0.0) -> Fre
     import control
 
     try:
+        # Spreadsheets write a byte order mark; lines are counted by the reader, as cells may contain line breaks.
         with open(file, encoding="utf-8-sig", newline="") as opened:
             reader = csv.reader(opened)
             numbered = [(reader.line_num, row) for row in reader if row and any(cell.strip() for cell in row)]
@@ -351,6 +352,7 @@ def read_frequency_data(file: str | os.PathLike[str], *, dt: float = 0.0) -> Fre
         gain, phase = take("gain", "gain_db"), take("phase_deg", "phase_rad")
         size = 10.0 ** (columns[gain] / 20.0) if gain == "gain_db" else columns[gain]
         value = size * np.exp(1j * (np.radians(columns[phase]) if phase == "phase_deg" else columns[phase]))
+    # Rows may be in any order; the same frequency twice has no phase between, so it is an error.
     order = np.argsort(omega, kind="stable")
     if (twice := np.flatnonzero(np.diff(omega[order]) == 0.0)).size:
         first, second = (numbered[1 + int(order[k])][0] for k in (twice[0], twice[0] + 1))

@@ -255,11 +255,13 @@ def _compile(
     method: str,
     newton: Mapping[frozenset[TickPattern], NewtonOptions],
 ) -> LaneCode:
+    # Lanes advance together, so nothing may happen at different times in two of them.
     if between := _between_ticks(flat, method):
         raise NoLanesError(between)
     if flat.apart:
         raise NoLanesError(f"{min(flat.apart)} is in model exchange")
     scalars = ScalarFunctions()
+    # Runs that start together evaluate a tick at the start, whose clocks may be in no later tick.
     ticks = TickSources(flat, [*acting, *(() if start is None else (start.clocks,))], scalars)
     loops = dict[int, LoopSource]()
     for i, clocks in enumerate(acting):

@@ -60,6 +60,7 @@ def resolve(
         )
     if name in wires or name in ports:
         return name
+    # The names that the user gave go before the ports, of which there are many.
     for group in (wires, ports):
         found = sorted(n for n in group if n.endswith("." + name))
         if found and (len(found) == 1 or (group is wires and len({wires[n] for n in found}) == 1)):
@@ -77,6 +78,7 @@ def resolve(
     whole, entry = split_entry(name, {*wires, *ports})
     if entry:
         return resolve(whole, wires, ports, blocks, outputs) + name[len(whole) :]
+    # Nothing fits. The errors below say what the name most likely means.
     if hidden := _hidden_variable(name, blocks or {}):
         path, variable = hidden
         raise UnknownNameError(

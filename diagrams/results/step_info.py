@@ -187,12 +187,14 @@ def measure_info(
             block=signal,
             port="since",
         )
+    # The sample before the step is the value at rest; the step itself may already move the first one.
     before = float(y[max(first - 1, 0)])
     times = np.append(0.0, np.maximum(after - since, 0.0))
     r = np.append(0.0, y[first:] - before)
     found = measure_step(times, r, held=held, target=None if final is None else final - before)
     change = found["final"].value
     far = int(np.argmax(np.abs(r)))
+    # Extremes after the rise and the undershoot need a change to be measured against.
     low = high = under = math.nan
     if math.isfinite(change) and change != 0.0:
         under = max(0.0, float(np.max(-r / change)))

@@ -169,6 +169,7 @@ def header(
     outputs : mapping, optional
         Outputs by their blocks' paths, secondary ones aside, by which a block's name is found to be a signal.
     """
+    # Entries count from 1 and carry their port's name: other tools read these column names.
     entries = [""] * width
     for name, where in layout.slices.items():
         many = layout.shapes[name] != ()

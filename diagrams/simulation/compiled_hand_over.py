@@ -82,6 +82,7 @@ def bind_hybrid(
         Tells the events that have happened.
     """
     flat, here, domains, blocks = workspace.flat, workspace.here, continuous.domains, continuous.exchanged
+    # Blocks in model exchange and their own events come together, or neither is there.
     handed = (
         None
         if blocks is None or continuous.own_events is None

@@ -437,6 +437,7 @@ class LiveRun(ShownAsTable):
         done, origin = 0, pace.clock()
         with _interrupts() as interrupted:
             while simulation.stopped is None and (left is None or left > 0 or rest):
+                # Frames are due by counting from the start: a sum of pauses would drift.
                 due = origin + self.slipped + done * base / pace.speed
                 ended = self._await(due, interrupted)
                 if ended:
@@ -444,6 +445,7 @@ class LiveRun(ShownAsTable):
                 began = pace.clock()
                 late = max(0.0, began - due)
                 self._late.append(late)
+                # A small delay is caught up; after a long one (a laptop that slept) the clock is moved instead.
                 if late > pace.catch_up:
                     self.slipped += late
                     due += late

@@ -477,6 +477,7 @@ class _File:
             path = ".".join(filter(None, (at, name)))
             if name in elements:
                 raise self.error(f"found two elements {name!r}; expected one. Rename one.", at)
+            # Counted over all files: a few nested references could otherwise ask for millions of elements.
             self.reader.count += 1
             if self.reader.count > _MOST_ELEMENTS:
                 raise self.error(f"found more than {_MOST_ELEMENTS} elements; expected fewer. Take a part of it.", path)

@@ -98,6 +98,7 @@ class Writer:
                 "loopwright.build(diagram).",
                 block=self.wired.name,
             )
+        # A named constant at the top level is what the system is given: it becomes a value of the SSP's parameter set.
         inputs = (
             set()
             if self.flat
@@ -110,6 +111,8 @@ class Writer:
         self.wired, exported = split_diagram(self.wired, {*fmus}, inputs)
         self.table = self.wired.scheduled
         arrays = any(v.shape for b in fmus.values() for v in b.description.scalars.values() if v.causality in _SIGNALS)
+        # Sampled parts come first in the file: a tool that steps components in this order gives their values to the
+        # plants at the same instant.
         first = order_sampled(self.table, exported)
         for path in first:
             self._add_export(path, arrays=arrays)

@@ -164,6 +164,7 @@ def make_goal(
                 port="loop",
             )
         return Goal({tuple(wires): {quantity: None}})
+    # Each wire is a separate loop, with the limits that apply to it.
     found: dict[tuple[str, ...], Mapping[str, Limit | None]] = {}
     for wire in dict.fromkeys(wires or requirements.loops):
         limits = requirements.limits_of([wire], "")
@@ -176,6 +177,7 @@ def make_goal(
             "a function as quantity looks for their worst case.",
             block=diagram,
         )
+    # These requirements belong to the report; the result names them as not looked at.
     steps = [requirements.step, *requirements.steps, *(of.step for of in requirements.loops.values())]
     left_out = [f"step.{name}" for step in steps if step is not None for name in step.limits]
     left_out += [f"loops.{name}" for name in requirements.loops if wires and name not in wires]

@@ -266,6 +266,7 @@ def find_worst_case(
         quantity = "disk_margin"
     if points is not None and at is not None:
         raise OptionError("found at and points; expected one of them. Give points=[…] alone.", block=diagram.name)
+    # A function as quantity cuts no loop, so it sees the diagram as it is.
     if measure is not None:
         goal = Goal({(measure.place,): {measure.name: None}})
     else:
@@ -282,6 +283,7 @@ def find_worst_case(
     check_ranges(diagram, boxes)
     places = tuple(points) if points is not None else (at,)
     study = Study(diagram, goal, boxes, places, delay, options, progress or (lambda text: None), measure)
+    # Without a nominal case there is nothing that a worst case could be compared with.
     nominal = study.run({}, CaseOrigin.NOMINAL)
     if all(case.state is CaseState.FAILED for case in nominal):
         way_out = "Mend that first."
@@ -301,6 +303,7 @@ def find_worst_case(
     if boxes and starts > 0:
         study.try_corners()
         study.search(starts, steps)
+    # Equal cases: the first one, so that the result doesn't depend on the search.
     worst = study.with_findings(min(study.cases, key=lambda case: (order_key(case.goodness), case.index)))
     study.cases[worst.index] = worst
     cases = tuple(study.cases)

@@ -59,6 +59,7 @@ def plot_cases(
                     y = [c.numbers[loop][quantity].value for c in mine]
                     axes.scatter([c.parameters[name] for c in mine], y, s=size, color=color, label=label, alpha=0.8)
             bad = [c for c in cases if c.parameters and c.state in (CaseState.UNSTABLE, CaseState.FAILED)]
+            # Cases without a number are drawn at the lower edge, where they can't be taken for a small margin's value.
             low = axes.get_ylim()[0] if axes.collections else 0.0
             if bad:
                 x = [c.parameters[name] for c in bad]

@@ -238,6 +238,7 @@ class Sweep(ShownAsTable):
         axes: Mapping[str, tuple[Any, ...]] | None = samples.axes
         dims = ("sample",) if axes is None else tuple(axes)
         coordinates: dict[str, Any] = {}
+        # Only a grid has an axis for each parameter; other samples share one, with the parameters along it.
         if axes is None:
             coordinates["sample"] = ("sample", np.arange(len(samples)))
             for k, name in enumerate(samples.names):
@@ -257,6 +258,7 @@ class Sweep(ShownAsTable):
             variables[name] = (dims, values.reshape(samples.shape), attributes)
         inner: tuple[str, ...] = ()
         if self._signals:
+            # Runs with steps of equal length share their times; else each run has its own.
             if self.t.ndim == 1:
                 inner, coordinates["t"] = ("t",), ("t", self.t, {"units": "s"})
             else:

@@ -106,6 +106,7 @@ def sweep(
         messages = tuple(dict.fromkeys(m for o in outcomes if o is not None for m in o.messages))
         return Sweep(found, tuple(outcomes), name, perf_counter() - started, reused, messages, tuple(plan.reductions))
 
+    # A stored outcome counts only for the same plan and sample; its key is made of both.
     try:
         keys = [key_of(sample, seeded=bool(plan.seeds)) for sample in found] if store is not None else []
         for place, key in enumerate(keys):
@@ -122,6 +123,7 @@ def sweep(
                     store.add(keys[outcome.index], outcome)
                 done += 1
                 show(done)
+    # What was computed until Ctrl-C is not lost: the error has it, and the store has it on disk.
     except KeyboardInterrupt as interrupt:
         raise InterruptedSweep(result()) from interrupt
     finally:

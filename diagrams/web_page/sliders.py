@@ -236,6 +236,7 @@ def _range(value: float, spec: Any, limits: Any, path: str, name: str, option: s
     most = spec.maximum
     if limits is None:
         size = abs(value)
+        # A positive quantity, such as a mass, is moved by factors; a signed one around zero.
         if spec.above is not None and value > spec.above >= 0.0:
             low, high = value / 5.0, value * 5.0
         elif value == 0.0:

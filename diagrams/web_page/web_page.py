@@ -284,6 +284,7 @@ def make_page(
     columns.add_wires()
     groups = [("Inputs" if tuned else "", moved), *_under_headings(tuned, headings or {})]
     every = [*moved, *tuned]
+    # The module is compiled with room for just these values; sliders of plants reach theirs through the plant.
     targets = [slider.target for slider in every if not slider.of_plant]
     targets += [target for target, _ in scene.moved.values()] if scene else []
     wires = [(Wire(column.block, column.port, None), column.entry) for column in columns.found]

@@ -52,6 +52,7 @@ def summarize(file: Path, *, limits: ArchiveLimits | None = None, load: bool = T
     fmi = str(model.fmiVersion)
     binaries = binaries_of(entries)
     native = native_platform()
+    # FMPy links a derivative to its state by the object itself.
     states = {id(v.derivative) for v in model.modelVariables if v.derivative is not None}
     variables = [_variable(v, id(v) in states) for v in model.modelVariables]
     interfaces = _interfaces(root, model)

@@ -289,6 +289,7 @@ def build(
         return build_fmu(
             made, out, fmi=fmi, arrays=arrays, platform=platform, documentation=documentation or "", notify=notify
         )
+    # A single block has no parts, ticks or solver of its own to choose.
     of_parts = subsystem or tuple(outside) or outputs is not None or start
     if of_parts or communication != "any" or solver or own_functions or clocks:
         raise OptionError(
@@ -305,6 +306,7 @@ def build(
         integrator=integrator or "rk4",
         tolerance=1e-8 if tolerance is None else tolerance,
     )
+    # Steps that the user chose are kept, and only compared with finer ones.
     is_chosen = internal_step is None and integrator is None
     spec = choose_internal_step(spec) if is_chosen else compare_internal_step(spec)
     text = block_text(block) if documentation is None else documentation

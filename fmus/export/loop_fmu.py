@@ -490,6 +490,7 @@ def _describe2(spec: LoopSpec, token: str) -> str:
         )
         for entry, one in rows
     ]
+    # FMI 2.0 names variables by their index, which counts from 1, where FMI 3.0 has value references.
     listed: dict[str, list[str]] = {"Output": [], "ContinuousStateDerivative": []}
     for tag, entry in _unknowns(entries):
         known = [e for e in _dependencies(spec, entry, inputs) if e.kind in ("time", "input", "state")]

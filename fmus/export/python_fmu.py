@@ -219,6 +219,7 @@ def _values(block: Block, name: str, kind: str) -> dict[str, dict[str, Any]]:
             f"it declares the outputs {', '.join(outputs)} but has no output(t, x, u); write it.", block=name
         )
     rates = {"continuous": ["derivative"], "sampled": ["update"]}.get(kind, [])
+    # Each equation is called once at the start: a wrong shape is an error now, not in another tool.
     for equation, ports in [*((rate, block.states) for rate in rates), *([("output", outputs)] if outputs else [])]:
         made = _call_at_start(block, name, equation, x, u, len(ports))
         for (key, port), value in zip(ports.items(), made, strict=True):

@@ -493,6 +493,8 @@ class Expressions:
         if operation in (ca.OP_INPUT, ca.OP_CONST):
             return self._leaf(node, fine)
         self.operations[_kind(operation)] += 1
+        # Each branch returns the text with the precedence of its outermost operator, so that no needless brackets are
+        # written.
         if operation in _BINARY:
             return self._binary(operation, arguments, fine)
         if operation == FIND:

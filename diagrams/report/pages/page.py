@@ -155,11 +155,13 @@ class Page:
         ]
         tops = dict.fromkeys(path.partition(".")[0] for path in numbers)
         numbering = _Numbering(numbers, with_appendix=with_appendix)
+        # The summary has no number, so that chapters begin with 1.
         begins = 1 if report.sections and report.sections[0].key == SUMMARY else 0
         first = numbering.sections(report.sections[:begins], "", "")
         chapters = () if report.summary else numbering.sections(report.sections[begins:], "", "", begins + 1)
         summary = first[0] if first else None
         about = tuple(_about(report.meta))
+        # Numbers without the appendix have no place that they could link to.
         if not with_appendix:
             return cls(report.title, about, summary, chapters, (), (), (), defines_loop=False)
         details = numbering.details()

@@ -67,6 +67,7 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities, confirmed: list
     lost: list[str] = []
     text: list[str] = []
     for name in names:
+        # Confirming costs linearizations on both sides of the value, so what an earlier loop has confirmed is taken.
         try:
             made = _take_confirmed([found[name, quantity] for quantity in shown], confirmed)
             if not made:
@@ -75,6 +76,7 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities, confirmed: list
                 confirmed += made
         except LoopwrightError as error:
             text.append(TEXTS.line("left_out", wire=wire, message=say(error)))
+            # The slopes are shown without their confirmation, and the text says why.
             rough = [found[name, quantity] for quantity in shown]
             made = [replace(row, slope=replace(row.slope, confirmed_by="")) for row in rough]
         bars[name] = next(row for row in made if row.quantity == first).per_percent.value

@@ -81,6 +81,7 @@ def subject(case: Case) -> Section:
     for path, block in sorted(diagram.blocks.items()):
         rows = list(_fmu_parameters(block) if isinstance(block, Fmu) else _parameters(block))
         for name, shown, unit, value in rows:
+            # Parameters without effect are listed in one line below the table; their numbers stay in the JSON.
             if name not in block.idle_parameters:
                 parameters.append((path, type(block).__name__, name, shown, print_unit(unit)))
             if isinstance(value, float) and np.isfinite(value):

@@ -243,6 +243,7 @@ def worst_case_of(reported: ReportedWorstCase | MissingWorstCase) -> Section:
     text = [TEXTS.line("worst", **counts, **facts)]
     if found.goal.left_out:
         text.append(TEXTS.line("not_looked_at", names=found.goal.left_out))
+    # A run of the worst case confirms it only if it agrees; one that doesn't is in the text.
     confirmed = run.trial if run is not None and run.agrees else ""
     if run is None:
         text.append(TEXTS.line("left_out", wire=", ".join(worst.loop) or "worst case", message=reported.problem))
