@@ -52,16 +52,11 @@ def _modes() -> _FloatingPoint:
 
 
 class HostState:
-    """The state as it is at the start of a ``with`` statement; its end sets it back, and tells what has been changed.
+    """State at the start of a ``with`` statement; its end sets it back, and reports once each thing that was changed.
 
     One within another keeps the state of the outer one. Rounding modes and traps are kept on Linux alone. There
     `settle` sets them back after each call, to what they were at the last such start, so that nothing is computed in
     those of a library.
-
-    Parameters
-    ----------
-    report : callable
-        Called once for each thing that was changed.
     """
 
     def __init__(self, report: Callable[[str], None]):

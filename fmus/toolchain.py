@@ -53,17 +53,9 @@ RUNTIME_FLAGS = ("-fno-unroll-loops",)
 
 
 def find_command(find_python: Callable[[], str]) -> tuple[tuple[str, ...], str] | None:
-    """Return the command of a C compiler, and where it is from; None without any.
+    """Return the command of a C compiler, and its source: "LOOPWRIGHT_CC", "ziglang" or "system"; None without any.
 
-    Parameters
-    ----------
-    find_python : callable
-        Returns the interpreter that runs zig's package where its binary isn't found.
-
-    Returns
-    -------
-    tuple of (tuple of str, str)
-        The command, and ``"LOOPWRIGHT_CC"``, ``"ziglang"`` or ``"system"``, in this order.
+    ``find_python`` returns the interpreter that runs zig's package where its binary isn't found.
     """
     if given := os.environ.get("LOOPWRIGHT_CC"):
         return tuple(shlex.split(given, posix=os.name != "nt")), "LOOPWRIGHT_CC"

@@ -12,18 +12,9 @@ from .variables import FmuVariable
 
 
 def find_aliases(variables: Mapping[str, FmuVariable]) -> tuple[dict[str, FmuVariable], dict[str, str]]:
-    """Return variables in which each input is listed once, and the other names of inputs and parameters.
+    """Return variables in which each input is listed once, and first names by the others of inputs and parameters.
 
-    Parameters
-    ----------
-    variables : mapping
-        All variables by name.
-
-    Returns
-    -------
-    dict, dict
-        The variables, in the same order: further names of an input are locals, which are read. And the first name of
-        each input or parameter by its further names.
+    Further names of an input are locals, which are read.
     """
     first: dict[tuple[str, tuple[int, ...]], FmuVariable] = {}
     found, aliases = dict(variables), {}

@@ -71,14 +71,7 @@ def judge_name(binary: str, identifier: str) -> tuple[FmuFinding, ...]:
 def missing_functions(library: SharedLibrary, version: str, *, model_exchange: bool) -> tuple[str, ...]:
     """Return the functions that a library must export and does not; empty if its symbols are not known.
 
-    Parameters
-    ----------
-    library : SharedLibrary
-        The library's header.
-    version : str
-        Version of FMI, such as "2.0"; none is known as missing in FMI 1.0, where names have the model's prefix.
-    model_exchange : bool
-        Whether model exchange is asked for; else co-simulation.
+    None is known as missing in FMI 1.0, where names have the model's prefix.
     """
     if library.symbols is None or library.damage:
         return ()
@@ -87,19 +80,7 @@ def missing_functions(library: SharedLibrary, version: str, *, model_exchange: b
 
 
 def check_binary(archive: FmuArchive, binary: str, version: str, *, model_exchange: bool = False) -> SharedLibrary:
-    """Return the header of an FMU's library, after holding it against this platform and the file's size.
-
-    Parameters
-    ----------
-    archive : FmuArchive
-        The FMU.
-    binary : str
-        The library's path in the archive.
-    version : str
-        Version of FMI in the description.
-    model_exchange : bool
-        Whether it is for model exchange.
-    """
+    """Return the header of an FMU's library, after holding it against this platform and the file's size."""
     library, native, file = read_library(archive.read(binary)), native_platform(), str(archive.path)
     if library.platforms and native not in library.platforms:
         raise FmuFileError(

@@ -28,18 +28,7 @@ def check_entries(
 ) -> tuple[dict[str, zipfile.ZipInfo], list[FmuFinding]]:
     """Return an archive's files by their paths with forward slashes, and findings about them.
 
-    Parameters
-    ----------
-    path : Path
-        The archive, for messages.
-    items : iterable of zipfile.ZipInfo
-        Its table of contents.
-    packed : int
-        Size of the archive in bytes.
-    limits : ArchiveLimits
-        Limits of its content.
-    noun : str
-        What the archive is, for messages: "FMU" or "SSP".
+    ``packed`` is the size of the archive in bytes.
     """
     items = list(items)
     if len(items) > limits.entries:

@@ -18,16 +18,7 @@ from .zip_file import DESCRIPTION
 def read_model(path: Path, text: bytes, root: Any, limits: ArchiveLimits | None = None) -> tuple[Any, tuple[str, ...]]:
     """Return FMPy's reading of a description, and complaints about rules of the standard that it breaks.
 
-    Parameters
-    ----------
-    path : Path
-        The FMU, for messages.
-    text : bytes
-        Its ``modelDescription.xml``.
-    root : lxml.etree.Element
-        The root of that; references that don't exist are taken out of it.
-    limits : ArchiveLimits, optional
-        Limits of the number of elements of a variable.
+    References that don't exist are taken out of the tree of ``root``.
     """
     from fmpy.validation import validate_model_description
     from lxml import etree

@@ -33,23 +33,12 @@ def gather(
     """Gather scalars with indices into arrays, where they are contiguous from 0 or 1, and alike.
 
     Alike are scalars of one type, causality, variability, ``initial`` and unit, that all or none have start values. A
-    derivative ``der(s[1])`` gathers into ``der(s)``. An array takes the place of its first scalar.
+    derivative ``der(s[1])`` gathers into ``der(s)``. An array takes the place of its first scalar. Names in ``taken``
+    are for none; ``joins`` are arrays that the user has put together, by their ports: an array of the FMU's own that
+    has one of their scalars is not gathered.
 
-    Parameters
-    ----------
-    scalars : mapping
-        All variables by name; those with a shape, and those without an index, stay.
-    taken : frozenset of str
-        Further names that an array can't have.
-    joins : mapping, optional
-        Arrays that the user has put together, by their ports; an array of the FMU's own that has one of their scalars
-        is not gathered.
-
-    Returns
-    -------
-    dict, dict, dict
-        Variables by name, array and index of each scalar that was gathered, and the ports of the joins by the names of
-        their arrays: the port's, where no variable has it, else those of the scalars.
+    Returned are variables by name, array and index of each scalar that was gathered, and the ports of the joins by the
+    names of their arrays: the port's, where no variable has it, else those of the scalars.
     """
     joins = joins or {}
     port_of = {v.name: port for port, join in joins.items() for v, _ in join}

@@ -23,15 +23,6 @@ def join_scalars(description: FmuDescription, rename: Mapping[str, str], label: 
     """Return the description with arrays of the scalars that are renamed to elements, such as ``position[1]``.
 
     All that holds for scalars ``s[1]``, ``s[2]`` of the FMU's own, which `gather` puts together, holds for these.
-
-    Parameters
-    ----------
-    description : FmuDescription
-        The FMU's description.
-    rename : mapping
-        FMU's names of ports and their new names; those without an index are left alone.
-    label : str
-        The block's name, for messages.
     """
     if not rename or not any("[" in new for new in rename.values()):
         return description

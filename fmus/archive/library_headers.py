@@ -25,37 +25,17 @@ _SHARED = 3
 
 @dataclass(frozen=True)
 class SharedLibrary:
-    """Header of a shared library.
+    """Header of a shared library."""
 
-    Parameters
-    ----------
-    platforms : tuple of str
-        Platforms, as FMI 3.0 names them (2.5.1.4), that it is for; none for an unknown format.
-    damage : str
-        Reason why it can't be loaded safely; empty if there is none.
-    needed : tuple of str
-        Names of the shared libraries that it needs; of ELF only.
-    symbols : frozenset of str, optional
-        Functions and data that it exports; None if they are not known, as for PE and Mach-O.
-    undefined : frozenset of str
-        Symbols that other libraries must define, weak ones left out; of ELF only.
-    """
-
-    platforms: tuple[str, ...] = ()
-    damage: str = ""
-    needed: tuple[str, ...] = ()
-    symbols: frozenset[str] | None = None
-    undefined: frozenset[str] = frozenset()
+    platforms: tuple[str, ...] = ()  # as FMI 3.0 names them (2.5.1.4); none for an unknown format
+    damage: str = ""  # reason why it can't be loaded safely
+    needed: tuple[str, ...] = ()  # shared libraries, of ELF only
+    symbols: frozenset[str] | None = None  # exported; None if they are not known, as for PE and Mach-O
+    undefined: frozenset[str] = frozenset()  # for other libraries to define, weak ones left out; of ELF only
 
 
 def read_library(data: bytes) -> SharedLibrary:
-    """Read the header of a shared library.
-
-    Parameters
-    ----------
-    data : bytes
-        Content of the file.
-    """
+    """Read the header of a shared library from its content."""
     if not data:
         return SharedLibrary(damage="it is empty")
     try:

@@ -52,10 +52,6 @@ class ModelExchangeInfo:
         """Return which elements of an output or a derivative may depend on which of an input or a state.
 
         One that the model structure doesn't list may depend on all.
-
-        Returns
-        -------
-        ndarray of bool, shape (unknown.size, known.size)
         """
         found = np.ones((unknown.size, known.size), dtype=bool)
         columns = _keys(known)
@@ -73,17 +69,7 @@ def _keys(variable: FmuVariable) -> list[Key]:
 
 
 def read_model_exchange(root: ET.Element, model: Any, binary: str) -> ModelExchangeInfo:
-    """Return what a description says of model exchange.
-
-    Parameters
-    ----------
-    root : Element
-        Root of the description.
-    model : fmpy.model_description.ModelDescription
-        The description, as FMPy has read it.
-    binary : str
-        The library for this platform.
-    """
+    """Return what a description says of model exchange; ``model`` is FMPy's reading of it."""
     two = not model.fmiVersion.startswith("3.")
     given = root if model.fmiVersion.startswith("1.") else root.find("ModelExchange")
     assert given is not None

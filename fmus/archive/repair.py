@@ -16,15 +16,10 @@ _INITIAL = {
 
 
 def repair(root: Any) -> list[str]:
-    """Take faults out of a description of FMI 2.0 or 3.0, and return a complaint for each.
+    """Take faults out of the tree of a description of FMI 2.0 or 3.0, and return a complaint for each.
 
     They are references to types, variables and dependencies that don't exist, and combinations of causality and
     variability that the standard doesn't know.
-
-    Parameters
-    ----------
-    root : lxml.etree.Element
-        Root of the description; it is changed.
     """
     two = root.get("fmiVersion", "").startswith("2.")
     variables = [v for v in root.iterfind("ModelVariables/*") if v.get("name") is not None]

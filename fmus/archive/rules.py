@@ -15,13 +15,7 @@ from .zip_file import DESCRIPTION
 
 
 def check_schema(root: Any) -> list[str]:
-    """Return the places at which a description breaks the standard's schema, which FMPy ships.
-
-    Parameters
-    ----------
-    root : lxml.etree.Element
-        Root of a ``modelDescription.xml`` of FMI 1.0, 2.0 or 3.x.
-    """
+    """Return the places at which a description breaks the standard's schema, which FMPy ships."""
     schema = _schema(root.get("fmiVersion")[0])
     if schema.validate(root):
         return []
@@ -42,13 +36,6 @@ def check_version(path: Path, root: Any) -> None:
     """Refuse a description of an unknown version, or in the form of another version than it states.
 
     A version 3.x in the form of FMI 3.0 passes, so that its content can be shown.
-
-    Parameters
-    ----------
-    path : Path
-        The FMU, for messages.
-    root : lxml.etree.Element
-        Root of its description, with an ``fmiVersion``.
     """
     version, form = root.get("fmiVersion"), _form(root)
     if not re.fullmatch(KNOWN_VERSIONS, version) and not (version.startswith("3.") and form in ("", "3.0")):
@@ -88,15 +75,7 @@ def _form(root: Any) -> str:
 
 
 def check_structure(path: Path, root: Any) -> None:
-    """Refuse a description without variables, or with dimensions by variables that don't exist.
-
-    Parameters
-    ----------
-    path : Path
-        The FMU, for messages.
-    root : lxml.etree.Element
-        Root of its description.
-    """
+    """Refuse a description without variables, or with dimensions by variables that don't exist."""
     variables = root.find("ModelVariables")
     if variables is None:
         raise FmuFileError(
@@ -119,19 +98,7 @@ def check_structure(path: Path, root: Any) -> None:
 
 
 def check_variables(path: Path, root: Any, model: Any, limits: ArchiveLimits) -> list[str]:
-    """Refuse variables that can't be told apart, or have no possible type or shape; return complaints about others.
-
-    Parameters
-    ----------
-    path : Path
-        The FMU, for messages.
-    root : lxml.etree.Element
-        Root of its description.
-    model : fmpy.model_description.ModelDescription
-        FMPy's reading of it.
-    limits : ArchiveLimits
-        Limits; `elements` counts.
-    """
+    """Refuse variables with one name, or no possible type or shape; return complaints about others."""
 
     def refuse(fault: FmuFault, name: str, text: str) -> FmuFileError:
         return FmuFileError(f"the variable {name!r} of {str(path)!r} {text}", fault=fault, subject=name)

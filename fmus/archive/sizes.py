@@ -11,14 +11,8 @@ import numpy as np
 def resize(model: Any, sizes: Mapping[str, int]) -> None:
     """Give structural parameters other values, and arrays the sizes that follow (FMI 3.0, 2.4.7.5).
 
-    Start values for each element that don't fit any more are dropped: only the FMU knows them.
-
-    Parameters
-    ----------
-    model : fmpy.model_description.ModelDescription
-        The description, as FMPy has read it; it is changed.
-    sizes : mapping
-        Values by the structural parameters' names.
+    FMPy's reading of the description is changed. Start values for each element that don't fit any more are dropped:
+    only the FMU knows them.
     """
     if not sizes:
         return

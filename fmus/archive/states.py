@@ -11,15 +11,7 @@ from .variables import FmuVariable
 
 
 def read_derivatives(model: Any) -> dict[str, str]:
-    """Return the continuous states' names by those of their derivatives, in the order of the model structure.
-
-    There are none if one of the states is no variable.
-
-    Parameters
-    ----------
-    model : fmpy.model_description.ModelDescription
-        The description, as FMPy has read it.
-    """
+    """Return the derivatives' names by those of their states, in order; none if one of these is no variable."""
     pairs = {
         u.variable.derivative.name: u.variable.name for u in model.derivatives if u.variable.derivative is not None
     }
@@ -33,23 +25,8 @@ def find_states(
 
     There are none if one is missing or no Float64. Variables are added where gathered arrays don't fit: a scalar state
     of an array with elements that are no states, and an array for derivatives that are not gathered like their states.
-
-    Parameters
-    ----------
-    pairs : mapping
-        See `read_derivatives`.
-    scalars : dict
-        Variables before they were gathered.
-    variables : dict
-        Variables after it; some may be added.
-    elements : dict
-        Array and index of each scalar that was gathered.
-
-    Returns
-    -------
-    dict, tuple of int
-        Names of derivatives by those of their states, and the place of each of the FMU's states among the elements of
-        these.
+    ``pairs`` are of `read_derivatives`, ``scalars`` the variables before they were gathered. The order has the place of
+    each of the FMU's states among the elements of those returned.
     """
     names = {*pairs, *pairs.values()}
     if any(n not in scalars or scalars[n].type != "Float64" for n in names):

@@ -18,11 +18,6 @@ class FmuUnits:
     A name counts as the definition says: also one that this library reads in another way, such as "m" for minutes, or
     not at all, such as "degF". One that it can't read is written in base units if its factor is 1. A name without a
     definition counts as this library reads it; else the variable has no unit here.
-
-    Attributes
-    ----------
-    complaints : list of str
-        Texts on units whose name means something else here.
     """
 
     def __init__(self, definitions: Mapping[str, Any]):

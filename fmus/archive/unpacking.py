@@ -67,15 +67,7 @@ def unpack_archive(archive: FmuArchive, folder: Path) -> None:
 
 
 def write_files(archive: FmuArchive, folder: Path, names: Iterable[str] | None = None) -> None:
-    """Write files of a checked archive, all of them without names, into an empty folder, and nothing outside of it.
-
-    Raises
-    ------
-    FmuFileError
-        If a file in the archive is damaged.
-    OSError
-        If a file can't be written.
-    """
+    """Write files of a checked archive, all of them without names, into an empty folder, and nothing outside of it."""
     root = folder.resolve()
     for name in archive.files if names is None else names:
         target = root.joinpath(*name.split("/"))

@@ -10,21 +10,10 @@ from .faults import FmuFault
 
 
 def parse_xml(path: Path, name: str, text: bytes, noun: str = "FMU") -> Any:
-    """Return the root element of an XML file of an FMU or an SSP, as lxml has it, without comments.
+    """Return the root element of an XML file of an FMU or an SSP (``noun``), as lxml has it, without comments.
 
     Entities are refused, since no tool writes any: an entity can hold others many times over, or another file. The
     parser has its own limits: for the depth of elements, and for the size of one text.
-
-    Parameters
-    ----------
-    path : Path
-        The FMU or SSP, for messages.
-    name : str
-        The file's path in the archive.
-    text : bytes
-        Its content.
-    noun : str
-        What it is part of, for messages: "FMU" or "SSP".
     """
     from lxml import etree
 

@@ -33,31 +33,14 @@ class FmuArchive:
     """Archive of an FMU, or of an SSP: the table of contents is checked, files are read within the limits.
 
     The file is read once, so that a file that changes meanwhile can't pass for the one that was checked.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    limits : ArchiveLimits
-        Limits of its content.
-    files : dict
-        Entries by their paths in the archive, with forward slashes; folders are left out.
-    findings : tuple of FmuFinding
-        Faults that don't keep it from being read.
-    digest : str
-        SHA-256 of the file.
-    size : int
-        Size of the file in bytes.
-    noun : str
-        What the file is expected to be, for messages: "FMU" or "SSP".
     """
 
     path: Path
     limits: ArchiveLimits
-    files: dict[str, zipfile.ZipInfo]
-    findings: tuple[FmuFinding, ...]
-    digest: str
-    size: int
+    files: dict[str, zipfile.ZipInfo]  # by their paths in the archive, with forward slashes; no folders
+    findings: tuple[FmuFinding, ...]  # faults that don't keep it from being read
+    digest: str  # SHA-256
+    size: int  # bytes of the file
     _zip: zipfile.ZipFile = field(repr=False)
     noun: str = "FMU"
 
@@ -84,15 +67,7 @@ class FmuArchive:
         return cls(path, limits, files, tuple(findings), hashlib.sha256(data).hexdigest(), len(data), content, noun)
 
     def read(self, name: str, most: int | None = None) -> bytes:
-        """Return the content of a file.
-
-        Parameters
-        ----------
-        name : str
-            Its path in the archive, with forward slashes.
-        most : int, optional
-            Largest size in bytes; the limit of the whole archive without one.
-        """
+        """Return the content of a file, of so many bytes at ``most``."""
         return b"".join(self.chunks(name, most))
 
     def chunks(self, name: str, most: int | None = None) -> Iterator[bytes]:

@@ -13,19 +13,7 @@ WARNING, DISCARD, ERROR, FATAL, PENDING = range(1, 6)
 
 
 class ChildFace(Protocol):
-    """A process that runs calls of a library, as whoever asks for them without `BoundCalls` sees it.
-
-    Attributes
-    ----------
-    name : str
-        The FMU.
-    number : int
-        Number of the last request.
-    arrived : bool
-        Whether the reply to it has been seen, though nobody has finished it yet.
-    alive, used : bool
-        Whether the process is there, and whether no other instance may be made in it.
-    """
+    """A process that runs calls of a library: `ChildProcess` of the package above, which this one can't import."""
 
     name: str
     number: int
@@ -47,41 +35,21 @@ class ChildFace(Protocol):
 
 
 class ChildRequest(NamedTuple):
-    """Calls in another process: who runs them, by which words in shared memory, and which pipes.
-
-    Attributes
-    ----------
-    process : ChildFace
-        The process.
-    sequence : int
-        Number of the calls.
-    words : int
-        Address of the words.
-    commands, replies : int
-        Pipes to wake the process, and to be woken.
-    ordered : bool
-        False where each request and reply is announced in the pipes.
-    looks : int
-        Most looks at a reply before one sleeps.
-    """
+    """Calls in another process: who runs them, by which words in shared memory, and which pipes."""
 
     process: ChildFace
-    sequence: int
-    words: int
-    commands: int
-    replies: int
-    ordered: bool
-    looks: int
+    sequence: int  # number of the calls
+    words: int  # address of the words
+    commands: int  # pipe that wakes the process
+    replies: int  # pipe by which it wakes this one
+    ordered: bool  # False where each request and reply is announced in the pipes
+    looks: int  # most looks at a reply before one sleeps
 
 
 class BoundCalls:
     """C functions with their arguments, bound once and called one after the other.
 
-    Parameters
-    ----------
-    calls : sequence of (function, arguments)
-        Functions of the library, with arguments that are C values; their memory is that of `FmiCalls.allocate` and
-        `FmiCalls.variable`, or doesn't change.
+    Arguments are C values; their memory is that of `FmiCalls.allocate` and `FmiCalls.variable`, or doesn't change.
     """
 
     failed = 0

@@ -22,10 +22,7 @@ class EventUpdate(NamedTuple):
 
 
 class AnswersAt(NamedTuple):
-    """Addresses of the answers of ``update`` and ``complete``: flags of some bytes each, and a time in s.
-
-    Another round is wanted where ``again`` is ``again_where``.
-    """
+    """Addresses of the answers of ``update`` and ``complete``: flags of ``width`` bytes each, and a time in s."""
 
     width: int
     again: int
@@ -35,7 +32,7 @@ class AnswersAt(NamedTuple):
     next_time: int
     wants: int
     ends: int
-    again_where: bool = True
+    again_where: bool = True  # value of the flag ``again`` with which another round is wanted
 
     def updated(self) -> EventUpdate:
         """Return the answer of the last ``update``."""

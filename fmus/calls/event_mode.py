@@ -52,7 +52,7 @@ class InputClock:
 
 @dataclass(frozen=True)
 class EventMemory:
-    """What is known of events besides the FMU's own state: the next ones, and the values that discrete inputs had."""
+    """Events besides the FMU's own state: the next ones, and the values that discrete inputs had."""
 
     next_event: float
     is_fresh: bool
@@ -61,26 +61,7 @@ class EventMemory:
 
 
 class EventMode:
-    """Events of an instance: before a step, within it, and at its end.
-
-    Parameters
-    ----------
-    fmu : StepFailures
-        The instance.
-    inputs : mapping of str to FmuVariable
-        Variables of the ports.
-    vector : ndarray
-        Values of all inputs, shared with the run.
-
-    Attributes
-    ----------
-    discrete : list of str
-        Ports of the inputs that are set in Event Mode alone.
-    clocks : list of InputClock
-        Input clocks whose ticks are known ahead.
-    next_event : float
-        Time in s of the next event of the FMU's own that it has announced; infinite without one.
-    """
+    """Events of an instance: before a step, within it, and at its end. ``vector`` are all inputs, shared."""
 
     def __init__(self, fmu: StepFailures, inputs: Mapping[str, FmuVariable], vector: np.ndarray):
         self.fmu, self.fmi = fmu, fmu.fmi

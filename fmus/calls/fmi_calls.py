@@ -125,14 +125,9 @@ class StepCall:
 
 
 class FmiCalls(ABC):
-    """Functions of an FMU's library for one instance.
+    """Functions of an FMU's library for one instance, by FMPy's object for it (``fmu``).
 
     Functions that fail raise an error of FMPy, with a ``status``; those that are not called at each step are methods.
-
-    Attributes
-    ----------
-    fmu : object
-        FMPy's object for the library.
     """
 
     table: ClassVar[FmiVersion]
@@ -406,13 +401,7 @@ class FmiCalls(ABC):
         return getattr(found, "value", found)
 
     def do_step(self, t: float, h: float, final: bool) -> bool:
-        """Take a step from t over h, both in s, by itself, with its events, if any.
-
-        Returns
-        -------
-        bool
-            Whether it ended early or asks to end the simulation.
-        """
+        """Take a step from t over h, both in s, with its events; return whether it ended early or ends the run."""
         now, width, flag, call = self._bare_step
         end, flag.value = t + h, final
         for _ in range(MOST_ROUNDS):
@@ -448,13 +437,7 @@ class FmiCalls(ABC):
         self.fmu.enterStepMode()
 
     def settle_events(self) -> None:
-        """Go through the event iteration of an FMU in Event Mode, and back to Step Mode.
-
-        Raises
-        ------
-        RuntimeError
-            If it does not end.
-        """
+        """Go through the event iteration of an FMU in Event Mode, and back to Step Mode."""
         for _ in range(MOST_ROUNDS):
             if not self.update_events().again:
                 self.enter_step_mode()

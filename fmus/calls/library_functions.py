@@ -18,15 +18,7 @@ def allow_missing(kind: Any, prefix: str, required: tuple[str, ...]) -> Any:
     """Return a class of FMPy's that loads a library without some functions too; their calls return an error.
 
     Tools leave out functions of capabilities that their FMUs don't have, though the standard asks for all of them.
-
-    Parameters
-    ----------
-    kind : type
-        Class of FMPy's.
-    prefix : str
-        Prefix of the functions' names.
-    required : tuple of str
-        Ends of the names of functions without which an FMU can't run.
+    ``required`` are the ends of the names of those without which an FMU can't run.
     """
 
     def load(fmu: Any) -> None:
@@ -66,16 +58,8 @@ def list_prototypes(kind: Any, prefix: str) -> tuple[Prototype, ...]:
 class LibraryFunctions(dict[str, Any]):
     """Functions of a loaded library by their names in FMPy; one gets its types when it is first asked for.
 
-    A run calls a third of them, and to bind all takes longer than to load the library.
-
-    Parameters
-    ----------
-    library : object
-        The library, with its functions as attributes.
-    kind, prefix, required
-        As `allow_missing` has them. One of these that is missing is an `AttributeError`.
-    identifier : str
-        The model identifier, with which names begin in FMI 1.0.
+    A run calls a third of them, and to bind all takes longer than to load the library. One of those that are required
+    (see `allow_missing`) and missing is an `AttributeError`. In FMI 1.0 names begin with the model identifier.
     """
 
     def __init__(self, library: Any, kind: Any, prefix: str, identifier: str, required: tuple[str, ...]):

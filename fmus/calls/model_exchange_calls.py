@@ -36,15 +36,6 @@ class Evaluation:
 
     The order of questions is that of `order_questions`. ``asked_first`` are the variables that are read before the
     derivatives where no outputs are wanted; None for an FMU that computes all that it is asked for, in any order.
-
-    Attributes
-    ----------
-    result : ndarray
-        Outputs, derivatives and indicators, one after the other.
-    rates_at : slice
-        Where the derivatives are in it.
-    warned : sequence of str
-        Names of the calls that gave a warning in the last run.
     """
 
     warned: Sequence[str] = ()
@@ -89,14 +80,7 @@ class Evaluation:
     def run(self, t: float, u: np.ndarray, *, running: bool) -> tuple[int, str]:
         """Evaluate it; return the status of a call that has failed, and its name; else 1 after a warning, else 0.
 
-        Parameters
-        ----------
-        t : float
-            Time in s.
-        u : ndarray
-            All inputs.
-        running : bool
-            Whether time and states are set: in Initialization Mode the FMU has its own.
+        ``running`` says whether time and states are set: in Initialization Mode the FMU has its own.
         """
         self._time.value = t
         if self._index.size:

@@ -41,16 +41,8 @@ class ModelExchangeInstance(RunningFmu):
     outputs, derivatives and indicators: this leaves its discrete states as they are. `handle_event` goes through Event
     Mode, where discrete inputs and tunable parameters are set.
 
-    States are in the order of the description's ``states``, inputs in that of the block's ports.
-
-    Attributes
-    ----------
-    about : ModelExchangeInfo
-        Model exchange as the FMU's description states it.
-    next_time : float
-        Time of its next time event in s, infinite without one.
-    nominals : ndarray
-        Nominal values of the continuous states.
+    States are in the order of the description's ``states``, inputs in that of the block's ports. ``next_time`` is the
+    time of its next time event in s, infinite without one.
     """
 
     def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):

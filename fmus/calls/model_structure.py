@@ -36,23 +36,13 @@ def check_structure(
 ) -> None:
     """Refuse a model structure that leaves out what outputs or derivatives follow; once for each point of an FMU.
 
-    FMUs that Loopwright has built are right. An input may act in some mode only, so every start is looked at. The
-    order of evaluation and linear models rest on it. Everything that some values should not follow is moved.
+    FMUs that Loopwright has built are right. An input may act in some mode only, so every start is looked at. The order
+    of evaluation and linear models rest on it. Everything that some values should not follow is moved.
 
     Values that differ between evaluations at one point, such as a processor time, follow nothing: that is noted.
 
-    Parameters
-    ----------
-    fmu : RunningFmu
-        The instance, in Continuous-Time Mode.
-    exchange : ModelExchangeInfo
-        Its model structure.
-    places : mapping of str to slice
-        Places of all inputs in u, by port.
-    evaluation : callable
-        Takes what is wanted, and returns its values as a function of t, x and u, with all smooth inputs set.
-    t, x, u
-        The point.
+    ``places`` are those of all inputs in u, by port; ``evaluation`` takes what is wanted, and returns its values as a
+    function of t, x and u, with all smooth inputs set.
     """
     about = fmu.description
     smooth = [port for port, v in fmu.inputs.items() if is_smooth(v)]

@@ -23,42 +23,19 @@ class ActionKind(IntEnum):
 
 
 class NativeAction(NamedTuple):
-    """One of the actions that an evaluation consists of, as C does it; numbers are addresses, but for ``type``.
-
-    Attributes
-    ----------
-    kind : ActionKind
-        Its kind.
-    names : tuple of str
-        Names of the calls.
-    function : int
-        The function that is called; its first argument is the instance.
-    arguments : tuple of int
-        Its arguments, as they are in registers; of `ActionKind.TIME` the instance, and where the time is.
-    bound : BoundCalls or None
-        Of `ActionKind.ASK`: calls that another process makes.
-    vector : int
-        Of a copy: the vector of float64.
-    places : ndarray of int64
-        Its entries, in the order of the buffer.
-    buffer : int
-        The buffer.
-    type : int
-        Type of the buffer's values: its place in `BUFFER_TYPES`.
-    low, high : float
-        Range of integers that fit.
-    """
+    """One of the actions of an evaluation, as C does it; numbers are addresses."""
 
     kind: ActionKind
-    names: tuple[str, ...] = ()
-    function: int = 0
+    names: tuple[str, ...] = ()  # of the calls
+    function: int = 0  # its first argument is the instance
+    # as they are in registers; of `ActionKind.TIME` the instance, and where the time is
     arguments: tuple[int, ...] = ()
-    bound: BoundCalls | None = None
-    vector: int = 0
-    places: np.ndarray = np.zeros(0, dtype=np.int64)
+    bound: BoundCalls | None = None  # of `ActionKind.ASK`: calls that another process makes
+    vector: int = 0  # of a copy: the vector of float64
+    places: np.ndarray = np.zeros(0, dtype=np.int64)  # its entries, in the order of the buffer
     buffer: int = 0
-    type: int = 0
-    low: float = 0.0
+    type: int = 0  # of the buffer's values: place in `BUFFER_TYPES`
+    low: float = 0.0  # range of integers that fit
     high: float = 0.0
 
 
@@ -124,35 +101,16 @@ def transfer_actions(
 
 @dataclass(frozen=True)
 class NativeLook:
-    """All that C needs to look at an instant with an FMU in model exchange: a step is complete, or events act.
+    """All that C needs to look at an instant with an FMU in model exchange: a step is complete, or events act."""
 
-    Attributes
-    ----------
-    complete : list of NativeAction
-        Says that a step is complete; empty where the FMU need not be told.
-    enter, update, leave : list of NativeAction
-        Go into Event Mode with all inputs for a first round of updates, take another round, go back and get the states.
-    answers : AnswersAt
-        Where the answers are.
-    final : object
-        C value that `complete` reads in another process: whether no earlier state will be restored; in this process
-        None, where it is its second argument, and a value that nobody reads in FMI 1.0.
-    least, relative : ndarray
-        Least change of each input that is a jump, by itself and relative to the input.
-    discrete : ndarray of bool
-        Inputs that are taken over by an event alone.
-    low, high : ndarray
-        Range of each input, infinite without a limit.
-    """
-
-    complete: list[NativeAction]
-    enter: list[NativeAction]
-    update: list[NativeAction]
-    leave: list[NativeAction]
+    complete: list[NativeAction]  # reports that a step is complete; empty where the FMU need not know
+    enter: list[NativeAction]  # go into Event Mode with all inputs for a first round of updates
+    update: list[NativeAction]  # take another round
+    leave: list[NativeAction]  # go back and get the states
     answers: AnswersAt
-    final: Any
-    least: np.ndarray
+    final: Any  # whether no earlier state will be restored, as a C value that ``complete`` reads; None in this process
+    least: np.ndarray  # least change of each input that is a jump, and, relative to the input,
     relative: np.ndarray
-    discrete: np.ndarray
-    low: np.ndarray
+    discrete: np.ndarray  # (bool) inputs that are taken over by an event alone
+    low: np.ndarray  # range of each input, infinite without a limit
     high: np.ndarray

@@ -32,42 +32,20 @@ class NativeTransfer:
 
 @dataclass(frozen=True)
 class NativeStep:
-    """A step as C calls it: inputs, the step itself, outputs; numbers are addresses, but for ``version``.
+    """A step as C calls it: inputs, the step itself, outputs; numbers are addresses, but for ``version``."""
 
-    Attributes
-    ----------
-    version : {1, 2, 3}
-        Version of FMI.
-    instance, step : int
-        The instance, and its function doStep.
-    inputs, outputs : NativeTransfer or None
-        Calls before and after it; None without such ports.
-    now, width : int
-        Of the time from which a step goes, and of its length, both in s; doStep takes them from there.
-    final : int
-        Of the flag noSetFMUStatePriorToCurrentPoint.
-    flags : int
-        Of the flags event, terminate, early return.
-    reached : int
-        Of the time that a step has reached, in s.
-    kept : tuple
-        Whatever must live as long as the addresses.
-    host : HostState or None
-        The state of this process, which a library that Loopwright has not built may change.
-    """
-
-    version: int
+    version: int  # of FMI: 1, 2 or 3
     instance: int
-    step: int
-    inputs: NativeTransfer | None
+    step: int  # function doStep
+    inputs: NativeTransfer | None  # calls before and after it; None without such ports
     outputs: NativeTransfer | None
-    now: int
+    now: int  # start and length of a step in s; doStep takes them from there
     width: int
-    final: int
-    flags: int
-    reached: int
-    kept: tuple[Any, ...]
-    host: HostState | None
+    final: int  # flag noSetFMUStatePriorToCurrentPoint
+    flags: int  # event, terminate, early return
+    reached: int  # time that a step has reached, in s
+    kept: tuple[Any, ...]  # whatever must live as long as the addresses
+    host: HostState | None  # state of this process, which a library that Loopwright has not built may change
 
 
 def native_step(
@@ -101,99 +79,46 @@ def native_step(
 
 @dataclass(frozen=True, eq=False)
 class SharedValues:
-    """Values of one type between the vector of a run and memory that is shared with another process.
-
-    Attributes
-    ----------
-    vector : ndarray
-        The run's vector.
-    shared : ndarray
-        Values in the shared memory.
-    index : ndarray of int, or None
-        Their places in the vector; None for all of them in order.
-    low, high : ndarray or None
-        Of inputs: the least and the greatest of each value; None without limits.
-    """
+    """Values of one type between the vector of a run and memory that is shared with another process."""
 
     vector: np.ndarray
     shared: np.ndarray
-    index: np.ndarray | None
-    low: np.ndarray | None
+    index: np.ndarray | None  # places of the shared values in the vector; None for all of them in order
+    low: np.ndarray | None  # of inputs: the least and the greatest of each value; None without limits
     high: np.ndarray | None
 
 
 @dataclass(frozen=True, eq=False)
 class QuietStep:
-    """When a step in another process has nothing but its calls to be done, and what is written before it.
+    """When a step in another process has nothing but its calls to be done, and what is written before it."""
 
-    Attributes
-    ----------
-    until : ndarray, shape (1,)
-        Time in s before whose neighbourhood C takes steps.
-    vector : ndarray
-        The run's vector of inputs.
-    watched : ndarray of int64
-        Places there of inputs at whose changes events are.
-    taken : ndarray
-        Their values as they were taken last.
-    sloped : ndarray of int64
-        Places of inputs whose slopes are told.
-    last : ndarray
-        Time in s and their values at the step before; NaN without one.
-    line, slopes : ndarray or None
-        Where their lines go (start, status, values, slopes), or the slopes alone.
-    event : int
-        Address of the flag of an event at the end of a step; 0 where it makes no difference.
-    changed : int
-        Address of the word that tells that texts have changed; 0 without texts.
-    added : ndarray, shape (1,), or None
-        Time in s that steps have added up to, at which the next one begins; NaN before the first one. None where steps
-        begin at the times of the run.
-    """
-
-    until: np.ndarray
-    vector: np.ndarray
-    watched: np.ndarray
-    taken: np.ndarray
-    sloped: np.ndarray
-    last: np.ndarray
-    line: np.ndarray | None
+    until: np.ndarray  # (1,) time in s before whose neighbourhood C takes steps
+    vector: np.ndarray  # the run's vector of inputs
+    watched: np.ndarray  # (int64) places there of inputs at whose changes events are
+    taken: np.ndarray  # their values as they were taken last
+    sloped: np.ndarray  # (int64) places of inputs whose slopes are set
+    last: np.ndarray  # time in s and their values at the step before; NaN without one
+    line: np.ndarray | None  # where their lines go (start, status, values, slopes), or the slopes alone
     slopes: np.ndarray | None
-    event: int
-    changed: int
-    added: np.ndarray | None
+    event: int  # address of the flag of an event at the end of a step; 0 where it makes no difference
+    changed: int  # address of the word that is not 0 when texts have changed; 0 without texts
+    added: np.ndarray | None  # (1,) sum in s at which the next step begins, NaN at first; None: at the times of the run
 
 
 @dataclass(frozen=True, eq=False)
 class RemoteStep:
-    """A step in another process as C asks for it; numbers are addresses.
-
-    Attributes
-    ----------
-    request : ChildRequest
-        The calls.
-    inputs, outputs : sequence of SharedValues
-        Values to be copied before and after them.
-    now, width, flags, reached : int
-        As those of `NativeStep`.
-    kept : tuple
-        Whatever must live as long as the addresses.
-    quiet : QuietStep or None
-        Of steps that may be more than these calls.
-    is_careful : bool
-        Whether other steps are Python's.
-    """
+    """A step in another process as C asks for it; numbers are addresses, as those of `NativeStep`."""
 
     request: ChildRequest
-    inputs: Sequence[SharedValues]
+    inputs: Sequence[SharedValues]  # copied before and after the calls
     outputs: Sequence[SharedValues]
     now: int
     width: int
     flags: int
     reached: int
-    kept: tuple[Any, ...]
-    quiet: QuietStep | None
-    is_careful: bool
+    kept: tuple[Any, ...]  # whatever must live as long as the addresses
+    quiet: QuietStep | None  # of steps that may be more than these calls
+    is_careful: bool  # whether other steps are Python's
 
 
 def remote_step(

@@ -176,14 +176,8 @@ class FmuState:
 class StateFormat:
     """Bytes of a state: what they are, the FMU's digest, this platform, some numbers, then the FMU's own.
 
-    Parameters
-    ----------
-    magic : bytes
-        Eight bytes at their beginning.
-    numbers : str
-        The numbers, as `struct` describes them.
-    kind, expected : str
-        What such bytes are, and which of them are expected, for messages.
+    ``magic`` are eight bytes at their beginning; ``numbers`` are as `struct` describes them. ``kind`` and ``expected``
+    say in messages what such bytes are.
     """
 
     def __init__(self, magic: bytes, numbers: str, kind: str, expected: str):

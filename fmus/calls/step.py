@@ -39,7 +39,7 @@ _SLOW_PARTS = 1000
 
 @dataclass(frozen=True)
 class StepMemory:
-    """What the steps keep besides the FMU's own state, for a return to it."""
+    """Memory of the steps besides the FMU's own state, for a return to it."""
 
     added: float
     sloped: np.ndarray
@@ -47,19 +47,10 @@ class StepMemory:
 
 
 class InstanceStep:
-    """Steps of an instance, with all that belongs to them by its options.
+    """Steps of an instance, with all that belongs to them by its options; u and y are shared with the run.
 
     All calls of a step are bound once. A library in this process makes them one after the other; another process makes
     them, and those that read the outputs, in one round trip.
-
-    Parameters
-    ----------
-    fmu : StepFailures
-        The instance, whose time and errors they are.
-    outputs : mapping of str to FmuVariable
-        Variables of the outputs, by port.
-    u, y : ndarray
-        Values of all inputs and outputs, shared with the run.
     """
 
     def __init__(self, fmu: StepFailures, outputs: Mapping[str, FmuVariable], u: np.ndarray, y: np.ndarray):
@@ -333,14 +324,8 @@ class InstanceStep:
     def judge_native(self, stage: int, status: int, t: float, h: float) -> None:
         """Judge a step in C from t over h, both in s, that was out of the ordinary: raise its error, or accept it.
 
-        It is one of a library in this process; for others see `finish_native`.
-
-        Parameters
-        ----------
-        stage : {0, 1, 2}
-            What was done last: setting the inputs, the step, reading the outputs.
-        status : int
-            Status of that.
+        It is one of a library in this process; for others see `finish_native`. ``stage`` is what was done last, with
+        this status: setting the inputs (0), the step (1), reading the outputs (2).
         """
         if stage == 0 and status == WARNING:  # nothing is lost by setting the inputs once more
             self.step(t, h)
@@ -531,27 +516,9 @@ class InstanceStep:
 class InputSlopes:
     """Slopes of real inputs, by their differences from the step before (FMI 2.0, 4.2.1; FMI 3.0, 4.2.2).
 
-    Parameters
-    ----------
-    fmu : StepFailures
-        The instance.
-    ports : sequence of str
-        Inputs that are set before each step.
-    u : ndarray
-        Values of all inputs.
-
-    Attributes
-    ----------
-    places : ndarray of int
-        Places of the inputs whose slopes are told.
-    last : ndarray
-        Time in s and values of these inputs at the step before; NaN without one.
-    line : ndarray or None
-        In FMI 3.0, where the FMU asks for its inputs within a step: start, status, values and slopes.
-    slopes : ndarray
-        Slopes that are told.
-    calls : list of Call
-        The call that tells them, before FMI 3.0.
+    ``last`` holds time in s and values of these inputs at the step before, NaN without one. ``line`` is there in FMI
+    3.0, where the FMU asks for its inputs within a step: start, status, values and slopes; before, a call sets the
+    slopes.
     """
 
     def __init__(self, fmu: StepFailures, ports: Sequence[str], u: np.ndarray):

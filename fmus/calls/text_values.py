@@ -76,19 +76,7 @@ def list_limits(label: str, about: FmuDescription, *, model_exchange: bool = Fal
 class TextWatch:
     """Calls behind a step in another process that note whether texts have changed, so that they need not be read.
 
-    Parameters
-    ----------
-    fmi : FmiCalls
-        The instance's calls.
-    variables : iterable of OtherVariable
-        The texts; no binary data.
-
-    Attributes
-    ----------
-    calls : list of Call
-        The calls.
-    changed : ctypes.c_int64
-        Not 0 where they may have changed.
+    They are of texts alone, no binary data; `changed` is not 0 where they may have changed.
     """
 
     def __init__(self, fmi: FmiCalls, variables: Iterable[OtherVariable]):

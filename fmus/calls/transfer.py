@@ -38,22 +38,10 @@ def is_kept(found: np.ndarray, put: np.ndarray, *, single: bool = False, toleran
 
 
 class Transfer:
-    """Calls that get or set the values of ports, all of one type in one call.
+    """Calls that get or set the values of ports, all of one type in one call; ``chosen`` of the ports, or all.
 
-    Float64 values are read and written in the vector itself if all ports are of that type.
-
-    Parameters
-    ----------
-    fmi : FmiCalls
-        Functions of the instance.
-    verb : {"Get", "Set"}
-        Direction.
-    ports : dict
-        Variables by port.
-    vector : array
-        Values of all ports, one after the other.
-    chosen : collection of str, optional
-        Those of the ports whose values are transferred; None for all.
+    The vector holds the values of all ports, one after the other. Float64 values are read and written in it if all
+    ports are of that type.
     """
 
     def __init__(
@@ -113,13 +101,7 @@ class Transfer:
         return [(group.function, group.arguments) for group in self.groups]
 
     def check_limits(self) -> None:
-        """Refuse values out of the ranges that the FMU's description states.
-
-        Raises
-        ------
-        OutOfRangeError
-            If a value is out of its port's range.
-        """
+        """Raise the error of a value out of the range that the FMU's description states (`OutOfRangeError`)."""
         places, low, high = self._bounded
         found = self.vector[places]
         wrong = (found < low) | (found > high)
@@ -130,34 +112,19 @@ class Transfer:
             raise OutOfRangeError(port, f"found {value:.9g}; expected {self._ports[port].range_text}")
 
     def fill(self) -> None:
-        """Copy the values of the vector to where the calls read them.
-
-        Raises
-        ------
-        UnfitError
-            If a value is none of its port's type.
-        """
+        """Copy the vector's values to where the calls read them; an `UnfitError` for one that is none of its type."""
         for group in self.groups:
             group.check_and_fill(self.vector)
 
     def spread(self) -> None:
-        """Copy the values that the calls have read into the vector.
-
-        Raises
-        ------
-        UnfitError
-            If a value is an integer that the vector can't hold.
-        """
+        """Copy the values that were read into the vector; an `UnfitError` for an integer that it can't hold."""
         for group in self.groups:
             group.spread(self.vector)
 
     def set(self) -> int:
         """Set the values of the vector; return the first status that is no success, else 1 after a warning, else 0.
 
-        Raises
-        ------
-        UnfitError
-            If a value is none of its port's type; nothing of this type has been set then.
+        After an `UnfitError` nothing of its type has been set.
         """
         self.fill()
         worst = 0
@@ -169,13 +136,7 @@ class Transfer:
         return worst
 
     def get(self) -> int:
-        """Get the values into the vector; return the first status that is no success, else 1 after a warning, else 0.
-
-        Raises
-        ------
-        UnfitError
-            If a value is an integer that the vector can't hold.
-        """
+        """Get the values into the vector; return the first status that is no success, else 1 for a warning, else 0."""
         worst = 0
         for group in self.groups:
             if status := group.function(*group.arguments):
@@ -294,17 +255,7 @@ class WatchedInputs:
 
 
 class BoundStart:
-    """Start values of type Float64, set in one call, and read back in another.
-
-    Parameters
-    ----------
-    fmi : FmiCalls
-        Functions of the instance.
-    description : FmuDescription
-        The FMU's description.
-    names : sequence of str
-        Names of the values, for which `fits` holds.
-    """
+    """Start values of type Float64, for which `fits` holds, set in one call, and read back in another."""
 
     def __init__(self, fmi: FmiCalls, description: FmuDescription, names: tuple[str, ...]):
         variables = {name: description.find(name) for name in names}
@@ -325,13 +276,7 @@ class BoundStart:
         return not late and not description.structural.keys() & set(names)
 
     def enter(self, values: Mapping[str, Any], tolerance: float | None) -> bool:
-        """Set the values, from which the run begins at t = 0, and enter Initialization Mode.
-
-        Returns
-        -------
-        bool
-            Whether the FMU has taken them to the last bit, without a word.
-        """
+        """Set the values, enter Initialization Mode at t = 0; return whether the FMU has taken them to the last bit."""
         np.concatenate([np.zeros(0), *(np.ravel(value) for value in values.values())], out=self._given)
         self._fmi.set_up(0.0, None, tolerance)
         if not self._call(self._set):

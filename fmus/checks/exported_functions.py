@@ -26,17 +26,7 @@ _PROMISES = {
 
 
 def missing_promises(library: SharedLibrary, place: str, summary: Mapping[str, Any]) -> Iterator[FmuFinding]:
-    """Yield functions that a library lacks: those of capabilities that it declares, and others of the standard.
-
-    Parameters
-    ----------
-    library : SharedLibrary
-        Header of the library.
-    place : str
-        Its path in the archive.
-    summary : mapping
-        The FMU's summary.
-    """
+    """Yield functions that a library lacks: those of capabilities that it declares, and others of the standard."""
     major = summary["fmi_version"][0]
     if library.symbols is None or major not in _PROMISES:
         return

@@ -96,19 +96,8 @@ def native_binary(
 def find_missing(archive: FmuArchive, native: str, folder: str, names: Iterable[str]) -> tuple[list[str], list[str]]:
     """Return the shared libraries and symbols that are missing here, without running code of the FMU's on Linux.
 
-    The system's loader is asked where it finds the libraries; the symbols are read from the files. On other systems
-    the library is loaded by another process.
-
-    Parameters
-    ----------
-    archive : FmuArchive
-        The FMU.
-    native : str
-        This machine's platform.
-    folder : str
-        Folder of binaries for it.
-    names : iterable of str
-        Libraries in it.
+    The system's loader is asked where it finds the libraries; the symbols are read from the files. On other systems the
+    library is loaded by another process.
     """
     missing: set[str] = set()
     undefined: set[str] = set()

@@ -26,25 +26,8 @@ INTERFACES = {
 def summarize(file: Path, *, limits: ArchiveLimits | None = None, load: bool = True) -> dict[str, Any]:
     """Return a summary of an FMU's description and archive.
 
-    Parameters
-    ----------
-    file : Path
-        An FMU of FMI 1.0, 2.0 or 3.0.
-    limits : ArchiveLimits, optional
-        Limits of its size; the usual ones without it.
-    load : bool
-        Whether another process may load its library to find missing ones, where the system's loader can't be asked:
-        elsewhere than on Linux.
-
-    Returns
-    -------
-    dict
-        JSON-like. ``variables`` is a list of dictionaries; ``shape`` of a scalar is an empty list.
-
-    Raises
-    ------
-    FmuFileError
-        If it can't be read.
+    ``load`` says whether another process may load its library to find missing ones, where the system's loader can't be
+    asked: elsewhere than on Linux. ``variables`` is a list of dictionaries; ``shape`` of a scalar is an empty list.
     """
     archive, root = open_fmu(file, limits)
     entries = sorted(archive.files)
@@ -97,13 +80,7 @@ def summarize(file: Path, *, limits: ArchiveLimits | None = None, load: bool = T
 
 
 def open_fmu(file: Path, limits: ArchiveLimits | None = None) -> tuple[FmuArchive, Any]:
-    """Return an FMU's archive and the root element of its ``modelDescription.xml``.
-
-    Raises
-    ------
-    FmuFileError
-        If the archive is unsafe, damaged or no FMU, or if its description can't be read.
-    """
+    """Return an FMU's archive and the root element of its ``modelDescription.xml``."""
     archive = FmuArchive.open(file, limits)
     return archive, parse_xml(file, DESCRIPTION, archive.description())
 

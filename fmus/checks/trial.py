@@ -40,24 +40,12 @@ BY_END = {
 
 @dataclass(frozen=True)
 class FmuProblem:
-    """A fault of an FMU.
+    """A fault of an FMU."""
 
-    Parameters
-    ----------
-    found : str
-        The fault, and its place.
-    step : str
-        The next step.
-    fault : FmuFault
-        Kind of the fault.
-    subject : str
-        File of the archive concerned; empty for the description, and for a run.
-    """
-
-    found: str
-    step: str
+    found: str  # the fault, and its place
+    step: str  # the next step
     fault: FmuFault = FmuFault.STANDARD
-    subject: str = ""
+    subject: str = ""  # file of the archive; empty for the description, and for a run
 
 
 def try_out(
@@ -70,20 +58,8 @@ def try_out(
 ) -> FmuProblem | None:
     """Run an FMU for some steps in its own process; return its fault, or None.
 
-    In model exchange the derivatives are evaluated at the start.
-
-    Parameters
-    ----------
-    file : Path
-        The FMU; it must have a library for this machine.
-    interface : {"CoSimulation", "ModelExchange"}
-        The interface to run.
-    experiment : dict
-        Default experiment: ``start_time``, ``stop_time`` and ``step_size`` in s, where they are given.
-    limits : ArchiveLimits, optional
-        Limits of its size; the usual ones without it.
-    progress : bool or callable, optional
-        Whether it is announced on the standard error after some time, or a function that is called with that line.
+    In model exchange the derivatives are evaluated at the start. It must have a library for this machine. The default
+    experiment has ``start_time``, ``stop_time`` and ``step_size`` in s, where they are given.
     """
     name = INTERFACES[interface]
     say = progress if callable(progress) else partial(print, file=sys.stderr, flush=True)

@@ -36,35 +36,15 @@ _AGAIN = "Export it again with a newer version of its tool ({tool}), or report i
 
 @dataclass(frozen=True)
 class ValidationReport:
-    """Result of a validation.
+    """Result of a validation."""
 
-    Parameters
-    ----------
-    problems : tuple of FmuProblem
-        The faults; empty if the FMU is clean.
-    done : tuple of str
-        Checks and runs that were done.
-    left : tuple of str
-        Checks that could not be done here, with the reason.
-    """
-
-    problems: tuple[FmuProblem, ...]
-    done: tuple[str, ...]
-    left: tuple[str, ...]
+    problems: tuple[FmuProblem, ...]  # empty if the FMU is clean
+    done: tuple[str, ...]  # checks and runs
+    left: tuple[str, ...]  # checks that could not be done here, with the reason
 
 
 def validate(file: Path, *, run: bool = True, limits: ArchiveLimits | None = None) -> ValidationReport:
-    """Validate an FMU.
-
-    Parameters
-    ----------
-    file : Path
-        The FMU.
-    run : bool
-        Whether to run it, in its own process.
-    limits : ArchiveLimits, optional
-        Limits of its size; the usual ones without it.
-    """
+    """Validate an FMU; ``run``: run it, too, in its own process."""
     try:
         archive, root = open_fmu(file, limits)
     except FmuFileError as error:
@@ -254,16 +234,9 @@ def _binaries(archive: FmuArchive, root: Any, tool: str) -> Iterator[FmuProblem]
 
 
 def reason_not_to_run(kind: str, element: Any, folders: Mapping[str, list[str]]) -> str:
-    """Return the reason why an interface can't be run here; empty if there is none.
+    """Return the reason why an interface can't be run here, by its attributes; empty if there is none.
 
-    Parameters
-    ----------
-    kind : str
-        Element of the interface, such as "CoSimulation".
-    element : mapping
-        Its attributes; an XML element serves.
-    folders : mapping
-        Libraries by folder, as `binaries_of` returns them.
+    An XML element serves as the attributes; libraries by folder are those of `binaries_of`.
     """
     if kind == "ScheduledExecution":
         return "scheduled execution needs a scheduler"

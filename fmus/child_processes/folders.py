@@ -25,11 +25,6 @@ def make_folder(place: str | os.PathLike[str] | None = None, prefix: str = "loop
     """Return a fresh folder in ``place``, else among the system's temporary files; `remove_folder` removes it.
 
     It is removed, too, if this process ends before, however that happens.
-
-    Raises
-    ------
-    OSError
-        If it can't be made.
     """
     folder = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
     keep_folder(folder)
@@ -44,13 +39,7 @@ def remove_folder(folder: Path) -> None:
 
 @contextmanager
 def folder_in(place: str | os.PathLike[str], prefix: str) -> Iterator[Path]:
-    """Yield a fresh folder in ``place``, which is removed when the block ends.
-
-    Raises
-    ------
-    OSError
-        If it can't be made.
-    """
+    """Yield a fresh folder in ``place``, which is removed when the block ends."""
     folder = make_folder(place, prefix)
     try:
         yield folder

@@ -21,14 +21,8 @@ from .keeper import POSIX, Keeper, make_group, release_group
 class ProcessGroup:
     """Child processes that end with this process, or with `end`, and with them all processes that they start.
 
-    A process is in the group before its program begins: at no moment could one be left behind.
-
-    Raises
-    ------
-    OSError
-        If the group can't be made.
-    LoopwrightError
-        If Python doesn't know its program.
+    A process is in the group before its program begins: at no moment could one be left behind. An `OSError` says that
+    the group can't be made.
     """
 
     def __init__(self) -> None:
@@ -43,13 +37,7 @@ class ProcessGroup:
         return self._groups[-1][1] if self._groups else None
 
     def start(self, command: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
-        """Start a process in the group; ``options`` are those of `subprocess.Popen`.
-
-        Raises
-        ------
-        OSError
-            If it can't be started, or the group has ended.
-        """
+        """Start a process in the group, as `subprocess.Popen`; an `OSError` if it can't, or if the group has ended."""
         if self._job is not None:
             flags = options.pop("creationflags", 0) | CREATE_SUSPENDED | CREATE_NEW_PROCESS_GROUP
             process = subprocess.Popen(command, creationflags=flags, **options)
@@ -102,25 +90,8 @@ def run_in_group(
 ) -> subprocess.CompletedProcess[str]:
     """Run a command to its end, and return its status and output: `subprocess.run` in a group.
 
-    The command and all processes that it has started end with this call, whatever happens, and with this process.
-
-    Parameters
-    ----------
-    command : sequence of str
-        Program and arguments.
-    cwd, environment
-        Its working folder and environment; those of this process if not given.
-    seconds : float, optional
-        Longest time in s.
-
-    Raises
-    ------
-    OSError
-        If it can't be started.
-    LoopwrightError
-        If Python doesn't know its program.
-    subprocess.TimeoutExpired
-        If it has not ended by then.
+    The command and all processes that it has started end with this call, whatever happens, and with this process. After
+    ``seconds`` it is a `subprocess.TimeoutExpired`.
     """
     with ProcessGroup() as group:
         process = group.start(

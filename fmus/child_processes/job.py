@@ -84,18 +84,7 @@ def load_kernel32() -> Any:
 
 
 class Job:
-    """A job object, whose processes end with this process.
-
-    Parameters
-    ----------
-    kernel32 : object, optional
-        The functions of kernel32.
-
-    Raises
-    ------
-    OSError
-        If it can't be made.
-    """
+    """A job object, whose processes end with this process; an `OSError` if it can't be made."""
 
     def __init__(self, kernel32: Any = None):
         self._kernel = load_kernel32() if kernel32 is None else kernel32
@@ -117,13 +106,7 @@ class Job:
         return result
 
     def take(self, process: int, pid: int) -> None:
-        """Take in a process that was started suspended, by its handle and number, and let it begin.
-
-        Raises
-        ------
-        OSError
-            If it can't be assigned, or has no thread to resume.
-        """
+        """Take in a process that was started suspended, by its handle and number, and let it begin."""
         if self._handle is None:
             raise ProcessLookupError("its group of processes has ended")
         self._check(self._kernel.AssignProcessToJobObject(self._handle, process), "AssignProcessToJobObject")

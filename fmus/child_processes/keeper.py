@@ -57,37 +57,19 @@ class Keeper:
         """Groups and folders."""
 
     def send(self, request: str, folder: str) -> None:
-        """Write a request about a folder.
-
-        Raises
-        ------
-        OSError
-            If the keeper has ended.
-        """
+        """Write a request about a folder; an `OSError` if the keeper has ended."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{request} {os.fsencode(folder).hex()}\n".encode())
 
     def make_group(self) -> int:
-        """Return the number of a new group of processes.
-
-        Raises
-        ------
-        OSError
-            If the keeper has ended, or can't make one.
-        """
+        """Return the number of a new group of processes; an `OSError` if the keeper has ended, or can't make one."""
         group = self._ask("group")
         if not group:
             raise BlockingIOError("no room for one more process")
         return group
 
     def end_group(self, group: int) -> None:
-        """End a group of processes; the first one of it is gone at the return.
-
-        Raises
-        ------
-        OSError
-            If the keeper has ended.
-        """
+        """End a group of processes; the first one of it is gone at the return."""
         self._ask("end", group)
 
     def _ask(self, request: str, *subject: int) -> int:
@@ -163,15 +145,7 @@ def _release(keeper: Keeper, subject: int | str, send: Callable[[], None]) -> No
 
 
 def make_group() -> tuple[Keeper, int]:
-    """Return a new group of processes that ends with this process, and its keeper.
-
-    Raises
-    ------
-    OSError
-        If it can't be made.
-    LoopwrightError
-        If Python doesn't know its program.
-    """
+    """Return a new group of processes that ends with this process, and its keeper."""
     with _LOCKS[0]:
         keeper = _current()
         try:

@@ -26,26 +26,14 @@ class _Messages:
         self._incoming, self._outgoing = incoming, outgoing
 
     def send(self, message: object) -> None:
-        """Send a message.
-
-        Raises
-        ------
-        OSError
-            If the other side has ended.
-        """
+        """Send a message; an `OSError` if the other side has ended."""
         data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
         self._outgoing.write(_HEAD.pack(len(data)))
         self._outgoing.write(data)
         self._outgoing.flush()
 
     def receive(self) -> Any:
-        """Wait for a message.
-
-        Raises
-        ------
-        EOFError
-            If the other side has ended.
-        """
+        """Wait for a message; an `EOFError` if the other side has ended."""
         head = self._incoming.read(_HEAD.size)
         if len(head) < _HEAD.size:
             raise EOFError
@@ -57,21 +45,9 @@ class _Messages:
 
 
 class PythonChild(_Messages):
-    """A child process that runs a function, as the process that has started it sees it.
+    """A child process that runs the function ``main`` of a module, which makes a `Host` first, seen from this one.
 
-    Parameters
-    ----------
-    group : ProcessGroup
-        The group that it belongs to.
-    module : str
-        Module with the function ``main``, which makes a `Host` first.
-
-    Raises
-    ------
-    OSError
-        If it can't be started.
-    LoopwrightError
-        If Python doesn't know its program.
+    An `OSError` says that it can't be started.
     """
 
     def __init__(self, group: ProcessGroup, module: str):
@@ -108,12 +84,7 @@ class Host(_Messages):
     """The process that has started this one, as the function of this one sees it.
 
     It takes standard input and output for the messages: what anybody prints goes to the standard error. Ctrl-C is left
-    to the host.
-
-    Raises
-    ------
-    EOFError
-        If the host has ended.
+    to the host. An `EOFError` says that the host has ended.
     """
 
     def __init__(self) -> None:

@@ -69,10 +69,7 @@ def count_cores() -> int:
 def copy_files(source: Path, target: Path) -> None:
     """Copy the files of an FMU that its library may read or write: sources and documentation are left out.
 
-    Raises
-    ------
-    OSError
-        The first one of a file: that of shutil lists the texts of all.
+    An `OSError` is that of the first file: that of shutil lists the texts of all.
     """
     faults: list[OSError] = []
 

@@ -39,18 +39,8 @@ class ChildProcess:
     """A child process: it answers one request at a time.
 
     It gets a copy of the ``files`` of the unpacked FMU, and shares ``size`` bytes of memory. ``memory`` and ``output``
-    are its limits in bytes; see `Isolation`.
-
-    Attributes
-    ----------
-    folder : Path
-        Private folder; its ``fmu`` is the copy of the files, its ``work`` the working folder.
-    take_message : callable
-        Takes status and text of the FMU's log messages.
-    arrived : bool
-        Whether C has seen the reply to the last request, which nobody has finished yet.
-    used : bool
-        Whether it can't be used again, since a call has failed or was interrupted.
+    are its limits in bytes; see `Isolation`. Its private ``folder`` has ``fmu``, the copy of the files, and ``work``,
+    the working folder.
     """
 
     def __init__(self, name: str, files: Path, size: int, memory: float, output: float):
@@ -158,14 +148,8 @@ class ChildProcess:
     ) -> tuple[Any, list[bytes]]:
         """Let the child do its method ``do_…`` with numbers, texts and lists, and with bytes, and return its result.
 
-        ``call`` is the call of the FMU, for an error; after ``seconds`` the process is ended.
-
-        Raises
-        ------
-        FmuProcessError
-            If the process ends, or is ended.
-        RuntimeError
-            With the text of the child's exception.
+        ``call`` is the call of the FMU, for an error; after ``seconds`` the process is ended. An exception of the child
+        is a `RuntimeError` here.
         """
         self._call = call
         self.check_alive(call)
@@ -281,7 +265,7 @@ class ChildProcess:
     # ---- messages ----
 
     def fetch_messages(self) -> None:
-        """Give the FMU's log messages to `told`."""
+        """Give the FMU's log messages to `take_message`."""
         self.words[MESSAGES] = 0
         for status, text in self._output.read_messages():
             self.take_message(status, text)

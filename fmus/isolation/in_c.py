@@ -96,18 +96,8 @@ Arguments = list[tuple[str, Any]]
 class Server:
     """Waits for requests in C, and makes bound calls; see `loopwright_serve` of ``child.c``.
 
-    Parameters
-    ----------
-    library : str
-        File of the library.
-    words : int
-        Address of the shared words.
-    commands, replies : int
-        The child's pipes.
-    ordered : bool
-        False where each request and reply is announced in the pipes.
-    looks : int
-        Most looks at a request before one sleeps.
+    ``words`` is the address of the shared words. Without ``ordered`` each request and reply is announced in the pipes.
+    After so many ``looks`` at a request one sleeps.
     """
 
     def __init__(self, library: str, words: int, commands: int, replies: int, ordered: bool, looks: int):

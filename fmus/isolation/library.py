@@ -24,19 +24,7 @@ def seconds_for(name: str, limits: Isolation) -> float:
 
 
 class RemoteLibrary:
-    """Functions of a library in a child, as attributes; they take what ctypes' functions take.
-
-    Parameters
-    ----------
-    process : ChildProcess
-        The child.
-    path : Path
-        The library.
-    names : sequence of str
-        Functions that may be asked for.
-    limits : Isolation
-        Longest times of calls.
-    """
+    """Functions of a library in a child, as attributes; they take what ctypes' functions take."""
 
     def __init__(self, process: ChildProcess, path: Path, names: Sequence[str], limits: Isolation):
         self._process, self._limits = process, limits

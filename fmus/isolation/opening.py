@@ -18,19 +18,9 @@ _EACH = 256  # bytes of shared memory for an element of a variable; only those t
 
 
 def open_fmu(kind: type[L], block: FmuBlock, *arguments: Any, **options: Any) -> L:
-    """Load an FMU and make an instance of it; all that loads an FMU comes here.
+    """Load an FMU, and make an instance of a class: `LoadedFmu`, or one of it. All that loads an FMU comes here.
 
     An FMU that Loopwright has not built is loaded in its own process, unless its block says otherwise.
-
-    Parameters
-    ----------
-    kind : type
-        `LoadedFmu` or a class of it, which takes ``make_calls``.
-    block : FmuBlock
-        Its ``isolate`` is True or limits for its own process, False for this process, None for this process if
-        Loopwright has built the FMU.
-    *arguments, **options
-        Further arguments of the class.
     """
     limits = find_limits(block)
     if limits is None:

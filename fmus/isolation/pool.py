@@ -28,19 +28,7 @@ _COLLECTED_NEXT = [_COLLECTED_AT]
 
 
 def take(key: Key, name: str, files: Path, size: int) -> ChildProcess:
-    """Return a process for an instance of an FMU: an idle one, else a new one.
-
-    Parameters
-    ----------
-    key : tuple
-        Processes of one key serve alike.
-    name : str
-        The FMU, for messages.
-    files : Path
-        Folder of the unpacked FMU.
-    size : int
-        Bytes of memory to share.
-    """
+    """Return a process for an instance of an FMU, with ``size`` bytes of shared memory: an idle one, else a new one."""
     while True:
         with _LOCKS[0]:
             found = next((entry for entry in reversed(_IDLE_ONES) if entry[0] == key), None)

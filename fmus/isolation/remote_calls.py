@@ -89,18 +89,7 @@ def _bind_round_trip(
     """Return a function that lets a child run a bound sequence, waits for it, and returns the status.
 
     It does what `ChildProcess.post` and `ChildProcess.finish` do one after the other, with everything looked up before:
-    a lookup costs a twentieth of the whole.
-
-    Parameters
-    ----------
-    process : ChildProcess
-        The child.
-    sequence : int
-        Number of the sequence.
-    seconds : float
-        Longest time of it in s.
-    note_failure : callable
-        Called with a status that is not 0, a warning too; returns it.
+    a lookup costs a twentieth of the whole. ``note_failure`` is called with a status that is not 0, a warning too.
     """
     words, patience, number_at = process.words, process.patience, wire.REPLY
     read, take, give = words.__getitem__, wire.ORDER.acquire, wire.ORDER.release

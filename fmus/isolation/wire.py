@@ -43,19 +43,8 @@ ORDER = threading.Lock()
 class Patience:
     """Number of looks at a word before its reader sleeps: all of them while watching is right, else none, and a trial.
 
-    Where the other side has no core of its own, or takes long, watching only takes time from it.
-
-    Parameters
-    ----------
-    looks : int
-        Number of looks, of some 40 ns each, if watching is right.
-    may : bool
-        Whether to watch at all.
-
-    Attributes
-    ----------
-    pause : int
-        Number of readings until the next trial; its reader sets it to `FEWEST` whenever watching was right.
+    A look takes some 40 ns. Where the other side shares this core, or takes long, watching only takes time from it.
+    `pause` is the number of readings until the next trial; the reader sets it to `FEWEST` whenever watching was right.
     """
 
     def __init__(self, looks: int, *, may: bool):

@@ -46,13 +46,7 @@ _ALL = slice(None)
 
 @dataclass(frozen=True, eq=False)
 class QuotientSlopes:
-    """Slopes of all values by one argument.
-
-    Attributes
-    ----------
-    slope, error : (n,) ndarray
-        Slopes, and their estimated errors.
-    """
+    """Slopes of all values (n,) by one argument, and their estimated errors."""
 
     slope: np.ndarray
     error: np.ndarray
@@ -61,7 +55,7 @@ class QuotientSlopes:
 def find_slopes(
     values: Callable[[float], np.ndarray], base: np.ndarray, size: float, first: float, limits: tuple[float, float]
 ) -> QuotientSlopes:
-    """Return the slopes of values at distance 0.
+    """Return the slopes of values at distance 0 along one argument, whose least and largest distances are limits.
 
     Quotients over d, 2 d and 4 d are extrapolated twice, to order 6 in d (3 if a limit leaves one side only). The
     distance between the extrapolations is an error, and so is the scatter of the values about a smooth curve. Where
@@ -69,18 +63,7 @@ def find_slopes(
     counts. A value that is straight at the point, and straight with the same slope at other heights farther away, moves
     in steps: its short differences say nothing.
 
-    Parameters
-    ----------
-    values : callable
-        Values at a distance from the point.
-    base : (n,) ndarray
-        Values at the point.
-    size : float
-        Size of the argument.
-    first : float
-        Length to begin with.
-    limits : (float, float)
-        Least and largest distance; one of them is at least four lengths away.
+    ``size`` is that of the argument, ``first`` the length to begin with; one limit is at least four of these away.
     """
     return _AlongArgument(values, base, size, limits).find(first)
 
@@ -255,16 +238,7 @@ def _find_grain(values: np.ndarray) -> np.ndarray:
 class Column:
     """Elements of variables that are moved one at a time about a point.
 
-    Parameters
-    ----------
-    about : FmuDescription
-        Description with nominal values and bounds.
-    names : list of str
-        The variables.
-    at : array
-        All elements at the point.
-    relative : float
-        Distance to move, relative to an element's nominal value, or to its value if that is larger.
+    They move by ``relative`` times an element's nominal value, or its value if that is larger.
     """
 
     def __init__(self, about: FmuDescription, names: list[str], at: np.ndarray, relative: float):
@@ -290,21 +264,11 @@ class Column:
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """Derivatives by differences.
-
-    Attributes
-    ----------
-    J, error : (n, m) ndarray
-        The derivatives, and the estimated error of each.
-    sizes : (m,) ndarray
-        Sizes of what was moved; 0 of columns that were not.
-    values : (n,) ndarray
-        Values at the point.
-    """
+    """Derivatives by differences, and the values at the point."""
 
     J: np.ndarray
-    error: np.ndarray
-    sizes: np.ndarray
+    error: np.ndarray  # estimates, as J: (n, m)
+    sizes: np.ndarray  # (m,) sizes of what was moved; 0 of columns that were not
     values: np.ndarray
 
     def find_coarseness(self, rows: np.ndarray | slice = _ALL) -> float:
@@ -329,17 +293,7 @@ class Differences:
 
 
 def differentiate(column: Column, values: np.ndarray, evaluate: Callable[[str, np.ndarray], np.ndarray]) -> Differences:
-    """Return the matrix of derivatives and the estimated error of each entry; see `find_slopes`.
-
-    Parameters
-    ----------
-    column : Column
-        The point, and what is moved about it.
-    values : (n,) ndarray
-        Values at the point.
-    evaluate : callable
-        Values when the elements of one variable are moved: ``evaluate(name, all_elements)``.
-    """
+    """Return the derivatives of ``evaluate(name, all_elements)``, and the error of each; see `find_slopes`."""
     found, sizes = [], []
     for name, i, d, (low, high) in column:
 

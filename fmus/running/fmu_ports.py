@@ -24,19 +24,10 @@ class FmuPorts:
 def choose_ports(
     description: FmuDescription, rename: tuple[tuple[str, str], ...], chosen: tuple[str, ...] | None, label: str
 ) -> FmuPorts:
-    """Return the ports of a block.
+    """Return the ports of a block; ``chosen`` are the variables that are ports, None for all inputs and outputs.
 
-    Parameters
-    ----------
-    description : FmuDescription
-        The FMU's description.
-    rename : tuple of pairs of str
-        Variables and the names of their ports. Scalars of a gathered array that are renamed are their own ports,
-        and so are the array's other scalars; those that are renamed to elements are one port (`join_scalars`).
-    chosen : tuple of str, optional
-        Variables that are ports; None for all inputs and outputs.
-    label : str
-        The block's name, for messages.
+    Scalars of a gathered array that are renamed are their own ports, and so are the array's other scalars; those that
+    are renamed to elements are one port (`join_scalars`).
     """
     members = {n: description.elements[n][0] for n in description.members}
     names = {n: port for n, port in rename if n not in members} | dict(description.joined)

@@ -220,19 +220,7 @@ def _article(noun: str) -> str:
 def read_sized(
     file: str | os.PathLike[str], start: Mapping[str, Any], limits: ArchiveLimits | None, label: str
 ) -> tuple[FmuDescription, dict[str, int]]:
-    """Return an FMU's description with the sizes of arrays that start values give, and those start values.
-
-    Parameters
-    ----------
-    file : str or PathLike
-        The FMU.
-    start : mapping
-        Start values by the FMU's names; structural parameters among them count.
-    limits : ArchiveLimits, optional
-        Limits of the file.
-    label : str
-        Name of the block, for messages.
-    """
+    """Return an FMU's description with the sizes of arrays that start values give, and those start values."""
     try:
         description = read_description(file, limits=limits)
         sizes = {n: int(check_value(description, n, v, label)) for n, v in start.items() if n in description.structural}

@@ -282,14 +282,9 @@ def find_exchange_slopes(
     x: np.ndarray,
     u: np.ndarray,
 ) -> Differences:
-    """Return the derivative of values by (x, u) of model exchange, by differences.
+    """Return the derivative of ``values(x, u)``, flat, by (x, u) of model exchange, by differences.
 
-    Parameters
-    ----------
-    wired : sequence of str
-        Inputs that are moved; others, and those without derivatives, have zero columns.
-    values : callable
-        ``values(x, u)``: flat, at states and inputs.
+    Wired inputs are moved; others, and those without derivatives, have zero columns.
     """
     about, places = block.description, Layout.of({p: v.shape for p, v in block.input_variables.items()}).slices
     moved = {port: v for port, v in block.input_variables.items() if port in wired and is_smooth(v)}
@@ -326,10 +321,7 @@ def check_exchange_slopes(
     u: np.ndarray,
     J: np.ndarray,
 ) -> SlopeCheck:
-    """Return the FMU's own derivatives ``J`` of values by (x, u), held against differences; see `check_slopes`.
-
-    Parameters are those of `find_exchange_slopes`.
-    """
+    """Return the FMU's own derivatives ``J`` of values by (x, u), held against differences; see `check_slopes`."""
     places = Layout.of({p: v.shape for p, v in block.input_variables.items()}).slices
     n = x.size
     nominals, low, high = np.ones(n + u.size), np.full(n + u.size, -np.inf), np.full(n + u.size, np.inf)
@@ -428,14 +420,7 @@ def find_step_gap(
     """Return how far a step is from a linear model of it, in one random direction, and the error of that distance.
 
     Both are relative to the model's own motion. States that can't be set at the start move as the FMU's initialization
-    makes them: one may follow from those that are set.
-
-    Parameters
-    ----------
-    h, t, state, inputs
-        As of `Fmu.step_difference`.
-    A, B : ndarray
-        States after the step, by states before it and by inputs.
+    makes them: one may follow from those that are set. A and B are of the states after the step.
     """
     point = FmuPoint(block, t, state, inputs)
     about = point.about

@@ -179,15 +179,7 @@ def _find_misfits(
 
 
 def suggest_names(fmu: _WithVariables, inputs: Mapping[str, Input], outputs: Mapping[str, Output]) -> dict[str, str]:
-    """Return the entries of ``rename`` that an FMU may need to have some ports, as far as they are unique.
-
-    Parameters
-    ----------
-    fmu : Fmu
-        The FMU.
-    inputs, outputs : mapping
-        The ports that are wanted, with shapes and units; those that the FMU has are left alone.
-    """
+    """Return the entries of ``rename`` that an FMU may need to have some ports, as far as they are unique."""
     found: dict[str, str] = {}
     for wanted, ports, variables in (
         (inputs, fmu.inputs, fmu.input_variables),

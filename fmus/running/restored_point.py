@@ -16,24 +16,9 @@ _ROUNDING = 1e-12
 class RestoredPoint:
     """A state that is saved and restored, as long as that has the values of the point again.
 
-    Values are compared until each has moved and come back once. They are read after a restore at the point itself,
-    too, so that an FMU which computes outputs again then is compared with itself.
-
-    Parameters
-    ----------
-    instance : LoadedFmu
-        The instance.
-    names : sequence of str
-        Variables to compare, by the FMU's names.
-    start : callable
-        Brings a fresh instance to the point, where a state can't be restored, or the FMU does not restore it.
-
-    Attributes
-    ----------
-    is_restored : bool
-        Whether states are restored; else every return begins again.
-    lied : bool
-        Whether the FMU has said that it restored a state, and had not.
+    Values are compared until each has moved and come back once. They are read after a restore at the point itself, too,
+    so that an FMU which computes outputs again then is compared with itself. Where a state can't be restored, or the
+    FMU says that it has restored one and has not (`lied`), ``start`` brings a fresh instance to the point.
     """
 
     def __init__(self, instance: LoadedFmu, names: Sequence[str], start: Callable[[], None]):

@@ -17,19 +17,7 @@ def take_shifted_steps(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return states and outputs at the end of a step: from an operating point, then from each shifted point.
 
-    Parameters
-    ----------
-    block : Fmu
-        The FMU.
-    h, t, state, inputs
-        As of `Fmu.step_difference`.
-    shifts : sequence of (ndarray, ndarray)
-        Shifts of all states and all inputs, as `FmuPoint.states` and `FmuPoint.inputs` lay them out.
-
-    Returns
-    -------
-    list of (ndarray, ndarray)
-        States and outputs at the end of the step.
+    Shifts are of all states and all inputs, as `FmuPoint.states` and `FmuPoint.inputs` lay them out.
     """
     point = FmuPoint(block, t, state, inputs)
     about = point.about

@@ -30,25 +30,14 @@ _EPS = float(np.finfo(float).eps)
 
 @dataclass(frozen=True, eq=False)
 class SlopeCheck:
-    """Directional derivatives after their check.
+    """Directional derivatives after their check."""
 
-    Attributes
-    ----------
-    J : ndarray
-        The derivatives, with differences in place of those that are plainly wrong.
-    error : ndarray
-        Estimated error of each entry; 0 where the derivative agrees with its difference, NaN where that is no evidence.
-    gap : float
-        Largest distance of a derivative from its difference, relative to the size of the values' change; 0 if all
-        agree, NaN if the values could not be computed, or their differences are no evidence.
-    is_wrong : bool
-        Whether some derivatives are plainly wrong.
-    """
-
-    J: np.ndarray
+    J: np.ndarray  # with differences in place of those that are plainly wrong
+    # estimate of each entry; 0 where the derivative agrees with its difference, NaN where that is no evidence
     error: np.ndarray = field(repr=False)
+    # largest distance from a difference, relative to the values' change; 0 if all agree, NaN without evidence
     gap: float
-    is_wrong: bool
+    is_wrong: bool  # whether some derivatives are plainly wrong
 
     def describe(self, derivation: Derivation) -> Derivation:
         """Return the method of the derivatives, after this check of directional ones."""
@@ -69,19 +58,7 @@ def check_slopes(
 
     Only where a direction shows a gap, each column is looked at by itself. A derivative that is the slope to one side
     of a kink is right; one between both sides, such as their mean, is kept, with its distance as its error.
-
-    Parameters
-    ----------
-    J : (n, m) ndarray
-        Derivatives of the values at ``at``.
-    values : callable
-        The values at an argument, shape (n,), in a new array.
-    at, nominals : (m,) ndarray
-        The argument, and sizes of its entries.
-    limits : pair of (m,) ndarray
-        Least and largest arguments.
-    moved : (m,) ndarray of bool
-        Entries that may be moved.
+    ``nominals`` are sizes of the entries of ``at``, ``moved`` those that may be moved.
     """
     agreed = SlopeCheck(J, np.zeros(J.shape), 0.0, False)
     checker = _Checker(values, at, nominals, limits, moved)
