@@ -54,7 +54,10 @@ class HandedOver:
 
     def _by_python(self, stage: OpaqueStage, vectors: EvaluationVectors) -> Callable[[], int]:
         """Return the function that evaluates a stage, or looks at an instant, by Python while C waits."""
-        path, call = stage.path, self._evaluators[stage.path].bind(stage.names, vectors, again=False)
+        path, evaluator, (t, x, u, into) = stage.path, self._evaluators[stage.path], vectors
+
+        def call() -> None:
+            into[:] = evaluator.evaluate(stage.names, float(t[0]), x, u)
 
         def evaluate() -> int:
             try:
@@ -68,7 +71,7 @@ class HandedOver:
 
         def look() -> int:
             with self.native.lent(path):
-                self._look(path, float(vectors.t[0]), call)
+                self._look(path, float(t[0]), call)
             return _DONE
 
         return look if stage.names == (JUMP,) else evaluate

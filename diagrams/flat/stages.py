@@ -33,7 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Protocol
 
 import casadi as ca
@@ -70,16 +70,6 @@ class Evaluator(Protocol):
         """Return the derivative of `evaluate` by (t, x, u), shape (n, 1 + x.size + u.size); None: by differences.
 
         A column by t that is not finite is computed by differences, where it is needed.
-        """
-        ...
-
-    def bind(self, names: tuple[str, ...], vectors: EvaluationVectors, *, again: bool) -> Callable[[], None]:
-        """Return the call that reads and writes these vectors as `evaluate` does its arguments and its result.
-
-        Parameters
-        ----------
-        again : bool
-            Whether another bound call always comes right before it, at the same t and x.
         """
         ...
 
@@ -258,13 +248,9 @@ class Schedule:
         if len(self.stages) == 1:
             return bind_function(self.last.evaluated, arguments, results)
         c, calls, kept = np.zeros(self.width), list[Callable[[], None]](), list[Bound]()
-        paths = set[str]()
         for stage in self.stages:
             if isinstance(stage, OpaqueStage):
-                evaluator = stage.evaluator(evaluators or {})
-                bound = evaluator.bind(stage.names, stage.vectors(arguments[0], c), again=stage.path in paths)
-                calls.append(bound)
-                paths.add(stage.path)
+                calls.append(partial(stage.run, stage.evaluator(evaluators or {}), arguments[0], c))
             else:
                 into = results if stage is self.last else [c[stage.makes]]
                 kept.append(bind_function(stage.evaluated, [*arguments, c], into))

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ...blocks.core import EvaluationVectors, SimulationError, Wanted
+from ...blocks.core import SimulationError, Wanted
 from ...blocks.tracing import GUARDS, NEXT
 from ..flat import JUMP, FlatDiagram, no_evaluator, sort_names
 
@@ -68,12 +68,6 @@ class ModelExchangeBlock(Protocol):
         """Return the call ``(t, x, u) -> values`` of outputs, rates of the states and indicators, one after the other.
 
         It leaves everything that the block keeps as it is.
-        """
-
-    def bound_evaluation(self, wanted: Wanted, vectors: EvaluationVectors, *, again: bool) -> Callable[[], None]:
-        """Return the call that reads and writes these vectors as an `evaluation` does its arguments and its result.
-
-        With ``again`` another such call always comes right before it, at the same t and x.
         """
 
     def slopes(self, ports: Sequence[str], *, rates: bool, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
@@ -191,25 +185,6 @@ class ModelExchangeEvaluator:
         wanted = sort_names(names)
         assert self._outputs.issuperset(wanted.outputs)
         return wanted
-
-    def bind(self, names: tuple[str, ...], vectors: EvaluationVectors, *, again: bool) -> Callable[[], None]:
-        """Return `evaluate` bound to vectors; see `loopwright.diagrams.flat.stages.Evaluator.bind`."""
-        if names == (JUMP,):
-            t, x, u, into = vectors
-
-            def jump() -> None:
-                into[:] = self._jump(float(t[0]), x, u)
-
-            return jump
-        made: Callable[[], None] | None = None
-
-        def call() -> None:  # the block is loaded after the functions are bound
-            nonlocal made
-            if made is None:
-                made = self.block.bound_evaluation(self._wanted(names), vectors, again=again)
-            made()
-
-        return call
 
     def _jump(self, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Look at an instant that is reached: let events act, or take note of a step that the solver has accepted.

@@ -135,77 +135,12 @@ def order_questions(values: Sequence[T], derivatives: Sequence[T], values_again:
     return [*values, *derivatives, *(values_again if derivatives else ())]
 
 
-class DirectEvaluation:
-    """An evaluation in this process on vectors of the caller's: no value is copied.
-
-    Parameters
-    ----------
-    time : c_double
-        The time, as an argument of the calls.
-    vectors : EvaluationVectors
-        Its states are in the FMU's order, its inputs those that are set.
-    again : bool
-        Whether time and states need not be set.
-    """
-
-    def __init__(
-        self,
-        fmi: FmiCalls,
-        *,
-        time: ctypes.c_double,
-        vectors: EvaluationVectors,
-        inputs: Sequence[int],
-        outputs: Sequence[int],
-        rates: bool,
-        indicators: int,
-        again: bool,
-    ):
-        t, x, u, into = vectors
-        n = x.size
-        count = into.size - indicators - (n if rates else 0)
-        slopes, last = into[count : count + n], into[into.size - indicators :]
-        calls: list[_Named] = []
-        if not again:
-            calls = [(fmi.exchange_function("set_time"), (fmi.instance_argument, time), "setting the time")]
-            calls += _vector_call(fmi, Vector("set_states", x), "setting the continuous states")
-        calls += _values_call(fmi, "Set", inputs, u, "setting the inputs")
-        if rates:
-            calls += _vector_call(fmi, Vector("derivatives", slopes), "computing the derivatives of its states")
-        calls += _values_call(fmi, "Get", outputs, into[:count], "reading the outputs")
-        calls += _vector_call(fmi, Vector("indicators", last), "computing the event indicators")
-        self._time, self._t, self._kept = time, t, (x, u, into)
-        self._calls = tuple((function, arguments) for function, arguments, _ in calls)
-        self.actions = [action for _, _, action in calls]
-
-    def run(self) -> tuple[int, int]:
-        """Evaluate it; return the status of a call that has failed, and its place; else 1 after a warning, else 0."""
-        self._time.value = self._t[0]
-        worst, self.warned = 0, []
-        for function, arguments in self._calls:
-            if status := function(*arguments):
-                place = next(i for i, (_, made) in enumerate(self._calls) if made is arguments)
-                if status > WARNING:
-                    return status, place
-                worst = status
-                self.warned.append(self.actions[place])
-        return worst, 0
-
-
 def call_actions(calls: BoundCalls, names: Sequence[str], first: int = 0) -> list[NativeAction]:
     """Return bound calls from one on as actions of C: one each, or one request to another process for all of them."""
     if (request := calls.request) is not None:
         assert not first
         return [NativeAction(ActionKind.ASK, tuple(names), arguments=(request.sequence,), bound=calls)]
     return [call_action(call, name) for call, name in zip(calls.calls[first:], names[first:], strict=True)]
-
-
-def _values_call(fmi: FmiCalls, verb: str, references: Sequence[int], values: np.ndarray, action: str) -> list[_Named]:
-    """Return the call that sets or gets variables of type Float64."""
-    if not references:
-        return []
-    kept = (ctypes.c_uint * len(references))(*references)
-    arguments = fmi.value_arguments(kept, len(references), values.ctypes.data, values.size)
-    return [(fmi.value_function(verb, "Float64"), arguments, action)]
 
 
 def _vector_call(fmi: FmiCalls, vector: Vector | None, action: str) -> list[_Named]:

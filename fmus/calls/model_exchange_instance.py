@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import cached_property, partial
-from itertools import pairwise
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from .event_calls import EventUpdate
 from .fmi_calls import MOST_ROUNDS
 from .fmu_block import FmuBlock, check_next_time
 from .loaded_library import MakeCalls
-from .model_exchange_calls import DirectEvaluation, Evaluation, Vector, call_actions
+from .model_exchange_calls import Evaluation, Vector, call_actions
 from .model_structure import check_structure, is_smooth
 from .native_actions import ActionKind, NativeAction, NativeLook, copy_action, transfer_actions
 from .running_fmu import RunningFmu
@@ -61,8 +60,6 @@ class ModelExchangeInstance(RunningFmu):
         self._evaluations: dict[Wanted, Evaluation] = {}
         self._is_own = self.fmi.in_process and self.is_built_here
         self._guarded = self.fmi.in_process and not self._is_own
-        self._is_placed = False
-        """Whether a bound evaluation has just set time and states."""
         self._discarded = ""
         self._u = np.zeros(0)
         """Values of all inputs at the last instant that was reached."""
@@ -141,60 +138,6 @@ class ModelExchangeInstance(RunningFmu):
         ]
         read = {v.name: v for v in sorted(computed or rates or states, key=lambda v: v.size)[:1]}
         return Transfer(self.fmi, "Get", read, self._allocate(sum(v.size for v in read.values())))
-
-    def bound_evaluation(self, wanted: Wanted, vectors: EvaluationVectors, *, again: bool) -> Callable[[], None]:
-        """Return the call that reads and writes these vectors as `evaluation` does its arguments and its result.
-
-        An FMU that Loopwright has built reads and writes these vectors itself. With ``again`` another such call always
-        comes right before it, at the same t and x, which need not be set again.
-        """
-        plain = self.evaluation(wanted)
-        t, x, u, into = vectors
-
-        def copy() -> None:
-            into[:] = plain(t[0], x, u)
-
-        made = self._bind_direct(wanted, vectors, again=False)
-        if made is None:
-            return copy
-        short = self._bind_direct(wanted, vectors, again=True) if again else None
-
-        def call() -> None:
-            if not self._running:
-                copy()
-                return
-            direct = made if short is None or not self._is_placed else short
-            status, place = direct.run()
-            self._is_placed = status <= WARNING
-            if status:
-                self._x[:] = x
-                self._judge_evaluation(
-                    status, direct.warned if status <= WARNING else [direct.actions[place]], t[0], into
-                )
-
-        return call
-
-    def _bind_direct(self, wanted: Wanted, vectors: EvaluationVectors, *, again: bool) -> DirectEvaluation | None:
-        """Return an evaluation on vectors of the caller's; None where values have to be copied or converted."""
-        outputs = [self.block.output_variables[port] for port in wanted.outputs]
-        used = [port for port in self._places if port in self._smooth]
-        inputs = [port for port in used if wanted.indicators or self._is_needed(port, wanted)]
-        variables = [*outputs, *(self._ports[port] for port in inputs)]
-        places = [self._places[port] for port in inputs]
-        adjoining = all(a.stop == b.start for a, b in pairwise(places))
-        sorted_states = np.array_equal(self._order, np.arange(self._order.size))
-        if not (self._is_own and sorted_states and adjoining and all(v.type == "Float64" for v in variables)):
-            return None
-        return DirectEvaluation(
-            self.fmi,
-            time=self._time,
-            vectors=vectors._replace(u=vectors.u[places[0].start : places[-1].stop] if places else vectors.u[:0]),
-            inputs=[r for port in inputs for r in self._ports[port].references],
-            outputs=[r for v in outputs for r in v.references],
-            rates=wanted.rates,
-            indicators=len(self.about.indicators) if wanted.indicators else 0,
-            again=again,
-        )
 
     def _is_needed(self, port: str, wanted: Wanted) -> bool:
         """Whether outputs or rates that are wanted may depend on an input."""
@@ -527,7 +470,11 @@ class ModelExchangeInstance(RunningFmu):
         return None
 
     def native_evaluation(self, wanted: Wanted, vectors: EvaluationVectors, *, again: bool) -> list[NativeAction]:
-        """Return `bound_evaluation` as actions of C."""
+        """Return `evaluation` as actions of C on these vectors.
+
+        With ``again`` another one always comes right before it, at the same t and x, which an FMU that Loopwright has
+        built need not be given again.
+        """
         return self._evaluation(wanted).native(vectors, self._order, again=again and self._is_own)
 
     def native_look(self, vectors: EvaluationVectors) -> NativeLook:

@@ -37,19 +37,7 @@ A_Q, B_Q, C_Q, D_Q = RNG.normal(size=(2, 2)), RNG.normal(size=(2, 2)), RNG.norma
 A_R, B_R, C_R, D_R = RNG.normal(size=(2, 2)), RNG.normal(size=(2, 2)), RNG.normal(size=(2, 2)), RNG.normal(size=(2, 2))
 
 
-class Outside:
-    """An evaluator whose bound calls are those of `evaluate`."""
-
-    def bind(self, names, vectors, *, again):
-        t, x, u, into = vectors
-
-        def call():
-            into[:] = self.evaluate(names, float(t[0]), x, u)
-
-        return call
-
-
-class Matrices(Outside):
+class Matrices:
     """A linear block, evaluated from outside."""
 
     def __init__(self, A, B, C, D, *, slopes=True):
@@ -68,7 +56,7 @@ class Matrices(Outside):
         return np.hstack([np.zeros((len(J), 1)), J])
 
 
-class Equations(Outside):
+class Equations:
     """Any traced block, its equations called from outside."""
 
     def __init__(self, flat, path):
@@ -137,7 +125,7 @@ def loop(*more):
     return Diagram("loop", p(r(Wave(name="wave") - q(p.y))), *(made(p.y) for made in more))
 
 
-class WaveOutside(Outside):
+class WaveOutside:
     """The wave, evaluated from outside."""
 
     def evaluate(self, names, t, x, u):
