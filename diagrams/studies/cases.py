@@ -106,23 +106,27 @@ class Goal:
     """Requirements that a worst case is not looked for with, as those of steps."""
 
     def goodness(self, loop: tuple[str, ...], quantity: str, value: float) -> float:
-        """Return the distance of a number to its limit over the limit's size; without a limit the number by its sense.
-
-        Infinite numbers are as good as can be.
-        """
+        """Return a number's distance to its limit over the limit's size, or by its sense; infinite ones are best."""
         limit = self.loops[loop][quantity]
         if limit is None:
-            return value if SENSES.get(quantity, Sense.LEAST) is Sense.LEAST else -value
-        ends = [abs(end) for end in limit if math.isfinite(end)]
-        return limit.distance(value) / (max(ends) or 1.0)
+            return _sign_of(quantity) * value
+        return limit.distance(value) / _size_of(limit)
 
     def slope(self, loop: tuple[str, ...], quantity: str, value: float) -> float:
         """Return the derivative of the goodness by the number."""
         limit = self.loops[loop][quantity]
         if limit is None:
-            return 1.0 if SENSES.get(quantity, Sense.LEAST) is Sense.LEAST else -1.0
-        ends = [abs(end) for end in limit if math.isfinite(end)]
-        return (1.0 if value - limit.low < limit.high - value else -1.0) / (max(ends) or 1.0)
+            return _sign_of(quantity)
+        return (1.0 if value - limit.low < limit.high - value else -1.0) / _size_of(limit)
+
+
+def _sign_of(quantity: str) -> float:
+    """Return 1 for a number that is the worse, the smaller, else −1."""
+    return 1.0 if SENSES.get(quantity, Sense.LEAST) is Sense.LEAST else -1.0
+
+
+def _size_of(limit: Limit) -> float:
+    return max(abs(end) for end in limit if math.isfinite(end)) or 1.0
 
 
 def describe(case: StudyCase) -> str:
@@ -146,6 +150,7 @@ def make_goal(
             "as quantity='disk_margin', or Requirements(phase_margin_deg=45).",
             block=diagram,
         )
+    # A number without a limit, of one loop.
     if quantity is not None and quantity not in SENSES:
         raise OptionError(
             f"a loop has no number {quantity!r}. {near(quantity, SENSES)}", block=diagram, port="quantity"

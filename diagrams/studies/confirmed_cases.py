@@ -114,10 +114,7 @@ class RunConfirmation:
 def confirm_case(
     diagram: WiredDiagram, case: StudyCase, at: Any, amplitude: float | None, delay: int, options: Mapping[str, Any]
 ) -> RunConfirmation:
-    """Return the confirmation of a case by a run of the diagram with its parameters.
-
-    ``options`` are those of the linear models.
-    """
+    """Return the confirmation of a case by a run; ``options`` are those of the linear models."""
     if not case.loop or delay:
         raise OptionError(
             "found a case without a loop that a run has, as it failed, or has a delay in series; expected one with "

@@ -20,21 +20,11 @@ KEYS = (*PortNames._fields, "direction", "at", "stairs", REQUIRED)
 
 @dataclass(frozen=True)
 class ContactTask:
-    """Contacts that a TOML file asks for.
-
-    Attributes
-    ----------
-    file : TomlFile
-        The file.
-    places : mapping
-        Entries of each contact's table, by its name.
-    limits : mapping of str to tuple of ContactLimits
-        Limits by the names of contacts; those of all have the name "".
-    """
+    """Contacts that a TOML file asks for."""
 
     file: TomlFile
-    places: Mapping[str, Mapping[str, Any]]
-    limits: Mapping[str, tuple[ContactLimits, ...]]
+    places: Mapping[str, Mapping[str, Any]]  # entries of each contact's table, by its name
+    limits: Mapping[str, tuple[ContactLimits, ...]]  # by the names of contacts; those of all have the name ""
     _made: dict[str, Contact] = field(default_factory=dict, repr=False)
 
     @classmethod

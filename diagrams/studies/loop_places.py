@@ -27,28 +27,13 @@ STEP = 1e-3
 
 @dataclass(frozen=True)
 class LoopPlace:
-    """The place at which a report cuts a loop.
-
-    Attributes
-    ----------
-    wire : str
-        Name of the wire.
-    to : tuple of (str, str)
-        Block and port of the inputs ahead of which it is cut; empty for all consumers.
-    own : tuple of (str, str)
-        Other consumers, by which the controller comes back to itself.
-    at : str
-        Wire that feeds these inputs, where it is one behind the wire; empty where it is the wire itself.
-    others : tuple of (str, tuple of str)
-        Wires and inputs of other cuts of it, as of `Linearization.loop`, where several blocks may be the plant; no
-        inputs for all consumers.
-    """
+    """The place at which a report cuts a loop."""
 
     wire: str
-    to: tuple[tuple[str, str], ...] = ()
-    own: tuple[tuple[str, str], ...] = ()
-    at: str = ""
-    others: OtherCuts = ()
+    to: tuple[tuple[str, str], ...] = ()  # block and port of the inputs ahead of which it is cut; () for all consumers
+    own: tuple[tuple[str, str], ...] = ()  # other consumers, by which the controller comes back to itself
+    at: str = ""  # wire behind this one that feeds these inputs, if it is another
+    others: OtherCuts = ()  # of the loop, where several blocks may be the plant
 
     @property
     def name(self) -> str:
@@ -147,10 +132,7 @@ def place_loops(
 
 
 def numbers_at_other_cuts(model: Linearization, others: OtherCuts, delay: int = 0) -> dict[str, dict[str, Number]]:
-    """Return the numbers of a loop at other cuts of its wire by their inputs; those from which nothing comes back none.
-
-    A loop that has no numbers there has none in its mapping.
-    """
+    """Return the numbers of a loop at other cuts by their inputs, {} where it has none; zero loops are left out."""
     found: dict[str, dict[str, Number]] = {}
     for wire, inputs in others:
         try:

@@ -26,14 +26,8 @@ OF_LIMIT = ("vary", "low", "high", "per_decade", "stiffness", "damping", "mass",
 class ContactMeasure:
     """Limit of coupled stability of a contact.
 
-    Parameters
-    ----------
-    given : mapping
-        Arguments of `Diagram.contact` and of `Contact.stability_limit`, together.
-    diagram : WiredDiagram
-        The diagram.
-    options : mapping
-        Options of the run, and ``stairs``.
+    ``given`` are arguments of `Diagram.contact` and of `Contact.stability_limit` together, ``options`` those of the
+    run, and ``stairs``.
     """
 
     def __init__(self, given: Mapping[str, Any], diagram: WiredDiagram, options: Mapping[str, Any]):
@@ -78,15 +72,7 @@ class ContactMeasure:
 
 
 class FunctionMeasure:
-    """A function of a user's own, from a diagram to a number.
-
-    Parameters
-    ----------
-    function : callable
-        The function.
-    diagram : str
-        Name of the diagram.
-    """
+    """A function of a user's own, from a diagram to a number."""
 
     def __init__(self, function: Callable[[Any], Any], diagram: str):
         self._function, self.place = function, diagram

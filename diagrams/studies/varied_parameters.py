@@ -53,21 +53,10 @@ def _holds_numbers(value: Any) -> bool:
 
 
 def check_parameters(diagram: WiredDiagram, names: Iterable[str], study: str, *, blocks: bool = False) -> None:
-    """Refuse parameters that are structure of the linear model, and no numbers in it.
+    """Refuse parameters that are structure of the linear model, and no numbers in it; ``blocks`` allows whole blocks.
 
     These are settings of subsystems (sample time, delay, offset, method), whole numbers, such as orders and counts,
     parameters that are true or false, and those that are no numbers.
-
-    Parameters
-    ----------
-    diagram : Diagram
-        The diagram.
-    names : iterable of str
-        Full paths.
-    study : str
-        The study, for errors.
-    blocks : bool
-        Whether whole blocks may be named.
     """
     for name in names:
         if name in diagram.structure.blocks and blocks:

@@ -119,7 +119,7 @@ class WorstCase(ShownAsTable):
 
     @property
     def failures(self) -> tuple[StudyCase, ...]:
-        """The cases that could not be analysed; each tells its reason."""
+        """The cases that could not be analysed; each has its reason."""
         return tuple(case for case in self.cases if case.state is CaseState.FAILED)
 
     @property
@@ -129,7 +129,7 @@ class WorstCase(ShownAsTable):
 
     @property
     def worst_sample(self) -> StudyCase:
-        """The worst of the samples, from which the search went on."""
+        """The worst of the samples, where the search began."""
         mine = [case for case in self.cases if case.origin is CaseOrigin.SAMPLE]
         return min(mine, key=lambda case: case.goodness)
 
@@ -275,6 +275,7 @@ def find_worst_case(
         at = carry_point(whole, at, diagram)
         points = None if points is None else [carry_point(whole, point, diagram) for point in points]
         goal = make_goal(loop, quantity, requirements, diagram.name)
+    # The samples, and the ranges in which a search may move.
     if isinstance(samples, str) and samples == "latin" and count is None:
         count = 100
     drawn = read_samples(diagram, parameters, samples, count=count, seed=seed)
@@ -284,6 +285,7 @@ def find_worst_case(
     places = tuple(points) if points is not None else (at,)
     study = Study(diagram, goal, boxes, places, delay, options, progress or (lambda text: None), measure)
     # Without a nominal case there is nothing that a worst case could be compared with.
+    # Slopes and loops of variants begin with its linear model.
     nominal = study.run({}, CaseOrigin.NOMINAL)
     if all(case.state is CaseState.FAILED for case in nominal):
         way_out = "Mend that first."
@@ -298,6 +300,7 @@ def find_worst_case(
             block=diagram.name,
             port="loop" if study.has_no_loop else "",
         )
+    # The worst case is linearized as a whole, for its findings: the others come from their loops' matrices.
     for sample in drawn:
         study.run(sample.parameters, CaseOrigin.SAMPLE)
     if boxes and starts > 0:

@@ -38,7 +38,12 @@ def plot_cases(
             raise OptionError(f"found no parameter {name!r} with one number in the study. {near(name, every)}")
     if not names:
         raise OptionError("found no parameter with one number; expected one to draw over. Look at table().")
-    loop, quantity = _drawn(worst, goal)
+    # A worst case without a number is drawn over the goal's first.
+    if worst.quantity:
+        loop, quantity = worst.loop, worst.quantity
+    else:
+        loop = next(iter(goal.loops))
+        quantity = next(iter(goal.loops[loop]))
     rows, columns = math.ceil(len(names) / 3), min(len(names), 3)
     with shown_figure(0.3 + 2.4 * rows, is_shown=is_shown) as figure:
         grid = figure.subplots(rows, columns, squeeze=False)
@@ -80,11 +85,3 @@ def plot_cases(
                 axes.set_ylabel(with_unit(quantity, unit))
         legend_above(figure, grid.flat[0])
     return figure
-
-
-def _drawn(worst: StudyCase, goal: Goal) -> tuple[tuple[str, ...], str]:
-    """Return the loop and the number that are drawn: those of the worst case, or else the first."""
-    if worst.quantity:
-        return worst.loop, worst.quantity
-    loop = next(iter(goal.loops))
-    return loop, next(iter(goal.loops[loop]))

@@ -218,7 +218,7 @@ class Study:
         return found
 
     def fractions_of(self, parameters: Mapping[str, Any]) -> np.ndarray:
-        """Return the point of the ranges at which parameters stand."""
+        """Return the point of the ranges at which parameters are."""
         parts = []
         for name, box in self.boxes.items():
             low, high, value = (np.ravel(np.asarray(v, dtype=float)) for v in (box.low, box.high, parameters[name]))
@@ -261,6 +261,9 @@ class Study:
         if not self._is_lost():
             self._polish()
 
+    def _worst_at(self, fractions: np.ndarray) -> StudyCase:
+        return min(self.run(self.parameters_at(fractions), CaseOrigin.SEARCH), key=lambda c: c.goodness)
+
     def _is_lost(self) -> bool:
         return any(case.state is CaseState.UNSTABLE for case in self.cases)
 
@@ -271,7 +274,7 @@ class Study:
         ends = list[np.ndarray]()
 
         def evaluate(x: np.ndarray) -> tuple[float, np.ndarray]:
-            case = min(self.run(self.parameters_at(x), CaseOrigin.SEARCH), key=lambda c: c.goodness)
+            case = self._worst_at(x)
             if case.state in (CaseState.UNSTABLE, CaseState.FAILED):
                 raise _LostError
             gradient = self.gradient(case, x)
@@ -328,7 +331,7 @@ class Study:
         side = -1.0 if fractions[i] > 0.5 else 1.0
         moved = fractions.copy()
         moved[i] += side * DIFFERENCE
-        other = min(self.run(self.parameters_at(moved), CaseOrigin.SEARCH), key=lambda c: c.goodness)
+        other = self._worst_at(moved)
         change = (other.goodness - case.goodness) / (side * DIFFERENCE)
         bad = other.state in (CaseState.UNSTABLE, CaseState.FAILED)
         return change if math.isfinite(change) and not bad else 0.0
@@ -348,7 +351,7 @@ class Study:
                     moved[i] = np.clip(moved[i] + side * step, 0.0, 1.0)
                     if moved[i] == middle[i]:
                         continue
-                    case = min(self.run(self.parameters_at(moved), CaseOrigin.SEARCH), key=lambda c: c.goodness)
+                    case = self._worst_at(moved)
                     if case.goodness < best.goodness - 1e-9 * (1.0 + abs(best.goodness)):
                         best, better = case, True
                         break

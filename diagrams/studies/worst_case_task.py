@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -28,27 +29,13 @@ RANGE = ("low", "high", "scale")
 
 @dataclass(frozen=True)
 class WorstCaseTask:
-    """Search of a worst case that a TOML file asks for.
-
-    Attributes
-    ----------
-    file : TomlFile
-        The file.
-    ranges : mapping
-        Ranges, or values for a grid, by the paths of parameters.
-    loops : tuple of str
-        Wires of the loops.
-    requirements : Requirements, optional
-        Limits of the file's table.
-    options : mapping
-        All else that `Diagram.worst_case` takes.
-    """
+    """Search of a worst case that a TOML file asks for."""
 
     file: TomlFile
-    ranges: Mapping[str, Any]
-    loops: tuple[str, ...]
+    ranges: Mapping[str, Any]  # or values for a grid, by the paths of parameters
+    loops: tuple[str, ...]  # wires
     requirements: Requirements | None
-    options: Mapping[str, Any]
+    options: Mapping[str, Any]  # all else that `Diagram.worst_case` takes
 
     @classmethod
     def read(cls, source: str | os.PathLike[str] | TomlFile) -> Self:
@@ -93,7 +80,7 @@ class WorstCaseTask:
         loops = (loop,) if isinstance(loop, str) else tuple(loop) if isinstance(loop, list) else (None,)
         if not all(isinstance(wire, str) for wire in loops):
             raise file.error(f'found {loop!r}; expected the name of a wire. Write loop = "u".', f"{TABLE}.loop")
-        asked = file.table(TABLE).get("requirements")
+        asked = table.get("requirements")
         limits = None if asked is None else _requirements(file, asked)
         options = {key: value for key, value in table.items() if key not in ("ranges", "loop", "requirements")}
         return cls(file, ranges, loops, limits, options)
@@ -102,11 +89,11 @@ class WorstCaseTask:
         """Check the task against a diagram, before anything is computed."""
         flat = diagram.flatten(None if diagram.has_clock else STEP)
         for wire in self.loops:
-            with _Placed(self.file, f"{TABLE}.loop"):
+            with _placed(self.file, f"{TABLE}.loop"):
                 find_signal(flat, wire)
         samples = self.options.get("samples", "latin")
         for name, values in self.ranges.items():
-            with _Placed(self.file, f"{TABLE}.ranges.{name}"):
+            with _placed(self.file, f"{TABLE}.ranges.{name}"):
                 check_parameters(diagram, [diagram.find_parameter(name)], "a worst case", blocks=True)
                 if samples == "latin" and not (
                     isinstance(values, Box) or (isinstance(values, list) and len(values) == 2)
@@ -117,7 +104,7 @@ class WorstCaseTask:
                     )
                 if samples == "latin":
                     check_ranges(diagram, {diagram.find_parameter(name): Box.of(values)})
-        with _Placed(self.file, TABLE):
+        with _placed(self.file, TABLE):
             if "contact" in self.options:
                 ContactMeasure(self.options["contact"], diagram, {})
             else:
@@ -133,24 +120,15 @@ class WorstCaseTask:
         progress: Callable[[str], None] | None = None,
         **options: Any,
     ) -> WorstCase:
-        """Return the worst case.
+        """Return the worst case; ``options`` are those of `Diagram.worst_case`, such as ``at``.
 
-        Parameters
-        ----------
-        diagram : Diagram
-            The diagram.
-        requirements : Requirements, optional
-            Those of the report. They are taken where the file names no number and no limits of its own, and they limit
-            a number of the loop.
-        progress : callable, optional
-            Told a line for every case.
-        **options
-            Of `Diagram.worst_case`, such as ``at``.
+        ``requirements`` are the report's. They are taken where the file names no number and no limits itself, and they
+        limit a number of the loop. ``progress`` gets a line for every case.
         """
         self.check(diagram, requirements)
         given = {key: value for key, value in self.options.items() if key != "quantity"}
         quantity, limits = self._asked(diagram, requirements)
-        with _Placed(self.file, TABLE):
+        with _placed(self.file, TABLE):
             return find_worst_case(
                 diagram,
                 self.ranges or None,
@@ -179,10 +157,7 @@ class WorstCaseTask:
     def find_limits(
         self, diagram: WiredDiagram, requirements: Requirements | None = None
     ) -> Mapping[tuple[str, ...], Mapping[str, Limit | None]]:
-        """Return the limits that the worst case is looked for with, by the wires of the loops and the numbers' names.
-
-        A number without a limit has None.
-        """
+        """Return the limits of the worst case by loops' wires and numbers' names; None of a number without one."""
         return {} if "contact" in self.options else self._goal(diagram, requirements).loops
 
     def _goal(self, diagram: WiredDiagram, requirements: Requirements | None) -> Goal:
@@ -190,20 +165,13 @@ class WorstCaseTask:
         return make_goal(self.loops, quantity, limits, diagram.name)
 
 
-class _Placed:
-    """Names the file and the line in errors about an entry."""
-
-    def __init__(self, file: TomlFile, key: str):
-        self.file, self.key = file, key
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        if isinstance(error, LoopwrightError):
-            known = error.port if self.key == TABLE and error.port in KEYS else ""
-            key = ".".join(part for part in (self.key, known) if part)
-            raise self.file.error(error.message, key) from None
+@contextmanager
+def _placed(file: TomlFile, key: str) -> Iterator[None]:
+    """Name the file and the line in errors about an entry."""
+    try:
+        yield
+    except LoopwrightError as error:
+        raise file.error(error.message, f"{key}.{error.port}" if key == TABLE and error.port in KEYS else key) from None
 
 
 def _flatten(file: TomlFile, given: Any, path: str = "") -> Iterator[tuple[str, Any]]:

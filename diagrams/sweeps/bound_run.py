@@ -25,18 +25,9 @@ Progress = Callable[[float], None]
 
 
 class BoundRun:
-    """Runs of a diagram over one duration, one after the other, each with its own numbers.
+    """Runs of a diagram over one duration in s, one after the other, each with its own numbers.
 
-    It is used in a ``with`` statement, which loads the FMUs and frees them.
-
-    Parameters
-    ----------
-    diagram : WiredDiagram
-        The diagram.
-    duration : float
-        Simulated time of each run in s.
-    options : RunOptions
-        Options of the runs; they begin at t = 0, and are recorded in memory.
+    It is used in a ``with`` statement, which loads the FMUs and frees them. Runs begin at t = 0 and stay in memory.
     """
 
     def __init__(self, diagram: WiredDiagram, duration: float, options: RunOptions):
@@ -87,13 +78,8 @@ class BoundRun:
             self._stack.close()
 
     @property
-    def is_possible(self) -> bool:
-        """Whether its runs can follow each other: each leaves nothing behind for the next one."""
-        return not self.obstacle
-
-    @property
     def obstacle(self) -> str:
-        """Why its runs can't follow each other, as a clause; empty if they can."""
+        """Why its runs can't follow each other, as a clause; empty if each leaves nothing behind for the next one."""
         engine, flat = self.engine, self.flat
         if opaque := [path for path in flat.checked.traced if flat.table.blocks[path].opaque]:
             return f"{opaque[0]} is evaluated by Python, and may keep something of a run"
@@ -131,15 +117,7 @@ class BoundRun:
         return any(isinstance(p, FmuInstance) and p.fatal for p in self.engine.plants.values())
 
     def run(self, numbers: Numbers, progress: Progress) -> Run:
-        """Run with the numbers of a sample.
-
-        Parameters
-        ----------
-        numbers : Numbers
-            Numbers of the diagram.
-        progress : callable
-            Called with the time in s now and then; an exception that it raises ends the run.
-        """
+        """Run with the numbers of a sample; an exception that ``progress`` raises ends the run."""
         engine, recorder, started = self.engine, self.recorder, perf_counter()
         recorder.begin_again()
         try:
@@ -161,13 +139,7 @@ class BoundRun:
         return self._take_record(started)
 
     def begin(self, numbers: Numbers) -> None:
-        """Go back to t = 0 with the numbers of a sample: the engine's workspace holds them, and its plants are begun.
-
-        Raises
-        ------
-        SimulationError
-            If the start can't be found with them.
-        """
+        """Go back to t = 0 with a sample's numbers, which the engine's workspace then holds, and begin its plants."""
         with nullcontext() if self._has_begun else LOADING:  # the first start traces functions
             self._forget_messages()
             for path, plant in self.engine.plants.items():
@@ -192,21 +164,7 @@ class BoundRun:
         messages: Sequence[str],
         residual: np.ndarray | None,
     ) -> Run:
-        """Return a run from its samples.
-
-        Parameters
-        ----------
-        t, data : ndarray
-            Times in s, and the samples that the recorder would keep.
-        stopped : Stopped or None
-            The stop condition that has ended it.
-        started : float
-            Reading of the clock at its start.
-        messages : sequence of str
-            Messages of the run.
-        residual : ndarray or None
-            Largest residual of the algebraic loops, by sample.
-        """
+        """Return a run from samples as the recorder keeps them; ``started`` is the clock's reading at its start."""
         run = Run(
             t=t,
             data=data,
@@ -228,7 +186,7 @@ class BoundRun:
         run.find_in(self._places)
         return run
 
-    def _note(self, event: Occurrence) -> None:
+    def _note(self, event: Occurrence) -> None:  # the engine is made before its recorder
         self.recorder.event(event)
 
     def _forget_messages(self) -> None:

@@ -32,24 +32,12 @@ Made = tuple[Callable[..., WiredDiagram], tuple[Any, ...]]
 
 @dataclass(frozen=True, eq=False)
 class Parcel:
-    """A sweep without the files of its FMUs, as it travels.
+    """A sweep without the files of its FMUs, as it travels."""
 
-    Attributes
-    ----------
-    plan : Plan
-        The sweep; its diagram is built again where it arrives.
-    made : tuple
-        Function and arguments that make the diagram.
-    files : mapping of str to str
-        SHA-256 digest of each FMU's file, by the block's path.
-    built : frozenset of str
-        Digests of the FMUs that Loopwright has built.
-    """
-
-    plan: Plan
-    made: Made
-    files: Mapping[str, str]
-    built: frozenset[str]
+    plan: Plan  # its diagram is built again where it arrives
+    made: Made  # function and arguments that make the diagram
+    files: Mapping[str, str]  # SHA-256 digest of each FMU's file, by the block's path
+    built: frozenset[str]  # digests of the FMUs that Loopwright has built
 
     @classmethod
     def of(cls, plan: Plan) -> tuple[Parcel, dict[str, bytes]]:

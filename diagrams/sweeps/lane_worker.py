@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -43,7 +42,7 @@ _FIRST, _WISHED = 64, 0.05
 class LaneWorker(Worker):
     """Runs samples of a sweep side by side; those whose runs can't go so are run one after the other.
 
-    A run that fails in its lane is run again by itself, which says what has happened.
+    A run that fails in its lane is run again by itself, so that its error names the failure.
     """
 
     def __init__(self, plan: Plan):
@@ -102,14 +101,15 @@ class LaneWorker(Worker):
                 else:
                     ready.setdefault(start.steps, []).append((sample, start))
         together += [
-            ([sample for sample, _ in runs], found.gather([start for _, start in runs])) for runs in ready.values()
+            ([sample for sample, _ in runs], LaneVectors.of(found.code, [start for _, start in runs]))
+            for runs in ready.values()
         ]
         for samples, vectors in together:
             for sample, run in zip(samples, found.run(vectors, progress, started), strict=True):
                 if run is None:
                     left.append(sample)
                 else:
-                    yield self._judge(sample, partial(_itself, run))
+                    yield self._judge(sample, lambda run=run: run)  # type: ignore[misc]
         for sample, note in alone:
             outcome = self.run(sample, progress)
             yield outcome if note is None else _note(outcome, note)
@@ -162,16 +162,16 @@ class _Lanes:
         search = StartSearch(bound) if agrees else None
         source, here = None if search is None else search.source, engine.workspace.here.x
         loops = {clocks: newton_options(flat, clocks, here) for clocks in acting if flat.active_loops(clocks)}
-        self._code: LaneCode = compile_lanes(flat, acting, count, source, method if flat.continuous.size else "", loops)
+        self.code: LaneCode = compile_lanes(flat, acting, count, source, method if flat.continuous.size else "", loops)
         width, every = max(1, len(self._columns)), bound.recorder.every
         self._chunk = max(1, min(len(self._ticks), every * _BYTES // (8 * width * count)))
         self._span = min(_FIRST, self._chunk)
         self._room = make_room(self._chunk // every + 1, width, count)
         self._stops = StopConditions(flat, engine.workspace.log, str)
         self._start: VectorStart | None = None
-        if search is not None and self._code.starts is not None:
+        if search is not None and self.code.starts is not None:
             with suppress(NoLanesError):  # of the FMUs' own numbers; each start raises its own
-                start = VectorStart(search, self._code, self._columns, self._stops.entries)
+                start = VectorStart(search, self.code, self._columns, self._stops.entries)
                 for path, step in start.steps.items():
                     self._refuse_fine(path, step)
                 self._start = start
@@ -182,18 +182,8 @@ class _Lanes:
             return None, []
         return self._start.find(group)
 
-    def gather(self, starts: Sequence[LaneStart]) -> LaneVectors:
-        """Return the vectors of runs that were started one by one."""
-        return LaneVectors.of(self._code, starts)
-
     def start(self, numbers: Numbers) -> LaneStart | None:
-        """Return a run's numbers at its first tick; None if it ends there.
-
-        Raises
-        ------
-        NoLanesError
-            If this run can't go with others.
-        """
+        """Return a run's numbers at its first tick; None if it ends there. NoLanesError: it can't go with others."""
         bound = self.bound
         engine, workspace = bound.engine, bound.engine.workspace
         bound.recorder.begin_again()
@@ -208,7 +198,7 @@ class _Lanes:
         if engine.continuous is not None:
             self._refuse_between_ticks(engine.continuous.sources)
         plants, steps = dict[str, np.ndarray](), list[float]()
-        for path, plant in self._code.plants.items():
+        for path, plant in self.code.plants.items():
             instance = engine.plants[path]
             assert isinstance(instance, FmuInstance)
             plants[path], step = plant.read(instance)
@@ -239,7 +229,7 @@ class _Lanes:
         """Yield the runs; None for one that has failed."""
         bound, n = self.bound, len(self._columns)
         runs = LaneRuns(
-            self._code, vectors, columns=self._columns, every=bound.recorder.every, stops=self._stops.entries
+            self.code, vectors, columns=self._columns, every=bound.recorder.every, stops=self._stops.entries
         )
         kept = [[row[None]] for row in np.ascontiguousarray(vectors.row.T[: vectors.count])]
         room = self._room
@@ -278,10 +268,6 @@ class _Lanes:
 def _number(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], ticks: np.ndarray) -> np.ndarray:
     """Return which set of clocks acts at each of some ticks; −1 for another one."""
     return ClockSets(flat.distinct, {clocks: k for k, clocks in enumerate(acting)}).at(ticks)
-
-
-def _itself(run: Run) -> Run:
-    return run
 
 
 def _note(outcome: SampleOutcome, text: str) -> SampleOutcome:

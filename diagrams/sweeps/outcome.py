@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, SimulationError, explain_calls
+from ...blocks.core import explain_calls
 
 
 @explain_calls
@@ -46,45 +46,14 @@ WORKER_ENDED = "WorkerEnded"
 
 @dataclass(frozen=True, eq=False)
 class SampleOutcome:
-    """The outcome of a sample.
+    """The outcome of a sample."""
 
-    Attributes
-    ----------
-    index : int
-        Place of the sample.
-    numbers : mapping of str to ndarray
-        Reductions by name; none of a run that failed.
-    t : ndarray or None
-        Times of the samples that are kept, in s.
-    signals : mapping of str to ndarray
-        Samples by signal, (n, *shape); those until the end of a run that failed.
-    end : float
-        Time in s at which the run ended; NaN if it did not begin.
-    stopped : str
-        Path of the stop condition that ended it; empty without one.
-    failure : Failure or None
-        The failure that ended it.
-    units : mapping of str to str
-        Units of the signals that are kept, and of reductions.
-    messages : tuple of str
-        Messages of the run.
-    """
-
-    index: int
-    numbers: Mapping[str, np.ndarray] = field(default_factory=dict)
-    t: np.ndarray | None = None
-    signals: Mapping[str, np.ndarray] = field(default_factory=dict)
-    end: float = float("nan")
-    stopped: str = ""
+    index: int  # place of the sample
+    numbers: Mapping[str, np.ndarray] = field(default_factory=dict)  # reductions by name; none of a run that failed
+    t: np.ndarray | None = None  # times of the samples that are kept, in s
+    signals: Mapping[str, np.ndarray] = field(default_factory=dict)  # (n, *shape); until the end of a run that failed
+    end: float = float("nan")  # time in s at which the run ended; NaN if it did not begin
+    stopped: str = ""  # path of the stop condition that ended it
     failure: Failure | None = None
-    units: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)  # of the signals that are kept, and of reductions
     messages: tuple[str, ...] = ()
-
-
-def describe_failure(index: int, error: BaseException) -> Failure:
-    """Return an error as data."""
-    if not isinstance(error, LoopwrightError):
-        return Failure(index, type(error).__name__, str(error))
-    run = error.run if isinstance(error, SimulationError) else None
-    reached = float(run.t[-1]) if run is not None and len(run.t) else float("nan")
-    return Failure(index, type(error).__name__, str(error), reached, error.block or "", error.port or "")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import TracebackType
 from typing import Any
 
@@ -19,7 +20,7 @@ from ..flat import WiredDiagram
 from ..results import Run
 from ..simulation import RunOptions, simulate
 from .bound_run import BoundRun, Progress
-from .outcome import SampleOutcome, describe_failure
+from .outcome import Failure, SampleOutcome
 from .reductions import Reduction
 from .samples import Sample, seed_of
 from .variation import Numbers, Variation
@@ -30,33 +31,15 @@ _BOUND = 4
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A sweep without its samples.
-
-    Attributes
-    ----------
-    diagram : WiredDiagram
-        The diagram.
-    duration : float
-        Simulated time of each run in s.
-    options : mapping
-        Options of the runs by name.
-    signals : tuple of str
-        Signals whose samples are kept.
-    reductions : mapping of str to callable
-        Functions of a run by name.
-    seeds : tuple of str
-        Full paths of the parameters that take a sample's seed.
-    lanes : int
-        Runs that go side by side in the lanes of a vector; 1 for one after the other.
-    """
+    """A sweep without its samples."""
 
     diagram: WiredDiagram
-    duration: float
+    duration: float  # simulated time of each run in s
     options: Mapping[str, Any]
-    signals: tuple[str, ...] = ()
+    signals: tuple[str, ...] = ()  # whose samples are kept
     reductions: Mapping[str, Callable[[Run], Any]] = field(default_factory=dict)
-    seeds: tuple[str, ...] = ()
-    lanes: int = 1
+    seeds: tuple[str, ...] = ()  # full paths of the parameters that take a sample's seed
+    lanes: int = 1  # runs that go side by side in the vector lanes of a processor; 1: one after the other
 
     @property
     def run_options(self) -> RunOptions:
@@ -76,28 +59,23 @@ class Plan:
         return {**sample.parameters, **seeds}
 
     @property
-    def runs_in_threads(self) -> bool:
-        """Whether its FMUs can run in several threads: all were built by Loopwright on this machine."""
-        return all(find_limits(plant) is None and is_built_here(plant.description.digest) for plant in self._plants)
-
-    @property
     def obstacle(self) -> str:
         """Why its runs can't follow each other in a thread, as a clause; empty if nothing of the plan forbids it."""
-        if "start" in self.options and self.options["start"] is not None:
+        if self.options.get("start") is not None:
             return "they continue from a state, start="
-        for path, block in self.diagram.scheduled.blocks.items():
-            if isinstance(block, Fmu) and not (find_limits(block) is None and is_built_here(block.description.digest)):
+        for path, plant in self._plants.items():
+            if find_limits(plant) is not None or not is_built_here(plant.description.digest):
                 return f"{path} was not built by Loopwright on this machine, or runs in its own process"
         return ""
 
     @property
     def is_alone(self) -> bool:
         """Whether a process can run one sample at a time: an FMU of another tool is loaded in it."""
-        return not all(find_limits(p) is not None or is_built_here(p.description.digest) for p in self._plants)
+        return not all(find_limits(p) is not None or is_built_here(p.description.digest) for p in self._plants.values())
 
     @property
-    def _plants(self) -> list[Fmu]:
-        return [block for block in self.diagram.scheduled.blocks.values() if isinstance(block, Fmu)]
+    def _plants(self) -> dict[str, Fmu]:
+        return {path: block for path, block in self.diagram.scheduled.blocks.items() if isinstance(block, Fmu)}
 
 
 class Worker:
@@ -111,9 +89,9 @@ class Worker:
         self._variation = Variation(plan.diagram)
         self._bound: OrderedDict[Any, BoundRun] = OrderedDict()
         self._known_units: tuple[Layout, dict[str, str]] | None = None
-        self._repeats = self._options.start is None and plan.runs_in_threads
-        self._alone = "" if self._repeats else plan.obstacle
+        self._alone = plan.obstacle
         """Why each run needs its own set-up, as a clause, where it does."""
+        self._repeats = not self._alone
 
     def __enter__(self) -> Worker:
         return self
@@ -140,15 +118,7 @@ class Worker:
             yield self.run(sample, progress)
 
     def run(self, sample: Sample, progress: Progress = lambda t: None) -> SampleOutcome:
-        """Run a sample; a run that fails is an outcome, too.
-
-        Parameters
-        ----------
-        sample : Sample
-            The sample.
-        progress : callable
-            Called with the simulated time in s now and then; an exception that it raises ends the run.
-        """
+        """Run a sample; a run that fails is an outcome, too. An exception that ``progress`` raises ends the run."""
         return self._judge(sample, lambda: self._simulate(self.plan.parameters_of(sample), progress))
 
     def _judge(self, sample: Sample, make: Callable[[], Run]) -> SampleOutcome:
@@ -156,14 +126,13 @@ class Worker:
         try:
             return self._outcome(sample, make())
         except LoopwrightError as error:
-            failure = describe_failure(sample.index, error)
             run = error.run if isinstance(error, SimulationError) else None
+            reached = float(run.t[-1]) if run is not None and len(run.t) else math.nan
+            kind, block, port = type(error).__name__, error.block or "", error.port or ""
+            failure = Failure(sample.index, kind, str(error), reached, block, port)
             if run is None or not len(run.t):
-                return SampleOutcome(sample.index, failure=failure, end=failure.t)
-            t = run.t.copy() if self.plan.signals else None
-            return SampleOutcome(
-                sample.index, {}, t, self._signals(run), failure.t, "", failure, self._units(run), run.messages
-            )
+                return SampleOutcome(sample.index, failure=failure)
+            return self._with_samples(SampleOutcome(sample.index, failure=failure), run)
 
     # --- its runs ----------------------------------------------------------------------------------------------------
 
@@ -188,8 +157,8 @@ class Worker:
             except SimulationError as error:  # at these numbers; others may do
                 self._alone = f"the diagram's own numbers give no start ({error})"
                 return None
-            if not bound.is_possible:
-                self._alone = bound.obstacle
+            if obstacle := bound.obstacle:
+                self._alone = obstacle
                 bound.__exit__(None, None, None)
                 self._repeats = self._repeats and numbers.key is not None
                 return None
@@ -203,19 +172,15 @@ class Worker:
 
     def _outcome(self, sample: Sample, run: Run) -> SampleOutcome:
         numbers = {name: self._reduce(name, function, run) for name, function in self.plan.reductions.items()}
-        t = run.t.copy() if self.plan.signals else None
         stopped = "" if run.stopped is None else run.stopped.block
-        return SampleOutcome(
-            sample.index,
-            numbers,
-            t,
-            self._signals(run),
-            float(run.t[-1]),
-            stopped,
-            None,
-            self._units(run),
-            run.messages,
-        )
+        return self._with_samples(SampleOutcome(sample.index, numbers, stopped=stopped), run)
+
+    def _with_samples(self, outcome: SampleOutcome, run: Run) -> SampleOutcome:
+        """Return an outcome with the samples that are kept of a run."""
+        t = run.t.copy() if self.plan.signals else None
+        signals = {name: np.array(run[name]) for name in self.plan.signals}
+        end, units = float(run.t[-1]), self._units(run)
+        return replace(outcome, t=t, signals=signals, end=end, units=units, messages=run.messages)
 
     def _reduce(self, name: str, function: Callable[[Run], Any], run: Run) -> np.ndarray:
         try:
@@ -231,17 +196,11 @@ class Worker:
             failure = SimulationError(text, block=self.plan.diagram.name, port=name, t=float(run.t[-1]))
             raise failure.keep(run) from error
 
-    def _signals(self, run: Run) -> dict[str, np.ndarray]:
-        return {name: np.array(run[name]) for name in self.plan.signals}
-
     def _units(self, run: Run) -> Mapping[str, str]:
         if self._known_units is None or self._known_units[0] is not run.layout:
-            self._known_units = run.layout, self._find_units(run)
+            found = {name: run.unit(name) for name in self.plan.signals}
+            for name, function in self.plan.reductions.items():
+                if isinstance(function, Reduction):
+                    found[name] = run.unit(function.signal) if function.unit is None else function.unit
+            self._known_units = run.layout, {name: str(unit) for name, unit in found.items() if unit}
         return self._known_units[1]
-
-    def _find_units(self, run: Run) -> dict[str, str]:
-        found = {name: run.unit(name) for name in self.plan.signals}
-        for name, function in self.plan.reductions.items():
-            if isinstance(function, Reduction):
-                found[name] = run.unit(function.signal) if function.unit is None else function.unit
-        return {name: str(unit) for name, unit in found.items() if unit}

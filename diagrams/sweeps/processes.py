@@ -47,13 +47,7 @@ def run_in_processes(plan: Plan, samples: Iterable[Sample], count: int) -> Gener
 
 
 def to_bytes(plan: object, name: str) -> bytes:
-    """Return a plan as bytes; with cloudpickle, where it is installed, functions and classes of a script travel, too.
-
-    Raises
-    ------
-    OptionError
-        If it can't be turned into bytes.
-    """
+    """Return a plan as bytes; with cloudpickle, where it is installed, a script's functions and classes travel, too."""
     try:
         import cloudpickle
 

@@ -159,9 +159,9 @@ class Sweep(ShownAsTable):
         OptionError
             If no signal was kept, or none of such a name.
         """
-        from .sweep_plot import DrawnSweep, plot_sweep
+        from .sweep_plot import plot_sweep
 
-        return plot_sweep(DrawnSweep(self.samples, self.outcomes, self.units, self.diagram_name), names, xlim)
+        return plot_sweep(self.samples, self.outcomes, self.units, self.diagram_name, names, xlim)
 
     def _stack(self, name: str, values: Sequence[np.ndarray | None]) -> np.ndarray:
         shapes = {value.shape for value in values if value is not None}

@@ -41,7 +41,7 @@ def digest_of(parts: Parts) -> str:
 
 
 def parts_of(plan: Plan) -> dict[str, dict[str, str]]:
-    """Return all that the outcomes of a sweep depend on besides its samples, by kind and name.
+    """Return all that the outcomes of a sweep depend on, except its samples, by kind and name.
 
     Each part is a short text of its value, or a digest. Equations count by their traces, so that a change in a function
     that they call is seen; those of blocks that Python evaluates count by their source. FMUs count by their content. A

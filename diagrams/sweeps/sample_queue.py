@@ -37,15 +37,8 @@ class SampleQueue:
     ) -> Generator[SampleOutcome, None, None]:
         """Yield the outcomes of workers, each in its own thread, as they become ready.
 
-        The error of a worker closes the queue and is raised. When the caller stops, the queue is closed, and the
-        workers are waited for.
-
-        Parameters
-        ----------
-        workers : sequence of callable
-            Each takes samples from this queue and adds their outcomes, until there are none.
-        end : callable
-            Called when the queue has been closed, before the workers are waited for.
+        The error of a worker closes the queue and is raised. When the caller stops, the queue is closed, then ``end``
+        is called, and the workers are waited for.
         """
 
         def work(worker: Callable[[SampleQueue], None]) -> None:

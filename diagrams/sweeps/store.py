@@ -23,19 +23,7 @@ _EVERY = 1.0  # s between two parts
 
 
 class Store:
-    """Keeps outcomes in a folder, and finds those that are there.
-
-    Parameters
-    ----------
-    folder : path
-        The folder; it is made where it isn't there.
-    parts : mapping
-        All that outcomes depend on besides their samples; see `parts_of`.
-    about : mapping
-        Facts for people who look into the folder.
-    overwrite : bool
-        Replace a sweep of another revision in the folder.
-    """
+    """Keeps outcomes in a folder, which it makes, and finds those that are there; ``about`` is for its readers."""
 
     def __init__(self, folder: Path, parts: Parts, about: dict[str, Any], *, overwrite: bool = False):
         own = {"block": str(about.get("diagram", "")) or None, "port": "to"}

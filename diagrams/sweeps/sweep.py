@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -115,7 +115,8 @@ def sweep(
         done = reused = sum(outcome is not None for outcome in outcomes)
         left = [sample for sample in found if outcomes[sample.index] is None]
         run = _run(plan, left, processors() if workers is None else int(workers), client)
-        with one_thread(), _bar(name, len(found), progress) as show, closing(run) as stream:
+        bar = progress_bar(name, 0, len(found), progress, "{task.completed:.0f} of {task.total:.0f} samples")
+        with one_thread(), bar as show, closing(run) as stream:
             show(done)
             for outcome in stream:
                 outcomes[outcome.index] = outcome
@@ -252,9 +253,3 @@ def _check_room(plan: Plan, flat: FlatDiagram, count: int) -> None:
             block=plan.diagram.name,
             port="signals",
         )
-
-
-@contextmanager
-def _bar(name: str, total: int, show: ProgressOption) -> Iterator[Callable[[int], None]]:
-    with progress_bar(name, 0, total, show, "{task.completed:.0f} of {task.total:.0f} samples") as advance:
-        yield advance

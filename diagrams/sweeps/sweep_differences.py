@@ -25,13 +25,7 @@ _VALUES = ("sweep", "parameter", "setting", "option")
 
 
 def describe_differences(old: Parts, new: Parts) -> str:
-    """Return in words in what a sweep that is stored, and another one, differ; "" where no part does.
-
-    Parameters
-    ----------
-    old, new : mapping
-        Their parts, as `parts_of` returns them.
-    """
+    """Return in words in what a stored sweep and a new one differ, by their `parts_of`; "" where no part does."""
     differ = [
         (kind, name)
         for kind in _KINDS

@@ -19,20 +19,9 @@ class Halt(BaseException):
 def run_in_threads(
     plan: Plan, samples: Iterable[Sample], count: int, worker: Worker
 ) -> Generator[SampleOutcome, None, None]:
-    """Yield the outcomes of samples, in the order in which they are ready.
+    """Yield the outcomes of samples, in the order in which they are ready; ``worker``, the first thread's, is set up.
 
     Where the caller stops, such as after Ctrl-C, the runs at hand end within a chunk of ticks.
-
-    Parameters
-    ----------
-    plan : Plan
-        The sweep.
-    samples : iterable of Sample
-        The samples.
-    count : int
-        Number of threads.
-    worker : Worker
-        The worker of the first thread, which has been set up; each of the others makes its own.
     """
 
     def work(worker: Worker, queue: SampleQueue) -> None:

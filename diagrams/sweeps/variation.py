@@ -20,24 +20,12 @@ _KEPT = 8
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """A sample as numbers of a diagram.
+    """A sample as numbers of a diagram."""
 
-    Attributes
-    ----------
-    diagram : Diagram
-        The diagram whose functions the run takes.
-    key : object
-        Which diagram that is: equal keys, equal functions.
-    blocks : mapping of str to Block
-        Blocks of other parameters, by path.
-    starts : mapping of str to mapping
-        Start values of FMUs, checked, by the block's path and the FMU's names.
-    """
-
-    diagram: WiredDiagram
-    key: Any
-    blocks: Mapping[str, Block] = field(default_factory=dict)
-    starts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    diagram: WiredDiagram  # whose functions the run takes
+    key: Any  # equal keys, equal functions
+    blocks: Mapping[str, Block] = field(default_factory=dict)  # of other parameters, by path
+    starts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # of FMUs, by the block's path and name
 
     def make_diagram(self) -> WiredDiagram:
         """Return the diagram with these numbers; it shares the functions of `diagram`."""
@@ -51,13 +39,7 @@ class Numbers:
 
 
 class Variation:
-    """Finds the numbers of samples.
-
-    Parameters
-    ----------
-    diagram : Diagram
-        The diagram that is varied.
-    """
+    """Finds the numbers of samples of a diagram that is varied."""
 
     def __init__(self, diagram: WiredDiagram):
         self._diagram = diagram

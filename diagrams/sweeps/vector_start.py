@@ -30,13 +30,7 @@ _KEPT = 1000
 
 
 class StartSearch:
-    """What the start of a bound diagram's runs needs, read once.
-
-    Attributes
-    ----------
-    source : StartSource or None
-        The functions from which runs start; None where Python has to start them.
-    """
+    """Functions from which a bound diagram's runs start, read once."""
 
     def __init__(self, bound: BoundRun):
         self.bound, flat = bound, bound.flat
@@ -74,28 +68,10 @@ class StartSearch:
 
 
 class VectorStart:
-    """Starts runs side by side, as `initialize` and the first tick do it for one.
+    """Starts runs side by side, as `initialize` and the first tick do it for one; ``code.starts`` is there.
 
-    Parameters
-    ----------
-    search : StartSearch
-        The diagram.
-    code : LaneCode
-        Its code; ``starts`` is there.
-    columns : ndarray
-        Entries of the log that are kept.
-    stops : sequence of int
-        Entries of the log that end a run where they are true.
-
-    Attributes
-    ----------
-    steps : dict of str to float
-        Longest step of each FMU's integrator in s.
-
-    Raises
-    ------
-    NoLanesError
-        If an FMU integrates with steps that are not fixed.
+    ``columns`` are the entries of the log that are kept, ``stops`` those that end a run where they are true.
+    NoLanesError: an FMU integrates with steps that are not fixed.
     """
 
     def __init__(self, search: StartSearch, code: LaneCode, columns: np.ndarray, stops: Sequence[int]):
@@ -137,13 +113,7 @@ class VectorStart:
         return known and not (numbers.blocks.keys() & self._sources)
 
     def find(self, group: Sequence[Numbers]) -> tuple[LaneVectors | None, list[int]]:
-        """Return runs at their first tick, and which of a group these are; the others are started one by one.
-
-        Parameters
-        ----------
-        group : sequence of Numbers
-            Numbers of the runs, at most as many as there are lanes.
-        """
+        """Return runs at their first tick, and which of a group these are; the others are started one by one."""
         places = [i for i, numbers in enumerate(group) if self.fits(numbers)]
         while places:
             vectors = LaneVectors(self._code, len(self._columns))

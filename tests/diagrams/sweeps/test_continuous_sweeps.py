@@ -23,8 +23,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.sweeps import bound_run
-from loopwright.diagrams.sweeps.outcome import describe_failure
-from loopwright.sweeps import final
+from loopwright.sweeps import Failure, final
 
 QUIET = {"progress": False}
 
@@ -142,7 +141,8 @@ def test_runs_that_follow_each_other_in_one_thread_have_the_bits_of_single_ones(
         try:
             single = made.replace(sample.parameters).simulate(duration, compile=True, **options, **QUIET)
         except SimulationError as error:
-            failure = describe_failure(sample.index, error)
+            kind, block, port = type(error).__name__, error.block or "", error.port or ""
+            failure = Failure(sample.index, kind, str(error), float(error.run.t[-1]), block, port)
         else:
             failure = None
         assert outcome.failure == failure

@@ -161,7 +161,7 @@ def test_fmus_travel_as_bytes_and_are_files_of_the_cache_where_they_arrive(tmp_p
     path = Path(arrived.diagram["plant"].file)
     assert path.is_relative_to(tmp_path / "there")
     assert path.read_bytes() == content
-    assert arrived.runs_in_threads
+    assert not arrived.obstacle
     with Worker(arrived) as worker:
         there = worker.run(Sample(0, {}, 0))
     assert here.failure is there.failure is None
