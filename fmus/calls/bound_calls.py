@@ -80,10 +80,6 @@ class BoundCalls:
                 worst, self.warned = status, self.warned | bit_of(place)
         return worst
 
-    def runner(self) -> Callable[[], int]:
-        """Return `run` as a function, for a caller to whom each lookup counts."""
-        return self.run
-
     @property
     def request(self) -> ChildRequest | None:
         """The calls as a request to another process; None where they run in this one, or C can't ask for them."""

@@ -109,13 +109,13 @@ class InstanceStep:
 
     def function(self) -> Callable[[float, float], None]:
         """Return `step`; for plain steps of whole vectors of Float64 a function that looks up little."""
-        fmu, call, run = self.fmu, self.call, self._calls.runner()
+        fmu, call, run = self.fmu, self.call, self._calls.run
         is_plain = self._ins.is_whole and self._outs.is_whole and not self._ins.has_limits
         if not is_plain or self.parts or self._texts.variables or not isinstance(self._guard, nullcontext):
             return self.step
         now, width, any_flag, reached = fmu.now, fmu.width, call.any_flag, call.reached
         filled, spread = self._ins.views, self._outs.views  # (from, to) each, in the sense of setting
-        read = self._reads.runner() if self.fmi.in_process else None
+        read = self._reads.run if self.fmi.in_process else None
 
         def step(t: float, h: float) -> None:
             for here, there in filled:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import ctypes
 from collections import deque
 from collections.abc import Callable, Sequence
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuError, FmuProcessError
+from ...blocks.core import FmuError
 from ..calls import (
     CALLS,
     ERROR,
@@ -48,15 +47,11 @@ class RemoteBoundCalls(BoundCalls):
             max((seconds_for(name, limits) for name in names), default=limits.step_time)
         )
         self._sequence = process.bind(described, blobs, limits.step_time)
-        self._run = _bind_round_trip(process, self._sequence, self._seconds, self._note)
 
     def run(self) -> int:
         """Run them and return the status; see `BoundCalls`."""
-        return self._run()
-
-    def runner(self) -> Callable[[], int]:
-        """Return `run` as one function."""
-        return self._run
+        self._process.post(self._sequence)
+        return self.finish()
 
     def start(self) -> None:
         """Let the child begin."""
@@ -81,50 +76,6 @@ class RemoteBoundCalls(BoundCalls):
             self._process.used = True
         self.failed = self._process.failed_place
         return status
-
-
-def _bind_round_trip(
-    process: ChildProcess, sequence: int, seconds: float, note_failure: Callable[[int], int]
-) -> Callable[[], int]:
-    """Return a function that lets a child run a bound sequence, waits for it, and returns the status.
-
-    It does what `ChildProcess.post` and `ChildProcess.finish` do one after the other, with everything looked up before:
-    a lookup costs a twentieth of the whole. ``note_failure`` is called with a status that is not 0, a warning too.
-    """
-    words, patience, number_at = process.words, process.patience, wire.REPLY
-    read, take, give = words.__getitem__, wire.ORDER.acquire, wire.ORDER.release
-    request, chosen, sleeps = wire.REQUEST, wire.SEQUENCE, wire.CHILD_SLEEPS
-    messages, status_at, fewest, ordered = wire.MESSAGES, wire.STATUS, wire.FEWEST, wire.ORDERED
-
-    def run() -> int:
-        if not process.alive:
-            process.post(sequence)  # it raises the error
-        words[chosen] = sequence
-        process.number = number = process.number + 1
-        words[request] = number
-        if take(False):  # the write above is seen before the read below is done
-            give()
-        if words[sleeps] or not ordered:
-            process.wake(sequence)
-        try:
-            for _ in repeat(None, patience.looks):
-                if read(number_at) == number:
-                    patience.pause = fewest
-                    break
-            else:
-                patience.slept()
-                process.sleep(sequence, number, seconds)
-        except FmuProcessError:
-            raise
-        except BaseException:  # an interrupt: the reply is still to come
-            process.give_up()
-            raise
-        if words[messages]:
-            process.fetch_messages()
-        status = words[status_at]
-        return note_failure(status) if status else 0
-
-    return run
 
 
 class RemoteWatch:

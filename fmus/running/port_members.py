@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,7 @@ class PortMembers(Block):
     """Members of an FMU's block that are its ports, or read them."""
 
     if TYPE_CHECKING:
+        file: str | os.PathLike[str]
         start: Mapping[str, Any]
         rename: Mapping[str, str]
         ports: Sequence[str] | None

@@ -6,7 +6,6 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
-from typing import Protocol, Self
 
 import numpy as np
 
@@ -28,37 +27,15 @@ from ...blocks.core import (
     same_unit,
 )
 from ..archive import FmuVariable
+from .port_members import PortMembers
 
+Port = Input | Output | State
+Ports = Mapping[str, Port]
 _ALIKE = 0.5
 """Similarity of two names, from 0 to 1, from which on one is suggested in place of the other."""
 _SHOWN = 12
 _AXES = frozenset({*map(str, range(10)), "x", "y", "z", "X", "Y", "Z"})
 """Letters that name the entries of a vector; those that follow one another belong together."""
-
-
-class _WithVariables(Protocol):
-    """Members of an FMU's block that the comparison needs."""
-
-    @property
-    def file(self) -> object: ...
-    @property
-    def label(self) -> str: ...
-    @property
-    def drawn_as(self) -> str: ...
-    @property
-    def rename(self) -> Mapping[str, str]: ...
-    @property
-    def convert_units(self) -> bool: ...
-    @property
-    def inputs(self) -> Mapping[str, Input]: ...
-    @property
-    def outputs(self) -> Mapping[str, Output]: ...
-    @property
-    def input_variables(self) -> Mapping[str, FmuVariable]: ...
-    @property
-    def output_variables(self) -> Mapping[str, FmuVariable]: ...
-    def replace(self, **changes: object) -> Self:
-        """Return the block with other parameters."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +46,7 @@ class _Misfit:
     text: str
 
 
-def check_replacement(fmu: _WithVariables, old: Block, wired: Collection[str], read: Collection[str]) -> None:
+def check_replacement(fmu: PortMembers, old: Block, wired: Collection[str], read: Collection[str]) -> None:
     """Refuse an FMU that doesn't fit the wires of a block, port by port; see `Block.check_place`."""
     try:
         old.inputs, old.outputs  # noqa: B018
@@ -103,7 +80,7 @@ def check_replacement(fmu: _WithVariables, old: Block, wired: Collection[str], r
 
 
 def _find_names(
-    fmu: _WithVariables, old: Block, wired: Collection[str], read: Collection[str], rename: Mapping[str, str]
+    fmu: PortMembers, old: Block, wired: Collection[str], read: Collection[str], rename: Mapping[str, str]
 ) -> dict[str, str]:
     """Return the names with which an FMU fits, but for inputs that are extra; empty if there are none."""
     both = {**{a: b for a, b in fmu.rename.items() if a not in rename}, **rename}
@@ -115,7 +92,7 @@ def _find_names(
     return {} if left else both
 
 
-def _guess_names(fmu: _WithVariables, old: Block, wired: Collection[str], read: Collection[str]) -> dict[str, str]:
+def _guess_names(fmu: PortMembers, old: Block, wired: Collection[str], read: Collection[str]) -> dict[str, str]:
     """Return names with which an FMU fits where several ports may be meant by one; empty if none do.
 
     A port that is missing gets, of those of its shape and unit, the one that is most alike by name if that is alike at
@@ -137,12 +114,12 @@ def _guess_names(fmu: _WithVariables, old: Block, wired: Collection[str], read: 
     return _find_names(fmu, old, wired, read, guess) if guess else {}
 
 
-def _may_be(new: Input | Output | State, old: Input | Output | State, converts: bool) -> bool:
+def _may_be(new: Port, old: Port, converts: bool) -> bool:
     return new.shape == old.shape and _fits(new.unit, old.unit, converts=converts)
 
 
 def _find_misfits(
-    fmu: _WithVariables, old: Block, wired: Collection[str], read: Collection[str]
+    fmu: PortMembers, old: Block, wired: Collection[str], read: Collection[str]
 ) -> tuple[list[_Misfit], dict[str, str], dict[str, str]]:
     """Return the ports that don't fit, names for those that may only be called otherwise, and for elements of ports."""
     misfits, rename, elements = list[_Misfit](), dict[str, str](), dict[str, str]()
@@ -167,18 +144,13 @@ def _find_misfits(
             pair = ports[name], before[name], variables[name], _variable(old, side, name)
             misfits += _compare(side, name, *pair, converts=fmu.convert_units)
         wanted, free = {n: before[n] for n in missing}, {n: ports[n] for n in spare if n not in before}
-        pairs = _match(wanted, free, converts=fmu.convert_units)
-        rename |= {variables[new].name: name for name, new in pairs.items()}
-        elements |= _match_elements(
-            {n: p for n, p in wanted.items() if n not in pairs},
-            {n: p for n, p in free.items() if n not in pairs.values()},
-            variables,
-            converts=fmu.convert_units,
-        )
+        names, parts = _suggest(wanted, free, variables, converts=fmu.convert_units)
+        rename |= names
+        elements |= parts
     return misfits, rename, elements
 
 
-def suggest_names(fmu: _WithVariables, inputs: Mapping[str, Input], outputs: Mapping[str, Output]) -> dict[str, str]:
+def suggest_names(fmu: PortMembers, inputs: Mapping[str, Input], outputs: Mapping[str, Output]) -> dict[str, str]:
     """Return the entries of ``rename`` that an FMU may need to have some ports, as far as they are unique."""
     found: dict[str, str] = {}
     for wanted, ports, variables in (
@@ -187,18 +159,23 @@ def suggest_names(fmu: _WithVariables, inputs: Mapping[str, Input], outputs: Map
     ):
         missing = {n: p for n, p in wanted.items() if n not in ports}
         free = {n: p for n, p in ports.items() if n not in wanted}
-        pairs = _match(missing, free, converts=fmu.convert_units)
-        found |= {variables[new].name: name for name, new in pairs.items()}
-        found |= _match_elements(
-            {n: p for n, p in missing.items() if n not in pairs},
-            {n: p for n, p in free.items() if n not in pairs.values()},
-            variables,
-            converts=fmu.convert_units,
-        )
+        names, parts = _suggest(missing, free, variables, converts=fmu.convert_units)
+        found |= names | parts
     return found
 
 
-def _text(side: str, name: str, port: Input | Output | State) -> str:
+def _suggest(
+    missing: Ports, spare: Ports, variables: Mapping[str, FmuVariable], *, converts: bool
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the FMU's names of ports that may be those that are missing, then of scalars that may be elements."""
+    pairs = _match(missing, spare, converts=converts)
+    names = {variables[new].name: name for name, new in pairs.items()}
+    open_ = {n: p for n, p in missing.items() if n not in pairs}
+    free = {n: p for n, p in spare.items() if n not in pairs.values()}
+    return names, _match_elements(open_, free, variables, converts=converts)
+
+
+def _text(side: str, name: str, port: Port) -> str:
     shape = "" if not port.shape else f" {list(port.shape)}"
     return f"{side} {name}{shape}{f' in {port.unit}' if port.unit else ''}"
 
@@ -209,14 +186,7 @@ def _variable(block: Block, side: str, port: str) -> FmuVariable | None:
 
 
 def _compare(
-    side: str,
-    name: str,
-    new: Input | Output | State,
-    old: Input | Output | State,
-    variable: FmuVariable,
-    before: FmuVariable | None,
-    *,
-    converts: bool,
+    side: str, name: str, new: Port, old: Port, variable: FmuVariable, before: FmuVariable | None, *, converts: bool
 ) -> list[_Misfit]:
     """Return the differences in shape, unit and type of a port that both blocks have."""
     found = list[_Misfit]()
@@ -249,9 +219,7 @@ def _kind(variable: FmuVariable) -> str:
     return variable.type if variable.type in ("Boolean", "Enumeration") else "integer"
 
 
-def _match(
-    missing: Mapping[str, Input | Output | State], spare: Mapping[str, Input | Output | State], *, converts: bool
-) -> dict[str, str]:
+def _match(missing: Ports, spare: Ports, *, converts: bool) -> dict[str, str]:
     """Return ports that may be meant by those that are missing: of their shape and unit, and the most alike by name.
 
     An FMU that ``converts`` units may have one of the same dimension. A port without one that is alike by name gets the
@@ -272,11 +240,7 @@ def _match(
 
 
 def _match_elements(
-    missing: Mapping[str, Input | Output | State],
-    spare: Mapping[str, Input | Output | State],
-    variables: Mapping[str, FmuVariable],
-    *,
-    converts: bool,
+    missing: Ports, spare: Ports, variables: Mapping[str, FmuVariable], *, converts: bool
 ) -> dict[str, str]:
     """Return elements of missing array ports by the FMU's names of the scalars that may be these.
 
