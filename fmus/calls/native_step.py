@@ -11,8 +11,7 @@ import numpy as np
 
 from ..host_state import HostState
 from .bound_calls import ChildRequest
-from .fmi_calls import StepCall
-from .transfer import Transfer, TypeGroup
+from .transfer import Transfer
 
 
 @dataclass(frozen=True)
@@ -46,35 +45,6 @@ class NativeStep:
     reached: int  # time that a step has reached, in s
     kept: tuple[Any, ...]  # whatever must live as long as the addresses
     host: HostState | None  # state of this process, which a library that Loopwright has not built may change
-
-
-def native_step(
-    fmi: str,
-    now: ctypes.c_double,
-    width: ctypes.c_double,
-    final: Any,
-    call: StepCall,
-    ins: Transfer,
-    outs: Transfer,
-    *,
-    host: HostState | None,
-) -> NativeStep:
-    """Return a step of a library in this process as addresses."""
-    at = ctypes.addressof
-    return NativeStep(
-        version=int(fmi[0]),
-        instance=call.arguments[0].value,
-        step=address_of(call.function),
-        inputs=_transfer(ins),
-        outputs=_transfer(outs),
-        now=at(now),
-        width=at(width),
-        final=at(final),
-        flags=at(call.flags),
-        reached=at(call.reached),
-        kept=(now, width, final, call, ins, outs),
-        host=host,
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,40 +91,25 @@ class RemoteStep:
     is_careful: bool  # whether other steps are Python's
 
 
-def remote_step(
-    request: ChildRequest,
-    now: ctypes.c_double,
-    width: ctypes.c_double,
-    call: StepCall,
-    ins: Transfer,
-    outs: Transfer,
-    *,
-    quiet: QuietStep | None,
-    is_careful: bool,
-) -> RemoteStep | None:
-    """Return a step of a library in another process as addresses; None where inputs are of an odd enumeration."""
-    at = ctypes.addressof
-    given, found = ([_share(of, group) for group in of.groups if group.size] for of in (ins, outs))
-    low, high = ins.limits
-    for i, values in enumerate(given):
-        group = [group for group in ins.groups if group.size][i]
-        limits = group.limits
-        if limits is None:
-            return None
-        least, most = np.maximum(limits[0], low[group.index]), np.minimum(limits[1], high[group.index])
-        if group.is_integer or np.isfinite(least).any() or np.isfinite(most).any():
-            given[i] = SharedValues(values.vector, values.shared, values.index, least, most)
-    kept = (now, width, call, ins, outs)
-    numbers = at(now), at(width), at(call.flags), at(call.reached)
-    return RemoteStep(request, given, found, *numbers, kept, quiet, is_careful)
+def share(transfer: Transfer, *, checked: bool) -> list[SharedValues] | None:
+    """Return the values of a transfer, with limits where they are ``checked``; None for an odd enumeration."""
+    made = []
+    for group in (group for group in transfer.groups if group.size):
+        low = high = None
+        if checked:
+            if (of_type := group.limits) is None:
+                return None
+            low, high = (side[group.index] for side in transfer.limits)
+            low, high = np.maximum(of_type[0], low), np.minimum(of_type[1], high)
+            if not group.is_integer and not np.isfinite(low).any() and not np.isfinite(high).any():
+                low = high = None  # C need not look at them
+        index = None if group.is_whole else np.ascontiguousarray(group.index, dtype=np.int64)
+        made.append(SharedValues(transfer.vector, group.buffer[: group.size], index, low, high))
+    return made
 
 
-def _share(of: Transfer, group: TypeGroup) -> SharedValues:
-    index = None if group.is_whole else np.ascontiguousarray(group.index, dtype=np.int64)
-    return SharedValues(of.vector, group.buffer[: group.size], index, None, None)
-
-
-def _transfer(of: Transfer) -> NativeTransfer | None:
+def transfer_at(of: Transfer) -> NativeTransfer | None:
+    """Return the one call of a plain transfer; None without ports."""
     if of.plain_call is None:
         return None
     function, (_, references, count, values, *size) = of.plain_call

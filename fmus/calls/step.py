@@ -1,7 +1,7 @@
 """A communication step of an FMU: its inputs are set, time advances, its outputs are read.
 
 `StepParts` says what else belongs to it. It is the same step in this process and in another one, for Python and for the
-loops in C, which take it by its addresses (`native_step`).
+loops in C, which take it by its addresses (`InstanceStep.native`, `InstanceStep.remote`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ..archive import FmuVariable
 from .bound_calls import BoundCalls, Call
 from .event_mode import EventMemory, EventMode
 from .fmi_calls import DISCARD, MOST_ROUNDS, WARNING
-from .native_step import NativeStep, QuietStep, RemoteStep, native_step, remote_step
+from .native_step import NativeStep, QuietStep, RemoteStep, address_of, share, transfer_at
 from .saved_state import FmuState
 from .step_failures import NEAR, ROUNDED, StepFailures
 from .step_options import StepParts, parts_of_step
@@ -480,16 +480,28 @@ class InstanceStep:
         fmu, is_plain = self.fmu, self._ins.is_plain and self._outs.is_plain and not self._ins.has_limits
         if not self.fmi.in_process or not is_plain or self.parts or self._texts.variables:
             return None
-        host = None if fmu.is_built_here else fmu.host
-        arguments = fmu.now, fmu.width, fmu.final, self.call, self._ins, self._outs
-        return native_step(fmu.description.fmi, *arguments, host=host)
+        at, call = ctypes.addressof, self.call
+        return NativeStep(
+            version=int(fmu.description.fmi[0]),
+            instance=call.arguments[0].value,
+            step=address_of(call.function),
+            inputs=transfer_at(self._ins),
+            outputs=transfer_at(self._outs),
+            now=at(fmu.now),
+            width=at(fmu.width),
+            final=at(fmu.final),
+            flags=at(call.flags),
+            reached=at(call.reached),
+            kept=(fmu.now, fmu.width, fmu.final, call, self._ins, self._outs),
+            host=None if fmu.is_built_here else fmu.host,
+        )
 
     @property
     def remote(self) -> RemoteStep | None:
         """The step in another process as addresses; None in this one, and where Python has to take each step."""
         request, call, by_python = self._calls.request, self.call, bool(self.parts & _BY_PYTHON)
         odd = (by_python and StepParts.ADDED_TIME in self.parts) or (self._texts.variables and self._watch is None)
-        if request is None or odd:
+        if request is None or odd or (given := share(self._ins, checked=True)) is None:
             return None
         quiet = None
         if self.parts or self._watch is not None:
@@ -508,8 +520,18 @@ class InstanceStep:
                 changed=0 if self._watch is None else ctypes.addressof(self._watch.changed),
                 added=self._added if StepParts.ADDED_TIME in self.parts else None,
             )
-        return remote_step(
-            request, self.fmu.now, self.fmu.width, call, self._ins, self._outs, quiet=quiet, is_careful=by_python
+        at, fmu = ctypes.addressof, self.fmu
+        return RemoteStep(
+            request=request,
+            inputs=given,
+            outputs=share(self._outs, checked=False) or [],
+            now=at(fmu.now),
+            width=at(fmu.width),
+            flags=at(call.flags),
+            reached=at(call.reached),
+            kept=(fmu.now, fmu.width, call, self._ins, self._outs),
+            quiet=quiet,
+            is_careful=by_python,
         )
 
 

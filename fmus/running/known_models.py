@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import fields
 from threading import Lock
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,12 +16,25 @@ from .fmu_point import FmuLinearization
 from .linearization import find_step_gap
 
 MOST = 512
-"""Models that are kept at a time."""
-_KNOWN: OrderedDict[Any, FmuLinearization] = OrderedDict()
+"""Models, and gaps, that are kept at a time."""
+_MODELS: OrderedDict[Hashable, FmuLinearization] = OrderedDict()
+_GAPS: OrderedDict[Hashable, tuple[float, float]] = OrderedDict()
 _LOCK = Lock()
+R = TypeVar("R")
 
 
-_GAPS: OrderedDict[Any, tuple[float, float]] = OrderedDict()
+def _recall(known: OrderedDict[Hashable, R], key: Hashable, make: Callable[[], R]) -> R:
+    """Return what is known under a key, or make it; the one that was asked for longest ago is forgotten first."""
+    with _LOCK:
+        if key in known:
+            known.move_to_end(key)
+            return known[key]
+    found = make()  # without the lock: two threads may make the same, and neither waits for the other's FMU
+    with _LOCK:
+        known[key] = found
+        while len(known) > MOST:
+            known.popitem(last=False)
+    return found
 
 
 def step_gap(
@@ -29,15 +42,7 @@ def step_gap(
 ) -> tuple[float, float]:
     """Return how far a step of an FMU is from a linear model of it, and the error of that; see `find_step_gap`."""
     key = identity(block), t, identity(state), identity(inputs), h, A.tobytes(), B.tobytes()
-    with _LOCK:
-        if key in _GAPS:
-            return _GAPS[key]
-    found = find_step_gap(block, h, t, state, inputs, A, B)
-    with _LOCK:
-        _GAPS[key] = found
-        while len(_GAPS) > MOST:
-            _GAPS.popitem(last=False)
-    return found
+    return _recall(_GAPS, key, lambda: find_step_gap(block, h, t, state, inputs, A, B))
 
 
 def linearize_fmu(
@@ -50,21 +55,15 @@ def linearize_fmu(
     """
     _ = block.description  # an FMU whose file has changed is refused
     made_by = (type(block).linear_model, type(block).step_difference)  # a class of users' may have its own
-    key = made_by, identity(block), t, identity(state), identity(inputs), h
-    with _LOCK:
-        found = _KNOWN.get(key)
-        if found is not None:
-            _KNOWN.move_to_end(key)
-            return found
-    if h is None:
-        found = block.linear_model(t=t, state=state, inputs=inputs)
-    else:
-        found = block.step_difference(h, t=t, state=state, inputs=inputs)
-    for value in (getattr(found, f.name) for f in fields(found)):
-        if isinstance(value, np.ndarray):
-            value.setflags(write=False)
-    with _LOCK:
-        _KNOWN[key] = found
-        while len(_KNOWN) > MOST:
-            _KNOWN.popitem(last=False)
-    return found
+
+    def make() -> FmuLinearization:
+        if h is None:
+            found = block.linear_model(t=t, state=state, inputs=inputs)
+        else:
+            found = block.step_difference(h, t=t, state=state, inputs=inputs)
+        for value in (getattr(found, f.name) for f in fields(found)):
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+        return found
+
+    return _recall(_MODELS, (made_by, identity(block), t, identity(state), identity(inputs), h), make)
