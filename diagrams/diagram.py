@@ -443,7 +443,7 @@ class Diagram(ShownAsTable):
         count : int, optional
             Number of samples of a Latin hypercube.
         seed : int
-            Seed of the sweep; each sample has one of its own, which depends on this one and its place alone.
+            Seed of the sweep; each sample has its own, which depends on this one and its place alone.
         seeds : list of str
             Parameters that take the sample's seed, such as ``"noise.seed"``. Where a seed is fixed in a
             block's equations, these runs are interpreted by default.
@@ -463,7 +463,7 @@ class Diagram(ShownAsTable):
         progress : bool or callable, optional
             Show a progress bar, or a function that is called with the number of samples that are done; see `simulate`.
         lanes : bool or {2, 4, 8, 16}, optional
-            Make so many runs side by side in the lanes of the processor's vectors, 8 for True: some times as fast.
+            Make so many runs side by side in vector lanes of the processor, 8 for True: some times as fast.
             Their values then differ from those of single runs by rounding, and the sweep's messages say so. A motion
             that magnifies small differences (a limit cycle, sticking) magnifies these, too; see docs/howto/sweeps.md.
             Every FMU must have been built by Loopwright on this machine, with steps of fixed length and without events;
@@ -716,8 +716,8 @@ class Diagram(ShownAsTable):
         Parameters
         ----------
         wire : str
-            A wire or port, or an entry of it, ``"motor_force[1]"``. Of one with several entries, each is excited in a
-            run of its own, and the responses are matrices.
+            A wire or port, or an entry of it, ``"motor_force[1]"``. Of one with several entries, each is excited in its
+            own run, and the responses are matrices.
         frequencies : array_like
             In rad/s. They are moved by less than half a sample in a window, so that whole periods fit into it.
         amplitude : float

@@ -30,18 +30,12 @@ TOOLS = runpy.run_path(str(ROOT / "fmus" / "toolchain.py"))
 
 def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
     """Ask for zig where the machine has no compiler."""
-    return [
-        *build_meta.get_requires_for_build_wheel(config_settings),
-        *([] if TOOLS["find_command"](lambda: sys.executable) else COMPILER),
-    ]
+    return [*build_meta.get_requires_for_build_wheel(config_settings), *_missing()]
 
 
 def get_requires_for_build_editable(config_settings: Any = None) -> list[str]:
     """Ask for zig where the machine has no compiler."""
-    return [
-        *build_meta.get_requires_for_build_editable(config_settings),
-        *([] if TOOLS["find_command"](lambda: sys.executable) else COMPILER),
-    ]
+    return [*build_meta.get_requires_for_build_editable(config_settings), *_missing()]
 
 
 def _missing() -> list[str]:

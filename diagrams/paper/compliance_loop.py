@@ -28,7 +28,7 @@ implementations:
     acts ``delay`` samples later.
 
 `AdmittanceLoop.contact` is the contact of a diagram: Fig. 3 around robots with these M, C and M̂, Ĉ, at a point with
-the same q of a path whose frame is the axes, a line or a circle. One direction stands alone where M, C, M̂ and Ĉ are
+the same q of a path whose frame is the axes, a line or a circle. One direction is decoupled where M, C, M̂ and Ĉ are
 diagonal in the frame of the path, such as at rest on a path along an axis. Elsewhere unequal axes couple the two
 directions: the contact then has both, and the environment acts in one.
 
@@ -146,7 +146,7 @@ class AdmittanceLoop(Value):
         side : str, optional
             ``"par"`` or ``"perp"``.
         point : OperatingPoint, optional
-            Instant of the diagram that gives the plant's states besides position and velocity, such as contact; the
+            Instant of the diagram that gives the plant's states other than position and velocity, such as contact; the
             start without it.
         **changes
             Parameters that the diagram does not hold, or other values: ``eta`` and ``xi`` of the point on the path,
@@ -273,7 +273,7 @@ class AdmittanceLoop(Value):
 
     @cached_property
     def motions(self) -> tuple[Motion, Motion]:
-        """Inertia and friction slope of the plant and of the model; of one direction if it stands alone."""
+        """Inertia and friction slope of the plant and of the model; of one direction if it is decoupled."""
         both = self.both_motions
         diagonal = all(abs(X[0, 1]) + abs(X[1, 0]) <= _DECOUPLED * np.abs(X).max() for m in both for X in m)
         if diagonal or self.implementation == "ideal":
@@ -317,7 +317,7 @@ def _reduce_to_motion(loop: AdmittanceLoop, model: PlanarModel) -> Motion:
 
 
 def _contact_of(loop: AdmittanceLoop) -> Contact:
-    """Return the contact of a loop, in its own direction where that stands alone, else in both."""
+    """Return the contact of a loop, in its own direction where that is decoupled, else in both."""
     if loop.implementation == "ideal":
         made = make_contact(_perfect_diagram(loop), PortNames("plant.external_force", force=None), [1.0], None, {})
         # the force moves it as its sensor feels it, so that another tool is another mass

@@ -69,7 +69,7 @@ def key_numbers(experiment: Experiment, run: Run) -> dict[str, float | None]:
       force.
 
     It is looked at from the tick of the step until any reference, set-point or desired force changes next, or the
-    experiment ends; a run that stopped before tells nothing about it.
+    experiment ends; a run that stopped before shows nothing of it.
 
     Parameters
     ----------

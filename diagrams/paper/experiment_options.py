@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from fractions import Fraction
 from numbers import Real
 from types import MappingProxyType
@@ -47,22 +47,26 @@ limits None (or infinity) is no limit. ``sample_time``: s, a number or a `Fracti
 duration. ``admittance_method``: ``exact`` or ``semi_implicit``.
 """
 
+_NOT_NEGATIVE = ("a number that is not negative", lambda value: is_number(value) and value >= 0, float)
+KINDS: Mapping[str, tuple[str, Callable[[Any], bool], Callable[[Any], Any]]] = {
+    "friction_width": ("a positive number", lambda value: is_number(value) and value > 0, float),
+    **dict.fromkeys(("coulomb_scale", "viscous_scale", "tool_mass", "encoder"), _NOT_NEGATIVE),
+    "delay": ("0 or 1 samples", lambda value: is_number(value) and value in (0, 1), int),
+    "admittance_method": (
+        "'exact' or 'semi_implicit'",
+        lambda value: isinstance(value, str) and value in ("exact", "semi_implicit"),
+        str,
+    ),
+    "path": ("a path, such as Ellipse(…)", lambda value: isinstance(value, Path), lambda value: value),
+}
+"""Options that are conditions on one value: what is expected, whether a value is that, and the form it takes."""
 LIMITS = ("motor_force_limit", "velocity_limit", "acceleration_limit")
 
 
 def merge(letter: str, duration: float, given: Mapping[str, Any], **own: Any) -> dict[str, Any]:
     """Merge what is given with the defaults; check it, and bring numbers into one form.
 
-    Parameters
-    ----------
-    letter : str
-        The experiment's letter.
-    duration : float
-        Its duration in s, which the sample time divides.
-    given : mapping
-        Options that were given.
-    **own
-        Options of this experiment alone, with their defaults.
+    The sample time divides the duration in s. ``own`` are options of this experiment alone, True or False.
     """
     known = {**DEFAULTS, **own}
     for name in given:
@@ -77,23 +81,12 @@ def merge(letter: str, duration: float, given: Mapping[str, Any], **own: Any) ->
         if not isinstance(options[name], bool | np.bool_):
             raise refuse(name, "True or False")
         options[name] = bool(options[name])
-    for name in ("friction_width", "coulomb_scale", "viscous_scale", "tool_mass", "encoder"):
-        value, positive = options[name], name == "friction_width"
-        if not is_number(value) or value < 0 or (positive and value == 0):
-            raise refuse(name, "a positive number" if positive else "a number that is not negative")
-        options[name] = float(value)
+    for name, (expected, holds, made) in KINDS.items():
+        if not holds(options[name]):
+            raise refuse(name, expected)
+        options[name] = made(options[name])
     for name in LIMITS:
         options[name] = _limit(options[name], lambda expected, name=name: refuse(name, expected))
-    if not is_number(options["delay"]) or options["delay"] not in (0, 1):
-        raise refuse("delay", "0 or 1 samples")
-    options["delay"] = int(options["delay"])
-    if not isinstance(options["admittance_method"], str) or options["admittance_method"] not in (
-        "exact",
-        "semi_implicit",
-    ):
-        raise refuse("admittance_method", "'exact' or 'semi_implicit'")
-    if not isinstance(options["path"], Path):
-        raise refuse("path", "a path, such as Ellipse(…)")
     if isinstance(options["plant"], str | os.PathLike) and os.path.isdir(os.path.expanduser(options["plant"])):
         raise OptionError(
             f"{str(options['plant'])!r} is a folder; expected an FMU, a file that ends in .fmu. Name the file.",

@@ -11,7 +11,6 @@ import math
 import os
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from pathlib import Path as File
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -147,15 +146,6 @@ class Experiment(ShownAsTable):
                 raise OptionError("it is no option of a run. Give it to the experiment.", block=self.letter, port=name)
 
 
-def _gantry() -> File:
-    return gantry.build()
-
-
-def _internal_step(width: float) -> float:
-    """Return a step that resolves the friction's sign change: its rate is F_c/(M w), w its width."""
-    return float(gantry.INTERNAL_STEP * min(1.0, width / DEFAULTS["friction_width"]))
-
-
 def _admittance(options: Mapping[str, Any], side: int, **impedance: Any) -> AdmittanceFilter:
     limits: dict[str, Any] = {}
     for name in ("velocity_limit", "acceleration_limit"):
@@ -170,7 +160,7 @@ def _plant(letter: str, options: Mapping[str, Any], given: Collection[str], posi
     A plant of one's own keeps what its ``start`` says, and what nobody has given.
     """
     own = options["plant"] is not None
-    plant = options["plant"] if own else _gantry()
+    plant = options["plant"] if own else gantry.build()
     plant = plant.replace(name="plant") if isinstance(plant, Fmu) else Fmu(plant, name="plant")
     check_plant(plant)
     variables = plant.description.variables
@@ -209,7 +199,9 @@ def _plant(letter: str, options: Mapping[str, Any], given: Collection[str], posi
             )
         start |= entry
     if not own:
-        start["internal_step"] = _internal_step(options["friction_width"])
+        # it resolves the friction's sign change, whose rate is F_c/(M w), w its width
+        width = options["friction_width"] / DEFAULTS["friction_width"]
+        start["internal_step"] = float(gantry.INTERNAL_STEP * min(1.0, width))
     return plant.replace(start={**start, **plant.start})
 
 
@@ -339,17 +331,12 @@ def hand_guiding(**options: Any) -> Experiment:
         + Pulse(start_time=6.5, end_time=7.5, amplitude=-6.0, unit="N")
         + Pulse(start_time=8.5, end_time=9.7, amplitude=-6.0, unit="N")
     )
-    par = Channel(
-        Reference(0.2, unit="m", name="eta_d"),
-        _admittance(o, 0, mass=0.5, stiffness=0.0, damping=_damping(IMPEDANCE_PAR)),
-    )
-    perp = Channel(Reference(0.0, unit="m", name="xi_d"), _admittance(o, 1, **IMPEDANCE_PERP))
     path = o["path"]
 
     def hand(position: Any) -> Any:
         return HandForce(path, name="hand")(position, f_par=f_par, f_perp=f_perp)
 
-    return _build("C", "hand_guiding", 12.0, o, (0.2, 0.0), par, perp, hand, given=options)
+    return _build("C", "hand_guiding", 12.0, o, (0.2, 0.0), *_free_along(o), hand, given=options)
 
 
 def guided_by_hand(**options: Any) -> Experiment:
@@ -369,18 +356,19 @@ def guided_by_hand(**options: Any) -> Experiment:
         As in `path_following`.
     """
     o = merge("C", 12.0, options)
-    path = o["path"]
-    start = (0.2, 0.0)
-    par = Channel(
-        Reference(0.2, unit="m", name="eta_d"),
-        _admittance(o, 0, mass=0.5, stiffness=0.0, damping=_damping(IMPEDANCE_PAR)),
-    )
-    perp = Channel(Reference(0.0, unit="m", name="xi_d"), _admittance(o, 1, **IMPEDANCE_PERP))
+    path, start = o["path"], (0.2, 0.0)
 
     def hand(position: Any) -> Any:
         return pull_by_hand(position, path.to_plane(*start))
 
-    return _build("C", "guided_by_hand", 12.0, o, start, par, perp, hand, given=options)
+    return _build("C", "guided_by_hand", 12.0, o, start, *_free_along(o), hand, given=options)
+
+
+def _free_along(options: Mapping[str, Any]) -> tuple[Channel, Channel]:
+    """Return the channels of experiment C: free along the path, a spring across it."""
+    free = _admittance(options, 0, mass=0.5, stiffness=0.0, damping=_damping(IMPEDANCE_PAR))
+    par = Channel(Reference(0.2, unit="m", name="eta_d"), free)
+    return par, Channel(Reference(0.0, unit="m", name="xi_d"), _admittance(options, 1, **IMPEDANCE_PERP))
 
 
 def hand_page(path: str | os.PathLike[str] | None = None, **options: Any) -> WebPage:

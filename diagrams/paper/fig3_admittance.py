@@ -246,10 +246,7 @@ def _first_unstable(k: np.ndarray, growth: np.ndarray) -> np.ndarray:
 
 
 def _find_contacts(case: Fig3Case) -> Mapping[str, Mapping[Implementation, Contact]] | None:
-    """Return the contacts of all variants by direction, or None where the linear models don't show them.
-
-    Stairs that linearize to zero, and a plant with discrete states, have none.
-    """
+    """Return contacts by direction; None where linear models don't show them: stairs of slope 0, discrete states."""
     if case.has_events:
         return None
     found: dict[str, dict[Implementation, Contact]] = {side: {} for side in SIDES}
@@ -283,10 +280,7 @@ def _contact_side(case: Fig3Case, found: Mapping[Implementation, Contact], side:
 
 
 def _tried(variants: Variants) -> tuple[list[Table], list[str]]:
-    """Return the table of limits that were tried in the nonlinear run, and why others were not.
-
-    A run that contradicts a limit however small the push raises its `ConfirmationError`.
-    """
+    """Return the table of limits that were tried in runs, and why others were not; a contradiction is raised."""
     rows: list[dict[str, Any]] = []
     remarks: dict[str, None] = {}
     damping = contacts.TRIED_DAMPING

@@ -97,7 +97,7 @@ class Fig3Case(Case):
 
     @property
     def has_friction(self) -> bool:
-        """Whether variants with and without the plant's friction are told apart."""
+        """Whether variants with and without the plant's friction differ."""
         return any(not variant.is_design for variant in self.variants.values())
 
     def _without_delay(self) -> WiredDiagram:
@@ -160,8 +160,7 @@ class Fig3Case(Case):
     def plant_model(self) -> Gantry | None:
         """The plant as the model that the admittance is reduced with, None where it is not shown to be such a gantry.
 
-        Its parameters are read from the FMU by their names. Names promise nothing, so that the plant's own linear model
-        is compared with the model that they make.
+        Names of parameters promise nothing: the plant's own linear model is compared with the model that they make.
         """
         if self.plant is None or not isinstance(self.model, Gantry):
             return None
@@ -188,10 +187,7 @@ class Fig3Case(Case):
 
     @cached_property
     def reduced(self) -> ReducedLoops | LoopwrightError | None:
-        """The reduced loops with admittances, or the error that says why the plant is not shown to be reduced to them.
-
-        None where there are no admittances in both directions, or no variant could be analysed, which the notes say.
-        """
+        """The reduced loops, or the error why there are none; None without both admittances, or an analysed variant."""
         where = next(self.designs(Implementation.CONTINUOUS, Implementation.SAMPLED), None)
         if where is None or any(f"controller.admittance_{side}" not in self.diagram.blocks for side in SIDES):
             return None

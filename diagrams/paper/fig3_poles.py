@@ -117,15 +117,15 @@ def _asked(case: Fig3Case, side: str, wire: str, block: ErrorDynamics, numbers: 
 def _off(got: np.ndarray, formula: np.ndarray) -> float:
     """Return the difference of a polynomial from another one; NaN where it has a lower order.
 
-    A loop of a higher order has modes besides, factors of its polynomial where they are hidden: the remainder of the
-    division is told, over the quotient, on circles of the size of the roots that are looked for.
+    A loop of a higher order has more modes, factors of its polynomial where they are hidden. Then the remainder of the
+    division counts, over the quotient, on circles of the size of the roots that are looked for.
     """
     if len(got) <= len(formula):
         return relative_difference(got, formula) if len(got) == len(formula) else np.nan
-    besides, rest = np.polydiv(got, formula)
+    others, rest = np.polydiv(got, formula)
     circle = np.exp(2j * np.pi * (np.arange(16) + 0.5) / 16)
     on = np.abs(np.roots(formula))[:, None] * circle  # a circle for each: a delay's root is far from the others
-    left = np.abs(np.polyval(rest, on)) / np.abs(np.polyval(besides, on))
+    left = np.abs(np.polyval(rest, on)) / np.abs(np.polyval(others, on))
     return float(np.max(np.max(left, axis=1) / np.max(np.abs(np.polyval(formula, on)), axis=1)))
 
 

@@ -54,7 +54,7 @@ def friction_in_keys(case: Fig3Case) -> Section:
 
 
 def has_friction(case: Fig3Case) -> bool:
-    """Return whether variants with and without the plant's friction are told apart."""
+    """Return whether variants with and without the plant's friction differ."""
     return case.has_friction
 
 

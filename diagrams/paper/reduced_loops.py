@@ -18,7 +18,7 @@ from .compliance_loop import AdmittanceLoop
 from .coupled_stability import StabilityLimit, stability_limit
 
 FRICTION = "_friction"
-"""End of the keys of what has the plant's friction, where it is told apart from the same without it."""
+"""End of the keys of what has the plant's friction, where there is the same without it, too."""
 NO_FRICTION = {"coulomb_scale": 0.0, "viscous_scale": 0.0}
 OPTIONS: Mapping[Implementation, Mapping[str, Any]] = {
     Implementation.CONTINUOUS: {"implementation": "continuous", "delay": 0},
@@ -43,18 +43,10 @@ class LoopKind(NamedTuple):
 
 @dataclass(frozen=True)
 class ReducedLoops:
-    """The reduced loops of a diagram: by direction, with or without friction, impedance control or force tracking.
+    """The reduced loops of a diagram: by direction, with or without friction, impedance control or force tracking."""
 
-    Attributes
-    ----------
-    plain : mapping of str to AdmittanceLoop
-        By direction; of the design without friction, where the diagram has some.
-    rough : mapping of str to AdmittanceLoop
-        By direction; with the slope of the friction at rest, and with its compensation. Empty where there is none.
-    """
-
-    plain: Mapping[str, AdmittanceLoop]
-    rough: Mapping[str, AdmittanceLoop]
+    plain: Mapping[str, AdmittanceLoop]  # of the design without friction, where there is some
+    rough: Mapping[str, AdmittanceLoop]  # with the slope of friction at rest, and its compensation; {} without
     _limits: dict[tuple[str, str, Implementation, float], StabilityLimit] = field(default_factory=dict, repr=False)
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Comparison of a diagram's plant with the reduced model that stands for it in `AdmittanceLoop`.
+"""Comparison of a diagram's plant with its reduced model in `AdmittanceLoop`.
 
 The reduced model is p̈ = G_v (u + F) + S ṗ + constant with S = ∂f_v/∂x_v: four states, no stiffness. It is compared
 with the plant's own linear model in the coordinates (position, velocity): `Fmu.linear_model` of an FMU, the traced
@@ -77,24 +77,11 @@ def check_plant(
     velocity: Array | None = None,
     point: OperatingPoint | None = None,
 ) -> None:
-    """Refuse a plant whose linear model is not that of the reduced model.
+    """Refuse a plant whose linear model is not that of the reduced, Cartesian model.
 
-    Parameters
-    ----------
-    diagram : Diagram
-        Diagram of Fig. 3.
-    path : str
-        Path of the plant.
-    model : PlanarModel
-        Reduced model, Cartesian.
-    rate : float
-        Rate of the controller in 1/s, the measure for errors.
-    frame : ndarray, optional
-        Frame [t n] for the masses in error texts; the axes without it.
-    position, velocity : array, optional
-        Position in m and velocity in m/s of both models; those of the plant without them.
-    point : OperatingPoint, optional
-        Instant of the diagram that gives the plant's other states; its start without it.
+    ``rate`` of the controller in 1/s is the measure for errors, ``frame`` = [t n] that of masses in their texts (the
+    axes without it). Both models are taken at ``position`` in m and ``velocity`` in m/s, those of the plant without
+    them. ``point`` gives the plant's other states; its start without it.
     """
     try:
         linear = _linearize_at(
@@ -102,15 +89,10 @@ def check_plant(
         )
     except ParameterError:
         raise
-    except LoopwrightError as error:
+    except (LoopwrightError, ArithmeticError, RuntimeError, NotImplementedError) as error:
+        text = error.message.rstrip(".") if isinstance(error, LoopwrightError) else f"{type(error).__name__}: {error}"
         raise ParameterError(
-            f"found no linear model ({error.message.rstrip('.')}); expected one to compare with the reduced model. "
-            "Build the AdmittanceLoop by hand if the plant is known to be rigid.",
-            block=path,
-        ) from error
-    except (ArithmeticError, RuntimeError, NotImplementedError) as error:
-        raise ParameterError(
-            f"found no linear model ({type(error).__name__}: {error}); expected one to compare with the reduced model. "
+            f"found no linear model ({text}); expected one to compare with the reduced model. "
             "Build the AdmittanceLoop by hand if the plant is known to be rigid.",
             block=path,
         ) from error

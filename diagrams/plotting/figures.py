@@ -185,7 +185,7 @@ def _publish(figure: Any) -> None:
     """Send a figure's picture to the notebook, in the format that is set there."""
     from IPython.display import publish_display_data
 
-    hidden = ["_ipython_display_", *["_repr_png_"] * _is_inline()]  # the formats that are set there, and no PNG besides
+    hidden = ["_ipython_display_", *["_repr_png_"] * _is_inline()]  # the formats that are set there, and no other PNG
     figure.__dict__.update(dict.fromkeys(hidden))
     try:
         data, metadata = _shell().display_formatter.format(figure)

@@ -18,7 +18,7 @@ GUESS = 0.5
 
 
 def lay_out(figure: Figure) -> bool:
-    """Place the axes of a figure; return whether it could: they stand in one grid, each in one place of it."""
+    """Place the axes of a figure; return whether it could: they are in one grid, each in one place of it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     cells = _cells(figure)
@@ -48,7 +48,7 @@ def lay_out(figure: Figure) -> bool:
 
 
 def _cells(figure: Figure) -> dict[Axes, tuple[int, int]]:
-    """Return the row and column of all axes; none where they don't stand in one grid, as a color bar doesn't."""
+    """Return the row and column of all axes; none where they are not in one grid, as a color bar isn't."""
     found: dict[Axes, tuple[int, int]] = {}
     grids: list[object] = []
     for ax in figure.axes:

@@ -78,22 +78,8 @@ def style() -> Iterator[None]:
         yield
 
 
-_OWN = {
-    "axes",
-    "figure",
-    "font",
-    "grid",
-    "legend",
-    "lines",
-    "mathtext",
-    "patch",
-    "path",
-    "savefig",
-    "svg",
-    "text",
-    "xtick",
-    "ytick",
-}
+_OWN = {name.partition(".")[0] for name in STYLE} | {"patch", "path", "text"}
+"""Families of settings that a user's own style doesn't reach."""
 
 
 LETTERS = 118

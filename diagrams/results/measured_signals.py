@@ -21,20 +21,10 @@ _FORMS = '(t, y), {"t": t, "speed": y} or a data frame with a column "t"'
 
 
 class MeasuredSignals:
-    """Samples of some signals, at times of their own.
+    """Samples of some signals, at their own times.
 
-    Parameters
-    ----------
-    data : (array, array), mapping of str to array, or data frame
-        Times in s, shape (N,), and the samples of one signal, (N, …); or columns by name, with the times in ``"t"`` or
-        ``"time"``, of a data frame also in its index.
-    label : str
-        Name in the legend.
-
-    Raises
-    ------
-    OptionError
-        For anything else, and for samples that don't fit the times.
+    ``data`` is a pair of times in s, (N,), and samples of one signal, (N, …); or columns by name, with the times in
+    ``"t"`` or ``"time"``, of a data frame also in its index. ``label`` is for the legend.
     """
 
     def __init__(self, data: Any, label: str):

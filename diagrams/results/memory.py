@@ -23,20 +23,8 @@ def check_memory(
 ) -> None:
     """Refuse a run whose samples can't fit, before it takes the machine down.
 
-    Parameters
-    ----------
-    samples : int
-        Samples of the run, one more than its ticks.
-    width : int
-        Numbers that are recorded of each sample, without the time.
-    base : Fraction
-        Seconds between two ticks.
-    name : str
-        The diagram's name.
-    every : int
-        One of so many samples is recorded.
-    to : path, optional
-        Folder on disk for the samples; without it they stay in memory.
+    There is one sample more than ticks of ``base`` seconds; ``width`` numbers of one sample in ``every`` are recorded,
+    in memory, or on disk at ``to``.
     """
     needed = -(-samples // every) * 8 * (width + 1)
     if to is None:

@@ -126,15 +126,23 @@ class OperatingPoint(ShownAsTable):
     """Every signal at the tick by its path."""
     layout: StateLayout = field(default=(), repr=False)
     """Names and shapes of the entries of its vectors: diagrams with equal layouts can exchange operating points."""
+    units: Mapping[str, str] = field(default_factory=dict, repr=False)
+    """Units of the FMUs' states and ports at the point, by their dotted paths."""
+    asked: bool = False
+    """Whether ``base`` was asked for, as a ``step``: FMUs step at every tick then."""
+    coupling: str = ""
+    """Coupling of the FMUs in the run that has reached it, where it is not the default."""
+    coupling_order: tuple[str, ...] = ()
+    """Paths of the FMUs in the order in which they step there, where one steps after the other."""
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    """Parameters that a trim has found with it, by path, as `Diagram.replace` takes them."""
+    free: tuple[FreeDirection, ...] = ()
+    """Directions that a trim left free, to first order: with targets or fixed states for them it is unique."""
+    residuals: Mapping[str, float] = field(default_factory=dict, repr=False)
+    """Remainder of each equation of a trim by name, largest first, relative to 1 + the size of its quantity."""
 
     def check_fits(self, flat: FlatDiagram, name: str) -> None:
-        """Refuse the operating point of a diagram with other blocks, states or ports.
-
-        Raises
-        ------
-        OptionError
-            If it is one.
-        """
+        """Refuse the operating point of a diagram with other blocks, states or ports."""
         sizes = (self.x.size, self.w.size, self.z.size)
         needed = (flat.width, flat.plant_outputs.total, flat.plant_inputs.total)
         if sizes == needed and (not self.layout or self.layout == layout_of(flat)):
@@ -150,25 +158,10 @@ class OperatingPoint(ShownAsTable):
             port="operating point",
         )
 
-    units: Mapping[str, str] = field(default_factory=dict, repr=False)
-    """Units of the FMUs' states and ports at the point, by their dotted paths."""
-
     def check_units(self, blocks: Mapping[str, Any], name: str) -> None:
         """Refuse the operating point of a diagram whose FMUs have their states or ports in other units.
 
         Its numbers are in the units of the FMUs that it was found with; in another unit they would be others.
-
-        Parameters
-        ----------
-        blocks : mapping
-            Blocks of the diagram by path.
-        name : str
-            The diagram's name.
-
-        Raises
-        ------
-        OptionError
-            If a unit is another one.
         """
         here = units_of(blocks, (*self.plants, *self.exchanged))
         for path, unit in self.units.items():
@@ -179,18 +172,6 @@ class OperatingPoint(ShownAsTable):
                     block=name,
                     port="operating point",
                 )
-
-    asked: bool = False
-    """Whether ``base`` was asked for, as a ``step``: FMUs step at every tick then."""
-    coupling: str = ""
-    """Coupling of the FMUs in the run that has reached it, where it is not the default."""
-    coupling_order: tuple[str, ...] = ()
-    """Paths of the FMUs in the order in which they step there, where one steps after the other."""
-    parameters: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters that a trim has found with it, by path, as `Diagram.replace` takes them."""
-    free: tuple[FreeDirection, ...] = ()
-    """Directions that a trim left free, to first order: with targets or fixed states for them it is unique."""
-    residuals: Mapping[str, float] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
         moves = f"residual {self.residual:.3g}" + (f" by {self.largest}" if self.largest else "")
@@ -236,8 +217,6 @@ class OperatingPoint(ShownAsTable):
         """Yield the name, value and unit of each state, those of FMUs too."""
         for name, values in self.states.items():
             yield from _entries(name, np.ravel(values), self.units.get(name, ""))
-
-    """Remainder of each equation of a trim by name, largest first, relative to 1 + the size of its quantity."""
 
 
 def _entries(name: str, values: np.ndarray, unit: str) -> Iterator[tuple[str, Any, str]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -40,32 +40,16 @@ TICKS = 2000
 
 @dataclass(frozen=True)
 class DrawnSignal:
-    """A signal to draw.
-
-    Attributes
-    ----------
-    name, run : str
-        Names of the signal and of its run; "" where there is one run.
-    t, values : ndarray
-        Times in s, shape (N,), and samples, (N, …).
-    units : sequence of str
-        Unit of each entry.
-    is_set_point : bool
-        Whether it comes from a source: nothing in the diagram changes it.
-    is_held : bool
-        Whether it is held between its samples.
-    limits : tuple of float
-        Limits that it is kept within.
-    """
+    """A signal to draw."""
 
     name: str
-    t: np.ndarray
-    values: np.ndarray
-    units: Sequence[str]
-    run: str = ""
-    is_set_point: bool = False
-    is_held: bool = False
-    limits: tuple[float, ...] = ()
+    t: np.ndarray  # s, (N,)
+    values: np.ndarray  # (N, …)
+    units: Sequence[str]  # of each entry
+    run: str = ""  # name of its run; "" where there is one
+    is_set_point: bool = False  # it comes from a source: nothing in the diagram changes it
+    is_held: bool = False  # between its samples
+    limits: tuple[float, ...] = ()  # that it is kept within
 
 
 Panel = Sequence[DrawnSignal]
@@ -83,7 +67,13 @@ def plot_signals(
         raise OptionError('found no signal to draw; expected names, such as run.plot("eta", "xi").')
     if axes is not None:
         with style():
-            return _draw_panels(_check_axes(axes, len(panels)), panels, events, xlim)
+            own: list[Axes] = list(np.ravel(np.asarray(axes, dtype=object)))
+            if len(own) != len(panels):
+                raise OptionError(
+                    f"found {len(own)} axes for {len(panels)} signals; expected one for each. Make as many, or give "
+                    "none."
+                )
+            return _draw_panels(own, panels, events, xlim)
     height = 0.5 + 1.35 * len(panels) + 0.2 * sum(_is_long(panel) for panel in panels)
     with shown_figure(height) as figure:
         rows = list(figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0])
@@ -91,16 +81,6 @@ def plot_signals(
         if all(_has_legend_of_runs(panel) for panel in panels):
             legend_above(figure, rows[0])
         return drawn
-
-
-def _check_axes(axes: Sequence[Axes] | np.ndarray, count: int) -> list[Axes]:
-    """Return axes that are given, as many as are drawn into."""
-    rows: list[Axes] = list(np.ravel(np.asarray(axes, dtype=object)))
-    if len(rows) != count:
-        raise OptionError(
-            f"found {len(rows)} axes for {count} signals; expected one for each. Make as many, or give none."
-        )
-    return rows
 
 
 def _draw_panels(
@@ -123,10 +103,9 @@ def _draw_panels(
             ax.set_xlim(*xlim)
     _mark_events(rows, events, shown)
     rows[-1].set_xlabel("t [s]")
-    top: Any = rows[0].figure  # a figure, or a part of one
-    result: Figure = top
-    result.align_ylabels()
-    return result
+    figure = cast("Figure", rows[0].figure)  # a figure, or a part of one
+    figure.align_ylabels()
+    return figure
 
 
 def _legend_over(ax: Axes) -> None:
@@ -265,6 +244,4 @@ def _draw_curve(
     if is_equal:
         ax.set_aspect("equal", adjustable="datalim")
     ax.set(xlabel=labels[0], ylabel=labels[1])
-    top: Any = ax.figure
-    result: Figure = top
-    return result
+    return cast("Figure", ax.figure)

@@ -45,25 +45,10 @@ class Recorder:
     the middle is left out. After a power failure the same holds for the data that the operating system had written by
     then, and for everything once `finish` has returned.
 
-    Parameters
-    ----------
-    width : int
-        Entries of the vector of a sample, without the residual.
-    columns : sequence of int, optional
-        Entries that are kept, ascending; None for all.
-    every : int
-        One of so many calls of `row` is kept, beginning with the first.
-    rows : int, optional
-        Calls to come, if that is known: memory is then taken once.
-    residual : bool
-        Whether the vector has one more entry at its end: the residual of the algebraic loops. It is always kept, apart
-        from the data.
-    to : path, optional
-        Folder for a run on disk; see `loopwright.Run.open`.
-    header : mapping, optional
-        Header of the run on disk (`stored.header`); needed with ``to``.
-    overwrite : bool
-        Whether a stored run at ``to`` may be replaced.
+    ``columns`` are the entries of a sample's vector that are kept, ascending; None for all. The first of ``every``
+    calls of `row` is kept. Where the number of calls to come is known, ``rows``, memory is taken once. With
+    ``residual`` the vector has one more entry than ``width`` at its end, the residual of the algebraic loops; it is
+    always kept, apart from the data. ``header`` is that of the run on disk (`stored.header`).
     """
 
     row: Callable[[float, np.ndarray], None]
@@ -109,13 +94,7 @@ class Recorder:
         """After `finish`: the residual of each sample kept."""
 
     def watch(self, outputs: Mapping[str, slice]) -> None:
-        """Look for samples of some outputs that are no finite numbers, as far as they are kept; see `lost_outputs`.
-
-        Parameters
-        ----------
-        outputs : mapping
-            Their entries in the vector of a sample, by dotted path.
-        """
+        """Look for samples of outputs (entries of the vector by path) that are no finite numbers: `lost_outputs`."""
         column = None if self._pick is None else {entry: k for k, entry in enumerate(self._pick.tolist(), 1)}
         watched = dict(self._watched)
         for name, where in outputs.items():
@@ -193,13 +172,7 @@ class Recorder:
         return self._skip
 
     def room(self, t: float) -> np.ndarray:
-        """Return rows that the caller writes, shape (n, 1 + entries), n > 0: time, then values; see `took`.
-
-        Parameters
-        ----------
-        t : float
-            Time that the run has reached in s, for an error.
-        """
+        """Return rows that the caller writes, (n, 1 + entries), n > 0: time, then values; see `took`."""
         if self._k == self._limit or (self.to is not None and monotonic() >= self._due):
             if self.to is None:
                 self._grow(t)
@@ -307,13 +280,7 @@ class Recorder:
         )
 
     def finish(self, **end: object) -> tuple[np.ndarray, np.ndarray]:
-        """Close the files, and return times, shape (n,), and samples, shape (n, entries kept).
-
-        Parameters
-        ----------
-        **end
-            Facts about the run's end (``elapsed``, ``messages``, ``stopped``), for the run on disk.
-        """
+        """Close the files, with an `End`, and return times, (n,), and samples, (n, entries kept)."""
         if self.to is not None:
             return self._close(end)
         if self._k:
@@ -365,19 +332,8 @@ def select(
 ) -> np.ndarray | None:
     """Return the entries of a sample's vector that a selection keeps, ascending; None for all.
 
-    Parameters
-    ----------
-    record : iterable of str, optional
-        Signals, by the names that ``run[name]`` takes; a subsystem or a block stands for all its signals. None for
-        all.
-    layout : Layout
-        Entries of each port in the vector; from ``layout.total`` to ``width`` it holds the states.
-    wires : mapping
-        The named wires.
-    states : bool
-        Whether the states are kept.
-    blocks : mapping, optional
-        Blocks by path, for errors; see `resolve`.
+    A name is one that ``run[name]`` takes, or a subsystem or block for all its signals; ``record`` None keeps all. The
+    vector has the ports of ``layout``, then the states up to ``width``. ``blocks`` are for errors; see `resolve`.
     """
     if record is None:
         return None if states else np.arange(layout.total)

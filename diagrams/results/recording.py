@@ -64,15 +64,7 @@ class Recording:
         return {join(*port): unit for port, unit in self.flat.checked.units.items()}
 
     def check_memory(self, ticks: int, *, every_tick: bool) -> None:
-        """Refuse a run whose samples can't fit; see `check_memory`.
-
-        Parameters
-        ----------
-        ticks : int
-            Ticks of the run.
-        every_tick : bool
-            Whether each tick is a sample, not only those at which a subsystem acts.
-        """
+        """Refuse a run whose samples can't fit: at every tick, or at those at which a subsystem acts."""
         width = self.width if self.columns is None else len(self.columns)
         clocks = self.flat.distinct
         samples = ticks + 1
@@ -81,13 +73,7 @@ class Recording:
         check_memory(samples, width, self.flat.base, self.name, every=self.every, to=self.to)
 
     def begin(self, rows: int | None = None) -> Recorder:
-        """Return a recorder that has no sample yet.
-
-        Parameters
-        ----------
-        rows : int, optional
-            Samples to come, if that is known.
-        """
+        """Return a recorder that has no sample yet; ``rows`` are the samples to come, if that is known."""
         flat, head = self.flat, None
         residual = bool(flat.loops.slices)
         if self.to is not None:

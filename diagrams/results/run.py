@@ -760,10 +760,7 @@ class Run(ShownAsTable):
         to_mat(path, self.t, signals, units, self.diagram_name)
 
     def _names_to_export(self, names: Iterable[str]) -> list[str]:
-        """Return signals, each once: those given, else all that were recorded.
-
-        A port is left out where the names of wires cover all its entries: each value is there once at least.
-        """
+        """Return signals, each once: those given, else all that were recorded, but for ports that wires cover."""
         names = list(names)
         for name in names:
             check_argument(name, kinds.text, "names", self.diagram_name)

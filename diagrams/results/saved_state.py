@@ -67,10 +67,7 @@ class RunState:
 
 
 def layout_of(flat: FlatDiagram) -> StateLayout:
-    """Return the layout of a saved state: two diagrams with equal layouts can exchange states.
-
-    A block's states count by their names, since its parameters may leave some out.
-    """
+    """Return the layout of a state, by names, as parameters may leave states out; equal ones can exchange states."""
     return flat.keep("layout of a saved state", lambda: _lay_out(flat))
 
 

@@ -1,4 +1,4 @@
-"""Names of a run's signals: full names, and the entries that they stand for.
+"""Names of a run's signals: full names, and the entries that they mean.
 
 ``name[i]`` is an entry of a vector, ``name[i,j]`` one of a matrix. In names entries are counted from 1, as in FMI; of a
 matrix a single number counts row by row, as the columns of exported tables do.
@@ -37,21 +37,11 @@ def resolve(
     blocks: Mapping[str, Any] | None = None,
     outputs: BlockOutputs | None = None,
 ) -> str:
-    """Return the full name that ``name`` stands for: a wire's or port's path, or a unique end of one; wires go first.
+    """Return the full name that ``name`` means: a wire's or port's path, or a unique end of one; wires go first.
 
     An output ``w`` goes before ports of the same block with longer names, such as ``inertia.w``. An entry, ``name[1]``,
-    stays behind it. Last of all, a block with one output, secondary ones aside, is that output by its own name.
-
-    Parameters
-    ----------
-    name : str
-        The name.
-    wires, ports : mapping, collection
-        Named wires, and the dotted paths of ports.
-    blocks : mapping, optional
-        Blocks by path, whose names stand for their outputs; an error names their variables that are no ports.
-    outputs : mapping, optional
-        Outputs by their blocks' paths, where the blocks are not there: those of `outputs_of`.
+    stays behind it. Last of all, a block with one output, secondary ones aside, is that output by its own name: by
+    ``blocks``, with which an error names their variables that are no ports, or by ``outputs`` of `outputs_of`.
     """
     if not isinstance(name, str):
         raise UnknownNameError(
@@ -104,12 +94,12 @@ def outputs_of(blocks: Mapping[str, Any]) -> BlockOutputs:
 
 
 def find_blocks(name: str, paths: Collection[str]) -> list[str]:
-    """Return the paths of the blocks that a name stands for: the path itself, or all of which it is an end."""
+    """Return the paths of the blocks that a name means: the path itself, or all of which it is an end."""
     return [name] if name in paths else [path for path in paths if path.endswith("." + name)]
 
 
 def _only_output(name: str, ports: Collection[str], outputs: BlockOutputs) -> str:
-    """Return the path of the only output of the blocks that a name stands for, "" where there is none."""
+    """Return the path of the only output of the blocks that a name means, "" where there is none."""
     paths = find_blocks(name, outputs)
     found = [full for path in paths for full in (f"{path}.{output}" for output in outputs[path]) if full in ports]
     if len(found) < 2:

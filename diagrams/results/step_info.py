@@ -137,13 +137,7 @@ class StepInfo(ShownAsTable):
 
 
 def find_step(diagram: Any, end: float, start: float, who: str) -> float:
-    """Return the time in s of the only step of a diagram's `Step` blocks up to an end; the start where there is none.
-
-    Raises
-    ------
-    OptionError
-        If there are several.
-    """
+    """Return the time in s of the only step of a diagram's `Step` blocks up to an end; the start without any."""
     blocks: Mapping[str, Any] = {} if diagram is None else diagram.blocks
     found = [
         (float(t), path) for path, block in blocks.items() if isinstance(block, Step) for t in np.ravel(block.times)
@@ -163,20 +157,9 @@ def find_step(diagram: Any, end: float, start: float, who: str) -> float:
 def measure_info(
     signal: str, unit: str, t: np.ndarray, y: np.ndarray, since: float, *, held: bool, final: float | None
 ) -> StepInfo:
-    """Return the numbers of a signal's response to a step.
+    """Return the numbers of a signal's response to a step at ``since``, with times and samples up to its end.
 
-    Parameters
-    ----------
-    signal, unit : str
-        Name of the signal, and its unit.
-    t, y : (N,) ndarray
-        Times in s up to the end of the response, and the signal.
-    since : float
-        Time of the step.
-    held : bool
-        Whether the signal is constant between its samples.
-    final : float, optional
-        Value that is expected at the end.
+    ``held`` is whether the signal is constant between its samples, ``final`` the value that it should come to.
     """
     first = int(np.searchsorted(t, since * (1.0 - 1e-12) - 1e-12))
     after = t[first:]

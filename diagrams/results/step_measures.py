@@ -28,25 +28,13 @@ NONE = Measured(math.nan, math.nan)
 
 @dataclass(frozen=True, eq=False)
 class ExpectedStep:
-    """The linear model's response to a step, next to which a response is measured.
+    """The linear model's response to a step, next to which a response is measured."""
 
-    Attributes
-    ----------
-    response : (N,) ndarray
-        Change of the signal at the samples.
-    final : float
-        Change that it comes to; NaN where it does not rest.
-    low, high : float
-        Smallest and largest change after the last sample.
-    between : float
-        Largest size between the samples, less that at the samples; NaN where it is not known.
-    """
-
-    response: np.ndarray
-    final: float
-    low: float
-    high: float
-    between: float
+    response: np.ndarray  # (N,): change of the signal at the samples
+    final: float  # change that it comes to; NaN where it does not rest
+    low: float  # smallest change after the last sample
+    high: float  # largest change after the last sample
+    between: float  # largest size between the samples, less that at them; NaN where it is not known
 
 
 def measure_step(
@@ -61,40 +49,23 @@ def measure_step(
 ) -> dict[str, Measured]:
     """Return the numbers of a step response: ``final``, ``overshoot``, ``settling``, ``rise`` and ``peak``.
 
+    ``t`` are the times since the step in s, two of one time before and after a jump, ``r`` the change of the signal,
+    (N,) both; ``held``: it is constant between samples. Otherwise a peak may lie between two: the tolerance has twice
+    the height of a parabola through three of them, or what the linear model has there. ``target`` is the final change
+    that is expected; a response that is not there at the end has not settled: a limit may hold it elsewhere. The final
+    value of ``expected`` is a target, too. ``slowest`` is the rate in 1/s of the slowest mode, without which a response
+    is taken to stay as it is in the last tenth; ``accuracy`` the samples' error, relative to the largest change.
+
     The tolerances contain what may lie between two samples, and what the response may still do after its record. With a
     linear model next to it, its final value is that of the model plus the distance at the end of the record. That
     distance, or without a model the response itself, may still change by what its slowest mode has left, by its
     movement in the second half of the record.
 
-    Parameters
-    ----------
-    t : (N,) array
-        Time since the step in s, ascending; two samples of one time are those before and after a jump.
-    r : (N,) array
-        Change of the signal.
-    held : bool
-        Whether the signal is constant between the samples. Otherwise a peak may lie between two: the tolerance has
-        twice the height of a parabola through three of them, or what the linear model has there.
-    target : float, optional
-        Final change that is expected, such as the linear model's. A response that is not there at the end has not
-        settled: a limit may hold it elsewhere. Without it the response's own end is taken.
-    expected : ExpectedStep, optional
-        The linear model's response; its final value is a target, too.
-    slowest : float, optional
-        Rate in 1/s of the slowest mode. Without it a response is taken to stay as it is in the last tenth.
-    accuracy : float
-        Error of the response at the samples, relative to its largest change.
+    The peak of a response that does not rest (`is_at_rest`) is that of its record. All others are NaN where the
+    response has no final value, goes back to zero, or may still leave the band around its final value after the
+    record. With a target, the times of a response that does not come to it are infinite. An overshoot within its
+    tolerance is 0.
 
-    Returns
-    -------
-    dict of str to Measured
-        The peak of a response that does not rest (`is_at_rest`) is that of its record. All others are NaN where the
-        response has no final value, goes back to zero, or may still leave the band around its final value after the
-        record. With a target, the times of a response that does not come to it are infinite. An overshoot within its
-        tolerance is 0.
-
-    Examples
-    --------
     >>> t = np.linspace(0.0, 10.0, 1001)
     >>> found = measure_step(t, 1 - np.exp(-t), held=False)
     >>> [round(found[name].value, 2) for name in ("final", "overshoot", "settling", "rise")]

@@ -120,20 +120,13 @@ class Header(TypedDict):
     outputs: NotRequired[Mapping[str, Sequence[str]]]
 
 
-class StoppedEntry(TypedDict):
-    """A `Stopped` in a file."""
-
-    t: float
-    block: str
-
-
 class End(TypedDict, total=False):
     """The end of a stored run."""
 
     elapsed: float
     messages: list[str]
     texts: dict[str, list[list[Any]]]
-    stopped: StoppedEntry | None
+    stopped: dict[str, Any] | None
 
 
 def header(
@@ -150,24 +143,9 @@ def header(
 ) -> Header:
     """Return the header of a stored run.
 
-    Parameters
-    ----------
-    diagram : str
-        The diagram's name.
-    layout : Layout
-        Entries of each port in the vector of a sample; the states follow them.
-    wires, units : mapping
-        Named wires, and units of ports.
-    width : int
-        Entries of that vector, without the residual.
-    columns : sequence of int, optional
-        Entries that are recorded; None for all.
-    has_states : bool
-        Whether the states are among them.
-    residual : bool
-        Whether each row ends with the residual of the algebraic loops.
-    outputs : mapping, optional
-        Outputs by their blocks' paths, secondary ones aside, by which a block's name is found to be a signal.
+    The vector of a sample has the ports of ``layout``, then the states, ``width`` entries, of which ``columns`` are
+    recorded (None for all). With ``residual`` each row ends with that of the algebraic loops. ``outputs`` are those of
+    `outputs_of`, by which a block's name is found to be a signal.
     """
     # Entries count from 1 and carry their port's name: other tools read these column names.
     entries = [""] * width
@@ -218,10 +196,7 @@ def prepare(folder: Path, overwrite: bool) -> None:
 
 
 def create(folder: Path, head: Mapping[str, object]) -> tuple[FileIO, TextIO]:
-    """Write the header, and return the open files for rows and events.
-
-    Files of an earlier run are removed, not emptied, so a reader that has them open still reads the earlier run.
-    """
+    """Write the header, and return the open files for rows and events; an earlier run that a reader has open stays."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in (HEADER, END, EVENTS, ROWS):
         (folder / name).unlink(missing_ok=True)
@@ -248,25 +223,9 @@ def event_line(event: Occurrence) -> str:
 
 
 def write(folder: Path, head: Header, parts: Sequence[np.ndarray], events: Iterable[Occurrence], **end: object) -> None:
-    """Write a run that is complete; see `Run.save`.
+    """Write a run that is complete; see `Run.save`. DiskError: it can't be written.
 
-    Parameters
-    ----------
-    folder : Path
-        The run's folder.
-    head : Header
-        Its header.
-    parts : sequence of ndarray
-        Times, shape (n, 1), samples, shape (n, columns), and residuals, shape (n, 1), where there are any.
-    events : iterable of Occurrence
-        The events that fired.
-    **end
-        Facts about its end; see `End`.
-
-    Raises
-    ------
-    DiskError
-        If it can't be written.
+    ``parts`` are times, (n, 1), samples, (n, columns), and residuals, (n, 1), where there are any; ``end`` as in `End`.
     """
     events, n = list(events), _BLOCK // (8 * len(head["columns"])) + 1
     with explain_disk_errors(f"the run can't be written to {os.fspath(folder)!r}", folder, OTHER_PATH):

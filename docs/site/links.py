@@ -19,7 +19,6 @@ _NAME = re.compile(r"(?:loopwright\.)?[A-Za-z_][\w.]*?(?=\(|$)")
 _INSTANCES = {"diagram": "Diagram", "run": "Run", "fmu": "Fmu"}
 """Names that pages give to instances, and their classes."""
 
-
 _ALSO_WORDS = {"final", "hold", "maximum", "mean", "minimum"}
 """Functions whose names are those of parameters, too: linked where they are called."""
 
@@ -41,7 +40,7 @@ def _index(env: BuildEnvironment) -> dict[str, _Described]:
     found: dict[str, _Described] = {}
     for full, entry in env.domaindata["py"]["objects"].items():
         parts = full.split(".")
-        if entry.objtype in ("module",):
+        if entry.objtype == "module":
             continue
         member = entry.objtype in ("method", "property", "attribute")
         short = ".".join(parts[-2:] if member else parts[-1:])

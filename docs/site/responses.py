@@ -48,30 +48,14 @@ _ELLIPSE = b.Ellipse(semi_axes=(0.3, 0.15))
 
 @dataclass(frozen=True)
 class Example:
-    """A block, the sources at its inputs, and what is shown of it.
-
-    Attributes
-    ----------
-    block : Block
-        The block.
-    inputs : Mapping[str, Block]
-        A source for each of its inputs that is shown.
-    duration : float
-        Simulated time in s.
-    sample_time : float or None
-        Seconds between two ticks; None leaves the block in continuous time.
-    outputs : tuple of str
-        Outputs to show; all of them where it is empty.
-    hidden : tuple of str
-        Inputs that are wired and not shown.
-    """
+    """A block, the sources at its inputs, and what is shown of it."""
 
     block: Block
     inputs: Mapping[str, Block | Call | Signal] = field(default_factory=dict)
-    duration: float = 1.0
-    sample_time: float | None = None
-    outputs: tuple[str, ...] = ()
-    hidden: tuple[str, ...] = ()
+    duration: float = 1.0  # s
+    sample_time: float | None = None  # s; None leaves the block in continuous time
+    outputs: tuple[str, ...] = ()  # to show; all where it is empty
+    hidden: tuple[str, ...] = ()  # inputs that are wired and not shown
 
 
 def _sine(amplitude: float = 1.0, frequency: float = 1.0, bias: float = 0.0, **options: Any) -> Block:
