@@ -5,7 +5,7 @@ from .differences import differentiate, extrapolate
 from .discretization import check_method, find_hold, hold
 from .equations import initial_state, is_only_sampled, start_shapes, start_values, state_after_start
 from .model_exchange import describe_model_exchange
-from .numpy_check import GUARDS, NEXT, evaluate
+from .numpy_check import GUARDS, NEXT, Columns, Point, Values, evaluate
 from .opaque_equations import raise_failure
 from .operations import MATH_FUNCTIONS
 from .structure import has_structure, is_traced_by, traced_parameters
@@ -18,8 +18,11 @@ __all__ = [
     "GUARDS",
     "MATH_FUNCTIONS",
     "NEXT",
+    "Columns",
     "Line",
+    "Point",
     "Traced",
+    "Values",
     "as_traced",
     "bundle",
     "check_method",

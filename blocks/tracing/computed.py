@@ -25,17 +25,8 @@ _SAME = 1e-9  # relative difference between a traced result and Python's, beyond
 def trace_initial(
     block: Block, traced: Traced, sampled: bool, at: Mapping[str, np.ndarray], p: np.ndarray, expected: np.ndarray
 ) -> Any:
-    """Return the states that ``initial`` computes, as a function of the inputs' columns and p; None if it can't be had.
-
-    Parameters
-    ----------
-    at : mapping of str to ndarray
-        Inputs, flat, at which the function is compared with Python's result.
-    p : ndarray
-        Parameters of the block, as `Traced.pack` gives them.
-    expected : ndarray
-        The states that ``initial`` returns there, flat.
-    """
+    """Return the states that ``initial`` computes, as a function of the inputs' columns and p; None if that fails."""
+    # it is compared with the states that Python's `initial` returns at the inputs `at`; all are flat
     try:
         tracer = _Tracer(block, dict(traced.inputs), sampled, traced.method, True)
         u = bundle("u", {n: wrap(c, s) for (n, s), c in zip(traced.inputs.items(), tracer.u, strict=True)})
@@ -50,15 +41,8 @@ def trace_initial(
 
 
 def trace_numbers(block: Block, traced: Traced, T: float, p: np.ndarray) -> Any:
-    """Return all numbers behind the parameters in p as a CasADi function of these; None if it can't be had.
-
-    Parameters
-    ----------
-    T : float
-        Sample time in s; NaN in continuous time.
-    p : ndarray
-        Parameters of the block, as `Traced.pack` gives them, with which the function is compared.
-    """
+    """Return all numbers behind the parameters in p as a CasADi function of these; None if that fails."""
+    # T is NaN in continuous time; the function is compared with p, as `Traced.pack` gives it
     entries = [*traced_parameters(block)]
     count = sum(int(np.size(value)) for _, value in entries)
     try:

@@ -45,12 +45,9 @@ def hold(A: np.ndarray, T: float, method: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_hold(A: Any, T: float, method: str) -> tuple[Any, Any]:
-    """Return what `hold` does, from arguments of known kinds: a sweep does so for each of its runs.
-
-    A may be rows of symbols, as a block's parameters are where it is exported.
-    """
+    """Return the matrices of `hold`, from arguments of known kinds: a sweep does so for each of its runs."""
     check_method(method)
-    if holds_symbols(A):
+    if holds_symbols(A):  # a block's parameters, where it is exported
         return hold_of_symbols(A, T, method)
     A = np.atleast_2d(np.asarray(A, dtype=float))
     n = len(A)

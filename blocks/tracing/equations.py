@@ -27,7 +27,7 @@ _ARGUMENTS = {
     "constants": ("T", "method"),
     "next_instant": ("t",),
 }
-_SAMPLED = ("output", "update", "guards")  # may take T besides
+_SAMPLED = ("output", "update", "guards")  # may take T as well
 
 
 def check_definition(block: Block) -> None:

@@ -16,17 +16,7 @@ from .traced import Traced
 
 
 def describe_model_exchange(block: Block, shapes: Mapping[str, Shape], *, sampled: bool) -> Traced:
-    """Return the description of a block whose class says ``in_model_exchange``.
-
-    Its functions have the ports and the structure of dependencies; their values are NaN, since an evaluator gives them.
-
-    Parameters
-    ----------
-    shapes : mapping
-        Shape of every input.
-    sampled : bool
-        Whether the block is in a sampled subsystem.
-    """
+    """Return the description of a block whose class says ``in_model_exchange``, for inputs of the given shapes."""
     if sampled:
         raise SampleTimeError(
             "a solver integrates its states (model exchange), and it is in a sampled subsystem, which has no solver. "
@@ -40,6 +30,7 @@ def describe_model_exchange(block: Block, shapes: Mapping[str, Shape], *, sample
     t, x, p = ca.MX.sym("t"), ca.MX.sym("x", sizes[NEXT]), ca.MX.sym("p", 1)
     u = [ca.MX.sym(f"u{i}", size(s)) for i, s in enumerate(shapes.values())]
     known = {"t": t, "x": x, **dict(zip(shapes, u, strict=True))}
+    # The functions have the ports and the structure of dependencies. Their values are NaN: an evaluator gives them.
     results, depends = [], {}
     # Dependences are read from the sparsity of these functions, as for every block; so each result is NaN, and
     # depends on what the FMU declares.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -34,21 +35,9 @@ def compare(
 ) -> None:
     """Evaluate a traced function and its equations at random points, and at halves, zeros and integers.
 
-    A point at which NumPy can't compute (a division by zero, a singular matrix) is left out.
-
-    Parameters
-    ----------
-    block : Block
-        The block of the equations.
-    function : casadi.Function
-        Function of (t, x, one column per input, p), for ``jump`` also of the events that have fired.
-    names : sequence of str
-        Names of the function's results: outputs, `NEXT`, `GUARDS`, ``derivative``, ``indicators``, ``jump``.
-    shapes, starts, entries, constants
-        Shapes of the inputs, start values of the states, parameters and precomputed numbers.
-    sampled : bool
-        Whether the block is in a sampled subsystem; the sample time is then 1 s.
+    ``names`` are those of the function's results: outputs, `NEXT`, `GUARDS`, ``derivative``, ``indicators``, ``jump``.
     """
+    # a point at which NumPy can't compute (a division by zero, a singular matrix) is left out
     T = 1.0 if sampled else float("nan")
     p = np.concatenate([*(np.ravel(v) for _, v in entries), [T], *map(np.ravel, constants.values())])
     numbers_of_p = ca.DM(np.concatenate([p, np.zeros(function.numel_in(2 + len(shapes)) - p.size)]))  # converted once
@@ -56,7 +45,7 @@ def compare(
     rng = np.random.default_rng(20140)
     _refuse_rounding(block, next(_special_points(shapes, starts, block)), np.float64(T), numbers, names)
 
-    def evaluate_with_numpy(point: _Point) -> dict[str, np.ndarray]:
+    def evaluate_with_numpy(point: Point) -> dict[str, np.ndarray]:
         try:
             found = evaluate(block, point.arguments(), np.float64(T), numbers, names)
         except _SINGULAR:
@@ -69,7 +58,7 @@ def compare(
             if not expected:
                 continue
             arguments = [
-                *point.flatten(),
+                *point.columns(),
                 numbers_of_p,
                 *([np.array(list(point.fired.values()))] if "jump" in names else []),
             ]
@@ -86,58 +75,76 @@ def compare(
                     )
 
 
-class _Point:
-    """Arguments at which equations are evaluated."""
+Columns = list[float | np.ndarray]
+"""Arguments of a traced function: t, then flat vectors, or matrices of one column for each point."""
+Values = dict[str, np.float64 | np.ndarray]
+"""Values of states, inputs or events by name."""
 
-    def __init__(self, t: float, x: dict[str, np.ndarray], u: dict[str, np.ndarray], fired: dict[str, float]):
-        self.t, self.x, self.u, self.fired = t, x, u, fired
 
-    def flatten(self) -> list[Any]:
+@dataclass(frozen=True)
+class Point:
+    """Arguments at which equations are evaluated; states, inputs and events by name."""
+
+    t: float
+    x: dict[str, np.ndarray]
+    u: dict[str, np.ndarray]
+    fired: dict[str, float]
+
+    def columns(self) -> Columns:
         """Return t, x and the inputs, flat, as a traced function takes them."""
         return [self.t, np.concatenate([*map(np.ravel, self.x.values()), np.zeros(0)]), *map(np.ravel, self.u.values())]
 
-    def arguments(self) -> tuple[Any, dict[str, Any], dict[str, Any], dict[str, Any]]:
-        """Return t, x, u and fired as `evaluate` takes them: NumPy's numbers, which divide by zero without raising."""
-        x, u = ({n: np.float64(v) if np.ndim(v) == 0 else v for n, v in d.items()} for d in (self.x, self.u))
+    def arguments(self) -> tuple[np.float64, Values, Values, Values]:
+        """Return copies of t, x, u and fired as `evaluate` takes them."""
+        # NumPy's own numbers divide by zero without raising, as a trace does
+        x, u = ({n: np.float64(v) if np.ndim(v) == 0 else np.array(v) for n, v in d.items()} for d in (self.x, self.u))
         return np.float64(self.t), x, u, {n: np.float64(v) for n, v in self.fired.items()}
 
-    def move(self, rng: np.random.Generator) -> _Point:
+    def with_input(self, name: str, value: np.ndarray) -> Point:
+        """Return the point with another value of one input."""
+        return replace(self, u={**self.u, name: value})
+
+    def move(self, rng: np.random.Generator) -> Point:
         """Return a point nearby."""
 
         def shift(value: Any) -> Any:
             return value + _NEARBY * rng.choice([-1.0, 1.0], size=np.shape(value))
 
         x, u = ({n: shift(v) for n, v in d.items()} for d in (self.x, self.u))
-        return _Point(float(shift(self.t)), x, u, self.fired)
+        return Point(float(shift(self.t)), x, u, self.fired)
+
+    def __str__(self) -> str:
+        x, u = ({n: np.asarray(v).tolist() for n, v in d.items()} for d in (self.x, self.u))
+        return f"t = {self.t:.6g}, x = {x}, u = {u}"
 
 
 def _random_points(
     rng: np.random.Generator, shapes: Mapping[str, Shape], starts: Mapping[str, np.ndarray], block: Block
-) -> Iterator[_Point]:
+) -> Iterator[Point]:
     for _ in range(_POINTS):
         t = float(rng.uniform(0.0, 2.0))
         x = {k: v + 0.1 * rng.standard_normal(v.shape) for k, v in starts.items()}
         u = {k: rng.standard_normal(s) for k, s in shapes.items()}
-        yield _Point(t, x, u, {k: float(rng.integers(2)) for k in block.events})
+        yield Point(t, x, u, {k: float(rng.integers(2)) for k in block.events})
 
 
-def _special_points(shapes: Mapping[str, Shape], starts: Mapping[str, np.ndarray], block: Block) -> Iterator[_Point]:
+def _special_points(shapes: Mapping[str, Shape], starts: Mapping[str, np.ndarray], block: Block) -> Iterator[Point]:
     for number, values in enumerate(_SPECIAL):
         x = {k: v + np.resize(values, v.shape) for k, v in starts.items()}
         u = {k: np.resize(values, s) for k, s in shapes.items()}
-        yield _Point(abs(values[0]), x, u, {k: float((i + number) % 2) for i, k in enumerate(block.events)})
+        yield Point(abs(values[0]), x, u, {k: float((i + number) % 2) for i, k in enumerate(block.events)})
 
 
-def _is_on_edge(traced: np.ndarray, name: str, point: _Point, evaluate_with_numpy: Any) -> bool:
+def _is_on_edge(traced: np.ndarray, name: str, point: Point, evaluate_with_numpy: Any) -> bool:
     """Whether NumPy gives the traced values at points nearby: at an edge, either side is right."""
     rng = np.random.default_rng(2014)
     met = np.zeros(traced.shape, dtype=bool)
     for _ in range(8):
-        beside = evaluate_with_numpy(point.move(rng)).get(name)
-        if beside is None or beside.shape != traced.shape:
+        nearby = evaluate_with_numpy(point.move(rng)).get(name)
+        if nearby is None or nearby.shape != traced.shape:
             return True
         with np.errstate(all="ignore"):
-            met |= ~(np.abs(traced - beside) > 1e-4 * (1.0 + np.abs(beside)))
+            met |= ~(np.abs(traced - nearby) > 1e-4 * (1.0 + np.abs(nearby)))
     return bool(met.all())
 
 
@@ -216,13 +223,11 @@ def evaluate(
     return result
 
 
-def _refuse_rounding(block: Block, point: _Point, T: Any, numbers: Mapping[str, Any], names: Sequence[str]) -> None:
-    """Refuse `np.round` and `np.rint`: they differ from a trace at halves only, which random points don't hit.
-
-    Errors of the equations at this point are passed over, as elsewhere, except an operation that nobody handles.
-    """
-    t, x, u, fired = point.arguments()
-    x, u, fired, seen = ({n: watch(v) for n, v in d.items()} for d in (x, u, fired, numbers))
+def _refuse_rounding(block: Block, point: Point, T: Any, numbers: Mapping[str, Any], names: Sequence[str]) -> None:
+    """Refuse `np.round` and `np.rint`: they differ from a trace at halves only, which random points don't hit."""
+    # errors of the equations at this point are passed over, as elsewhere, except an operation that nobody handles
+    t, *given = point.arguments()
+    x, u, fired, seen = ({n: watch(v) for n, v in d.items()} for d in (*given, numbers))
     with record_rounding() as rounded:
         try:
             evaluate(block, (watch(t), x, u, fired), watch(T), seen, names)

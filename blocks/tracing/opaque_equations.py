@@ -20,17 +20,7 @@ from .symbols import bundle, size, with_values, wrap
 
 
 class Foreign:
-    """The equations of an opaque block.
-
-    Parameters
-    ----------
-    block : Block
-        The block.
-    shapes, starts
-        Shapes of the inputs, start values of the states.
-    numbers : sequence of (str, value)
-        Entries of p, in order; "T" is the sample time.
-    """
+    """The equations of an opaque block; ``numbers`` are the entries of p in their order, with "T" the sample time."""
 
     def __init__(
         self,
@@ -189,10 +179,7 @@ class _Equation(_Foreign):
 
 
 class _Differences(_Foreign):
-    """Jacobian of an equation, by central differences of fourth order.
-
-    The steps are relative to the value, or to its nominal value where that is larger.
-    """
+    """Jacobian of an equation: differences whose steps are relative to a value, or its nominal one if larger."""
 
     def __init__(self, equation: _Equation, name: str, options: Mapping[str, Any]):
         self.equation = equation

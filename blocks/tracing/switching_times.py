@@ -19,21 +19,9 @@ _LARGEST = 20_000  # operations beyond which a trace is not searched
 
 
 def switching_times(traced: Traced, p: np.ndarray, lines: Mapping[str, Line]) -> dict[float, bool]:
-    """Return the times at which outputs or rates may not be smooth.
+    """Return the times at which outputs or rates may not be smooth, where ``lines`` are the inputs that are lines.
 
     Each comes with whether the equations still have the value from before at the time itself, as ``t > 0.5`` has.
-
-    A block whose equation says ``np.where(t > 0.5, …)`` switches at 0.5 s, and so does one that says it of an input
-    that is a straight line in time.
-
-    Parameters
-    ----------
-    traced : Traced
-        The equations of the block.
-    p : ndarray
-        Its parameters, as its functions take them.
-    lines : mapping
-        By name, the inputs that are straight lines in time.
     """
     try:
         function = traced.function.expand()

@@ -23,11 +23,7 @@ def holds_symbols(rows: Any) -> bool:
 
 
 def hold_of_symbols(rows: Any, T: float, method: str) -> tuple[Any, Any]:
-    """Return Ad and Φ of `loopwright.hold` as arrays of symbols; see there.
-
-    ``exact`` is computed by Taylor's series of a matrix that is scaled down, and squarings: as many as its norm asks
-    for.
-    """
+    """Return Ad and Φ of `loopwright.hold` as arrays of symbols; see there."""
     A = _matrix(rows)
     n = A.size1()
     eye: Any = ca.MX(ca.DM.eye(n))
@@ -48,7 +44,7 @@ def hold_of_symbols(rows: Any, T: float, method: str) -> tuple[Any, Any]:
 
 
 def exponential(A: Any) -> Any:
-    """Return exp(A) of a square matrix of symbols."""
+    """Return exp(A) of a square matrix of symbols: Taylor's series of A scaled down, then squarings by its norm."""
     A = ca.densify(A)
     n = A.size1()
     eye: Any = ca.densify(ca.MX(ca.DM.eye(n)))

@@ -47,10 +47,7 @@ def has_large_product(function: Any) -> bool:
 
 
 def expand(function: Any) -> Any:
-    """Return the function in scalar (SX) operations, each done once.
-
-    With a table lookup in it, or a product with a large matrix, it is returned unchanged.
-    """
+    """Return the function in scalar (SX) operations, each done once; unchanged with a table or a large matrix in it."""
     if has_large_product(function):
         return function
     try:

@@ -104,24 +104,9 @@ def trace(
     zeros: bool = True,
     cache: dict[Any, Traced] | None = None,
 ) -> Traced:
-    """Trace ``block`` for inputs of the given shapes.
-
-    Parameters
-    ----------
-    block : Block
-        Any block with equations.
-    shapes : mapping
-        Shape of every input.
-    sampled : bool
-        Whether the block is in a sampled subsystem.
-    method : str
-        Discretization of a continuous block in a sampled subsystem.
-    zeros : bool
-        Whether parameters that are exactly zero are structure; False keeps every number a symbol, for export.
-    cache : dict, optional
-        Traces of users' blocks that may be shared: one dictionary for each build of a diagram. Blocks of the library
-        share theirs in the whole process.
-    """
+    """Trace ``block`` for inputs of the given shapes; ``zeros=False`` keeps exact zeros symbols, for export."""
+    # Traces of users' blocks are shared within one build of a diagram, which brings the cache; those of the library's
+    # blocks in the whole process.
     shared = None if block.opaque else _CACHE if _is_ours(block) else cache
     key = (structure(block), tuple(shapes.items()), sampled, method, zeros)
     found = None if shared is None else shared.get(key)
@@ -143,11 +128,9 @@ _OURS = __name__.partition(".")[0]
 
 
 def _is_ours(value: Any) -> bool:
-    """Whether a value is data, or an object of this package whose parameters are data or of this package too.
-
-    Functions, and the equations of other classes, may change between two builds: they may read a constant of their
-    module, a class attribute or a helper.
-    """
+    """Whether a value is data, or an object of this package whose parameters are data or of this package too."""
+    # Functions, and the equations of other classes, may change between two builds: they may read a constant of their
+    # module, a class attribute or a helper.
     if isinstance(value, Value):
         own = type(value).__module__.partition(".")[0] == _OURS
         return own and all(_is_ours(v) for v in value.parameters.values())

@@ -187,10 +187,8 @@ def _logic(operation: Callable[[Any, Any], Any], a: Any, b: Any) -> Any:
 
 
 def _hand_on(name: str, compute: Callable[[], Any]) -> Any:
-    """Return what CasADi's interface computes.
-
-    Arguments that it does not know it hands back to NumPy, which asks it again, without end: that is an error.
-    """
+    """Return what CasADi's interface computes."""
+    # arguments that it does not know it hands back to NumPy, which asks it again, without end: that is an error
     depth = _depth.get()
     if depth >= _DEEPEST:
         raise NotTracedError(advise_on_arguments(name))

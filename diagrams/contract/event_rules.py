@@ -4,24 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import casadi as ca
 import numpy as np
 
 from ...blocks.core import Block, LoopwrightError, is_before, left_of, right_of
 from ...blocks.library import Clock
-from ...blocks.tracing import bundle, switching_times
-from .exercise import Bench, Columns, Point
+from ...blocks.tracing import Columns, Point, bundle, initial_state, switching_times
+from .exercise import Bench
 from .value_rules import rule_error
 
 N = TypeVar("N", float, np.ndarray)
 
-_INSTANTS = 200  # looked at, at most
+_INSTANTS = 20_000  # of those that a block announces, looked at, at most
+_TIMES, _OPAQUE_TIMES = 20_000, 2_001  # at which equations are looked at, and those of an opaque block
 _SAME_INSTANT = 100  # jumps that may follow each other at one instant
 _FINENESS = 13  # refinements of an interval, by 8 each
-_INSTANTS, _FOREIGN_INSTANTS = 20_000, 2_001
-"""Points in time at which equations are looked at, and those of foreign code."""
 _TIME = np.zeros(1), np.ones(1)  # the time as a straight line
 
 
@@ -56,15 +55,7 @@ def find_instants(block: Block, end: float) -> list[float]:
 
 
 def check_smooth(bench: Bench, announced: list[float], duration: float) -> int:
-    """Look for jumps that nothing announces, in a continuous subsystem, and return the number of intervals searched.
-
-    Parameters
-    ----------
-    announced : list of float
-        Instants that the block announces.
-    duration : float
-        Time in s over which jumps in time are looked for.
-    """
+    """Look for jumps that ``announced`` instants don't explain, within ``duration``; return the number of intervals."""
     if bench.sampled or not (bench.traced.outputs or bench.traced.states) or bench.block.memory:
         return 0
     searched = 0
@@ -73,7 +64,7 @@ def check_smooth(bench: Bench, announced: list[float], duration: float) -> int:
     hidden = {} if bench.block.opaque else switching_times(bench.traced, bench.p, dict.fromkeys(clocks, _TIME))
     hidden = {t: late for t, late in hidden.items() if 0.0 < t < duration and not _is_known(t, announced)}
     edges = np.unique([0.0, *announced[:24], *sorted(hidden)[:24], duration])
-    points = _FOREIGN_INSTANTS if bench.block.opaque else _INSTANTS // (len(edges) - 1) + 65
+    points = _OPAQUE_TIMES if bench.block.opaque else _TIMES // (len(edges) - 1) + 65
     function = bench.traced.function
     symbols = function.mx_in()
     *outputs, rates, _ = function.call(symbols)
@@ -164,11 +155,9 @@ def _evaluate_domains(bench: Bench, columns: Columns) -> tuple[bool, ...]:
 def _find_jump(
     values_at: Callable[[np.ndarray], np.ndarray], domains_at: Callable[[float], tuple[bool, ...]], points: int = 65
 ) -> float | None:
-    """Return a place in [0, 1] at which a row of a function jumps without a change of domains, or None.
-
-    The part with the largest change is refined again and again. The change of a smooth function shrinks with it, that
-    of a jump stays.
-    """
+    """Return a place in [0, 1] at which a row of a function jumps without a change of domains, or None."""
+    # The part with the largest change is refined again and again. The change of a smooth function shrinks with it, that
+    # of a jump stays.
     grid = np.linspace(0.0, 1.0, points)
     coarse = values_at(grid)
     for row in range(len(coarse)):
@@ -203,7 +192,7 @@ def check_events(bench: Bench) -> tuple[int, set[str]]:
     x, shown = np.asarray(bench.points[0].columns()[1]), np.zeros(len(names), dtype=int)
     if block.starts_from_inputs:
         first = {n: np.asarray(v) for n, v in exercise.inputs_at(0).items()}
-        x = np.concatenate([np.ravel(v) for v in _as_tuple(block.initial(bundle("u", first)), len(block.states))])
+        x = initial_state(block, bench.traced.states, bundle("u", first))
     above = None
     h = exercise.times[1]
     for i, t in enumerate(exercise.times):
@@ -241,7 +230,3 @@ def check_events(bench: Bench) -> tuple[int, set[str]]:
         if bench.traced.advance == "derivative":
             x = x + h * np.ravel(bench.evaluate_trace([t, x, *inputs])[len(bench.traced.outputs)])
     return int(shown.sum()), {n for n, count in zip(names, shown, strict=True) if not count}
-
-
-def _as_tuple(value: Any, count: int) -> tuple[Any, ...]:
-    return (value,) if count == 1 else tuple(value)

@@ -31,6 +31,8 @@ from ...blocks.core import (
 from ...blocks.tracing import (
     GUARDS,
     NEXT,
+    Columns,
+    Point,
     Traced,
     bundle,
     constants_of,
@@ -44,11 +46,6 @@ from ..results import Run
 from ..wiring import Collector, exact_time
 
 _SAMPLES = 400  # of the exercise, over its duration
-
-Columns = list[float | np.ndarray]
-"""Arguments of a traced function: t, then flat vectors, or matrices of one column for each point."""
-Values = dict[str, np.float64 | np.ndarray]
-"""Values of states, inputs or events by name."""
 
 
 class Wander(Block):
@@ -78,50 +75,13 @@ class Wander(Block):
 
 
 @dataclass(frozen=True)
-class Point:
-    """Arguments of equations; states and inputs by name."""
-
-    t: float
-    x: dict[str, np.ndarray]
-    u: dict[str, np.ndarray]
-    fired: dict[str, float]
-
-    def with_input(self, name: str, value: np.ndarray) -> Point:
-        """Return the point with another value of one input."""
-        return replace_fields(self, u={**self.u, name: value})
-
-    def columns(self) -> Columns:
-        """Return t, x and the inputs as a traced function takes them."""
-        return [self.t, np.concatenate([*map(np.ravel, self.x.values()), np.zeros(0)]), *map(np.ravel, self.u.values())]
-
-    def arguments(self) -> tuple[np.float64, Values, Values, Values]:
-        """Return t, x, u and fired as equations take them: copies, as NumPy's numbers and arrays."""
-        x, u = ({n: np.float64(v) if np.ndim(v) == 0 else np.array(v) for n, v in d.items()} for d in (self.x, self.u))
-        return np.float64(self.t), x, u, {n: np.float64(v) for n, v in self.fired.items()}
-
-    def __str__(self) -> str:
-        x, u = ({n: np.asarray(v).tolist() for n, v in d.items()} for d in (self.x, self.u))
-        return f"t = {self.t:.6g}, x = {x}, u = {u}"
-
-
-@dataclass(frozen=True)
 class Exercise:
-    """Ranges and signals that drive a block's inputs.
-
-    Attributes
-    ----------
-    shapes : dict
-        Shape of every input.
-    ranges : dict
-        Lowest and highest values of the inputs that are not wired to a signal.
-    signals : dict
-        Signals that the other inputs are wired to.
-    """
+    """Ranges and signals that drive a block's inputs."""
 
     block: Block
-    shapes: dict[str, Shape]
-    ranges: dict[str, tuple[np.ndarray, np.ndarray]]
-    signals: dict[str, Signal]
+    shapes: dict[str, Shape]  # of every input
+    ranges: dict[str, tuple[np.ndarray, np.ndarray]]  # lowest and highest values of the inputs without a signal
+    signals: dict[str, Signal]  # that the other inputs are wired to
     sample_time: float
     ticks: int
     seed: int

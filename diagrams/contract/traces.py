@@ -6,8 +6,8 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core import GuardError, ShapeError, TraceError, lay_out
-from ...blocks.tracing import GUARDS, NEXT, bundle
-from .exercise import Bench, Point
+from ...blocks.tracing import GUARDS, NEXT, Point, bundle
+from .exercise import Bench
 from .value_rules import rule_error
 
 _STEP = 1e-6  # of differences, relative to 1 + |v|

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import Block, DefinitionError, LoopwrightError, Shape, UnitError, parse_unit
-from ...blocks.tracing import bundle, size, state_after_start, with_values
-from .exercise import Exercise, Point, Values, numbers_of
+from ...blocks.core import Block, DefinitionError, Layout, LoopwrightError, Shape, UnitError, parse_unit
+from ...blocks.tracing import Point, Values, bundle, size, state_after_start, with_values
+from .exercise import Exercise, numbers_of
 
 
 def rule_error(
@@ -200,7 +200,7 @@ def check_purity(exercise: Exercise, sampled: bool, places: list[Point]) -> int:
 
 
 def _evaluate_all(block: Block, point: Point, T: float | None) -> dict[str, bytes]:
-    """Return the result of every equation as bytes, without those that fail; tracing tells why they do."""
+    """Return the result of every equation as bytes, without those that fail: tracing says why they do."""
     result = {}
     for equation in ("output", "derivative", "update", "guards", "indicators", "jump", "initial"):
         if not hasattr(block, equation) or (equation == "update" and T is None):
@@ -212,8 +212,6 @@ def _evaluate_all(block: Block, point: Point, T: float | None) -> dict[str, byte
             arguments.append(bundle("fired", fired))
         try:
             found = _call(block, equation, arguments, T)
-        except LoopwrightError:
-            continue
         except Exception:  # a user's equation may raise anything
             continue
         _expect_unchanged(block, equation, point, x, u)
@@ -222,12 +220,10 @@ def _evaluate_all(block: Block, point: Point, T: float | None) -> dict[str, byte
 
 
 def check_after_start(exercise: Exercise, sampled: bool, places: list[Point], shapes: Mapping[str, Shape]) -> str:
-    """Check the states that ``after_start`` gives, and return a summary; ``shapes`` are those of the states.
-
-    They are finite, have the states' shapes, are the same again for the same arguments, and come from arguments that
-    stay unchanged. From states after the branch it leads to themselves: a point that is taken twice is the same point.
-    With the states after that of the start, the outputs are those of the start; the first place is there.
-    """
+    """Check the states that ``after_start`` gives, and return a summary; ``shapes`` are those of the states."""
+    # They are finite, have the states' shapes, are the same again for the same arguments, and come from arguments that
+    # stay unchanged. From states after the branch it leads to themselves: a point taken twice is the same point.
+    # With the states after that of the start, the outputs are those of the start; the first place is there.
     block = exercise.block
     T = exercise.sample_time if sampled else None
     shadow = with_values(block, numbers_of(block, math.nan if T is None else T, "exact"))
@@ -263,10 +259,7 @@ def check_after_start(exercise: Exercise, sampled: bool, places: list[Point], sh
                 f"{'None in a continuous subsystem' if T is None else f'{T:g} s here'}.",
                 block,
             )
-        ends = np.cumsum([0, *(size(shape) for shape in shapes.values())])
-        split: dict[str, Any] = {
-            n: found[a:b].reshape(s) for (n, s), a, b in zip(shapes.items(), ends, ends[1:], strict=False)
-        }
+        split: Values = {**Layout.of(shapes).split(found)}
         again = evaluate(split, u)
         if np.max(np.abs(again - found) / (1.0 + np.abs(found)), initial=0.0) > 1e-9:
             raise rule_error(
