@@ -7,6 +7,7 @@ import re
 import stat
 import weakref
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -31,7 +32,7 @@ from .aliases import find_aliases
 from .archive_limits import ArchiveLimits
 from .binaries import find_binary, judge_name
 from .faults import FmuFault, FmuFinding
-from .feedthrough import Feedthrough, feeds_through, read_feedthrough
+from .feedthrough import Dependencies, read_dependencies
 from .fmpy_description import read_model
 from .gathering import Elements, gather
 from .model_exchange_description import ModelExchangeInfo, read_model_exchange
@@ -109,18 +110,12 @@ class FmuDescription(ShownAsTable):
     """End of the default experiment in s, beyond which some FMUs take no step unless they are told a later one."""
     step_size: float | None = None
     """Communication step of the default experiment in s."""
-    dependencies: Feedthrough = field(default_factory=dict)
+    dependencies: Dependencies = field(default_factory=dict)
     """Variables that each output depends on, as the model structure says."""
     states: dict[str, str] = field(default_factory=dict)
     """Continuous states that are variables, with their derivatives' names, in the order of the model structure."""
     state_order: tuple[int, ...] = ()
     """Place of each of the FMU's continuous states among the elements of `states`; FMI sets them in its own order."""
-    model_exchange: str | None = None
-    """Model identifier of the model-exchange interface; None without that interface."""
-    model_exchange_binary: str = ""
-    """The library of the model-exchange interface for this platform, as its path in the archive."""
-    model_exchange_has_derivatives: bool = False
-    """Whether the FMU computes directional derivatives in model exchange."""
     limits: ArchiveLimits = field(default_factory=ArchiveLimits)
     """Limits within which it is read and unpacked."""
     findings: tuple[FmuFinding, ...] = ()
@@ -176,6 +171,16 @@ class FmuDescription(ShownAsTable):
         )
 
     @property
+    def model_exchange(self) -> str | None:
+        """Model identifier of the model-exchange interface; None without that interface."""
+        return None if self.exchange is None else self.exchange.identifier
+
+    @property
+    def model_exchange_has_derivatives(self) -> bool:
+        """Whether the FMU computes directional derivatives in model exchange."""
+        return self.exchange is not None and self.exchange.has_derivatives
+
+    @property
     def capabilities(self) -> list[str]:
         """What it can do in a run, in words."""
         flags = {
@@ -216,7 +221,8 @@ class FmuDescription(ShownAsTable):
 
     def feeds_through(self, source: FmuVariable, output: FmuVariable) -> bool:
         """Return whether an output may follow an input at once; it may where the model structure doesn't say."""
-        return feeds_through(self.dependencies, source, output)
+        found = [self.dependencies.get(key) for key in output.keys]
+        return any(of is None or not of.isdisjoint(source.keys) for of in found)
 
     @property
     def names(self) -> set[str]:
@@ -416,13 +422,10 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
     """Return the variables, states and capabilities of an FMU, as arguments of its description."""
     version = model.fmiVersion
     flags = _capabilities(root, version)
-    if flags["model_exchange"] is not None:
-        try:
-            flags["model_exchange_binary"] = find_binary(path, entries, version, flags["model_exchange"])
-        except FmuFileError:
-            flags["model_exchange"] = None
-        else:
-            flags["exchange"] = read_model_exchange(root, model, flags["model_exchange_binary"])
+    if model.modelExchange is not None:
+        with suppress(FmuFileError):  # without a library for this platform it is as good as none
+            binary = find_binary(path, entries, version, model.modelExchange.modelIdentifier)
+            flags["exchange"] = read_model_exchange(root, model, binary)
     flags["co_simulation"] = model.coSimulation is not None
     dropped, units = _dropped_attributes(root), FmuUnits({u.name: u for u in model.unitDefinitions})
     scalars, other, negated = {}, {}, read_negated(root, model)
@@ -453,7 +456,7 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
         "scalars": scalars,
         "derivatives": derivatives,
         "aliases": aliases,
-        "dependencies": read_feedthrough(model),
+        "dependencies": read_dependencies(model.outputs),
         "states": states,
         "state_order": order,
         "unit_complaints": tuple(units.complaints),
@@ -462,20 +465,16 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
 
 
 def _capabilities(root: Any, version: str) -> dict[str, Any]:
-    """Return the interfaces' flags (FMI 2.0, 3.3.1 and 4.3.1; FMI 3.0, 3.4 and 4.4), some of which FMPy drops."""
-    steps, exchange = root.find("CoSimulation"), root.find("ModelExchange")
-    if version == "1.0":
-        steps = root.find("Implementation//Capabilities")
-        exchange = root if root.find("Implementation/*") is None else None  # such an FMU has one interface
+    """Return the flags of co-simulation (FMI 2.0, 4.3.1; FMI 3.0, 4.4), some of which FMPy drops."""
+    steps = root.find("Implementation//Capabilities" if version == "1.0" else "CoSimulation")
     two = not version.startswith("3.")
     state = "FMUstate" if two else "FMUState"
-    derivative = "providesDirectionalDerivative" if two else "providesDirectionalDerivatives"
     fixed = None if steps is None or two else steps.get("fixedInternalStepSize")
     experiment = root.find("DefaultExperiment")
     return {
         "can_save": _flag(steps, f"canGetAndSet{state}"),
         "can_serialize": _flag(steps, f"canGetAndSet{state}") and _flag(steps, f"canSerialize{state}"),
-        "has_derivatives": _flag(steps, derivative),
+        "has_derivatives": _flag(steps, "providesDirectionalDerivative" if two else "providesDirectionalDerivatives"),
         "only_once": _flag(steps, "canBeInstantiatedOnlyOncePerProcess"),
         "has_event_mode": _flag(steps, "hasEventMode"),
         "interpolates_inputs": _flag(steps, "canInterpolateInputs" if two else "providesIntermediateUpdate"),
@@ -483,8 +482,6 @@ def _capabilities(root: Any, version: str) -> dict[str, Any]:
         "fixed_internal_step": None if fixed is None else float(fixed),
         "stop_time": None if experiment is None else _number(experiment.get("stopTime")),
         "step_size": None if experiment is None else _number(experiment.get("stepSize")),
-        "model_exchange": None if exchange is None else exchange.get("modelIdentifier"),
-        "model_exchange_has_derivatives": _flag(exchange, derivative),
     }
 
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
 from dataclasses import dataclass, field
 from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from .variables import FmuVariable, fmi3_type
-
-Key = tuple[str, int]
-"""Type, as FMI 3.0 names it, and value reference of a variable."""
+from .feedthrough import Dependencies, Key, key_of, read_dependencies
+from .variables import FmuVariable
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +34,7 @@ class ModelExchangeInfo:
     """Number of continuous states."""
     indicators: tuple[str, ...] = ()
     """Names of the event indicators."""
-    dependencies: Mapping[Key, frozenset[Key] | None] = field(default_factory=dict)
+    dependencies: Dependencies = field(default_factory=dict)
     """For each output and derivative of a state, the variables that it depends on; None: all. They are by type and
     value reference."""
 
@@ -90,7 +88,7 @@ def read_model_exchange(root: ET.Element, model: Any, binary: str) -> ModelExcha
         completes_steps=completes,
         state_count=int(model.numberOfContinuousStates),
         indicators=_indicators(model),
-        time=next((_key(v) for v in model.modelVariables if v.causality == "independent"), None),
+        time=next((key_of(v) for v in model.modelVariables if v.causality == "independent"), None),
         dependencies=_read_dependencies(root, model),
     )
 
@@ -105,20 +103,13 @@ def _read_dependencies(root: ET.Element, model: Any) -> dict[Key, frozenset[Key]
             if (found := element.find("DirectDependency")) is not None
         }
         return {
-            _key(known[name]): frozenset(_key(known[of]) for of in names if of in known)
+            key_of(known[name]): frozenset(key_of(known[of]) for of in names if of in known)
             for name, names in given.items()
             if name in known
         }
-    listed = {
-        _key(unknown.variable): None if unknown.dependencies is None else frozenset(map(_key, unknown.dependencies))
-        for unknown in (*model.outputs, *model.derivatives)
-    }
-    states = [_key(v.variable.derivative) for v in model.derivatives if v.variable.derivative is not None]
+    listed = read_dependencies((*model.outputs, *model.derivatives))
+    states = [key_of(v.variable.derivative) for v in model.derivatives if v.variable.derivative is not None]
     return {**listed, **{key: frozenset([key]) for key in states}}  # a state follows nothing else at once
-
-
-def _key(variable: Any) -> Key:
-    return fmi3_type(variable.type), variable.valueReference
 
 
 def _indicators(model: Any) -> tuple[str, ...]:
@@ -126,11 +117,8 @@ def _indicators(model: Any) -> tuple[str, ...]:
     count = int(model.numberOfEventIndicators)
     names: list[str] = []
     for unknown in model.eventIndicators:
-        size = 1
-        for extent in unknown.variable.shape or ():
-            size *= int(extent)
-        name = unknown.variable.name
-        names += [name] if size == 1 and not unknown.variable.shape else [f"{name}[{i + 1}]" for i in range(size)]
+        name, shape = unknown.variable.name, unknown.variable.shape
+        names += [f"{name}[{i + 1}]" for i in range(math.prod(map(int, shape)))] if shape else [name]
     if len(names) != count or len(set(names)) != count:
         names = [f"indicator[{i + 1}]" for i in range(count)]
     return tuple(names)

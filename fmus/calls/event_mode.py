@@ -172,21 +172,18 @@ class EventMode:
     def _settle(self, t: float) -> None:
         """Update the discrete states until nothing changes, and go back to Step Mode."""
         fmu = self.fmu
-        for _ in range(MOST_ROUNDS):
-            found = fmu.call("updating its discrete states", self.fmi.update_events)
-            if found.terminate:  # it stays in Event Mode, in which outputs can be read
-                fmu.take_end(t, 0.0, t)
-                return
-            if not found.again:
-                self.next_event = check_next_time(fmu.block, found.next_time, t)
-                break
-        else:
+        found = fmu.call("updating its discrete states", self.fmi.iterate_events)
+        if found.terminate:  # it stays in Event Mode, in which outputs can be read
+            fmu.take_end(t, 0.0, t)
+            return
+        if found.again:
             raise FmuRuntimeError(
                 f"the events don't settle in {MOST_ROUNDS} rounds (discreteStatesNeedUpdate); expected that they end. "
                 "Report it to its makers.",
                 block=fmu.block.label,
                 t=t,
             )
+        self.next_event = check_next_time(fmu.block, found.next_time, t)
         self._read_intervals(t, [c for c in self.clocks if not c.variable.is_periodic])
         fmu.call("entering Step Mode", self.fmi.enter_step_mode)
 

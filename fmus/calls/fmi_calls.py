@@ -438,11 +438,19 @@ class FmiCalls(ABC):
 
     def settle_events(self) -> None:
         """Go through the event iteration of an FMU in Event Mode, and back to Step Mode."""
+        if self.iterate_events().again:
+            raise RuntimeError(f"the events don't settle in {MOST_ROUNDS} rounds")
+        self.enter_step_mode()
+
+    def iterate_events(self) -> EventUpdate:
+        """Take rounds of the event iteration, and return what the last one says: ``again`` if they don't settle."""
         for _ in range(MOST_ROUNDS):
-            if not self.update_events().again:
-                self.enter_step_mode()
-                return
-        raise RuntimeError(f"the events don't settle in {MOST_ROUNDS} rounds")
+            found = self.update_events()
+            if found.terminate:
+                return found._replace(again=False)
+            if not found.again:
+                break
+        return found
 
     def activate_clocks(self, references: Sequence[int]) -> None:
         """Let input clocks tick, in Event Mode (FMI 3.0, 2.2.9)."""

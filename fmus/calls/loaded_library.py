@@ -55,7 +55,8 @@ class LoadedFmu:
         description, self.host = self.description, HostState(self.add_note)
         if make_calls is None:
             self._refuse_second()
-        make = make_calls or CALLS[description.fmi[0]]
+        make, exchange = make_calls or CALLS[description.fmi[0]], description.exchange
+        library = exchange.binary if model_exchange and exchange is not None else description.binary
         try:
             files = unpack(description)
         except FmuError as error:
@@ -68,7 +69,7 @@ class LoadedFmu:
                     name=block.label,
                     token=description.token,
                     folder=files,
-                    library=files / (description.model_exchange_binary if model_exchange else description.binary),
+                    library=files / library,
                     model_exchange=model_exchange,
                 )
                 self._fmu, self.fmi.lose, self._reading = self.fmi.fmu, self.lose, BoundReading(self.fmi)

@@ -23,21 +23,8 @@ _FORMS = {
     form: place
     for place, form in enumerate(
         (
-            "ppnp",
-            "ppnpn",
-            "pddi",
-            "pddc",
-            "pddcpppp",
-            "pd",
-            "ppn",
-            "p",
-            "pp",
-            "ppppppp",
-            "pipp",
-            "pcpp",
-            "ppnpp",
-            "pnp",
-            "pcp",
+            *("ppnp", "ppnpn", "pddi", "pddc", "pddcpppp", "pd", "ppn", "p"),
+            *("pp", "ppppppp", "pipp", "pcpp", "ppnpp", "pnp", "pcp"),
         )
     )
 }

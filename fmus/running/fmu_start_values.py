@@ -72,6 +72,10 @@ def check_state(variable: FmuVariable, value: Any, label: str) -> np.ndarray:
 def check_value(description: FmuDescription, name: str, value: Any, label: str) -> Any:
     """Return one start value in its variable's shape, or a text, after checking it; see `check_start`."""
     port = f"start.{name}"
+
+    def refuse(text: str) -> ParameterError:
+        return ParameterError(text, block=label, port=port)
+
     if name in description.other:
         return _check_text(description, name, value, label)
     if not any(name in known for known in (description.variables, description.elements, description.spelled)):
@@ -87,50 +91,39 @@ def check_value(description: FmuDescription, name: str, value: Any, label: str) 
     variable = description.find(name)
     if variable.causality in ("output", "local") and variable.start is None:
         if name in description.states:
-            raise ParameterError(
+            raise refuse(
                 "found a state without a start value in the FMU's description, as the FMU computes it when it "
-                "initializes; expected a variable that has one. Set the parameters or inputs that it is computed from.",
-                block=label,
-                port=port,
+                "initializes; expected a variable that has one. Set the parameters or inputs that it is computed from."
             )
-        raise ParameterError(
+        raise refuse(
             "found a variable that is computed and has no start value; set the states and parameters that it "
-            "depends on.",
-            block=label,
-            port=port,
+            "depends on."
         )
     if variable.variability == "constant" or variable.causality == "calculatedParameter":
         kind = "a constant" if variable.variability == "constant" else "a parameter that is computed"
-        raise ParameterError(
-            f"found {kind}, which can't be set; expected a parameter, a state or an input. Leave it out.",
-            block=label,
-            port=port,
-        )
+        raise refuse(f"found {kind}, which can't be set; expected a parameter, a state or an input. Leave it out.")
     if type(value) is float and _is_plainly_within(variable, value):
         return np.array(value)
-    numbers = _number_items(variable, value)
+    numbers = variable.items.get(value, value) if isinstance(value, str) else value
     if isinstance(numbers, str | bytes) or np.asarray(numbers).dtype.kind in "US":
         raise _refuse_words(variable, value, label)
     try:
         array = np.array(np.broadcast_to(np.asarray(numbers, dtype=float), variable.shape))
     except (TypeError, ValueError):
-        raise ParameterError(
-            f"found {value!r}; expected numbers of shape {variable.shape}.", block=label, port=port
-        ) from None
+        raise refuse(f"found {value!r}; expected numbers of shape {variable.shape}.") from None
     if variable.is_integer and _too_large(numbers):  # before it is rounded
-        raise ParameterError(
+        raise refuse(
             f"found {value!r}; expected at most 2**53 in size, up to which a signal holds every integer of its type "
-            f"{variable.type}. Give another value.",
-            block=label,
-            port=port,
+            f"{variable.type}. Give another value."
         )
     if not np.all(np.isfinite(array)):
-        raise ParameterError(f"found {value!r}; expected finite numbers{_unit_text(variable)}.", block=label, port=port)
+        unit = f" in {variable.unit}" if variable.unit else ""
+        raise refuse(f"found {value!r}; expected finite numbers{unit}.")
     if reason := variable.complaint(array):
-        raise ParameterError(f"{reason}. Give another value.", block=label, port=port)
+        raise refuse(f"{reason}. Give another value.")
     low, high = variable.limits
     if np.any((array < low) | (array > high)):
-        raise ParameterError(f"found {value!r}; the FMU allows {variable.range_text}.", block=label, port=port)
+        raise refuse(f"found {value!r}; the FMU allows {variable.range_text}.")
     return array
 
 
@@ -145,45 +138,34 @@ def _is_plainly_within(variable: FmuVariable, value: float) -> bool:
 def _check_text(description: FmuDescription, name: str, value: Any, label: str) -> Any:
     """Return a text or binary data; those of an array as a tuple of its elements, in C order."""
     variable, port = description.other[name], f"start.{name}"
+
+    def refuse(text: str) -> ParameterError:
+        return ParameterError(text, block=label, port=port)
+
     if variable.negated_of:
-        raise ParameterError(f"found {value!r} for {variable.refusal}", block=label, port=port)
+        raise refuse(f"found {value!r} for {variable.refusal}")
     if not variable.is_text:
-        raise ParameterError(
-            f"found {value!r} for a {variable.interval_variability} clock, which ticks in a run alone. Leave it out.",
-            block=label,
-            port=port,
+        raise refuse(
+            f"found {value!r} for a {variable.interval_variability} clock, which ticks in a run alone. Leave it out."
         )
     if variable.causality in ("output", "local", "calculatedParameter"):
-        raise ParameterError(
-            f"found {_article(variable.causality)} of type {variable.type}, which the FMU computes. Leave it out.",
-            block=label,
-            port=port,
+        raise refuse(
+            f"found {_article(variable.causality)} of type {variable.type}, which the FMU computes. Leave it out."
         )
     kind, noun = (str, "a text") if variable.type == "String" else (bytes, "bytes")
     if not variable.shape:
         if isinstance(value, kind):
             return value
-        raise ParameterError(
-            f"found {value!r} for a variable of type {variable.type}; expected {noun}. Give a {kind.__name__}.",
-            block=label,
-            port=port,
+        raise refuse(
+            f"found {value!r} for a variable of type {variable.type}; expected {noun}. Give a {kind.__name__}."
         )
     elements = () if isinstance(value, str | bytes) else tuple(np.ravel(np.array(value, dtype=object)).tolist())
     if len(elements) != variable.size or not all(isinstance(element, kind) for element in elements):
-        raise ParameterError(
+        raise refuse(
             f"found {value!r}; expected {noun} for each of {variable.size} elements, of shape {variable.shape}. Give a "
-            f"list of {kind.__name__}.",
-            block=label,
-            port=port,
+            f"list of {kind.__name__}."
         )
     return elements
-
-
-def _number_items(variable: FmuVariable, value: Any) -> Any:
-    """Return numbers for the names of an enumeration."""
-    if isinstance(value, str) and value in variable.items:
-        return variable.items[value]
-    return value
 
 
 def _refuse_words(variable: FmuVariable, value: Any, label: str) -> ParameterError:
@@ -207,10 +189,6 @@ def _too_large(numbers: Any) -> bool:
     """Whether an integer is among numbers that a float64 may not hold."""
     found = np.ravel(np.array(numbers, dtype=object))
     return any(isinstance(number, int | np.integer) and abs(int(number)) > 2**53 for number in found)
-
-
-def _unit_text(variable: FmuVariable) -> str:
-    return f" in {variable.unit}" if variable.unit else ""
 
 
 def _article(noun: str) -> str:

@@ -86,13 +86,14 @@ def _enter_continuous_time(point: FmuPoint, instance: LoadedFmu) -> None:
     """
     instance.begin()
     computed = point.lost(instance.values(point.states))
-    for _ in range(100):
-        found = instance.call("the events at the start", instance.fmi.update_events)
-        if found.terminate:
-            raise _end_error(point, "in an event there")
-        if not found.again:
-            break
-    else:
+    found = instance.call("the events at the start", instance.fmi.iterate_events)
+    if found.terminate:
+        raise FmuError(
+            f"the FMU asks to end the simulation (terminateSimulation) at t = {point.t:.9g} s, in an event there, so "
+            "it has no linear model there. Choose another operating point.",
+            block=point.block.label,
+        )
+    if found.again:
         raise FmuError(
             "the events at the start don't settle in 100 rounds. Choose another operating point.",
             block=point.block.label,
@@ -107,14 +108,6 @@ def _enter_continuous_time(point: FmuPoint, instance: LoadedFmu) -> None:
         for name in guessed:
             x[where[name]] = np.ravel(point.given[name])
         instance.set_continuous_states(x)
-
-
-def _end_error(point: FmuPoint, place: str) -> FmuError:
-    return FmuError(
-        f"the FMU asks to end the simulation (terminateSimulation) at t = {point.t:.9g} s, {place}, so it has no "
-        "linear model there. Choose another operating point.",
-        block=point.block.label,
-    )
 
 
 def _values(point: FmuPoint, instance: LoadedFmu) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import Array, Event, FmuError, FmuFileError, State
+from ...blocks.core import Array, Event, FmuFileError, State
 from ...blocks.tracing import NEXT
 from ..archive import FmuDescription, FmuVariable, ModelExchangeInfo
 from ..calls import ModelExchangeInstance, StepOptions, is_smooth
@@ -105,16 +105,51 @@ class ModelExchangeMembers(PortMembers):
     @property
     def states(self) -> Mapping[str, State]:  # type: ignore[override]
         """The continuous states in model exchange; in co-simulation they are the FMU's own."""
-        return states_of(self) if self.in_model_exchange else {}
+        about, exchange = self.description, self.description.exchange
+        if not self.in_model_exchange or exchange is None:
+            return {}
+        if not about.states:
+            n = exchange.state_count
+            return {UNNAMED: State(shape=(n,), name=UNNAMED, description="states that are no variables")} if n else {}
+        return {name: self._state(about.find(name)) for name in about.states}
+
+    def _state(self, v: FmuVariable) -> State:
+        start = self.start.get(v.name, v.start)
+        value = np.zeros(v.shape) if start is None else np.broadcast_to(np.asarray(start, dtype=float), v.shape)
+        return State(v.unit, v.description, shape=v.shape, start=np.array(value), name=v.name)
 
     @property
     def events(self) -> Mapping[str, Event]:  # type: ignore[override]
-        """The events of the indicators in model exchange."""
-        return events_of(self) if self.in_model_exchange else {}
+        """The events of the indicators in model exchange; a change of domain in both directions fires one."""
+        exchange = self.description.exchange
+        if not self.in_model_exchange or exchange is None:
+            return {}
+        return {name: Event(name=name) for name in exchange.indicators}
 
     def dependence(self, equation: str) -> Mapping[str, Array]:
-        """Return what depends on what in model exchange, by the model structure; see `loopwright.Block`."""
-        return dependence(self, equation, NEXT)
+        """Return which entries of an output, or of the derivatives, depend on which of the states and inputs.
+
+        It is that of model exchange, by the model structure; see `loopwright.Block`. The states are under ``"x"``,
+        inputs under their ports. Discrete inputs and parameters act at events alone.
+        """
+        about, exchange = self.description, self.model_exchange_info
+        assert exchange is not None
+        n = exchange.state_count
+        states = [about.find(name) for name in about.states]
+        if equation != NEXT:
+            unknown = [self.output_variables[equation]]
+        else:
+            unknown = [about.find(name) for name in about.states.values()]
+        rows = n if equation == NEXT else unknown[0].size
+
+        def follows(known: FmuVariable) -> np.ndarray:
+            parts = [exchange.pattern(of, known) for of in unknown]
+            return np.vstack(parts) if parts else np.ones((rows, known.size), dtype=bool)
+
+        found = {port: follows(v) for port, v in self.input_variables.items() if is_smooth(v)}
+        found["t"] = np.full((rows, 1), not unknown or any(map(exchange.varies, unknown)))
+        found["x"] = np.hstack([follows(v) for v in states]) if states else np.ones((rows, n), dtype=bool)
+        return found
 
     @contextmanager
     def exchange(self, wired: Sequence[str], *, start_time: float = 0.0) -> Iterator[ModelExchangeInstance]:
@@ -134,55 +169,3 @@ class ModelExchangeMembers(PortMembers):
             yield instance
         finally:
             instance.close()
-
-
-def states_of(block: ModelExchangeMembers) -> dict[str, State]:
-    """Return the continuous states as those of a block, with start values and nominal values."""
-    about = block.description
-    exchange = about.exchange
-    if exchange is None:
-        raise FmuError("it has no model exchange. Take co-simulation.", block=block.label)
-    if not about.states:
-        n = exchange.state_count
-        return {UNNAMED: State(shape=(n,), name=UNNAMED, description="states that are no variables")} if n else {}
-    return {name: _state(block, about.find(name)) for name in about.states}
-
-
-def _state(block: ModelExchangeMembers, v: FmuVariable) -> State:
-    start = block.start.get(v.name, v.start)
-    value = np.zeros(v.shape) if start is None else np.broadcast_to(np.asarray(start, dtype=float), v.shape)
-    return State(v.unit, v.description, shape=v.shape, start=np.array(value), name=v.name)
-
-
-def events_of(block: ModelExchangeMembers) -> dict[str, Event]:
-    """Return one event for each indicator; a change of domain in both directions fires it."""
-    exchange = block.description.exchange
-    return {name: Event(name=name) for name in exchange.indicators} if exchange is not None else {}
-
-
-def dependence(block: ModelExchangeMembers, equation: str, rates: str) -> dict[str, np.ndarray]:
-    """Return which entries of an output, or of the derivatives (``rates``), depend on which of the states and inputs.
-
-    The states are under ``"x"``, inputs under their ports. Discrete inputs and parameters act at events alone.
-    """
-    about, exchange = block.description, block.model_exchange_info
-    assert exchange is not None
-    n = exchange.state_count
-    states = [about.find(name) for name in about.states]
-    if equation != rates:
-        unknown = [block.output_variables[equation]]
-    else:
-        unknown = [about.find(name) for name in about.states.values()]
-    rows = n if equation == rates else unknown[0].size
-    found: dict[str, np.ndarray] = {}
-    for port, v in block.input_variables.items():
-        if is_smooth(v):
-            found[port] = _stack([exchange.pattern(of, v) for of in unknown], rows, v.size)
-    by_states = [_stack([exchange.pattern(of, v) for of in unknown], rows, v.size) for v in states]
-    found["t"] = np.full((rows, 1), not unknown or any(map(exchange.varies, unknown)))
-    found["x"] = np.hstack(by_states) if states else np.ones((rows, n), dtype=bool)
-    return found
-
-
-def _stack(parts: list[np.ndarray], rows: int, columns: int) -> np.ndarray:
-    return np.vstack(parts) if parts else np.ones((rows, columns), dtype=bool)
