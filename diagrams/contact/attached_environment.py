@@ -40,10 +40,7 @@ _ROUNDED = 1e-9
 
 
 class Environment(Block):
-    """Spring, damper and mass along a direction: f = −k dᵀ(p − p₀) − b dᵀv − m dᵀa.
-
-    The kick acts on the plant besides, and is not measured.
-    """
+    """Spring, damper and mass along a direction: f = −k dᵀ(p − p₀) − b dᵀv − m dᵀa; the kick is not measured."""
 
     direction: Array = parameter(unit="1", description="unit vector d")
     anchor: Array = parameter(unit="m", description="place where the spring is relaxed")
@@ -128,24 +125,9 @@ def attach_environment(
 ) -> WiredDiagram:
     """Return a diagram with an environment next to its plant; the measured force has the environment's.
 
-    Parameters
-    ----------
-    diagram : WiredDiagram
-        The diagram.
-    ports : Ports
-        Plant, and its ports at the contact.
-    model : PlantEquations
-        Linear model of the plant.
-    measured : Tap, optional
-        Wire to which its force is added, for all readers but the plant.
-    mooring : Mooring
-        The environment.
-    tool : dict, optional
-        Mass in kg beyond a force sensor, by the sensor's path; the diagram's own without it.
-    tick : Fraction, optional
-        Sample time of a sampled diagram in s.
-    held : bool
-        Keep the plant in co-simulation, and hold the force between communication points.
+    ``measured`` is the wire to which its force is added, for all readers but the plant. ``tool`` holds the mass in kg
+    beyond a force sensor, by the sensor's path. ``tick`` is the sample time in s of a sampled diagram. With ``held``
+    the plant stays in co-simulation, and the force is held between communication points.
     """
     path, block = ports.plant, diagram.blocks[ports.plant]
     if measured is not None and measured.port[0] == path:

@@ -104,15 +104,7 @@ class TriedContact(Protocol):
 
 @dataclass
 class LimitTrials:
-    """Runs next to a limit, and predictions for them.
-
-    Attributes
-    ----------
-    contact, limit
-        As `Contact.confirm` takes them.
-    method : TrialMethod
-        Place of the environment.
-    """
+    """Runs next to a limit, and predictions for them."""
 
     contact: TriedContact
     limit: ContactLimit
@@ -448,13 +440,7 @@ def confirm_limit(
 
 
 def try_limit(contact: TriedContact, limit: ContactLimit) -> ContactConfirmation:
-    """Return the confirmation of a limit by the largest push that leaves the diagram linear.
-
-    Raises
-    ------
-    OptionError, ConfirmationError
-        As `Contact.confirm`: if the runs contradict the limit however small the push.
-    """
+    """Return the confirmation of a limit by the largest push that leaves the diagram linear."""
     for push in PUSHES[:-1]:
         try:
             return confirm_limit(contact, limit, push)
@@ -465,15 +451,6 @@ def try_limit(contact: TriedContact, limit: ContactLimit) -> ContactConfirmation
 
 def measure_growth(t: np.ndarray, signal: np.ndarray, omega: float, begin: float, window: float) -> float:
     """Return the growth rate in 1/s of a mode of frequency ω, by its amplitude in two windows one after the other.
-
-    Parameters
-    ----------
-    t, signal : (N,) array
-        Times in s, and the signal.
-    omega : float
-        Frequency of the mode in rad/s.
-    begin, window : float
-        Beginning of the first window, and length of both, in s.
 
     Examples
     --------

@@ -74,13 +74,7 @@ def join_environment(
     mass: Array = 0.0,
     tool_mass: Array | None = None,
 ) -> Joined:
-    """Return the plant with spring, damper and mass along a direction; properties may be arrays, which are broadcast.
-
-    Raises
-    ------
-    ParameterError
-        If a property is NaN, infinite or negative.
-    """
+    """Return the plant with spring, damper and mass along a direction; properties may be arrays, to be broadcast."""
     check_environment(stiffness=stiffness, damping=damping, mass=mass, tool_mass=tool_mass)
     tool = parts.tool_mass if tool_mass is None else tool_mass
     k, b, m, more = (
@@ -177,22 +171,12 @@ def _close_tick(
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """Coordinates that split the modes that an environment moves from the others.
+    """Coordinates that split the modes that an environment moves from the others."""
 
-    Attributes
-    ----------
-    left, right : ndarray
-        ``left @ A @ right`` is the matrix of the modes that the environment can move.
-    fixed : ndarray
-        Poles of the others, s or z.
-    growing : ndarray of bool
-        Which of the others grow by more than rounding. A drift doesn't.
-    """
-
-    left: np.ndarray
+    left: np.ndarray  # left @ A @ right is the matrix of the modes that the environment can move
     right: np.ndarray
-    fixed: np.ndarray
-    growing: np.ndarray
+    fixed: np.ndarray  # poles of the others, s or z
+    growing: np.ndarray  # which of the others grow by more than rounding; a drift doesn't
 
     def reduce(self, A: np.ndarray) -> np.ndarray:
         """Return the matrix of the modes that the environment can move."""
@@ -344,19 +328,7 @@ def find_direction(parts: ContactParts, direction: np.ndarray, state: np.ndarray
 
 
 def find_frequency(parts: ContactParts, loop: ClosedLoop, rate: complex, state: np.ndarray) -> float:
-    """Return the frequency in rad/s of a mode.
-
-    Parameters
-    ----------
-    parts : ContactParts
-        Plant and controller.
-    loop : ClosedLoop
-        The coupled loop, without axes of a batch.
-    rate : complex
-        Its pole in 1/s.
-    state : ndarray
-        State of the mode at the beginning of the period.
-    """
+    """Return the frequency in rad/s of a mode."""
     T = parts.sample_time
     if not T:
         return float(abs(rate.imag))

@@ -74,18 +74,8 @@ def hold_signals(
 ) -> tuple[ControllerTick, ...]:
     """Return the controllers of all ticks, with the signals that are held as states.
 
-    Parameters
-    ----------
-    models : sequence of TickModel
-        Models of the ticks.
-    cut : function
-        Controller at a tick, from the matrices there: its inputs are the plant's outputs and the measured force.
-    shown : int
-        Number of entries of the plant's outputs.
-    felt_wire : int or None
-        Number of the injected wire of the measured force; None if nothing renews or holds it by itself.
-    inside : bool
-        Whether the plant measures the force itself, and shows it at its communication points.
+    ``felt_wire`` is the number of the injected wire of the measured force, None if nothing renews or holds it by
+    itself. With ``inside`` the plant measures the force itself, and shows it at its communication points.
     """
     matrices = [cut(model.matrices) for model in models]
     many, entries = len(matrices[0].C), matrices[0].B.shape[1]
@@ -136,55 +126,26 @@ _DOUBTFUL = 10.0
 
 @dataclass(frozen=True, eq=False)
 class ContactParts:
-    """Plant and controller, linear at an operating point; n_f is the number of entries of the force.
+    """Plant and controller, linear at an operating point; n_f is the number of entries of the force."""
 
-    Attributes
-    ----------
-    plant : StateMatrices
-        From the plant's wired inputs to its wired outputs, continuous.
-    force : ndarray, shape (n, n_f)
-        Input matrix of the force port.
-    force_shown : ndarray
-        Feedthrough from the force port to the wired outputs.
-    position, velocity : ndarray, shape (n_f, n)
-        Output matrices of position and velocity at the contact.
-    controller : StateMatrices
-        From the plant's outputs and the n_f entries of the measured force to the plant's wired inputs. In several
-        rates, at the first tick of the period.
-    sample_time : float
-        Sample time T of the controller in s, the period of several rates; 0 if everything is continuous.
-    is_stepped : bool
-        Whether the plant is an FMU, whose outputs at a tick are those under its last inputs.
-    tool : Tool
-        Tool that the diagram's force sensor feels.
-    derivation : Derivation
-        Method by which the plant was differentiated.
-    errors : tuple of StateMatrices
-        Errors of the entries of ``plant``, and of those of (A, force, position, velocity); zero if they are exact.
-    findings : tuple of Finding
-        Kinks, stairs and flat slopes that the model leaves out.
-    entry : str or None
-        Wire to which the environment's force is added; None if the controller does not measure it.
-    ticks : tuple of ControllerTick
-        Controllers at the ticks of a period with several; empty with one.
-    states : pair of tuple of str
-        Names of the plant's states and of the controller's; the latter are empty in several rates.
-    """
-
-    plant: StateMatrices
-    force: np.ndarray
-    force_shown: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
+    plant: StateMatrices  # from the plant's wired inputs to its wired outputs, continuous
+    force: np.ndarray  # input matrix of the force port, shape (n, n_f)
+    force_shown: np.ndarray  # feedthrough from the force port to the wired outputs
+    position: np.ndarray  # output matrix of the contact's position, shape (n_f, n)
+    velocity: np.ndarray  # the same of its velocity
+    # from the plant's outputs and the measured force to the plant's inputs; in several rates at the first tick
     controller: StateMatrices
-    sample_time: float
-    is_stepped: bool
+    sample_time: float  # T in s, the period of several rates; 0 if everything is continuous
+    is_stepped: bool  # whether the plant is an FMU, whose outputs at a tick are those under its last inputs
     tool: Tool
     derivation: Derivation
+    # of the entries of `plant`, and of those of (A, force, position, velocity); zero if they are exact
     errors: tuple[StateMatrices, StateMatrices]
     findings: tuple[Finding, ...]
+    # wire to which the environment's force is added; None if the controller does not measure it
     entry: str | None = None
-    ticks: tuple[ControllerTick, ...] = ()
+    ticks: tuple[ControllerTick, ...] = ()  # controllers at the ticks of a period with several; empty with one
+    # names of the plant's states and of the controller's; the latter are empty in several rates
     states: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
 
     @property
@@ -301,13 +262,7 @@ def _find_sources(flat: FlatDiagram, path: str) -> dict[str, DrivingPort]:
 def _find_entries(
     m: PlantEquations, ports: Ports, measured: str | None, felt: int
 ) -> tuple[list[int], list[int], list[int]]:
-    """Return the entries of the force among the model's inputs, of position and velocity among its outputs.
-
-    Parameters
-    ----------
-    felt : int
-        Number of entries of the measured force, 0 without one.
-    """
+    """Return the entries of the force among the model's inputs, of position and velocity among its outputs."""
     pushed = m.inputs.entries([ports.force])
     position, velocity = (m.outputs.entries([name]) for name in (ports.position, ports.velocity))
     if not len(position) == len(velocity) == len(pushed) or felt not in (0, len(pushed)):

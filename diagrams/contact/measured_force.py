@@ -46,23 +46,7 @@ def find_entry(
     opened: Sequence[str],
     options: Mapping[str, Any],
 ) -> Tap:
-    """Return the wire to which the environment's force is added.
-
-    Parameters
-    ----------
-    diagram, point
-        Diagram, and its operating point.
-    ports : Ports
-        Plant and its ports.
-    signal : Tap
-        Measured force.
-    wires : mapping
-        Sources of the plant's inputs.
-    opened : sequence of str
-        Outputs of the plant that are used.
-    options : mapping
-        Options of the linear model.
-    """
+    """Return the wire to which the environment's force is added."""
     flat, source = diagram.flatten_like(point), wires.get(ports.force)
     if source is not None and (source.block, source.port) == signal.port:
         return find_signal(flat, signal.name)  # measured ahead of what is added: the plant has that already
@@ -173,21 +157,11 @@ than this moves by itself below 3e-5 rad/s only.
 
 @dataclass(frozen=True)
 class Tool:
-    """Tool beyond the force sensor of a contact.
+    """Tool beyond the force sensor of a contact."""
 
-    Attributes
-    ----------
-    sensor : str or None
-        Path of the force sensor; None without one.
-    mass : float
-        Its mass in kg.
-    problem : str
-        Reason why the loop with another tool is not known; "" if it is.
-    """
-
-    sensor: str | None = None
-    mass: float = 0.0
-    problem: str = ""
+    sensor: str | None = None  # path of the force sensor; None without one
+    mass: float = 0.0  # in kg
+    problem: str = ""  # reason why the loop with another tool is not known; "" if it is
 
     def check(self) -> None:
         """Refuse another tool where a model and a run would be different loops."""
@@ -207,20 +181,7 @@ def find_tool(
 ) -> Tool:
     """Return the tool of a contact.
 
-    Parameters
-    ----------
-    flat : FlatDiagram
-        The diagram.
-    ports : Ports
-        Plant and its ports.
-    model : PlantEquations
-        Linear model of the plant.
-    signal, entry : Tap, optional
-        Measured force, and the wire to which the environment's force is added.
-    linear : function
-        Linear model from wires to the plant's inputs, with the plant's outputs opened.
-    sampled : bool
-        Whether the controller is sampled.
+    ``linear`` makes the linear model from wires to the plant's inputs, with the plant's outputs opened.
     """
     if signal is None or entry is None or signal.port[0] == ports.plant:
         return Tool()

@@ -39,26 +39,16 @@ FORCE = "environment_force"
 
 @dataclass(frozen=True)
 class Mooring:
-    """An environment that is put into a plant.
+    """An environment that is put into a plant."""
 
-    Attributes
-    ----------
-    direction, anchor : ndarray
-        Unit vector along which it acts, and the place where its spring is relaxed.
-    stiffness, damping, mass : float
-        Its properties, N/m, N·s/m and kg.
-    kick, kick_time, kick_start : float
-        A force in N in its direction, which sets it in motion, and its end and beginning in s.
-    """
-
-    direction: np.ndarray
-    anchor: np.ndarray
-    stiffness: float = 0.0
-    damping: float = 0.0
-    mass: float = 0.0
-    kick: float = 0.0
-    kick_time: float = 0.0
-    kick_start: float = 0.0
+    direction: np.ndarray  # unit vector along which it acts
+    anchor: np.ndarray  # place where its spring is relaxed
+    stiffness: float = 0.0  # N/m
+    damping: float = 0.0  # N·s/m
+    mass: float = 0.0  # kg
+    kick: float = 0.0  # force in N in its direction, which sets it in motion
+    kick_time: float = 0.0  # end of the kick in s
+    kick_start: float = 0.0  # its beginning in s
 
     def parameters(self) -> dict[str, Any]:
         """Return the parameters of a moored plant."""
@@ -77,15 +67,7 @@ class _Pushed:
 
 
 def moor(plant: type[Block], port: str, position: str, velocity: str) -> type[Block]:
-    """Return the class of a plant with an environment inside, by the plant's own equations.
-
-    Parameters
-    ----------
-    plant : type of Block
-        Class of the plant: its acceleration is affine in the force.
-    port, position, velocity : str
-        Its ports of the force, and of position and velocity at the contact.
-    """
+    """Return the class of a plant with an environment inside; its acceleration has to be affine in the force."""
 
     def read(block: Block, t: Array, x: Any, u: Any, name: str) -> Any:
         if name in block.states:
@@ -172,20 +154,8 @@ def moored_diagram(
 ) -> WiredDiagram:
     """Return a diagram with an environment inside its plant; the measured force has the environment's.
 
-    Parameters
-    ----------
-    diagram : WiredDiagram
-        The diagram.
-    plant : str
-        Path of its plant, one of the library.
-    ports : (str, str, str)
-        Ports of force, position and velocity at the contact.
-    measured : Tap, optional
-        Wire to which its force is added, for all readers but the plant.
-    mooring : Mooring
-        The environment.
-    tool : dict, optional
-        Mass in kg beyond a force sensor, by the sensor's path; the diagram's own without it.
+    ``ports`` are those of force, position and velocity at the contact; ``measured`` and ``tool`` are those of
+    `attach_environment`.
     """
     block = diagram.blocks[plant]
     cls = library_class(block)

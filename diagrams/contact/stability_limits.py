@@ -69,15 +69,6 @@ def growth_rounding(modes: Modes, rates: Callable[[np.ndarray], np.ndarray], A: 
     are split off, every entry, zeros too, is changed by some roundings of the largest one next to it, as LAPACK's
     transformations do. The eigenvalues answer as they do to the rounding of any machine: one that stands alone by as
     much, several in one place by far more.
-
-    Parameters
-    ----------
-    modes : Modes
-        The modes that the environment can move.
-    rates : callable
-        From a stack of their matrices to growth rates.
-    A : ndarray, shape (n, n)
-        Matrix of the loop.
     """
     if not np.isfinite(A).all():
         return math.inf
@@ -132,28 +123,8 @@ def find_first_limit(
     Brent's method refines each change of sign of the growth rate; extrema between the points are looked at, too. A
     growth rate that is 0 but for its rounding, such as that of an undamped motion, is not unstable.
 
-    Parameters
-    ----------
-    name : str
-        The property.
-    grid, sigma : ndarray, shape (n,)
-        The points of the scan, and the growth rates there in 1/s.
-    growth_at, growth_by_control : callable
-        The growth rate at a value, and that of an independent computation.
-    rounding_at : callable
-        Bound of the growth rate's rounding error at a value, see `growth_rounding`.
-    model_error : callable, optional
-        Bound of the growth rate's error by that of the loop's model, at the limit.
-
-    Returns
-    -------
-    FoundLimit
-        Its value is 0 where the scan's start is unstable, and infinite without a limit.
-
-    Raises
-    ------
-    ConfirmationError
-        If the independent computation is not stable below the limit and unstable above it.
+    ``growth_by_control`` is that of an independent computation, ``model_error`` the bound of the growth rate's error by
+    that of the loop's model. The limit is 0 where the scan's start is unstable, and infinite without one.
     """
     scan = GrowthScan(grid, sigma, growth_at, rounding_at)
     changes = tuple(_refine_change(growth_at, *bracket) for bracket in scan.find_brackets())
@@ -494,15 +465,7 @@ def find_limit(
     held: Mapping[str, float],
     grid: np.ndarray,
 ) -> ContactLimit:
-    """Return the first value of a property at which the coupled loop loses its stability; see `Contact`.
-
-    Raises
-    ------
-    ParameterError
-        If a property is NaN, infinite or negative.
-    ConfirmationError
-        If python-control's interconnection of the same parts is not stable below the limit and unstable above it.
-    """
+    """Return the first value of a property at which the coupled loop loses its stability; see `Contact`."""
     loop = CoupledLoop.of(parts, direction, vary, held)
     frequency, moved, second = math.nan, tuple[float, ...](), math.nan
     # A mode that grows without the environment is no limit of it: then no value is stable, and nothing is scanned.

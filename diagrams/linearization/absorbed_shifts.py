@@ -30,24 +30,12 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class ShiftedBlock:
-    """A block on a loop that has states: its equations, and the signals that its inputs read.
-
-    Attributes
-    ----------
-    path : str
-        Its path.
-    slopes : BlockSlopes
-        Its equations.
-    watched : tuple of str
-        Inputs whose wires are on a loop.
-    taps : mapping of str to Tap
-        Signals of its wired inputs.
-    """
+    """A block on a loop that has states: its equations, and the signals that its inputs read."""
 
     path: str
     slopes: BlockSlopes
-    watched: tuple[str, ...]
-    taps: Mapping[str, Tap]
+    watched: tuple[str, ...]  # inputs whose wires are on a loop
+    taps: Mapping[str, Tap]  # signals of its wired inputs
 
     @classmethod
     def of(cls, flat: FlatDiagram, path: str, watched: Sequence[str]) -> ShiftedBlock | None:
@@ -62,16 +50,7 @@ class ShiftedBlock:
     def absorbs(self, flat: FlatDiagram, t: float, states: np.ndarray, inputs: Mapping[str, np.ndarray]) -> bool:
         """Return whether the answer to a shift is the same at every point, and in proportion to the shift.
 
-        Parameters
-        ----------
-        flat : FlatDiagram
-            The diagram.
-        t : float
-            Time in s.
-        states : ndarray
-            Shift of the block's states, in a unit of the motion.
-        inputs : mapping of str to ndarray
-            Shifts of its wired inputs.
+        ``states`` and ``inputs`` are the shifts of its states and of its wired inputs, in a unit of the motion.
         """
         columns, d = self.slopes.columns, np.zeros(self.slopes.columns.total)
         d[: len(states)] = states

@@ -66,32 +66,18 @@ class BlockSlopes:
 
     Columns are the states, then the inputs; rows the outputs, then the next states. Names begin with ``x `` for a
     state and ``u `` for a port, as an output may be a state of the same name.
-
-    Parameters
-    ----------
-    trace : Traced
-        The block's traced equations.
-
-    Attributes
-    ----------
-    columns, rows : Side
-        Names of the columns and rows.
-    is_opaque : bool
-        Whether the equations are any Python, without exact derivatives.
-    is_large : bool
-        Whether the equations multiply a large matrix, and are not written out entry by entry.
     """
 
     def __init__(self, trace: Traced):
         # the trace itself is not kept: it is the key of a weak dictionary
         self.function, self.indicators, self.jump = trace.function, trace.indicators, trace.jump
         self.inputs, self.outputs, self.depends = tuple(trace.inputs), tuple(trace.outputs), trace.depends
-        self.is_opaque = trace.foreign is not None
+        self.is_opaque = trace.foreign is not None  # any Python, without exact derivatives
         self.columns = _side(trace.inputs, trace.states, states_first=True)
         advance = trace.states if trace.function.numel_out(len(trace.outputs)) else {}
         self.rows = _side(trace.outputs, advance, states_first=False)
         self._sizes = [Layout.of(trace.states).total, *(size(s) for s in trace.inputs.values())]
-        self.is_large = has_large_product(trace.function)
+        self.is_large = has_large_product(trace.function)  # a large matrix, which is not written out by entries
         try:
             self.scalar: Any = None if self.is_large else trace.function.expand()
         except RuntimeError:  # a table, or an opaque block

@@ -25,53 +25,28 @@ _RESTS = 1e-9
 
 @dataclass
 class LinearStep:
-    """A communication step about its operating point: derivatives of states, inputs and outputs, with their values.
+    """A communication step about its operating point: derivatives of states, inputs and outputs, with their values."""
 
-    Attributes
-    ----------
-    x, z, w, p : ndarray
-        Derivatives of the states of blocks after the flow, of the inputs that act, of the outputs, and of the FMUs'
-        states, one row for each entry. ``w`` are the outputs before the step, and then those after it.
-    t, end : float
-        Times in s.
-    x_end, w_here, z_here : ndarray
-        Values of the states of blocks after the flow, of outputs before the step, and of inputs at the tick.
-    p_places : dict of str to slice
-        Rows of each FMU's states, by path.
-    """
-
-    x: np.ndarray
-    z: np.ndarray
-    w: np.ndarray
-    p: np.ndarray
-    t: float
+    x: np.ndarray  # derivatives of the states of blocks after the flow, one row for each entry
+    z: np.ndarray  # of the inputs that act
+    w: np.ndarray  # of the outputs before the step, and then of those after it
+    p: np.ndarray  # of the FMUs' states
+    t: float  # in s
     end: float
-    x_end: np.ndarray
-    w_here: np.ndarray
-    z_here: np.ndarray
-    p_places: dict[str, slice]
+    x_end: np.ndarray  # states of blocks after the flow
+    w_here: np.ndarray  # outputs before the step
+    z_here: np.ndarray  # inputs at the tick
+    p_places: dict[str, slice]  # rows of each FMU's states, by path
 
 
 @dataclass(frozen=True)
 class CoupledChain:
-    """Communication steps of one scheme, linearized.
-
-    Attributes
-    ----------
-    flat : FlatDiagram
-        The diagram.
-    local : LocalDerivatives
-        Derivatives of the diagram's functions.
-    links : Links
-        Links between the FMUs.
-    order : tuple of str
-        Order in which the FMUs step one after the other; empty for iterated coupling.
-    """
+    """Communication steps of one scheme, linearized."""
 
     flat: FlatDiagram
     local: LocalDerivatives
     links: Links
-    order: tuple[str, ...]
+    order: tuple[str, ...]  # in which the FMUs step one after the other; empty for iterated coupling
 
     @property
     def straight(self) -> np.ndarray:
@@ -88,14 +63,8 @@ class CoupledChain:
     ) -> dict[str, PlantModel]:
         """Take a step: ``step`` holds what follows; return the models of the FMUs' steps.
 
-        Parameters
-        ----------
-        step : LinearStep
-            The step. Its ``x`` and ``z`` come with held outputs, its ``p`` are the FMUs' states before it.
-        model : callable
-            Returns the model of an FMU's step from its path and all inputs.
-        flow_by_w : ndarray
-            Derivative of the states of blocks after the flow by the outputs that are held over it.
+        ``step.x`` and ``step.z`` come with held outputs, ``step.p`` are the FMUs' states before it. ``flow_by_w`` is
+        the derivative of the blocks' states after the flow by the outputs that are held over it.
         """
         return self._go_in_order(step, model) if self.order else self._iterate(step, model, flow_by_w)
 

@@ -41,23 +41,8 @@ def acts_back(J: Numbers, continuous: np.ndarray, channels: DelayChannels) -> np
 class DelayedFlow:
     """The flow of a sampled diagram between the ticks of a period, with transport delays.
 
-    Parameters
-    ----------
-    channels : DelayChannels
-        Transport delays of a diagram.
-    continuous : ndarray
-        Places of the continuous states in x.
-    J : mapping
-        Derivatives between ticks, which are the same at all of them.
-    ticks : sequence of Fraction
-        Times of the ticks of a period from its first one on, in s.
-    period : Fraction
-        The period in s.
-
-    Attributes
-    ----------
-    held : tuple of ndarray
-        Places in x, w and d of the signals that are held between ticks.
+    ``J`` are the derivatives between ticks, the same at all of them; ``ticks`` are the times in s of the ticks of a
+    period from its first one on.
     """
 
     def __init__(
@@ -234,20 +219,6 @@ class DelayLine:
 
     The line keeps either the held signals and continuous states at the last ticks, or what the past will add to
     continuous states and to outputs of delays at the next ticks, whichever needs fewer states.
-
-    Parameters
-    ----------
-    flow : DelayedFlow
-        Flow between ticks.
-    flat : FlatDiagram
-        Diagram.
-    injected : sequence of str
-        Names of the injected signals.
-
-    Attributes
-    ----------
-    labels : list of str
-        Names of the states.
     """
 
     def __init__(self, flow: DelayedFlow, flat: FlatDiagram, injected: Sequence[str]):
@@ -326,13 +297,7 @@ class DelayLine:
 def find_steady_slopes(
     flat: FlatDiagram, local: LocalDerivatives, channels: DelayChannels, t: float, x: np.ndarray, w: np.ndarray
 ) -> Numbers:
-    """Return the derivatives between ticks, which must be constant: a delay's output was its input at another instant.
-
-    Raises
-    ------
-    OptionError
-        If the point is not at rest, and the derivatives of the continuous blocks depend on where they are.
-    """
+    """Return the derivatives between ticks, which must be constant: a delay puts out its input of another instant."""
     J = local.differentiate(NONE, t, x, w)
     moves = np.max(np.abs(np.real(J["dx"])) / (1.0 + np.abs(x[flat.continuous])), initial=0.0) > EQUILIBRIUM
     if moves and not local.has_constant_slopes:

@@ -62,27 +62,13 @@ Numbers: TypeAlias = dict[str | tuple[str, str], np.ndarray]
 
 @dataclass(frozen=True)
 class Tap:
-    """A tap: an output port of a diagram, or entries of it.
-
-    Attributes
-    ----------
-    name : str
-        Name of the wire or port.
-    port : (str, str)
-        Path of the block, and name of its port.
-    entries : tuple of int
-        Numbers of the entries in the flat port.
-    labels : tuple of str
-        Names of the entries.
-    entry : tuple of int
-        Numbers of the entry that the name asks for, counted from 1; () for the whole.
-    """
+    """A tap: an output port of a diagram, or entries of it."""
 
     name: str
-    port: tuple[str, str]
-    entries: tuple[int, ...]
+    port: tuple[str, str]  # path of the block, and name of its port
+    entries: tuple[int, ...]  # numbers of the entries in the flat port
     labels: tuple[str, ...]
-    entry: tuple[int, ...] = ()
+    entry: tuple[int, ...] = ()  # numbers of the entry that the name asks for, counted from 1; () for the whole
 
 
 def find_signal(flat: FlatDiagram, name: str) -> Tap:
@@ -127,30 +113,9 @@ class LocalDerivatives:
 
     With a ``direction`` of the parameters they carry their slopes along it, as do the operating points that they take.
 
-    Parameters
-    ----------
-    flat : FlatDiagram
-        Diagram to differentiate.
-    inputs : sequence of Tap
-        Ports at which signals d are injected: d is added to the signal of all consumers.
-    outputs : sequence of Tap
-        Ports whose signals are measured, ahead of the injection.
-    openings : sequence of Tap
-        Ports behind which the wire is cut. Consumers get the port's value in the closed diagram, as a constant, plus
-        the injected signal. The motion therefore stays that of the closed diagram.
-    evaluators : mapping, optional
-        Evaluators of opaque stages; see `Schedule`.
-    stairs : Stairs
-        Stairs that are replaced by their mean slopes.
-
-    Attributes
-    ----------
-    direction : ndarray or None
-        Direction of the diagram's vector of parameters p.
-    scale : float
-        Size of the parameter.
-    error : float
-        Largest estimated error of a slope that is made of differences; 0 if all are exact.
+    Signals d are injected at the ``inputs``: they are added for all consumers. ``outputs`` are measured ahead of the
+    injection. Behind the ``openings`` the wire is cut: consumers get the port's value in the closed diagram, as a
+    constant, plus the injected signal. The motion therefore stays that of the closed diagram.
     """
 
     def __init__(
@@ -171,7 +136,9 @@ class LocalDerivatives:
             self.cut.setdefault(s.port, set()).update(s.entries)
         self.evaluators = evaluators
         self.direction: np.ndarray | None = None
+        """Direction of the diagram's vector of parameters p, along which slopes are carried."""
         self.scale, self.error = 1.0, 0.0
+        """Size of the parameter, and the largest estimated error of a slope that is made of differences."""
         self._schedules: dict[frozenset[TickPattern], Schedule] = {}
         self._derivatives: dict[frozenset[TickPattern], Derivative] = {}
         self._closed_slopes: dict[frozenset[TickPattern], Derivative] = {}
@@ -334,17 +301,12 @@ class LocalDerivatives:
         t: float,
         x: np.ndarray,
         w: np.ndarray,
-        beside: tuple[np.ndarray, np.ndarray] | None = None,
+        stairs_from: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> Numbers:
         """Return the values of `differentiate` without their derivatives, and more of stairs that are replaced.
 
-        Parameters
-        ----------
-        acting, t, x, w
-            As of `differentiate`.
-        beside : tuple of ndarray, optional
-            Inputs v and own values s of the stairs at another instant, from which they continue by their mean slope.
-            Without it they have their own values.
+        ``stairs_from`` are inputs v and own values s of the stairs at another instant, from which they continue by
+        their mean slope. Without it they have their own values.
         """
         names, zeros = (*_RESULTS, "s"), np.zeros(self.n_inputs)
         x = self._solve_loops(acting, t, x, w)
@@ -354,7 +316,9 @@ class LocalDerivatives:
         e = np.zeros(self.stairs.e.total)
         for _ in range(len(self.stairs.stairs) + 1):  # a stair may follow another one
             found: Numbers = dict(zip(names, schedule(*at, zeros, e, c, evaluators=self.evaluators), strict=True))
-            new = e if beside is None else self.stairs.K @ (found["v"] - beside[0]) - (found["s"] - beside[1])
+            new = e
+            if stairs_from is not None:
+                new = self.stairs.K @ (found["v"] - stairs_from[0]) - (found["s"] - stairs_from[1])
             if np.array_equal(new, e):
                 break
             e = new

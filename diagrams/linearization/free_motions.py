@@ -176,15 +176,7 @@ def deflate(A: np.ndarray, V: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_free_motions(model: ClosedModel, required: Iterable[str] = ()) -> FreeMotions:
-    """Return the free motions of a linear model.
-
-    Parameters
-    ----------
-    model : ClosedModel
-        Linear model of a diagram.
-    required : iterable of str
-        Wires and ports on which something is required: a motion that changes one of them is not free.
-    """
+    """Return the free motions of a linear model: they change no wire or port on which something is required."""
     none = FreeMotions.none(len(model.A))
     kept = [i for i, name in enumerate(model.states) if name not in model.memory]
     A = model.A[np.ix_(kept, kept)]
@@ -515,7 +507,7 @@ class _Look:
         sizes, stairs = (self.sizes, (before["v"], before["s"])) if quantum is None else (QUANTA, None)
         for far in (sign * (quantum or unit) * s for s in sizes for sign in (1.0, -1.0)):
             x, w = instant.x + far * vx, instant.w + far * vw
-            after = evaluate(acting, t, x, w, beside=stairs)
+            after = evaluate(acting, t, x, w, stairs_from=stairs)
             for name, rows in instant.rows.items():
                 follows = far * self._shift(instant.follows(name), v)
                 by_x, by_w = (np.abs(instant.numbers[name, a][rows]) for a in "xw")

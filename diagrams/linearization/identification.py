@@ -53,16 +53,6 @@ class IdentifiedStep:
     """Model x⁺ = A x + B (z − z0), y = y0 + C x of an FMU's step.
 
     y are the outputs after the step; x is zero at the operating point.
-
-    Attributes
-    ----------
-    states : tuple of str
-        Names of the model's states, "mode[i]": those of the FMU are not known.
-    singular_values : ndarray
-        All singular values of the scaled Hankel matrix; the order is the number that the model uses.
-    uncertainty : float
-        Largest difference between a Markov parameter of the model and the measured one, plus the largest error of the
-        measured ones.
     """
 
     A: np.ndarray
@@ -86,23 +76,8 @@ def identify_step(
 ) -> IdentifiedStep:
     """Identify a linear model of an FMU's communication step at rest.
 
-    Parameters
-    ----------
-    block : Fmu
-        FMU to identify.
-    point : mapping
-        Operating point of the FMU: ``t`` in s, ``inputs`` by port, ``state`` by name; states that can't be set are left
-        out.
-    h : float
-        Length of a step in s.
-    outputs : ndarray, optional
-        Outputs at the operating point; the FMU must come to rest there.
-    samples : int
-        Steps of a response.
-
-    Notes
-    -----
-    Each point of an FMU is identified once, however many loops are looked at; errors are not kept.
+    States of ``point`` that can't be set are left out. At ``outputs``, those of the operating point, the FMU must come
+    to rest. Each point of an FMU is identified once, however many loops are looked at; errors are not kept.
     """
     _ = block.description  # an FMU whose file has changed is refused
     now = tuple(identity(point[name]) for name in ("t", "inputs", "state"))
@@ -163,17 +138,8 @@ def _check_rest(y0: np.ndarray, outputs: np.ndarray, block: Fmu) -> None:
 def output_drift(block: Fmu, point: Mapping[str, Any], h: float) -> dict[str, float]:
     """Return how far the outputs of an FMU move over `WATCHED` steps from its start with held inputs.
 
-    For an FMU that lists no states: outputs that move show that it has a memory.
-
-    Parameters
-    ----------
-    block, point, h
-        See `identify_step`.
-
-    Returns
-    -------
-    dict of str to float
-        Largest change after the first step, relative to 1 + the output's size, by output.
+    For an FMU that lists no states: outputs that move show that it has a memory. Changes are those after the first
+    step, relative to 1 + the output's size.
     """
     runner = _Runner(block, point, h)
     try:
@@ -319,12 +285,8 @@ def _space_offsets(most: int) -> np.ndarray:
 def realize(G: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return A, B, C with C Aᵏ⁻¹ B = Gₖ, of the lowest order that explains G, and all singular values.
 
-    Parameters
-    ----------
-    G : (N, outputs, inputs) ndarray
-        Markov parameters from k = 1 on.
-    noise : (outputs, inputs) ndarray
-        Estimated errors of G.
+    G are the Markov parameters from k = 1 on, of shape (N, outputs, inputs), ``noise`` their estimated errors by output
+    and input.
     """
     samples, q, p = G.shape
     rows = np.max(np.abs(G), axis=(0, 2), initial=0.0)

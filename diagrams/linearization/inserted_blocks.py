@@ -87,13 +87,7 @@ def split_inputs(
 
 
 def name_inputs(labels: Iterable[str], ports: Mapping[str, str]) -> tuple[str, ...]:
-    """Return labels of signals with the names of inputs in place of the inserted blocks' ports.
-
-    Parameters
-    ----------
-    ports : mapping
-        Port of the inserted block, by the input's name.
-    """
+    """Return labels of signals with the names of inputs in place of the inserted blocks' ports."""
     names = {port: name for name, port in ports.items()}
     parts = [label.partition("[") for label in labels]
     return tuple(names.get(base, base) + bracket + entry for base, bracket, entry in parts)
@@ -114,14 +108,7 @@ def insert_ahead(
 ) -> tuple[WiredDiagram, OperatingPoint, str]:
     """Return the diagram with a block ahead of inputs of one source, its operating point, and the block's port.
 
-    Parameters
-    ----------
-    inputs : sequence of (str, str)
-        Block and port of each input, all in one subsystem.
-    source : (str, str)
-        Port that is wired to them.
-    entries : sequence of int
-        Its entries that are.
+    The inputs are in one subsystem; ``entries`` are those of the source that are wired to them.
     """
     table = diagram.structure.copy()
     path = _insert(table, inputs)
@@ -189,10 +176,7 @@ def _carry_point(
 def split_consumers(
     diagram: WiredDiagram, point: OperatingPoint, wires: Sequence[str], to: Iterable[str]
 ) -> tuple[WiredDiagram, OperatingPoint, str]:
-    """Return the diagram with a block ahead of some consumers of a wire, its operating point, and the block's port.
-
-    The block passes the signal on.
-    """
+    """Return the diagram with a block ahead of some consumers of a wire, its operating point, and the block's port."""
     if len(wires) != 1:
         raise OptionError(
             f"found {len(wires)} wires with to=…; expected one. Name the wire of these inputs.",

@@ -185,26 +185,14 @@ class ZeroSlope(BlockFinding):
 
 @dataclass(frozen=True)
 class CutFromTracking(Finding):
-    """A cut that separates a block's tracking input from the output that it follows in the closed loop.
-
-    Attributes
-    ----------
-    wire : str
-        The cut wire.
-    block, port, output : str
-        Path of the block, its tracking input, and the output that this input has the true value of.
-    offered : str
-        Wire that feeds the tracking input.
-    to : tuple of str
-        Its other consumers on the loop: ``loop(offered, to=to)`` leaves the tracking as it is.
-    """
+    """A cut that separates a block's tracking input from the output that it follows in the closed loop."""
 
     wire: str
     block: str
-    port: str
-    output: str
-    offered: str
-    to: tuple[str, ...]
+    port: str  # tracking input
+    output: str  # the output that it has the true value of
+    offered: str  # wire that feeds the tracking input
+    to: tuple[str, ...]  # its other consumers on the loop: loop(offered, to=to) leaves the tracking as it is
 
     def __str__(self) -> str:
         step = f" For the loop without it take loop({self.offered!r}, to={_shown(self.to)})." if self.to else ""
@@ -216,25 +204,13 @@ class CutFromTracking(Finding):
 
 @dataclass(frozen=True)
 class SharedCut(Finding):
-    """A cut that also takes the controller's own way back, such as the model of a Smith predictor or an observer.
-
-    Attributes
-    ----------
-    wire : str
-        The cut wire.
-    to : tuple of str
-        Inputs of the plant: ``loop(wire, to=to)`` is the loop there.
-        Empty where no single cut separates them from the others.
-    own : tuple of str
-        The other consumers, from which the wire is reached again without the plant.
-    at : str
-        Wire that feeds the inputs of the plant, where it is not the cut wire but one behind it.
-    """
+    """A cut that also takes the controller's own way back, such as the model of a Smith predictor or an observer."""
 
     wire: str
+    # inputs of the plant: loop(wire, to=to) is the loop there; empty where no single cut separates them
     to: tuple[str, ...]
-    own: tuple[str, ...]
-    at: str = ""
+    own: tuple[str, ...]  # the other consumers, from which the wire is reached again without the plant
+    at: str = ""  # wire that feeds the inputs of the plant, where it is not the cut wire but one behind it
 
     def __str__(self) -> str:
         step = (
@@ -250,18 +226,11 @@ class SharedCut(Finding):
 
 @dataclass(frozen=True)
 class ParallelWays(Finding):
-    """A cut wire with several ways back, of which nothing says which one is the plant's.
-
-    Attributes
-    ----------
-    wire : str
-        The cut wire.
-    cuts : tuple of (str, tuple of str)
-        Wires and inputs at which each way can be cut alone: the wire itself, or one behind blocks without states.
-    """
+    """A cut wire with several ways back, of which nothing says which one is the plant's."""
 
     limits_numbers: ClassVar[bool] = False
     wire: str
+    # wires and inputs at which each way can be cut alone: the wire itself, or one behind blocks without states
     cuts: tuple[tuple[str, tuple[str, ...]], ...]
 
     @property
@@ -283,22 +252,12 @@ def _shown(to: tuple[str, ...]) -> str:
 
 @dataclass(frozen=True)
 class InertConsumer(Finding):
-    """A consumer of a cut wire from which nothing follows at the operating point: L is the loop through the others.
-
-    Attributes
-    ----------
-    wire : str
-        The cut wire.
-    block, port : str
-        Path of the block, and its input.
-    to : tuple of str
-        The other consumers on the loop.
-    """
+    """A consumer of a cut wire from which nothing follows at the operating point: L is the loop through the others."""
 
     wire: str
     block: str
     port: str
-    to: tuple[str, ...]
+    to: tuple[str, ...]  # the other consumers on the loop
 
     def __str__(self) -> str:
         return (
@@ -309,19 +268,11 @@ class InertConsumer(Finding):
 
 @dataclass(frozen=True)
 class EventWithinPeriod(Finding):
-    """An event within the period of the model; the model is that of the motion without it.
-
-    Attributes
-    ----------
-    block, event : str
-        Path of the block, and name of its event.
-    t : float
-        Start of the period in s.
-    """
+    """An event within the period of the model; the model is that of the motion without it."""
 
     block: str
     event: str
-    t: float
+    t: float  # start of the period in s
 
     def __str__(self) -> str:
         return (
@@ -332,19 +283,11 @@ class EventWithinPeriod(Finding):
 
 @dataclass(frozen=True)
 class MemoryActs(Finding):
-    """A block's memory that affects the motion, so that it counts as a state.
-
-    Attributes
-    ----------
-    block : str
-        Path of the block.
-    slope : float
-        Largest derivative of a state by the memory.
-    """
+    """A block's memory that affects the motion, so that it counts as a state."""
 
     limits_numbers: ClassVar[bool] = False
     block: str
-    slope: float
+    slope: float  # largest derivative of a state by the memory
 
     def __str__(self) -> str:
         return f"{self.block}: its memory affects the motion (slope {self.slope:.3g}): it counts as a state"
@@ -450,13 +393,6 @@ class EntryTaken(Finding):
 
     Names count entries from 1 since version 0.2.0; before, these names counted from 0. This finding says which entry is
     meant, for one release.
-
-    Attributes
-    ----------
-    name : str
-        Name of the signal.
-    entry : tuple of int
-        Numbers of the entry, counted from 1.
     """
 
     limits_numbers: ClassVar[bool] = False

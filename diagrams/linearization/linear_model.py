@@ -549,21 +549,8 @@ def linearize_within(
 ) -> Linearization:
     """Return the model over the period of all clocks, with its outputs at all ticks and between them.
 
-    Parameters
-    ----------
-    diagram : WiredDiagram
-        A diagram with a clock, or with FMUs that step.
-    point : OperatingPoint
-        The operating point, on the diagram's ticks.
-    parts : int
-        Parts of the time from one tick to the next: outputs are read at the beginning of each. FMUs step by each.
-    inputs, outputs, stairs
-        As of `linearize`; names of wires and ports alone.
-
-    Returns
-    -------
-    Linearization
-        Its inputs are held over the period; its outputs are those of the first instant, then those of the next one, ….
+    Outputs are read at the beginning of each of so many ``parts`` of the time from one tick to the next; FMUs step by
+    each. Inputs are held over the period; the outputs are those of the first instant, then those of the next one, ….
     """
     return _linearize(
         diagram,

@@ -31,24 +31,13 @@ MEANS = {ca.OP_FLOOR: -0.5, ca.OP_CEIL: 0.5}
 
 @dataclass(frozen=True, eq=False)
 class Stair:
-    """A way through a block that goes in stairs, with its mean slope.
-
-    Attributes
-    ----------
-    path : str
-        Path of the block.
-    row, source : str
-        Its output (``u y``) or state (``x level``), and the input.
-    slope : ndarray
-        Mean slope, shape (entries of the row, entries of the input).
-    asked : bool
-        Whether it is taken because all stairs were asked for: the block does not name the steps of this input.
-    """
+    """A way through a block that goes in stairs, with its mean slope."""
 
     path: str
-    row: str
+    row: str  # its output, "u y", or state, "x level"
     source: str
-    slope: np.ndarray
+    slope: np.ndarray  # mean slope, shape (entries of the row, entries of the input)
+    # whether it is taken because all stairs were asked for: the block does not name the steps of this input
     asked: bool = False
 
 

@@ -272,15 +272,6 @@ def copy_point(diagram: WiredDiagram, point: OperatingPoint, other: WiredDiagram
 
     States that only the other diagram has are those of its start. An FMU may be in co-simulation in one diagram and in
     model exchange in the other.
-
-    Parameters
-    ----------
-    diagram : Diagram
-        Diagram of the point.
-    point : OperatingPoint
-        The point.
-    other : Diagram
-        The other diagram.
     """
     from ..simulation import copy_states
 

@@ -173,13 +173,7 @@ def ticks_between_renewals(flat: FlatDiagram, ports: Iterable[tuple[str, str]]) 
 
 
 def find_slower_clocks(flat: FlatDiagram, ports: Iterable[tuple[str, str]], name: str) -> frozenset[TickPattern]:
-    """Return the clocks that are slower than the wires: than the fastest clock behind their sources, or their readers.
-
-    Raises
-    ------
-    OptionError
-        If no sampled subsystem makes or reads a wire.
-    """
+    """Return the clocks slower than the wires: than the fastest clock behind their sources, or their readers."""
     ports = list(ports)
     for reading in (False, True):
         found = [_find_clocks(flat, port, reading=reading) for port in ports]
@@ -356,13 +350,7 @@ def _find_channels(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, m
 def confirm_loop(
     cut: Model, A: np.ndarray, wires: tuple[str, ...], name: str, delays: LinearDelays | None = None
 ) -> None:
-    """Compare the poles of the closed loop with those of the diagram, of matrix A with its delays.
-
-    Raises
-    ------
-    ConfirmationError
-        If they differ.
-    """
+    """Compare the poles of the closed loop with those of the diagram, of matrix A with its delays."""
     Ac, B, C, D = cut.matrices
     back = np.eye(len(D)) - D
     if len(D) and not np.linalg.cond(back) < 1e12:
@@ -410,23 +398,14 @@ class TickModel(NamedTuple):
 
     The matrices lead from the states just before the tick and the injected signals to those before the next one, and
     to the signals that are measured at the tick.
-
-    Attributes
-    ----------
-    matrices : tuple of ndarray
-        A, B, C and D.
-    duration : float
-        Time to the next tick in s.
-    steps : bool
-        Whether the plant exchanges signals at the tick: always, if it is no FMU.
-    renews : tuple of bool
-        Whether each injected wire is renewed at the tick, by the clock of its block; wires of continuous blocks and
-        FMUs always are.
     """
 
     matrices: FourMatrices
-    duration: float
-    steps: bool
+    duration: float  # time to the next tick in s  # time to the next tick in s
+    # whether the plant exchanges signals at the tick: always, if it is no FMU
+    steps: bool  # whether the plant exchanges signals at the tick: always, if it is no FMU
+    # whether each injected wire is renewed at the tick; wires of continuous blocks and FMUs always are
+    # whether each injected wire is renewed at the tick; wires of continuous blocks and FMUs always are
     renews: tuple[bool, ...]
 
 
@@ -439,21 +418,7 @@ def model_ticks(
     openings: Sequence[str],
     stairs: str | None = None,
 ) -> tuple[tuple[TickModel, ...], list[str]]:
-    """Return the models of all ticks of a sampled diagram's period, and the names of their states.
-
-    Parameters
-    ----------
-    diagram : Diagram
-        Sampled diagram.
-    at : OperatingPoint
-        Instant at whose tick the period begins.
-    path : str
-        Path of the plant.
-    inputs, outputs, openings : sequence of str
-        Wires at which signals are injected and measured, and wires that are cut.
-    stairs : str, optional
-        Treatment of stairs, as `linearize` takes it.
-    """
+    """Return the models of all ticks of a sampled diagram's period, and the names of their states."""
     flat = diagram.flatten_like(at)
     injected, measured, cut = ([find_signal(flat, name) for name in names] for names in (inputs, outputs, openings))
     means = replace_stairs(diagram, flat, at, stairs)

@@ -46,28 +46,13 @@ _RESTS: WeakKeyDictionary[Linearization, dict[tuple[bytes, bytes], OperatingPoin
 
 @dataclass(frozen=True, eq=False)
 class LoopSlope:
-    """A loop's matrices, and their derivatives by one number of a parameter.
+    """A loop's matrices, and their derivatives by one number of a parameter."""
 
-    Attributes
-    ----------
-    parameter : str
-        Path of the parameter as `Diagram.replace` takes it, with the entry of an array: ``"pid.poles[2]"``.
-    value : float
-        Value of that number.
-    matrices, slopes : tuple of ndarray
-        A, B, C, D of L, and their derivatives by the number.
-    errors : tuple of ndarray
-        Estimated errors of the slopes' entries; zeros where they are exact.
-    rest_lost : bool
-        Whether the operating point was an equilibrium that no longer is one when the parameter changes: the states are
-        held then.
-    """
-
-    parameter: str
+    parameter: str  # path as `Diagram.replace` takes it, with the entry of an array: "pid.poles[2]"
     value: float
-    matrices: FourMatrices
-    slopes: FourMatrices
-    errors: FourMatrices
+    matrices: FourMatrices  # A, B, C, D of L
+    slopes: FourMatrices  # their derivatives by the number
+    errors: FourMatrices  # estimated errors of the slopes' entries; zeros where they are exact
     rest_lost: bool = False
 
     @property
@@ -87,22 +72,9 @@ def differentiate_loop(
 ) -> list[LoopSlope]:
     """Return the derivatives of a loop's matrices by parameters, one result for each of their numbers.
 
-    Parameters
-    ----------
-    model : Linearization
-        Linear model of the diagram.
-    wires : iterable of str
-        Wires that the loop is cut at, as of `Linearization.loop`.
-    parameters : iterable of str
-        Paths, as `Diagram.trim` frees them: of numbers in traced equations, or start values of FMUs; or of one entry of
-        an array, ``"motor.denominator[1]"``.
-    find : callable, optional
-        How the operating point is found: a changed diagram's point is found again, and the derivatives count that.
-        Without it, an equilibrium follows the parameter, and any other point keeps its states.
-    slow : {"closed", "open"}
-        As of `Linearization.loop`.
-    left_out : dict, optional
-        Takes the messages of parameters that have no derivative, by their paths; without it they are errors.
+    With ``find`` a changed diagram's operating point is found again, and the derivatives count that. Without it, an
+    equilibrium follows the parameter, and any other point keeps its states. ``left_out`` takes the messages of
+    parameters that have no derivative, by their paths; without it they are errors.
     """
     cut = _Cut(model, tuple(wires), slow)
     found = []

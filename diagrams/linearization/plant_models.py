@@ -204,23 +204,10 @@ def model_step(
 ) -> PlantModel:
     """Return the linear model of one communication step of an FMU.
 
-    Parameters
-    ----------
-    flat : FlatDiagram
-        Diagram.
-    at : OperatingPoint
-        Operating point at the beginning of the step.
-    path : str
-        Path of the FMU.
-    z : ndarray
-        Inputs of all FMUs over the step.
-    h : float
-        Length of the step in s.
-    way : {None, "equations", "step", "identified"}
-        "equations" takes the matrix exponential of the equations' Jacobians under held inputs, which is exact at an
-        equilibrium; "step" differences the step itself; "identified" takes pulse responses from rest. None takes the
-        first at an equilibrium, else the second; where the FMU does not allow that, the first with its error, or the
-        third.
+    ``z`` are the inputs of all FMUs over the step, h its length in s. As to the ``way``: "equations" takes the matrix
+    exponential of the equations' Jacobians under held inputs, which is exact at an equilibrium; "step" differences the
+    step itself; "identified" takes pulse responses from rest. None takes the first at an equilibrium, else the second;
+    where the FMU does not allow that, the first with its error, or the third.
     """
     mine, w, wired = plant_entries(flat, path)
     block = fmu_at(flat, path)
@@ -448,17 +435,7 @@ class PlantEquations(NamedTuple):
 
 
 def linearize_plant(diagram: WiredDiagram, at: OperatingPoint, path: str) -> PlantEquations:
-    """Return the linear model of the equations of one block or FMU of a diagram.
-
-    Parameters
-    ----------
-    diagram : Diagram
-        Diagram with the plant.
-    at : OperatingPoint
-        Instant of the diagram.
-    path : str
-        Path of the plant.
-    """
+    """Return the linear model of the equations of one block or FMU of a diagram."""
     flat, block = diagram.flatten_like(at), diagram.blocks[path]
     trace = flat.checked.traced.get(path)
     if block.in_model_exchange:

@@ -37,43 +37,22 @@ MOST = 6
 
 @dataclass(frozen=True)
 class CutAhead:
-    """A cut ahead of some consumers of a port.
-
-    Attributes
-    ----------
-    port : (str, str)
-        The port.
-    to : tuple of (str, str)
-        The consumers; empty for all of them.
-    """
+    """A cut ahead of some consumers of a port."""
 
     port: Port
-    to: tuple[Port, ...] = ()
+    to: tuple[Port, ...] = ()  # the consumers; empty for all of them
 
 
 @dataclass(frozen=True)
 class WaysBack:
-    """The consumers of a wire that lead back to it.
+    """The consumers of a wire that lead back to it."""
 
-    Attributes
-    ----------
-    plant : tuple of (str, str)
-        Inputs of the plant, or all of them where none is the controller's own.
-    own : tuple of (str, str)
-        Inputs by which the wire's source comes back to itself without the plant.
-    port : (str, str)
-        Port whose consumers the plant's inputs are: the wire's, or one behind blocks without states that it feeds.
-    others : tuple of CutAhead
-        Cuts that nothing excludes besides, where several blocks may be the plant.
-    is_separable : bool
-        Whether one cut separates the plant's inputs from the controller's own.
-    """
-
-    plant: tuple[Port, ...]
-    own: tuple[Port, ...]
+    plant: tuple[Port, ...]  # inputs of the plant, or all of them where none is the controller's own
+    own: tuple[Port, ...]  # inputs by which the wire's source comes back to itself without the plant
+    # port whose consumers the plant's inputs are: the wire's, or one behind blocks without states that it feeds
     port: Port
-    others: tuple[CutAhead, ...] = ()
-    is_separable: bool = True
+    others: tuple[CutAhead, ...] = ()  # further cuts that nothing excludes, where several blocks may be the plant
+    is_separable: bool = True  # whether one cut separates the plant's inputs from the controller's own
 
 
 def find_ways_back(flat: FlatDiagram, port: Port) -> WaysBack:

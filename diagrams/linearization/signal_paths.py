@@ -26,13 +26,6 @@ class SignalPaths:
 
     An output follows an input at once, by states, or by events, but none that counts at the start alone. Outputs of an
     FMU follow all its inputs; those of the blocks in an enabled or triggered subsystem follow its control.
-
-    Parameters
-    ----------
-    flat : FlatDiagram
-        Diagram with its traced blocks.
-    cut : iterable of (str, str)
-        Ports behind which the wire is cut.
     """
 
     def __init__(self, flat: FlatDiagram, cut: Iterable[tuple[str, str]] = ()):

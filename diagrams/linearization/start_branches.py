@@ -19,15 +19,7 @@ from ..wiring import join
 
 
 def leave_start(flat: FlatDiagram, x: np.ndarray, values: Mapping[str, Any]) -> np.ndarray:
-    """Return x with the states of all blocks after their branches of the start; x itself where none changes.
-
-    Parameters
-    ----------
-    x : ndarray, shape (n,)
-        The vector x of the flattened diagram.
-    values : mapping of str to array
-        Signals by the paths of their ports, as an operating point has them.
-    """
+    """Return x with the states of all blocks after their branches of the start; x itself where none changes."""
     found = x.copy()
     for path, trace in flat.checked.traced.items():
         block = flat.table.blocks[path]

@@ -59,33 +59,15 @@ def ticks_of_period(flat: FlatDiagram, first: int, period: int, *, every: bool =
 
 @dataclass(frozen=True, eq=False)
 class Visit:
-    """A tick of a chain with what its linear model was made of.
+    """A tick of a chain with what its linear model was made of."""
 
-    Attributes
-    ----------
-    acting : frozenset of TickPattern
-        Clocks that act.
-    point : OperatingPoint
-        The operating point just before the tick.
-    h : float
-        Time to the next tick in s.
-    numbers : mapping
-        Values and derivatives at the tick, as `LocalDerivatives.differentiate` returns them.
-    W : ndarray
-        Derivatives of the FMUs' outputs before the tick by the chain's state.
-    x : ndarray
-        The vector x after the tick.
-    begun : tuple of PlantModel
-        Models of the FMUs' steps that begin at the tick.
-    """
-
-    acting: frozenset[TickPattern]
-    point: OperatingPoint
-    h: float
-    numbers: Numbers
-    W: np.ndarray
-    x: np.ndarray
-    begun: tuple[PlantModel, ...]
+    acting: frozenset[TickPattern]  # clocks that act
+    point: OperatingPoint  # operating point just before the tick
+    h: float  # time to the next tick in s
+    numbers: Numbers  # values and derivatives at the tick, of `LocalDerivatives.differentiate`
+    W: np.ndarray  # derivatives of the FMUs' outputs before the tick by the chain's state
+    x: np.ndarray  # the vector x after the tick
+    begun: tuple[PlantModel, ...]  # models of the FMUs' steps that begin at the tick
 
 
 class Chain:
@@ -235,13 +217,7 @@ class Chain:
             )
 
     def _begin_line(self, x1: np.ndarray) -> DelayLine | None:
-        """Return the line of what transport delays keep, from the derivatives after the first tick; None without any.
-
-        Raises
-        ------
-        OptionError
-            If these derivatives change from tick to tick, or between two.
-        """
+        """Return the line of transport delays' past, from the derivatives after the first tick; None without delays."""
         if not len(self._channels):
             return None
         flat, here = self.flat, self.here

@@ -196,19 +196,7 @@ class Plants:
 
 
 class ExchangedPlants:
-    """FMUs in model exchange whose start values are free: evaluators of the FMUs with other values, and differences.
-
-    Parameters
-    ----------
-    diagram : Diagram
-        The diagram.
-    flat : FlatDiagram
-        The flattened diagram.
-    at : OperatingPoint
-        Where the search begins.
-    free : list of Free
-        All free parameters.
-    """
+    """FMUs in model exchange whose start values are free: evaluators of the FMUs with other values, and differences."""
 
     def __init__(self, diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, free: list[Free]):
         self.diagram, self.at_start, self.free = diagram, at, free
@@ -228,17 +216,7 @@ class ExchangedPlants:
         values: Sequence[np.ndarray],
         evaluate: Callable[[Evaluators | None], Sequence[np.ndarray]],
     ) -> list[np.ndarray]:
-        """Return the derivatives of vectors by all free parameters: differences, zeros of those of other blocks.
-
-        Parameters
-        ----------
-        q : sequence of ndarray
-            Values of the free parameters.
-        values : sequence of ndarray
-            The vectors there.
-        evaluate : callable
-            Function from evaluators to the vectors.
-        """
+        """Return the derivatives of vectors by all free parameters: differences, zeros of those of other blocks."""
         sizes = [v.size for v in values]
         return differentiate_by(self.free, q, self.mine, sizes, lambda _, beside: evaluate(self.evaluators(beside)))
 
@@ -252,18 +230,8 @@ def differentiate_by(
 ) -> list[np.ndarray]:
     """Return the derivatives of vectors by all free parameters: central differences by those that are chosen, or zeros.
 
-    Parameters
-    ----------
-    free : sequence of Free
-        The parameters.
-    q : sequence of ndarray
-        Their values.
-    chosen : iterable of int
-        Numbers of those that the vectors may follow.
-    sizes : sequence of int
-        Sizes of the vectors.
-    evaluate : callable
-        Function from the number of a parameter and the values with another one of it to the vectors.
+    ``chosen`` are the numbers of those that the vectors may follow, ``sizes`` the vectors' sizes. ``evaluate`` leads
+    from the number of a parameter, and the values with another one of it, to the vectors.
     """
     columns = [np.zeros((size, sum(value.size for value in q))) for size in sizes]
     first = np.cumsum([0, *(value.size for value in q)])

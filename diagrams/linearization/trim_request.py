@@ -43,33 +43,17 @@ class Target:
 
 @dataclass(eq=False)
 class Free:
-    """A parameter that a trim may change.
+    """A parameter that a trim may change."""
 
-    Attributes
-    ----------
-    name : str
-        Path of the block, and name of the parameter in it.
-    path : str
-        Path of the block.
-    keys : list of str
-        Name of the parameter, with the names in it.
-    start, low, high : ndarray
-        First value and bounds of the entries.
-    shape : tuple of int
-        Shape of the parameter.
-    where : slice or None
-        The block's slice of the parameters of the flattened diagram; None for an FMU.
-    """
-
-    name: str
+    name: str  # path of the block, and name of the parameter in it
     path: str
-    keys: list[str]
+    keys: list[str]  # name of the parameter, with the names in it
     block: Block
-    start: np.ndarray
-    low: np.ndarray
+    start: np.ndarray  # first value of the entries
+    low: np.ndarray  # their bounds
     high: np.ndarray
     shape: tuple[int, ...]
-    where: slice | None = None
+    where: slice | None = None  # the block's slice of the parameters of the flattened diagram; None for an FMU
     pack: Callable[[Block], np.ndarray] | None = field(default=None, repr=False)
 
     def find_entries(self, entry: tuple[int, ...]) -> list[tuple[int, str]]:

@@ -34,24 +34,12 @@ BETWEEN = 0.01
 
 @dataclass(frozen=True)
 class Instants:
-    """Instants of a sample at which signals are read.
+    """Instants of a sample at which signals are read."""
 
-    Attributes
-    ----------
-    finer : int
-        Ticks of the run for each tick of the diagram.
-    count : int
-        Instants in a sample; they divide its ticks evenly.
-    looked : int
-        Parts of a tick of the diagram at which the linear model is looked at.
-    turns : float
-        Time constants of the fastest mode between two ticks, or radians of it, in a sample.
-    """
-
-    finer: int = 1
-    count: int = 1
-    looked: int = 1
-    turns: float = 0.0
+    finer: int = 1  # ticks of the run for each tick of the diagram
+    count: int = 1  # instants in a sample; they divide its ticks evenly
+    looked: int = 1  # parts of a tick of the diagram at which the linear model is looked at
+    turns: float = 0.0  # time constants of the fastest mode between two ticks, or radians of it, in a sample
 
 
 def choose_instants(diagram: WiredDiagram, point: OperatingPoint, ticks: int, samples: int) -> Instants:
@@ -89,12 +77,7 @@ def _without_own_steps(diagram: WiredDiagram) -> WiredDiagram:
 class WithinSamples:
     """The linear model between the ticks of a sampled diagram, with one input that is held over each sample.
 
-    Parameters
-    ----------
-    model : Linearization
-        The model with its outputs at instants that divide its period evenly; see `linearize_within`.
-    outputs : int
-        Number of outputs at each instant.
+    Its ``outputs`` are as many at each instant; instants divide the period evenly (`linearize_within`).
     """
 
     def __init__(self, model: Linearization, outputs: int):

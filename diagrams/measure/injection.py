@@ -61,20 +61,12 @@ class Waveform:
 
 @dataclass(frozen=True, eq=False)
 class InjectedDiagram:
-    """A diagram with a test signal added at one of its ports; all other blocks keep their paths.
-
-    Attributes
-    ----------
-    source, sum : str
-        Paths of the test signal's block and of the sum.
-    lines : int
-        Number of lines of the test signal.
-    """
+    """A diagram with a test signal added at one of its ports; all other blocks keep their paths."""
 
     diagram: WiredDiagram
-    source: str
-    sum: str
-    lines: int
+    source: str  # path of the test signal's block
+    sum: str  # path of the sum
+    lines: int  # number of lines of the test signal
 
 
 def inject_signal(
@@ -82,21 +74,8 @@ def inject_signal(
 ) -> InjectedDiagram:
     """Return a diagram in which every consumer of a port gets the port's signal plus a test signal.
 
-    Parameters
-    ----------
-    diagram : WiredDiagram
-        Diagram without the test signal.
-    signal : Tap
-        Port.
-    lines : int
-        Number of lines of the test signal.
-    held : (Fraction, Fraction), optional
-        Seconds between two samples of the test signal, and time of the first one; without it the signal is continuous.
-
-    Raises
-    ------
-    WiringError
-        If the port has no consumer.
+    ``held`` are the seconds between two samples of the test signal, and the time of the first one; without it the
+    signal is continuous.
     """
     lowered = diagram.scheduled
     table = lowered.copy()
@@ -154,27 +133,8 @@ def _find_free_name(name: str, taken: set[str]) -> str:
 class InjectionRun:
     """A running simulation with a test signal that can be changed between samples; use it in a ``with`` statement.
 
-    Parameters
-    ----------
-    diagram : WiredDiagram
-        Diagram without the test signal.
-    made : InjectedDiagram
-        Diagram with the test signal.
-    signal : Tap
-        Port to which the test signal is added.
-    outputs : iterable of Tap
-        Other signals to measure.
-    begins : OperatingPoint or float
-        Beginning of the measurement: an operating point, or a time in s to which the diagram is run. To a point that a
-        run has reached it is run as well where its states are not all that has to be known, or an FMU does not let
-        them be set.
-    options : mapping
-        Options of the run; see `RunOptions`.
-
-    Raises
-    ------
-    OptionError
-        If the diagram, run again, is elsewhere than at the operating point.
+    It ``begins`` at an operating point, or at a time in s to which the diagram is run. To a point that a run has
+    reached it is run as well where its states are not all that has to be known, or an FMU does not let them be set.
     """
 
     def __init__(

@@ -133,11 +133,6 @@ def _find_noise(phasors: np.ndarray) -> np.ndarray:
 
     Of m complex normal values, |mean − true|² over Σ|value − mean|²/(m (m − 1)) is F-distributed with 2 and 2 (m − 1)
     degrees of freedom, whose quantile is (m − 1) ((1 − share)^(−1/(m − 1)) − 1).
-
-    Parameters
-    ----------
-    phasors : (m, lines, entries) ndarray
-        Phasors of the windows.
     """
     m = len(phasors)
     quantile = (m - 1) * ((1.0 - SHARE) ** (-1.0 / (m - 1)) - 1.0)

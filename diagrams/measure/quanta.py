@@ -38,25 +38,13 @@ TAIL = 0.2
 @explain_calls
 @dataclass(frozen=True)
 class Converter:
-    """An input that its block follows in steps.
-
-    Attributes
-    ----------
-    block, source : str
-        Path of the block, and its input.
-    size : ndarray
-        Size of the steps, one for each entry of the input.
-    signal : str
-        Port that feeds the input.
-    entries : tuple of int
-        Entries of that port that reach the input.
-    """
+    """An input that its block follows in steps."""
 
     block: str
     source: str
-    size: np.ndarray
-    signal: str
-    entries: tuple[int, ...]
+    size: np.ndarray  # size of the steps, one for each entry of the input
+    signal: str  # port that feeds the input
+    entries: tuple[int, ...]  # entries of that port that reach the input
 
     @property
     def name(self) -> str:
@@ -67,18 +55,10 @@ class Converter:
 @explain_calls
 @dataclass(frozen=True)
 class Quantum:
-    """Largest change of a signal by one step of one converter.
+    """Largest change of a signal by one step of one converter."""
 
-    Attributes
-    ----------
-    value : float
-        The change, in the signal's unit.
-    converter : str
-        Name of the converter's input.
-    """
-
-    value: float
-    converter: str
+    value: float  # in the signal's unit
+    converter: str  # name of the converter's input
 
 
 def find_converters(flat: FlatDiagram) -> list[Converter]:
@@ -128,14 +108,8 @@ def find_rest(
 ) -> float:
     """Return the time in s after a step from whose `TAIL` on its motion is a tenth of a quantum, by the linear model.
 
-    Parameters
-    ----------
-    size : float
-        Height of the step at the wire.
-    slowest : float
-        Rate in 1/s of the slowest mode.
-    length : float
-        Time in s within which the step moves the converters' inputs most.
+    ``slowest`` is the rate in 1/s of the slowest mode, ``length`` the time in s within which the step moves the
+    converters' inputs most.
     """
     converters = find_converters(diagram.flatten_like(point))
     if not converters:
@@ -148,15 +122,7 @@ def find_rest(
 def find_least_sine(
     diagram: WiredDiagram, point: OperatingPoint, wire: str, L: LoopTransfer, frequencies: np.ndarray
 ) -> tuple[float, Quantum] | None:
-    """Return the amplitude of sines at a wire that move it by `LEAST_SINE` quanta at each frequency, and the quantum.
-
-    Parameters
-    ----------
-    L : control.StateSpace
-        The wire's loop transfer function.
-    frequencies : ndarray
-        Frequencies in rad/s.
-    """
+    """Return the amplitude of sines at a wire that move it by `LEAST_SINE` quanta everywhere, and the quantum."""
     quantum = find_quantum(diagram, point, wire, PERIODS * 2.0 * np.pi / float(np.min(frequencies)))
     if quantum is None:
         return None
@@ -183,13 +149,6 @@ def remaining_oscillation(change: np.ndarray, predicted: np.ndarray, size: np.nd
     """Return the largest amplitude, in quanta, of a converter's inputs at the end of a record.
 
     What the linear model does there doesn't count; where the run doesn't follow the model, the run's own motion does.
-
-    Parameters
-    ----------
-    change, predicted : (N, K) ndarray
-        Entries of the input over the record, of the run and of the linear model.
-    size : (K,) ndarray
-        Size of the steps.
     """
     begins = int((1.0 - TAIL) * len(change))
     spans = [np.ptp(part[begins:], axis=0) for part in (change, change - predicted)]

@@ -203,32 +203,7 @@ def step_response(
     outputs: Iterable[str] = (),
     stairs: str | None = None,
 ) -> StepResponse:
-    """Return the response of the running diagram to a step at a wire, and the linear model's.
-
-    Parameters
-    ----------
-    diagram : WiredDiagram
-        The diagram.
-    wire : str
-        Wire with one entry, or one entry of a wire.
-    size : float
-        Height of the step in the wire's unit.
-    length : float
-        Length of the response in s.
-    at : OperatingPoint, Snapshot or float, optional
-        Beginning; the start without it.
-    outputs : iterable of str
-        Further wires or ports.
-    stairs : {"gain", "zero"}, optional
-        Treatment of stairs in the linear model, as of `Diagram.linearize`.
-
-    Raises
-    ------
-    OptionError
-        A wire with several entries, or a step or length that is none.
-    DivergenceError
-        The response grows without end.
-    """
+    """Return the response of the running diagram to a step at a wire, and the linear model's."""
     point = operating_point(diagram, at, {})
     variant = diagram.replace(point.parameters) if point.parameters else diagram
     if point.residual <= EQUILIBRIUM and can_start_at(variant, point):
@@ -366,14 +341,9 @@ def step_response(
 def predict(model: Linearization, d: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the outputs of a linear model with one input d: sampled as it is, or held from the first sample on.
 
-    Returns
-    -------
-    rows : (N, K) ndarray
-        Outputs at the samples.
-    later : (2, K) ndarray
-        Smallest and largest outputs after the last sample, with d held at its last value.
-    between : (K,) ndarray
-        Largest size of the outputs between the samples, less that at the samples; 0 of a sampled model.
+    These are the rows at the samples, (N, K); the smallest and largest outputs after the last sample, with d held at
+    its last value, (2, K); and the largest size of the outputs between the samples, less that at the samples, (K,),
+    which is 0 of a sampled model.
     """
     if model.delays is not None:
         return _predict_with_delays(model, d, t)

@@ -23,23 +23,13 @@ def choose_step(omega: np.ndarray) -> Fraction:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A part of the test signal and its window.
-
-    Attributes
-    ----------
-    samples : int
-        Samples of the window.
-    lines, omega : (K,) ndarray
-        Lines to read: whole periods in the window, and frequencies in rad/s.
-    every_line : bool
-        Whether the signal has all lines, as a chirp has.
-    """
+    """A part of the test signal and its window."""
 
     waveform: Waveform
-    samples: int
-    lines: np.ndarray
-    omega: np.ndarray
-    every_line: bool
+    samples: int  # samples of the window
+    lines: np.ndarray  # lines to read: whole periods in the window
+    omega: np.ndarray  # their frequencies in rad/s
+    every_line: bool  # whether the signal has all lines, as a chirp has
 
     @property
     def silence(self) -> Waveform:
@@ -48,19 +38,7 @@ class Part:
 
 
 def plan_signal(kind: str, omega: np.ndarray, dt: float, amplitude: float) -> Iterator[Part]:
-    """Yield the parts of a test signal, to be played one after the other.
-
-    Parameters
-    ----------
-    kind : {"sine", "multisine", "chirp"}
-        A part for each frequency, or one part for all.
-    omega : (K,) ndarray
-        Frequencies in rad/s, rising.
-    dt : float
-        Seconds between two samples.
-    amplitude : float
-        Largest value of the signal.
-    """
+    """Yield the parts of a test signal, to be played one after the other."""
     zero = np.zeros(1)
     if kind == "sine":
         for w in omega:
@@ -95,13 +73,6 @@ def compute_phasors(part: Part, data: np.ndarray) -> tuple[np.ndarray, np.ndarra
     The distortion is the rms of the rest next to the lines, relative to that of each line; NaN for a part with every
     line. Over a window of whole periods the lines are orthogonal to all others. The difference of the window's end from
     its beginning is a drift, and is subtracted.
-
-    Parameters
-    ----------
-    part : Part
-        Window and lines.
-    data : (samples + 1, signals) ndarray
-        Samples of the window, both ends included.
     """
     n = part.samples
     k = np.arange(n)
