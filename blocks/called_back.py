@@ -26,16 +26,9 @@ class CalledBack:
     ) -> int:
         """Return the address of a function for C, which lives as long as this.
 
-        Parameters
-        ----------
-        kind : ctypes function type
-            Its arguments and its result.
-        call : callable
-            The function; None stands for 0.
-        failed : int, default 0
-            Its result where an error waits.
-        interrupted : callable, optional
-            Called in its place, with its arguments, where an interrupt has come before.
+        ``call``: the function; None stands for 0.
+        ``failed``: its result where an error waits.
+        ``interrupted``: called in its place, with its arguments, where an interrupt has come before.
         """
 
         def guarded(*arguments: Any) -> int:

@@ -20,12 +20,8 @@ class Interrupts(threading.local):
 
     Python raises it at its next instruction: the first one of a function that C calls, where ctypes would drop it.
 
-    Attributes
-    ----------
-    heard : bool
-        Whether an interrupt is raised at once: Python has been called by C, and catches it.
-    came : bool
-        Whether one waits to be raised.
+    ``heard``: whether an interrupt is raised at once: Python has been called by C, and catches it.
+    ``came``: whether one waits to be raised.
     """
 
     def __init__(self) -> None:

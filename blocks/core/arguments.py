@@ -55,16 +55,9 @@ def shortened(name: str, value: Any) -> str:
 class Kind:
     """Declared kind of values, with the words of the error for another one.
 
-    Attributes
-    ----------
-    expected : str
-        The kind in words.
-    holds : callable
-        Whether a value is of the kind.
-    step : str or callable, optional
-        One next step, or a function of the value that returns it; without one: to give such a value.
-    found : callable, optional
-        Returns the error's first words from the argument's name and its value.
+    ``holds``: whether a value is of the kind.
+    ``step``: one next step, or a function of the value that returns it; without one: to give such a value.
+    ``found``: returns the error's first words from the argument's name and its value.
     """
 
     expected: str
@@ -105,15 +98,10 @@ class Kind:
 def accepts(called: str | None = "", error: type[LoopwrightError] = OptionError, /, **kinds: Kind) -> Callable[[F], F]:
     """Check the kinds of a function's arguments before it runs, or of a dataclass's fields; a default is always right.
 
-    Parameters
-    ----------
-    called : str or None
-        Name by which users know the function, where it is another one, or that of an argument's object:
-        ``"{diagram.name}"``. None: the callers fill it in.
-    error : type
-        Class of the error.
-    **kinds
-        A kind for each argument that is checked; one of ``*args`` or ``**kwargs`` holds for each of their values.
+    ``called``: name by which users know the function, where it is another one, or that of an argument's object:
+    ``"{diagram.name}"``. None: the callers fill it in.
+    ``**kinds``: a kind for each argument that is checked; one of ``*args`` or ``**kwargs`` holds for each of their
+    values.
     """
 
     def wrap(subject: F) -> F:

@@ -22,12 +22,7 @@ def system_text(value: Any) -> str:
 def as_block(value: Any, wired: str = "") -> str:
     """Return what to write in place of a linear system of python-control, "" of anything else.
 
-    Parameters
-    ----------
-    value : object
-        The system.
-    wired : str
-        What follows the block, such as ``"(u)"``.
+    ``wired``: what follows the block, such as ``"(u)"``.
     """
     if not (kind := kind_of_system(value)):
         return ""

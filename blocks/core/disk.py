@@ -27,15 +27,10 @@ _PROBE = 2**24
 def describe_disk_error(error: OSError, place: str | os.PathLike[str], instead: str) -> str:
     """Return what the system found wrong with a file or folder, what was expected, and one next step.
 
-    Parameters
-    ----------
-    error : OSError
-        The system's error. Where one of ours was made of it before, that one's cause counts.
-    place : path
-        The file or folder that was used; an error that names another one is about that.
-    instead : str
-        A sentence that says how to use another place, such as "Name another folder." It is the next step wherever
-        nothing can be mended in this one.
+    ``error``: the system's error. Where one of ours was made of it before, that one's cause counts.
+    ``place``: the file or folder that was used; an error that names another one is about that.
+    ``instead``: a sentence that says how to use another place, such as "Name another folder." It is the next step
+    wherever nothing can be mended in this one.
     """
     while isinstance(error, DiskError) and isinstance(error.__cause__, OSError):
         error = error.__cause__
@@ -93,16 +88,7 @@ def explain_disk_errors(
 ) -> Iterator[None]:
     """Turn an error of the system, within a block that uses a file or folder, into one of ours.
 
-    Parameters
-    ----------
-    failed : str
-        What failed, such as "the FMU can't be built": the error begins with it.
-    place, instead
-        See `describe_disk_error`.
-    raised : class
-        Class of the error.
-    **where
-        ``block`` and ``port`` of the error.
+    ``failed``: what failed, such as "the FMU can't be built": the error begins with it.
     """
     try:
         yield

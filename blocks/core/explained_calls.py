@@ -52,10 +52,7 @@ class UnknownArgumentError(OptionError, UnknownNameError):
 def offer_elsewhere(**ways: str) -> Callable[[F], F]:
     """Make the errors of a function's calls offer what to write for names that are no arguments of it.
 
-    Parameters
-    ----------
-    **ways
-        For each name the text, such as ``title="about={'title': …}"``.
+    ``**ways``: for each name the text, such as ``title="about={'title': …}"``.
     """
 
     def mark(function: F) -> F:
@@ -72,11 +69,8 @@ def explain_calls(subject: F) -> F:
     becomes an `OptionError` that names the argument and those near it. The signature is looked at only then: a call
     whose arguments fit costs one frame more, and nothing else.
 
-    Parameters
-    ----------
-    subject : function or class
-        A class is changed in place, after `dataclass` has made its constructor; methods that it inherits stay as
-        they are.
+    ``subject``: a class is changed in place, after `dataclass` has made its constructor; methods that it inherits stay
+    as they are.
     """
     if not inspect.isclass(subject):
         return _explained(subject)

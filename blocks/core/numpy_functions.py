@@ -31,17 +31,7 @@ class Place:
 
 
 class NumpyCall:
-    """A NumPy function of signals and of numbers, such as ``np.sum(…, axis=0)``; a value that can be pickled.
-
-    Parameters
-    ----------
-    function : callable
-        NumPy's function.
-    args : tuple
-        Its arguments, with a `Place` for each signal.
-    kwargs : mapping
-        Its keywords.
-    """
+    """A NumPy function of signals and of numbers, such as ``np.sum(…, axis=0)``; a value that can be pickled."""
 
     def __init__(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]):
         self.function, self.args, self.kwargs = function, freeze(args), FrozenMapping(kwargs)

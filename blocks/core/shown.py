@@ -55,16 +55,8 @@ class ShownMembers(ABCMeta):
 def missing_member(owner: object, name: str, kind: str, ways: Mapping[str, str]) -> AttributeError:
     """Return the error of an attribute that an object doesn't have: what to write for it, or near names.
 
-    Parameters
-    ----------
-    owner : object
-        The object; what `dir` lists of it is known.
-    name : str
-        The attribute.
-    kind : str
-        What the object is, such as "a run".
-    ways : mapping of str
-        For names that users of other tools know: what to write.
+    ``owner``: the object; what `dir` lists of it is known.
+    ``ways``: for names that users of other tools know: what to write.
     """
     if hasattr(type(owner), name):
         object.__getattribute__(owner, name)  # a property that has failed: its own error

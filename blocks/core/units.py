@@ -57,19 +57,7 @@ class Unit:
 
 
 class DefinedUnit(str):
-    """Name of a unit that is defined elsewhere, as in an FMU's description; it counts as the definition says.
-
-    Parameters
-    ----------
-    unit : Unit
-        The definition, with the name as its text.
-
-    Examples
-    --------
-    >>> inch = DefinedUnit(Unit("in", (0, 1, 0, 0, 0, 0, 0, 0), 0.0254))
-    >>> inch, convert_unit("mm", inch)
-    ('in', (0.03937007874015748, 0.0))
-    """
+    """Name of a unit that is defined elsewhere, as in an FMU's description; it counts as the definition says."""
 
     unit: Unit
 

@@ -13,15 +13,8 @@ from ..core import Block, ParameterError, SampleTimeError, kinds, shorten
 def check_system(cls: type[Block], system: Any, kind: str) -> dict[str, Any]:
     """Refuse anything but a system of this kind and of the block's time; return the keyword ``dt`` of a discrete one.
 
-    Parameters
-    ----------
-    cls : type
-        Class of the block to be made; in discrete time if it is a `FixedSampleTime`. A system with an unspecified time,
-        ``dt=None``, may be either.
-    system : object
-        The object to check.
-    kind : {"StateSpace", "TransferFunction"}
-        Class of python-control that is expected.
+    ``cls``: class of the block to be made; in discrete time if it is a `FixedSampleTime`. A system with an unspecified
+    time, ``dt=None``, may be either.
     """
     import control
 

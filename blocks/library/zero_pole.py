@@ -30,10 +30,7 @@ class UnpairedRootError(ValueError):
 def real_factors(roots: Sequence[complex]) -> list[list[complex]]:
     """Return roots in groups that make real polynomials: conjugate pairs, and single real roots.
 
-    Raises
-    ------
-    UnpairedRootError
-        For a complex root without its conjugate.
+    Raises `UnpairedRootError`: for a complex root without its conjugate.
     """
     rest = sorted((complex(r) for r in roots), key=lambda r: (r.real, abs(r.imag), r.imag))
     groups: list[list[complex]] = []

@@ -69,10 +69,7 @@ _SHOWN = {"m": ("mm", 1e3), "1": ("%", 100.0), "m/s2": ("m/s²", 1.0)}
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status.
 
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        The arguments; those of the process without it.
+    ``argv``: the arguments; those of the process without it.
     """
     parser = _make_parser()
     try:

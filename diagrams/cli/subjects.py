@@ -64,12 +64,9 @@ def proposed(subject: str) -> dict[str, float]:
 def open_user_diagram(subject: str) -> Iterator[tuple[Diagram, Experiment | None]]:
     """Yield the diagram of ``FILE.py:NAME`` or ``FILE.ssp``, and its experiment where it has one.
 
-    Raises
-    ------
-    OptionError
-        No such file or name, or a name that is no diagram.
-    DefinitionError
-        The file, or the function that makes the diagram, raises: with the line in the user's file.
+    Raises `OptionError`: no such file or name, or a name that is no diagram.
+    Raises `DefinitionError`: the file, or the function that makes the diagram, raises: with the line in the user's
+    file.
     """
     if is_ssp(subject):
         yield Diagram.from_ssp(*split_ssp(subject)), None

@@ -62,10 +62,7 @@ def fit(text: str, stream: IO[str]) -> str:
 def check_file(name: str) -> Path:
     """Return the path of an FMU that is named on the command line.
 
-    Raises
-    ------
-    OptionError
-        If there is no such file.
+    Raises `OptionError` if there is no such file.
     """
     path = Path(name).expanduser()
     with explain_disk_errors("it can't be read", path, "Give another file.", OptionError, block=str(path)):

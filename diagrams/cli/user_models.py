@@ -21,12 +21,7 @@ _MODULE = "loopwright_user_model"
 class UserModel:
     """A block, a diagram or a subsystem in a user's file.
 
-    Parameters
-    ----------
-    block : Block, Diagram or Subsystem
-        It.
-    beside : tuple of Path
-        The modules next to the file that it has imported: files, or folders of packages.
+    ``beside``: the modules next to the file that it has imported: files, or folders of packages.
     """
 
     block: Block | Diagram | Subsystem
@@ -37,12 +32,8 @@ class UserModel:
 def load_user_model(text: str) -> Iterator[UserModel]:
     """Load a model from ``FILE.py:Name``; its module, and those next to it that it imports, are forgotten afterwards.
 
-    Raises
-    ------
-    OptionError
-        No such file, no such name, a name that is no block, or a class that needs parameters.
-    DefinitionError
-        The file can't be imported, or the class can't be made.
+    Raises `OptionError`: no such file, no such name, a name that is no block, or a class that needs parameters.
+    Raises `DefinitionError`: the file can't be imported, or the class can't be made.
     """
     path, name = _split_name(text)
     with _load(path) as module:
@@ -56,17 +47,8 @@ def load_user_model(text: str) -> Iterator[UserModel]:
 def load_user_file(text: str, *, port: str) -> Iterator[tuple[ModuleType, Path, str]]:
     """Load a file from ``FILE.py:NAME``, or ``FILE.py``; yield its module, its path, and the name or "".
 
-    Parameters
-    ----------
-    port : str
-        The argument of the command that gave it.
-
-    Raises
-    ------
-    OptionError
-        No such file.
-    DefinitionError
-        The file can't be imported.
+    Raises `OptionError`: no such file.
+    Raises `DefinitionError`: the file can't be imported.
     """
     path, name = _split_name(text, port, "loop.py:diagram")
     with _load(path) as module:

@@ -43,23 +43,14 @@ class HeldFrom(StrEnum):
 class CoupledConnection:
     """A connection from or to an FMU, with its delay.
 
-    Attributes
-    ----------
-    source, target : str
-        Dotted ports; the source is the block that the input is wired to, with the part of its port.
-    kind : LinkKind
-        FMU → FMU, block → FMU or FMU → block.
-    follows : tuple of str
-        For an input of an FMU: the FMUs' outputs that it follows between ticks.
-    step : float
-        Longest communication step of the FMU that is written to or read from, in s.
-    held : HeldFrom
-        Instant of the value that acts over a communication step.
-    steps : int
-        Communication steps from an instant to the first outputs that show the source's value at that instant; 0 where
-        those at the instant itself do.
-    delay : float
-        Mean age in s of the value that acts, against the source in continuous time; negative where it is ahead.
+    ``source``, ``target``: dotted ports; the source is the block that the input is wired to, with the part of its port.
+    ``kind``: FMU → FMU, block → FMU or FMU → block.
+    ``follows``: for an input of an FMU: the FMUs' outputs that it follows between ticks.
+    ``step``: longest communication step of the FMU that is written to or read from, in s.
+    ``held``: instant of the value that acts over a communication step.
+    ``steps``: communication steps from an instant to the first outputs that show the source's value at that instant; 0
+    where those at the instant itself do.
+    ``delay``: mean age in s of the value that acts, against the source in continuous time; negative where it is ahead.
     """
 
     source: str

@@ -39,24 +39,9 @@ class Effort:
 class CoupledSteps:
     """Communication steps of all plants of a run, by a scheme other than the default.
 
-    Parameters
-    ----------
-    flat : FlatDiagram
-        The diagram.
-    name : str
-        Its name, for errors.
-    plants : mapping of str to Plant
-        The plants by path; it may be filled later.
-    coupling : Coupling
-        The scheme.
-    steps : PlantSteps
-        The plants with their ticks.
-    z, w : ndarray
-        Inputs and outputs of the plants in the run.
-    exchange : callable
-        Gives the inputs that follow from w at a time in s, between ticks.
-    rest : Rest
-        The blocks in continuous time.
+    ``plants``: the plants by path; it may be filled later.
+    ``z``, ``w``: inputs and outputs of the plants in the run.
+    ``exchange``: gives the inputs that follow from w at a time in s, between ticks.
     """
 
     def __init__(
@@ -141,17 +126,9 @@ class CoupledSteps:
     def go(self, t: float, end: float, h: float) -> float | None:
         """Go from one tick to the next.
 
-        Parameters
-        ----------
-        t, end : float
-            Times of the ticks in s.
-        h : float
-            Length of the step between them in s, rounded once.
-
-        Returns
-        -------
-        float or None
-            Time in s at which a stop condition has ended the run before the next tick.
+        ``t``, ``end``: times of the ticks in s.
+        ``h``: length of the step between them in s, rounded once.
+        Returns: time in s at which a stop condition has ended the run before the next tick.
         """
         if self.coupling.error is not None or self.coupling.scheme == Scheme.ITERATED:
             try_steps(self._plants.values())

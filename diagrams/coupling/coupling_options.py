@@ -95,12 +95,7 @@ class Coupling:
 def refuse_model_exchange(coupling: Coupling, blocks: Mapping[str, Any]) -> None:
     """Refuse a scheme that goes back over a step where a model-exchange FMU can't.
 
-    Parameters
-    ----------
-    coupling : Coupling
-        The coupling.
-    blocks : mapping
-        The FMUs that are evaluated by the solver, by path.
+    ``blocks``: the FMUs that are evaluated by the solver, by path.
     """
     if coupling.scheme != Scheme.ITERATED and coupling.error is None:
         return

@@ -20,11 +20,6 @@ class Links:
     """Links between the plants of a diagram: entries of their inputs z and of their outputs w.
 
     Signals that sampled subsystems make are held between ticks, and make no link.
-
-    Attributes
-    ----------
-    flat : FlatDiagram
-        The diagram.
     """
 
     flat: FlatDiagram
@@ -227,10 +222,7 @@ class Links:
 def direct_ports(flat: FlatDiagram, *, wired: bool = False) -> set[tuple[str, str, str]]:
     """Return the plants with an input and an output that may follow it at once; a plant that doesn't say so may.
 
-    Parameters
-    ----------
-    wired : bool
-        Whether only outputs that something is wired to are looked at.
+    ``wired``: whether only outputs that something is wired to are looked at.
     """
     found, used = set(), {(wire.block, wire.port) for wire in flat.table.wires.values()}
     for path, block in stepped_blocks(flat.table).items():

@@ -15,31 +15,14 @@ from .plants import Plant, bind, part_of
 class PlantSteps:
     """The plants of a run with their ticks, and the inputs that they hold between them.
 
-    Parameters
-    ----------
-    flat : FlatDiagram
-        The diagram.
-    plants : mapping of str to Plant
-        The plants by path; it may be filled later.
-    z, w : ndarray
-        Inputs of the plants, as the diagram has computed them, and their outputs.
-    time_of : callable
-        Gives the time of a tick in s.
-    every_tick : bool
-        Whether the run visits every tick.
-
-    Attributes
-    ----------
-    regular : bool
-        Whether every plant steps at every tick that the run visits. Then inputs are read from z itself.
-    z : ndarray
-        Inputs of the plants, as the diagram has computed them last.
-    inputs : ndarray
-        Inputs of the plants, each as of its last communication point.
-    own : dict
-        The inputs of each plant among them, as a slice, by path.
-    reached : dict
-        Tick at which each plant is, by path.
+    ``plants``: the plants by path; it may be filled later.
+    ``z``, ``w``: inputs of the plants, as the diagram has computed them, and their outputs.
+    ``time_of``: gives the time of a tick in s.
+    ``every_tick``: whether the run visits every tick.
+    ``regular``: whether every plant steps at every tick that the run visits. Then inputs are read from z itself.
+    ``z``: inputs of the plants, as the diagram has computed them last.
+    ``inputs``: inputs of the plants, each as of its last communication point.
+    ``own``: the inputs of each plant among them, as a slice, by path.
     """
 
     def __init__(
@@ -206,10 +189,7 @@ def step_each(steps: Iterable[tuple[Plant, float, float]]) -> None:
 def end_all(ends: Iterable[Callable[[], None]], failure: SimulationError | None = None) -> None:
     """End steps that have begun, each of them; then raise an error, by the rule of `step_all`.
 
-    Parameters
-    ----------
-    failure : SimulationError, optional
-        Error with which one could not begin.
+    ``failure``: error with which one could not begin.
     """
     for end in ends:
         try:

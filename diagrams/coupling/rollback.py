@@ -21,13 +21,6 @@ class Rollback:
 
     Both are read after a restore, so that an FMU which computes its outputs again then is compared with itself. An
     output is compared until it has moved in a step and come back once.
-
-    Parameters
-    ----------
-    links : Links
-        Names and sizes of the outputs.
-    w : ndarray
-        Outputs of the plants in the run.
     """
 
     def __init__(self, links: Links, w: np.ndarray) -> None:
@@ -42,16 +35,9 @@ class Rollback:
     def check(self, path: str, stepped: np.ndarray, begun: np.ndarray, t: float | None) -> None:
         """Compare the outputs of a plant that has just been restored.
 
-        Parameters
-        ----------
-        path : str
-            Path of the plant.
-        stepped : ndarray
-            Its outputs before it was restored.
-        begun : ndarray
-            Outputs of all plants, read after a restore at the beginning of the step.
-        t : float or None
-            Time of the state in s.
+        ``stepped``: its outputs before it was restored.
+        ``begun``: outputs of all plants, read after a restore at the beginning of the step.
+        ``t``: time of the state in s.
         """
         mine = self._links.outputs[path]
         found, expected = self._w[mine], begun[mine]
@@ -83,16 +69,9 @@ def find_taken_back(links: Links, paths: Iterable[str], made: Sequence[np.ndarra
     A step behind a state that may be restored is not said to be final (noSetFMUStatePriorToCurrentPoint = false). There
     are FMUs that go back to its beginning when the next one begins, although nothing has restored their state.
 
-    Parameters
-    ----------
-    links : Links
-        Names and sizes of the outputs.
-    paths : iterable of str
-        Plants that were tried, from one state and with the same inputs.
-    made : sequence of ndarray
-        Outputs of all plants after half a step, after two halves, and after a whole step.
-    t : float
-        Time in s at which these begin.
+    ``paths``: plants that were tried, from one state and with the same inputs.
+    ``made``: outputs of all plants after half a step, after two halves, and after a whole step.
+    ``t``: time in s at which these begin.
     """
     moved, (half, halves, whole) = set(), made
     for path in paths:

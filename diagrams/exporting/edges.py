@@ -21,10 +21,7 @@ Edges = tuple[tuple[float, float], ...]
 def find_edges(opened: OpenDiagram, sources: Sequence[tuple[str, Announcer]]) -> tuple[Edges, Edges]:
     """Return discontinuities of sources, each with the time at which it is seen there; and first ones with periods.
 
-    Raises
-    ------
-    DefinitionError
-        For a source with very many of them that don't repeat.
+    Raises `DefinitionError`: for a source with very many of them that don't repeat.
     """
     late = find_late(sources)
     single, periodic = set[float](), list[tuple[float, float]]()

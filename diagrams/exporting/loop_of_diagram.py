@@ -75,27 +75,11 @@ def loop_spec(
 ) -> LoopSpec:
     """Return a diagram as it is exported.
 
-    Parameters
-    ----------
-    opened : OpenDiagram
-        The diagram, with its inputs and outputs.
-    solver : str
-        Method between ticks; "auto" is chosen by `_choose_solver`.
-    rtol, atol : float
-        Relative and absolute tolerance of a method of variable step.
-    between : bool, default True
-        Whether outputs follow inputs between ticks, too, where nothing moves there.
-    differentiated : bool, default False
-        Whether its derivatives are wanted.
-    name, description, **options
-        Fields of `LoopSpec`.
-
-    Raises
-    ------
-    DefinitionError
-        For what can't be exported, by its path.
-    SimulationError
-        If its start isn't found.
+    ``rtol``, ``atol``: relative and absolute tolerance of a method of variable step.
+    ``between``: whether outputs follow inputs between ticks, too, where nothing moves there.
+    ``differentiated``: whether its derivatives are wanted.
+    Raises `DefinitionError`: for what can't be exported, by its path.
+    Raises `SimulationError` if its start isn't found.
     """
     refuse(opened)
     own_fmus(opened)  # or refused, before anything is made
@@ -217,10 +201,7 @@ def _flatten(opened: OpenDiagram, name: str, step: float, *, between: bool) -> F
 def _continuous(workspace: Workspace, name: str, solver: str, rtol: float, atol: float, step: float) -> Continuous:
     """Return the continuous part, with a method that C has.
 
-    Raises
-    ------
-    OptionError
-        For a method of another library.
+    Raises `OptionError`: for a method of another library.
     """
     known = METHODS.get(solver)
     if known is not None and known.kind is MethodKind.LIBRARY:

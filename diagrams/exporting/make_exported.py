@@ -27,20 +27,9 @@ def make_exported(
 ) -> LoopSpec | None:
     """Return what is exported of a diagram or a subsystem; None for anything else.
 
-    Parameters
-    ----------
-    name : str, optional
-        Its name; without one, the diagram's or the subsystem's.
-    subsystem : str, optional
-        Path of the subsystem of a diagram that is exported; without it, the diagram.
-    outside : iterable of str
-        Paths of blocks of a diagram that are not exported; see `open_whole`.
-    outputs : iterable of str, optional
-        Signals that are outputs.
-    start : mapping of str, optional
-        Start values of inputs, by their names.
-    **options
-        Fields of `LoopSpec`.
+    ``name``: its name; without one, the diagram's or the subsystem's.
+    ``subsystem``: path of the subsystem of a diagram that is exported; without it, the diagram.
+    ``outside``: paths of blocks of a diagram that are not exported; see `open_whole`.
     """
     found = open_model(model, name=name, subsystem=subsystem, outside=outside, outputs=outputs)
     if found is None:
@@ -64,10 +53,7 @@ def open_model(
 ) -> tuple[str, OpenDiagram, str] | None:
     """Return the name of what is exported, with its inputs and outputs, and a line about it; None for anything else.
 
-    Raises
-    ------
-    OptionError
-        For arguments that don't fit together.
+    Raises `OptionError`: for arguments that don't fit together.
     """
     if isinstance(model, SubsystemCall):
         model = model.subsystem

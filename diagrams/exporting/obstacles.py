@@ -10,10 +10,7 @@ from .open_diagram import OpenDiagram
 def refuse(opened: OpenDiagram) -> None:
     """Refuse a diagram with parts that can't be exported.
 
-    Raises
-    ------
-    DefinitionError
-        For the first one.
+    Raises `DefinitionError`: for the first one.
     """
     table = opened.wired.scheduled
     for path, block in table.blocks.items():

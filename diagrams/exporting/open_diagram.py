@@ -21,20 +21,12 @@ _OUTSIDE = "outside"
 class OpenDiagram:
     """A diagram with inputs and outputs.
 
-    Attributes
-    ----------
-    wired : WiredDiagram
-        Its blocks and wires; the inputs are outputs of a block that nothing steps.
-    outside : str
-        Path of that block; empty without inputs.
-    outputs : mapping of str to Wire
-        The outputs: by name, where their values come from, in the diagram as it was wired.
-    inside : str
-        Path of the subsystem that it is a part of; names are shown from there on.
-    states : mapping of str to ndarray
-        States of blocks at the start, flat, by path, as the diagram around it finds them.
-    moved : frozenset of str
-        Parameters, by path, of which zeros are numbers in the functions; see `let_move`.
+    ``wired``: its blocks and wires; the inputs are outputs of a block that nothing steps.
+    ``outside``: path of that block; empty without inputs.
+    ``outputs``: the outputs: by name, where their values come from, in the diagram as it was wired.
+    ``inside``: path of the subsystem that it is a part of; names are shown from there on.
+    ``states``: states of blocks at the start, flat, by path, as the diagram around it finds them.
+    ``moved``: parameters, by path, of which zeros are numbers in the functions; see `let_move`.
     """
 
     wired: WiredDiagram
@@ -61,10 +53,7 @@ class OpenDiagram:
 def open_subsystem(subsystem: Subsystem, facade_class: type[Any], name: str) -> OpenDiagram:
     """Return a subsystem with its arguments as inputs; shapes and units are those that its blocks declare.
 
-    Raises
-    ------
-    WiringError, TraceError
-        As for a diagram of it.
+    Raises `WiringError, TraceError`: as for a diagram of it.
     """
     names = [p.name for p in subsystem.parameters]
     if subsystem.control_input and subsystem.control_input not in names:
@@ -108,10 +97,7 @@ def _declared(table: Structure, name: str, start: Any) -> tuple[str, tuple[int, 
 def open_part(wired: WiredDiagram, path: str, name: str) -> OpenDiagram:
     """Return a subsystem of a diagram with whatever it reads from around it as inputs.
 
-    Raises
-    ------
-    UnknownNameError
-        If there is no such subsystem.
+    Raises `UnknownNameError` if there is no such subsystem.
     """
     table = wired.structure
     found = find_path(path, {p: p for p in table.subsystems if p}, "subsystem", wired.name)
@@ -177,15 +163,7 @@ def open_whole(wired: WiredDiagram, outside: Sequence[str], name: str) -> OpenDi
     What they put out are its inputs, and what they read its outputs; if they read nothing, the named wires are, and
     without any the outputs of blocks that nothing reads.
 
-    Parameters
-    ----------
-    outside : sequence of str
-        Paths of the blocks.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such block.
+    Raises `UnknownNameError` if there is no such block.
     """
     table = wired.structure.copy()
     ports: list[tuple[Any, ...]] = []
@@ -238,10 +216,8 @@ def open_whole(wired: WiredDiagram, outside: Sequence[str], name: str) -> OpenDi
 def start_at(opened: OpenDiagram, start: Mapping[str, Any]) -> OpenDiagram:
     """Return a diagram whose inputs have other start values, by their names.
 
-    Raises
-    ------
-    UnknownNameError, ParameterError
-        For a name that no input has, and what are no finite numbers of its shape.
+    Raises `UnknownNameError, ParameterError`: for a name that no input has, and what are no finite numbers of its
+    shape.
     """
     if not start:
         return opened
@@ -276,10 +252,7 @@ def start_at(opened: OpenDiagram, start: Mapping[str, Any]) -> OpenDiagram:
 def let_move(opened: OpenDiagram, targets: Sequence[Target]) -> OpenDiagram:
     """Return a diagram in which some parameters can be moved that are zero, and structure else.
 
-    Parameters
-    ----------
-    targets : sequence of (str, list of str)
-        Path of a block, and the names that lead to a parameter in it.
+    ``targets``: path of a block, and the names that lead to a parameter in it.
     """
     names = {join(path, ".".join([*keys[:-1], split_entry(keys[-1], ())[0]])) for path, keys in targets}
     return replace(opened, wired=with_movable(opened.wired, targets), moved=opened.moved | names)

@@ -26,10 +26,7 @@ _WAY_OUT = (
 def own_fmus(opened: OpenDiagram, way_out: str = _WAY_OUT) -> dict[str, Fmu]:
     """Return the FMUs of a diagram that are merged, by path; ``way_out`` is what an error says at last.
 
-    Raises
-    ------
-    DefinitionError
-        For an FMU that can't be, by its path, with a next step.
+    Raises `DefinitionError`: for an FMU that can't be, by its path, with a next step.
     """
     found = {}
     for path, block in opened.wired.scheduled.blocks.items():
@@ -75,10 +72,7 @@ def _check(block: Any, path: str, way_out: str) -> None:
 def merge(opened: OpenDiagram, flat: FlatDiagram, width: int) -> tuple[tuple[MergedPlant, ...], tuple[Placed, ...]]:
     """Return the FMUs of a diagram as they are merged, and their parameters.
 
-    Parameters
-    ----------
-    width : int
-        Size of the diagram's own p, behind which the parameters of its FMUs are.
+    ``width``: size of the diagram's own p, behind which the parameters of its FMUs are.
     """
     plants, parameters = [], list[Placed]()
     for path, block in own_fmus(opened).items():

@@ -25,27 +25,12 @@ def trace_slopes(
 ) -> tuple[Slopes | None, list[Any], dict[tuple[str, int], frozenset[tuple[str, int]]]]:
     """Return the derivatives of a diagram, their functions, and on what each value depends.
 
-    Parameters
-    ----------
-    acting : sequence of frozenset of TickPattern
-        Kinds of ticks.
-    entries : sequence of int
-        Entries of the log.
-    numbers : mapping
-        Numbers that are computed from parameters, whose derivatives are those by the parameters.
-    start : casadi.Function or None
-        The states at the start, of (t, x, w, p).
-    rates : bool
-        Whether there are continuous states.
-
-    Returns
-    -------
-    slopes : Slopes or None
-        None where CasADi can't differentiate, and with algebraic loops, which C code solves.
-    functions : list of casadi.Function
-        Those of the slopes.
-    depends : dict
-        By ("log", entry) or ("rates", entry), the entries of the vectors that it depends on at some kind of tick.
+    ``numbers``: numbers that are computed from parameters, whose derivatives are those by the parameters.
+    ``start``: the states at the start, of (t, x, w, p).
+    ``rates``: whether there are continuous states.
+    Returns: none where CasADi can't differentiate, and with algebraic loops, which C code solves.
+    Returns: those of the slopes.
+    Returns: by ("log", entry) or ("rates", entry), the entries of the vectors that it depends on at some kind of tick.
     """
     if flat.loops.slices or flat.in_model_exchange:
         return None, [], {}

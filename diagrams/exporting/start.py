@@ -16,17 +16,7 @@ _STEP = 1e-3  # s, of a diagram without any; its start has none
 
 @dataclass(frozen=True, eq=False)
 class DiagramStart:
-    """Signals and states of a diagram at t = 0.
-
-    Attributes
-    ----------
-    flat : FlatDiagram or None
-        The diagram.
-    log : ndarray
-        All outputs.
-    states : mapping of str to ndarray
-        States of blocks, flat, by path.
-    """
+    """Signals and states of a diagram at t = 0."""
 
     flat: FlatDiagram | None
     log: np.ndarray
@@ -47,10 +37,7 @@ class DiagramStart:
 def find_start(wired: WiredDiagram) -> DiagramStart:
     """Begin a run of a diagram, and return its start.
 
-    Raises
-    ------
-    LoopwrightError
-        As a run does.
+    Raises `LoopwrightError`: as a run does.
     """
     with Simulation(wired, RunOptions(step=None if wired.has_base else _STEP)) as simulation:
         flat, view = simulation.flat, simulation.view

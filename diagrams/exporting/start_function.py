@@ -19,17 +19,9 @@ def trace_start_values(flat: FlatDiagram, workspace: Workspace) -> tuple[Any, tu
 
     It does what `find_start_values` does. Blocks whose ``initial`` can't be traced keep the states in x.
 
-    Parameters
-    ----------
-    workspace : Workspace
-        The start with the numbers at hand, with which traced results are compared.
-
-    Returns
-    -------
-    function : casadi.Function or None
-        None if nothing is computed at the start.
-    untraced : tuple of str
-        Paths of blocks whose states are not computed.
+    ``workspace``: the start with the numbers at hand, with which traced results are compared.
+    Returns: none if nothing is computed at the start.
+    Returns: paths of blocks whose states are not computed.
     """
     left = {port: np.ravel(np.asarray(tap(None))) for port, tap in values_from_left(workspace).items()}
     functions = trace_start(flat, left)

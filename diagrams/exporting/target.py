@@ -132,12 +132,8 @@ def to_c(
 def target_spec(opened: OpenDiagram, *, name: str, description: str) -> TargetSpec:
     """Return a diagram as C for a target is made of it.
 
-    Raises
-    ------
-    DefinitionError
-        For what can't be on a target, by its path.
-    SimulationError
-        If its start isn't found.
+    Raises `DefinitionError`: for what can't be on a target, by its path.
+    Raises `SimulationError` if its start isn't found.
     """
     refuse(opened)
     _refuse_fmus(opened)

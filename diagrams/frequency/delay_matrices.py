@@ -156,10 +156,7 @@ class DelayMatrices:
 
         Where ways without a state have a gain of 1 or more, infinitely many are not stable, and some are returned.
 
-        Raises
-        ------
-        ConfirmationError
-            If fewer were found than the argument says, or more.
+        Raises `ConfirmationError` if fewer were found than the argument says, or more.
         """
         found = self.plain_poles.tolist()
         for part in self.delayed:
@@ -287,10 +284,8 @@ class DelayMatrices:
 
         A root on the axis, up to rounding, counts, as do poles of parts without delays.
 
-        Raises
-        ------
-        ConfirmationError
-            If the argument can't be followed, or a root is found where it says that there is none.
+        Raises `ConfirmationError` if the argument can't be followed, or a root is found where it says that there is
+        none.
         """
         if self.gain_at_infinity >= NEUTRAL:
             return math.inf
@@ -411,10 +406,7 @@ def replace_delays(
 
     The system is ẋ = A x + B u + G w, z = Z x + F u + H w, y = C x + D u + E w. Numbers may be complex, with slopes.
 
-    Raises
-    ------
-    LinAlgError
-        If a way around the delays without a state has no unique solution.
+    Raises `LinAlgError` if a way around the delays without a state has no unique solution.
     """
     m, q = len(tau), sum(orders)
     kind = np.result_type(A, G, tau)

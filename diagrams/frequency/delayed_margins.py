@@ -27,13 +27,7 @@ SAME = 1e-8
 
 
 class ByArgument:
-    """The scan of a loop with delays, and confirmations by counting roots of its characteristic function.
-
-    Attributes
-    ----------
-    floor : float
-        |L| above which all crossings are found.
-    """
+    """The scan of a loop with delays, and confirmations by counting roots of its characteristic function."""
 
     stability = ARGUMENT
     late = ARGUMENT + ", with the delay in series"

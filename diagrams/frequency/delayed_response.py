@@ -45,10 +45,7 @@ class DelayedEquations:
     def respond(self, u: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Return the outputs at rising times from 0 on, from rest, with constant inputs from t = 0 on.
 
-        Raises
-        ------
-        ConfirmationError
-            If the response needs too many elements.
+        Raises `ConfirmationError` if the response needs too many elements.
         """
         end = float(times[-1])
         edges = self._edges(end)

@@ -24,20 +24,10 @@ OFF_THE_PAGE = 1e3
 class DrawnLoop:
     """A loop to draw.
 
-    Attributes
-    ----------
-    title : str
-        Name in the legend.
-    omega, values : ndarray
-        Frequencies in rad/s, ascending, and L there.
-    look : mapping
-        Color and line.
-    margins : Margins or None
-        Margins that are marked; None where they are not known.
-    dt : float
-        Sample time in s, 0 of a continuous loop.
-    is_measured : bool
-        Whether the values are points of data.
+    ``omega``, ``values``: frequencies in rad/s, ascending, and L there.
+    ``margins``: margins that are marked; None where they are not known.
+    ``dt``: sample time in s, 0 of a continuous loop.
+    ``is_measured``: whether the values are points of data.
     """
 
     title: str

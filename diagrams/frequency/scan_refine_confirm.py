@@ -119,10 +119,7 @@ def confirm_limit(
 ) -> Confirmation:
     """Confirm that stability ends at a limit, seen from the nominal value; return the computation.
 
-    Raises
-    ------
-    ConfirmationError
-        If the loop is not stable on the near side and unstable on the far side.
+    Raises `ConfirmationError` if the loop is not stable on the near side and unstable on the far side.
     """
     inside, outside = pick_test_values(value, others, nominal)
     found = stable(inside), stable(outside)
@@ -170,16 +167,10 @@ def number_of_limit(
 ) -> Number:
     """Return a limit of stability as a confirmed number.
 
-    Parameters
-    ----------
-    value : float
-        The limit; 0 or infinite where none was found, so that stability is confirmed at the values of ``tried``.
-    stable : callable
-        Whether the loop is stable at a value, by a computation other than the scan; ``how`` names it.
-    nominal : float
-        Value at which the loop is stable, as it is.
-    others : sequence of float
-        Further limits, which the tests on both sides stay clear of.
+    ``value``: the limit; 0 or infinite where none was found, so that stability is confirmed at the values of ``tried``.
+    ``stable``: whether the loop is stable at a value, by a computation other than the scan; ``how`` names it.
+    ``nominal``: value at which the loop is stable, as it is.
+    ``others``: further limits, which the tests on both sides stay clear of.
     """
     if value in (0.0, np.inf):
         return Number(value, unit, 0.0, confirm_no_limit(name, tried, stable, how))

@@ -18,10 +18,7 @@ _SETTLED = 1e-13  # relative change of a state between two passes at the start, 
 class BlocksInModelExchange:
     """All blocks of a run in model exchange, with their events.
 
-    Attributes
-    ----------
-    evaluators : dict
-        Their evaluators, by path; they are there before the blocks are loaded.
+    ``evaluators``: their evaluators, by path; they are there before the blocks are loaded.
     """
 
     def __init__(self, flat: FlatDiagram):
@@ -54,15 +51,7 @@ class BlocksInModelExchange:
     def exchange(self, x: np.ndarray, look: Callable[[], None]) -> str:
         """Set the inputs of all blocks, and write the states that follow into x.
 
-        Parameters
-        ----------
-        look : callable
-            Evaluates `JUMP`, which brings the inputs.
-
-        Returns
-        -------
-        str
-            Path of a block whose states or inputs have changed; empty without one.
+        Returns: path of a block whose states or inputs have changed; empty without one.
         """
         moved, before = "", {path: e.u for path, e in self.evaluators.items()}
         look()

@@ -156,12 +156,7 @@ class ModelExchangeEvaluator:
     def look_at(self, call: Callable[[], None], *, completes_step: bool) -> str | None:
         """Look at an instant that is reached, and return the name of the event that has acted, if any: see `event`.
 
-        Parameters
-        ----------
-        call : callable
-            The look, bound to vectors.
-        completes_step : bool
-            Whether the solver has accepted a step that ends there; else events may act.
+        ``completes_step``: whether the solver has accepted a step that ends there; else events may act.
         """
         self.look, self.event = Look.STEP if completes_step else Look.EVENTS, None
         call()

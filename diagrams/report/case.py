@@ -95,33 +95,12 @@ class Case:
     It knows nothing of the diagram but its structure. A kind of diagram that is known better has a case of its own: a
     subclass that overrides `bases`, `named_wires` and `excitation`.
 
-    Parameters
-    ----------
-    diagram : WiredDiagram
-        The diagram.
-    point : OperatingPoint, Snapshot or float, optional
-        Where it is analysed; the start without it.
-    experiment : ReportedExperiment, optional
-        Where the diagram comes from.
-    wires : tuple of str, optional
-        Wires at which loops are looked at, instead of all named ones on loops.
-    stairs : {"gain", "zero"}, optional
-        Treatment of stairs in the linear models, as of `Diagram.linearize`.
-    requirements : Requirements, optional
-        Requirements on the design.
-
-    Attributes
-    ----------
-    variants : dict of str to Variant
-        All variants by key, those that can't be analysed as well; the diagram as it is comes first.
-    notes : list of str
-        Remarks on how the variants were made.
-    keys : tuple of str
-        Keys of the sections that the report is to have.
-    axes : AxisUnits
-        Units of the axes of frequency responses.
-    notify : callable
-        Told what is being done, where a section takes long.
+    ``point``: where it is analysed; the start without it.
+    ``wires``: wires at which loops are looked at, instead of all named ones on loops.
+    ``stairs``: treatment of stairs in the linear models, as of `Diagram.linearize`.
+    ``variants``: all variants by key, those that can't be analysed as well; the diagram as it is comes first.
+    ``keys``: keys of the sections that the report is to have.
+    ``notify``: told what is being done, where a section takes long.
     """
 
     inputs: tuple[str, ...] = ()

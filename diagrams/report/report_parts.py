@@ -39,15 +39,10 @@ def always(case: Case) -> bool:
 class ReportPart(Generic[C_contra]):
     """A part of a report.
 
-    Attributes
-    ----------
-    key : str
-        Key of its section, which starts the dotted paths of its numbers. Parts of one key are one section, in their
-        order, under the title of the first.
-    make : callable
-        Returns the section of a case, or what is added to it; None where nothing is to be said.
-    applies : callable
-        Whether the part applies to a case.
+    ``key``: key of its section, which starts the dotted paths of its numbers. Parts of one key are one section, in
+    their order, under the title of the first.
+    ``make``: returns the section of a case, or what is added to it; None where nothing is to be said.
+    ``applies``: whether the part applies to a case.
     """
 
     key: str
@@ -59,16 +54,9 @@ class ReportPart(Generic[C_contra]):
 class ReportKind(Generic[C]):
     """A kind of report.
 
-    Attributes
-    ----------
-    case : type of Case
-        Makes the case of a diagram: its variants.
-    parts : tuple of ReportPart
-        The parts in the order in which they stand in the report.
-    definitions : mapping
-        Definitions of the terms in the paths of numbers.
-    titles : mapping
-        Titles of sections, by their keys, in place of those that their parts give.
+    ``parts``: the parts in the order in which they stand in the report.
+    ``definitions``: definitions of the terms in the paths of numbers.
+    ``titles``: titles of sections, by their keys, in place of those that their parts give.
     """
 
     case: Callable[

@@ -80,35 +80,16 @@ class Cut(StrEnum):
 class Variant:
     """A diagram that is analysed: itself, without sampling, with a delay.
 
-    Attributes
-    ----------
-    key : str
-        Its part of dotted paths, such as ``sampled_d0``.
-    title : str
-        Its name in words.
-    diagram : WiredDiagram
-        The diagram.
-    where : OperatingPoint, Snapshot or float, optional
-        The operating point, or where it is looked for; the start without it.
-    implementation : Implementation
-        Whether it is sampled, and delayed.
-    is_design : bool
-        Whether it is the design itself. Other variants show what a real plant adds to it; they get margins, but no
-        figures, and python-control is not asked about them.
-    is_actual : bool
-        Whether it is the diagram as it is, with nothing left out and nothing added.
-    problem : str
-        Why it can't be analysed; empty where it can.
-    source : WiredDiagram, optional
-        The diagram of an operating point that is taken over.
-    inputs, outputs : tuple of str
-        Inputs and outputs of the linear model.
-    stairs : {"gain", "zero"}, optional
-        Treatment of stairs in the linear model.
-    required : tuple of str
-        Wires and ports on which something is required: a motion that changes one of them is not free.
-    every_state : bool
-        Whether free motions count as any other: the strict rule.
+    ``key``: its part of dotted paths, such as ``sampled_d0``.
+    ``where``: the operating point, or where it is looked for; the start without it.
+    ``implementation``: whether it is sampled, and delayed.
+    ``is_design``: whether it is the design itself. Other variants show what a real plant adds to it; they get margins,
+    but no figures, and python-control is not asked about them.
+    ``is_actual``: whether it is the diagram as it is, with nothing left out and nothing added.
+    ``problem``: why it can't be analysed; empty where it can.
+    ``source``: the diagram of an operating point that is taken over.
+    ``required``: wires and ports on which something is required: a motion that changes one of them is not free.
+    ``every_state``: whether free motions count as any other: the strict rule.
     """
 
     key: str

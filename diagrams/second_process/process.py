@@ -26,12 +26,7 @@ class SecondProcess(Generic[T]):
     Every part is the same, whichever process makes it, and they are returned in their order. A part that the second
     process can't make or send, or on which it ends, is made here. Its end is that of the ``with`` block.
 
-    Parameters
-    ----------
-    make : callable
-        Makes the parts there, see `Make`; it is pickled.
-    name : str
-        Name of the diagram, for errors.
+    ``make``: makes the parts there, see `Make`; it is pickled.
     """
 
     def __init__(self, make: Make, name: str):
@@ -72,14 +67,8 @@ class SecondProcess(Generic[T]):
 
         The first one is always made here.
 
-        Parameters
-        ----------
-        keys : sequence of str
-            The keys, in the order of the result.
-        make : callable
-            Makes a part here.
-        report : callable
-            Called with what the second process reports, by this thread.
+        ``keys``: the keys, in the order of the result.
+        ``report``: called with what the second process reports, by this thread.
         """
         self._left = deque(keys[1:])
         if self._child is not None:

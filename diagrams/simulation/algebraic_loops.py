@@ -33,18 +33,8 @@ _STARTS = (0.0, 1.0, -1.0, 10.0, -10.0, 0.1, -0.1, 100.0, -100.0)
 class LoopSolver:
     """Solves the algebraic loops at the vectors that an evaluation of them is bound to.
 
-    Parameters
-    ----------
-    names : sequence of str
-        What to call each entry, such as "e.y".
-    where : sequence of int
-        Entries of x that hold v.
-    t, x : ndarray
-        The time, shape (1,), and x: v is sought in it, from the values there on.
-    call : callable
-        Evaluates what comes round the loops less v, and J, into ``r`` and ``J``.
-    loops : sequence of str
-        The loops, written port by port, for messages.
+    ``t``, ``x``: the time, shape (1,), and x: v is sought in it, from the values there on.
+    ``call``: evaluates what comes round the loops less v, and J, into ``r`` and ``J``.
     """
 
     def __init__(
@@ -215,10 +205,7 @@ def _length(r: np.ndarray) -> float:
 def _eliminate(J: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return J⁻¹ r by Gaussian elimination, operation by operation as `newton.c` does it.
 
-    Raises
-    ------
-    LinAlgError
-        If J is singular.
+    Raises `LinAlgError` if J is singular.
     """
     a, b = J.tolist(), r.tolist()
     n = len(b)
@@ -273,10 +260,7 @@ def loop_solver(
 def newton_options(flat: FlatDiagram, clocks: frozenset[TickPattern], here: np.ndarray) -> NewtonOptions:
     """Return Newton's method in C for the algebraic loops at a tick at which some clocks act.
 
-    Parameters
-    ----------
-    here : ndarray
-        States of the instant that is reached, at which the loops have to determine their values.
+    ``here``: states of the instant that is reached, at which the loops have to determine their values.
     """
     from ..compiled import NewtonOptions
 

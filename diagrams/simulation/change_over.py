@@ -15,13 +15,7 @@ _PATIENCE = 0.02  # s of interpreted ticks before which nobody thinks of a compi
 
 
 class ChangeOver:
-    """Watches an interpreted run, and has C code generated for it if it takes long.
-
-    Parameters
-    ----------
-    position : Position
-        The instant that the run has reached.
-    """
+    """Watches an interpreted run, and has C code generated for it if it takes long."""
 
     def __init__(self, position: Position):
         self._position, self._possible = position, True

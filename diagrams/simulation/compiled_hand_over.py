@@ -74,12 +74,7 @@ def bind_hybrid(
 ) -> tuple[CompiledHybrid, HandedOver | None]:
     """Return the loop in C, bound to the numbers of a run, and its blocks in model exchange.
 
-    Parameters
-    ----------
-    rest : callable
-        Evaluates a tick for which there is no code; see `CompiledLoop`.
-    drain : callable
-        Tells the events that have happened.
+    ``rest``: evaluates a tick for which there is no code; see `CompiledLoop`.
     """
     flat, here, domains, blocks = workspace.flat, workspace.here, continuous.domains, continuous.exchanged
     # Blocks in model exchange and their own events come together, or neither is there.
@@ -119,12 +114,8 @@ def accepts_of(
 ) -> int:
     """Return after which steps blocks are evaluated; see `CompiledHybrid`.
 
-    Parameters
-    ----------
-    judged : bool
-        Whether outputs may be non-finite while states are finite.
-    plants, exchanged : bool
-        Whether there are FMUs, and some in model exchange.
+    ``judged``: whether outputs may be non-finite while states are finite.
+    ``plants``, ``exchanged``: whether there are FMUs, and some in model exchange.
     """
     flat, judged = workspace.flat, judged and not continuous.fixed
     always = plants or workspace.looped or remembers(flat) or has_guards(flat)
@@ -160,10 +151,7 @@ def find_edges(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the discontinuities of sources from t on, up to the first one of each after the end; see `Span`.
 
-    Parameters
-    ----------
-    limited : bool
-        Return None if there are more than fit into a call.
+    ``limited``: return None if there are more than fit into a call.
     """
     found = set[float]()
     for path, source in continuous.sources:
@@ -179,13 +167,7 @@ def find_edges(
 
 
 class EdgesAhead:
-    """Discontinuities of sources that are found once for a stretch of ticks, in however many calls C goes through it.
-
-    Parameters
-    ----------
-    continuous : Continuous
-        The solver, with the sources.
-    """
+    """Discontinuities of sources found once for a stretch of ticks, in however many calls C goes through it."""
 
     def __init__(self, continuous: Continuous):
         self._continuous = continuous

@@ -50,27 +50,9 @@ from .workspace import Workspace
 class HybridTicks:
     """The ticks of a run with continuous states, gone through in C.
 
-    Parameters
-    ----------
-    workspace : Workspace
-        The run's numbers.
-    continuous : Continuous
-        Its solver and events.
-    plants : PlantsInC
-        The plants, bound.
-    stops : sequence of int
-        Entries of the log that end the run where they are true.
-    every : bool
-        Visit every tick, not only those at which something acts.
-    machine : bool, default False
-        Let the virtual machine evaluate the functions.
-    fuse : bool, default False
-        Compile for the processor of this machine.
-
-    Raises
-    ------
-    CompilerError
-        If there is no compiler, or it fails.
+    ``stops``: entries of the log that end the run where they are true.
+    ``every``: visit every tick, not only those at which something acts.
+    Raises `CompilerError` if there is no compiler, or it fails.
     """
 
     def __init__(
@@ -123,10 +105,7 @@ class HybridTicks:
     ) -> float | None:
         """Run the ticks after tick ``k`` up to ``last`` and record them; see `CompiledTicks.run`.
 
-        Returns
-        -------
-        float or None
-            Time in s at which a stop condition has ended the run between two ticks.
+        Returns: time in s at which a stop condition has ended the run between two ticks.
         """
         loop = self._bind(recorder)
         if k == 0:  # of a run before nothing is left
@@ -223,10 +202,7 @@ class HybridTicks:
 
         Within a step of the plants the loop waits for this; see `PlantsInC`.
 
-        Returns
-        -------
-        float or None
-            Time in s at which a stop condition has ended the run.
+        Returns: time in s at which a stop condition has ended the run.
         """
         loop, none = self._loop, np.zeros((1, 0))
         assert loop is not None
@@ -403,14 +379,7 @@ def make_hybrid(
 ) -> tuple[HybridTicks | None, tuple[str, ...]]:
     """Return the ticks of a run with continuous states in C, None where they can't be had, and messages about them.
 
-    Parameters
-    ----------
-    plants : PlantsInC
-        The plants, bound.
-    machine : bool, default False
-        Let the virtual machine evaluate the functions; then nothing is said but that the library can't be had.
-    fuse : bool, default False
-        Compile them for the processor of this machine.
+    ``machine``: let the virtual machine evaluate the functions; then nothing is said but that the library can't be had.
     """
 
     def make() -> HybridTicks:

@@ -27,21 +27,9 @@ from ..flat import FlatDiagram, StepTable, times_of
 class PlantsInC:
     """The plants of a run, in the order in which the loop in C goes over them.
 
-    Parameters
-    ----------
-    flat : FlatDiagram
-        The diagram.
-    plants : mapping of str to Plant
-        The plants by path, bound.
-    steps : PlantSteps
-        Their steps.
-    coupled : CoupledSteps, optional
-        Their coupling, where it is another one than "jacobi".
-
-    Attributes
-    ----------
-    entries : dict
-        What C goes over, by path: an FMU, or a step that Python takes; one step of all plants where they are coupled.
+    ``coupled``: their coupling, where it is another one than "jacobi".
+    ``entries``: what C goes over, by path: an FMU, or a step that Python takes; one step of all plants where they are
+    coupled.
     """
 
     def __init__(

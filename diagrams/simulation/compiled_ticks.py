@@ -91,23 +91,10 @@ class _Window:
 class CompiledTicks:
     """The ticks of a run, gone through in C.
 
-    Parameters
-    ----------
-    workspace : Workspace
-        The run's numbers.
-    plants : PlantsInC
-        The plants, bound.
-    stops : sequence of int
-        Entries of the log that end the run where they are true.
-    every : bool
-        Visit every tick, not only those at which a subsystem acts.
-    code : TickCode, optional
-        Their code; without it they are compiled.
-
-    Raises
-    ------
-    CompilerError
-        If there is no compiler, or it fails.
+    ``stops``: entries of the log that end the run where they are true.
+    ``every``: visit every tick, not only those at which a subsystem acts.
+    ``code``: their code; without it they are compiled.
+    Raises `CompilerError` if there is no compiler, or it fails.
     """
 
     def __init__(
@@ -158,13 +145,9 @@ class CompiledTicks:
     ) -> None:
         """Run the ticks after tick ``k`` up to ``last`` and record them.
 
-        Parameters
-        ----------
-        arrived : callable
-            Called with the ticks at which the loop has returned, and whether plants are in the next step already, in
-            which one may ask for the end; returns whether the run ends there.
-        progress : callable
-            Called with the time after each chunk.
+        ``arrived``: called with the ticks at which the loop has returned, and whether plants are in the next step
+        already, in which one may ask for the end; returns whether the run ends there.
+        ``progress``: called with the time after each chunk.
         """
         for window in self._windows(k, last):
             if self._run_window(window, last, recorder, arrived, progress):
@@ -276,11 +259,6 @@ def bind_evaluations(
     """Return the evaluations of ticks in C, with the bits of interpreted ones; empty where they can't be had.
 
     The functions of a large diagram take seconds to trace as a whole, and calls of its blocks need none of them.
-
-    Parameters
-    ----------
-    find_code : callable
-        Returns the code of ticks.
     """
     flat, here = workspace.flat, workspace.here
     if flat.loops.slices or flat.in_model_exchange:
@@ -305,14 +283,8 @@ def make_compiled(
 ) -> tuple[CompiledTicks | None, tuple[str, ...]]:
     """Return the ticks of a run in C, None where they can't be had, and messages about them.
 
-    Parameters
-    ----------
-    plants : PlantsInC
-        The plants, bound.
-    machine : bool, default False
-        Let the virtual machine evaluate them; then nothing is said where they can't be had.
-    fuse : bool, default False
-        Compile ticks and plants of our own together, for the processor of this machine.
+    ``machine``: let the virtual machine evaluate them; then nothing is said where they can't be had.
+    ``fuse``: compile ticks and plants of our own together, for the processor of this machine.
     """
     flat = workspace.flat
 
@@ -370,13 +342,7 @@ def _is_plain(block: Fmu) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class LaterCode(Generic[Code]):
-    """Generated code that takes over from an interpreted run: to the last bit it makes no difference when.
-
-    Attributes
-    ----------
-    background : BackgroundCode
-        The code that is being made.
-    """
+    """Generated code that takes over from an interpreted run: to the last bit it makes no difference when."""
 
     background: BackgroundCode[Code]
 

@@ -30,31 +30,10 @@ TIGHT = 1e-9
 class Continuous:
     """The continuous part of a run.
 
-    Parameters
-    ----------
-    workspace : Workspace
-        The run's numbers and functions.
-    name : str
-        The diagram's name.
-    solver, rtol, atol, max_step
-        See `Diagram.simulate`.
-    on_event : callable
-        Called with every event that fires.
-    exchanged : BlocksInModelExchange, optional
-        Blocks in model exchange.
-
-    Attributes
-    ----------
-    method : Method
-        The method of integration.
-    domains : Domains or None
-        The domains of the indicators; None without events.
-    delays : Delays or None
-        Transport delays; None without any.
-    own_events : OwnEvents or None
-        Events of blocks in model exchange; None without such blocks.
-    beyond : tuple of float and ndarray, or None
-        Time in s and states of the last trial of the method at which a rate was not finite.
+    ``domains``: the domains of the indicators; None without events.
+    ``delays``: transport delays; None without any.
+    ``own_events``: events of blocks in model exchange; None without such blocks.
+    ``beyond``: time in s and states of the last trial of the method at which a rate was not finite.
     """
 
     def __init__(
@@ -234,10 +213,8 @@ class Continuous:
     def plan_with(self, path: str, block: Block) -> None:
         """Plan steps with the instants that a variant of a block announces, or moves; see `Workspace.set_parameters`.
 
-        Raises
-        ------
-        ParameterError
-            If the block changes within another time than before: the longest step of the method follows from that.
+        Raises `ParameterError` if the block changes within another time than before: the longest step of the method
+        follows from that.
         """
         if block.time_scale() != self.flat.table.blocks[path].time_scale():
             raise ParameterError(
@@ -270,10 +247,7 @@ class Continuous:
     def fits(self, old: Mapping[str, Block], new: Mapping[str, Block]) -> bool:
         """Whether it fits variants of some blocks: no tolerance and no limit of a step changes with them.
 
-        Parameters
-        ----------
-        old, new : mapping of str to Block
-            By path: the blocks that it was set up with, and those that differ.
+        ``old``, ``new``: by path: the blocks that it was set up with, and those that differ.
         """
         return self.delays is None and all(scales_of(block) == scales_of(old[path]) for path, block in new.items())
 

@@ -30,19 +30,10 @@ class ContinuousPart:
 
     Events are reported when they are accepted: those of a pass that is gone back over have not happened.
 
-    Parameters
-    ----------
-    workspace : Workspace
-        The run's numbers.
-    continuous : Continuous or None
-        Its method, events and delays; None where nothing happens between ticks.
-    exchanged : BlocksInModelExchange
-        Model-exchange FMUs, which keep their own memory.
-
-    Attributes
-    ----------
-    go_between : callable or None
-        Takes them from one instant to another, as `HybridTicks.go_between`; None where nothing happens between ticks.
+    ``continuous``: its method, events and delays; None where nothing happens between ticks.
+    ``exchanged``: model-exchange FMUs, which keep their own memory.
+    ``go_between``: takes them from one instant to another, as `HybridTicks.go_between`; None where nothing happens
+    between ticks.
     """
 
     def __init__(self, workspace: Workspace, continuous: Continuous | None, exchanged: BlocksInModelExchange):

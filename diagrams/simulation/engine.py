@@ -43,18 +43,7 @@ if TYPE_CHECKING:
 class Engine:
     """The numbers of a run, its plants, its solver and its events; it goes from tick to tick.
 
-    Parameters
-    ----------
-    flat : FlatDiagram
-        The diagram.
-    name : str
-        Its name.
-    options : RunOptions
-        Options of the run.
-    every_tick : bool
-        Visit every tick, not only those at which a subsystem acts.
-    on_event : callable
-        Called with every event that fires.
+    ``every_tick``: visit every tick, not only those at which a subsystem acts.
     """
 
     def __init__(
@@ -200,12 +189,7 @@ class Engine:
     def begin_again(self, flat: FlatDiagram, set_start: Callable[[Workspace], None] | None = None) -> None:
         """Go back to t = 0 with other numbers; the plants, initialized again before, stay bound.
 
-        Parameters
-        ----------
-        flat : FlatDiagram
-            The diagram with its numbers; its functions are those that are bound.
-        set_start : callable, optional
-            Computes start values, as `initialize` takes it.
+        ``flat``: the diagram with its numbers; its functions are those that are bound.
         """
         self.workspace.begin_again(flat)
         self.position.restore(0, None)
@@ -279,12 +263,7 @@ class Engine:
     def go(self, last: int, recorder: Recorder, progress: Progress) -> None:
         """Continue to a tick, or to where a stop condition ends the run.
 
-        Parameters
-        ----------
-        recorder : Recorder
-            Records the samples.
-        progress : callable
-            Called with the time now and then, and at the end.
+        ``progress``: called with the time now and then, and at the end.
         """
         self.is_ahead, ticks = False, self._ticks()
         if self._compile == "auto" and not self._generated:

@@ -25,21 +25,7 @@ def failure(
     acting: frozenset[TickPattern],
     evaluators: Evaluators | None = None,
 ) -> SimulationError:
-    """Return the error of the first block that made a value that is not finite, or whose guard fails.
-
-    Parameters
-    ----------
-    flat : FlatDiagram
-        The diagram.
-    here : Vectors
-        The instant.
-    log : ndarray
-        The outputs of all blocks there.
-    acting : frozenset of TickPattern
-        The clocks that act there.
-    evaluators : mapping, optional
-        Evaluators of blocks in model exchange, by path.
-    """
+    """Return the error of the first block that made a value that is not finite, or whose guard fails."""
     forget_trials(flat)
     for name, where in flat.plant_outputs.slices.items():
         if name not in flat.unread and not np.all(np.isfinite(here.w[where])):

@@ -368,10 +368,7 @@ def domains_from_left(workspace: Workspace, domains: np.ndarray) -> np.ndarray:
 
     Subsystems are evaluated as if they acted: what a sampled one puts out before its first tick jumps with its sources.
 
-    Parameters
-    ----------
-    domains : ndarray of int
-        Those at t = 0: the answer for those that no jump of a source changes.
+    ``domains``: those at t = 0: the answer for those that no jump of a source changes.
     """
     taps = values_from_left(workspace)
     if not taps:

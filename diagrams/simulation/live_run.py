@@ -89,16 +89,9 @@ class Advancing(Protocol):
 class Pace:
     """How a live run keeps pace.
 
-    Attributes
-    ----------
-    speed : float
-        Simulated seconds in a second of the clock.
-    frame : float
-        Seconds of the clock in a frame.
-    catch_up : float
-        Seconds of the clock that are caught up after a delay; of a longer one all are given up.
-    clock, sleep : callable
-        The clock in s, and what waits for some seconds of it.
+    ``speed``: simulated seconds in a second of the clock.
+    ``catch_up``: seconds of the clock that are caught up after a delay; of a longer one all are given up.
+    ``clock``, ``sleep``: the clock in s, and what waits for some seconds of it.
     """
 
     speed: float = 1.0
@@ -137,14 +130,7 @@ class _Control:
 class Controls:
     """Parameters that are moved by hand in a run.
 
-    Parameters
-    ----------
-    table : Structure
-        The structure of the diagram.
-    inputs : mapping of str
-        By name: a function of the time in s, an object with a ``value`` (a slider), or a number.
-    diagram : str
-        The diagram's name, for errors.
+    ``inputs``: by name: a function of the time in s, an object with a ``value`` (a slider), or a number.
     """
 
     def __init__(self, table: Structure, inputs: Mapping[str, Any], diagram: str):

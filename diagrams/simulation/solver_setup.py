@@ -34,10 +34,7 @@ def has_guards(flat: FlatDiagram) -> bool:
 def absolute_tolerances(flat: FlatDiagram, atol: float, nominals: np.ndarray | None = None) -> Any:
     """Return the absolute tolerance of each continuous state: ``atol`` times its nominal value.
 
-    Parameters
-    ----------
-    nominals : ndarray, optional
-        Nominal values of the entries of x whose blocks declare none.
+    ``nominals``: nominal values of the entries of x whose blocks declare none.
     """
     scale = np.ones(flat.width) if nominals is None else nominals.copy()
     for path, own in flat.states.of_block.items():

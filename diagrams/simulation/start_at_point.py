@@ -81,15 +81,7 @@ def copy_states(values: np.ndarray, old: FlatDiagram, new: FlatDiagram, into: np
 def start_at(workspace: Workspace, point: OperatingPoint, name: str) -> int:
     """Put a run that has just been initialized to the instant just before an operating point's tick; return that tick.
 
-    Parameters
-    ----------
-    name : str
-        The diagram's name.
-
-    Raises
-    ------
-    OptionError
-        A point of another diagram, or one that is on none of the run's ticks.
+    Raises `OptionError`: a point of another diagram, or one that is on none of the run's ticks.
     """
     flat, here = workspace.flat, workspace.here
     tick = point.tick * point.base / flat.base
@@ -138,15 +130,6 @@ def take_over(workspace: Workspace, x: np.ndarray, of: FlatDiagram, acting: froz
 
     States that only this diagram has, such as those of a delay, take the values that they settle at while the others
     are held.
-
-    Parameters
-    ----------
-    x : ndarray
-        The states, laid out as ``of`` says.
-    of : FlatDiagram
-        The other diagram.
-    acting : frozenset of TickPattern
-        The clocks that act.
     """
     flat, here = workspace.flat, workspace.here
     marked = np.zeros(flat.width)

@@ -14,14 +14,8 @@ from ..wiring import join
 class StopConditions:
     """The stop conditions of a diagram, looked up in the last evaluation.
 
-    Parameters
-    ----------
-    flat : FlatDiagram
-        The diagram.
-    log : ndarray
-        The outputs of all blocks: the run's own vector, which it evaluates into.
-    asking : callable
-        Returns the path of an FMU that asks for the end of the run; empty if none does.
+    ``log``: the outputs of all blocks: the run's own vector, which it evaluates into.
+    ``asking``: returns the path of an FMU that asks for the end of the run; empty if none does.
     """
 
     def __init__(self, flat: FlatDiagram, log: np.ndarray, asking: Callable[[], str]):

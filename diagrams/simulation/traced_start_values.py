@@ -21,10 +21,7 @@ Port = tuple[str, str]
 class StartValues:
     """Computes initial states and first held outputs as `find_start_values` does, from functions that are traced once.
 
-    Parameters
-    ----------
-    workspace : Workspace
-        The numbers of the runs, to which the functions are bound.
+    ``workspace``: the numbers of the runs, to which the functions are bound.
     """
 
     def __init__(self, workspace: Workspace):
@@ -115,14 +112,10 @@ class _StartFunctions:
 class StartFunctions:
     """The functions of a start, each of ``(x, w, p, left)``, with some sources as they are just before t = 0.
 
-    Attributes
-    ----------
-    places : mapping of (str, str) to slice
-        Where the outputs of these sources are in ``left``. Its last entry is the time, 0.
-    inputs : mapping of str to (casadi.Function, list of str)
-        Inputs of the blocks that start from them, with their ports, in the order in which the states are computed.
-    held, gates : casadi.Function or None
-        The first held outputs, and the signals that enable or trigger subsystems.
+    ``places``: where the outputs of these sources are in ``left``. Its last entry is the time, 0.
+    ``inputs``: inputs of the blocks that start from them, with their ports, in the order in which the states are
+    computed.
+    ``held``, ``gates``: the first held outputs, and the signals that enable or trigger subsystems.
     """
 
     places: Mapping[Port, slice]

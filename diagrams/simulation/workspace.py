@@ -30,29 +30,15 @@ class Workspace:
 
     `evaluate` looks at an instant; `tick` and `jump` go beyond it: they take over the next states.
 
-    Attributes
-    ----------
-    evaluators : mapping or None
-        Evaluators of the blocks of opaque stages, by path.
-    here, trial : Vectors
-        The instant that the run has reached, and the one that a solver tries.
-    p : ndarray
-        Parameters of this run.
-    x_next : ndarray
-        x after the instant that was evaluated last.
-    z : ndarray
-        Inputs of plants and of transport delays there.
-    log : ndarray
-        Outputs there, as `FlatDiagram.log` lays them out; then x before the instant, and, with algebraic loops, their
-        residual.
-    ok : ndarray
-        Shape (1,); 0 where a value was not finite or a guard failed.
-    native : mapping
-        Evaluations of ticks at ``here`` that need no traced function of the whole diagram, by the clocks that act.
-    begun : bool
-        Whether the start has been found: algebraic loops must determine their values from then on.
-    messages : tuple of str
-        Messages about the run so far.
+    ``evaluators``: evaluators of the blocks of opaque stages, by path.
+    ``here``, ``trial``: the instant that the run has reached, and the one that a solver tries.
+    ``x_next``: x after the instant that was evaluated last.
+    ``log``: outputs there, as `FlatDiagram.log` lays them out; then x before the instant, and, with algebraic loops,
+    their residual.
+    ``ok``: shape (1,); 0 where a value was not finite or a guard failed.
+    ``native``: evaluations of ticks at ``here`` that need no traced function of the whole diagram, by the clocks that
+    act.
+    ``begun``: whether the start has been found: algebraic loops must determine their values from then on.
     """
 
     def __init__(self, flat: FlatDiagram, evaluators: Evaluators | None = None):

@@ -49,16 +49,9 @@ LARGE = 1e6  # size of a state compared with its scale, from which on its growth
 class Problem:
     """The differential equation x' = rate(t, x).
 
-    Parameters
-    ----------
-    size : int
-        Number of states.
-    rate : callable
-        ``rate(t, x)``: the derivative. It may return the same array at every call.
-    jacobian : callable
-        ``jacobian(t, x)``: ∂rate/∂x, size × size.
-    names : sequence of str
-        Name of each entry of x, for messages: ``"block.state[i]"``.
+    ``rate``: ``rate(t, x)``: the derivative. It may return the same array at every call.
+    ``jacobian``: ``jacobian(t, x)``: ∂rate/∂x, size × size.
+    ``names``: name of each entry of x, for messages: ``"block.state[i]"``.
     """
 
     size: int
@@ -71,14 +64,9 @@ class Problem:
 class Polynomial:
     """The state over a step of a method: x + Σ cₖ ((time − t)/h)ᵏ, k ≥ 1.
 
-    Attributes
-    ----------
-    t, h : float
-        Start and length of the step, in s.
-    x : ndarray, shape (n,)
-        State at the start.
-    coefficients : ndarray, shape (q, n)
-        c₁ to c_q.
+    ``t``, ``h``: start and length of the step, in s.
+    ``x``: shape (n,); state at the start.
+    ``coefficients``: shape (q, n); c₁ to c_q.
     """
 
     t: float
@@ -99,10 +87,7 @@ class Polynomial:
 class AcceptedStep:
     """One accepted step, from ``t_old`` to ``t``, where the state is ``x``; both in s.
 
-    Attributes
-    ----------
-    prepare : callable
-        Returns the dense output; valid until the solver's next step or restart.
+    ``prepare``: returns the dense output; valid until the solver's next step or restart.
     """
 
     t_old: float
@@ -114,16 +99,8 @@ class AcceptedStep:
 class Integration:
     """A differential equation, the method that integrates it, and its tolerances; with the errors of that method.
 
-    Parameters
-    ----------
-    name : str
-        Name of the method.
-    problem : Problem
-        The equation.
-    rtol, atol : float, float or ndarray
-        Tolerances of a step; NaN with a fixed step.
-    max_step : float
-        Longest step in s; with a fixed step that step.
+    ``rtol``, ``atol``: tolerances of a step; NaN with a fixed step.
+    ``max_step``: longest step in s; with a fixed step that step.
     """
 
     fixed = False
@@ -260,18 +237,9 @@ class Library(Enum):
 class MethodFacts:
     """What there is to know of a method.
 
-    Attributes
-    ----------
-    title : str
-        Its name in messages.
-    kind : MethodKind
-        How C takes its steps.
-    library : Library, optional
-        The library that it is one of.
-    stages : int
-        Of a fixed step: evaluations of the rates, by which `fmus/runtime/fixed_step.c` knows the method; else 0.
-    uses_slope : bool
-        Whether it needs the derivative of the rates by the states.
+    ``stages``: of a fixed step: evaluations of the rates, by which `fmus/runtime/fixed_step.c` knows the method; else
+    0.
+    ``uses_slope``: whether it needs the derivative of the rates by the states.
     """
 
     title: str

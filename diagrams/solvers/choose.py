@@ -69,16 +69,7 @@ def make_solver(
 ) -> Solver:
     """Return the multistep method of a name, as a library has it; capitals don't matter.
 
-    Parameters
-    ----------
-    name : str
-        "BDF", "LSODA", "CVODE_BDF" or "CVODE_Adams".
-    problem : Problem
-        The differential equation.
-    rtol, atol : float, float or ndarray
-        They hold each step's error in entry i below about atol[i] + rtol·|x[i]|.
-    max_step : float, optional
-        Upper bound of the step, s.
+    ``rtol``, ``atol``: they hold each step's error in entry i below about atol[i] + rtol·|x[i]|.
     """
     name, tolerance = _check(name, problem.size, rtol=rtol, atol=atol, max_step=max_step)
     longest = math.inf if max_step is None else float(max_step)
@@ -96,18 +87,8 @@ class Method(Integration):
     the border of the stable region for 15 looks, and the leftmost eigenvalue of the exact Jacobian agrees, Radau goes
     on. It hands back when h‖J‖ < 1 for 20 steps: an explicit method would take them too. Each change is reported.
 
-    Parameters
-    ----------
-    name : str
-        One of `SOLVERS`; capitals don't matter.
-    problem : Problem
-        The differential equation.
-    rtol, atol : float, float or ndarray
-        They hold each step's error in entry i below about atol[i] + rtol·|x[i]|.
-    step : float
-        Step of a fixed-step method, s.
-    max_step : float, optional
-        Upper bound of the step of a variable-step method, s.
+    ``rtol``, ``atol``: they hold each step's error in entry i below about atol[i] + rtol·|x[i]|.
+    ``max_step``: upper bound of the step of a variable-step method, s.
     """
 
     def __init__(
@@ -150,10 +131,7 @@ class Method(Integration):
     def decide(self, t: float, x: np.ndarray, h: float, *, stuck: bool) -> tuple[str, ...]:
         """Decide at (t, x), after a sign at steps of h in s, which method continues; return what to report of it.
 
-        Parameters
-        ----------
-        stuck : bool
-            Whether the explicit method can take no step there.
+        ``stuck``: whether the explicit method can take no step there.
         """
         explicit, implicit = self.names[0], self.names[-1]
         if self.active == implicit:

@@ -47,16 +47,8 @@ class Feed(NamedTuple):
 class Assembly:
     """A system structure on its way to a diagram's structure.
 
-    Parameters
-    ----------
-    root : System
-        The root system.
-    limits : ArchiveLimits
-        Limits of the FMUs' files.
-    inputs : mapping
-        Values of inputs of the root system, in place of those of the parameter sets.
-    notes : list of str
-        Takes remarks on what has no effect.
+    ``inputs``: values of inputs of the root system, in place of those of the parameter sets.
+    ``notes``: takes remarks on what has no effect.
     """
 
     root: System
@@ -77,12 +69,8 @@ class Assembly:
     def structure(self) -> Structure:
         """Return the structure.
 
-        Raises
-        ------
-        SspFileError
-            For connections and parameters that don't fit the FMUs.
-        DoubleDriveError
-            For a connector at which two connections end.
+        Raises `SspFileError`: for connections and parameters that don't fit the FMUs.
+        Raises `DoubleDriveError`: for a connector at which two connections end.
         """
         self.flow = Dataflow(self.root, self.parts, self.notes)
         self.given, notes = apply_bindings(self.root, self.parts)
@@ -241,10 +229,8 @@ class Assembly:
     def _make_inputs(self, wired: Mapping[ConnectorKey, Feed]) -> None:
         """Make a block of each input of the root system: a constant, which `Diagram.replace` takes another source for.
 
-        Raises
-        ------
-        SspFileError
-            For an input without a value, whose connections end at inputs with different start values.
+        Raises `SspFileError`: for an input without a value, whose connections end at inputs with different start
+        values.
         """
         users: dict[ConnectorKey, list[tuple[ConnectorKey, Feed]]] = {}
         for node, feed in wired.items():

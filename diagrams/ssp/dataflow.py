@@ -38,14 +38,7 @@ class Hop(NamedTuple):
 class Dataflow:
     """Hop that ends at each connector, and what each connector is.
 
-    Parameters
-    ----------
-    root : System
-        The root system.
-    parts : mapping
-        The FMUs by the names of their components.
-    notes : list of str
-        Remarks on connectors that no variable has, and that nothing is connected to.
+    ``notes``: remarks on connectors that no variable has, and that nothing is connected to.
     """
 
     root: System

@@ -23,14 +23,7 @@ GROUP = "blocks"
 class Export:
     """Subsystem that becomes an FMU.
 
-    Attributes
-    ----------
-    path : str
-        Path of the subsystem.
-    inputs : dict
-        Where its inputs come from, by their names.
-    outputs : dict
-        Its outputs by the block, the port and the entry that makes them: name, and entry; None for a scalar.
+    ``outputs``: its outputs by the block, the port and the entry that makes them: name, and entry; None for a scalar.
     """
 
     path: str
@@ -40,10 +33,7 @@ class Export:
     def find(self, source: tuple[str, str, int | None]) -> tuple[str, int | None]:
         """Return the output that makes a signal.
 
-        Raises
-        ------
-        SspFileError
-            If it has none.
+        Raises `SspFileError` if it has none.
         """
         if source not in self.outputs:
             name = f"{source[0]}.{source[1]}"
@@ -59,12 +49,7 @@ class Export:
 def split_diagram(wired: WiredDiagram, fmus: set[str], inputs: set[str]) -> tuple[WiredDiagram, list[str]]:
     """Return a diagram in which what becomes an FMU is in subsystems of its own, and their paths.
 
-    Parameters
-    ----------
-    wired : WiredDiagram
-        The diagram.
-    fmus, inputs : set of str
-        Paths of its FMUs, and of the constants that are inputs of the SSP.
+    ``fmus``, ``inputs``: paths of its FMUs, and of the constants that are inputs of the SSP.
     """
     table = wired.scheduled
     free = _free_subsystems(table, fmus)

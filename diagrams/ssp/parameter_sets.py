@@ -28,10 +28,7 @@ class Given:
     def number(self, unit: str | None, items: Mapping[str, int]) -> Any:
         """Return the value in a unit, and an item of an enumeration as its number; a text as a text.
 
-        Raises
-        ------
-        SspFileError
-            For a value that is none of its type, and a unit of another dimension.
+        Raises `SspFileError`: for a value that is none of its type, and a unit of another dimension.
         """
         found, change = self._read(items), self.transformation
         if self.value.type in REALS and unit and self.value.unit and not self.suppress_units:

@@ -85,17 +85,9 @@ class Parsed:
 def parse_package(package: Package, variant: str | None = None) -> Parsed:
     """Read a description of a package, with all that it refers to.
 
-    Parameters
-    ----------
-    package : Package
-        The package.
-    variant : str, optional
-        File name of the description, or its name; ``SystemStructure.ssd`` without it.
-
-    Raises
-    ------
-    SspFileError
-        If a file is missing or damaged, breaks the standard, or has something that is not supported here.
+    ``variant``: file name of the description, or its name; ``SystemStructure.ssd`` without it.
+    Raises `SspFileError` if a file is missing or damaged, breaks the standard, or has something that is not supported
+    here.
     """
     return _SspReader().parse_description(_choose(package, variant))
 

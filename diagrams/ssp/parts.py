@@ -20,18 +20,8 @@ _INTERFACES = {"any": None, "CoSimulation": "co_simulation", "ModelExchange": "m
 class FmuPart:
     """FMU of a component.
 
-    Parameters
-    ----------
-    names : tuple of str
-        Names of the component from the root system down.
-    component : Component
-        The component as the file has it.
-    limits : ArchiveLimits
-        Limits of the FMU's file.
-    read : set of str
-        Variables that are read by a connection and are no outputs: they become ports, too.
-    start : dict
-        Start values of the block.
+    ``names``: names of the component from the root system down.
+    ``read``: variables that are read by a connection and are no outputs: they become ports, too.
     """
 
     names: Names
@@ -82,10 +72,7 @@ class FmuPart:
     def variable(self, name: str) -> FmuVariable:
         """Return a variable with numbers as values.
 
-        Raises
-        ------
-        SspFileError
-            If there is none, or if no wire carries it.
+        Raises `SspFileError` if there is none, or if no wire carries it.
         """
         about = self.description
         if name in about.names:
@@ -105,10 +92,7 @@ class FmuPart:
     def connector(self, name: str) -> Connector:
         """Return a connector, with its kind and unit by the FMU.
 
-        Raises
-        ------
-        SspFileError
-            If the FMU has no such variable, or the file gives it another unit.
+        Raises `SspFileError` if the FMU has no such variable, or the file gives it another unit.
         """
         given = self.component.connectors.get(name) or Connector(name, "unspecified")
         own = self.canonical(name)

@@ -161,10 +161,8 @@ def read_structure(
 ) -> tuple[str, Structure]:
     """Return the name and the structure of an SSP's diagram; parameters are those of `Diagram.from_ssp`.
 
-    Raises
-    ------
-    SspFileError, DoubleDriveError, OptionError
-        As `read_ssp`; for connections and parameters that don't fit the FMUs; for an unknown name in ``inputs``.
+    Raises `SspFileError, DoubleDriveError, OptionError`: as `read_ssp`; for connections and parameters that don't fit
+    the FMUs; for an unknown name in ``inputs``.
     """
     if inputs is not None and not isinstance(inputs, Mapping):
         raise OptionError(

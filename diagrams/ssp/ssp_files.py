@@ -25,14 +25,7 @@ _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 class Package:
     """Files of an SSP, and of a description that is a file of its own.
 
-    Parameters
-    ----------
-    file : Path
-        The ``.ssp`` or ``.ssd``, for messages.
-    archive : FmuArchive or None
-        The archive; None for a description that is a file of its own.
-    limits : ArchiveLimits
-        Limits of what is read.
+    ``archive``: the archive; None for a description that is a file of its own.
     """
 
     file: Path
@@ -63,17 +56,7 @@ class Package:
     def read(self, name: str, subject: str) -> bytes:
         """Return the content of a small file.
 
-        Parameters
-        ----------
-        name : str
-            Its path from the root, with forward slashes.
-        subject : str
-            The element that names it, for messages.
-
-        Raises
-        ------
-        SspFileError
-            If it is missing, damaged or too large.
+        Raises `SspFileError` if it is missing, damaged or too large.
         """
         if self.archive is not None:
             if name not in self.archive.files:
@@ -126,10 +109,7 @@ class PackagedFile:
     def resolve(self, uri: str, subject: str) -> PackagedFile:
         """Return the file that a relative URI names.
 
-        Raises
-        ------
-        SspFileError
-            For a URI with a scheme, an absolute one, and one that points out of an archive.
+        Raises `SspFileError`: for a URI with a scheme, an absolute one, and one that points out of an archive.
         """
         scheme = _SCHEME.match(uri)
         if scheme or uri.startswith("/"):
@@ -168,10 +148,7 @@ class PackagedFile:
 def open_package(file: str | os.PathLike[str], limits: ArchiveLimits | None = None) -> Package:
     """Open an SSP, or a description that is a file of its own, or its folder.
 
-    Raises
-    ------
-    SspFileError
-        If the file is missing, or its archive is unsafe, damaged or beyond the limits, as of an FMU.
+    Raises `SspFileError` if the file is missing, or its archive is unsafe, damaged or beyond the limits, as of an FMU.
     """
     path, limits = Path(file).expanduser(), limits or ArchiveLimits()
     if path.is_dir() and (path / DEFAULT).is_file():

@@ -18,16 +18,8 @@ from .value_table import ValueTable
 class Term:
     """Value of one entry of a signal: factor · source + offset, or what a table has for the source.
 
-    Attributes
-    ----------
-    source : (str, str, int or None), optional
-        Block, port and entry where it comes from; None for a number, which is then ``offset``.
-    factor, offset : float
-        Its linear transformation.
-    table : tuple
-        Pairs of a table of whole numbers.
-    stopped : str
-        Path of the block that is no transformation of one value; empty for others.
+    ``source``: block, port and entry where it comes from; None for a number, which is then ``offset``.
+    ``stopped``: path of the block that is no transformation of one value; empty for others.
     """
 
     source: tuple[str, str, int | None] | None = None
@@ -52,12 +44,7 @@ class Term:
 class Terms:
     """Terms of a diagram's wires.
 
-    Parameters
-    ----------
-    wired : WiredDiagram
-        The diagram.
-    sources : set of str
-        Blocks at which a term ends: FMUs, what is exported, and constants that become inputs.
+    ``sources``: blocks at which a term ends: FMUs, what is exported, and constants that become inputs.
     """
 
     wired: WiredDiagram

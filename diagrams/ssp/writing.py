@@ -79,10 +79,7 @@ class Writer:
     def fill(self) -> None:
         """Make the root system with all that is in it.
 
-        Raises
-        ------
-        SspFileError
-            For a diagram without FMUs, and a block that has no place in an SSP.
+        Raises `SspFileError`: for a diagram without FMUs, and a block that has no place in an SSP.
         """
         fmus = {path: block for path, block in self.table.blocks.items() if isinstance(block, Fmu)}
         for path, block in sorted(self.table.blocks.items()):
@@ -406,12 +403,8 @@ def write_ssp(
 ) -> Path:
     """Write a diagram as an SSP, and return the file; see `Diagram.to_ssp`.
 
-    Raises
-    ------
-    OptionError
-        A path that does not end in ``.ssp``, a folder that isn't there, a time that is not positive.
-    SspFileError
-        A block that has no place in it.
+    Raises `OptionError`: a path that does not end in ``.ssp``, a folder that isn't there, a time that is not positive.
+    Raises `SspFileError`: a block that has no place in it.
     """
     file = check_file(path)
     if file.suffix.lower() != ".ssp":

@@ -24,14 +24,7 @@ Place = tuple[str, int]
 class WebModule:
     """A diagram to run in a page.
 
-    Attributes
-    ----------
-    spec : LoopSpec
-        Its loop, with its FMUs.
-    source : str
-        The C text of all of it.
-    places : mapping of (str, str) to list of Place
-        Of each output of a block, by path and port: where its entries are.
+    ``places``: of each output of a block, by path and port: where its entries are.
     """
 
     spec: LoopSpec
@@ -41,10 +34,7 @@ class WebModule:
     def compile(self) -> bytes:
         """Return the module.
 
-        Raises
-        ------
-        CompilerError
-            If there is no compiler that builds WebAssembly, or it fails.
+        Raises `CompilerError` if there is no compiler that builds WebAssembly, or it fails.
         """
         with TemporaryDirectory() as folder:
             out = Path(folder) / "module.wasm"
@@ -62,21 +52,9 @@ def make_module(
 ) -> WebModule:
     """Return a diagram as a module.
 
-    Parameters
-    ----------
-    flat : FlatDiagram
-        The diagram with the ticks at which it is sampled.
-    columns : sequence of (Wire, int)
-        What samples have: outputs of blocks, each with an entry, flat.
-    moved : sequence of Target
-        Parameters of blocks that the page changes.
-    solver : str
-        Method of the continuous states.
-
-    Raises
-    ------
-    DefinitionError
-        For what can't be in a page, by its path, with a next step.
+    ``flat``: the diagram with the ticks at which it is sampled.
+    ``columns``: what samples have: outputs of blocks, each with an entry, flat.
+    Raises `DefinitionError`: for what can't be in a page, by its path, with a next step.
     """
     opened = let_move(open_whole(wired, (), "diagram"), moved)
     own_fmus(opened, _WAY_OUT)

@@ -21,16 +21,8 @@ import numpy as np
 class Change:
     """A number that was moved on a page.
 
-    Attributes
-    ----------
-    after : int
-        Number of samples since the reset that there were; it acts at the next one.
-    t : float or None
-        Time of the last one of them in s; None: there was none, so that it is a start value.
-    name : str
-        What the page calls it.
-    value : float
-        Its new value.
+    ``after``: number of samples since the reset that there were; it acts at the next one.
+    ``t``: time of the last one of them in s; None: there was none, so that it is a start value.
     """
 
     after: int
@@ -43,12 +35,8 @@ class Change:
 class PageRecord:
     """Samples that a page has sent since its last reset, and what was moved.
 
-    Attributes
-    ----------
-    width : int
-        Numbers of a sample: the time and the columns.
-    key : str
-        What a page and its listener know each other by.
+    ``width``: numbers of a sample: the time and the columns.
+    ``key``: what a page and its listener know each other by.
     """
 
     width: int

@@ -17,23 +17,9 @@ def repeat(
 ) -> Run:
     """Return the run in Python.
 
-    Parameters
-    ----------
-    diagram : Diagram
-        The page's diagram.
-    sliders : mapping of str to Slider
-        What is moved, by the names of the page.
-    changes : sequence of Change
-        Its moves.
-    duration : float
-        Simulated time in s.
-    options : mapping
-        Options of `Diagram.simulation`: the step and the solver.
-
-    Raises
-    ------
-    OptionError
-        If a parameter of an FMU was moved while the page ran.
+    ``sliders``: what is moved, by the names of the page.
+    ``duration``: simulated time in s.
+    Raises `OptionError` if a parameter of an FMU was moved while the page ran.
     """
     start: dict[str, float] = {}
     moves: dict[str, list[Change]] = {}

@@ -22,16 +22,7 @@ _MOST_CURVES, _MOST_PLOTS = 4, 6
 class ShownColumn:
     """An entry of a signal, which every sample has.
 
-    Attributes
-    ----------
-    name, unit : str
-        The name of the signal, with the entry, and its unit; empty without one.
-    block, port : str
-        Where it comes from.
-    entry : int
-        Its place in the output, flat.
-    place : int
-        Its place among all outputs of a sample.
+    ``name``, ``unit``: the name of the signal, with the entry, and its unit; empty without one.
     """
 
     name: str
@@ -53,10 +44,7 @@ class ShownColumns:
     def add(self, name: str) -> list[int]:
         """Return the numbers of the columns of a signal; new ones are appended.
 
-        Raises
-        ------
-        UnknownNameError
-            If there is no such signal.
+        Raises `UnknownNameError` if there is no such signal.
         """
         flat, wires = self.flat, self.flat.table.names
         full = resolve(name, wires, flat.log.slices, flat.table.blocks)
@@ -99,10 +87,7 @@ def plots_of(columns: ShownColumns, plots: PlotNames | None) -> list[dict[str, A
 
     Without a choice the named wires are drawn, those of one unit together; where there are none, outputs of blocks.
 
-    Raises
-    ------
-    OptionError, UnknownNameError
-        For what are no names; for a name that no signal has.
+    Raises `OptionError, UnknownNameError`: for what are no names; for a name that no signal has.
     """
     if plots is None:
         return _default_plots(columns)

@@ -40,24 +40,12 @@ class _Bounds:
 class Slider:
     """A slider: one number that a page moves.
 
-    Attributes
-    ----------
-    name : str
-        The name that it was asked for by, with the entry of an array.
-    path, keys
-        The block, and the names that lead to the parameter in it.
-    entry : int
-        The place of the number in the parameter, flat.
-    value, low, high : float
-        Its start value, and its range.
-    unit : str
-        Its unit; empty without one.
-    label : str
-        What the page calls it.
-    of_plant : bool
-        Whether the parameter is that of an FMU.
-    index : str
-        The entry that the keys don't have, such as ``[2]``; empty of a number, and where the keys have it.
+    ``name``: the name that it was asked for by, with the entry of an array.
+    ``path``, ``keys``: the block, and the names that lead to the parameter in it.
+    ``entry``: the place of the number in the parameter, flat.
+    ``unit``: its unit; empty without one.
+    ``of_plant``: whether the parameter is that of an FMU.
+    ``index``: the entry that the keys don't have, such as ``[2]``; empty of a number, and where the keys have it.
     """
 
     name: str
@@ -103,17 +91,8 @@ class Slider:
 def find_sliders(wired: WiredDiagram, given: Any, option: str) -> list[Slider]:
     """Return the sliders that a user asks for: one for each number.
 
-    Parameters
-    ----------
-    given : mapping of str, or list of str
-        Names, with or without ranges.
-    option : str
-        The argument, for errors.
-
-    Raises
-    ------
-    OptionError, UnknownNameError
-        What are no names or ranges; a name that nothing movable has.
+    ``given``: names, with or without ranges.
+    Raises `OptionError, UnknownNameError`: what are no names or ranges; a name that nothing movable has.
     """
     if isinstance(given, str):
         given = [given]
@@ -285,10 +264,7 @@ def _range(value: float, spec: Any, limits: Any, path: str, name: str, option: s
 def place_of(slider: Slider, spec: LoopSpec) -> int:
     """Return the place of a slider's number among the parameters of a module.
 
-    Raises
-    ------
-    OptionError
-        If the equations of the diagram don't take it as a number of its own.
+    Raises `OptionError` if the equations of the diagram don't take it as a number of its own.
     """
     if slider.of_plant:
         whole = [one.variable.name for one in spec.parameters]

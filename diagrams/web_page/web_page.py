@@ -45,16 +45,8 @@ _HINT = (
 class Scene:
     """A picture of what runs, which a script draws, and parameters that it moves.
 
-    Attributes
-    ----------
-    script : str
-        A script that defines ``window.makeScene(page, box)``, which returns an object with ``draw()``.
-    data : mapping
-        What it needs; it is ``page.data.scene``.
-    moved : mapping of str to (Target, int)
-        Numbers that it moves by ``page.set``, by its names for them: the parameter, and the entry in it.
-    signals : tuple of str
-        Signals that it reads by ``page.now``.
+    ``script``: a script that defines ``window.makeScene(page, box)``, which returns an object with ``draw()``.
+    ``moved``: numbers that it moves by ``page.set``, by its names for them: the parameter, and the entry in it.
     """
 
     script: str
@@ -74,19 +66,7 @@ class PageText:
 
 @dataclass(frozen=True)
 class Played:
-    """Parts of a page that its record needs.
-
-    Attributes
-    ----------
-    diagram : Diagram
-        The diagram.
-    columns : ShownColumns
-        Columns of a sample.
-    sliders : mapping of str to Slider
-        All that is moved, by name.
-    options : mapping
-        The step and the solver.
-    """
+    """Parts of a page that its record needs."""
 
     diagram: Any
     columns: ShownColumns
@@ -260,18 +240,9 @@ def make_page(
 ) -> WebPage:
     """Return a diagram as a page that runs; see `Diagram.to_html`.
 
-    Parameters
-    ----------
-    facts : Facts
-        Shapes and units of its signals, for the drawing.
-    text : PageText, optional
-        Its words; ``title`` is one of them.
-    labels : mapping of str to str, optional
-        What the page calls sliders and signals, by their names.
-    headings : mapping of str to str, optional
-        Headings above sliders of parameters, by their names; those of one heading follow each other.
-    scene : Scene, optional
-        A picture above the plots.
+    ``facts``: shapes and units of its signals, for the drawing.
+    ``labels``: what the page calls sliders and signals, by their names.
+    ``headings``: headings above sliders of parameters, by their names; those of one heading follow each other.
     """
     text = text or PageText(title or wired.name)
     moved = find_sliders(wired, inputs, "inputs") if inputs is not None else default_sources(wired)

@@ -11,12 +11,7 @@ from .structure import join
 def explain_absent_state(blocks: Mapping[str, Any], name: str) -> str:
     """Return why a state of that name, or of a name that ends so, is left out, with a next step; "" if none is.
 
-    Parameters
-    ----------
-    blocks : mapping
-        Blocks by path.
-    name : str
-        Path of the state, or an end of it: ``"controller.pid.integral"``, ``"pid.integral"``.
+    ``name``: path of the state, or an end of it: ``"controller.pid.integral"``, ``"pid.integral"``.
     """
     for path, block in blocks.items():
         for state, reason in getattr(block, "absent_states", {}).items():

@@ -122,10 +122,7 @@ def name_ports(
 ) -> dict[tuple[str, ...], str]:
     """Return the port of a subsystem for each signal of a bus: its names, joined, after the bus's where that is taken.
 
-    Raises
-    ------
-    DuplicateNameError
-        For two signals with one port.
+    Raises `DuplicateNameError`: for two signals with one port.
     """
     made: dict[tuple[str, ...], str] = {}
     for path in paths:

@@ -41,11 +41,6 @@ class Collector:
     """Walks from the roots against the wires, then gives every block its path.
 
     Two blocks are the same node only if they are one object.
-
-    Parameters
-    ----------
-    roots : iterable of Wireable
-        The calls that close the diagram.
     """
 
     def __init__(self, roots: Iterable[object]):

@@ -10,17 +10,7 @@ import numpy as np
 def find_cyclic_parts(keys: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list[set[str]]:
     """Return the strongly connected parts of a graph that have a cycle: several nodes, or one with an arrow to itself.
 
-    Parameters
-    ----------
-    keys : sequence of str
-        The nodes; the parts come in the order of their first ones.
-    pairs : iterable of (str, str)
-        From node to node.
-
-    Examples
-    --------
-    >>> [sorted(part) for part in find_cyclic_parts("abcd", ["ab", "ba", "bc", "dd"])]
-    [['a', 'b'], ['d']]
+    ``keys``: the nodes; the parts come in the order of their first ones.
     """
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import connected_components

@@ -27,18 +27,8 @@ Entry = tuple[str, str, int]
 class EntryOrder:
     """Order of the entries of ports that are stuck in or behind loops of ports.
 
-    Parameters
-    ----------
-    table : Structure
-        Blocks and wires.
-    traced : mapping
-        Traced equations, by path.
-    waits : mapping
-        For every output, next state and guard, the ports that it waits for.
-    stuck : set of Port
-        Those that are stuck.
-    start : bool
-        Whether it is the order of initialization.
+    ``waits``: for every output, next state and guard, the ports that it waits for.
+    ``start``: whether it is the order of initialization.
     """
 
     def __init__(
@@ -57,13 +47,7 @@ class EntryOrder:
             self._add(path, name, waits[path, name], whole=whole)
 
     def sort(self, torn: Iterable[Port] = ()) -> tuple[list[OrderStep], dict[Port, set[Port]]]:
-        """Return the steps that can be evaluated, in order, and for each port that is still stuck those it waits for.
-
-        Parameters
-        ----------
-        torn : iterable of Port
-            Ports whose values are taken as known.
-        """
+        """Return the steps that can be evaluated, in order, and for each port that is stuck those it waits for."""
         known = set(torn)
         waits = {entry: {s for s in sources if s[:2] not in known} for entry, sources in self.waits.items()}
         missing = {entry: len(sources) for entry, sources in waits.items()}

@@ -49,17 +49,7 @@ def dependencies(table: Structure, traced: Mapping[str, Traced], *, start: bool 
 
 @dataclass(frozen=True)
 class Order:
-    """The order of evaluation.
-
-    Attributes
-    ----------
-    steps : list of OrderStep
-        Equations to evaluate, block by block.
-    torn : tuple of Port
-        Output ports whose values are taken as known.
-    loops : tuple of str
-        Every algebraic loop, printed port by port.
-    """
+    """The order of evaluation."""
 
     steps: list[OrderStep]
     torn: tuple[Port, ...] = ()
@@ -71,12 +61,8 @@ def evaluation_order(
 ) -> Order:
     """Return the order of evaluation; a block is evaluated in one go where its inputs allow it.
 
-    Parameters
-    ----------
-    start : bool
-        The order of initialization; see `dependencies`.
-    solve : bool
-        Tear algebraic loops instead of refusing them.
+    ``start``: the order of initialization; see `dependencies`.
+    ``solve``: tear algebraic loops instead of refusing them.
     """
     waits = dependencies(table, traced, start=start)
     steps, stuck = _sort(traced, waits)

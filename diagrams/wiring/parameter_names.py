@@ -22,15 +22,6 @@ def find_name(table: Structure, name: object, diagram: str) -> str:
 
     A start value of an FMU is found without ``start`` as well: ``"plant.mass"`` is ``"plant.start.mass"``. An entry of
     an array is one, too, counted from 1: ``"motor.denominator[1]"``.
-
-    Parameters
-    ----------
-    table : Structure
-        The structure of the diagram.
-    name : str
-        The path, or its unique end.
-    diagram : str
-        The diagram's name, for errors.
     """
     name = check_name(name, diagram)
     if name in table.blocks:

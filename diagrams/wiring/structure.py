@@ -98,26 +98,14 @@ class Wire:
 class Structure:
     """Blocks, subsystems and wires of a diagram, by path.
 
-    Attributes
-    ----------
-    blocks : dict
-        Every block by its path.
-    subsystem_of : dict
-        Path of the subsystem that a block is in, by the block's path.
-    subsystems : dict
-        Settings of every subsystem by its path, the diagram's own under "".
-    wires : dict
-        The source of every wired input, by (block path, input).
-    names : dict
-        The source of every named wire.
-    controls : dict
-        The source of the signal that enables or triggers a subsystem, by the subsystem's path.
-    handed : dict
-        For an input, by (block path, input): the subsystems, each with its output, that only pass its signal through.
-    results : dict
-        The source of every output of a subsystem, by (the subsystem's path, output).
-    arguments : dict
-        The source of every input of a subsystem, by (the subsystem's path, input).
+    ``subsystem_of``: path of the subsystem that a block is in, by the block's path.
+    ``subsystems``: settings of every subsystem by its path, the diagram's own under "".
+    ``wires``: the source of every wired input, by (block path, input).
+    ``controls``: the source of the signal that enables or triggers a subsystem, by the subsystem's path.
+    ``handed``: for an input, by (block path, input): the subsystems, each with its output, that only pass its signal
+    through.
+    ``results``: the source of every output of a subsystem, by (the subsystem's path, output).
+    ``arguments``: the source of every input of a subsystem, by (the subsystem's path, input).
     """
 
     blocks: dict[str, Block] = field(default_factory=dict)
@@ -188,12 +176,7 @@ class Structure:
 def stepped_blocks(table: Structure, inside: str = "") -> dict[str, Block]:
     """Return the blocks that a run steps from outside, such as FMUs, by path in alphabetical order.
 
-    Parameters
-    ----------
-    table : Structure
-        The diagram's structure.
-    inside : str
-        Path of a block or a subsystem, to which the search is limited; the whole diagram without it.
+    ``inside``: path of a block or a subsystem, to which the search is limited; the whole diagram without it.
     """
     paths = [p for p, b in table.blocks.items() if b.stepped and (not inside or f"{p}.".startswith(f"{inside}."))]
     return {path: table.blocks[path] for path in sorted(paths)}

@@ -17,12 +17,7 @@ _MOST_ROUNDS = 100
 def follow_units(table: Structure, converted: Mapping[Port, Unit]) -> dict[Port, Unit]:
     """Return the unit of every output that has one: declared, or that of the input which the output is like.
 
-    Parameters
-    ----------
-    table : Structure
-        Blocks and wires.
-    converted : mapping
-        Units to which wires are converted, by the input at their end.
+    ``converted``: units to which wires are converted, by the input at their end.
     """
     units: dict[Port, Unit] = {}
     for path, block in table.blocks.items():

@@ -49,20 +49,10 @@ _TOLERANCE_DESCRIPTION = (
 class Entry:
     """Variable of the FMU; its value reference is its index in the table of variables.
 
-    Parameters
-    ----------
-    reference : int
-        Value reference.
-    kind : str
-        One of time, fixed, tunable, input, state, discrete (state), derivative, output, (event) indicator.
-    variable : Variable
-        The model's variable; of time and of derivatives only name, unit, shape and description count.
-    name : str
-        Name in the FMU: ``der(x)`` for the derivative of ``x``.
-    first : int
-        Index of its first element in the values of an instance.
-    of : int, optional
-        Reference of the state of a derivative.
+    ``kind``: one of time, fixed, tunable, input, state, discrete (state), derivative, output, (event) indicator.
+    ``variable``: the model's variable; of time and of derivatives only name, unit, shape and description count.
+    ``name``: name in the FMU: ``der(x)`` for the derivative of ``x``.
+    ``first``: index of its first element in the values of an instance.
     """
 
     reference: int
@@ -314,21 +304,9 @@ def _generate_equations(functions: Sequence[ca.Function]) -> str:
 def generate(spec: ModelSpec, token: str, fmi: int = 3) -> tuple[str, bool]:
     """Return the text of ``model.c``.
 
-    Parameters
-    ----------
-    spec : ModelSpec
-        The model.
-    token : str
-        The instantiation token (FMI 3.0, 2.3.1).
-    fmi : {3, 2}
-        Version of FMI.
-
-    Returns
-    -------
-    text : str
-        The C text; it includes the files of `runtime`.
-    derivatives : bool
-        Whether there are directional and adjoint derivatives.
+    ``token``: the instantiation token (FMI 3.0, 2.3.1).
+    Returns: the C text; it includes the files of `runtime`.
+    Returns: whether there are directional and adjoint derivatives.
     """
     entries = layout(spec)
     equations = _equations(spec)

@@ -43,14 +43,8 @@ _INSTALL = 'Install one: pip install "loopwright[build]" (it brings ziglang), or
 class Compiler:
     """A compiler command.
 
-    Parameters
-    ----------
-    command : tuple of str
-        Command line up to the flags.
-    identity : str
-        Text that identifies the compiler and its version; part of cache keys.
-    zig : bool
-        Whether it takes zig's ``-target``.
+    ``identity``: text that identifies the compiler and its version; part of cache keys.
+    ``zig``: whether it takes zig's ``-target``.
     """
 
     command: tuple[str, ...]
@@ -61,10 +55,7 @@ class Compiler:
 def find_compiler() -> Compiler:
     """Return the compiler to use: LOOPWRIGHT_CC, the ziglang package, else the system's cc, gcc or clang.
 
-    Raises
-    ------
-    CompilerError
-        If there is none; the text says how to install one.
+    Raises `CompilerError` if there is none; the text says how to install one.
     """
     found = find_command(find_python)
     if found is None:
@@ -94,10 +85,7 @@ def _version(command: tuple[str, ...]) -> str:
 def describe_compiler(platform: str) -> tuple[str, ...]:
     """Return the compiler's name, version and flags for a platform, for keys of caches.
 
-    Raises
-    ------
-    CompilerError
-        If there is none.
+    Raises `CompilerError` if there is none.
     """
     compiler = find_compiler()
     return (compiler.identity, *flags(platform, zig=compiler.zig))
@@ -126,30 +114,14 @@ def compile_shared(
 ) -> None:
     """Compile C sources into a shared library.
 
-    Parameters
-    ----------
-    sources : mapping of str to str
-        Text of each file, headers too, by name.
-    out : Path
-        The library to write; it appears complete or not at all.
-    platform : str, optional
-        FMI 3.0 platform tuple; native if not given.
-    compiled : sequence of str, optional
-        Names of the sources to compile; if not given, all that end in ``.c``.
-    include : sequence of Path
-        Further folders of headers.
-    compiler : Compiler, optional
-        The compiler; `find_compiler`'s if not given.
-    more_flags : sequence of str
-        Flags after those of every library.
-
-    Raises
-    ------
-    CompilerError
-        If there is no compiler, it does not end, or it fails; then its message is quoted. If the folder of ``out``
-        can't be written.
-    FmuError
-        If the cache can't be written.
+    ``out``: the library to write; it appears complete or not at all.
+    ``platform``: FMI 3.0 platform tuple; native if not given.
+    ``compiled``: names of the sources to compile; if not given, all that end in ``.c``.
+    ``compiler``: the compiler; `find_compiler`'s if not given.
+    ``more_flags``: flags after those of every library.
+    Raises `CompilerError` if there is no compiler, it does not end, or it fails; then its message is quoted. If the
+    folder of ``out`` can't be written.
+    Raises `FmuError` if the cache can't be written.
     """
     check_cache()  # zig retries for ever if it can't write there
     compiler = compiler or find_compiler()
@@ -165,19 +137,10 @@ def compile_shared(
 def compile_webassembly(source: str, out: Path) -> None:
     """Compile a C source into a WebAssembly module, which imports nothing but functions of JavaScript's Math.
 
-    Parameters
-    ----------
-    source : str
-        The C text; it finds the headers of ``webassembly/``, and no C library.
-    out : Path
-        The module to write; it appears complete or not at all.
-
-    Raises
-    ------
-    CompilerError
-        If the package's compiler isn't there, or it fails.
-    FmuError
-        If the cache can't be written.
+    ``source``: the C text; it finds the headers of ``webassembly/``, and no C library.
+    ``out``: the module to write; it appears complete or not at all.
+    Raises `CompilerError` if the package's compiler isn't there, or it fails.
+    Raises `FmuError` if the cache can't be written.
     """
     check_cache()
     compiler = find_compiler()
@@ -222,23 +185,10 @@ def run_compiler(
 ) -> dict[str, bytes]:
     """Run a compiler's commands in a fresh folder with sources, and return the content of files that they write.
 
-    Parameters
-    ----------
-    sources : mapping of str to str
-        Text of each file, by name, with its folder.
-    commands : sequence of sequence of str
-        Commands, one after the other.
-    results : sequence of str
-        Names of files that they write.
-    platform : str
-        Name of the platform in messages.
-
-    Raises
-    ------
-    CompilerError
-        If a command can't be run, does not end, or fails; then its message is quoted.
-    FmuError
-        If the cache can't be written.
+    ``sources``: text of each file, by name, with its folder.
+    ``commands``: commands, one after the other.
+    Raises `CompilerError` if a command can't be run, does not end, or fails; then its message is quoted.
+    Raises `FmuError` if the cache can't be written.
     """
     check_cache()
     place = cache_folder()

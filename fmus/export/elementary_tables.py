@@ -26,16 +26,8 @@ _DIGITS = 60
 def prepare_functions(equations: str) -> str:
     """Return the C text that goes before equations: the tables of the functions that they call, and their names.
 
-    Parameters
-    ----------
-    equations : str
-        C text that calls functions of math.h.
-
-    Returns
-    -------
-    str
-        Empty if it calls none of `FUNCTIONS`. After the text, ``sin`` is ``lw_sin`` and so on; `restore_functions`
-        ends that.
+    Returns: empty if it calls none of `FUNCTIONS`. After the text, ``sin`` is ``lw_sin`` and so on; `restore_functions`
+    ends that.
     """
     called = [name for name in FUNCTIONS if re.search(rf"\b{name}\(", equations)]
     if not called:
@@ -56,10 +48,7 @@ def restore_functions() -> str:
 def prepare_single(called: Iterable[str]) -> str:
     """Return the C text that goes before functions of single precision: their tables, and which are called.
 
-    Parameters
-    ----------
-    called : iterable of str
-        Of `SINGLE_FUNCTIONS`. ``sin`` is ``lw_sinf`` in C, and so on.
+    ``called``: of `SINGLE_FUNCTIONS`. ``sin`` is ``lw_sinf`` in C, and so on.
     """
     needs = [f"#define LW_NEEDS_{name.upper()}_SINGLE 1\n" for name in called]
     tables = dict.fromkeys(table for name in called for table in _OF_SINGLE.get(name, ()))

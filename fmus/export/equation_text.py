@@ -81,21 +81,9 @@ def _choice(op: int, operands: Sequence[Term], choices: dict[str, tuple[str, str
 def equations(f: ca.Function, knowns: Sequence[Sequence[str]], unknowns: Sequence[str], limit: int = 400) -> list[str]:
     """Return a function of scalar operations as equations in text.
 
-    Parameters
-    ----------
-    f : casadi.Function
-        A function of dense columns with one column as its result.
-    knowns : sequence of sequences of str
-        Names of the elements of each argument.
-    unknowns : sequence of str
-        Names of the elements of the result.
-    limit : int
-        Number of operations beyond which the text would be too long to read.
-
-    Returns
-    -------
-    list of str
-        One equation in each text, shared expressions first; empty without a scalar expansion, or beyond the limit.
+    ``f``: a function of dense columns with one column as its result.
+    ``limit``: number of operations beyond which the text would be too long to read.
+    Returns: one equation in each text, shared expressions first; empty without a scalar expansion, or beyond the limit.
     """
     try:
         f = f.expand()

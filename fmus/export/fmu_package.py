@@ -47,14 +47,7 @@ FOLDERS2 = {"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin
 class Options:
     """Options of a build, besides the model.
 
-    Parameters
-    ----------
-    fmi : {3, 2}
-        Version of FMI.
-    platforms : tuple of str
-        FMI 3.0 platform tuples.
-    documentation : str
-        Text of the documentation.
+    ``platforms``: FMI 3.0 platform tuples.
     """
 
     fmi: int
@@ -194,10 +187,7 @@ def file_for(out: Path | str, name: str) -> Path:
 
     Other tools find FMUs by their ending, so none is written without it. Other endings stay: ``pend.v2.fmu``.
 
-    Raises
-    ------
-    FmuError
-        If this user can't look there.
+    Raises `FmuError` if this user can't look there.
     """
     out = Path(out)
     with explain_disk_errors(f"the FMU can't be written to {str(out)!r}", out, OTHER_FOLDER, FmuError):
@@ -209,10 +199,7 @@ def file_for(out: Path | str, name: str) -> Path:
 def write_atomically(path: Path, data: bytes, instead: str = OTHER_FOLDER) -> None:
     """Write a file so that it is complete or does not exist, never half written; make its folder.
 
-    Raises
-    ------
-    FmuError
-        If it can't be written; ``instead`` says how to use another place.
+    Raises `FmuError` if it can't be written; ``instead`` says how to use another place.
     """
     with explain_disk_errors(f"the FMU can't be written to {str(path)!r}", path, instead, FmuError):
         path.parent.mkdir(parents=True, exist_ok=True)

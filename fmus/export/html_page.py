@@ -140,19 +140,9 @@ def _section(title: str, body: Sequence[str]) -> list[str]:
 def index_html(spec: ModelSpec, text: str = "", *, fmi: int = 3) -> str:
     """Return the text of ``documentation/index.html`` (FMI 3.0, 2.5.1; FMI 2.0, 2.3).
 
-    Parameters
-    ----------
-    spec : ModelSpec
-        The model as exported, with arrays or without.
-    text : str
-        Plain text by the author, such as a docstring; shown unchanged.
-    fmi : {3, 2}
-        Version of FMI.
-
-    Returns
-    -------
-    str
-        HTML 5 without references to other files.
+    ``spec``: the model as exported, with arrays or without.
+    ``text``: plain text by the author, such as a docstring; shown unchanged.
+    Returns: HTML 5 without references to other files.
     """
     traced = _equations(spec)
     if traced:

@@ -22,18 +22,10 @@ def inline_model(path: str | os.PathLike[str], prefix: str) -> str | None:
     The text defines ``<prefix>lw_inline_step``, see ``runtime/in_loop.c``: a communication step of an instance that the
     FMU's library has made.
 
-    Parameters
-    ----------
-    path : path
-        An FMU that Loopwright has built on this machine.
-    prefix : str
-        Begin of every name of it, so that several are in one unit.
-
-    Returns
-    -------
-    str or None
-        None for an FMU of others, for one with events, and for one of another version of Loopwright, whose instances
-        may be laid out otherwise.
+    ``path``: an FMU that Loopwright has built on this machine.
+    ``prefix``: begin of every name of it, so that several are in one unit.
+    Returns: none for an FMU of others, for one with events, and for one of another version of Loopwright, whose
+    instances may be laid out otherwise.
     """
     content = Path(path).read_bytes()
     if not is_built_here(hashlib.sha256(content).hexdigest()):

@@ -43,10 +43,7 @@ class LoopCode(TargetCode):
     def measure(self, inputs: Mapping[str, Any] | None = None, **options: Any) -> NoReturn:
         """Refuse to count instructions: how many a tick has depends on its events and equations.
 
-        Raises
-        ------
-        OptionError
-            Always.
+        Raises `OptionError`: always.
         """
         raise OptionError(
             "instructions are counted of sampled diagrams alone; this one has a solver inside, whose steps and "
@@ -84,10 +81,7 @@ class LoopCode(TargetCode):
 def write_loop_c(spec: LoopSpec, folder: Path, *, own_functions: bool = False) -> LoopCode:
     """Write C for a target to a folder: header, source, example and report.
 
-    Raises
-    ------
-    DiskError
-        If it can't be written.
+    Raises `DiskError` if it can't be written.
     """
     code = LoopCode(spec, folder, own_functions)
     code._write()

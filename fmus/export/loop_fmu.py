@@ -89,14 +89,7 @@ def loop_layout(spec: LoopSpec) -> tuple[Entry, ...]:
 class OfferedClock:
     """A clock of a diagram as a periodic input clock of its FMU (FMI 3.0, 2.2.9).
 
-    Attributes
-    ----------
-    name, description : str
-        Its name and what ticks by it.
-    reference : int
-        Value reference.
-    interval, shift : Fraction
-        Seconds between two ticks, and before the first one.
+    ``interval``, ``shift``: seconds between two ticks, and before the first one.
     """
 
     name: str

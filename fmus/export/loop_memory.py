@@ -15,18 +15,8 @@ _LINE = 8  # values in a line of a table
 class Field:
     """A member of the memory: a struct, several of them, pointers, or a vector of numbers.
 
-    Attributes
-    ----------
-    name : str
-        Its name.
-    kind : str
-        C type of an entry.
-    length : int
-        Number of entries; 0 for a single one.
-    start : ndarray, optional
-        Start values of a vector.
-    each : int
-        Bytes of an entry, where pointers have eight.
+    ``length``: number of entries; 0 for a single one.
+    ``each``: bytes of an entry, where pointers have eight.
     """
 
     name: str
@@ -50,14 +40,8 @@ class Field:
 class LoopMemory:
     """The memory of a loop: an instance is one block of it, and nothing else is allocated.
 
-    Attributes
-    ----------
-    fields : tuple of Field
-        The members of the struct ``lw_memory``.
-    numbers : tuple of (str, str)
-        Numbers in structs that are not 0 at the start: the member, and the number, as C text.
-    pointers : tuple of (str, str)
-        Pointers: the member, and what it points to; ``m`` is the memory.
+    ``numbers``: numbers in structs that are not 0 at the start: the member, and the number, as C text.
+    ``pointers``: pointers: the member, and what it points to; ``m`` is the memory.
     """
 
     fields: tuple[Field, ...]

@@ -29,21 +29,12 @@ _BETWEEN = ("problem.c", "delays.c", "methods.c", "radau.c", "event_search.c", "
 class Placed:
     """A variable, and where its values are.
 
-    Attributes
-    ----------
-    variable : Variable
-        The variable.
-    vector : {"p", "w", "x", "log"}
-        Member of the memory that holds its values: parameters, inputs and outputs of plants, states, or all outputs of
-        blocks.
-    places : tuple of int
-        The entries, row by row.
-    sampled : bool
-        Whether it changes at ticks and events only.
-    clock : int, optional
-        The clock that its block acts at, among `LoopSpec.clocks`; None in continuous time and for a triggered block.
-    rates : tuple of int
-        Of a continuous state with slopes: the entries of its rates.
+    ``vector``: member of the memory that holds its values: parameters, inputs and outputs of plants, states, or all
+    outputs of blocks.
+    ``sampled``: whether it changes at ticks and events only.
+    ``clock``: the clock that its block acts at, among `LoopSpec.clocks`; None in continuous time and for a triggered
+    block.
+    ``rates``: of a continuous state with slopes: the entries of its rates.
     """
 
     variable: Variable
@@ -58,12 +49,7 @@ class Placed:
 class CFunction:
     """A function in the code, as CasADi writes it.
 
-    Attributes
-    ----------
-    name : str
-        Its name.
-    sizes : tuple of int
-        Entries of its lists of arguments and results, and of its memory of integers and numbers.
+    ``sizes``: entries of its lists of arguments and results, and of its memory of integers and numbers.
     """
 
     name: str
@@ -87,14 +73,7 @@ class CFunction:
 class Guards:
     """What must stay positive at a kind of tick.
 
-    Attributes
-    ----------
-    names : tuple of (str, str)
-        Block and name of each.
-    function : CFunction or None
-        The function of (t, x, w, p) that has their values; None without any.
-    texts : tuple of str
-        What each block says of it.
+    ``function``: the function of (t, x, w, p) that has their values; None without any.
     """
 
     names: tuple[tuple[str, str], ...] = ()
@@ -106,18 +85,10 @@ class Guards:
 class Slopes:
     """Derivatives of a diagram: of some entries of the log, and of the rates of all continuous states behind these.
 
-    Attributes
-    ----------
-    forward, reverse : tuple of CFunction
-        By kind of tick: of (t, x, w, p) and a seed, the product with the Jacobian by (t, x, w, p), or its transpose.
-    start : tuple of CFunction
-        Forward and reverse of the states at the start; none where none are computed.
-    entries : tuple of int
-        The entries of the log.
-    rates : int
-        Number of the rates.
-    function : CFunction or None
-        The rates, as a function of (t, x, w, p).
+    ``forward``, ``reverse``: by kind of tick: of (t, x, w, p) and a seed, the product with the Jacobian by (t, x, w,
+    p), or its transpose.
+    ``start``: forward and reverse of the states at the start; none where none are computed.
+    ``function``: the rates, as a function of (t, x, w, p).
     """
 
     forward: tuple[CFunction, ...]
@@ -132,12 +103,8 @@ class Slopes:
 class ComputedNumbers:
     """ComputedNumbers that are computed from the parameters of a block, behind these.
 
-    Attributes
-    ----------
-    first, parameters, count : int
-        Entry of p with which the block's parameters begin, their number, and that of the computed numbers.
-    function : CFunction
-        The function from one to the other.
+    ``first``, ``parameters``, ``count``: entry of p with which the block's parameters begin, their number, and that of
+    the computed numbers.
     """
 
     first: int
@@ -150,64 +117,31 @@ class ComputedNumbers:
 class LoopSpec:
     """A diagram to export.
 
-    Attributes
-    ----------
-    name : str
-        A C identifier.
-    description : str
-        One line.
-    inputs, outputs, signals, parameters, states : tuple of Placed
-        Its variables: ``signals`` are named wires and outputs of blocks that are no outputs of the diagram.
-    base : Fraction
-        Seconds between two ticks.
-    clocks : tuple of (int, int)
-        Ticks at which sampled subsystems act: every so many ticks, from an offset on.
-    clocked : tuple of str
-        The subsystems of each clock, in words.
-    offers_clocks : bool
-        Whether an FMU of FMI 3.0 has its clocks as input clocks.
-    sets : tuple of int
-        Sets of clocks that act together, as bits, in the order of the loop's kinds of ticks.
-    hybrid : bool
-        Whether anything happens between ticks.
-    memory : LoopMemory
-        The memory of the loop.
-    code : str
-        C code of the functions that the memory points to.
-    labels : tuple of (str, str, int, int)
-        Outputs of blocks in the order of evaluation: block, port, first entry of the log, number of entries.
-    guards : tuple of Guards
-        What must stay positive at each kind of tick.
-    start : CFunction or None
-        The states at the start, of (t, x, w, p); None where none are computed.
-    start_kind : int
-        Kind of the tick at which all clocks act, by which algebraic loops are solved at the start; -1: there are none.
-    numbers : tuple of ComputedNumbers
-        ComputedNumbers that are computed from parameters.
-    events : tuple of (str, str, bool)
-        Events between ticks: block, name, whether it enables or triggers a subsystem.
-    left : CFunction or None
-        The indicators of all events just before the start, then at it, where sources jump at the start; else None.
-    edges : tuple of (float, float)
-        Discontinuities of sources, s: each with the time at which it is seen there, which may be just after it.
-    periodic : tuple of (float, float)
-        Discontinuities of sources that repeat without end: the first one and the period, s.
-    depends : mapping of str to tuple of int
-        Entries of w on which each output and each signal depends at an instant; all where it is missing.
-    slopes : Slopes or None
-        Derivatives; None where there are none.
-    knowns : mapping of (str, int) to frozenset of (str, int)
-        With slopes: by "log" or "rates" and an entry, the entries of t, x, w and p that it depends on at an instant.
-    found_at_build : tuple of str
-        States whose start the blocks' Python code has found when it was exported: start values, which can be set.
-    plants : tuple of MergedPlant
-        FMUs of our own that are merged into it.
-    steps_on_ticks : bool
-        Whether communication steps must go from tick to tick.
-    own_functions : bool
-        See `write_unit`.
-    step_size, stop_time : float
-        Default experiment, s.
+    ``inputs``, ``outputs``, ``signals``, ``parameters``, ``states``: its variables: ``signals`` are named wires and
+    outputs of blocks that are no outputs of the diagram.
+    ``clocks``: ticks at which sampled subsystems act: every so many ticks, from an offset on.
+    ``offers_clocks``: whether an FMU of FMI 3.0 has its clocks as input clocks.
+    ``sets``: sets of clocks that act together, as bits, in the order of the loop's kinds of ticks.
+    ``hybrid``: whether anything happens between ticks.
+    ``code``: C code of the functions that the memory points to.
+    ``labels``: outputs of blocks in the order of evaluation: block, port, first entry of the log, number of entries.
+    ``guards``: what must stay positive at each kind of tick.
+    ``start``: the states at the start, of (t, x, w, p); None where none are computed.
+    ``start_kind``: kind of the tick at which all clocks act, by which algebraic loops are solved at the start; -1:
+    there are none.
+    ``events``: events between ticks: block, name, whether it enables or triggers a subsystem.
+    ``left``: the indicators of all events just before the start, then at it, where sources jump at the start; else
+    None.
+    ``edges``: discontinuities of sources, s: each with the time at which it is seen there, which may be just after it.
+    ``periodic``: discontinuities of sources that repeat without end: the first one and the period, s.
+    ``depends``: entries of w on which each output and each signal depends at an instant; all where it is missing.
+    ``slopes``: derivatives; None where there are none.
+    ``knowns``: with slopes: by "log" or "rates" and an entry, the entries of t, x, w and p that it depends on at an
+    instant.
+    ``found_at_build``: states whose start the blocks' Python code has found when it was exported: start values, which
+    can be set.
+    ``plants``: FMUs of our own that are merged into it.
+    ``steps_on_ticks``: whether communication steps must go from tick to tick.
     """
 
     name: str
@@ -260,13 +194,8 @@ def write_unit(spec: LoopSpec, *, own_functions: bool = False) -> str:
     What it offers is in ``fmus/runtime/exported.c``: ``lw_memory``, ``lw_fill``, ``lw_bind``, ``lw_begin``,
     ``lw_go``.
 
-    Parameters
-    ----------
-    spec : LoopSpec
-        The diagram.
-    own_functions : bool, default False
-        Take sine, exponential and so on from this package, with the same bits on every platform, and not from the
-        platform's library, with the bits of a run here.
+    ``own_functions``: take sine, exponential and so on from this package, with the same bits on every platform, and not
+    from the platform's library, with the bits of a run here.
     """
     code = spec.code
     if own_functions:

@@ -89,14 +89,9 @@ Sized = Sequence[tuple[int, int]]
 class PlacedPlant:
     """Where a merged FMU is in the loop of its diagram.
 
-    Attributes
-    ----------
-    path : str
-        Its path in the diagram.
-    clocks : tuple of (int, int)
-        Ticks that are its communication points: every so many ticks, from an offset on.
-    first_input, first_output, first_parameter : int
-        Entries of z, w and p at which its inputs, outputs and parameters begin.
+    ``clocks``: ticks that are its communication points: every so many ticks, from an offset on.
+    ``first_input``, ``first_output``, ``first_parameter``: entries of z, w and p at which its inputs, outputs and
+    parameters begin.
     """
 
     path: str
@@ -110,22 +105,10 @@ class PlacedPlant:
 class MergedPlant:
     """An FMU of our own that is merged into an exported diagram.
 
-    Attributes
-    ----------
-    sources : dict of str to str
-        The C sources that it carries; see `read_own_sources`.
-    inputs, outputs : sequence of (int, int)
-        What is set before a step, and got after it.
-    parameters : sequence of (int, int)
-        What is set from the diagram's parameters.
-    tunable : sequence of bool
-        Which of these may be set between two steps.
-    start : sequence of (int, sequence of float)
-        Value references, each with its start value; before the parameters.
-    implicit : bool
-        Whether it starts with the implicit integrator, which needs a matrix.
-    placed : PlacedPlant
-        Where it is in the diagram.
+    ``inputs``, ``outputs``: what is set before a step, and got after it.
+    ``tunable``: which of these may be set between two steps.
+    ``start``: value references, each with its start value; before the parameters.
+    ``implicit``: whether it starts with the implicit integrator, which needs a matrix.
     """
 
     sources: dict[str, str]

@@ -149,16 +149,8 @@ class EventSpec:
     The FMU's own integrators find a change that lasts over a quarter of a step, and a shorter one if the rate of z
     shows it. Several changes within one integrator step can be missed: take shorter communication steps there.
 
-    Parameters
-    ----------
-    name : str
-        Name, like a `Variable`'s; the indicator's name in the FMU is ``<name>.indicator``.
-    direction : {"both", "rising", "falling"}
-        Direction of the changes that fire it; rising is from z <= 0 to z > 0.
-    description : str
-        One line.
-    nominal : float
-        Usual size of z, positive.
+    ``name``: name, like a `Variable`'s; the indicator's name in the FMU is ``<name>.indicator``.
+    ``direction``: direction of the changes that fire it; rising is from z <= 0 to z > 0.
     """
 
     name: str

@@ -28,10 +28,7 @@ def read_own_sources(path: str | os.PathLike[str]) -> dict[str, str] | None:
 def expand_sources(name: str, sources: dict[str, str], behind: dict[str, str] | None = None) -> str:
     """Return a source with what it includes, but for the functions of FMI.
 
-    Parameters
-    ----------
-    behind : dict of str to str, optional
-        Texts that come behind sources that are included, by the names of these.
+    ``behind``: texts that come behind sources that are included, by the names of these.
     """
 
     def include(found: re.Match[str]) -> str:

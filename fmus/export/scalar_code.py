@@ -48,16 +48,7 @@ CHOOSE = -3
 class ScalarNode:
     """A value.
 
-    Attributes
-    ----------
-    operation : int
-        CasADi's number of it, `FIND`, or `TAKE`.
-    arguments : tuple of int
-        Nodes that it is computed from.
-    constant : float
-        Its value, of a constant.
-    place : tuple of int
-        Argument and entry, of an input; the table, of `FIND`; table and offset of `TAKE`.
+    ``place``: argument and entry, of an input; the table, of `FIND`; table and offset of `TAKE`.
     """
 
     operation: int
@@ -73,17 +64,7 @@ class ScalarNode:
 
 @dataclass(frozen=True, eq=False)
 class Lookup:
-    """A lookup that is no scalar operation; its results are arguments of a function behind the ordinary ones.
-
-    Attributes
-    ----------
-    kind : int
-        `FIND` or `TAKE`.
-    table : ndarray
-        Breakpoints, or entries.
-    count : int
-        Number of results.
-    """
+    """A lookup that is no scalar operation; its results are arguments of a function behind the ordinary ones."""
 
     kind: int
     table: np.ndarray
@@ -95,17 +76,8 @@ def split_lookups(function: Any, expand: Callable[[Any], Any]) -> tuple[Any, tup
 
     Their results are further arguments of the function, and what they look up further results, in this order.
 
-    Parameters
-    ----------
-    function : casadi.Function
-        The function.
-    expand : callable
-        Returns a function as scalar operations where that is possible, else the function.
-
-    Raises
-    ------
-    DefinitionError
-        If it has other operations that are not scalar.
+    ``expand``: returns a function as scalar operations where that is possible, else the function.
+    Raises `DefinitionError` if it has other operations that are not scalar.
     """
     made = expand(function)
     if made.is_a("SXFunction"):
@@ -142,12 +114,7 @@ def split_lookups(function: Any, expand: Callable[[Any], Any]) -> tuple[Any, tup
 class Scalars:
     """The operations of a function of scalar operations.
 
-    Attributes
-    ----------
-    nodes : list of ScalarNode
-        All values.
-    results : list of list of int
-        By result of the function: the nodes of its entries.
+    ``results``: by result of the function: the nodes of its entries.
     """
 
     nodes: list[ScalarNode] = field(default_factory=list)
@@ -203,10 +170,7 @@ class Scalars:
     def folded(self, known: Callable[[int, int], float | None]) -> Scalars:
         """Return the same values with what is constant computed, to the same bits.
 
-        Parameters
-        ----------
-        known : callable
-            Returns the value of an input that is constant, by argument and entry; else None.
+        ``known``: returns the value of an input that is constant, by argument and entry; else None.
         """
         found = Scalars()
         new: dict[int, int] = {}
@@ -383,25 +347,11 @@ class Tables:
 class Expressions:
     """C text of values: written inside others, or assigned to variables.
 
-    Parameters
-    ----------
-    scalars : Scalars
-        The operations.
-    uses : Counter
-        How often each value is used.
-    read : callable
-        Returns the C text of an input, by argument, entry, and whether it is wanted in double precision.
-    tables : Tables
-        The tables of its lookups.
-    call : callable
-        Returns the C name of a function of math.h, by its name and whether it is that of double precision.
-    real : str
-        The C type of numbers.
-    single : bool
-        Whether numbers are of single precision. Values that follow from the time and parameters alone are of double
-        precision nevertheless: a float of the time is as coarse as a tick after some hours.
-    timed : bool
-        Whether argument 0 is the time, 1 states, 2 inputs and 3 parameters.
+    ``read``: returns the C text of an input, by argument, entry, and whether it is wanted in double precision.
+    ``call``: returns the C name of a function of math.h, by its name and whether it is that of double precision.
+    ``single``: whether numbers are of single precision. Values that follow from the time and parameters alone are of
+    double precision nevertheless: a float of the time is as coarse as a tick after some hours.
+    ``timed``: whether argument 0 is the time, 1 states, 2 inputs and 3 parameters.
     """
 
     def __init__(

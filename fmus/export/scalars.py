@@ -27,15 +27,7 @@ def _scalars(variables: Iterable[Variable]) -> tuple[Variable, ...]:
 def scalarize(spec: ModelSpec) -> ModelSpec:
     """Return the model with every array replaced by its elements; the flat vectors, and so the equations, are the same.
 
-    Parameters
-    ----------
-    spec : ModelSpec
-        The model.
-
-    Returns
-    -------
-    ModelSpec
-        The model, with all variables of shape ``()``.
+    Returns: the model, with all variables of shape ``()``.
     """
     return replace(
         spec,

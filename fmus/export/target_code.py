@@ -61,21 +61,7 @@ _ABOUT = {
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """A member of the struct.
-
-    Attributes
-    ----------
-    group : str
-        The struct in it.
-    name : str
-        C identifier.
-    variable : Variable
-        The variable.
-    places : tuple of int
-        Entries of its vector.
-    start : ndarray
-        Start values, flat.
-    """
+    """A member of the struct."""
 
     group: str
     name: str
@@ -130,24 +116,8 @@ class TickFacts:
 class TargetText:
     """C for a target, as text.
 
-    Attributes
-    ----------
-    name : str
-        Its name: that of the files, and the begin of all names in them.
-    number : {"double", "float"}
-        Type of all numbers.
-    members : tuple of Member
-        Parameters, inputs, outputs, signals and states.
-    files : mapping of str to str
-        Text of each file, by its name.
-    ticks : tuple of TickFacts
-        What each kind of tick touches.
-    bytes_of : mapping of str to int
-        Bytes of each group of the struct, of the struct, and of constant tables.
-    platform_functions : tuple of str
-        Functions of math.h that it calls.
-    statuses : tuple of str
-        By status: what it says.
+    ``name``: its name: that of the files, and the begin of all names in them.
+    ``bytes_of``: bytes of each group of the struct, of the struct, and of constant tables.
     """
 
     name: str
@@ -163,15 +133,8 @@ class TargetText:
 def write_target(spec: TargetSpec, *, number: Number = "double", own_functions: bool = False) -> TargetText:
     """Return a sampled diagram as C.
 
-    Parameters
-    ----------
-    spec : TargetSpec
-        The diagram.
-    number : {"double", "float"}
-        Type of all numbers.
-    own_functions : bool, default False
-        Take sine, cosine, tangent hyperbolic, exponential, exp(x) - 1, logarithm and power from this package, with the
-        same bits on every platform, and not from math.h. In ``float`` they compute in single precision.
+    ``own_functions``: take sine, cosine, tangent hyperbolic, exponential, exp(x) - 1, logarithm and power from this
+    package, with the same bits on every platform, and not from math.h. In ``float`` they compute in single precision.
     """
     return _SourceWriter(spec, number, own_functions).write()
 

@@ -147,10 +147,7 @@ class TargetCode:
 def write_c(spec: TargetSpec, folder: Path, *, number: Number = "double", own_functions: bool = False) -> TargetCode:
     """Write C for a target to a folder; see `write_target`.
 
-    Raises
-    ------
-    DiskError
-        If it can't be written.
+    Raises `DiskError` if it can't be written.
     """
     code = TargetCode(spec, write_target(spec, number=number, own_functions=own_functions), folder, own_functions)
     code._write()

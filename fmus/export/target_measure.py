@@ -102,23 +102,9 @@ class ProcessorMeasurement:
 def measure(text: TargetText, processor: str, inputs: Mapping[str, Any], ticks: int) -> ProcessorMeasurement:
     """Compile C for a processor without a warning, and count the instructions of ticks in an emulator.
 
-    Parameters
-    ----------
-    text : TargetText
-        The C.
-    processor : str
-        One of `PROCESSORS`.
-    inputs : mapping of str to array_like
-        Values of inputs at each tick, shape (ticks, …), or one value for all.
-    ticks : int
-        Number of ticks.
-
-    Raises
-    ------
-    CompilerError
-        If there is no compiler that builds for it, or a warning.
-    OptionError
-        For another processor, or values of inputs that don't fit.
+    ``inputs``: values of inputs at each tick, shape (ticks, …), or one value for all.
+    Raises `CompilerError` if there is no compiler that builds for it, or a warning.
+    Raises `OptionError`: for another processor, or values of inputs that don't fit.
     """
     if processor not in PROCESSORS:
         raise OptionError(f"there is no processor {processor!r}. {near(processor, PROCESSORS)}", port="processor")
@@ -418,10 +404,7 @@ _SEEN = """#if defined(_WIN32)
 def run_here(text: TargetText, inputs: Mapping[str, Any], ticks: int) -> dict[str, np.ndarray]:
     """Compile C for this machine, and return the outputs and signals after each tick.
 
-    Raises
-    ------
-    CompilerError
-        If there is no compiler, or a tick of the test signal fails.
+    Raises `CompilerError` if there is no compiler, or a tick of the test signal fails.
     """
     rows = input_rows(text, inputs, ticks)
     ins = [m for m in text.members if m.group == "inputs"]

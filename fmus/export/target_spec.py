@@ -24,12 +24,7 @@ CLOCK_LIMIT = 32
 class BlockOutput:
     """An output of a block.
 
-    Attributes
-    ----------
-    block, port, kind : str
-        The block's path, the port, and the block's class.
-    first, count : int
-        Its entries in the log.
+    ``block``, ``port``, ``kind``: the block's path, the port, and the block's class.
     """
 
     block: str
@@ -43,18 +38,10 @@ class BlockOutput:
 class TargetTick:
     """A kind of tick: the clocks of a set act.
 
-    Attributes
-    ----------
-    acting : int
-        The set, as bits in the order of ``loop.clocks``.
-    function : casadi.Function
-        Scalar operations ``(t, x, w, p, …) -> (x_next, log, guards, …)``; behind them what `lookups` find, and seek.
-    lookups : tuple of Lookup
-        Its lookups in tables.
-    outputs : tuple of BlockOutput
-        Outputs of the blocks that act, in the order of evaluation.
-    guards : tuple of (str, str)
-        Block and name of each guard.
+    ``acting``: the set, as bits in the order of ``loop.clocks``.
+    ``function``: scalar operations ``(t, x, w, p, …) -> (x_next, log, guards, …)``; behind them what `lookups` find,
+    and seek.
+    ``outputs``: outputs of the blocks that act, in the order of evaluation.
     """
 
     acting: int
@@ -68,12 +55,8 @@ class TargetTick:
 class Kept:
     """Entries of x that are kept from one tick to the next.
 
-    Attributes
-    ----------
-    variable : Variable
-        Name, shape, unit, description and start values.
-    first : int
-        The first entry.
+    ``variable``: name, shape, unit, description and start values.
+    ``first``: the first entry.
     """
 
     variable: Variable
@@ -84,14 +67,8 @@ class Kept:
 class TargetNumbers:
     """Numbers that are computed from the parameters of a block, behind these.
 
-    Attributes
-    ----------
-    block : str
-        The block's path.
-    first, parameters, count : int
-        Entry of p with which the block's parameters begin, their number, and that of the computed numbers.
-    function : casadi.Function
-        Scalar operations from one to the other.
+    ``first``, ``parameters``, ``count``: entry of p with which the block's parameters begin, their number, and that of
+    the computed numbers.
     """
 
     block: str
@@ -105,22 +82,9 @@ class TargetNumbers:
 class TargetSpec:
     """A sampled diagram as C for a target.
 
-    Attributes
-    ----------
-    loop : LoopSpec
-        Its variables and clocks.
-    ticks : tuple of TargetTick
-        Its kinds of ticks: each set of clocks that act together is in one of them.
-    kept : tuple of Kept
-        All of x.
-    start : mapping of str to ndarray
-        Start values of x, w, p and log.
-    acting : tuple of tuple of str
-        By clock: the subsystems that act with it.
-    numbers : tuple of TargetNumbers
-        Numbers that are computed from parameters.
-    fixed : tuple of (int, int)
-        Entries of p, from one on and up to another, from which numbers are computed here alone: they are constants.
+    ``ticks``: its kinds of ticks: each set of clocks that act together is in one of them.
+    ``fixed``: entries of p, from one on and up to another, from which numbers are computed here alone: they are
+    constants.
     """
 
     loop: LoopSpec

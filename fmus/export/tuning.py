@@ -21,10 +21,7 @@ _FLAGS = ("-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math")
 def processor_flags() -> tuple[str, ...]:
     """Return the flags of a compiler for the processor of this machine, with products and sums fused.
 
-    Raises
-    ------
-    CompilerError
-        If there is no compiler.
+    Raises `CompilerError` if there is no compiler.
     """
     zig_or_other = find_compiler().zig or not native_platform().startswith("x86")
     return (*_FLAGS, "-mcpu=native" if zig_or_other else "-march=native")

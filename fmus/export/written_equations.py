@@ -82,14 +82,8 @@ _VARIABLE = re.compile(r'\{"((?:[^"\\]|\\.)*)", LW_([A-Z]+), \w+, \w+, (\d+), (\
 class WrittenVariable:
     """A variable of an exported FMU.
 
-    Attributes
-    ----------
-    name : str
-        Its name.
-    kind : str
-        One of time, fixed, tunable, input, state, discrete, derivative, output, indicator.
-    first, size : int
-        Its interval among the values of an instance (``runtime/model.h``).
+    ``kind``: one of time, fixed, tunable, input, state, discrete, derivative, output, indicator.
+    ``first``, ``size``: its interval among the values of an instance (``runtime/model.h``).
     """
 
     name: str
@@ -102,16 +96,9 @@ class WrittenVariable:
 class WrittenEquations:
     """The equations of an exported FMU.
 
-    Attributes
-    ----------
-    derivative, output : casadi.Function
-        ``(t, x, u, p) -> dx`` and ``(t, x, u, p) -> y``, of scalar operations.
-    variables : tuple of WrittenVariable
-        The variables by value reference.
-    states : int
-        Number of continuous states; discrete ones follow them in x.
-    first : mapping of str to int
-        Where p, u, x, y and the setting of the internal step begin among the values, and the integrator.
+    ``derivative``, ``output``: ``(t, x, u, p) -> dx`` and ``(t, x, u, p) -> y``, of scalar operations.
+    ``states``: number of continuous states; discrete ones follow them in x.
+    ``first``: where p, u, x, y and the setting of the internal step begin among the values, and the integrator.
     """
 
     derivative: Any
@@ -124,15 +111,8 @@ class WrittenEquations:
 def read_equations(path: Path) -> WrittenEquations:
     """Read the equations of an FMU that Loopwright has exported from its sources.
 
-    Parameters
-    ----------
-    path : Path
-        The FMU.
-
-    Raises
-    ------
-    FmuError
-        If it has no such sources, or those of another version, has events, or its equations are no scalar operations.
+    Raises `FmuError` if it has no such sources, or those of another version, has events, or its equations are no scalar
+    operations.
     """
     try:
         with zipfile.ZipFile(os.fspath(path)) as archive:

@@ -95,14 +95,8 @@ def _structure(spec: ModelSpec, entries: tuple[Entry, ...]) -> list[str]:
 def model_description2(spec: ModelSpec, token: str, *, derivatives: bool) -> str:
     """Return the text of ``modelDescription.xml`` (FMI 2.0, 2.2).
 
-    Parameters
-    ----------
-    spec : ModelSpec
-        The model, without arrays (`scalarize`).
-    token : str
-        The GUID.
-    derivatives : bool
-        Whether the binary has directional derivatives.
+    ``spec``: the model, without arrays (`scalarize`).
+    ``derivatives``: whether the binary has directional derivatives.
     """
     entries = layout(spec)
     root = {

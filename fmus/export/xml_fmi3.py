@@ -40,15 +40,7 @@ def package_version() -> str:
 
 @dataclass(frozen=True)
 class Dependency:
-    """Dependency of an unknown on a known (FMI 3.0, 2.4.8).
-
-    Parameters
-    ----------
-    known : int
-        Value reference of the known.
-    kind : str
-        FMI's dependenciesKind: constant, fixed, tunable or dependent.
-    """
+    """Dependency of an unknown on a known (FMI 3.0, 2.4.8)."""
 
     known: int
     kind: str
@@ -110,15 +102,7 @@ def _kind(of: Iterable[set[int] | None], at: list[Entry]) -> str:
 def dependencies(spec: ModelSpec) -> dict[int, tuple[Dependency, ...]]:
     """Return the dependencies of outputs, derivatives and event indicators on time, parameters, inputs and states.
 
-    Parameters
-    ----------
-    spec : ModelSpec
-        The model.
-
-    Returns
-    -------
-    dict
-        Dependencies by the value reference of the unknown, in the order of value references.
+    Returns: dependencies by the value reference of the unknown, in the order of value references.
     """
     entries = layout(spec)
     at = _entry_at(entries)
@@ -247,14 +231,7 @@ def _units_and_types(units: Iterable[str], types: Iterable[str]) -> list[str]:
 def model_description(spec: ModelSpec, token: str, *, derivatives: bool) -> str:
     """Return the text of ``modelDescription.xml`` (FMI 3.0, 2.4).
 
-    Parameters
-    ----------
-    spec : ModelSpec
-        The model.
-    token : str
-        The instantiation token.
-    derivatives : bool
-        Whether the binary has directional and adjoint derivatives.
+    ``derivatives``: whether the binary has directional and adjoint derivatives.
     """
     entries = layout(spec)
     root = {

@@ -20,23 +20,7 @@ TEXTS = Texts(__package__, "figures")
 
 
 class DrawnLoops(NamedTuple):
-    """Loops at a wire, as their figures draw them: by their keys.
-
-    Attributes
-    ----------
-    wire : str
-        The wire.
-    loops : mapping of str to LinearSystem
-        L of each.
-    found : mapping of str to Margins
-        Their margins, which are marked.
-    titles : mapping of str to str
-        Their names in legends.
-    looks : mapping of str to dict
-        Colors and lines.
-    axes : AxisUnits
-        Units of the axes.
-    """
+    """Loops at a wire, as their figures draw them: by their keys."""
 
     wire: str
     loops: Mapping[str, Any]

@@ -78,12 +78,8 @@ class TableView:
 class Numbered:
     """Tables of a page in the making, numbered from 1.
 
-    Parameters
-    ----------
-    numbers : mapping
-        The report's numbers by path, which those in tables lead to.
-    linked : bool
-        Whether the page has the appendix that they lead to.
+    ``numbers``: the report's numbers by path, which those in tables lead to.
+    ``linked``: whether the page has the appendix that they lead to.
     """
 
     def __init__(self, numbers: Mapping[str, Number], *, linked: bool = True):

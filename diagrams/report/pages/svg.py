@@ -26,14 +26,7 @@ WIDE = 900.0
 class EmbeddedFigure:
     """A figure as a page holds it: SVG for the screen, and another one for paper where it is turned there.
 
-    Attributes
-    ----------
-    screen : Markup
-        The SVG.
-    paper : Markup, optional
-        SVG of a wide figure for paper, with ids of its own.
-    width, height : float
-        Size of a wide figure in pixels.
+    ``paper``: SVG of a wide figure for paper, with ids of its own.
     """
 
     screen: Markup

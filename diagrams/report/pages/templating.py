@@ -49,17 +49,8 @@ def write_digits(value: float, most: int) -> str:
 class Texts:
     """The texts of a section: macros of a template, filled with facts.
 
-    Parameters
-    ----------
-    package : str
-        Import name of the package that has the template.
-    name : str
-        The template's name, without its ending.
-
-    Examples
-    --------
-    >>> Texts("loopwright.diagrams.report.figures", "figures").line("sensitivities", wire="u")
-    'Sensitivity S and complementary sensitivity T at u. ○: M_s and M_t.'
+    ``package``: import name of the package that has the template.
+    ``name``: the template's name, without its ending.
     """
 
     package: str

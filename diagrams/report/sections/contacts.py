@@ -186,16 +186,8 @@ def check_contacts(diagram: WiredDiagram, contacts: Mapping[str, Any]) -> Mappin
 class ReportedContacts:
     """Contacts of a report, with the limits that are required of them.
 
-    Attributes
-    ----------
-    contacts : mapping of str to Contact
-        Contacts by their names.
-    limits : mapping of str to tuple of ContactLimits
-        Required limits by the contacts' names; those of all contacts have the name "".
-    weakest : list of mapping
-        Facts of each contact on the first page, once its section is made.
-    refuted : set of str
-        Paths of limits that a nonlinear run contradicts.
+    ``limits``: required limits by the contacts' names; those of all contacts have the name "".
+    ``weakest``: facts of each contact on the first page, once its section is made.
     """
 
     contacts: Mapping[str, Contact]

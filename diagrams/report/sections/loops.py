@@ -353,14 +353,8 @@ def _zero(v: Variant, wire: str) -> str:
 class LoopPart:
     """The section of a loop.
 
-    Attributes
-    ----------
-    section : Section
-        The section.
-    numbers : mapping of (Variant, Cut) to mapping of str to Number
-        Those of its numbers that come from each variant's loop, by path behind the key of `cut_key`.
-    drawn : DrawnLoops, optional
-        What its figures draw; None for several channels.
+    ``numbers``: those of its numbers that come from each variant's loop, by path behind the key of `cut_key`.
+    ``drawn``: what its figures draw; None for several channels.
     """
 
     section: Section

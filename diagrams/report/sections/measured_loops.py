@@ -41,18 +41,8 @@ SOURCE = "the data's uncertainty, and the distance of their points"
 class MeasuredLoop:
     """A loop that was measured.
 
-    Attributes
-    ----------
-    wire : str
-        Its wire, as it was given.
-    key : str
-        Its part of dotted paths: that of the loop in the report, where the wire is one of them.
-    data : control.FrequencyResponseData
-        L over frequency.
-    uncertainty : ndarray, optional
-        Relative uncertainty of each point; None where the data don't say it.
-    margins : MeasuredMargins
-        Its margins with intervals.
+    ``key``: its part of dotted paths: that of the loop in the report, where the wire is one of them.
+    ``uncertainty``: relative uncertainty of each point; None where the data don't say it.
     """
 
     wire: str

@@ -221,18 +221,9 @@ def steps(case: Case) -> Section | None:
 class Quantized:
     """What the converters and encoders of a diagram have to do with a step.
 
-    Attributes
-    ----------
-    least : float
-        Height of the step that moves the answer by `LEAST` quanta; 0 without converters.
-    quantum : Quantum, optional
-        The quantum of the answer.
-    usual : float, optional
-        Height that the step would have without converters; None where its height was given.
-    oscillations : mapping of str to Number
-        By converter, what is left of its input's motion at the end of the record, in quanta.
-    size : StepSize
-        Where the height comes from.
+    ``least``: height of the step that moves the answer by `LEAST` quanta; 0 without converters.
+    ``usual``: height that the step would have without converters; None where its height was given.
+    ``oscillations``: by converter, what is left of its input's motion at the end of the record, in quanta.
     """
 
     least: float = 0.0

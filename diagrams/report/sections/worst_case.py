@@ -121,12 +121,7 @@ def _name_wires(
 class MissingWorstCase:
     """Worst case that a file asks for, and that could not be looked for.
 
-    Attributes
-    ----------
-    limits : mapping
-        Limits that it was to be looked for with, by loops and numbers.
-    problem : str
-        The reason, with the file and the entry.
+    ``limits``: limits that it was to be looked for with, by loops and numbers.
     """
 
     limits: Mapping[tuple[str, ...], Mapping[str, Limit | None]]
@@ -155,14 +150,7 @@ class MissingWorstCase:
 class ReportedWorstCase:
     """Worst case of a report.
 
-    Attributes
-    ----------
-    found : WorstCase
-        The worst case.
-    run : RunConfirmation, optional
-        Its run; None where it has none.
-    problem : str
-        Why it has none.
+    ``run``: its run; None where it has none.
     """
 
     found: WorstCase
