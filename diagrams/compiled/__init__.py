@@ -1,6 +1,7 @@
 """The compiled loop: C code of a diagram's ticks and of what happens between them, and the loops that run it."""
 
 from .background import BackgroundCode
+from .bound_functions import bind_call
 from .compiled_libraries import load_compiled
 from .compiled_loop import CompiledLoop, Outcome, ReturnReason
 from .event_domains import Domains
@@ -29,7 +30,6 @@ from .hybrid_code import (
 )
 from .kernels import Kernel
 from .library_method import StepFailure
-from .native_tick import bind_call
 from .newton import NewtonOptions
 from .plants_called_back import REFUSED, TAKEN_BY_PYTHON, UNDER_WAY, PythonStep, compile_other_side
 from .runtime import load_runtime

@@ -41,17 +41,34 @@ class BoundFunction:
     """The last error of Python within a call that has failed."""
 
 
-@dataclass(frozen=True, eq=False)
-class CompiledFunction:
-    """A CasADi function, and the C function of the same name in a library.
+BlockBinder = Callable[..., Any]
+"""``bind_block(stage, t, c, again=…)`` returns a block between traced stages as C knows it: see `staged`."""
 
-    Attributes
-    ----------
-    function : casadi.Function
-        The function that was compiled.
-    address : int
-        Address of the C function.
+
+@dataclass(frozen=True, eq=False)
+class FunctionInC(ABC):
+    """A function of a diagram that the loop in C calls.
+
+    This is the one way to what is behind the loop's pointers, whatever evaluates the function: generated code, the
+    virtual machine, Python, tables over either of them, or a sequence of such stages with FMUs between them.
     """
+
+    @abstractmethod
+    def bind(
+        self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], bind_block: BlockBinder | None = None
+    ) -> BoundFunction:
+        """Return it bound to vectors, for one call at a time; what is returned must live as long as C calls it.
+
+        ``bind_block`` binds the blocks that an evaluator evaluates, where there are some.
+        """
+
+    def hand_over(self, to: Any) -> None:  # noqa: B027 (most have nothing to hand over)
+        """Let generated code of the same function take its place wherever it is bound; C must not run meanwhile."""
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledFunction(FunctionInC):
+    """A CasADi function, and the C function of the same name in a library."""
 
     function: Any
     address: int
@@ -67,7 +84,9 @@ class CompiledFunction:
         rows, columns = self.function.sparsity_out(0).get_triplet()
         return np.array(rows, dtype=np.int64), np.array(columns, dtype=np.int64)
 
-    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> BoundFunction:
+    def bind(
+        self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], bind_block: BlockBinder | None = None
+    ) -> BoundFunction:
         """Return it bound to vectors, for one call at a time."""
         f = self.function
         return self._bind(arguments, results, np.zeros(f.sz_iw() + 1, dtype=np.int64), np.zeros(f.sz_w() + 1))
@@ -89,14 +108,16 @@ class MachineFunction(CompiledFunction):
     program: MachineProgram
     _bound: list[tuple[Any, BoundFunction]] = field(default_factory=list)
 
-    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> BoundFunction:
+    def bind(
+        self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], bind_block: BlockBinder | None = None
+    ) -> BoundFunction:
         """Return it bound to vectors, for one call at a time."""
         program, values = self.program.bind()
         self._bound.append((program, self._bind(arguments, results, program, values)))
         return self._bound[-1][1]
 
-    def hand_over(self, to: CompiledFunction) -> None:
-        """Let generated code of the same function take its place wherever it is bound; C must not run meanwhile."""
+    def hand_over(self, to: Any) -> None:
+        """Let generated code of the same function take over."""
         for program, bound in self._bound:
             made = to.bind(bound.arguments, bound.results)
             program.iw, program.w = made.structure.iw, made.structure.w
@@ -112,7 +133,9 @@ _Call = ctypes.CFUNCTYPE(ctypes.c_int, _Vectors, _Vectors, ctypes.c_void_p, ctyp
 class CalledFunction(CompiledFunction):
     """A CasADi function that C has Python evaluate: one of matrices, such as a table."""
 
-    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> BoundFunction:
+    def bind(
+        self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], bind_block: BlockBinder | None = None
+    ) -> BoundFunction:
         """Return it bound to vectors, for one call at a time."""
         f = self.function
         taken, made = (
@@ -215,6 +238,21 @@ def address_of(library: ctypes.CDLL, name: str) -> int:
     address = ctypes.cast(library[name], ctypes.c_void_p).value
     assert address is not None
     return address
+
+
+def bind_call(tick: FunctionInC, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Callable[[], None]:
+    """Return a tick bound to the vectors (t, x, w, p) and (x_next, z, log, ok) of a run as a call from Python."""
+    bound = tick.bind(arguments, results)
+    of = bound.structure
+    function = TICK(of.evaluate)
+
+    def call() -> None:
+        if function(of.arguments, of.results, of.iw, of.w, 0):
+            raise bound.failures.pop()
+        if INTERRUPTS.came:
+            INTERRUPTS.check()
+
+    return call
 
 
 def list_vectors(vectors: Sequence[np.ndarray], length: int) -> Any:

@@ -17,14 +17,14 @@ from ...blocks.interrupts import INTERRUPTS
 from ...fmus.calls import NEAR, FmuInstance, NativeStep, RemoteStep
 from ...fmus.host_state import HostState
 from ..flat import TRUE, StepTable, TickPattern
-from .bound_functions import CALL, TICK, TickStructure, at
+from .bound_functions import CALL, TICK, FunctionInC, TickStructure, at
 from .grouped_functions import GroupedTick
 from .newton import NewtonOptions, NewtonStructure
 from .plants_called_back import PythonStep, RemotePlants
+from .rate_differences import Differences
 from .runtime import load_runtime
 from .staged import NativeModelExchange
-from .staged_functions import Staged, StagedEquations
-from .tick_code import CompiledTick, TickCode
+from .tick_code import TickCode
 
 _SEEN = 1e-6  # least singular value, relative to 1 + the loop's gain, that differences surely tell from 0
 
@@ -163,13 +163,13 @@ class CompiledLoop:
         self._remote, self._far = RemotePlants(), list[int | None]()
         self._remotes = [self._remote, *([] if exchange is None else [exchange.remote])]
         self._kept: list[Any] = [code, arguments, results, plants, columns, exchange]
-        self._exchange = exchange
+        self._bind_block = None if exchange is None else exchange.bind_block
         self.calls_python = any(isinstance(t, GroupedTick) and t.calls_python for t in code.ticks.values())
         self._watched: list[tuple[HostState, ctypes.c_bool]] = [] if exchange is None else [*exchange.watched]
         t, x, _, _ = arguments
         x_next, _, log, ok = results
         self.kinds = {clocks: i for i, clocks in enumerate(code.ticks)}
-        ticks = [self._tick(tick, arguments, results) for tick in code.ticks.values()]
+        ticks = [self._bind(tick, arguments, results) for tick in code.ticks.values()]
         # The tick after those with code stands for all other sets of clocks; C calls Python for it.
         if rest is not None:
             ticks.append(TickStructure(self.called.function(TICK, lambda *_: rest(), 1)))
@@ -227,18 +227,10 @@ class CompiledLoop:
         self._kept.append(array)
         return ctypes.addressof(array)
 
-    def _tick(
-        self,
-        tick: CompiledTick | StagedEquations,
-        arguments: Sequence[np.ndarray],
-        results: Sequence[np.ndarray],
-    ) -> ctypes.Structure:
-        if isinstance(tick, Staged | StagedEquations):
-            assert self._exchange is not None
-            if isinstance(tick, Staged):
-                return self._exchange.bind(tick, arguments, results)
-            return self._exchange.bind_equations(tick, arguments, results)
-        bound = tick.bind(arguments, results)
+    def _bind(
+        self, function: FunctionInC, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
+    ) -> TickStructure:
+        bound = function.bind(arguments, results, self._bind_block)
         self._kept.append(bound)
         return bound.structure
 
@@ -256,7 +248,7 @@ class CompiledLoop:
         r, J, before = np.zeros(n), np.zeros(n * n), np.zeros(n)
         found = NewtonStructure(
             n=n,
-            equations=self._tick(code.loops[clocks], arguments, [r, J]),
+            equations=self._bind(code.loops[clocks], arguments, [r, J]),
             where=self._array(where),
             r=self._array(r),
             J=self._array(J),
@@ -266,7 +258,7 @@ class CompiledLoop:
             rows=self._array(np.zeros(n, dtype=np.int64)),
             tolerance=options.tolerance,
             rounding=options.rounding,
-            singular=max(options.singular, _SEEN if isinstance(code.loops[clocks], StagedEquations) else 0.0),
+            singular=max(options.singular, _SEEN if isinstance(code.loops[clocks], Differences) else 0.0),
             iterations=options.iterations,
             halvings=options.halvings,
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..flat import bind_function
-from .bound_functions import BoundFunction, TickStructure, at, call_for_c, list_vectors
+from .bound_functions import BlockBinder, BoundFunction, FunctionInC, TickStructure, at, call_for_c, list_vectors
 from .grouping import BlockCalls, PartTables, PythonCall, TickTables
 from .kernels import Kernels
 from .machine import BlockProgramStructure
@@ -50,18 +50,8 @@ class _PartInC(ctypes.Structure):
 
 
 @dataclass(frozen=True, eq=False)
-class GroupedFunction(ABC):
-    """A function of a large diagram as runs of equal blocks.
-
-    Attributes
-    ----------
-    tables : TickTables or PartTables
-        Where the values of each block are.
-    kernels : Kernels
-        The blocks' functions.
-    address : int
-        Address of the C function that goes over the tables.
-    """
+class GroupedFunction(FunctionInC):
+    """A function of a large diagram as runs of equal blocks; the C function at ``address`` goes over its tables."""
 
     tables: TickTables | PartTables
     kernels: Kernels
@@ -73,7 +63,9 @@ class GroupedFunction(ABC):
         """Whether Python evaluates some of the blocks."""
         return len(self.tables.calls.python) > 0
 
-    def bind(self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> BoundFunction:
+    def bind(
+        self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], bind_block: BlockBinder | None = None
+    ) -> BoundFunction:
         """Return it bound to vectors, for one call at a time."""
         v, kept, failures = self.tables.memory.copy(), list[Any](), list[Exception]()
         structure = self._structure(arguments)
@@ -84,7 +76,7 @@ class GroupedFunction(ABC):
         self._bound.append((structure, v, bound))
         return bound
 
-    def hand_over(self, to: GroupedFunction) -> None:
+    def hand_over(self, to: Any) -> None:
         """Let other kernels of the same blocks take over wherever it is bound; C must not run meanwhile."""
         for structure, v, bound in self._bound:
             structure.calls = _bind_calls(
@@ -124,21 +116,10 @@ class GroupedTick(GroupedFunction):
 
 @dataclass(frozen=True, eq=False)
 class GroupedPart(GroupedFunction):
-    """A function between ticks: rates, indicators, or states after events.
-
-    Attributes
-    ----------
-    operations : int
-        Operations of one evaluation.
-    """
+    """A function between ticks: rates, indicators, or states after events."""
 
     tables: PartTables
     operations: int
-
-    @property
-    def pattern(self) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column of each entry: none, it is no derivative."""
-        return np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32)
 
     def _structure(self, arguments: Sequence[np.ndarray]) -> Any:
         return _PartInC(

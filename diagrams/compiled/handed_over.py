@@ -11,7 +11,6 @@ from ...blocks.core import EvaluationVectors, FmuRuntimeError, SimulationError
 from ...fmus.calls import ModelExchangeInstance
 from ..flat import JUMP, FlatDiagram, OpaqueStage
 from ..model_exchange import OWN_EVENTS, ModelExchangeEvaluator
-from .runtime import load_runtime
 from .staged import NativeModelExchange, OwnEvent
 
 _DONE, _NOT_COMPUTED = range(2)
@@ -46,7 +45,7 @@ class HandedOver:
         self._evaluators, self._report, self._count = evaluators, report, count
         self._blocks: dict[str, ModelExchangeInstance] = {path: blocks[path] for path in flat.in_model_exchange}
         first = {path: flat.states.slices[path].start for path in flat.in_model_exchange}
-        self.native = NativeModelExchange(self._blocks, first, flat.width, load_runtime(), self._by_python)
+        self.native = NativeModelExchange(self._blocks, first, flat.width, self._by_python)
         """The blocks as C knows them."""
         self._with_c = False
 

@@ -12,18 +12,19 @@ import numpy as np
 
 from ..flat import NONE, FlatDiagram, StepTable, TickPattern
 from ..solvers import METHODS, MethodKind
-from .bound_functions import CALL, at
+from .bound_functions import CALL, CompiledFunction, FunctionInC, TickStructure, at
 from .compiled_loop import CompiledLoop, OutcomeStructure
 from .event_domains import Domains
-from .hybrid_code import Between, HybridCode
+from .grouped_functions import GroupedPart
+from .hybrid_code import HybridCode
 from .hybrid_structures import HybridStructure, MethodStructure, ProblemStructure, SpanStructure
 from .library_method import LibraryMethod, StepFailure
 from .newton import NewtonOptions, NewtonStructure
 from .radau import radau_numbers
-from .rate_differences import RateDifferences
+from .rate_differences import Differences
 from .runtime import load_runtime
 from .staged import NativeModelExchange
-from .staged_functions import Staged, StagedSlopes
+from .staged_functions import Staged
 from .transport_delays import Delays, NativeDelays
 from .watch import Fired, Pile, Watch
 
@@ -228,12 +229,16 @@ class CompiledHybrid:
         trial = [np.zeros(1), x.copy(), w if delays is None else w.copy(), p]
         where = flat.continuous
         slope = code.between.get("slope")
+        assert slope is None or isinstance(slope, CompiledFunction | Differences)
+        flow = code.between["flow"]
+        assert isinstance(flow, CompiledFunction | GroupedPart | Staged)
         slopes = np.zeros(0 if slope is None else n * n if loops else len(slope.pattern[0]))
         self._hybrid = hybrid = HybridStructure(l=loop.structure, automatic=len(methods) > 1, accepts=accepts)
         self._exchange, hybrid.looked = exchange, np.nan
+        self._bind_block = None if exchange is None else exchange.bind_block
         self._solver: NewtonStructure | None = None
         self._tolerances = list[np.ndarray]()
-        hybrid.budget = self._largest_budget = _budget(code.between["flow"].operations, methods, n)
+        hybrid.budget = self._largest_budget = _budget(flow.operations, methods, n)
         if exchange is not None:
             hybrid.budget = min(hybrid.budget, _UNKNOWN)
         hybrid.between = self.kinds[NONE]
@@ -241,7 +246,7 @@ class CompiledHybrid:
             n=n,
             width=width,
             where=self._own(where.astype(np.int64)),
-            flow=self._bind(code.between["flow"], trial, [np.zeros(n)]),
+            flow=self._bind(flow, trial, [np.zeros(n)]),
             t=self._own(trial[0]),
             x=self._own(trial[1]),
             slopes=self._own(slopes),
@@ -250,8 +255,9 @@ class CompiledHybrid:
         self._delays: NativeDelays | None = None
         if delays is not None:
             driven = np.zeros(flat.plant_inputs.total)
-            bound = self._bind(code.between["driven"], trial, [driven])
-            self._delays = NativeDelays(delays, bound, driven, w, trial[2], tolerances)
+            self._delays = NativeDelays(
+                delays, self._bind(code.between["driven"], trial, [driven]), driven, w, trial[2], tolerances
+            )
             hybrid.p.delays = self._delays.address
         # Algebraic loops are solved at each trial: the slope needs its parts by the loops' values, too.
         results = [slopes]
@@ -260,14 +266,19 @@ class CompiledHybrid:
             self._solver = loop.bind_loops(code.ticks, NONE, trial, loops)
             hybrid.p.loops, hybrid.p.here = ctypes.addressof(self._solver), at(x)
             hybrid.solved = self._own(np.zeros(m))
-            if not isinstance(slope, StagedSlopes):
+            if not isinstance(slope, Differences):
                 through = np.zeros(2 * n * m)
                 hybrid.p.by_loops = self._own(through)
                 results += [through[: n * m], through[n * m :], np.zeros(m * m)]
         if slope is not None:
             typical = np.maximum(np.abs(methods[-1].atol) / methods[-1].rtol, 1e-300)
-            hybrid.p.slope = self._bind(slope, trial, results, typical)
-            if loops is None or isinstance(slope, StagedSlopes):
+            if isinstance(slope, Differences):
+                bound = slope.bind(trial, results, self._bind_block, typical=typical, loops=self._solver)
+            else:
+                bound = slope.bind(trial, results)
+            hybrid.p.slope = bound.structure
+            self._kept.append(bound)
+            if loops is None or isinstance(slope, Differences):
                 rows, columns = slope.pattern
                 hybrid.p.entries = len(rows)
                 hybrid.p.row, hybrid.p.column = (self._own(np.array([*v, 0], dtype=np.int64)) for v in (rows, columns))
@@ -294,16 +305,14 @@ class CompiledHybrid:
         self.watch: Watch | None = None
         """The events; None without any."""
         if domains is not None:
-            more = {} if logged is None else {"logged": logged}
+            size = {} if logged is None else {"logged": logged}
             self.watch = Watch(
-                flat, code.between, trial, arguments, x_next, domains=domains, step=step, exchange=exchange, **more
+                flat, code.between, trial, arguments, x_next, domains=domains, step=step, exchange=exchange, **size
             )
             hybrid.w = self.watch.structure
         if exchange is not None:
-            jump = code.between["jump"]
-            assert isinstance(jump, Staged)
             fired = np.zeros(0) if self.watch is None else self.watch.fired
-            exchange.bind_jump(jump, [*arguments, fired], [x_next])
+            exchange.structure.jump = self._bind(code.between["jump"], [*arguments, fired], [x_next])
             hybrid.o = ctypes.addressof(exchange.structure)
         taken = [*(flat.taken_at(clocks) for clocks in self.kinds), np.arange(width)]
         self.taken_states = self._zeros(width)
@@ -355,23 +364,9 @@ class CompiledHybrid:
         return at(values)
 
     def _bind(
-        self,
-        function: Between,
-        arguments: Sequence[np.ndarray],
-        results: Sequence[np.ndarray],
-        typical: np.ndarray | None = None,
-    ) -> Any:
-        if self._exchange is not None and isinstance(function, Staged):
-            return self._exchange.bind(function, arguments, results)
-        if self._exchange is not None and isinstance(function, StagedSlopes):
-            assert typical is not None
-            return self._exchange.bind_slopes(function, arguments, results, typical, self._solver)
-        assert not isinstance(function, Staged | StagedSlopes)
-        if isinstance(function, RateDifferences):
-            assert typical is not None
-            bound = function.bind(arguments, results, typical)
-        else:
-            bound = function.bind(arguments, results)
+        self, function: FunctionInC, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
+    ) -> TickStructure:
+        bound = function.bind(arguments, results, self._bind_block)
         self._kept.append(bound)
         return bound.structure
 

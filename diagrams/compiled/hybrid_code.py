@@ -10,19 +10,20 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import casadi as ca
+import numpy as np
 
 from ...fmus.export import describe_processor, processor_flags
 from ..flat import NONE, FlatDiagram, OpaqueStage, PartProgram, Schedule, TickPattern, share_terms
-from .bound_functions import CodeOfFunctions, CompiledFunction, GeneratedCode, MachineFunction, address_of
+from .bound_functions import CodeOfFunctions, FunctionInC, GeneratedCode, address_of
 from .function_code import Sources
 from .generated_text import write_functions
-from .grouped_functions import GroupedFunction, GroupedPart
+from .grouped_functions import GroupedPart
 from .grouping import PartTables, make_part_tables
 from .kernels import BlockKinds, Kernels
-from .rate_differences import Columns, RateDifferences, find_columns
+from .rate_differences import Columns, Differences, find_columns
 from .runtime import load_runtime
 from .small_steps import STEPS, write_steps
-from .staged_functions import Staged, StagedEquations, StagedSlopes
+from .staged_functions import Staged
 from .step_outputs import may_fail_at_steps
 from .tick_code import (
     GroupedTicks,
@@ -35,9 +36,6 @@ from .tick_code import (
 
 FUSING = ("-finline-functions", "-freciprocal-math", "-fno-tree-vectorize", "-fno-tree-slp-vectorize")
 """Flags of fused code: a parameter's inverse is computed once; vectors of few values cost more than they save."""
-
-Between = CompiledFunction | GroupedPart | RateDifferences | Staged | StagedSlopes
-"""A function between ticks that was compiled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,31 +55,19 @@ class HybridCode:
     """
 
     ticks: TickCode
-    between: Mapping[str, Between]
+    between: Mapping[str, FunctionInC]
     steps: Mapping[str, int] = field(default_factory=dict)
     judged: bool = False
 
     def hand_over(self, to: HybridCode) -> None:
         """Let generated code take the place of the virtual machine wherever these functions are bound."""
         for clocks, tick in self.ticks.ticks.items():
-            _hand_over(tick, to.ticks.ticks[clocks])
+            tick.hand_over(to.ticks.ticks[clocks])
         for clocks, equations in self.ticks.loops.items():
-            _hand_over(equations, to.ticks.loops[clocks])
+            equations.hand_over(to.ticks.loops[clocks])
         for name, function in self.between.items():
-            _hand_over(function, to.between[name])
-
-
-def _hand_over(function: Any, to: Any) -> None:
-    match function:
-        case MachineFunction() | GroupedFunction():
-            function.hand_over(to)
-        case Staged():
-            for one, other in zip(function.functions, to.functions, strict=True):
-                _hand_over(one, other)
-        case StagedEquations():
-            _hand_over(function.mismatch, to.mismatch)
-        case StagedSlopes() | RateDifferences():
-            pass  # its rates are those between ticks
+            if not isinstance(function, Differences):  # their rates are handed over as "flow"
+                function.hand_over(to.between[name])
 
 
 def find_code_obstacle(flat: FlatDiagram) -> str | None:
@@ -209,7 +195,7 @@ def _write_straight(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], 
     def make(libraries: Sequence[CodeOfFunctions]) -> HybridCode:
         code = libraries[0]
         straight = {clocks: code.find(function) for clocks, function in ticks.items()}
-        between: dict[str, Between] = {name: code.find(function) for name, function in others.items()}
+        between: dict[str, FunctionInC] = {name: code.find(function) for name, function in others.items()}
         generated = isinstance(code, GeneratedCode) and steps()
         made = {method: code.address(step) for method, step in STEPS.items()} if generated else {}
         return HybridCode(TickCode(straight, exact=False, library=code.library), between, made)
@@ -229,6 +215,17 @@ def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *,
     equations = {f"loops_at{i}": (c, flat.loop_equations(c)) for i, c in enumerate(kinds if flat.loops.slices else ())}
     looped = {name: (c, made.schedule) for name, (c, made) in equations.items() if made and made.schedule.opaque}
     schedules |= {name: schedule for name, (_, schedule) in looped.items()}
+
+    def dense(where: Sequence[int] | np.ndarray) -> Columns:
+        return Columns.of(where, [np.arange(len(where))] * len(where))
+
+    @cache
+    def columns() -> Columns:
+        if flat.active_loops(NONE):  # they may lead from each state to each rate
+            return dense(flat.continuous)
+        depends = flat.flow.depends("dx", "x")[:, flat.continuous]
+        return Columns.of(flat.continuous, [np.flatnonzero(column) for column in depends.T])
+
     functions: dict[str, list[Any]] = {}
     for name, schedule in schedules.items():
         traced = [stage.fast for stage in schedule.stages if not isinstance(stage, OpaqueStage)]
@@ -238,10 +235,13 @@ def _write_staged(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *,
         code = libraries[0]
         staged = {name: Staged(schedule, [*map(code.find, functions[name])]) for name, schedule in schedules.items()}
         ticks = {clocks: staged.pop(f"tick{i}") for i, clocks in enumerate(kinds)}
-        loops = {c: StagedEquations(staged.pop(name), flat.active_loops(c)) for name, (c, _) in looped.items()}
-        between: dict[str, Between] = {**staged}
+        loops = {
+            c: Differences(staged.pop(name), dense(flat.active_loops(c)), values=True)
+            for name, (c, _) in looped.items()
+        }
+        between: dict[str, FunctionInC] = {**staged}
         if stiff:
-            between["slope"] = StagedSlopes.of(staged["flow"], flat.continuous, looped=bool(flat.active_loops(NONE)))
+            between["slope"] = Differences(staged["flow"], columns())
         return HybridCode(TickCode(ticks, exact=False, library=code.library, loops=loops), between)
 
     def write() -> str:
@@ -268,15 +268,14 @@ def _write_grouped(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *
         return find_columns(parts["flow"], flat.continuous)
 
     def make(libraries: Sequence[CodeOfFunctions]) -> HybridCode:
-        kernels, runtime = blocks.find(libraries[0]), load_runtime()
+        kernels = blocks.find(libraries[0])
         if kernels not in tables:
             tables[kernels] = {name: make_part_tables(part, kernels.of) for name, part in parts.items()}
-        address = address_of(runtime, "loopwright_grouped_part")
+        address = address_of(load_runtime(), "loopwright_grouped_part")
         found = {name: GroupedPart(of, kernels, address, counts[name]) for name, of in tables[kernels].items()}
-        between: dict[str, Between] = {**found}
+        between: dict[str, FunctionInC] = {**found}
         if stiff:
-            address = address_of(runtime, "loopwright_grouped_differences")
-            between["slope"] = RateDifferences(found["flow"], columns(), address)
+            between["slope"] = Differences(found["flow"], columns())
         exact = blocks.exact or kernels.generated is None
         return HybridCode(TickCode(ticks.find(kernels), exact, libraries[0].library), between)
 

@@ -1,4 +1,4 @@
-"""The derivative of a large diagram's rates, by differences."""
+"""Derivatives by differences: of the rates of large diagrams and of those in stages, and of their algebraic loops."""
 
 from __future__ import annotations
 
@@ -10,17 +10,16 @@ from typing import Any
 import numpy as np
 
 from ..flat import Operation, PartProgram
-from .bound_functions import BoundFunction, TickStructure, at, list_vectors
-from .grouped_functions import GroupedPart
+from .bound_functions import BlockBinder, BoundFunction, FunctionInC, TickStructure, address_of, at, list_vectors
+from .newton import NewtonStructure
+from .runtime import load_runtime
 
 _AT, _INT = ctypes.c_void_p, ctypes.c_int64
 
 
-class DifferencesStructure(ctypes.Structure):
-    """The derivative of the rates by differences, as C knows it."""
-
+class _DifferencesInC(ctypes.Structure):
     _fields_ = [
-        *((name, _AT) for name in ("rates", "arguments", "results", "iw", "v", "x", "dx", "before", "step", "typical")),
+        *((name, _AT) for name in ("rates", "loops", "x", "dx", "before", "step", "values", "typical")),
         *((name, _INT) for name in ("n", "colors")),
         *((name, _AT) for name in ("where", "first", "columns", "rows_first", "rows")),
     ]
@@ -31,22 +30,25 @@ class Columns:
     """Columns of a derivative that are computed together.
 
     Columns without a common row share a color, and are moved together: the rates are evaluated once for each color.
-
-    Attributes
-    ----------
-    where : ndarray of int
-        Entries of x that are integrated.
-    columns, first : ndarray of int32
-        Columns color by color, and where each color begins.
-    rows, rows_first : ndarray of int32
-        Rows column by column, and where each column begins.
     """
 
     where: np.ndarray
+    """Entries of x that are moved, one for each column."""
     columns: np.ndarray
     first: np.ndarray
+    """Columns color by color, and where each color begins."""
     rows: np.ndarray
     rows_first: np.ndarray
+    """Rows column by column, and where each column begins."""
+
+    @classmethod
+    def of(cls, where: Sequence[int] | np.ndarray, rows: Sequence[np.ndarray]) -> Columns:
+        """Return the columns for entries of x, and the results that may depend on each of them."""
+        columns, first = _color(rows)
+        every, ends = np.concatenate([np.zeros(0), *rows]), np.cumsum([0, *map(len, rows)])
+        return cls(
+            np.array(where, dtype=np.int64), *(np.array(v, dtype=np.int32) for v in (columns, first, every, ends))
+        )
 
     @property
     def pattern(self) -> tuple[np.ndarray, np.ndarray]:
@@ -55,27 +57,12 @@ class Columns:
 
 
 @dataclass(frozen=True, eq=False)
-class RateDifferences:
-    """The derivative of the rates by the integrated states, by differences.
+class Differences(FunctionInC):
+    """The derivative of a function by entries of x, by differences; with ``values`` its values come before it."""
 
-    Attributes
-    ----------
-    rates : GroupedPart
-        The rates.
-    columns : Columns
-        The columns.
-    address : int
-        Address of the C function.
-    """
-
-    rates: GroupedPart
+    rates: FunctionInC
     columns: Columns
-    address: int
-
-    @property
-    def operations(self) -> int:
-        """Operations of one evaluation."""
-        return len(self.columns.first) * self.rates.operations
+    values: bool = False
 
     @property
     def pattern(self) -> tuple[np.ndarray, np.ndarray]:
@@ -83,51 +70,54 @@ class RateDifferences:
         return self.columns.pattern
 
     def bind(
-        self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], typical: np.ndarray
+        self,
+        arguments: Sequence[np.ndarray],
+        results: Sequence[np.ndarray],
+        bind_block: BlockBinder | None = None,
+        *,
+        typical: np.ndarray | None = None,
+        loops: NewtonStructure | None = None,
     ) -> BoundFunction:
-        """Return it bound to vectors; ``typical`` are sizes of the states below which steps don't become smaller."""
+        """Return it bound to vectors, for one call at a time.
+
+        ``typical`` are sizes of the entries of x below which steps don't become smaller, 1 without them; ``loops`` are
+        solved wherever these are moved to.
+        """
         of, n = self.columns, len(self.columns.where)
-        dx, before, step, where = np.zeros(n), np.zeros(n), np.zeros(n), of.where.astype(np.int64)
-        sizes = np.ascontiguousarray(typical)
-        bound = self.rates.bind(arguments, [dx])
-        rates = bound.structure
-        group = DifferencesStructure(
-            rates=rates.evaluate,
-            arguments=rates.arguments,
-            results=rates.results,
-            iw=rates.iw,
-            v=rates.w,
+        dx, before, step = np.zeros(n), np.zeros(n), np.zeros(n)
+        sizes, values = np.ones(n) if typical is None else typical, np.zeros(0 if loops is None else loops.n)
+        bound = self.rates.bind(arguments, [dx], bind_block)
+        structure = _DifferencesInC(
+            rates=ctypes.addressof(bound.structure),
+            loops=None if loops is None else ctypes.addressof(loops),
             x=at(arguments[1]),
             dx=at(dx),
             before=at(before),
             step=at(step),
+            values=at(values),
             typical=at(sizes),
             n=n,
             colors=len(of.first) - 1,
-            where=at(where),
+            where=at(of.where),
             first=at(of.first),
             columns=at(of.columns),
             rows_first=at(of.rows_first),
             rows=at(of.rows),
         )
-        lists = list_vectors(arguments, 4), list_vectors(results, 1)
-        structure = TickStructure(self.address, *map(ctypes.addressof, (*lists, group)), None)
-        return BoundFunction(structure, arguments, results, [self, bound, group, lists, dx, before, step, where, sizes])
+        into = list_vectors(results, len(results))
+        address = address_of(load_runtime(), "loopwright_equations" if self.values else "loopwright_slopes")
+        evaluate = TickStructure(address, None, ctypes.addressof(into), ctypes.addressof(structure), None)
+        kept = [self, bound, structure, into, loops, dx, before, step, sizes, values]
+        return BoundFunction(evaluate, arguments, results, kept)
+
+    def hand_over(self, to: Any) -> None:
+        """Let generated code of the same function take over."""
+        self.rates.hand_over(to.rates)
 
 
 def find_columns(part: PartProgram, continuous: np.ndarray) -> Columns:
     """Return the columns of the derivative of rates by the integrated states, ``continuous`` entries of x."""
-    rows = _find_rows(part, continuous)
-    columns, first = color_columns(rows)
-    ends = np.cumsum([0, *map(len, rows)])
-    every = np.concatenate([np.zeros(0, dtype=np.int32), *rows])
-    return Columns(
-        continuous,
-        np.array(columns, dtype=np.int32),
-        np.array(first, dtype=np.int32),
-        every.astype(np.int32),
-        ends.astype(np.int32),
-    )
+    return Columns.of(continuous, _find_rows(part, continuous))
 
 
 def _find_rows(part: PartProgram, continuous: np.ndarray) -> list[np.ndarray]:
@@ -176,7 +166,7 @@ def _pattern_of(functions: Mapping[int, Any], op: Operation) -> list[list[list[t
     return found
 
 
-def color_columns(rows: Sequence[np.ndarray]) -> tuple[list[int], list[int]]:
+def _color(rows: Sequence[np.ndarray]) -> tuple[list[int], list[int]]:
     """Return the columns color by color, and where each begins; no two of a color have a common row."""
     taken = list[int]()  # of each color, the rows that its columns have, one bit for each
     members = list[list[int]]()

@@ -15,11 +15,8 @@ from ...fmus.calls import BoundCalls, ModelExchangeInstance, NativeAction, Nativ
 from ...fmus.host_state import HostState
 from ..flat import JUMP, OpaqueStage
 from ..model_exchange import OWN_EVENTS
-from .bound_functions import CALL, TickStructure, address_of, at, list_vectors
-from .newton import NewtonStructure
+from .bound_functions import CALL, TickStructure, at
 from .plants_called_back import LateReplies, RemotePlants
-from .rate_differences import color_columns
-from .staged_functions import Staged, StagedEquations, StagedSlopes
 
 _LOGGED = 2**20  # bytes of events in a call
 _TO_STEP, _FAILED_IN_PYTHON = 0, 2
@@ -78,7 +75,9 @@ class _ModelExchange(ctypes.Structure):
     ]
 
 
-class _Stage(ctypes.Structure):
+class StageStructure(ctypes.Structure):
+    """A stage of a schedule, as C knows it: a traced function, or a block that an evaluator evaluates."""
+
     _fields_ = [
         ("f", TickStructure),
         ("fmu", _AT),
@@ -87,18 +86,6 @@ class _Stage(ctypes.Structure):
         ("by_python", _AT),
         *_fields(_AT, "t x u into"),
         ("made", _INT),
-    ]
-
-
-class _Schedule(ctypes.Structure):
-    _fields_ = [("count", _INT), ("stages", _AT)]
-
-
-class _SlopesInC(ctypes.Structure):
-    _fields_ = [
-        *_fields(_AT, "rates loops x dx before step values typical"),
-        *_fields(_INT, "n colors"),
-        *_fields(_AT, "where first columns rows_first rows"),
     ]
 
 
@@ -137,8 +124,6 @@ class NativeModelExchange:
         Where the states of each are in the vector of all.
     width : int
         Number of all states.
-    library : CDLL
-        The runtime library.
     by_python : callable
         Returns, for a stage and its vectors, the function that does for C what it can't.
     """
@@ -148,14 +133,11 @@ class NativeModelExchange:
         blocks: Mapping[str, ModelExchangeInstance],
         first: Mapping[str, int],
         width: int,
-        library: ctypes.CDLL,
         by_python: Callable[[OpaqueStage, EvaluationVectors], Callable[[], int]],
     ):
         self._blocks, self._width, self._kept, self._by_python = blocks, width, list[Any](), by_python
         self.called = CalledBack()
         """Calls of Python, with the error that has ended a run."""
-        names = ("stages", "slopes", "equations")
-        self._stages, self._slopes, self._equations = (address_of(library, f"loopwright_{name}") for name in names)
         self.paths = [*blocks]
         self._each = (_Exchanged * len(blocks))()
         self._names = dict[int, tuple[str, ...]]()
@@ -193,77 +175,15 @@ class NativeModelExchange:
 
     # --- binding -----------------------------------------------------------------------------------------------------
 
-    def bind(self, staged: Staged, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> TickStructure:
-        """Return a schedule bound to vectors, as C knows it; valid as long as this lives."""
-        schedule, functions = staged.schedule, [*staged.functions]
-        c = np.zeros(schedule.width)
-        vectors = [*arguments, c] if schedule.width else [*arguments]
-        made, seen = (_Stage * len(schedule.stages))(), set[str]()
-        last: Any = None
-        for structure, stage in zip(made, schedule.stages, strict=True):
-            if isinstance(stage, OpaqueStage):
-                self._bind_fmu(structure, stage, arguments[0], c, again=stage.path in seen)
-                seen.add(stage.path)
-                continue
-            bound = functions.pop(0).bind(vectors, [*results] if stage is schedule.last else [c[stage.makes]])
-            self._kept.append(bound)
-            structure.f, last = bound.structure, bound.structure.results
-        found = _Schedule(len(made), ctypes.addressof(made))
-        self._kept += [made, found]
-        return TickStructure(self._stages, None, last, ctypes.addressof(found), None)
-
-    def bind_equations(
-        self, equations: StagedEquations, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
-    ) -> TickStructure:
-        """Return the equations of algebraic loops bound to vectors."""
-        where, n = np.array(equations.where), len(equations.where)
-        slopes = StagedSlopes(equations.mismatch, where, [np.arange(n, dtype=np.int32)] * n)
-        made = self.bind_slopes(slopes, arguments, results, np.ones(n))
-        made.evaluate = self._equations
-        return made
-
-    def bind_slopes(
-        self,
-        slopes: StagedSlopes,
-        arguments: Sequence[np.ndarray],
-        results: Sequence[np.ndarray],
-        typical: np.ndarray,
-        loops: NewtonStructure | None = None,
-    ) -> TickStructure:
-        """Return the derivative of rates bound to vectors; ``loops`` are solved wherever the states are moved to."""
-        n = slopes.where.size
-        dx = np.zeros(n)
-        rates = self.bind(slopes.rates, arguments, [dx])
-        columns, first = color_columns(slopes.rows)
-        ends = np.cumsum([0, *map(len, slopes.rows)])
-        found = _SlopesInC(
-            rates=ctypes.addressof(rates),
-            loops=None if loops is None else ctypes.addressof(loops),
-            values=self._own(np.zeros(0 if loops is None else loops.n)),
-            x=at(arguments[1]),
-            dx=at(dx),
-            **{name: self._own(np.zeros(n)) for name in ("before", "step")},
-            typical=self._own(typical),
-            n=n,
-            colors=len(first) - 1,
-            where=self._own(slopes.where.astype(np.int64)),
-            first=self._own(np.array(first, dtype=np.int32)),
-            columns=self._own(np.array(columns, dtype=np.int32)),
-            rows_first=self._own(ends.astype(np.int32)),
-            rows=self._own(slopes.pattern[0].astype(np.int32)),
-        )
-        into = list_vectors(results, len(results))
-        self._kept += [rates, loops, found, into, dx, arguments, results]
-        return TickStructure(self._slopes, None, ctypes.addressof(into), ctypes.addressof(found), None)
-
-    def bind_jump(self, staged: Staged, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
-        """Bind the looks at an instant that is reached."""
-        self.structure.jump = self.bind(staged, arguments, results)
-
-    def _bind_fmu(self, structure: _Stage, stage: OpaqueStage, t: np.ndarray, c: np.ndarray, *, again: bool) -> None:
+    def bind_block(self, stage: OpaqueStage, t: np.ndarray, c: np.ndarray, *, again: bool) -> StageStructure:
+        """Return a stage as C knows it; valid as long as this lives. See `Evaluator.bind`."""
         place = self.paths.index(stage.path)
-        block, fmu = self._blocks[stage.path], self._each[place]
-        vectors = stage.vectors(t, c)
+        block, fmu, vectors, structure = (
+            self._blocks[stage.path],
+            self._each[place],
+            stage.vectors(t, c),
+            StageStructure(),
+        )
         structure.fmu = ctypes.addressof(self._each) + place * ctypes.sizeof(_Exchanged)
         structure.t, structure.x, structure.u, structure.into = map(at, vectors)
         structure.made, structure.looks = vectors.into.size, stage.names == (JUMP,)
@@ -271,12 +191,12 @@ class NativeModelExchange:
         if fmu.by_python:
             fmu.states = vectors.x.size
             self._inputs.setdefault(stage.path, np.zeros(0))
-            return
-        if structure.looks:
+        elif structure.looks:
             self._bind_look(fmu, stage.path, block.native_look(vectors), vectors.x.size)
             fmu.events = vectors.u.size - fmu.inputs
-            return
-        structure.calls = self._sequence(stage.path, block.native_evaluation(stage.wanted, vectors, again=again))
+        else:
+            structure.calls = self._sequence(stage.path, block.native_evaluation(stage.wanted, vectors, again=again))
+        return structure
 
     def _bind_look(self, fmu: _Exchanged, path: str, look: NativeLook, states: int) -> None:
         fmu.states, fmu.inputs = states, look.least.size

@@ -1,27 +1,27 @@
-"""Functions of a diagram in stages, and the derivative of one, compiled."""
+"""Functions of a diagram in stages: traced ones, and between them blocks that an evaluator evaluates."""
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from ..flat import Schedule
-from .bound_functions import CompiledFunction
+from ..flat import OpaqueStage, Schedule
+from .bound_functions import BlockBinder, BoundFunction, CompiledFunction, FunctionInC, TickStructure, address_of
+from .runtime import load_runtime
+from .staged import StageStructure
+
+
+class _ScheduleInC(ctypes.Structure):
+    _fields_ = [("count", ctypes.c_int64), ("stages", ctypes.c_void_p)]
 
 
 @dataclass(frozen=True, eq=False)
-class Staged:
-    """A schedule whose traced stages were compiled.
-
-    Attributes
-    ----------
-    schedule : Schedule
-        The schedule.
-    functions : sequence of CompiledFunction
-        Its traced stages, in their order.
-    """
+class Staged(FunctionInC):
+    """A schedule whose traced stages, in their order, are functions in C."""
 
     schedule: Schedule
     functions: Sequence[CompiledFunction]
@@ -31,59 +31,28 @@ class Staged:
         """Operations of one evaluation, without those of the FMUs."""
         return sum(function.operations for function in self.functions)
 
-    @property
-    def pattern(self) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column of each entry: none, it is no derivative."""
-        return np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32)
+    def bind(
+        self, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray], bind_block: BlockBinder | None = None
+    ) -> BoundFunction:
+        """Return it bound to vectors, for one call at a time; ``bind_block`` binds the stages between."""
+        assert bind_block is not None
+        schedule, functions = self.schedule, iter(self.functions)
+        c = np.zeros(schedule.width)
+        vectors = [*arguments, c] if schedule.width else [*arguments]
+        made, seen, kept = (StageStructure * len(schedule.stages))(), set[str](), list[Any]()
+        for i, stage in enumerate(schedule.stages):
+            if isinstance(stage, OpaqueStage):
+                made[i] = bind_block(stage, arguments[0], c, again=stage.path in seen)
+                seen.add(stage.path)
+                continue
+            kept.append(next(functions).bind(vectors, results if stage is schedule.last else [c[stage.makes]]))
+            made[i].f = kept[-1].structure
+        found = _ScheduleInC(len(made), ctypes.addressof(made))
+        address, last = address_of(load_runtime(), "loopwright_stages"), made[len(made) - 1].f.results
+        structure = TickStructure(address, None, last, ctypes.addressof(found), None)
+        return BoundFunction(structure, arguments, results, [self, c, *kept, made, found])
 
-
-@dataclass(frozen=True, eq=False)
-class StagedSlopes:
-    """The derivative of staged rates by the integrated states, by differences.
-
-    Attributes
-    ----------
-    rates : Staged
-        The rates.
-    where : ndarray of int
-        Entries of x that are integrated.
-    rows : sequence of ndarray
-        Rates that may depend on each of them.
-    """
-
-    rates: Staged
-    where: np.ndarray
-    rows: Sequence[np.ndarray]
-
-    @staticmethod
-    def of(rates: Staged, where: np.ndarray, *, looped: bool = False) -> StagedSlopes:
-        """Return them for rates and the entries of x that are integrated; loops may lead from each to each."""
-        depends = np.ones((where.size, where.size), bool) if looped else rates.schedule.depends("dx", "x")[:, where]
-        return StagedSlopes(rates, where, [np.flatnonzero(column).astype(np.int32) for column in depends.T])
-
-    @property
-    def operations(self) -> int:
-        """Operations of one evaluation."""
-        return (1 + len(self.rows)) * self.rates.operations
-
-    @property
-    def pattern(self) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column of each entry."""
-        columns = np.repeat(np.arange(len(self.where)), [len(own) for own in self.rows])
-        return np.concatenate([np.zeros(0, dtype=np.int32), *self.rows]), columns
-
-
-@dataclass(frozen=True, eq=False)
-class StagedEquations:
-    """The mismatch of algebraic loops in stages, and its derivative by their values, by differences.
-
-    Attributes
-    ----------
-    mismatch : Staged
-        The mismatch.
-    where : sequence of int
-        Entries of x that hold the values.
-    """
-
-    mismatch: Staged
-    where: Sequence[int]
+    def hand_over(self, to: Any) -> None:
+        """Let generated code of the same stages take over."""
+        for one, other in zip(self.functions, to.functions, strict=True):
+            one.hand_over(other)

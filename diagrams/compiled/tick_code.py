@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 from ...blocks.core import CompilerError
 from ...fmus.runtime import read_sources
 from ..flat import EXACT_LOOP, FlatDiagram, TickPattern, TickProgram, share_terms
-from .bound_functions import CodeOfFunctions, CompiledFunction, GeneratedCode, address_of
+from .bound_functions import CodeOfFunctions, CompiledFunction, FunctionInC, GeneratedCode, address_of
 from .compiled_libraries import load_compiled
 from .function_code import Sources
 from .generated_text import write_functions
@@ -21,15 +21,10 @@ from .grouping import TickTables, make_tables
 from .kernels import BlockKinds, Kernels
 from .reordered import put_in_order
 from .runtime import load_runtime
-from .staged_functions import Staged, StagedEquations
 
 LARGEST = 6_000
 """Operations of a function up to which it is compiled as a whole: the compiler's time grows faster than they do."""
 LOOP_OVER_TICKS = "loopwright_run"
-
-
-CompiledTick = CompiledFunction | GroupedTick | Staged
-"""A tick that was compiled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +49,10 @@ class TickCode:
         What a run reports of its code.
     """
 
-    ticks: Mapping[frozenset[TickPattern], CompiledTick]
+    ticks: Mapping[frozenset[TickPattern], FunctionInC]
     exact: bool
     library: ctypes.CDLL
-    loops: Mapping[frozenset[TickPattern], CompiledFunction | StagedEquations] = field(default_factory=dict)
+    loops: Mapping[frozenset[TickPattern], FunctionInC] = field(default_factory=dict)
     run_ticks: Any = None
     notes: tuple[str, ...] = ()
 

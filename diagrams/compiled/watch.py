@@ -10,12 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..flat import FlatDiagram
-from .bound_functions import TickStructure, at
+from .bound_functions import FunctionInC, TickStructure, at
 from .event_domains import Domains
-from .hybrid_code import Between
-from .rate_differences import RateDifferences
 from .staged import NativeModelExchange
-from .staged_functions import Staged, StagedSlopes
 
 _LOGGED = 2**22  # bytes of what has fired in a call
 _INSTANTS = 1100  # of a step that are looked at together, at most
@@ -70,7 +67,7 @@ class Watch:
     ----------
     flat : FlatDiagram
         The diagram.
-    functions : mapping of str to Between
+    functions : mapping of str to FunctionInC
         Its functions ``"indicators"`` and ``"jump"``.
     trial, here : sequence of ndarray
         The vectors (t, x, w, p) of a trial, and of the instant that is reached.
@@ -94,7 +91,7 @@ class Watch:
     def __init__(
         self,
         flat: FlatDiagram,
-        functions: Mapping[str, Between],
+        functions: Mapping[str, FunctionInC],
         trial: Sequence[np.ndarray],
         here: Sequence[np.ndarray],
         x_next: np.ndarray,
@@ -113,13 +110,12 @@ class Watch:
         z, opened, fired = np.zeros(m), np.zeros(m), np.zeros(m)
         for name, vectors in {"z": z, "open": opened, "fired": fired}.items():
             self._put(name, vectors)
-        indicators = functions["indicators"]
-        if exchange is None:
-            self._bind("indicators", indicators, trial, [z, opened])
-            self._bind("jump", functions["jump"], [*here, fired], [x_next])
-        else:
-            assert isinstance(indicators, Staged)
-            self.structure.indicators = exchange.bind(indicators, trial, [z, opened])
+        indicators = functions["indicators"].bind(trial, [z, opened], None if exchange is None else exchange.bind_block)
+        self.structure.indicators = indicators.structure
+        self._kept.append(indicators)
+        if exchange is None:  # blocks in model exchange look at every instant: their jumps are theirs, see `hybrid`
+            self._kept.append(functions["jump"].bind([*here, fired], [x_next]))
+            self.structure.jump = self._kept[-1].structure
         self.fired = fired
         """Which events fire in a jump, from 0 to 1."""
         flags = {
@@ -175,14 +171,6 @@ class Watch:
         self._put("gate", gates)
         self._put("inside", np.array([j for own in inside for j in own] + [0], dtype=np.int64))
         self._put("inside_first", np.cumsum([0, *map(len, inside)]).astype(np.int64))
-
-    def _bind(
-        self, name: str, function: Between, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
-    ) -> None:
-        assert not isinstance(function, RateDifferences | Staged | StagedSlopes)
-        bound = function.bind(arguments, results)
-        self._kept.append(bound)
-        setattr(self.structure, name, bound.structure)
 
     def take_slid(self) -> list[tuple[float, int]]:
         """Return the events that have begun to slide since the last call, and when, in s."""

@@ -403,9 +403,9 @@ static inline void put_loops(const newton *s, const double *values, double *x) {
 VISIBLE int loopwright_slopes(const double **arguments, double **results, long long *iw, double *w, int memory) {
     const slopes_of *g = (const slopes_of *)iw;
     const tick *f = g->rates;
-    double *out = results[0], *into[] = {g->dx};
+    double *out = results[0];
     (void)arguments, (void)w;
-    if (f->evaluate(f->arguments, into, f->iw, f->w, memory)) return 1;
+    if (f->evaluate(f->arguments, f->results, f->iw, f->w, memory)) return 1;
     memcpy(g->before, g->dx, (size_t)g->n * sizeof(double));
     if (g->loops) keep_loops(g->loops, g->x, g->values);
     for (int64_t c = 0; c < g->colors; c++) {
@@ -415,7 +415,8 @@ VISIBLE int loopwright_slopes(const double **arguments, double **results, long l
             g->step[k] = *x;
             *x = moved;
         }
-        const int failed = (g->loops && !solve_loops(g->loops, g->x)) || f->evaluate(f->arguments, into, f->iw, f->w, memory);
+        const int failed = (g->loops && !solve_loops(g->loops, g->x)) ||
+                           f->evaluate(f->arguments, f->results, f->iw, f->w, memory);
         for (int32_t k = g->first[c]; k < g->first[c + 1]; k++) {
             const int32_t j = g->columns[k];
             double *x = g->x + g->where[j];

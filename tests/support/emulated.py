@@ -21,7 +21,7 @@ import unicorn
 from unicorn import arm64_const as arm
 from unicorn import x86_const as x86
 
-from loopwright.diagrams.compiled import compiled_libraries, native_tick, plants_called_back, runtime
+from loopwright.diagrams.compiled import bound_functions, compiled_libraries, plants_called_back, runtime
 from loopwright.fmus.export import compile_shared
 from loopwright.fmus.toolchain import DIAGRAM_FLAGS
 
@@ -307,5 +307,5 @@ def emulate(patch, platform, folder):
     _replace(patch, runtime.load_runtime, lru_cache(runtime.load_runtime.__wrapped__))
     _replace(patch, compiled_libraries.load_compiled, load)
     patch.setattr(plants_called_back, "load_runtime", native_runtime)  # code of other processes
-    patch.setattr(native_tick, "TICK", function)
+    patch.setattr(bound_functions, "TICK", function)
     return processor
