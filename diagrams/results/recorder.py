@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from io import FileIO
 from pathlib import Path
 from time import monotonic
@@ -51,9 +51,6 @@ class Recorder:
     always kept, apart from the data. ``header`` is that of the run on disk (`stored.header`).
     """
 
-    row: Callable[[float, np.ndarray], None]
-    """Append a sample ``(t, vector)``; the vector is copied."""
-
     def __init__(
         self,
         width: int,
@@ -82,12 +79,10 @@ class Recorder:
         self._fired: list[Occurrence] = []
         self.events: Sequence[Occurrence] = self._fired
         self._done: list[np.ndarray] = []
-        self._chunk = self._times = self._values = np.empty((0, 0))
+        self._chunk = np.empty((0, 0))
         self._k = self._limit = self._skip = 0
         self._due, self._broken = 0.0, False
         self._tail: np.ndarray | None = None  # the newest row that was flushed
-        self._keep = self._keep_in_memory if to is None else self._keep_on_disk
-        self.row = self._keep if self.every == 1 else self._keep_nth
         self._watched: Mapping[str, np.ndarray] = {}
         self._lost: dict[str, float] = {}
         self.residual: np.ndarray | None = None
@@ -133,33 +128,21 @@ class Recorder:
                 if lost.any():
                     self._lost[name] = float(rows[int(np.argmax(lost)), 0])
 
-    # --- samples: called at every tick -------------------------------------------------------------------------------
+    # --- samples: C writes almost all of them into `room` ------------------------------------------------------------
 
-    def _keep_in_memory(self, t: float, vector: np.ndarray) -> None:
-        k = self._k
-        if k == self._limit:
-            self._grow(t)
-            k = 0
-        self._times[k] = t
-        self._values[k] = vector if self._pick is None else vector[self._pick]
-        self._k = k + 1
-
-    def _keep_on_disk(self, t: float, vector: np.ndarray) -> None:
-        k = self._k
-        if k == self._limit or monotonic() >= self._due:
-            self._start()
-            self.flush()
-            k = 0
-        self._times[k] = t
-        self._values[k] = vector if self._pick is None else vector[self._pick]
-        self._k = k + 1
-
-    def _keep_nth(self, t: float, vector: np.ndarray) -> None:
+    def row(self, t: float, vector: np.ndarray) -> None:
+        """Append a sample, which is copied, if it is the one of ``every`` that is kept."""
         if self._skip:
             self._skip -= 1
         else:
             self._skip = self.every - 1
             self._keep(t, vector)
+
+    def _keep(self, t: float, vector: np.ndarray) -> None:
+        row = self.room(t)[0]
+        row[0] = t
+        row[1:] = vector if self._pick is None else vector[self._pick]
+        self._k += 1
 
     @property
     def entries(self) -> np.ndarray | None:
@@ -215,7 +198,6 @@ class Recorder:
 
     def _begin_chunk(self, rows: int) -> None:
         self._chunk = np.empty((rows, self._width), "<f8")
-        self._times, self._values = self._chunk[:, 0], self._chunk[:, 1:]
         self._k, self._limit = 0, rows
 
     def _grow(self, t: float) -> None:

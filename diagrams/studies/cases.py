@@ -41,43 +41,19 @@ class CaseOrigin(StrEnum):
 
 @dataclass(frozen=True)
 class StudyCase:
-    """One choice of parameters at one operating point, with its numbers.
+    """One choice of parameters at one operating point, with its numbers."""
 
-    Attributes
-    ----------
-    index : int
-        Place among all cases.
-    origin : CaseOrigin
-        Sample, corner or search.
-    parameters : mapping
-        Values by path, as `Diagram.replace` takes them; empty of the diagram as it is.
-    point : int
-        Place of the operating point among those asked for.
-    state : CaseState
-        Outcome.
-    goodness : float
-        Distance to the limit, or the number by its sense: the smaller, the worse.
-    loop, quantity : tuple of str, str
-        The loop and the number that the goodness belongs to.
-    numbers : mapping
-        Numbers of the loops, by wires and name.
-    growth : float
-        Growth of the fastest unstable pole in 1/s; NaN of a stable case.
-    reason : str
-        Why it failed.
-    """
-
-    index: int
+    index: int  # place among all cases
     origin: CaseOrigin
-    parameters: Mapping[str, Any]
-    point: int
+    parameters: Mapping[str, Any]  # as `Diagram.replace` takes them; {} of the diagram as it is
+    point: int  # place of the operating point among those asked for
     state: CaseState
-    goodness: float
-    loop: tuple[str, ...] = ()
-    quantity: str = ""
+    goodness: float  # distance to the limit, or the number by its sense: the smaller, the worse
+    loop: tuple[str, ...] = ()  # to which the goodness belongs
+    quantity: str = ""  # number of the loop to which the goodness belongs
     numbers: Mapping[tuple[str, ...], Mapping[str, Number]] = field(default_factory=dict, repr=False)
-    growth: float = math.nan
-    reason: str = ""
+    growth: float = math.nan  # of the fastest unstable pole in 1/s; NaN of a stable case
+    reason: str = ""  # why it failed
 
     @property
     def value(self) -> float:

@@ -64,7 +64,7 @@ def find_places(diagram: WiredDiagram, wires: Mapping[str, str], asked: Requirem
 
 
 def _place_at_plant(diagram: WiredDiagram, wire: str, flat: FlatDiagram) -> LoopPlace:
-    """Return the place ahead of the plant's inputs, where they can be told from others and all take the whole wire."""
+    """Return the place ahead of the plant's inputs, where they can be found and all take the whole wire."""
     tap, wires = find_signal(flat, wire), diagram.structure.wires
     ways = find_ways_back(flat, tap.port)
 

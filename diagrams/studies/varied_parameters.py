@@ -82,8 +82,8 @@ def _find_structure(diagram: WiredDiagram, name: str) -> str:
         return f"{article} {last.replace('_', ' ')} of a subsystem"
     path, keys = split_path(diagram.structure, name, diagram.name)
     block: Any = diagram.structure.blocks[path]
-    if (block.stepped or block.in_model_exchange) and keys[0] == "start":
-        variable = block.description.find(".".join(keys[1:]))
+    if start := _start_value(block, keys):
+        variable = block.description.find(start)
         kind = "b" if variable.type == "Boolean" else "i" if variable.is_integer else "f"
     else:
         kind = np.asarray(read_parameter(diagram, name)).dtype.kind
@@ -91,13 +91,19 @@ def _find_structure(diagram: WiredDiagram, name: str) -> str:
     return said.get(kind, "a parameter that is no number")
 
 
+def _start_value(block: Block, keys: list[str]) -> str:
+    """Return the name of the FMU's variable whose start value a path names; "" for another parameter."""
+    is_fmu = block.stepped or block.in_model_exchange
+    return ".".join(keys[1:]) if is_fmu and keys[0] == "start" else ""
+
+
 def unit_of(diagram: WiredDiagram, parameter: str) -> str:
     """Return the declared unit of a parameter; "" where there is none."""
     path, keys = split_path(diagram.structure, parameter.partition("[")[0], diagram.name)
     block: Block = diagram.structure.blocks[path]
-    if (block.stepped or block.in_model_exchange) and keys[0] == "start":
+    if start := _start_value(block, keys):
         about: Any = block
-        variable = about.description.variables.get(".".join(keys[1:]))
+        variable = about.description.variables.get(start)
         return str(getattr(variable, "unit", None) or "")
     spec = _find_declaration(block, keys)
     return "" if spec is None or spec.unit is None else spec.unit
@@ -166,10 +172,9 @@ def read_parameter(diagram: WiredDiagram, name: str) -> Any:
     """Return the value of a parameter, or of an FMU's start value, by its full path; or of an entry of an array."""
     path, keys = split_path(diagram.structure, name, diagram.name)
     owner: Any = diagram.structure.blocks[path]
-    if (owner.stepped or owner.in_model_exchange) and keys[0] == "start":
-        key = ".".join(keys[1:])
-        known = owner.start.get(key)
-        return owner.description.find(key).start if known is None else known
+    if start := _start_value(owner, keys):
+        known = owner.start.get(start)
+        return owner.description.find(start).start if known is None else known
     last, entry = split_entry(keys[-1], ())
     for key in (*keys[:-1], last):
         owner = owner.__dict__[key] if isinstance(owner, Value) else owner[key]

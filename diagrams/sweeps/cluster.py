@@ -16,7 +16,7 @@ from ...blocks.core import OptionError, one_thread, replace_file
 from ...fmus import Fmu
 from ...fmus.platform import cache_folder, explain_cache_errors, is_built_here, record_build
 from ..flat import WiredDiagram
-from .outcome import WORKER_ENDED, Failure, SampleOutcome
+from .outcome import SampleOutcome
 from .plan import Plan, Worker
 from .processes import to_bytes
 from .samples import Sample
@@ -175,7 +175,7 @@ def run_on_cluster(plan: Plan, samples: Sequence[Sample], client: Any) -> Genera
             error = future.exception() if future.status == "error" else None
             if future.status == "finished":
                 yield from future.result()
-            elif error is not None and not _has_ended(error):
+            elif error is not None and not isinstance(error, library.KilledWorker):
                 raise OptionError(
                     f"the cluster's workers can't run the sweep: {type(error).__name__}: {error}. They need Loopwright "
                     "of this version, and the modules of the diagram's blocks.",
@@ -187,23 +187,9 @@ def run_on_cluster(plan: Plan, samples: Sequence[Sample], client: Any) -> Genera
                     chunks[alone := submit([sample])] = [sample]
                     waiting.add(alone)
             else:
-                yield _lost(some[0])
+                end = "the workers of the cluster that ran this sample ended, several times"
+                yield SampleOutcome.of_lost(some[0], end)
     finally:
         client.cancel([*chunks, packed, *files])
         with suppress(Exception):  # a cluster that is gone has nothing left to free
             client.run(release, key)
-
-
-def _has_ended(error: BaseException) -> bool:
-    from distributed import KilledWorker
-
-    return isinstance(error, KilledWorker)
-
-
-def _lost(sample: Sample) -> SampleOutcome:
-    values = ", ".join(f"{name!r}: {value!r}" for name, value in sample.parameters.items())
-    text = (
-        "the workers of the cluster that ran this sample ended, several times. Run it alone: "
-        f"diagram.replace({{{values}}}).simulate(…)."
-    )
-    return SampleOutcome(sample.index, failure=Failure(sample.index, WORKER_ENDED, text))

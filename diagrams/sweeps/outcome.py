@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...blocks.core import explain_calls
+from .samples import Sample
 
 
 @explain_calls
@@ -57,3 +58,10 @@ class SampleOutcome:
     failure: Failure | None = None
     units: Mapping[str, str] = field(default_factory=dict)  # of the signals that are kept, and of reductions
     messages: tuple[str, ...] = ()
+
+    @classmethod
+    def of_lost(cls, sample: Sample, end: str) -> SampleOutcome:
+        """Return the outcome of a sample whose process has ended; ``end`` says how."""
+        values = ", ".join(f"{name!r}: {value!r}" for name, value in sample.parameters.items())
+        text = f"{end}. Run it alone: diagram.replace({{{values}}}).simulate(…)."
+        return cls(sample.index, failure=Failure(sample.index, WORKER_ENDED, text))

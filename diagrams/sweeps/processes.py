@@ -11,7 +11,7 @@ from contextlib import suppress
 
 from ...blocks.core import OptionError
 from ...fmus.child_processes import ProcessGroup, PythonChild
-from .outcome import WORKER_ENDED, Failure, SampleOutcome
+from .outcome import SampleOutcome
 from .plan import Plan
 from .sample_queue import SampleQueue
 from .samples import Sample
@@ -96,7 +96,7 @@ class _Process:
             child.send(sample)
             found: SampleOutcome = child.receive()
         except (EOFError, OSError):
-            return SampleOutcome(sample.index, failure=Failure(sample.index, WORKER_ENDED, self._describe_end(sample)))
+            return SampleOutcome.of_lost(sample, f"the worker process ended {self._describe_end()} in this run")
         return found
 
     def _begin(self) -> PythonChild:
@@ -115,15 +115,13 @@ class _Process:
                 )
         return child
 
-    def _describe_end(self, sample: Sample) -> str:
+    def _describe_end(self) -> str:
         child, self._child = self._child, None
         code = None if child is None else child.wait()
-        end = f"with exit status {code}"
         if code is not None and code < 0:
             with suppress(ValueError):
-                end = f"by signal {signal.Signals(-code).name}"
-        values = ", ".join(f"{name!r}: {value!r}" for name, value in sample.parameters.items())
-        return f"the worker process ended {end} in this run. Run it alone: diagram.replace({{{values}}}).simulate(…)."
+                return f"by signal {signal.Signals(-code).name}"
+        return f"with exit status {code}"
 
     def end(self) -> None:
         """End the process, whatever it does."""

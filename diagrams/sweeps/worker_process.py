@@ -19,7 +19,7 @@ def _answer(host: Host) -> None:
     try:
         plan = pickle.loads(data)
     except Exception as error:
-        host.send(error_text(error))
+        host.send(f"{type(error).__name__}: {error}")
         return
     from ...blocks.core import one_thread
     from ...fmus.child_processes import end_all
@@ -33,8 +33,3 @@ def _answer(host: Host) -> None:
                     host.send(outcome)
     finally:
         end_all()
-
-
-def error_text(error: BaseException) -> str:
-    """Return an error with its class."""
-    return f"{type(error).__name__}: {error}"
